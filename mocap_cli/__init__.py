@@ -1,0 +1,1 @@
+"""The `mocap` command line: arguments in, one call, results out."""

@@ -1,0 +1,1 @@
+"""Every foreign file format, one module each, registered by an entry point."""

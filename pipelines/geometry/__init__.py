@@ -1,0 +1,1 @@
+"""Poses, cameras, triangulation, alignment, noise models and metrics: arrays in, arrays out."""

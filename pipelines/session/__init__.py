@@ -1,0 +1,1 @@
+"""What a session is: manifest, tables, storage, stages, skeletons, errors and registries."""

@@ -1,0 +1,36 @@
+"""The errors a user can cause or mend. Each is one line: which file, what is wrong, what to do.
+
+The command line prints the line and exits 1. Anything else that escapes is our own bug.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class MocapError(Exception):
+    """Root of every error that is reported as one line instead of a traceback."""
+
+
+class DataError(MocapError):
+    """Input that cannot be used.
+
+    Args:
+        source: the file, folder or setting at fault.
+        problem: what is wrong with it, with the numbers involved.
+        remedy: what the user can do about it; empty only when the problem says it already.
+    """
+
+    def __init__(self, source: Path | str, problem: str, remedy: str = "") -> None:
+        self.source = source
+        self.problem = problem
+        self.remedy = remedy
+        super().__init__(f"{source}: {problem}" + (f"; {remedy}" if remedy else ""))
+
+
+class NotYetReadError(DataError):
+    """A valid part of `flight.yaml` whose reader is not part of this version."""
+
+
+class BusyError(MocapError):
+    """Another process is writing the session."""

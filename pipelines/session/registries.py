@@ -1,0 +1,141 @@
+"""What others can add: formats, exports, detectors, noise models and planner arms.
+
+Each is found through an entry point, so adding one is one module and one line in a pyproject.toml,
+in this package or in a package of the user's own. An entry point names an object of the protocol here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Generic, Protocol, TypeVar, runtime_checkable
+
+from pipelines.session.errors import DataError
+from pipelines.session.records import CalibratedCamera, Detections, JointMotion, Recording, Trajectory
+
+T = TypeVar("T")
+
+
+class Format(Protocol):
+    """A foreign file format. The reading method depends on what the format holds (below)."""
+
+    name: str  # what the user writes after `format:`
+    title: str  # what `mocap info` calls it
+    suffixes: tuple[str, ...]  # lower case; a quick refusal before `recognises` opens anything
+
+    def recognises(self, path: Path) -> bool:
+        """Whether this file or folder is of this format, by its content. Never raises on bad content."""
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """What is inside, for `mocap info`: names to numbers, text or lists, JSON-able, in reading order."""
+
+
+@runtime_checkable
+class KeypointFormat(Format, Protocol):
+    """2D keypoints of one camera."""
+
+    def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
+        """Read them all; `skeleton` where the user states it; file frame k becomes k - first_frame."""
+
+
+@runtime_checkable
+class TrajectoryFormat(Format, Protocol):
+    """Poses over time."""
+
+    def read_trajectory(self, path: Path) -> Trajectory:
+        """Read them in the axes of the file; rows that cannot be used are dropped and counted."""
+
+
+@runtime_checkable
+class CalibrationFormat(Format, Protocol):
+    """Cameras that stand still: intrinsics, poses or both, by camera name."""
+
+    def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
+        """Read every camera; the world's axes are those of the file."""
+
+
+@runtime_checkable
+class JointFormat(Format, Protocol):
+    """3D joints over time."""
+
+    def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
+        """Read them as metres, z up. `unit` (m, cm, mm) and `axes` (z-up, y-up) where the user states them."""
+
+
+class Export(Protocol):
+    """A way out of a session."""
+
+    name: str  # what the user writes after `--to`
+    title: str
+
+    def write(self, recording: Recording, folder: Path) -> list[Path]:
+        """Write into an existing empty folder; the paths written, sorted. DataError if there is nothing to write."""
+
+
+class Registry(Generic[T]):
+    """The objects that one group of entry points names, loaded when they are asked for."""
+
+    def __init__(self, group: str, noun: str) -> None:
+        self.group = group
+        self.noun = noun
+
+    @cached_property
+    def _entries(self) -> dict[str, EntryPoint]:
+        return {entry.name: entry for entry in sorted(entry_points(group=self.group), key=lambda e: e.name)}
+
+    def names(self) -> list[str]:
+        """Every registered name, sorted."""
+        return list(self._entries)
+
+    def get(self, name: str) -> T:
+        """The object of that name.
+
+        Raises:
+            DataError: no such name; the message lists those there are.
+        """
+        if name not in self._entries:
+            raise DataError(name, f"no such {self.noun}", f"there are {', '.join(self.names()) or 'none'}")
+        loaded: T = self._entries[name].load()
+        return loaded
+
+    def all(self) -> list[T]:
+        """Every registered object, in the order of their names."""
+        return [self.get(name) for name in self.names()]
+
+
+FORMATS: Registry[Format] = Registry("mocap.formats", "format")
+EXPORTS: Registry[Export] = Registry("mocap.exports", "export format")
+
+F = TypeVar("F")
+
+
+def recognise(path: Path, protocol: type[F], noun: str, formats: Sequence[Format] | None = None) -> F:
+    """The one registered format of a kind that recognises a file.
+
+    Args:
+        path: an existing file or folder.
+        protocol: the kind, one of the runtime-checkable protocols above.
+        noun: what the kind is called in messages ("keypoint file", "camera trajectory").
+        formats: the candidates; every registered format by default.
+
+    Raises:
+        DataError: the path is missing, no format of the kind knows it, or several do.
+    """
+    if not path.exists():
+        raise DataError(
+            path, "does not exist", "check the path; paths are relative to the file that names them"
+        )
+    candidates = [f for f in (FORMATS.all() if formats is None else formats) if isinstance(f, protocol)]
+    matches = [f for f in candidates if f.recognises(path)]
+    if len(matches) == 1:
+        return matches[0]
+    known = ", ".join(sorted(f.name for f in candidates))
+    if not matches:
+        raise DataError(path, f"not recognised as a {noun}", f"known formats: {known}")
+    raise DataError(
+        path,
+        f"could be {' or '.join(sorted(f.name for f in matches))}",
+        "say which with `format:`",
+    )

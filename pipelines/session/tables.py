@@ -1,0 +1,94 @@
+"""The columns of every table of a session, and how they are read and written.
+
+The files are plain Parquet that pandas reads without this program. The same frame gives the same
+bytes: no index, no pandas metadata, fixed writer settings.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pyarrow as pa
+
+from pipelines.session.errors import DataError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+STATUS = ("ok", "filled", "few_views", "low_parallax", "rejected", "not_detected", "no_pose")
+
+_POSE = [(name, pa.float64()) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+COVARIANCE_COLUMNS = tuple(f"c{i}{j}" for i in range(6) for j in range(i, 6))
+"""Upper triangle of a pose covariance: position in world, rotation vector in camera."""
+
+FRAMES = pa.schema([("frame", pa.int64()), ("t_ns", pa.int64()), ("pts_ns", pa.int64())])
+POSES = pa.schema([("t_ns", pa.int64()), *_POSE])
+POSES_WITH_COVARIANCE = pa.schema([*POSES, *[(name, pa.float64()) for name in COVARIANCE_COLUMNS]])
+KEYPOINTS = pa.schema(
+    [
+        ("frame", pa.int64()),
+        ("t_ns", pa.int64()),
+        ("person", pa.int64()),
+        ("joint", pa.string()),
+        ("x", pa.float64()),
+        ("y", pa.float64()),
+        ("confidence", pa.float64()),
+    ]
+)
+TRUTH = pa.schema(
+    [
+        ("t_ns", pa.int64()),
+        ("person", pa.int64()),
+        ("joint", pa.string()),
+        ("x", pa.float64()),
+        ("y", pa.float64()),
+        ("z", pa.float64()),
+    ]
+)
+CAMERA_POSES = pa.schema([("t_ns", pa.int64()), ("camera", pa.string()), *_POSE])
+"""truth_poses.parquet: the true pose of every camera."""
+
+SKELETON = pa.schema(
+    [
+        ("t_ns", pa.int64()),
+        ("person", pa.int64()),
+        ("joint", pa.string()),
+        ("x", pa.float64()),
+        ("y", pa.float64()),
+        ("z", pa.float64()),
+        *[(name, pa.float64()) for name in ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")],
+        ("views", pa.int64()),
+        ("reprojection_px", pa.float64()),
+        ("status", pa.string()),
+    ]
+)
+
+
+def write_table(path: Path, frame: pd.DataFrame, schema: pa.Schema) -> None:
+    """Write a table with exactly the columns of `schema`; NaN stays NaN."""
+    import pyarrow.parquet as pq
+
+    columns = [pa.array(frame[field.name].to_numpy(), type=field.type, from_pandas=False) for field in schema]
+    pq.write_table(pa.Table.from_arrays(columns, schema=schema), path, compression="zstd", version="2.6")
+
+
+def read_table(path: Path, schema: pa.Schema) -> pd.DataFrame:
+    """Read a table and check that it holds the columns of `schema` (more are allowed and kept).
+
+    Raises:
+        DataError: not a Parquet file, truncated, or columns are missing.
+    """
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowException) as error:
+        raise DataError(
+            path, "cannot be read as Parquet", "run the stage that wrote it again with --force"
+        ) from error
+    missing = [name for name in schema.names if name not in table.column_names]
+    if missing:
+        raise DataError(path, f"lacks the columns {', '.join(missing)}", "run the stage again with --force")
+    frame: pd.DataFrame = table.to_pandas()
+    return frame

@@ -1,0 +1,1 @@
+"""Flights with known truth: motion, drones and the files they would bring home."""
