@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 DistortionModel = Literal["none", "radtan", "fisheye"]
+
+COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5, 8), "fisheye": (4,)}
+"""How many distortion coefficients each model takes."""
+
+# Beyond 89.94 degrees off the axis, x/z says nothing any more.
+_WIDEST = 1e3
 
 
 @dataclass(frozen=True)
@@ -19,6 +29,10 @@ class Intrinsics:
     `radtan` is OpenCV's order k1 k2 p1 p2 [k3 [k4 k5 k6]], `fisheye` is OpenCV's k1 k2 k3 k4
     (equidistant). The centre of the top left pixel is (0, 0). `readout_s` is the time a rolling
     shutter takes from the first to the last row, 0 when unknown.
+
+    Raises:
+        ValueError: sizes or focal lengths that are not positive, numbers that are not finite, an unknown
+            model or a number of coefficients that the model does not have; all problems in one message.
     """
 
     width: int
@@ -30,3 +44,283 @@ class Intrinsics:
     model: DistortionModel = "none"
     distortion: tuple[float, ...] = ()
     readout_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        problems = []
+        if not all(float(size).is_integer() and size > 0 for size in (self.width, self.height)):
+            problems.append(f"picture size {self.width} x {self.height} is not positive whole numbers")
+        if not all(np.isfinite(focal) and focal > 0 for focal in (self.fx, self.fy)):
+            problems.append(f"focal lengths {self.fx}, {self.fy} px are not positive")
+        if not np.isfinite([self.cx, self.cy]).all():
+            problems.append(f"principal point {self.cx}, {self.cy} px is not finite")
+        if not (np.isfinite(self.readout_s) and self.readout_s >= 0):
+            problems.append(f"readout time {self.readout_s} s is not a time")
+        counts = COEFFICIENT_COUNTS.get(self.model)
+        if counts is None:
+            problems.append(f"distortion model {self.model} is none of {', '.join(COEFFICIENT_COUNTS)}")
+        elif len(self.distortion) not in counts:
+            expected = " or ".join(str(count) for count in counts)
+            problems.append(f"{self.model} has {len(self.distortion)} coefficients instead of {expected}")
+        if not np.isfinite(self.distortion).all():
+            problems.append(f"distortion coefficients {list(self.distortion)} are not all finite")
+        if problems:
+            raise ValueError("; ".join(problems))
+
+
+def camera_matrix(intrinsics: Intrinsics) -> Float:
+    """K, [3, 3] in pixels, without skew."""
+    return np.array(
+        [[intrinsics.fx, 0.0, intrinsics.cx], [0.0, intrinsics.fy, intrinsics.cy], [0.0, 0.0, 1.0]]
+    )
+
+
+def project(points_camera: Float, intrinsics: Intrinsics) -> Float:
+    """Where points in the camera's frame appear in the picture.
+
+    The picture's border is not applied. Where the distortion polynomial has folded back on itself,
+    OpenCV returns the pixel of the fold's other branch; here such points have no pixel, so that
+    `undistort` is the exact inverse.
+
+    Args:
+        points_camera: [..., 3] m, x right, y down, z forward.
+        intrinsics: the camera.
+
+    Returns:
+        [..., 2] px; NaN for points that are NaN, behind the camera (z <= 0) or outside the model's
+        valid radius.
+    """
+    depth = np.where(points_camera[..., 2] > 0, points_camera[..., 2], np.nan)
+    with np.errstate(over="ignore", invalid="ignore"):
+        normalised = points_camera[..., :2] / depth[..., None]
+        normalised = np.where(np.isfinite(normalised).all(axis=-1, keepdims=True), normalised, np.nan)
+        distorted = _DISTORT[intrinsics.model](normalised, intrinsics.distortion)
+    pixels: Float = distorted * [intrinsics.fx, intrinsics.fy] + [intrinsics.cx, intrinsics.cy]
+    return pixels
+
+
+def undistort(pixels: Float, intrinsics: Intrinsics) -> Float:
+    """The viewing ray of each pixel, as x/z and y/z.
+
+    Args:
+        pixels: [..., 2] px.
+        intrinsics: the camera.
+
+    Returns:
+        [..., 2] normalised coordinates, solved to 1e-10 (relative above 1); NaN for pixels that are NaN
+        or that no ray within the model's valid radius reaches.
+    """
+    distorted = (pixels - [intrinsics.cx, intrinsics.cy]) / [intrinsics.fx, intrinsics.fy]
+    flat = distorted.reshape(-1, 2)
+    normalised = np.full_like(flat, np.nan)
+    known = np.isfinite(flat).all(axis=1)
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        normalised[known] = _UNDISTORT[intrinsics.model](flat[known], intrinsics.distortion)
+    return normalised.reshape(distorted.shape)
+
+
+def rescaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
+    """The same camera with its pictures resized to `width` x `height`; no half-pixel shift."""
+    sx, sy = width / intrinsics.width, height / intrinsics.height
+    return replace(
+        intrinsics,
+        width=width,
+        height=height,
+        fx=intrinsics.fx * sx,
+        fy=intrinsics.fy * sy,
+        cx=intrinsics.cx * sx,
+        cy=intrinsics.cy * sy,
+    )
+
+
+def fit_to_size(intrinsics: Intrinsics, width: int, height: int) -> tuple[Intrinsics, str | None]:
+    """Intrinsics for pictures of a size that the calibration may not have been made for.
+
+    The same shape (aspect ratio within 0.5 %) at another size is a resized picture: rescaled. Another
+    shape, both sides within 2 %, is a picture cropped or padded by its codec: kept.
+
+    Returns:
+        The intrinsics to use, and a note where the sizes differ.
+
+    Raises:
+        ValueError: the sizes differ by more than that.
+    """
+    if (width, height) == (intrinsics.width, intrinsics.height):
+        return intrinsics, None
+    sizes = (
+        f"pictures are {width} x {height}, the calibration is for {intrinsics.width} x {intrinsics.height}"
+    )
+    sx, sy = width / intrinsics.width, height / intrinsics.height
+    if min(sx, sy) > 0 and abs(sx / sy - 1) <= 0.005:
+        return rescaled(intrinsics, width, height), f"{sizes}: rescaled"
+    if max(abs(sx - 1), abs(sy - 1)) <= 0.02:
+        return replace(intrinsics, width=width, height=height), f"{sizes}: within 2 %, used as it is"
+    raise ValueError(f"{sizes}: another shape, and more than 2 % off")
+
+
+# --- distortion models, on normalised coordinates [..., 2] ---------------------------------------------
+
+
+def _distort_none(normalised: Float, _: tuple[float, ...]) -> Float:
+    return normalised
+
+
+def _distort_radtan(normalised: Float, coefficients: tuple[float, ...]) -> Float:
+    distorted, jacobian = _radtan(normalised, coefficients)
+    return np.where(_radtan_holds(normalised, jacobian, coefficients)[..., None], distorted, np.nan)
+
+
+def _distort_fisheye(normalised: Float, coefficients: tuple[float, ...]) -> Float:
+    radius = np.hypot(normalised[..., 0], normalised[..., 1])
+    theta = np.arctan(radius)
+    theta_distorted, _ = _fisheye_angle(theta, coefficients)
+    factor = np.where(radius > 0, theta_distorted / np.where(radius > 0, radius, 1.0), 1.0)
+    valid = theta < _fisheye_limit(coefficients)
+    return np.where(valid[..., None], normalised * factor[..., None], np.nan)
+
+
+def _undistort_radtan(distorted: Float, coefficients: tuple[float, ...]) -> Float:
+    """Newton on both coordinates, from the exact solution without the tangential part."""
+    target = np.hypot(distorted[:, 0], distorted[:, 1])
+    radius = _invert(lambda r: _radtan_radius(r, coefficients), target, _radtan_limit(coefficients))
+    normalised = distorted * np.where(target > 0, radius / target, 1.0)[:, None]
+    for _ in range(20):
+        value, jacobian = _radtan(normalised, coefficients)
+        step = _solve_symmetric(jacobian, distorted - value)
+        normalised = normalised + step
+        small = np.abs(step) <= 1e-10 * np.maximum(1.0, np.abs(normalised))
+        # NaN steps (a singular Jacobian) will never get small.
+        if (small | np.isnan(step)).all():
+            break
+    _, jacobian = _radtan(normalised, coefficients)
+    solved = small.all(axis=1) & _radtan_holds(normalised, jacobian, coefficients)
+    return np.where(solved[:, None], normalised, np.nan)
+
+
+def _undistort_fisheye(distorted: Float, coefficients: tuple[float, ...]) -> Float:
+    target = np.hypot(distorted[:, 0], distorted[:, 1])
+    limit = _fisheye_limit(coefficients)
+    theta = _invert(lambda angle: _fisheye_angle(angle, coefficients), target, limit)
+    value, slope = _fisheye_angle(theta, coefficients)
+    solved = (np.abs(value - target) <= 1e-10 * slope) & (theta < limit)
+    factor = np.where(target > 0, np.tan(theta) / target, 1.0)
+    return np.where(solved[:, None], distorted * factor[:, None], np.nan)
+
+
+_DISTORT = {"none": _distort_none, "radtan": _distort_radtan, "fisheye": _distort_fisheye}
+_UNDISTORT = {"none": _distort_none, "radtan": _undistort_radtan, "fisheye": _undistort_fisheye}
+
+
+def _radtan(normalised: Float, coefficients: tuple[float, ...]) -> tuple[Float, tuple[Float, Float, Float]]:
+    """Brown's model in OpenCV's form, and its symmetric Jacobian as (xx, xy, yy)."""
+    x, y = normalised[..., 0], normalised[..., 1]
+    p1, p2 = coefficients[2:4]
+    square = x * x + y * y
+    gain, slope = _radtan_gain(square, coefficients)
+    distorted = np.stack(
+        [
+            x * gain + 2 * p1 * x * y + p2 * (square + 2 * x * x),
+            y * gain + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+    xx = gain + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    xy = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    yy = gain + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return distorted, (xx, xy, yy)
+
+
+def _radtan_holds(
+    normalised: Float, jacobian: tuple[Float, Float, Float], coefficients: tuple[float, ...]
+) -> Bool:
+    """Whether points lie where the model has not folded: a positive definite Jacobian from the centre on."""
+    xx, xy, yy = jacobian
+    inside = np.hypot(normalised[..., 0], normalised[..., 1]) < _radtan_limit(coefficients)
+    holds: Bool = inside & (xx * yy - xy * xy > 0) & (xx + yy > 0)
+    return holds
+
+
+def _radtan_gain(square: Float, coefficients: tuple[float, ...]) -> tuple[Float, Float]:
+    """The radial factor at a squared radius, and its derivative by the squared radius."""
+    numerator, denominator = _radtan_polynomials(coefficients)
+    above, below = numerator(square), denominator(square)
+    gain = above / below
+    slope = (numerator.deriv()(square) - gain * denominator.deriv()(square)) / below
+    return gain, slope
+
+
+def _radtan_radius(radius: Float, coefficients: tuple[float, ...]) -> tuple[Float, Float]:
+    """The distorted radius without the tangential part, and its derivative."""
+    square = radius * radius
+    gain, slope = _radtan_gain(square, coefficients)
+    return radius * gain, gain + 2 * square * slope
+
+
+@lru_cache(maxsize=256)
+def _radtan_polynomials(
+    coefficients: tuple[float, ...],
+) -> tuple[np.polynomial.Polynomial, np.polynomial.Polynomial]:
+    k1, k2, _, _, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
+    return np.polynomial.Polynomial([1, k1, k2, k3]), np.polynomial.Polynomial([1, k4, k5, k6])
+
+
+@lru_cache(maxsize=256)
+def _radtan_limit(coefficients: tuple[float, ...]) -> float:
+    """The radius below which the distorted radius grows: to its first turn, or the first pole."""
+    above, below = _radtan_polynomials(coefficients)
+    square = np.polynomial.Polynomial([0, 1])
+    slope = above * below + 2 * square * (above.deriv() * below - above * below.deriv())
+    return min(math.sqrt(min(_first_positive_root(slope), _first_positive_root(below))), _WIDEST)
+
+
+def _fisheye_angle(theta: Float, coefficients: tuple[float, ...]) -> tuple[Float, Float]:
+    """The distorted angle (Kannala & Brandt 2006, Eq. 6, in OpenCV's scaling), and its derivative."""
+    k1, k2, k3, k4 = coefficients
+    square = theta * theta
+    gain = 1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))
+    slope = 1 + square * (3 * k1 + square * (5 * k2 + square * (7 * k3 + square * 9 * k4)))
+    return theta * gain, slope
+
+
+@lru_cache(maxsize=256)
+def _fisheye_limit(coefficients: tuple[float, ...]) -> float:
+    """The angle below which the distorted angle grows, and the point is in front of the camera."""
+    k1, k2, k3, k4 = coefficients
+    slope = np.polynomial.Polynomial([1, 3 * k1, 5 * k2, 7 * k3, 9 * k4])
+    return min(math.sqrt(_first_positive_root(slope)), math.atan(_WIDEST))
+
+
+def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
+    """The smallest positive root of a polynomial that is 1 at 0; infinity without one."""
+    # Roots of the reversed polynomial are the reciprocals. Its leading coefficient is 1, so it stays
+    # well conditioned when the highest coefficients are tiny or zero.
+    reciprocals = np.asarray(np.polynomial.Polynomial(polynomial.coef[::-1]).roots(), dtype=np.complex128)
+    largest = float(np.max(reciprocals.real[reciprocals.imag == 0], initial=0.0))
+    return 1 / largest if largest > 1 / _WIDEST**2 else math.inf
+
+
+def _invert(function: Callable[[Float], tuple[Float, Float]], target: Float, limit: float) -> Float:
+    """Solve f(u) = target on [0, limit] for an f that grows there; the limit where f stays below.
+
+    Newton, replaced by bisection wherever it would leave the bracket. `function` gives f and f'.
+    """
+    low, high = np.zeros_like(target), np.full_like(target, limit)
+    solution = np.minimum(target, limit)
+    for _ in range(100):
+        value, slope = function(solution)
+        above = value > target
+        high, low = np.where(above, solution, high), np.where(above, low, solution)
+        newton = solution - (value - target) / slope
+        better = np.where((newton >= low) & (newton <= high), newton, (low + high) / 2)
+        settled = np.abs(better - solution) <= 1e-14 * np.maximum(1.0, solution)
+        solution = better
+        if settled.all():
+            break
+    return solution
+
+
+def _solve_symmetric(matrix: tuple[Float, Float, Float], right: Float) -> Float:
+    """Solve 2 x 2 systems given as (xx, xy, yy); NaN or infinite where singular."""
+    xx, xy, yy = matrix
+    x, y = right[..., 0], right[..., 1]
+    determinant = xx * yy - xy * xy
+    return np.stack([(yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant], axis=-1)

@@ -1,0 +1,204 @@
+"""Cameras against OpenCV's own projection, and back again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipelines.geometry.cameras import (
+    Float,
+    Intrinsics,
+    camera_matrix,
+    fit_to_size,
+    project,
+    rescaled,
+    undistort,
+)
+
+PINHOLE = Intrinsics(width=1280, height=720, fx=900.0, fy=910.0, cx=640.5, cy=355.25)
+BARREL = replace(PINHOLE, model="radtan", distortion=(-0.28, 0.07, 0.0008, -0.0005))
+FIVE = replace(PINHOLE, model="radtan", distortion=(-0.28, 0.07, 0.0008, -0.0005, 0.011))
+RATIONAL = replace(
+    PINHOLE, model="radtan", distortion=(0.31, -0.12, 0.0006, -0.0004, 0.004, 0.65, 0.02, -0.006)
+)
+FISHEYE = replace(PINHOLE, fx=400.0, fy=402.0, model="fisheye", distortion=(0.02, -0.011, 0.003, -0.0006))
+EVERY = pytest.mark.parametrize(
+    "camera",
+    [PINHOLE, BARREL, FIVE, RATIONAL, FISHEYE],
+    ids=["none", "radtan4", "radtan5", "radtan8", "fisheye"],
+)
+
+
+def points_in_view(camera: Intrinsics, count: int = 200) -> Float:
+    """Points whose undistorted image lies in the picture, 1 to 40 m away."""
+    rng = np.random.default_rng(3)
+    pixels = rng.uniform([0, 0], [camera.width, camera.height], (count, 2))
+    normalised = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    depth = rng.uniform(1, 40, (count, 1))
+    return np.concatenate([normalised * depth, depth], axis=1)
+
+
+def opencv_pixels(points: Float, camera: Intrinsics) -> Float:
+    zero = np.zeros(3)
+    coefficients = np.array(camera.distortion or [0.0] * 4)
+    if camera.model == "fisheye":
+        pixels, _ = cv2.fisheye.projectPoints(
+            points.reshape(1, -1, 3), zero, zero, camera_matrix(camera), coefficients
+        )
+    else:
+        pixels, _ = cv2.projectPoints(points, zero, zero, camera_matrix(camera), coefficients)
+    return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+
+
+@EVERY
+def test_projection_is_opencv_s(camera: Intrinsics) -> None:
+    points = points_in_view(camera)
+    # Both compute in double: a few units in the last place of pixels up to 1300 (2e-13 each).
+    np.testing.assert_allclose(project(points, camera), opencv_pixels(points, camera), rtol=0, atol=1e-10)
+
+
+@EVERY
+def test_undistorting_what_opencv_projected_gives_the_rays(camera: Intrinsics) -> None:
+    points = points_in_view(camera)
+    rays = undistort(opencv_pixels(points, camera), camera)
+    np.testing.assert_allclose(rays, points[:, :2] / points[:, 2:], rtol=0, atol=1e-10)
+
+
+@EVERY
+@given(data=st.data())
+def test_every_pixel_with_a_ray_is_where_that_ray_projects(camera: Intrinsics, data: st.DataObject) -> None:
+    pixel = np.array(data.draw(st.tuples(st.floats(-3000, 4000), st.floats(-3000, 4000))))
+    ray = undistort(pixel, camera)
+    if np.isnan(ray).any():
+        assert camera.model != "none"
+        return
+    back = project(np.array([*ray, 1.0]), camera)
+    # Rays are good to 1e-10 relative above 1; a pixel moves by at most f times that times the slope of
+    # the distortion, which is below 1.6 wherever these cameras see.
+    scale = max(1.0, float(np.abs(ray).max()))
+    np.testing.assert_allclose(back, pixel, rtol=0, atol=camera.fx * 1e-10 * scale * 1.6)
+
+
+@given(
+    k=st.lists(st.floats(-0.5, 0.5), min_size=3, max_size=3),
+    p=st.lists(st.floats(-0.005, 0.005), min_size=2, max_size=2),
+    ray=st.tuples(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5)),
+)
+def test_a_projected_ray_comes_back_or_is_nan(
+    k: list[float], p: list[float], ray: tuple[float, float]
+) -> None:
+    camera = replace(PINHOLE, model="radtan", distortion=(k[0], k[1], p[0], p[1], k[2]))
+    pixel = project(np.array([*ray, 1.0]), camera)
+    back = undistort(pixel, camera)
+    # Right at the fold the inverse has no finite slope: NaN is allowed there, another ray never is. An accepted
+    # Newton step of 1e-10 on a residual of 1e-16 leaves a slope of 1e-6, and 1e-16 / 1e-6 is far below 1e-6.
+    if not np.isnan(back).any():
+        np.testing.assert_allclose(back, ray, rtol=0, atol=1e-6)
+
+
+def test_nothing_behind_the_camera_or_unknown_has_a_pixel() -> None:
+    points = np.array(
+        [[0.0, 0, 0], [1, 1, -5], [np.nan, 0, 1], [0, 0, np.nan], [1e300, 0, 1e-300], [0, 0, 2]]
+    )
+    pixels = project(points, BARREL)
+    assert np.isnan(pixels[:5]).all()
+    np.testing.assert_array_equal(pixels[5], [BARREL.cx, BARREL.cy])
+
+
+def test_beyond_the_fold_there_is_no_ray_and_no_pixel() -> None:
+    # r (1 + k r^2) with k = -0.3 turns at r = sqrt(1 / 0.9) = 1.0541, where the distorted radius is 0.7027.
+    camera = replace(PINHOLE, fx=100.0, fy=100.0, model="radtan", distortion=(-0.3, 0.0, 0.0, 0.0))
+    radii = np.array([1.05, 1.06, 1.5])
+    pixels = project(np.stack([radii, 0 * radii, 0 * radii + 1], axis=1), camera)
+    assert np.isfinite(pixels).all(axis=1).tolist() == [True, False, False]
+    seen = np.array([0.70, 0.705, 3.0])
+    rays = undistort(np.stack([camera.cx + 100 * seen, 0 * seen + camera.cy], axis=1), camera)
+    assert np.isfinite(rays).all(axis=1).tolist() == [True, False, False]
+    assert rays[0, 0] < np.sqrt(1 / 0.9)
+    assert rays[0, 0] * (1 - 0.3 * rays[0, 0] ** 2) == pytest.approx(0.70, abs=1e-10)
+
+
+def test_a_pole_of_the_rational_model_bounds_its_rays() -> None:
+    # 1 / (1 - r^2 / 4) grows without end towards r = 2: every pixel has its ray on this side of the pole.
+    camera = replace(PINHOLE, model="radtan", distortion=(0, 0, 0, 0, 0, -0.25, 0, 0))
+    rays = undistort(np.array([[camera.cx + 900.0 * radius, camera.cy] for radius in (1.0, 50.0)]), camera)
+    # r = t (1 - r^2 / 4)  =>  r = 2 (sqrt(1 + t^2) - 1) / t
+    np.testing.assert_allclose(
+        rays[:, 0], [2 * (np.sqrt(1 + t * t) - 1) / t for t in (1.0, 50.0)], atol=1e-10
+    )
+    assert np.isnan(project(np.array([2.1, 0.0, 1.0]), camera)).all()
+
+
+def test_undistort_keeps_shapes_and_missing_pixels() -> None:
+    pixels = np.full((2, 3, 4, 2), 100.0)
+    pixels[1, 2, 3, 0] = np.nan
+    rays = undistort(pixels, FISHEYE)
+    assert rays.shape == pixels.shape
+    assert np.isnan(rays[1, 2, 3]).all()
+    assert np.isfinite(rays).sum() == pixels.size - 2
+    assert undistort(np.empty((0, 2)), BARREL).shape == (0, 2)
+
+
+def test_resized_pictures_show_the_same_rays() -> None:
+    half = rescaled(BARREL, 640, 360)
+    points = points_in_view(BARREL)
+    np.testing.assert_allclose(project(points, half), project(points, BARREL) / 2, rtol=0, atol=1e-10)
+
+
+def test_a_calibration_fits_its_own_size_silently() -> None:
+    assert fit_to_size(BARREL, 1280, 720) == (BARREL, None)
+
+
+def test_the_same_shape_at_another_size_is_rescaled() -> None:
+    fitted, note = fit_to_size(PINHOLE, 1920, 1080)
+    assert (fitted.width, fitted.height) == (1920, 1080)
+    assert (fitted.fx, fitted.cy) == (1350.0, 532.875)
+    assert note is not None
+    assert "1920 x 1080" in note
+    assert "rescaled" in note
+
+
+def test_a_slightly_other_shape_is_kept_with_a_note() -> None:
+    # The real recording: pictures 1080 wide, calibrated at 1088 (0.7 % off).
+    calibrated = replace(PINHOLE, width=1088, height=1920)
+    fitted, note = fit_to_size(calibrated, 1080, 1920)
+    assert fitted == replace(calibrated, width=1080)
+    assert note is not None
+    assert "1088 x 1920" in note
+
+
+@pytest.mark.parametrize("size", [(960, 720), (1280, 700), (720, 1280), (0, 0)])
+def test_another_shape_is_refused_with_both_sizes(size: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match=rf"{size[0]} x {size[1]}.*1280 x 720"):
+        fit_to_size(PINHOLE, *size)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": 0}, "picture size 0 x 720"),
+        ({"height": 720.5}, "picture size"),
+        ({"fx": -900.0}, "focal lengths"),
+        ({"fy": np.nan}, "focal lengths"),
+        ({"cx": np.inf}, "principal point"),
+        ({"readout_s": -0.01}, "readout"),
+        ({"model": "kb4"}, "none of none, radtan, fisheye"),
+        ({"model": "radtan", "distortion": (0.1,) * 12}, "12 coefficients instead of 4 or 5 or 8"),
+        ({"model": "fisheye", "distortion": ()}, "0 coefficients instead of 4"),
+        ({"distortion": (0.1,)}, "1 coefficients instead of 0"),
+        ({"model": "fisheye", "distortion": (0.1, np.nan, 0, 0)}, "not all finite"),
+    ],
+)
+def test_impossible_intrinsics_are_refused(change: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(PINHOLE, **change)  # type: ignore[arg-type]  # wrong on purpose
+
+
+def test_all_problems_come_in_one_message() -> None:
+    with pytest.raises(ValueError, match=r"picture size.*focal lengths.*principal point"):
+        replace(PINHOLE, width=-1, fx=0.0, cy=np.nan)
