@@ -61,7 +61,7 @@ class JointFormat(Format, Protocol):
     """3D joints over time."""
 
     def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
-        """Read them as metres, z up. `unit` (m, cm, mm) and `axes` (z-up, y-up) where the user states them."""
+        """Read them as metres, z up; `unit` (m, cm, mm), `axes` (z-up, y-up) where the user states them."""
 
 
 class Export(Protocol):
@@ -71,7 +71,7 @@ class Export(Protocol):
     title: str
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write into an existing empty folder; the paths written, sorted. DataError if there is nothing to write."""
+        """Write into an existing empty folder; the paths written, sorted. DataError without content."""
 
 
 class Registry(Generic[T]):

@@ -1,0 +1,433 @@
+"""`flight.yaml`: where everything of one flight lies and how it hangs together (DESIGN, section 4).
+
+The whole schema stands here, also the parts whose readers come later: those are valid, and refused by
+the stage that would need them. Every problem of a manifest is told in one message, an unknown key with
+the nearest known one.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Mapping
+from decimal import Decimal
+from fractions import Fraction
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
+
+from pipelines.session.errors import DataError
+
+SCHEMA = 1
+CAMERA_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_LARGEST_MANIFEST = 1_000_000  # bytes; a real one has a few thousand
+
+Axes = Literal["enu", "ned"]
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+Quaternion = Annotated[list[float], Field(min_length=4, max_length=4)]
+
+
+def _unit_quaternion(value: list[float]) -> list[float]:
+    norm = math.sqrt(sum(component * component for component in value))
+    if abs(norm - 1) > 1e-3:
+        raise ValueError(f"is no unit quaternion (norm {norm:.4g})")
+    return [component / norm for component in value]
+
+
+def _fps(value: object) -> Fraction:
+    try:
+        fps = Fraction(str(value).replace(" ", ""))
+    except (ValueError, ZeroDivisionError):
+        raise ValueError("is no frame rate; write 30, 29.97 or 30000/1001") from None
+    if not 0 < fps <= 100_000:
+        raise ValueError("is no frame rate; it must lie above 0 and at most at 100000")
+    return fps
+
+
+def _nanoseconds(value: object) -> int:
+    try:
+        return int((Decimal(str(value)) * 1_000_000_000).to_integral_value())
+    except ArithmeticError:
+        raise ValueError("is no time in seconds") from None
+
+
+Fps = Annotated[Fraction, BeforeValidator(_fps)]
+SecondsAsNs = Annotated[int, BeforeValidator(_nanoseconds)]
+"""Seconds in the file (number or text), exact nanoseconds in the program."""
+
+
+class Part(BaseModel):
+    """A mapping of the manifest: unknown keys are refused, numbers are finite."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    shorthand: ClassVar[str | None] = None
+    """The key that a bare text (or list) stands for: `map: site.bt` means `map: {path: site.bt}`."""
+    one_of: ClassVar[tuple[str, ...]] = ()
+    """The keys that exclude each other; exactly one of them must be there."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expand_shorthand(cls, value: object) -> object:
+        return {cls.shorthand: value} if cls.shorthand and isinstance(value, str | list) else value
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> Part:
+        stated = [name for name in self.one_of if getattr(self, name) is not None]
+        if self.one_of and len(stated) != 1:
+            raise ValueError(f"needs exactly one of {', '.join(self.one_of)}" + f" (has {len(stated)})")
+        return self
+
+
+class Origin(Part):
+    """Where on Earth the world's origin lies."""
+
+    latitude_deg: float = Field(ge=-90, le=90)
+    longitude_deg: float = Field(ge=-180, le=180)
+    altitude_m: float = 0.0
+
+
+class World(Part):
+    """The axes that sources use unless they say otherwise."""
+
+    frame: Axes = "enu"
+    origin: Origin | None = None
+
+
+class LogClock(Part):
+    """How a recorder's clock relates to the world's: world time = log time * (1 + drift) + offset."""
+
+    offset_s: float = 0.0
+    drift_ppm: float = 0.0
+
+
+class WorldFromLog(Part):
+    """Where a drone's estimator has its origin."""
+
+    translation: Vector = [0.0, 0.0, 0.0]
+    yaw_deg: float = 0.0
+
+
+class Log(Part):
+    """A recording: one file or several parts of it."""
+
+    shorthand = "path"
+    path: Annotated[
+        list[str], BeforeValidator(lambda v: [v] if isinstance(v, str) else v), Field(min_length=1)
+    ]
+    stamps: Literal["header", "receive"] = "header"
+    axes: Axes | None = None
+    clock: LogClock = LogClock()
+    world_from_log: WorldFromLog = WorldFromLog()
+
+
+class Video(Part):
+    """A video file, or pictures in a log."""
+
+    shorthand = "path"
+    one_of = ("path", "log")
+    path: str | None = None
+    log: str | None = None
+    topic: str | None = None
+
+
+class FrameTimes(Part):
+    """When each frame was taken; container stamps from `start` on where nothing else is said."""
+
+    start: SecondsAsNs = 0
+    fps: Fps | None = None
+    csv: str | None = None
+    log: str | None = None
+    topic: str | None = None
+    srt: str | None = None
+
+
+class Clock(Part):
+    """World time = video time + offset; sigma 0 means that it is known."""
+
+    offset_s: SecondsAsNs = 0
+    sigma_s: float = Field(0.2, ge=0)
+
+
+class StaticPose(Part):
+    """A calibration that holds the pose of a camera that stands still."""
+
+    shorthand = "path"
+    path: str
+    camera: str | None = None
+
+
+class PoseSource(Part):
+    """Where a camera's poses come from."""
+
+    one_of = ("log", "tum", "csv", "static", "dji", "ulog")
+    log: str | None = None
+    topic: str | None = None
+    parent: str | None = None
+    child: str | None = None
+    tum: str | None = None
+    csv: str | None = None
+    static: StaticPose | None = None
+    dji: str | None = None
+    ulog: str | None = None
+    of: Literal["camera", "body"] | None = None
+    axes: Axes | None = None
+
+
+class RigidTransform(Part):
+    """Translation in metres and a unit quaternion."""
+
+    translation: Vector
+    rotation_xyzw: Annotated[Quaternion, AfterValidator(_unit_quaternion)]
+
+
+class Mount(Part):
+    """How the camera sits on the body."""
+
+    looks: Literal["forward", "backward", "left", "right", "down", "up"] | None = None
+    down_deg: float = 0.0
+    translation: Vector = [0.0, 0.0, 0.0]
+    body_from_camera: RigidTransform | None = None
+    one_of = ("looks", "body_from_camera")
+
+
+class Gimbal(Part):
+    """Angles of the gimbal over time."""
+
+    log: str
+    topic: str
+    relative_to: Literal["world", "body"]
+    order: Literal["ypr", "rpy"] = "ypr"
+    units: Literal["deg", "rad"] = "deg"
+
+
+class IntrinsicsSource(Part):
+    """A calibration file (and which of its cameras), a topic, or the numbers themselves."""
+
+    shorthand = "path"
+    one_of = ("path", "log", "fx")
+    path: str | None = None
+    camera: str | None = None
+    log: str | None = None
+    topic: str | None = None
+    width: int | None = Field(None, gt=0, le=100_000)
+    height: int | None = Field(None, gt=0, le=100_000)
+    fx: float | None = Field(None, gt=0)
+    fy: float | None = Field(None, gt=0)
+    cx: float | None = None
+    cy: float | None = None
+    model: Literal["radtan", "fisheye"] = "radtan"
+    distortion: list[float] = []
+    readout_s: float = Field(0.0, ge=0)
+
+    @model_validator(mode="after")
+    def _complete(self) -> IntrinsicsSource:
+        if self.fx is not None:
+            missing = [n for n in ("width", "height", "fy", "cx", "cy") if getattr(self, n) is None]
+            if missing:
+                raise ValueError(f"lacks {', '.join(missing)}")
+        return self
+
+
+class KeypointSource(Part):
+    """2D keypoints of this camera, made by a detector of the user's own."""
+
+    shorthand = "path"
+    path: str
+    format: str | None = None
+    skeleton: str | None = None
+    first_frame: int = 0
+    image_size: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
+
+
+class Camera(Part):
+    """One camera in the air (or on the ground)."""
+
+    video: Video | None = None
+    frame_times: FrameTimes | None = None
+    clock: Clock | None = None
+    pose: PoseSource
+    mount: Mount | None = None
+    gimbal: Gimbal | None = None
+    intrinsics: IntrinsicsSource
+    keypoints: KeypointSource | None = None
+    pose_noise: dict[str, dict[str, float | str]] | None = None
+
+    @model_validator(mode="after")
+    def _has_pictures(self) -> Camera:
+        if self.video is None and self.keypoints is None:
+            raise ValueError("needs a video or keypoints")
+        if self.pose.of == "body" and self.mount is None and self.gimbal is None:
+            raise ValueError("pose is of the body: say how the camera sits on it with `mount` or `gimbal`")
+        return self
+
+
+class Actor(Part):
+    """Where the actor was, as logged in flight."""
+
+    log: str
+    topic: str | None = None
+    point: Literal["hip", "head", "feet", "centre"] = "hip"
+
+
+class Map(Part):
+    """What stands around."""
+
+    shorthand = "path"
+    one_of = ("path", "log")
+    path: str | None = None
+    log: str | None = None
+    topic: str | None = None
+    unknown: Literal["free", "occupied"] = "free"
+
+
+class TruthJoints(Part):
+    """True joints, with unit and axes where the file leaves them open."""
+
+    shorthand = "path"
+    path: str
+    format: str | None = None
+    unit: Literal["m", "cm", "mm"] | None = None
+    axes: Literal["z-up", "y-up"] | None = None
+
+
+class Truth(Part):
+    """What is known to be true."""
+
+    shorthand = "joints"
+    joints: TruthJoints | None = None
+    poses: dict[str, str] = {}
+
+
+class Plan(Part):
+    """What the on-board planner commanded."""
+
+    log: str
+    topics: dict[str, str] = {}
+
+
+class Flight(Part):
+    """One flight, as `flight.yaml` states it."""
+
+    schema_version: Literal[1] = Field(alias="schema")
+    name: str = Field("", max_length=1000)
+    world: World = World()
+    clock_reference: str | None = None
+    logs: dict[str, Log] = {}
+    cameras: dict[str, Camera] = Field(min_length=1)
+    actor: Actor | None = None
+    actors: dict[str, Actor] = {}
+    map: Map | None = None
+    truth: Truth | None = None
+    plan: Plan | None = None
+
+    @model_validator(mode="after")
+    def _names_exist(self) -> Flight:
+        bad = [name for name in self.cameras if not CAMERA_NAME.fullmatch(name)]
+        if bad:
+            raise ValueError(f"camera name {bad[0]!r}: use 1 to 64 of A-Z a-z 0-9 _ -, it names a folder")
+        folded = [name.lower() for name in self.cameras]
+        if len(set(folded)) < len(folded):
+            raise ValueError("two cameras differ in case only: their folders would be one on some systems")
+        named = [self.clock_reference] if self.clock_reference else []
+        named += list(self.truth.poses) if self.truth else []
+        for name in named:
+            if name not in self.cameras:
+                near = difflib.get_close_matches(name, self.cameras, n=1)
+                raise ValueError(
+                    f"{name!r} is no camera of this flight" + (f", did you mean {near[0]!r}?" if near else "")
+                )
+        return self
+
+    @property
+    def reference_camera(self) -> str:
+        """The camera whose clock is held."""
+        return self.clock_reference or next(iter(self.cameras))
+
+
+def read_flight(path: Path) -> Flight:
+    """Read and validate a manifest.
+
+    Raises:
+        DataError: the file is missing, no YAML, or does not keep to the schema; the message holds
+            every problem that was found.
+    """
+    raw = _read_yaml(path)
+    if not isinstance(raw, Mapping):
+        raise DataError(path, "is no flight manifest", "it must be a mapping with `schema: 1` and `cameras:`")
+    if isinstance(raw.get("schema"), int) and raw["schema"] > SCHEMA:
+        raise DataError(
+            path, f"has schema {raw['schema']}, newer than {SCHEMA}", "use a newer version of mocap"
+        )
+    try:
+        flight = Flight.model_validate(raw)
+    except ValidationError as error:
+        problems = [_describe(problem) for problem in error.errors()]
+        raise DataError(path, "; ".join(dict.fromkeys(problems))) from None
+    return flight if flight.name else flight.model_copy(update={"name": path.stem})
+
+
+def _read_yaml(path: Path) -> object:
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+    try:
+        if path.stat().st_size > _LARGEST_MANIFEST:
+            raise DataError(path, f"is larger than {_LARGEST_MANIFEST} bytes", "this is no flight manifest")
+        text = path.read_text(encoding="utf-8-sig")
+        value: object = YAML(typ="safe", pure=True).load(text)
+    except OSError as error:
+        raise DataError(
+            path, f"cannot be read ({error.strerror})", "give the path of a flight.yaml"
+        ) from None
+    except UnicodeDecodeError:
+        raise DataError(path, "is no UTF-8 text", "give the path of a flight.yaml") from None
+    except MarkedYAMLError as error:
+        line = f" in line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        problem = " ".join(str(error.problem or error.context).split())
+        raise DataError(path, f"is no valid YAML{line} ({problem})", "mend that line") from None
+    except (YAMLError, ValueError, RecursionError) as error:
+        problem = " ".join(str(error).split())[:200]
+        raise DataError(path, f"is no valid YAML ({problem})", "mend it") from None
+    return value
+
+
+def _describe(problem: Any) -> str:  # pydantic_core.ErrorDetails, whose ctx has no fixed shape
+    place = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        known = _keys_at(problem["loc"][:-1])
+        near = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
+        return f"{place}: unknown key, {hint}"
+    if problem["type"] == "missing":
+        return f"{place}: is missing"
+    message = problem["msg"].removeprefix("Value error, ")
+    return f"{place}: {message}" if place else message
+
+
+def _keys_at(place: tuple[str | int, ...]) -> list[str]:
+    """The keys that the schema knows at a place, found by walking the types of the fields."""
+    kind: Any = Flight
+    for part in place:
+        if isinstance(kind, type) and issubclass(kind, Part):
+            fields = {field.alias or name: field for name, field in kind.model_fields.items()}
+            kind = _without_none(fields[str(part)].annotation)
+        else:
+            kind = _without_none(get_args(kind)[-1])
+    return [field.alias or name for name, field in kind.model_fields.items()]
+
+
+def _without_none(annotation: Any) -> Any:
+    if get_origin(annotation) is None or type(None) not in get_args(annotation):
+        return annotation
+    return next(a for a in get_args(annotation) if a is not type(None))
