@@ -1,0 +1,143 @@
+"""`session.json`: what a session holds and what was doubted when it was ingested.
+
+Ingest alone writes it; every later stage reads it through here instead of opening the manifest again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from pipelines.geometry.cameras import DistortionModel, Intrinsics
+from pipelines.session.errors import DataError
+from pipelines.session.storage import read_json
+
+
+class Entry(BaseModel):
+    """A mapping of session.json; keys that a later version added are kept out of the way."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, populate_by_name=True)
+
+
+class IntrinsicsEntry(Entry):
+    """`geometry.cameras.Intrinsics`, as it is stored."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    model: DistortionModel
+    distortion: tuple[float, ...]
+    readout_s: float
+
+    @classmethod
+    def of(cls, intrinsics: Intrinsics) -> IntrinsicsEntry:
+        """The entry of given intrinsics."""
+        return cls(**asdict(intrinsics))
+
+    def intrinsics(self) -> Intrinsics:
+        """The intrinsics of this entry."""
+        return Intrinsics(**self.model_dump())
+
+
+class FramesEntry(Entry):
+    """The pictures of a camera, in world time."""
+
+    count: int
+    first_t_ns: int
+    last_t_ns: int
+    rate_hz: float | None  # None for a single frame
+
+
+class PosesEntry(Entry):
+    """The poses of a camera, and the frames that none of them covers."""
+
+    source: str
+    static: bool
+    count: int
+    rate_hz: float | None
+    gaps_ns: list[tuple[int, int]]  # stretches of the log longer than the largest gap that is bridged
+    frames_without_pose: int
+    dropped: dict[str, int]
+
+
+class KeypointsEntry(Entry):
+    """The keypoints that came with a camera."""
+
+    source: str
+    format: str
+    joints: list[str]
+    detections: int
+    people_at_once: int
+    frames_without_person: int
+    dropped: dict[str, int]
+
+
+class ClockEntry(Entry):
+    """World time = camera time + offset; the offset is already applied to the tables."""
+
+    offset_s: float
+    sigma_s: float
+
+
+class CameraEntry(Entry):
+    """One camera."""
+
+    intrinsics: IntrinsicsEntry
+    frames: FramesEntry
+    poses: PosesEntry
+    keypoints: KeypointsEntry | None
+    clock: ClockEntry
+    pose_noise: dict[str, dict[str, float | str]] | None
+    media: str | None
+
+
+class TruthEntry(Entry):
+    """What is known to be true."""
+
+    joints: list[str]
+    people: int
+    first_t_ns: int
+    last_t_ns: int
+    cameras: list[str]
+
+
+class Interpolation(Entry):
+    """How far poses are trusted between and beyond the stamps of their log."""
+
+    max_gap_s: float
+    max_extrapolation_s: float
+
+
+class Description(Entry):
+    """The whole of session.json."""
+
+    schema_version: int = Field(alias="schema")
+    flight: str  # the name in the manifest
+    clock_reference: str
+    pose_interpolation: Interpolation
+    cameras: dict[str, CameraEntry]
+    truth: TruthEntry | None
+    sources: dict[str, str]  # path as the manifest states it -> sha256
+    warnings: list[str]
+
+
+def read_description(session: Path) -> Description:
+    """Read session.json of a session folder.
+
+    Raises:
+        DataError: the file is damaged or does not hold what this version needs.
+    """
+    path = session / "session.json"
+    try:
+        return Description.model_validate(read_json(path))
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise DataError(
+            path, f"is damaged ({place}: {first['msg']})", "ingest the flight again with --force"
+        ) from None
