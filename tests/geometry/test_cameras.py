@@ -95,8 +95,8 @@ def test_a_projected_ray_comes_back_or_is_nan(
     camera = replace(PINHOLE, model="radtan", distortion=(k[0], k[1], p[0], p[1], k[2]))
     pixel = project(np.array([*ray, 1.0]), camera)
     back = undistort(pixel, camera)
-    # Right at the fold the inverse has no finite slope: NaN is allowed there, another ray never is. An accepted
-    # Newton step of 1e-10 on a residual of 1e-16 leaves a slope of 1e-6, and 1e-16 / 1e-6 is far below 1e-6.
+    # Right at the fold the inverse has no finite slope: NaN is allowed there, another ray never is. An
+    # accepted Newton step of 1e-10 on a residual of 1e-16 leaves a slope of 1e-6; 1e-16 / 1e-6 is far below.
     if not np.isnan(back).any():
         np.testing.assert_allclose(back, ray, rtol=0, atol=1e-6)
 

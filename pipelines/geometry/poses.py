@@ -1,0 +1,252 @@
+"""Poses over time: rotations, chains of transforms, and what a log says between its stamps.
+
+Quaternions are xyzw and unit; NaN in gives NaN out. A pose `target_from_source` is a position [..., 3]
+(the source's origin in the target) and a quaternion [..., 4].
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+# A half turn about the diagonal between north and east: (x, y, z) -> (y, x, -z).
+_ENU_FROM_NED = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+
+# --- rotations -----------------------------------------------------------------------------------------
+
+
+def matrix_from_quaternion(quaternion_xyzw: Float) -> Float:
+    """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
+    x, y, z, w = np.moveaxis(quaternion_xyzw, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_matrix(matrix: Float) -> Float:
+    """Unit quaternions [..., 4] of rotation matrices [..., 3, 3], with w >= 0.
+
+    Shepperd 1978: of the four ways to divide, the one by the largest component.
+    """
+    m = matrix
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    xw, yw, zw = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    # Every row is the quaternion times four times one of its components.
+    candidates = np.stack(
+        [
+            np.stack([1 + xx - yy - zz, xy, xz, xw], axis=-1),
+            np.stack([xy, 1 - xx + yy - zz, yz, yw], axis=-1),
+            np.stack([xz, yz, 1 - xx - yy + zz, zw], axis=-1),
+            np.stack([xw, yw, zw, 1 + xx + yy + zz], axis=-1),
+        ],
+        axis=-2,
+    )
+    largest = np.argmax(np.diagonal(candidates, axis1=-2, axis2=-1), axis=-1)
+    quaternion = np.take_along_axis(candidates, largest[..., None, None], axis=-2)[..., 0, :]
+    norm = np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    unit: Float = quaternion / np.where(quaternion[..., 3:] < 0, -norm, norm)
+    return unit
+
+
+def multiply(left_xyzw: Float, right_xyzw: Float) -> Float:
+    """The rotation that applies `right` first, then `left`; [..., 4], broadcast."""
+    ax, ay, az, aw = np.moveaxis(left_xyzw, -1, 0)
+    bx, by, bz, bw = np.moveaxis(right_xyzw, -1, 0)
+    return np.stack(
+        [
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ],
+        axis=-1,
+    )
+
+
+def conjugate(quaternion_xyzw: Float) -> Float:
+    """The opposite rotation."""
+    return quaternion_xyzw * [-1.0, -1.0, -1.0, 1.0]
+
+
+def rotate(quaternion_xyzw: Float, vectors: Float) -> Float:
+    """Vectors [..., 3] turned by quaternions [..., 4], broadcast."""
+    axis, w = quaternion_xyzw[..., :3], quaternion_xyzw[..., 3:]
+    twice = 2 * np.cross(axis, vectors)
+    rotated: Float = vectors + w * twice + np.cross(axis, twice)
+    return rotated
+
+
+def quaternion_from_rotation_vector(rotation_vector: Float) -> Float:
+    """Unit quaternions [..., 4] of rotation vectors [..., 3] (axis times angle in rad)."""
+    half = np.linalg.norm(rotation_vector, axis=-1, keepdims=True) / 2
+    # np.sinc(u) is sin(pi u)/(pi u): sin(half)/half without a division by zero.
+    return np.concatenate([rotation_vector / 2 * np.sinc(half / np.pi), np.cos(half)], axis=-1)
+
+
+def rotation_vector_from_quaternion(quaternion_xyzw: Float) -> Float:
+    """Rotation vectors [..., 3] in rad of unit quaternions [..., 4], at most half a turn long."""
+    quaternion = quaternion_xyzw * np.where(quaternion_xyzw[..., 3:] < 0, -1.0, 1.0)
+    sine = np.linalg.norm(quaternion[..., :3], axis=-1, keepdims=True)
+    half = np.arctan2(sine, quaternion[..., 3:])
+    vector: Float = 2 * quaternion[..., :3] / np.sinc(half / np.pi)
+    return vector
+
+
+# --- chains of transforms ------------------------------------------------------------------------------
+
+
+def invert(position: Float, quaternion_xyzw: Float) -> tuple[Float, Float]:
+    """b_from_a of an a_from_b."""
+    inverse = conjugate(quaternion_xyzw)
+    return -rotate(inverse, position), inverse
+
+
+def compose(world_from_a: tuple[Float, Float], a_from_b: tuple[Float, Float]) -> tuple[Float, Float]:
+    """world_from_b = world_from_a . a_from_b; each is (position [..., 3], quaternion [..., 4]), broadcast."""
+    position_a, quaternion_a = world_from_a
+    position_b, quaternion_b = a_from_b
+    return position_a + rotate(quaternion_a, position_b), multiply(quaternion_a, quaternion_b)
+
+
+def transform(target_from_source: tuple[Float, Float], points: Float) -> Float:
+    """Points [..., 3] of the source frame in the target frame, broadcast."""
+    position, quaternion = target_from_source
+    return position + rotate(quaternion, points)
+
+
+def enu_from_ned(position: Float, quaternion_xyzw: Float) -> tuple[Float, Float]:
+    """Poses logged in a north-east-down world, in an east-north-up world of the same origin.
+
+    Only the world's axes change; the body keeps its own.
+    """
+    return compose((np.zeros(3), _ENU_FROM_NED), (position, quaternion_xyzw))
+
+
+# --- poses and points over time ------------------------------------------------------------------------
+
+
+def interpolate_poses(
+    t_ns: Int64,
+    position: Float,
+    quaternion_xyzw: Float,
+    at_ns: Int64,
+    *,
+    max_gap_ns: int,
+    max_extrapolation_ns: int,
+) -> tuple[Float, Float]:
+    """Poses between the stamps of a log: linear in position, slerp in rotation.
+
+    At a stamp the result is that row itself. Just outside the log the nearest pose is held: its error is
+    bounded by speed times tolerance, where a line through the last two rows would multiply their noise.
+
+    Args:
+        t_ns: [N] strictly increasing stamps.
+        position: [N, 3] m.
+        quaternion_xyzw: [N, 4] unit; rows may differ in sign.
+        at_ns: [M] times to interpolate to, in any order.
+        max_gap_ns: stamps further apart than this have no pose between them.
+        max_extrapolation_ns: how far before the first and after the last stamp a pose is held.
+
+    Returns:
+        Position [M, 3] and quaternion [M, 4], NaN where the log says nothing. Signs follow the log's, made
+        continuous from its first row on.
+
+    Raises:
+        ValueError: the stamps do not increase strictly.
+    """
+    between = _bracket(t_ns, at_ns, max_gap_ns, max_extrapolation_ns)
+    if not len(t_ns):
+        return np.full((len(at_ns), 3), np.nan), np.full((len(at_ns), 4), np.nan)
+    continuous = _continuous_signs(quaternion_xyzw)
+    fraction = between.fraction[:, None]
+    positions = position[between.before] + fraction * (position[between.after] - position[between.before])
+    quaternions = _slerp(continuous[between.before], continuous[between.after], fraction)
+    unknown = ~between.known[:, None]
+    return np.where(unknown, np.nan, positions), np.where(unknown, np.nan, quaternions)
+
+
+def interpolate_points(t_ns: Int64, values: Float, at_ns: Int64, *, max_gap_ns: int) -> Float:
+    """Values between stamps, linearly; never outside them, never across a gap or a missing sample.
+
+    Args:
+        t_ns: [N] strictly increasing stamps.
+        values: [N, ...]; NaN is missing.
+        at_ns: [M] times to interpolate to, in any order.
+        max_gap_ns: stamps further apart than this have nothing between them.
+
+    Returns:
+        [M, ...]; NaN where a neighbour is missing. Exactly at a stamp only that sample counts.
+
+    Raises:
+        ValueError: the stamps do not increase strictly.
+    """
+    between = _bracket(t_ns, at_ns, max_gap_ns, 0)
+    if not len(t_ns):
+        return np.full((len(at_ns), *values.shape[1:]), np.nan)
+    spread = (-1,) + (1,) * (values.ndim - 1)
+    fraction = between.fraction.reshape(spread)
+    before, after = values[between.before], values[between.after]
+    points = np.where(fraction == 0, before, before + fraction * (after - before))
+    return np.where(between.known.reshape(spread), points, np.nan)
+
+
+def gaps(t_ns: Int64, longer_than_ns: int) -> list[tuple[int, int]]:
+    """Start and end of every stretch longer than `longer_than_ns` between neighbouring stamps."""
+    (before,) = np.nonzero(np.diff(t_ns) > longer_than_ns)
+    return [(int(t_ns[i]), int(t_ns[i + 1])) for i in before]
+
+
+class _Bracket(NamedTuple):
+    """For every asked time, the rows around it."""
+
+    before: NDArray[np.intp]
+    after: NDArray[np.intp]
+    fraction: Float  # 0 at `before` (and where a row is held), below 1
+    known: NDArray[np.bool_]
+
+
+def _bracket(t_ns: Int64, at_ns: Int64, max_gap_ns: int, max_extrapolation_ns: int) -> _Bracket:
+    if (np.diff(t_ns) <= 0).any():
+        raise ValueError("stamps must increase strictly")
+    if not len(t_ns):
+        nothing = np.zeros(len(at_ns), dtype=np.intp)
+        return _Bracket(nothing, nothing, np.zeros(len(at_ns)), np.zeros(len(at_ns), dtype=np.bool_))
+    held = np.clip(at_ns, t_ns[0], t_ns[-1])
+    before = np.searchsorted(t_ns, held, side="right") - 1
+    after = np.minimum(before + 1, len(t_ns) - 1)
+    # Stamps since the epoch do not fit a double: subtract as integers, then divide.
+    step, since = t_ns[after] - t_ns[before], held - t_ns[before]
+    fraction = since / np.maximum(step, 1)
+    known = (np.abs(at_ns - held) <= max_extrapolation_ns) & ((step <= max_gap_ns) | (since == 0))
+    return _Bracket(before, after, fraction, known)
+
+
+def _continuous_signs(quaternion_xyzw: Float) -> Float:
+    """The same rotations, with the sign that keeps every row on the side of the one before it."""
+    same_side = np.sum(quaternion_xyzw[1:] * quaternion_xyzw[:-1], axis=-1) >= 0
+    flips = np.concatenate([[1.0], np.where(same_side, 1.0, -1.0)])
+    return quaternion_xyzw * np.cumprod(flips)[:, None]
+
+
+def _slerp(start: Float, end: Float, fraction: Float) -> Float:
+    """Shoemake 1985, between quaternions on the same side; exactly `start` at fraction 0."""
+    # Half-angle form: accurate for the small angles between neighbours, where arccos is not.
+    angle = 2 * np.arctan2(
+        np.linalg.norm(end - start, axis=-1, keepdims=True),
+        np.linalg.norm(end + start, axis=-1, keepdims=True),
+    )
+    sine = np.sin(angle)
+    still = sine == 0
+    safe = np.where(still, 1.0, sine)
+    weight_start = np.where(still, 1 - fraction, np.sin((1 - fraction) * angle) / safe)
+    weight_end = np.where(still, fraction, np.sin(fraction * angle) / safe)
+    return weight_start * start + weight_end * end
