@@ -1,0 +1,155 @@
+"""Files that survive a kill, JSON that is always the same, and hashes of what was read or written."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import math
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.session.errors import DataError
+
+_REMEDIES = {
+    errno.ENOSPC: "free some space and run the command again",
+    errno.EDQUOT: "free some space and run the command again",
+    errno.EACCES: "check its permissions, or choose another place with --output",
+    errno.EPERM: "check its permissions, or choose another place with --output",
+    errno.EROFS: "choose another place with --output",
+}
+
+
+def as_data_error(error: OSError, path: Path) -> DataError:
+    """What the operating system refused, as one line; `path` where the error itself names no file."""
+    remedy = _REMEDIES.get(error.errno or 0, "mend that and run the command again")
+    return DataError(error.filename or path, error.strerror or str(error), remedy)
+
+
+def sha256_of(path: Path) -> str:
+    """Hash of a file's content, or of a folder's: the relative names and contents of all its files, sorted.
+
+    Empty folders do not count, nor does what lies behind links to folders.
+
+    Raises:
+        DataError: the path is missing or cannot be read.
+    """
+    try:
+        if not path.is_dir():
+            return _file_digest(path).hex()
+        digest = hashlib.sha256()
+        for name, file in sorted((file.relative_to(path).as_posix(), file) for file in _files(path)):
+            # Zero byte after the name, a digest of fixed length: no two folders run together.
+            digest.update(os.fsencode(name) + b"\0" + _file_digest(file))
+        return digest.hexdigest()
+    except OSError as error:
+        raise as_data_error(error, path) from error
+
+
+def _file_digest(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").digest()
+
+
+def _files(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if path.is_file()]
+
+
+def jsonable(value: object) -> Any:
+    """The same value in what JSON knows: NaN becomes null, numpy numbers and arrays plain ones, tuples lists.
+
+    Raises:
+        TypeError: anything else (a path, an object, a key that is no string).
+        ValueError: an infinite number, which is neither a number in JSON nor missing.
+    """
+    match value:
+        case None | bool() | int():
+            return value
+        case np.generic() | np.ndarray():
+            return jsonable(value.tolist())
+        case float():
+            if math.isinf(value):
+                raise ValueError(f"{value} cannot be written as JSON")
+            return None if math.isnan(value) else float(value)
+        case str():
+            # Names of files that are not UTF-8 arrive with lone surrogates, which UTF-8 cannot hold.
+            return value.encode("utf-8", "replace").decode("utf-8")
+        case Mapping():
+            if not all(isinstance(key, str) for key in value):
+                raise TypeError(f"keys of JSON objects are strings: {list(value)}")
+            return {jsonable(key): jsonable(item) for key, item in value.items()}
+        case list() | tuple():
+            return [jsonable(item) for item in value]
+    raise TypeError(f"{type(value).__name__} cannot be written as JSON")
+
+
+def canonical_json(value: object) -> str:
+    """One text for equal values, whatever the order of their keys: what keys are made of."""
+    return json.dumps(jsonable(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a JSON object in its own order; a kill leaves the old file or the new one, whole.
+
+    Raises:
+        ValueError: it holds NaN or an infinite number (`jsonable` turns NaN into null).
+    """
+    text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    temporary = path.with_name(f"{path.name}.new")
+    temporary.write_bytes(text.encode("utf-8"))
+    _sync(temporary)
+    temporary.replace(path)
+    _sync(path.parent)
+
+
+def read_json(path: Path, remedy: str = "run the stage that wrote it again with --force") -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        DataError: missing, unreadable, not JSON, not an object, or it holds NaN.
+    """
+    try:
+        document = json.loads(path.read_bytes(), parse_constant=_refuse_constant)
+    except OSError as error:
+        raise as_data_error(error, path) from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(path, f"is damaged ({error})", remedy) from error
+    if not isinstance(document, dict):
+        raise DataError(path, f"holds a {type(document).__name__} where an object belongs", remedy)
+    return document
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"holds {name}, which is not JSON")
+
+
+def sync_tree(folder: Path) -> None:
+    """Make the files of a folder, its folders and itself outlast a loss of power."""
+    for path in [*folder.rglob("*"), folder]:
+        _sync(path)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make what was last renamed in a folder outlast a loss of power."""
+    _sync(folder)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def remove_tree(path: Path) -> None:
+    """Remove a file, a link or a folder with all it holds; nothing there is fine."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
