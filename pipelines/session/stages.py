@@ -277,9 +277,12 @@ def open_session(folder: Path) -> Session:
         DataError: not a session, damaged, of a later version, or unreadable.
         BusyError: it is being published right now.
     """
-    if not _is_interrupted(folder):
-        _check_session(folder)
-        return Session(folder)
+    try:
+        if not _is_interrupted(folder):
+            _check_session(folder)
+            return Session(folder)
+    except OSError as error:
+        raise as_data_error(error, folder) from error
     with locked(folder):
         return Session(folder)
 
@@ -300,8 +303,8 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
         DataError: not a session, or with `create` something else; of a later version; cannot be written.
         BusyError: another process holds it.
     """
-    is_new = create and not folder.exists()
     try:
+        is_new = create and not folder.exists()
         _refuse_newer_session(folder)
         if create:
             _check_target(folder, overwrite=overwrite)
@@ -330,7 +333,8 @@ def _check_session(folder: Path) -> None:
     path = folder / "session.json"
     if not path.is_file():
         raise DataError(folder, "is not a session", "make one with `mocap ingest FLIGHT.yaml`")
-    _refuse_newer(path, read_json(path, "run `mocap ingest` again"))
+    remedy = "run `mocap ingest` again"
+    _refuse_newer(path, read_json(path, remedy), remedy)
 
 
 def _check_target(folder: Path, *, overwrite: bool) -> None:
@@ -338,7 +342,7 @@ def _check_target(folder: Path, *, overwrite: bool) -> None:
         return
     if not folder.is_dir():
         raise DataError(folder, "is a file, not a folder", "choose another place with --output")
-    marks = ("session.json", "ingest/stage.json", "ingest.new/stage.json")
+    marks = ("ingest/stage.json", "ingest.new/stage.json")
     if overwrite or any((folder / mark).is_file() for mark in marks):
         return
     foreign = sorted({path.name for path in folder.iterdir()} - _LEFT_BY_KILLED_INGEST)
@@ -351,16 +355,18 @@ def _check_target(folder: Path, *, overwrite: bool) -> None:
 
 
 def _refuse_newer_session(folder: Path) -> None:
-    document: dict[str, Any] = {}
-    with suppress(DataError):  # missing or damaged: no matter here, ingest writes it anew
-        document = read_json(folder / "session.json")
-    _refuse_newer(folder / "session.json", document)
+    try:
+        _check_session(folder)
+    except NewerSchemaError:
+        raise
+    except DataError:
+        pass  # missing or damaged: whoever needs it says so, and ingest writes it anew
 
 
-def _refuse_newer(path: Path, document: Mapping[str, Any]) -> None:
-    schema = document.get("schema", SCHEMA)
+def _refuse_newer(path: Path, document: Mapping[str, Any], remedy: str) -> None:
+    schema = document.get("schema")
     if not isinstance(schema, int):
-        raise DataError(path, f"states the schema {schema!r}", "run `mocap ingest` again")
+        raise DataError(path, f"states no schema number (schema: {schema!r})", remedy)
     if schema > SCHEMA:
         raise NewerSchemaError(
             path, f"has schema {schema}, this version reads up to {SCHEMA}", "update mocap to read it"
@@ -401,7 +407,7 @@ def _leave_no_trace(folder: Path) -> None:
 def _read_record(path: Path) -> StageRecord:
     remedy = "run the stage again with --force"
     document = read_json(path, remedy)
-    _refuse_newer(path, document)
+    _refuse_newer(path, document, remedy)
     kinds = {
         "stage": str,
         "revision": int,
