@@ -14,14 +14,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.session.skeletons import get_skeleton
+
 Float = NDArray[np.float64]
 
 SIDES = ("left", "right")
-COCO17 = (
-    "nose",
-    *(f"{side}_{part}" for part in ("eye", "ear", "shoulder", "elbow", "wrist") for side in SIDES),
-    *(f"{side}_{part}" for part in ("hip", "knee", "ankle") for side in SIDES),
-)
+COCO17 = get_skeleton("coco17").joints
 
 # Degrees: mean, then cosine and sine of each harmonic of the stride; the left heel strikes at phase 0.
 _THIGH_DEG = (5.8, 21.0, -2.3, -4.0, -2.8, -0.7, 0.9)  # from the vertical: 19 behind to 25 in front
@@ -86,14 +84,31 @@ def walk(
     along = speed_mps * t_s + height_m * _periodic(sway, phase)
     joints = height_m * _standing_joints(phase)
 
-    heading = np.radians(heading_deg)
-    turned = np.zeros_like(along) if radius_m is None else along / radius_m
-    across = np.zeros_like(along) if radius_m is None else radius_m * (1.0 - np.cos(turned))
-    ahead = along if radius_m is None else radius_m * np.sin(turned)
-    joints = _about_up(joints, heading + turned)
-    joints[..., 0] += (start[0] + np.cos(heading) * ahead - np.sin(heading) * across)[:, None]
-    joints[..., 1] += (start[1] + np.sin(heading) * ahead + np.cos(heading) * across)[:, None]
+    ground, heading = route(along, start=start, heading_deg=heading_deg, radius_m=radius_m)
+    joints = _about_up(joints, heading)
+    joints[..., :2] += ground[:, None]
     return joints
+
+
+def route(
+    along_m: Float,
+    *,
+    start: tuple[float, float] = (0.0, 0.0),
+    heading_deg: float = 0.0,
+    radius_m: float | None = None,
+) -> tuple[Float, Float]:
+    """Where a straight line or a left-turning circle is after some way; arguments as those of `walk`.
+
+    Returns:
+        [T, 2] east and north in metres, and [T] the heading in radians, counterclockwise from east.
+    """
+    heading = np.radians(heading_deg)
+    turned = np.zeros_like(along_m) if radius_m is None else along_m / radius_m
+    ahead = along_m if radius_m is None else radius_m * np.sin(turned)
+    left = turned if radius_m is None else radius_m * (1.0 - np.cos(turned))
+    east = start[0] + np.cos(heading) * ahead - np.sin(heading) * left
+    north = start[1] + np.sin(heading) * ahead + np.cos(heading) * left
+    return np.stack([east, north], axis=-1), heading + turned
 
 
 def _standing_joints(phase: Float) -> Float:

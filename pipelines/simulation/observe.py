@@ -1,0 +1,110 @@
+"""What instruments make of the truth: keypoints of a detector, and the poses that a log holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.geometry.poses import (
+    invert,
+    multiply,
+    quaternion_from_rotation_vector,
+    transform,
+)
+
+Float = NDArray[np.float64]
+
+_OUTLIER_PX = (30.0, 150.0)  # how far a gross outlier lies from the truth
+
+
+@dataclass(frozen=True)
+class KeypointNoise:
+    """Errors of a keypoint detector: white noise, joints it misses and joints it puts elsewhere."""
+
+    pixel_px: float = 3.0  # sigma of each coordinate
+    missed_share: float = 0.0
+    outlier_share: float = 0.0  # of the joints that are not missed
+
+
+@dataclass(frozen=True)
+class PoseNoise:
+    """Errors of a camera's pose log; sigmas per axis.
+
+    White errors are new in every row of the log, a bias is drawn once per camera. Positions are
+    disturbed along the world's axes, orientations by a rotation vector in the camera's frame.
+    """
+
+    white_position_m: float = 0.0
+    white_rotation_deg: float = 0.0
+    bias_position_m: float = 0.0
+    bias_rotation_deg: float = 0.0
+
+
+def see(joints: Float, position: Float, quaternion_xyzw: Float, intrinsics: Intrinsics) -> Float:
+    """Exact pixels of joints; nothing hides anything.
+
+    Args:
+        joints: [T, J, 3] metres, world.
+        position: [T, 3] metres, world_from_camera.
+        quaternion_xyzw: [T, 4] unit.
+        intrinsics: the camera.
+
+    Returns:
+        [T, J, 2] px; NaN behind the camera and outside the picture, whose corner pixels have their
+        centres at (0, 0) and (width - 1, height - 1).
+    """
+    camera_from_world = invert(position[:, None], quaternion_xyzw[:, None])
+    pixels = project(transform(camera_from_world, joints), intrinsics)
+    inside = (pixels >= -0.5) & (pixels <= np.array([intrinsics.width, intrinsics.height]) - 0.5)
+    return np.where(inside.all(axis=-1, keepdims=True), pixels, np.nan)
+
+
+def detect(pixels: Float, noise: KeypointNoise, rng: np.random.Generator) -> tuple[Float, Float]:
+    """Keypoints as a detector reports them.
+
+    Args:
+        pixels: [..., 2] exact pixels, NaN for what cannot be seen.
+        noise: the detector's errors.
+        rng: draws as many numbers for joints that are seen as for those that are not.
+
+    Returns:
+        [..., 2] px with NaN for what was missed, and [...] confidences: 0 for those, 0.7 to 1 for good
+        ones, 0.3 to 0.9 for outliers, because detectors are often sure of what is wrong.
+    """
+    shape = pixels.shape[:-1]
+    offset = noise.pixel_px * rng.standard_normal(pixels.shape)
+    angle, length = rng.uniform(0.0, 2 * np.pi, shape), rng.uniform(*_OUTLIER_PX, shape)
+    outlier = rng.random(shape) < noise.outlier_share
+    missed = rng.random(shape) < noise.missed_share
+    sureness = rng.random(shape)
+
+    gross = length[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    found = pixels + np.where(outlier[..., None], gross, offset)
+    found = np.where(missed[..., None], np.nan, found)
+    confidence = np.where(outlier, 0.3 + 0.6 * sureness, 0.7 + 0.3 * sureness)
+    return found, np.where(np.isnan(found).any(axis=-1), 0.0, confidence)
+
+
+def log_poses(
+    position: Float, quaternion_xyzw: Float, noise: PoseNoise, rng: np.random.Generator
+) -> tuple[Float, Float]:
+    """Poses of one camera as its log states them.
+
+    Args:
+        position: [T, 3] metres, world_from_camera.
+        quaternion_xyzw: [T, 4] unit.
+        noise: the errors; all sigmas 0 gives the poses back exactly.
+        rng: draws one bias, then the white errors.
+
+    Returns:
+        Positions [T, 3] and unit quaternions [T, 4].
+    """
+    moved = noise.bias_position_m * rng.standard_normal(3)
+    turned_deg = noise.bias_rotation_deg * rng.standard_normal(3)
+    moved = moved + noise.white_position_m * rng.standard_normal(position.shape)
+    turned_deg = turned_deg + noise.white_rotation_deg * rng.standard_normal(position.shape)
+    turn = quaternion_from_rotation_vector(np.radians(turned_deg))
+    return position + moved, multiply(quaternion_xyzw, turn)
