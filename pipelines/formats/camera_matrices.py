@@ -1,0 +1,124 @@
+"""Camera matrices, Rodrigues vectors and camera_from_world poses to our records, checked.
+
+No pixel is shifted: what a file calls (cx, cy) is taken in our convention, the centre of the top left
+pixel at (0, 0), which is OpenCV's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.geometry.cameras import DistortionModel, Intrinsics
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float
+
+_MOST_COEFFICIENTS = (
+    8  # k1 k2 p1 p2 k3 k4 k5 k6; OpenCV's further ones (prism, tilt) are rare and mostly zero
+)
+
+
+def intrinsics(
+    source: Path,
+    camera: str,
+    *,
+    size: Sequence[float],
+    matrix: Float,
+    distortion: Sequence[float],
+    fisheye: bool,
+) -> Intrinsics:
+    """Intrinsics of a camera matrix and OpenCV's coefficients, all in pixels.
+
+    Args:
+        source: the file, for messages.
+        camera: the camera's name, for messages.
+        size: width, height.
+        matrix: [3, 3], last row 0 0 1, without skew.
+        distortion: OpenCV's order; all zero, or none, is no distortion (unless fisheye: then equidistant).
+        fisheye: whether the coefficients are those of cv2.fisheye.
+
+    Raises:
+        DataError: the numbers describe no camera, or one with skew, thin prism or tilt.
+    """
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or len(size) != 2:
+        raise DataError(source, f"camera {camera} has no 3 x 3 matrix of numbers and size of two")
+    skew, last = abs(matrix[0, 1]), matrix[2]
+    if skew > 1e-6 * abs(matrix[0, 0]) or matrix[1, 0] != 0 or not np.array_equal(last, (0, 0, 1)):
+        raise DataError(
+            source,
+            f"camera {camera}: its matrix has skew {matrix[0, 1]:.4g} or is not fx 0 cx, 0 fy cy, 0 0 1",
+            "calibrate without skew",
+        )
+    if any(distortion[_MOST_COEFFICIENTS:]):
+        raise DataError(
+            source,
+            f"camera {camera} has {len(distortion)} distortion coefficients (thin prism or tilt)",
+            f"calibrate with at most {_MOST_COEFFICIENTS}",
+        )
+    coefficients = tuple(float(value) for value in distortion[:_MOST_COEFFICIENTS])
+    if fisheye:
+        return build_intrinsics(source, camera, size, matrix, "fisheye", coefficients or (0.0,) * 4)
+    if not any(coefficients):
+        return build_intrinsics(source, camera, size, matrix, "none", ())
+    return build_intrinsics(source, camera, size, matrix, "radtan", coefficients)
+
+
+def build_intrinsics(
+    source: Path,
+    camera: str,
+    size: Sequence[float],
+    matrix: Float,
+    model: DistortionModel,
+    coefficients: tuple[float, ...],
+) -> Intrinsics:
+    """The record, with what is wrong about it as a DataError."""
+    width, height = (int(value) if float(value).is_integer() else 0 for value in size)
+    fx, fy, cx, cy = (float(value) for value in (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
+    try:
+        return Intrinsics(width, height, fx, fy, cx, cy, model, coefficients)
+    except ValueError as error:
+        raise DataError(source, f"camera {camera}: {error}", "correct the calibration") from error
+
+
+def invert_pose(source: Path, camera: str, quaternion_xyzw: Float, translation: Float) -> tuple[Float, Float]:
+    """Position [3] and quaternion [4] of world_from_camera, given camera_from_world.
+
+    Raises:
+        DataError: not finite, or a quaternion of length zero.
+    """
+    from scipy.spatial.transform import Rotation
+
+    numbers = np.concatenate([quaternion_xyzw, translation])
+    if numbers.shape != (7,) or not np.isfinite(numbers).all() or np.linalg.norm(quaternion_xyzw) < 1e-9:
+        raise DataError(source, f"camera {camera}: its rotation and translation are no pose")
+    world_from_camera = Rotation.from_quat(quaternion_xyzw).inv()
+    return -world_from_camera.apply(translation), world_from_camera.as_quat()
+
+
+def invert_rodrigues(source: Path, camera: str, rotation: Float, translation: Float) -> tuple[Float, Float]:
+    """`invert_pose` for a rotation vector [3] (Rodrigues, rad)."""
+    from scipy.spatial.transform import Rotation
+
+    if rotation.shape != (3,) or not np.isfinite(rotation).all():
+        raise DataError(source, f"camera {camera}: its rotation is no vector of three numbers")
+    return invert_pose(source, camera, Rotation.from_rotvec(rotation).as_quat(), translation)
+
+
+def invert_matrix(source: Path, camera: str, rotation: Float, translation: Float) -> tuple[Float, Float]:
+    """`invert_pose` for a rotation matrix [3, 3].
+
+    Raises:
+        DataError: the matrix is not a rotation to within 1e-3 (files carry few decimals).
+    """
+    from scipy.spatial.transform import Rotation
+
+    is_rotation = (
+        rotation.shape == (3, 3)
+        and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+        and np.linalg.det(rotation) > 0
+    )
+    if not is_rotation:
+        raise DataError(source, f"camera {camera}: R is not a rotation matrix")
+    return invert_pose(source, camera, Rotation.from_matrix(rotation).as_quat(), translation)
