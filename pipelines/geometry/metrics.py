@@ -1,0 +1,294 @@
+"""How far a skeleton is from the truth, and how plausible it is without one.
+
+Positions are [T, P, J, 3] in metres: time, person, joint; NaN is missing. A joint-frame is one joint of one
+person at one time, a person-frame one person at one time. Means run over joint-frames, each with the
+same weight.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.alignment import align_each
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+PCK_THRESHOLD_M = 0.15
+# A step longer than this many median steps is a gap in time: no acceleration or jerk is taken across it.
+_GAP_STEPS = 3
+# Median absolute deviation to standard deviation, for a normal distribution.
+_SIGMA_PER_MAD = 1.4826
+
+
+@dataclass(frozen=True)
+class JointErrors:
+    """The errors of a set of joints against the truth; NaN where nothing could be measured.
+
+    Attributes:
+        joint_frames: joint-frames that have truth.
+        reconstructed_share: share of these that were reconstructed at all, 0..1.
+        mpjpe_mm: mean distance, absolute.
+        root_mpjpe_mm: mean distance after both skeletons are moved to their root; the joint that is the
+            root itself is left out, because its distance is 0 by construction.
+        pa_mpjpe_mm: mean distance after a similarity per person-frame (Procrustes).
+        e_recon_m2: sum of squared distances (the objective of the reconstruction).
+        e_recon_terms: the joint-frames in that sum.
+        e_recon_per_joint_frame_m2: the sum divided by its terms.
+        pck150: share of the joint-frames with truth that are within 150 mm, 0..1; missing joints are wrong.
+        pck150_auc: mean of that share over every threshold from 0 to 150 mm.
+        acceleration_error_mm_s2: mean length of the difference between the accelerations, over three
+            consecutive samples that are all there.
+    """
+
+    joint_frames: int
+    reconstructed_share: float
+    mpjpe_mm: float
+    root_mpjpe_mm: float
+    pa_mpjpe_mm: float
+    e_recon_m2: float
+    e_recon_terms: int
+    e_recon_per_joint_frame_m2: float
+    pck150: float
+    pck150_auc: float
+    acceleration_error_mm_s2: float
+
+
+def measure(estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64) -> dict[str, object]:
+    """Every error of an estimate against the truth, over all joints and per joint.
+
+    Args:
+        estimate: [T, P, J, 3] m.
+        truth: [T, P, J, 3] m, the same people and joints at the same times.
+        joints: the J names; the root is `hip`, or the middle of `left_hip` and `right_hip`.
+        t_ns: [T] strictly increasing stamps.
+
+    Returns:
+        JSON-able: the fields of `JointErrors` (null for what could not be measured),
+        `root_frames_left_out` (person-frames with common joints but without a root on both sides),
+        `pa_frames_left_out` (person-frames whose common joints are fewer than 3 or lie on a line) and
+        `per_joint`: name to the same fields.
+
+    Raises:
+        ValueError: the shapes disagree, or the stamps do not increase strictly.
+    """
+    _check_shapes(estimate, truth, joints, t_ns)
+    distances = _Distances(
+        has_truth=common(truth),
+        absolute=_length(estimate - truth),
+        root=root_relative_distances(estimate, truth, joints),
+        aligned=aligned_distances(estimate, truth),
+        acceleration=_length(_derivative(estimate - truth, t_ns, 2)),
+    )
+    shared = np.isfinite(distances.absolute).any(axis=-1)
+    rooted = np.isfinite(_root(estimate, joints) - _root(truth, joints)).all(axis=-1)
+    aligned = np.isfinite(distances.aligned).any(axis=-1)
+    return {
+        **_jsonable(asdict(distances.errors(slice(None)))),
+        "root_frames_left_out": int((shared & ~rooted).sum()),
+        "pa_frames_left_out": int((shared & ~aligned).sum()),
+        "per_joint": {name: _jsonable(asdict(distances.errors(index))) for index, name in enumerate(joints)},
+    }
+
+
+def root_relative_distances(estimate: Float, truth: Float, joints: Sequence[str]) -> Float:
+    """Distances [T, P, J] in m of joints relative to their root; NaN without one, and for `hip` itself."""
+    root_error = _root(estimate, joints) - _root(truth, joints)
+    distances = _length(estimate - truth - root_error[:, :, None])
+    if "hip" in joints:
+        distances[:, :, joints.index("hip")] = np.nan
+    return distances
+
+
+def aligned_distances(estimate: Float, truth: Float) -> Float:
+    """Distances [T, P, J] in m after a similarity per person-frame; NaN where none is determined."""
+    return _length(align_each(estimate, truth, with_scale=True).apply(estimate) - truth)
+
+
+def common(*estimates: Float) -> Bool:
+    """The joint-frames [T, P, J] that every estimate [T, P, J, 3] has: where methods may be compared."""
+    return np.asarray(np.isfinite(np.stack(estimates)).all(axis=(0, -1)))
+
+
+# --- without truth -------------------------------------------------------------------------------------
+
+
+def bone_lengths(position: Float, joints: Sequence[str], bones: Sequence[tuple[str, str]]) -> Float:
+    """Lengths [T, P, B] in m of bones between named joints; NaN where either end is missing.
+
+    Raises:
+        ValueError: a bone ends at a joint that is not there.
+    """
+    unknown = sorted({end for bone in bones for end in bone} - set(joints))
+    if unknown:
+        raise ValueError(f"bones end at {', '.join(unknown)}, which the skeleton does not have")
+    starts, ends = ([joints.index(bone[end]) for bone in bones] for end in (0, 1))
+    return _length(position[:, :, ends] - position[:, :, starts])
+
+
+def measure_shape(
+    position: Float, joints: Sequence[str], bones: Sequence[tuple[str, str]], t_ns: Int64
+) -> dict[str, object]:
+    """How plausible a skeleton is in itself: bones that keep their length, symmetry, smoothness.
+
+    Args:
+        position: [T, P, J, 3] m.
+        joints: the J names.
+        bones: pairs of joint names.
+        t_ns: [T] strictly increasing stamps.
+
+    Returns:
+        JSON-able, null for what could not be measured. `bones`: name ("left_hip-left_knee") to
+        `median_mm`, `spread_mm` (1.4826 times the median absolute deviation from the person's own median)
+        and `frames`; `bone_spread_mm`: the median of those spreads; `asymmetry_mm`: bone without its
+        side ("hip-knee") to the distance between the left and right medians, mean over people;
+        `jerk_m_s3`: the median length of the third derivative, over four consecutive samples.
+
+    Raises:
+        ValueError: the shapes disagree, a joint of a bone is missing, or the stamps do not increase.
+    """
+    _check_shapes(position, position, joints, t_ns)
+    lengths = bone_lengths(position, joints, bones) * 1e3
+    own_median = np.array([[_median(bone) for bone in person.T] for person in np.moveaxis(lengths, 1, 0)])
+    deviation = np.abs(lengths - own_median)
+    names = [f"{start}-{end}" for start, end in bones]
+    summary = {
+        name: {
+            "median_mm": _median(lengths[:, :, index]),
+            "spread_mm": _SIGMA_PER_MAD * _median(deviation[:, :, index]),
+            "frames": int(np.isfinite(lengths[:, :, index]).sum()),
+        }
+        for index, name in enumerate(names)
+    }
+    return {
+        "bones": {name: _jsonable(bone) for name, bone in summary.items()},
+        "bone_spread_mm": _number(_median(np.array([bone["spread_mm"] for bone in summary.values()]))),
+        "asymmetry_mm": {
+            names[left].replace("left_", ""): _number(
+                _mean(np.abs(own_median[:, left] - own_median[:, right]))
+            )
+            for left, right in _mirrored(bones)
+        },
+        "jerk_m_s3": _number(_median(_length(_derivative(position, t_ns, 3)))),
+    }
+
+
+def _mirrored(bones: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
+    """Indices of the left and the right bone of every pair; bones that cross the middle have none."""
+    index_of = {frozenset(bone): index for index, bone in enumerate(bones)}
+    pairs = []
+    for index, bone in enumerate(bones):
+        mirror = frozenset(end.replace("left_", "right_") for end in bone)
+        if mirror in index_of and index_of[mirror] != index and not any("right_" in end for end in bone):
+            pairs.append((index, index_of[mirror]))
+    return pairs
+
+
+# --- shared steps --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Distances:
+    """Distances between estimate and truth in m (and m/s^2), [T, P, J], NaN where one is missing."""
+
+    has_truth: Bool
+    absolute: Float
+    root: Float
+    aligned: Float
+    acceleration: Float  # [T - 2, P, J]
+
+    def errors(self, joints: slice | int) -> JointErrors:
+        absolute = self.absolute[:, :, joints]
+        present = absolute[np.isfinite(absolute)]
+        judged = int(self.has_truth[:, :, joints].sum())
+        squared = float(np.sum(present**2))
+        # The integral of the share below a threshold, in closed form: each joint counts from its own
+        # distance on.
+        area = float(np.sum(np.maximum(0.0, 1 - present / PCK_THRESHOLD_M)))
+        return JointErrors(
+            joint_frames=judged,
+            reconstructed_share=_ratio(present.size, judged),
+            mpjpe_mm=1e3 * _mean(present),
+            root_mpjpe_mm=1e3 * _mean(self.root[:, :, joints]),
+            pa_mpjpe_mm=1e3 * _mean(self.aligned[:, :, joints]),
+            e_recon_m2=squared if present.size else math.nan,
+            e_recon_terms=present.size,
+            e_recon_per_joint_frame_m2=_ratio(squared, present.size),
+            pck150=_ratio(int((present <= PCK_THRESHOLD_M).sum()), judged),
+            pck150_auc=_ratio(area, judged),
+            acceleration_error_mm_s2=1e3 * _mean(self.acceleration[:, :, joints]),
+        )
+
+
+def _root(position: Float, joints: Sequence[str]) -> Float:
+    """The root [T, P, 3] of every skeleton; NaN where it is missing or has no joint."""
+    if "hip" in joints:
+        return position[:, :, joints.index("hip")]
+    if "left_hip" in joints and "right_hip" in joints:
+        return (position[:, :, joints.index("left_hip")] + position[:, :, joints.index("right_hip")]) / 2
+    return np.full((*position.shape[:2], 3), np.nan)
+
+
+def _derivative(position: Float, t_ns: Int64, order: int) -> Float:
+    """The derivative [T - order, ...] from neighbouring samples, by divided differences.
+
+    Exact for polynomials of that order whatever the steps; NaN where a sample is missing or the stretch
+    holds a gap in time.
+    """
+    samples = len(t_ns)
+    if samples <= order:
+        return np.empty((0, *position.shape[1:]))
+    derivative = position
+    spread = (-1,) + (1,) * (position.ndim - 1)
+    for k in range(1, order + 1):
+        seconds = (t_ns[k:] - t_ns[:-k]) / 1e9
+        derivative = np.diff(derivative, axis=0) * k / seconds.reshape(spread)
+    steps = np.diff(t_ns)
+    long = steps > _GAP_STEPS * np.median(steps)
+    across = np.any([long[k : samples - order + k] for k in range(order)], axis=0)
+    return np.where(across.reshape(spread), np.nan, derivative)
+
+
+def _check_shapes(estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64) -> None:
+    people = truth.shape[1] if truth.ndim == 4 else 1
+    expected = (len(t_ns), people, len(joints), 3)
+    if estimate.shape != expected or truth.shape != expected:
+        raise ValueError(
+            f"positions {estimate.shape} and {truth.shape} are not both [T, P, J, 3] = {expected}"
+        )
+    if (np.diff(t_ns) <= 0).any():
+        raise ValueError("stamps must increase strictly")
+
+
+def _length(vectors: Float) -> Float:
+    length: Float = np.linalg.norm(vectors, axis=-1)
+    return length
+
+
+def _mean(values: Float) -> float:
+    """The mean of what is there; NaN of nothing, without a warning."""
+    present = values[np.isfinite(values)]
+    return float(present.mean()) if present.size else math.nan
+
+
+def _median(values: Float) -> float:
+    present = values[np.isfinite(values)]
+    return float(np.median(present)) if present.size else math.nan
+
+
+def _ratio(part: float, whole: int) -> float:
+    return part / whole if whole else math.nan
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _jsonable(fields: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: _number(value) for name, value in fields.items()}

@@ -1,0 +1,241 @@
+"""Errors worked out by hand on skeletons of a few joints, and what each metric must not see."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from pipelines.geometry.metrics import Float, Int64, bone_lengths, common, measure, measure_shape
+
+JOINTS = ("left_hip", "right_hip", "left_knee", "right_knee", "nose")
+STANCE = np.array([[0.0, 0.1, 1.0], [0, -0.1, 1.0], [0.02, 0.12, 0.5], [-0.02, -0.12, 0.5], [0.05, 0, 1.7]])
+MS = 1_000_000
+
+
+def stamps(count: int, step_ms: int = 40) -> Int64:
+    return 1_700_000_000_000_000_000 + np.arange(count, dtype=np.int64) * step_ms * MS
+
+
+def walk(count: int = 6) -> Float:
+    """One person walking along x at 1.2 m/s, [T, 1, J, 3]."""
+    path = np.arange(count)[:, None] * np.array([1.2 * 0.04, 0, 0])
+    return np.asarray(STANCE + path[:, None, None])
+
+
+def shifted(truth: Float, joint: str, by: tuple[float, float, float]) -> Float:
+    estimate = truth.copy()
+    estimate[:, :, JOINTS.index(joint)] += by
+    return estimate
+
+
+def test_the_truth_itself_has_no_error() -> None:
+    found = measure(walk(), walk(), JOINTS, stamps(6))
+    assert found["mpjpe_mm"] == found["root_mpjpe_mm"] == found["e_recon_m2"] == 0
+    # Coordinates near 1 m through a rotation and back: 1e-15 m.
+    assert found["pa_mpjpe_mm"] == pytest.approx(0, abs=1e-11)
+    # Differences of zeros.
+    assert found["acceleration_error_mm_s2"] == 0
+    assert found["pck150"] == found["pck150_auc"] == found["reconstructed_share"] == 1
+
+
+def test_one_joint_off_by_a_known_distance() -> None:
+    # The nose is 30 mm, 40 mm off: 50 mm in one joint of five.
+    found: Any = measure(shifted(walk(), "nose", (0.03, 0, 0.04)), walk(), JOINTS, stamps(6))
+    assert found["mpjpe_mm"] == pytest.approx(10)
+    assert found["root_mpjpe_mm"] == pytest.approx(10)
+    assert found["e_recon_m2"] == pytest.approx(6 * 0.05**2)
+    assert found["e_recon_terms"] == 30
+    assert found["e_recon_per_joint_frame_m2"] == pytest.approx(0.05**2 / 5)
+    assert found["pck150"] == 1
+    # Four joints are right at every threshold, the nose from a third of the range on.
+    assert found["pck150_auc"] == pytest.approx((4 + 2 / 3) / 5)
+    assert found["per_joint"]["nose"]["mpjpe_mm"] == pytest.approx(50)
+    assert found["per_joint"]["nose"]["pck150_auc"] == pytest.approx(2 / 3)
+    assert found["per_joint"]["left_knee"]["mpjpe_mm"] == 0
+
+
+def test_a_hip_off_moves_the_root_by_half() -> None:
+    # left_hip 20 mm off in z: the root moves 10 mm, every other joint is 10 mm off relative to it.
+    found: Any = measure(shifted(walk(), "left_hip", (0, 0, 0.02)), walk(), JOINTS, stamps(6))
+    assert found["mpjpe_mm"] == pytest.approx(4)
+    assert found["root_mpjpe_mm"] == pytest.approx(10)
+
+
+def test_a_hip_joint_is_the_root_and_does_not_dilute_the_mean() -> None:
+    joints = ("hip", "nose", "neck")
+    truth = np.arange(9.0).reshape(1, 1, 3, 3) ** 1.1
+    estimate = truth + 0.5
+    estimate[0, 0, 1, 0] += 0.008
+    found: Any = measure(estimate, truth, joints, stamps(1))
+    assert found["root_mpjpe_mm"] == pytest.approx(4)  # nose 8 mm, neck 0; the hip is not counted
+    assert found["per_joint"]["hip"]["root_mpjpe_mm"] is None
+    assert found["acceleration_error_mm_s2"] is None
+
+
+@given(
+    shift=st.tuples(*[st.floats(-2, 2)] * 3),
+    turn=st.tuples(*[st.floats(-1, 1)] * 3),
+    scale=st.floats(0.5, 2),
+)
+def test_each_metric_is_blind_to_what_it_removes(
+    shift: tuple[float, float, float], turn: tuple[float, float, float], scale: float
+) -> None:
+    truth = walk()
+    moved = measure(truth + shift, truth, JOINTS, stamps(6))
+    assert moved["mpjpe_mm"] == pytest.approx(1e3 * np.linalg.norm(shift), abs=1e-9)
+    assert moved["root_mpjpe_mm"] == pytest.approx(0, abs=1e-9)
+    rotation = Rotation.from_rotvec(turn).as_matrix()
+    similar = measure(scale * truth @ rotation.T + shift, truth, JOINTS, stamps(6))
+    assert similar["pa_mpjpe_mm"] == pytest.approx(0, abs=1e-9)
+
+
+def test_missing_joints_are_wrong_for_pck_and_lower_only_the_share() -> None:
+    estimate = shifted(walk(), "nose", (0.2, 0, 0))
+    estimate[:3, 0, JOINTS.index("left_knee")] = np.nan
+    found: Any = measure(estimate, walk(), JOINTS, stamps(6))
+    # 30 joint-frames: 3 missing, 6 noses 200 mm off.
+    assert found["joint_frames"] == 30
+    assert found["reconstructed_share"] == pytest.approx(27 / 30)
+    assert found["pck150"] == pytest.approx(21 / 30)
+    assert found["mpjpe_mm"] == pytest.approx(6 * 200 / 27)
+    assert found["e_recon_terms"] == 27
+    assert found["per_joint"]["left_knee"]["reconstructed_share"] == 0.5
+    assert found["per_joint"]["left_knee"]["pck150"] == 0.5
+
+
+def test_joints_without_truth_are_judged_by_nothing() -> None:
+    truth = walk()
+    truth[:, :, JOINTS.index("nose")] = np.nan
+    found: Any = measure(walk(), truth, JOINTS, stamps(6))
+    assert found["joint_frames"] == 24
+    assert found["reconstructed_share"] == 1
+    assert found["per_joint"]["nose"] == {
+        **dict.fromkeys(found["per_joint"]["nose"]),
+        "joint_frames": 0,
+        "e_recon_terms": 0,
+    }
+
+
+def test_frames_without_a_root_or_an_alignment_are_counted() -> None:
+    estimate = walk()
+    estimate[0, 0, 0] = np.nan  # no left hip: no root, four joints still align
+    estimate[1, 0, [0, 1, 2]] = np.nan  # two joints left: neither
+    estimate[2] = np.nan  # nothing at all: nothing is left out of anything
+    found = measure(estimate, walk(), JOINTS, stamps(6))
+    assert found["root_frames_left_out"] == 2
+    assert found["pa_frames_left_out"] == 1
+
+
+def test_acceleration_is_exact_for_any_steps() -> None:
+    t_ns = stamps(5) + np.array([0, 7, -5, 11, 2], dtype=np.int64) * MS
+    t_s = (t_ns - t_ns[0])[:, None, None, None] / 1e9
+    truth = np.broadcast_to(STANCE, (5, 1, 5, 3))
+    estimate = truth + np.array([0.3, -0.4, 0]) * t_s**2 + np.array([1.0, 2, 3]) * t_s
+    found = measure(estimate, truth, JOINTS, t_ns)
+    # Twice 0.5 m/s^2. Second differences of 1e-16 m rounding over (40 ms)^2 leave 1e-13.
+    assert found["acceleration_error_mm_s2"] == pytest.approx(1000, abs=1e-8)
+
+
+def test_no_acceleration_across_missing_samples_or_gaps() -> None:
+    truth = walk(7)
+    estimate = truth.copy()
+    estimate[::2] += 0.01
+    alternating: Any = measure(estimate, truth, JOINTS, stamps(7))
+    # +-0.01 m in three axes at 40 ms: 2 * 0.01 * sqrt(3) / 0.04^2 m/s^2.
+    expected = 1e3 * 2 * 0.01 * np.sqrt(3) / 0.04**2
+    assert alternating["acceleration_error_mm_s2"] == pytest.approx(expected)
+    estimate[[2, 5]] = np.nan  # no three in a row are left
+    assert measure(estimate, truth, JOINTS, stamps(7))["acceleration_error_mm_s2"] is None
+    late = stamps(4) + np.array([0, 0, 1000, 1000], dtype=np.int64) * MS
+    assert measure(truth[:4], truth[:4], JOINTS, late)["acceleration_error_mm_s2"] is None
+
+
+def test_nothing_reconstructed_is_null_not_nan() -> None:
+    found: Any = measure(np.full((4, 2, 5, 3), np.nan), np.tile(walk(4), (1, 2, 1, 1)), JOINTS, stamps(4))
+    json.dumps(found, allow_nan=False)
+    assert found["mpjpe_mm"] is None
+    assert found["reconstructed_share"] == found["pck150"] == found["pck150_auc"] == 0
+
+
+def test_no_frames_at_all() -> None:
+    nothing = np.empty((0, 1, 5, 3))
+    found = measure(nothing, nothing, JOINTS, stamps(0))
+    assert found["joint_frames"] == 0
+    assert found["reconstructed_share"] is None
+
+
+def test_common_joint_frames_are_those_of_all() -> None:
+    a, b = walk(2), walk(2)
+    a[0, 0, 1] = np.nan
+    b[1, 0, 4, 2] = np.nan
+    expected = np.ones((2, 1, 5), dtype=bool)
+    expected[0, 0, 1] = expected[1, 0, 4] = False
+    np.testing.assert_array_equal(common(a, b), expected)
+
+
+def test_shapes_and_stamps_must_agree() -> None:
+    with pytest.raises(ValueError, match=r"T, P, J, 3"):
+        measure(walk(6), walk(5), JOINTS, stamps(6))
+    with pytest.raises(ValueError, match=r"T, P, J, 3"):
+        measure(walk(6), walk(6), JOINTS[:4], stamps(6))
+    with pytest.raises(ValueError, match="increase strictly"):
+        measure(walk(6), walk(6), JOINTS, stamps(6)[::-1])
+
+
+# --- without truth -------------------------------------------------------------------------------------
+
+BONES = (("left_hip", "left_knee"), ("right_hip", "right_knee"), ("left_hip", "right_hip"))
+
+
+def test_bones_have_their_lengths() -> None:
+    position = walk(3)
+    position[1, 0, JOINTS.index("left_knee")] = np.nan
+    lengths = bone_lengths(position, JOINTS, BONES)
+    thigh = np.sqrt(0.02**2 + 0.02**2 + 0.5**2)
+    np.testing.assert_allclose(
+        lengths[:, 0], [[thigh, thigh, 0.2], [np.nan, thigh, 0.2], [thigh, thigh, 0.2]], atol=1e-15
+    )
+    with pytest.raises(ValueError, match="tail"):
+        bone_lengths(position, JOINTS, (("nose", "tail"),))
+
+
+def test_shape_of_a_stiff_symmetric_walk_is_perfect() -> None:
+    found: Any = measure_shape(walk(8), JOINTS, BONES, stamps(8))
+    assert found["bones"]["left_hip-right_hip"] == {
+        "median_mm": pytest.approx(200),
+        "spread_mm": pytest.approx(0, abs=1e-9),
+        "frames": 8,
+    }
+    assert found["asymmetry_mm"] == {"hip-knee": pytest.approx(0, abs=1e-9)}
+    # Third differences of 1e-16 m rounding over (40 ms)^3: 1e-11.
+    assert found["jerk_m_s3"] == pytest.approx(0, abs=1e-10)
+
+
+def test_shape_tells_spread_asymmetry_and_jerk() -> None:
+    t_ns = stamps(9)
+    t_s = (t_ns - t_ns[0]) / 1e9
+    position = np.zeros((9, 2, 4, 3)) + (2 * t_s**3)[:, None, None, None] * [1.0, 0, 0]
+    # Left bone 400 mm +- {-4..4}, right bone 410 mm; the second person is 100 mm longer all over.
+    position[:, :, 1, 2] = 0.4 + np.arange(-4, 5)[:, None] * 1e-3 + [0, 0.1]
+    position[:, :, 3, 2] = 0.41 + np.array([0, 0.1])
+    joints = ("left_hip", "left_knee", "right_hip", "right_knee")
+    found: Any = measure_shape(position, joints, BONES[:2], t_ns)
+    # The absolute deviations are 0 1 1 2 2 3 3 4 4 mm: their median is 2, whatever the person's size.
+    assert found["bones"]["left_hip-left_knee"]["spread_mm"] == pytest.approx(1.4826 * 2)
+    assert found["bones"]["right_hip-right_knee"]["spread_mm"] == pytest.approx(0, abs=1e-9)
+    assert found["asymmetry_mm"]["hip-knee"] == pytest.approx(10)
+    # Half of the joints have 12 m/s^3 alone, and the moving bone end adds nothing to a third difference.
+    assert found["jerk_m_s3"] == pytest.approx(12, abs=1e-8)
+
+
+def test_shape_of_nothing_is_null() -> None:
+    found: Any = measure_shape(np.full((3, 1, 5, 3), np.nan), JOINTS, BONES, stamps(3))
+    json.dumps(found, allow_nan=False)
+    assert found["bone_spread_mm"] is None
+    assert found["jerk_m_s3"] is None
