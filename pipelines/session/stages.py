@@ -499,5 +499,5 @@ def _remove_partials(folder: Path, stage: str) -> None:
     partial = folder / ".partial"
     for chunks in sorted(partial.glob(f"{stage}-*")):
         remove_tree(chunks)
-    with suppress(OSError):
+    if partial.is_dir() and not any(partial.iterdir()):
         partial.rmdir()

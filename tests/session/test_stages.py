@@ -1,0 +1,552 @@
+"""A stage survives a kill at every step, a second writer, a full disk and damage."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import itertools
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.session.errors import BusyError, DataError
+from pipelines.session.stages import (
+    SCHEMA,
+    NewerSchemaError,
+    Run,
+    Stage,
+    key_of,
+    locked,
+    open_session,
+)
+from pipelines.session.storage import read_json, sha256_of, write_json
+
+INGEST = Stage("ingest", 1)
+RECONSTRUCT = Stage("reconstruct", 1)
+
+
+def ingest(folder: Path, flight: str, files: dict[str, str], **options: bool) -> Run:
+    """A small ingest: a session.json and `files`, path to content."""
+    with locked(folder, create=True, **options) as session:
+        run = session.begin(INGEST, settings={"flight": flight}, inputs={"flight": "0" * 64})
+        if not run.finished:
+            for name, content in files.items():
+                path = run.folder / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(content)
+            write_json(run.folder / "session.json", {"schema": SCHEMA, "flight": flight})
+            run.publish(counts={"files": len(files)})
+        return run
+
+
+def reconstruct(folder: Path, method: str, *, force: bool = False) -> Run:
+    """A small long stage: two chunks, put together from what ingest wrote."""
+    with locked(folder) as session:
+        inputs = {"session": sha256_of(folder / "session.json")}
+        run = session.begin(
+            RECONSTRUCT, settings={"method": method, "rate": None}, inputs=inputs, force=force
+        )
+        if not run.finished:
+            parts = [run.chunk(name, produce_part(f"{method} {name}")) for name in ("first", "second")]
+            (run.folder / "skeleton").write_text(" ".join((part / "part").read_text() for part in parts))
+            (run.folder / "deep").mkdir()
+            (run.folder / "deep" / "metrics").write_text(method)
+            run.publish(counts={"parts": len(parts)}, warnings=[f"used {method}"])
+        return run
+
+
+def produce_part(text: str) -> Callable[[Path], None]:
+    def produce(folder: Path) -> None:
+        (folder / "part").write_text(text)
+
+    return produce
+
+
+OLD = {
+    "cameras/a/frames": "old a",
+    "cameras/b/frames": "old b",
+    "map/0.npz": "old map",
+    "truth.parquet": "old",
+}
+NEW = {"cameras/a/frames": "new a", "cameras/c/frames": "new c", "actor.parquet": "new actor"}
+
+
+def work(folder: Path) -> None:
+    ingest(folder, "new", NEW)
+    reconstruct(folder, "robust")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All a session holds but the times of day; every leftover of a kill would show."""
+    files = {p.relative_to(folder).as_posix(): p for p in sorted(folder.rglob("*")) if p.is_file()}
+    folders = {f"{p.relative_to(folder).as_posix()}/": b"" for p in sorted(folder.rglob("*")) if p.is_dir()}
+    ours = {name: path.read_bytes() for name, path in files.items() if name not in {".lock", "run.json"}}
+    return {**folders, **ours}
+
+
+def assert_every_stage_is_whole(folder: Path) -> None:
+    """Each stage is the old one or the new one, never a mixture; what is not listed is not there."""
+    session = open_session(folder)
+    listed = set()
+    for stage in ("ingest", "reconstruct"):
+        record = session.record(stage)
+        if record is not None:
+            assert {name: sha256_of(folder / name) for name in record.outputs} == record.outputs
+            listed |= {*record.outputs, f"{stage}/stage.json"}
+    published = {
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if path.is_file() and not path.relative_to(folder).parts[0].startswith(".")
+    }
+    assert {name for name in published if ".new/" not in name} - {"run.json", "run.json.new"} == listed
+
+
+class Killed(BaseException):
+    """Stands for SIGKILL: once raised, no call that changes a file gets through, clean-up included."""
+
+
+@contextmanager
+def failing_at(step: int, failure: BaseException, *, for_good: bool) -> Iterator[list[int]]:
+    """Let the `step`-th call that changes the file system fail, and all after it if `for_good`."""
+    calls = [0]
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("rename", "replace", "unlink", "rmdir", "mkdir", "open"):
+            original = getattr(os, name)
+
+            def guarded(*args: Any, _original: Any = original, **kwargs: Any) -> Any:
+                calls[0] += 1
+                if calls[0] == step or (for_good and calls[0] > step):
+                    raise failure
+                return _original(*args, **kwargs)
+
+            patch.setattr(os, name, guarded)
+        patch.setattr(os, "fsync", lambda _: None)  # a kill loses nothing that was written
+        yield calls
+
+
+@pytest.fixture(scope="module", params=["fresh", "replacing"])
+def prepared(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Where the work starts from (perhaps nothing), and where it ends when nothing disturbs it."""
+    start = tmp_path_factory.mktemp(request.param) / "start.session"
+    end = start.with_name("end.session")
+    if request.param == "replacing":
+        ingest(start, "old", OLD)
+        reconstruct(start, "dlt")
+        shutil.copytree(start, end)
+    work(end)
+    return start, end
+
+
+def put(start: Path, folder: Path) -> Path:
+    shutil.rmtree(folder, ignore_errors=True)
+    if start.exists():
+        shutil.copytree(start, folder)
+    return folder
+
+
+def test_kill_at_every_step_and_again_while_mending(prepared: tuple[Path, Path], tmp_path: Path) -> None:
+    start, end = prepared
+    expected = contents(end)
+    # Fixed draws: the second kill falls somewhere into mending and going on.
+    draw = np.random.default_rng(1)
+    for step in itertools.count(1):
+        folder = put(start, tmp_path / "a.session")
+        try:
+            with failing_at(step, Killed(), for_good=True):
+                work(folder)
+        except Killed:
+            pass
+        else:
+            break
+        try:
+            with failing_at(int(draw.integers(1, 40)), Killed(), for_good=True):
+                work(folder)
+        except Killed:
+            pass
+        if (folder / "session.json").exists():
+            assert_every_stage_is_whole(folder)
+        work(folder)
+        assert contents(folder) == expected, f"killed at step {step}"
+    assert step > 40, "the faults were not injected"
+
+
+def test_a_full_disk_at_every_step_is_one_line(prepared: tuple[Path, Path], tmp_path: Path) -> None:
+    start, end = prepared
+    expected = contents(end)
+    lines = []
+    for step in itertools.count(1):
+        folder = put(start, tmp_path / "a.session")
+        full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        with failing_at(step, full, for_good=False) as calls:
+            try:
+                work(folder)
+            except DataError as error:
+                lines.append(str(error))
+        if calls[0] < step:
+            break
+        if (folder / "session.json").exists():
+            assert_every_stage_is_whole(folder)
+            assert not list(folder.glob("*.new")), "tidied at once"
+        work(folder)
+        assert contents(folder) == expected, f"disk full at step {step}"
+    assert len(lines) > 40, "the faults were not injected"
+    assert all("No space left on device; free some space" in line for line in lines)
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from tests.session.test_stages import NEW, OLD, ingest, reconstruct
+folder = Path(sys.argv[1])
+print("ready", flush=True)
+while True:
+    ingest(folder, "old", OLD)
+    reconstruct(folder, "dlt")
+    ingest(folder, "new", NEW)
+    reconstruct(folder, "robust")
+"""
+
+HOLDER = """
+import sys
+from pathlib import Path
+from pipelines.session.stages import locked
+with locked(Path(sys.argv[1])):
+    print("ready", flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextmanager
+def other_process(script: str, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    root = Path(__file__).resolve().parents[2]
+    with subprocess.Popen(
+        [sys.executable, "-c", script, str(folder)], cwd=root, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"ready\n"
+        yield process
+        process.kill()
+
+
+def test_sigkill_at_random_moments(tmp_path: Path) -> None:
+    work(tmp_path / "undisturbed.session")
+    folder = tmp_path / "a.session"
+    draw = np.random.default_rng(2)
+    for _ in range(5):
+        with other_process(WRITER, folder) as process:
+            time.sleep(draw.uniform(0.0, 0.2))
+            process.send_signal(signal.SIGKILL)
+        if (folder / "session.json").exists():
+            assert_every_stage_is_whole(folder)
+        work(folder)
+        # Chunks of the writer's other settings wait for those to come again.
+        shutil.rmtree(folder / ".partial", ignore_errors=True)
+        assert contents(folder) == contents(tmp_path / "undisturbed.session")
+
+
+def test_a_second_writer_is_told_who_writes_until_that_one_is_killed(tmp_path: Path) -> None:
+    folder = tmp_path / "a.session"
+    work(folder)
+    with other_process(HOLDER, folder) as process:
+        with pytest.raises(BusyError, match=rf"being written by process {process.pid}; wait"):
+            reconstruct(folder, "dlt")
+        with pytest.raises(BusyError):
+            ingest(folder, "old", OLD)
+        assert open_session(folder).record("reconstruct") is not None, "reading needs no lock"
+        interrupt_publication(folder)
+        with pytest.raises(BusyError):
+            open_session(folder)
+    assert reconstruct(folder, "robust").finished, "the lock ends with the process"
+
+
+def interrupt_publication(folder: Path) -> None:
+    """As if killed between the renaming away of the old stage and that of the new one."""
+    (folder / ".reconstruct.old").mkdir()
+    (folder / "reconstruct").rename(folder / "reconstruct.new")
+
+
+def test_a_reader_finishes_what_was_published_halfway(tmp_path: Path) -> None:
+    folder = tmp_path / "a.session"
+    work(folder)
+    expected = contents(folder)
+    interrupt_publication(folder)
+    assert open_session(folder).record("reconstruct") is not None
+    assert contents(folder) == expected
+
+
+def test_a_stage_whose_successor_was_removed_by_hand_comes_back(tmp_path: Path) -> None:
+    folder = tmp_path / "a.session"
+    work(folder)
+    expected = contents(folder)
+    (folder / ".reconstruct.old").mkdir()
+    (folder / "reconstruct").rename(folder / ".reconstruct.old" / "reconstruct")
+    open_session(folder)
+    assert contents(folder) == expected
+
+
+def test_a_copy_kept_by_the_user_stays(tmp_path: Path) -> None:
+    folder = tmp_path / "a.session"
+    work(folder)
+    shutil.copytree(folder / "reconstruct", folder / "reconstruct.old")
+    reconstruct(folder, "dlt")
+    assert (folder / "reconstruct.old" / "skeleton").read_text() == "robust first robust second"
+
+
+def test_the_key_is_the_hash_of_all_that_decides() -> None:
+    text = '{"inputs":{"flight":"ab"},"revision":3,"settings":{"a":[1,null],"b":0.1},"stage":"detect"}'
+    key = key_of(Stage("detect", 3), {"b": 0.1, "a": (1, None)}, {"flight": "ab"})
+    assert key == hashlib.sha256(text.encode()).hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("stage", "settings", "inputs"),
+    [
+        (Stage("report", 1), {"a": 1}, {"flight": "ab"}),
+        (Stage("detect", 2), {"a": 1}, {"flight": "ab"}),
+        (Stage("detect", 1), {"a": 2}, {"flight": "ab"}),
+        (Stage("detect", 1), {"a": 1, "b": None}, {"flight": "ab"}),
+        (Stage("detect", 1), {"a": 1}, {"flight": "ac"}),
+        (Stage("detect", 1), {"a": 1}, {"model": "ab"}),
+        (Stage("detect", 1), {"a": 1}, {}),
+    ],
+)
+def test_the_key_changes_with_each_ingredient(
+    stage: Stage, settings: dict[str, object], inputs: dict[str, str]
+) -> None:
+    assert key_of(stage, settings, inputs) != key_of(Stage("detect", 1), {"a": 1}, {"flight": "ab"})
+
+
+def test_an_unchanged_stage_is_skipped_and_a_forced_one_redone_to_the_same_bytes(tmp_path: Path) -> None:
+    folder = tmp_path / "a.session"
+    work(folder)
+    before = contents(folder)
+    again = reconstruct(folder, "robust")
+    assert again.finished
+    assert again.record.counts == {"parts": 2}
+    assert again.record.warnings == ["used robust"]
+    assert len(read_json(folder / "run.json")["runs"]) == 2, "skipping leaves no trace"
+    forced = reconstruct(folder, "robust", force=True)
+    assert not forced.finished
+    assert contents(folder) == before
+    assert [run["stage"] for run in read_json(folder / "run.json")["runs"]] == [
+        "ingest",
+        *["reconstruct"] * 2,
+    ]
+
+
+def test_what_a_changed_setting_replaces_is_told(tmp_path: Path) -> None:
+    folder = tmp_path / "a.session"
+    work(folder)
+    assert reconstruct(folder, "robust").replaces == {}
+    assert reconstruct(folder, "dlt").replaces == {"method": ("robust", "dlt")}
+
+
+def test_a_changed_input_is_no_finished_stage(tmp_path: Path) -> None:
+    folder = tmp_path / "a.session"
+    work(folder)
+    ingest(folder, "old", OLD)
+    again = reconstruct(folder, "robust")
+    assert not again.finished
+    assert again.replaces == {}
+
+
+def flip(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[0] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("damage", [flip, Path.unlink, lambda path: path.write_bytes(b"")])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "reconstruct/skeleton",
+        "reconstruct/stage.json",
+        "cameras/a/frames",
+        "session.json",
+        "ingest/stage.json",
+    ],
+)
+def test_a_damaged_stage_is_redone(tmp_path: Path, name: str, damage: Callable[[Path], object]) -> None:
+    folder = tmp_path / "a.session"
+    work(folder)
+    expected = contents(folder)
+    damage(folder / name)
+    overwrite = name == "ingest/stage.json"  # without its record the folder is no longer known as ours
+    ingest(folder, "new", NEW, overwrite=overwrite)
+    reconstruct(folder, "robust")
+    assert contents(folder) == expected
+
+
+def test_a_record_that_lacks_something_is_one_line(tmp_path: Path) -> None:
+    folder = tmp_path / "a.session"
+    work(folder)
+    path = folder / "reconstruct" / "stage.json"
+    write_json(
+        path, {name: value for name, value in read_json(path).items() if name not in {"key", "outputs"}}
+    )
+    with pytest.raises(DataError, match=r"stage\.json: has no usable key, outputs; run the stage again"):
+        open_session(folder).record("reconstruct")
+
+
+def test_an_interrupted_stage_keeps_its_finished_chunks(tmp_path: Path) -> None:
+    folder = tmp_path / "a.session"
+    work(folder)
+    before = contents(folder)
+    produced: list[str] = []
+
+    def attempt(interrupt: bool, method: str = "dlt") -> None:
+        def produce(name: str) -> Callable[[Path], None]:
+            def write(part: Path) -> None:
+                produced.append(name)
+                (part / "part").write_text(name)
+                if interrupt and name == "second":
+                    raise KeyboardInterrupt
+
+            return write
+
+        with locked(folder) as session:
+            run = session.begin(RECONSTRUCT, settings={"method": method}, inputs={})
+            for name in ("first", "second"):
+                assert (run.chunk(name, produce(name)) / "part").read_text() == name
+            (run.folder / "skeleton").touch()
+            run.publish(counts={})
+
+    with pytest.raises(KeyboardInterrupt):
+        attempt(interrupt=True)
+    with pytest.raises(KeyboardInterrupt):
+        attempt(interrupt=True, method="midpoint")
+    assert not (folder / "reconstruct.new").exists()
+    assert {n: c for n, c in contents(folder).items() if not n.startswith(".partial")} == before
+    attempt(interrupt=False)
+    assert produced == ["first", "second", "first", "second", "second"]
+    assert not (folder / ".partial").exists(), "neither these chunks nor those of other settings"
+
+
+def test_force_starts_over(tmp_path: Path) -> None:
+    folder = tmp_path / "a.session"
+    work(folder)
+    with locked(folder) as session:
+        session.begin(RECONSTRUCT, settings={}, inputs={}).chunk("first", produce_part("stale"))
+    with locked(folder) as session:
+        run = session.begin(RECONSTRUCT, settings={}, inputs={}, force=True)
+        assert (run.chunk("first", produce_part("fresh")) / "part").read_text() == "fresh"
+
+
+def fail_to_ingest(folder: Path) -> None:
+    with locked(folder, create=True) as session:
+        (session.begin(INGEST, settings={}, inputs={}).folder / "truth.parquet").touch()
+        raise DataError("flight.yaml", "cannot be used")
+
+
+def test_a_failed_first_ingest_leaves_nothing(tmp_path: Path) -> None:
+    folder = tmp_path / "deep" / "a.session"
+    with pytest.raises(DataError, match="cannot be used"):
+        fail_to_ingest(folder)
+    assert not folder.exists()
+
+
+def test_a_failed_ingest_leaves_an_existing_folder_and_an_existing_session(tmp_path: Path) -> None:
+    empty, old = tmp_path / "empty", tmp_path / "a.session"
+    empty.mkdir()
+    work(old)
+    before = contents(old)
+    for folder in (empty, old):
+        with pytest.raises(DataError, match="cannot be used"):
+            fail_to_ingest(folder)
+    assert contents(empty) == {}
+    assert contents(old) == before
+    work(empty)
+
+
+def test_a_foreign_folder_is_refused_unless_it_may_be_written_into(tmp_path: Path) -> None:
+    foreign = {"thesis.tex": b"years of work", "session.json": b'{"of": "another program"}', "map.new/": b""}
+    (tmp_path / "map.new").mkdir()
+    for name in ("thesis.tex", "session.json"):
+        (tmp_path / name).write_bytes(foreign[name])
+    with pytest.raises(DataError, match=r"not empty \(3 entries, the first map\.new\); .*--overwrite"):
+        ingest(tmp_path, "new", NEW)
+    assert contents(tmp_path) == foreign
+    assert not (tmp_path / ".lock").exists()
+    ingest(tmp_path, "new", NEW, overwrite=True)
+    assert (tmp_path / "thesis.tex").read_bytes() == b"years of work"
+    assert (tmp_path / "map.new").is_dir()
+    assert_record_of(tmp_path, "new")
+
+
+def assert_record_of(folder: Path, flight: str) -> None:
+    record = open_session(folder).record("ingest")
+    assert record is not None
+    assert record.settings == {"flight": flight}
+
+
+def test_a_file_and_a_place_below_a_file_are_no_targets(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="is a file, not a folder"):
+        ingest(tmp_path / "file", "new", NEW)
+    with pytest.raises(DataError, match="Not a directory"):
+        ingest(tmp_path / "file" / "a.session", "new", NEW)
+
+
+@pytest.mark.parametrize("opening", [open_session, lambda folder: reconstruct(folder, "dlt")])
+def test_what_is_no_session_is_told_to_become_one(tmp_path: Path, opening: Callable[[Path], object]) -> None:
+    for folder in (tmp_path, tmp_path / "nothing"):
+        with pytest.raises(DataError, match="is not a session; make one with `mocap ingest"):
+            opening(folder)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_newer_schemas_are_refused_and_left_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "a.session"
+    work(folder)
+    of_file: dict[str, list[Callable[[Path], object]]] = {
+        "session.json": [open_session, work, lambda f: reconstruct(f, "robust", force=True)],
+        "reconstruct/stage.json": [lambda f: open_session(f).record("reconstruct"), work],
+    }
+    for name, openings in of_file.items():
+        path = folder / name
+        kept = path.read_bytes()
+        path.write_text(json.dumps({**json.loads(kept), "schema": SCHEMA + 1}))
+        before = contents(folder)
+        for opening in openings:
+            with pytest.raises(NewerSchemaError, match=r"has schema 2, this version reads up to 1; update"):
+                opening(folder)
+        assert contents(folder) == before
+        path.write_bytes(kept)
+
+
+@pytest.mark.parametrize("schema", [None, "1", [1]])
+def test_a_session_without_a_schema_number_is_damaged(tmp_path: Path, schema: object) -> None:
+    folder = tmp_path / "a.session"
+    work(folder)
+    write_json(folder / "session.json", {"schema": schema})
+    with pytest.raises(DataError, match=r"states no schema number .*; run `mocap ingest` again"):
+        open_session(folder)
+    ingest(folder, "new", NEW)
+    open_session(folder)
+
+
+def test_ingest_publishes_only_what_it_owns(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"ingest does not own notes\.txt"):
+        ingest(tmp_path / "a.session", "new", {"notes.txt": ""})
+    with pytest.raises(ValueError, match="no-such is not a stage"):
+        Stage("no-such", 1)
+
+
+def test_the_record_of_an_unpublished_stage_cannot_be_asked_for(tmp_path: Path) -> None:
+    work(tmp_path / "a.session")
+    with locked(tmp_path / "a.session") as session:
+        run = session.begin(RECONSTRUCT, settings={}, inputs={})
+        with pytest.raises(RuntimeError, match="not published"):
+            _ = run.record

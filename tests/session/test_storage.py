@@ -1,0 +1,190 @@
+"""JSON that is always the same, hashes that see every change, errors that are one line."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipelines.session.errors import DataError
+from pipelines.session.storage import (
+    as_data_error,
+    canonical_json,
+    jsonable,
+    read_json,
+    remove_tree,
+    sha256_of,
+    sync_tree,
+    write_json,
+)
+
+NUMBERS = st.integers(-(2**53), 2**53) | st.floats(allow_nan=False, allow_infinity=False)
+VALUES = st.recursive(
+    st.none() | st.booleans() | NUMBERS | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=12,
+)
+DOCUMENTS = st.dictionaries(st.text(), VALUES, max_size=5)
+
+
+@settings(max_examples=40)  # each one is synced to the disk
+@given(DOCUMENTS)
+def test_what_is_json_already_survives_unchanged(
+    tmp_path_factory: pytest.TempPathFactory, document: Any
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "round_trip.json"
+    write_json(path, jsonable(document))
+    assert read_json(path) == document
+    assert list(read_json(path)) == list(document), "objects keep their order"
+
+
+@given(DOCUMENTS, st.randoms())
+def test_canonical_json_ignores_the_order_of_keys(document: dict[str, Any], random: Any) -> None:
+    names = list(document)
+    random.shuffle(names)
+    assert canonical_json({name: document[name] for name in names}) == canonical_json(document)
+    assert json.loads(canonical_json(document)) == document
+
+
+@given(st.lists(st.floats(allow_infinity=False) | st.just(math.nan), min_size=1))
+def test_numpy_writes_what_lists_write(numbers: list[float]) -> None:
+    expected = [None if math.isnan(number) else number for number in numbers]
+    assert jsonable(np.array(numbers)) == expected
+    assert jsonable(tuple(np.float64(number) for number in numbers)) == expected
+
+
+def test_numpy_scalars_become_plain_ones() -> None:
+    plain = jsonable(
+        {"flag": np.bool_(True), "count": np.int64(2**62), "share": np.float32(0.5), "name": np.str_("a")}
+    )
+    assert plain == {"flag": True, "count": 2**62, "share": 0.5, "name": "a"}
+    assert [type(value) for value in plain.values()] == [bool, int, float, str]
+
+
+@pytest.mark.parametrize(
+    "value", [math.inf, -math.inf, np.float64(np.inf), {"deep": [np.array([1.0, np.inf])]}]
+)
+def test_infinity_is_neither_a_number_nor_missing(value: object) -> None:
+    with pytest.raises(ValueError, match="inf cannot be written"):
+        jsonable(value)
+
+
+@pytest.mark.parametrize("value", [Path("flight.yaml"), {1: "one"}, {"set": {1}}, 1j, b"bytes"])
+def test_what_json_does_not_know_is_refused(value: object) -> None:
+    with pytest.raises(TypeError):
+        jsonable(value)
+
+
+def test_names_that_are_not_utf8_can_be_written(tmp_path: Path) -> None:
+    name = os.fsdecode(b"caf\xe9.mp4")
+    write_json(tmp_path / "a.json", jsonable({name: name}))
+    assert read_json(tmp_path / "a.json") == {"caf?.mp4": "caf?.mp4"}
+
+
+def test_json_is_readable_and_ends_with_a_newline(tmp_path: Path) -> None:
+    write_json(tmp_path / "a.json", {"name": "Hügel", "n": [1]})
+    assert (tmp_path / "a.json").read_bytes() == '{\n  "name": "Hügel",\n  "n": [\n    1\n  ]\n}\n'.encode()
+
+
+def test_nan_is_never_written_and_the_old_file_stays(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    write_json(path, {"n": 1})
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(path, {"n": math.nan})
+    assert read_json(path) == {"n": 1}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{",
+        b'{"n": NaN}',
+        b'{"n": -Infinity}',
+        b"[1]",
+        b"3",
+        b"\xff\xfe{",
+        b"[" * 100_000,
+        b'{"n": 1} {}',
+    ],
+)
+def test_damaged_json_is_one_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a.json"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"a\.json: .*; mend it") as caught:
+        read_json(path, "mend it")
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_json_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"a\.json: No such file"):
+        read_json(tmp_path / "a.json")
+
+
+def test_hash_of_a_file_is_its_sha256(tmp_path: Path) -> None:
+    content = b"keypoints" * 100_000
+    (tmp_path / "a").write_bytes(content)
+    assert sha256_of(tmp_path / "a") == hashlib.sha256(content).hexdigest()
+
+
+def test_hash_of_a_folder_sees_names_contents_and_nothing_else(tmp_path: Path) -> None:
+    def folder(name: str, files: dict[str, bytes]) -> Path:
+        for file, content in files.items():
+            path = tmp_path / name / file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        return tmp_path / name
+
+    files = {"a": b"1", "b/c": b"2", "b.c": b"3"}
+    reference = sha256_of(folder("reference", files))
+    assert sha256_of(folder("again", dict(reversed(files.items())))) == reference
+    changed = [
+        {"a": b"1", "b/c": b"2", "b.c": b"4"},
+        {"a": b"1", "b/d": b"2", "b.c": b"3"},
+        {"a": b"1", "c": b"2", "b.c": b"3"},
+        {"a": b"1", "b/c": b"2"},
+        {**files, "d": b""},
+        {"a": b"2", "b/c": b"1", "b.c": b"3"},
+    ]
+    hashes = [sha256_of(folder(f"changed{k}", other)) for k, other in enumerate(changed)]
+    assert len({reference, *hashes}) == 1 + len(changed)
+
+
+def test_hash_of_nothing_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="gone: No such file"):
+        sha256_of(tmp_path / "gone")
+
+
+def test_removing_takes_files_folders_links_and_nothing(tmp_path: Path) -> None:
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    (kept / "file").touch()
+    (tmp_path / "link").symlink_to(kept)
+    (tmp_path / "folder" / "inner").mkdir(parents=True)
+    (tmp_path / "folder" / "inner" / "file").touch()
+    sync_tree(tmp_path / "folder")
+    for name in ("link", "folder", "nothing"):
+        remove_tree(tmp_path / name)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "kept"]
+
+
+def test_errors_of_the_system_name_the_file_and_the_remedy() -> None:
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "skeleton.parquet")
+    assert (
+        str(as_data_error(full, Path("a.session")))
+        == "skeleton.parquet: No space left on device; free some space and run the command again"
+    )
+    # pyarrow gives a text alone
+    assert str(as_data_error(OSError("cannot write"), Path("a.session"))).startswith(
+        "a.session: cannot write; "
+    )
