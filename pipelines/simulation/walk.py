@@ -79,8 +79,8 @@ def walk(
     Returns:
         [T, 17, 3] metres, ENU, the ground at z = 0, joints in the order of `COCO17`.
     """
-    radians_per_metre, sway = _pelvis_travel()
-    phase = speed_mps * t_s * radians_per_metre / height_m
+    _, sway = _pelvis_travel()
+    phase = 2 * np.pi / stride_m(height_m) * speed_mps * t_s
     along = speed_mps * t_s + height_m * _periodic(sway, phase)
     joints = height_m * _standing_joints(phase)
 
@@ -88,6 +88,12 @@ def walk(
     joints = _about_up(joints, heading)
     joints[..., :2] += ground[:, None]
     return joints
+
+
+def stride_m(height_m: float = 1.75) -> float:
+    """How far a person of that height walks until the same foot lands again."""
+    radians_per_height, _ = _pelvis_travel()
+    return 2 * np.pi / radians_per_height * height_m
 
 
 def route(

@@ -1,0 +1,64 @@
+"""Formations: where the cameras are, and that the person is in their pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipelines.geometry.poses import matrix_from_quaternion
+from pipelines.simulation.drone_paths import look_at, orbit
+from pipelines.simulation.observe import see
+from pipelines.simulation.walk import COCO17, walk
+from tests.synthetic.flights import LENS
+
+T_S = np.linspace(0, 20, 41)
+TARGET = np.stack([1.2 * T_S, 3.0 + 0 * T_S, 1.0 + 0 * T_S], axis=1)
+
+
+@pytest.mark.parametrize(("cameras", "apart_deg"), [(1, None), (2, 90.0), (3, 120.0), (5, 72.0)])
+def test_slots_of_the_formation(cameras: int, apart_deg: float | None) -> None:
+    position, _ = orbit(T_S, TARGET, cameras=cameras, range_m=8.0, tilt_deg=20.0, yaw_deg=10.0)
+    from_target = position - TARGET
+    assert position.shape == (cameras, len(T_S), 3)
+    assert np.linalg.norm(from_target, axis=-1) == pytest.approx(8.0)
+    assert from_target[..., 2] == pytest.approx(8.0 * np.sin(np.radians(20.0)))
+    yaw = np.unwrap(np.arctan2(from_target[..., 1], from_target[..., 0]))
+    assert np.degrees(yaw[0]) == pytest.approx(10.0 + 4.0 * T_S)
+    if apart_deg is not None:
+        assert np.degrees(yaw[1] - yaw[0]) % 360 == pytest.approx(apart_deg)
+
+
+def test_variation_changes_the_formation_within_its_bounds() -> None:
+    position, _ = orbit(T_S, TARGET, cameras=3, variation=1.0)
+    distance = np.linalg.norm(position - TARGET, axis=-1)
+    tilt = np.degrees(np.arcsin((position - TARGET)[..., 2] / distance))
+    assert 1.0 < np.ptp(distance) <= 2.0
+    assert 3.0 < np.ptp(tilt) <= 6.0
+    assert np.ptp(distance[0] - distance[1]) > 0.5  # not all by the same amount
+
+
+def test_cameras_look_at_the_target_and_stand_upright() -> None:
+    position, quaternion = orbit(T_S, TARGET, cameras=3, variation=1.0)
+    right, down, forward = np.moveaxis(matrix_from_quaternion(quaternion), -1, 0)
+    towards = (TARGET - position) / np.linalg.norm(TARGET - position, axis=-1, keepdims=True)
+    assert forward == pytest.approx(towards, abs=1e-12)
+    assert right[..., 2] == pytest.approx(0.0, abs=1e-12)
+    assert (down[..., 2] < 0).all()
+    assert np.linalg.norm(quaternion, axis=-1) == pytest.approx(1.0)
+
+
+def test_looking_east_has_south_on_the_right() -> None:
+    axes = matrix_from_quaternion(look_at(np.zeros(3), np.array([5.0, 0.0, 0.0])))
+    assert axes == pytest.approx(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), abs=1e-15)
+
+
+def test_the_actor_is_near_the_middle_of_every_picture() -> None:
+    """At 10 m a body of 1.75 m spans 1.75/10 of the focal length: its middle within a quarter of that."""
+    joints = walk(T_S, start=(0.0, 3.0))
+    position, quaternion = orbit(T_S, TARGET, cameras=3)
+    for k in range(3):
+        pixels = see(joints, position[k], quaternion[k], LENS)
+        hips = pixels[:, [COCO17.index("left_hip"), COCO17.index("right_hip")]].mean(axis=1)
+        assert np.linalg.norm(hips - [LENS.cx, LENS.cy], axis=1).max() < 1.75 / 10 * LENS.fx / 4
+        assert np.isfinite(pixels).all()
+        assert (pixels[:, COCO17.index("nose"), 1] < pixels[:, COCO17.index("left_ankle"), 1]).all()

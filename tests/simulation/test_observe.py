@@ -1,0 +1,113 @@
+"""Simulated instruments: exact without noise, and with it as noisy as they say."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.geometry.cameras import camera_matrix
+from pipelines.geometry.poses import conjugate, invert, multiply, rotation_vector_from_quaternion
+from pipelines.simulation.drone_paths import look_at, orbit
+from pipelines.simulation.observe import KeypointNoise, PoseNoise, detect, log_poses, see
+from pipelines.simulation.walk import walk
+from tests.synthetic.flights import LENS
+
+T_S = np.linspace(0, 5, 7)
+TARGET = np.stack([1.2 * T_S, 0 * T_S, 1.0 + 0 * T_S], axis=1)
+
+
+def test_pixels_agree_with_opencv() -> None:
+    joints = walk(T_S)
+    position, quaternion = orbit(T_S, TARGET, cameras=2)
+    pixels = see(joints, position[1], quaternion[1], LENS)
+    for k in range(len(T_S)):
+        translation, rotation = invert(position[1, k], quaternion[1, k])
+        expected, _ = cv2.projectPoints(
+            joints[k],
+            rotation_vector_from_quaternion(rotation),
+            translation,
+            camera_matrix(LENS),
+            np.array(LENS.distortion),
+        )
+        assert pixels[k] == pytest.approx(expected[:, 0], abs=1e-6)
+
+
+def test_nothing_is_seen_behind_the_camera_or_beside_the_picture() -> None:
+    quaternion = look_at(np.zeros((1, 3)), np.array([[5.0, 0.0, 0.0]]))
+    # 5 m ahead, 5 m behind, and 80 degrees to the left, where 40 would be the border.
+    points = np.array([[[5.0, 0.0, 0.0], [-5.0, 0.0, 0.0], [5.0, 28.0, 0.0]]])
+    pixels = see(points, np.zeros((1, 3)), quaternion, LENS)
+    assert pixels[0, 0] == pytest.approx([LENS.cx, LENS.cy])
+    assert np.isnan(pixels[0, 1:]).all()
+
+
+def test_a_detector_without_noise_is_exact() -> None:
+    pixels = np.random.default_rng(0).uniform(0, 700, (20, 17, 2))
+    xy, confidence = detect(pixels, KeypointNoise(pixel_px=0.0), np.random.default_rng(1))
+    assert (xy == pixels).all()
+    assert ((confidence >= 0.7) & (confidence <= 1.0)).all()
+
+
+def test_a_detector_errs_as_it_says() -> None:
+    """40,000 joints: the standard error of a sigma is 1/sqrt(2 n) = 0.35 %, of a share sqrt(p/n) = 0.07 %."""
+    pixels = np.full((2000, 20, 2), 500.0)
+    noise = KeypointNoise(pixel_px=3.0, missed_share=0.05, outlier_share=0.02)
+    xy, confidence = detect(pixels, noise, np.random.default_rng(2))
+    missed = np.isnan(xy).any(axis=-1)
+    assert missed.mean() == pytest.approx(0.05, abs=0.005)
+    assert (np.isnan(xy).all(axis=-1) == missed).all()
+    assert ((confidence == 0) == missed).all()
+    far = np.linalg.norm(xy[~missed] - 500.0, axis=-1)
+    outlier = far > 25  # beyond 8 sigma of the white noise
+    assert outlier.mean() == pytest.approx(0.02, abs=0.004)
+    assert far[outlier].min() >= 30
+    assert far[outlier].max() <= 150
+    assert (xy[~missed][~outlier] - 500.0).std() == pytest.approx(3.0, rel=0.015)
+
+
+def test_what_cannot_be_seen_is_not_detected() -> None:
+    pixels = np.full((3, 17, 2), np.nan)
+    xy, confidence = detect(pixels, KeypointNoise(outlier_share=0.5), np.random.default_rng(3))
+    assert np.isnan(xy).all()
+    assert (confidence == 0).all()
+
+
+def test_the_same_seed_gives_the_same_keypoints() -> None:
+    pixels = np.full((5, 17, 2), 100.0)
+    noise = KeypointNoise(missed_share=0.1, outlier_share=0.1)
+    first, second = (detect(pixels, noise, np.random.default_rng(4)) for _ in range(2))
+    assert np.array_equal(first[0], second[0], equal_nan=True)
+    assert np.array_equal(first[1], second[1])
+
+
+def test_a_log_without_noise_is_exact() -> None:
+    position, quaternion = (rows[0] for rows in orbit(T_S, TARGET, cameras=1))
+    logged = log_poses(position, quaternion, PoseNoise(), np.random.default_rng(5))
+    assert (logged[0] == position).all()
+    assert logged[1] == pytest.approx(quaternion, abs=1e-15)
+
+
+def test_pose_errors_are_of_the_stated_size() -> None:
+    """15,000 white numbers of each kind: the standard error of their sigma is 0.6 %."""
+    t_s = np.linspace(0, 50, 5000)
+    target = np.stack([1.2 * t_s, 0 * t_s, 1.0 + 0 * t_s], axis=1)
+    position, quaternion = (rows[0] for rows in orbit(t_s, target, cameras=1))
+    noise = PoseNoise(0.02, 0.2, 0.05, 0.3)
+    logged = log_poses(position, quaternion, noise, np.random.default_rng(6))
+    moved = logged[0] - position
+    # Errors of rotation are right factors: world_from_camera = true times camera_from_erring_camera.
+    turned = np.degrees(rotation_vector_from_quaternion(multiply(conjugate(quaternion), logged[1])))
+    assert moved.std(axis=0) == pytest.approx(0.02, rel=0.04)
+    assert turned.std(axis=0) == pytest.approx(0.2, rel=0.04)
+
+    def biases(seed: int) -> NDArray[np.float64]:
+        only_bias = PoseNoise(bias_position_m=0.05, bias_rotation_deg=0.3)
+        shifted, _ = log_poses(position[:2], quaternion[:2], only_bias, np.random.default_rng(seed))
+        assert shifted[0] - position[0] == pytest.approx(shifted[1] - position[1], abs=1e-12)
+        bias: NDArray[np.float64] = shifted[0] - position[0]
+        return bias
+
+    # 1200 numbers: 2 %.
+    assert np.stack([biases(seed) for seed in range(400)]).std() == pytest.approx(0.05, rel=0.08)
