@@ -1,0 +1,333 @@
+"""What is wrong with the poses of a log: the vocabulary of errors, as priors and to disturb with.
+
+The error of a pose is a translation in m and a rotation vector in rad. The translation is along the
+world's axes, or along the camera's with `frame: body`; the rotation is about the camera's axes, applied
+on the right: noisy world_from_camera = (p + translation, q * exp(rotation)). Sigmas are per axis. The
+errors of several models add up.
+
+Models are registered under `mocap.noise_models`; `build` takes the classes by their registered names.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.poses import (
+    conjugate,
+    interpolate_poses,
+    multiply,
+    quaternion_from_rotation_vector,
+    rotate,
+    rotation_vector_from_quaternion,
+)
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Frame = Literal["world", "body"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseModel(ABC):
+    """One kind of pose error; the fields are the parameters that users write.
+
+    Raises:
+        ValueError: a number is negative or not finite, or `frame` is neither world nor body.
+    """
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            _check_parameter(field.name, getattr(self, field.name))
+
+    @abstractmethod
+    def marginal_sigma(self, elapsed_s: Float, speed_mps: Float, turn_rate_radps: Float) -> Float:
+        """Standard deviation of the error at each moment by itself.
+
+        Args:
+            elapsed_s: [T] time since the first pose.
+            speed_mps: [T] speed of the camera.
+            turn_rate_radps: [T] how fast the camera turns.
+
+        Returns:
+            [T, 2] per axis of the position (m) and of the rotation (rad).
+        """
+
+    @abstractmethod
+    def errors(self, t_ns: Int64, position: Float, quaternion_xyzw: Float, rng: np.random.Generator) -> Float:
+        """One draw of the errors of a whole log.
+
+        Args:
+            t_ns: [T] strictly increasing stamps.
+            position: [T, 3] m, the true world_from_camera.
+            quaternion_xyzw: [T, 4] unit, the same.
+            rng: where chance comes from.
+
+        Returns:
+            [T, 6]: translation in the world (m), rotation vector in the camera (rad).
+        """
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Process(NoiseModel):
+    """Six independent axes of one random process in time, whatever the camera does."""
+
+    frame: Frame = "world"
+
+    @abstractmethod
+    def _scale(self) -> tuple[float, float]:
+        """What the process of unit scale is multiplied by: m for the position, rad for the rotation."""
+
+    @abstractmethod
+    def _unit_sigma(self, elapsed_s: Float) -> Float:
+        """Standard deviation [T] of the process of unit scale."""
+
+    @abstractmethod
+    def _unit_draw(self, elapsed_s: Float, rng: np.random.Generator) -> Float:
+        """One draw [T, 6] of the process of unit scale."""
+
+    def marginal_sigma(
+        self,
+        elapsed_s: Float,
+        speed_mps: Float,  # noqa: ARG002  # the base class's signature
+        turn_rate_radps: Float,  # noqa: ARG002
+    ) -> Float:
+        """See `NoiseModel.marginal_sigma`; motion makes no difference."""
+        sigma: Float = self._unit_sigma(elapsed_s)[:, None] * self._scale()
+        return sigma
+
+    def errors(
+        self,
+        t_ns: Int64,
+        position: Float,  # noqa: ARG002  # the base class's signature
+        quaternion_xyzw: Float,
+        rng: np.random.Generator,
+    ) -> Float:
+        """See `NoiseModel.errors`."""
+        draw: Float = self._unit_draw((t_ns - t_ns[:1]) / 1e9, rng) * np.repeat(self._scale(), 3)
+        if self.frame == "body":
+            draw[:, :3] = rotate(quaternion_xyzw, draw[:, :3])
+        return draw
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stationary(_Process):
+    """A process whose scatter is the same at any time."""
+
+    position_m: float = 0.0
+    rotation_deg: float = 0.0
+
+    def _scale(self) -> tuple[float, float]:
+        return self.position_m, math.radians(self.rotation_deg)
+
+    def _unit_sigma(self, elapsed_s: Float) -> Float:
+        return np.ones_like(elapsed_s)
+
+
+@dataclass(frozen=True, kw_only=True)
+class White(_Stationary):
+    """An error of its own for every pose."""
+
+    def _unit_draw(self, elapsed_s: Float, rng: np.random.Generator) -> Float:
+        return rng.standard_normal((len(elapsed_s), 6))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bias(_Stationary):
+    """One error for the whole flight."""
+
+    def _unit_draw(self, elapsed_s: Float, rng: np.random.Generator) -> Float:
+        return np.tile(rng.standard_normal(6), (len(elapsed_s), 1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussMarkov(_Stationary):
+    """An error that is forgotten with a correlation time, as that of satellite positioning.
+
+    The autocorrelation is exp(-lag / correlation_s) (Gelb 1974, Applied Optimal Estimation, 3.8).
+    """
+
+    correlation_s: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.correlation_s == 0:
+            raise ValueError("correlation_s is 0: an error without memory is the model white")
+
+    def _unit_draw(self, elapsed_s: Float, rng: np.random.Generator) -> Float:
+        draw = rng.standard_normal((len(elapsed_s), 6))
+        kept = np.exp(-np.diff(elapsed_s) / self.correlation_s)
+        fresh = np.sqrt(-np.expm1(-2 * np.diff(elapsed_s) / self.correlation_s))
+        for k in range(1, len(draw)):
+            draw[k] = kept[k - 1] * draw[k - 1] + fresh[k - 1] * draw[k]
+        return draw
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drift(_Process):
+    """A random walk that starts at zero with the first pose."""
+
+    position_m_per_sqrt_s: float = 0.0
+    rotation_deg_per_sqrt_s: float = 0.0
+
+    def _scale(self) -> tuple[float, float]:
+        return self.position_m_per_sqrt_s, math.radians(self.rotation_deg_per_sqrt_s)
+
+    def _unit_sigma(self, elapsed_s: Float) -> Float:
+        return np.sqrt(elapsed_s)
+
+    def _unit_draw(self, elapsed_s: Float, rng: np.random.Generator) -> Float:
+        steps = np.diff(elapsed_s, prepend=elapsed_s[:1])
+        return np.cumsum(np.sqrt(steps)[:, None] * rng.standard_normal((len(steps), 6)), axis=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Latency(NoiseModel):
+    """A log that lags behind: the pose stamped t is where the camera was `latency_ms` before t."""
+
+    latency_ms: float
+
+    def marginal_sigma(
+        self,
+        elapsed_s: Float,  # noqa: ARG002  # the base class's signature
+        speed_mps: Float,
+        turn_rate_radps: Float,
+    ) -> Float:
+        """See `NoiseModel.marginal_sigma`: the full error, which lies along the motion, for every axis."""
+        return np.stack([speed_mps, turn_rate_radps], axis=-1) * (self.latency_ms / 1e3)
+
+    def errors(
+        self,
+        t_ns: Int64,
+        position: Float,
+        quaternion_xyzw: Float,
+        rng: np.random.Generator,  # noqa: ARG002  # the base class's signature
+    ) -> Float:
+        """See `NoiseModel.errors`; before the log's beginning the camera is taken to stand still."""
+        delay_ns = round(self.latency_ms * 1e6)
+        late_position, late_quaternion = interpolate_poses(
+            t_ns,
+            position,
+            quaternion_xyzw,
+            t_ns - delay_ns,
+            max_gap_ns=int(np.ptp(t_ns)) if len(t_ns) else 0,
+            max_extrapolation_ns=delay_ns,
+        )
+        turned = rotation_vector_from_quaternion(multiply(conjugate(quaternion_xyzw), late_quaternion))
+        return np.concatenate([late_position - position, turned], axis=1)
+
+
+def sum_sigma(
+    models: Sequence[NoiseModel], elapsed_s: Float, speed_mps: Float, turn_rate_radps: Float
+) -> Float:
+    """Standard deviation [T, 2] per axis (m, rad) of the sum of independent models; 0 without any."""
+    variance = np.zeros((len(elapsed_s), 2))
+    for model in models:
+        variance += model.marginal_sigma(elapsed_s, speed_mps, turn_rate_radps) ** 2
+    return np.sqrt(variance)
+
+
+def disturb(
+    models: Sequence[NoiseModel],
+    t_ns: Int64,
+    position: Float,
+    quaternion_xyzw: Float,
+    rng: np.random.Generator,
+) -> tuple[Float, Float]:
+    """A log as it would be with the models' errors, which add up before they are applied.
+
+    Args:
+        models: the errors, drawn in this order.
+        t_ns: [T] strictly increasing stamps.
+        position: [T, 3] m, the true world_from_camera.
+        quaternion_xyzw: [T, 4] unit, the same.
+        rng: where chance comes from; the same state gives the same log.
+
+    Returns:
+        Position [T, 3] and quaternion [T, 4].
+    """
+    error = np.zeros((len(t_ns), 6))
+    for model in models:
+        error += model.errors(t_ns, position, quaternion_xyzw, rng)
+    turned = multiply(quaternion_xyzw, quaternion_from_rotation_vector(error[:, 3:]))
+    return position + error[:, :3], turned
+
+
+def build(
+    parts: Iterable[tuple[str, Mapping[str, object]]], classes: Mapping[str, type[NoiseModel]]
+) -> list[NoiseModel]:
+    """The models that names and parameters ask for.
+
+    Args:
+        parts: (name, parameters) of each model: `pose_noise.items()` of a flight, or `parse(text)`.
+        classes: every known model by its registered name.
+
+    Raises:
+        ValueError: an unknown model or parameter (the message names those there are), one that is
+            missing, or a value that is out of range.
+    """
+    return [_build_one(name, parameters, classes) for name, parameters in parts]
+
+
+def parse(text: str) -> list[tuple[str, dict[str, object]]]:
+    """Names and parameters out of a text like `white:position_m=0.3,rotation_deg=1 + bias:position_m=0.1`.
+
+    Raises:
+        ValueError: the text does not have that form.
+    """
+    # The sign of an exponent (1e+3) does not start another model: its digits follow at once.
+    return [_parse_one(part.strip()) for part in re.split(r"\+(?!\d)", text)]
+
+
+def _build_one(
+    name: str, parameters: Mapping[str, object], classes: Mapping[str, type[NoiseModel]]
+) -> NoiseModel:
+    if name not in classes:
+        raise ValueError(f"noise model {name} is none of {', '.join(sorted(classes))}")
+    known = {field.name: field.default is MISSING for field in fields(classes[name])}
+    unknown = sorted(set(parameters) - set(known))
+    if unknown:
+        raise ValueError(f"{name} has no {', '.join(unknown)}; its parameters are {', '.join(sorted(known))}")
+    missing = [key for key, required in known.items() if required and key not in parameters]
+    if missing:
+        raise ValueError(f"{name} needs {', '.join(missing)}")
+    try:
+        return classes[name](**parameters)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+
+
+def _check_parameter(name: str, value: object) -> None:
+    if name == "frame":
+        if value not in ("world", "body"):
+            raise ValueError(f"frame is {value!r} instead of world or body")
+    elif not isinstance(value, (int, float)) or isinstance(value, bool):
+        raise ValueError(f"{name} is {value!r} instead of a number")
+    elif not (math.isfinite(value) and value >= 0):
+        raise ValueError(f"{name} is {value}; it must be finite and not negative")
+
+
+def _parse_one(part: str) -> tuple[str, dict[str, object]]:
+    match = re.fullmatch(r"([A-Za-z][\w-]*)\s*:\s*(.+)", part)
+    assignments = [item.partition("=") for item in match[2].split(",")] if match else []
+    if match is None or not all(key.strip() and value.strip() for key, _, value in assignments):
+        raise ValueError(f"{part!r} does not read as model:parameter=value,parameter=value")
+    parameters: dict[str, object] = {}
+    for key, _, value in assignments:
+        if key.strip() in parameters:
+            raise ValueError(f"{part!r} gives {key.strip()} twice")
+        parameters[key.strip()] = _number_or_word(value.strip())
+    return match[1], parameters
+
+
+def _number_or_word(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text

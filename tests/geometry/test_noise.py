@@ -1,0 +1,249 @@
+"""Pose errors: what is drawn has the stated scatter, in the stated frame, and nonsense is refused."""
+
+from __future__ import annotations
+
+import math
+from importlib.metadata import entry_points
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipelines.geometry.noise import (
+    Bias,
+    Drift,
+    Float,
+    GaussMarkov,
+    Int64,
+    Latency,
+    NoiseModel,
+    White,
+    build,
+    disturb,
+    parse,
+    sum_sigma,
+)
+from pipelines.geometry.poses import (
+    conjugate,
+    multiply,
+    quaternion_from_rotation_vector,
+    rotate,
+    rotation_vector_from_quaternion,
+)
+
+CLASSES: dict[str, type[NoiseModel]] = {
+    "white": White,
+    "bias": Bias,
+    "drift": Drift,
+    "gauss-markov": GaussMarkov,
+    "latency": Latency,
+}
+EPOCH = 1_700_000_000_000_000_000
+DRAWS = 3000
+
+
+def circling(t_s: Float) -> tuple[Int64, Float, Float]:
+    """A camera on a 10 m circle at 0.3 rad/s, turning with it."""
+    angle = 0.3 * t_s
+    position = 10 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    quaternion = quaternion_from_rotation_vector(angle[:, None] * np.array([0.0, 0, 1]))
+    return EPOCH + np.round(t_s * 1e9).astype(np.int64), position, quaternion
+
+
+def difference(log: tuple[Int64, Float, Float], noisy: tuple[Float, Float]) -> Float:
+    """[T, 6]: translation in the world, rotation vector in the camera."""
+    _, position, quaternion = log
+    turned = rotation_vector_from_quaternion(multiply(conjugate(quaternion), noisy[1]))
+    return np.concatenate([noisy[0] - position, turned], axis=1)
+
+
+def draws(models: list[NoiseModel], t_s: Float, count: int = DRAWS) -> Float:
+    """[count, T, 6] errors of independent draws."""
+    rng = np.random.default_rng(11)
+    log = circling(t_s)
+    return np.stack([difference(log, disturb(models, *log, rng)) for _ in range(count)])
+
+
+SCATTERED = [
+    White(position_m=0.3, rotation_deg=1.0),
+    Bias(position_m=0.3, rotation_deg=1.0, frame="body"),
+    Drift(position_m_per_sqrt_s=0.05, rotation_deg_per_sqrt_s=0.2),
+    Drift(position_m_per_sqrt_s=0.05, rotation_deg_per_sqrt_s=0.2, frame="body"),
+    GaussMarkov(position_m=0.5, rotation_deg=0.1, correlation_s=20),
+]
+
+
+@pytest.mark.parametrize("model", SCATTERED, ids=lambda model: f"{type(model).__name__}-{model.frame}")
+def test_draws_scatter_as_the_marginal_sigma_says(model: NoiseModel) -> None:
+    t_s = np.array([0.0, 0.5, 4.0, 30.0])
+    found = draws([model], t_s)
+    still = np.zeros_like(t_s)
+    expected = model.marginal_sigma(t_s, still, still)
+    measured = np.stack([found[..., :3], found[..., 3:]], axis=2).std(axis=(0, 3))
+    # A standard deviation from n values scatters by 1/sqrt(2 n); the 3 axes are independent: n = 3 DRAWS.
+    # Five of those sigmas: one failure in a million.
+    np.testing.assert_allclose(measured, expected, rtol=5 / math.sqrt(2 * 3 * DRAWS), atol=1e-15)
+    # The mean scatters by sigma / sqrt(DRAWS) on each of 24 axes and times.
+    assert (np.abs(found.mean(axis=0)) <= 5 * np.repeat(expected, 3, axis=1) / math.sqrt(DRAWS)).all()
+
+
+def correlation(found: Float) -> float:
+    """Between the first and the last time, over draws and axes of the position."""
+    first, last = found[:, 0, :3].ravel(), found[:, -1, :3].ravel()
+    return float(np.mean(first * last) / np.sqrt(np.mean(first**2) * np.mean(last**2)))
+
+
+@pytest.mark.parametrize(
+    ("model", "expected"),
+    [
+        (White(position_m=1.0), 0.0),
+        (Bias(position_m=1.0), 1.0),
+        (GaussMarkov(position_m=1.0, correlation_s=10.0), math.exp(-0.6)),
+        (Drift(position_m_per_sqrt_s=1.0), math.sqrt(2.0 / 8.0)),  # min(s, t) / sqrt(s t)
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_errors_remember_as_their_process_does(model: NoiseModel, expected: float) -> None:
+    # From 2 s to 8 s with uneven steps between; the first pose at 0 s is where drift starts.
+    found = draws([model], np.array([0.0, 2.0, 2.5, 6.0, 8.0]))[:, 1:]
+    # A correlation from n pairs scatters by (1 - r^2)/sqrt(n).
+    tolerance = 5 * (1 - expected**2) / math.sqrt(3 * DRAWS)
+    assert correlation(found) == pytest.approx(expected, abs=tolerance + 1e-9)
+
+
+def test_a_bias_is_constant_in_its_frame() -> None:
+    log = circling(np.linspace(0, 10, 30))
+    rng = np.random.default_rng(0)
+    in_world = difference(log, disturb([Bias(position_m=0.3, rotation_deg=2.0)], *log, rng))
+    np.testing.assert_allclose(in_world, np.tile(in_world[0], (30, 1)), atol=1e-12)
+    in_body = difference(log, disturb([Bias(position_m=0.3, frame="body")], *log, rng))
+    np.testing.assert_allclose(
+        rotate(conjugate(log[2]), in_body[:, :3]), np.tile(in_body[0, :3], (30, 1)), atol=1e-12
+    )
+    assert np.ptp(in_body[:, 0]) > 0.01
+
+
+def test_a_body_drift_accumulates_along_the_camera_s_axes() -> None:
+    log = circling(np.linspace(0, 10, 30))
+    model = Drift(position_m_per_sqrt_s=0.1)
+    body_model = Drift(position_m_per_sqrt_s=0.1, frame="body")
+    in_world = difference(log, disturb([model], *log, np.random.default_rng(4)))
+    in_body = difference(log, disturb([body_model], *log, np.random.default_rng(4)))
+    np.testing.assert_allclose(rotate(conjugate(log[2]), in_body[:, :3]), in_world[:, :3], atol=1e-12)
+
+
+def test_latency_shows_where_the_camera_was() -> None:
+    # Straight flight at 5 m/s turning at 0.4 rad/s, 100 ms late.
+    t_s = np.arange(0, 2, 0.05)
+    quaternion = quaternion_from_rotation_vector(t_s[:, None] * np.array([0.0, 0.4, 0]))
+    log = (EPOCH + np.arange(40, dtype=np.int64) * 50_000_000, t_s[:, None] * [5.0, 0, 0], quaternion)
+    model = Latency(latency_ms=100)
+    error = difference(log, disturb([model], *log, np.random.default_rng(0)))
+    late = np.array([-0.5, 0, 0, 0, -0.04, 0])
+    np.testing.assert_allclose(error[2:], np.tile(late, (38, 1)), atol=1e-12)
+    np.testing.assert_allclose(error[0], 0, atol=1e-15)  # nothing is known from before the log
+    sigma = model.marginal_sigma(t_s, np.full(40, 5.0), np.full(40, 0.4))
+    np.testing.assert_allclose(sigma, np.tile([0.5, 0.04], (40, 1)))
+
+
+def test_models_add_up() -> None:
+    t_s = np.array([0.0, 4.0])
+    models: list[NoiseModel] = [
+        White(position_m=0.3),
+        Drift(position_m_per_sqrt_s=0.2, rotation_deg_per_sqrt_s=1.0),
+        Latency(latency_ms=100),
+    ]
+    sigma = sum_sigma(models, t_s, np.full(2, 3.0), np.zeros(2))
+    # 0.3^2 + 0.2^2 * 4 + (0.1 * 3)^2 = 0.34
+    np.testing.assert_allclose(sigma[:, 0], [math.sqrt(0.18), math.sqrt(0.34)])
+    np.testing.assert_allclose(sigma[:, 1], [0, math.radians(2)])
+    assert not sum_sigma([], t_s, t_s, t_s).any()
+
+
+def test_no_models_and_no_rows_change_nothing() -> None:
+    log = circling(np.linspace(0, 1, 5))
+    position, quaternion = disturb([], *log, np.random.default_rng(0))
+    np.testing.assert_array_equal(position, log[1])
+    np.testing.assert_array_equal(quaternion, log[2])
+    nothing = circling(np.empty(0))
+    every = [*SCATTERED, Latency(latency_ms=5)]
+    assert disturb(every, *nothing, np.random.default_rng(0))[1].shape == (0, 4)
+
+
+def test_the_same_seed_gives_the_same_log() -> None:
+    log = circling(np.linspace(0, 1, 5))
+    first, second = (disturb(SCATTERED, *log, np.random.default_rng(9)) for _ in range(2))
+    np.testing.assert_array_equal(first[0], second[0])
+    np.testing.assert_array_equal(first[1], second[1])
+
+
+# --- from what users write -----------------------------------------------------------------------------
+
+
+def test_the_models_are_registered_under_their_names() -> None:
+    registered = {entry.name: entry.load() for entry in entry_points(group="mocap.noise_models")}
+    assert registered == CLASSES
+
+
+def test_a_flight_s_pose_noise_becomes_models() -> None:
+    pose_noise: dict[str, dict[str, object]] = {
+        "white": {"position_m": 0.1, "rotation_deg": 0.5},
+        "bias": {"frame": "body", "position_m": 1},
+    }
+    assert build(pose_noise.items(), CLASSES) == [
+        White(position_m=0.1, rotation_deg=0.5),
+        Bias(position_m=1.0, frame="body"),
+    ]
+
+
+def test_the_text_form_becomes_the_same_models() -> None:
+    text = "white:position_m=0.3, rotation_deg=1e+0 +drift: position_m_per_sqrt_s=5e-2,frame=body"
+    text += "+latency:latency_ms=40"
+    assert build(parse(text), CLASSES) == [
+        White(position_m=0.3, rotation_deg=1.0),
+        Drift(position_m_per_sqrt_s=0.05, frame="body"),
+        Latency(latency_ms=40.0),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "message"),
+    [
+        ("pink", {}, "pink is none of bias, drift, gauss-markov, latency, white"),
+        ("white", {"sigma": 1.0}, "white has no sigma; its parameters are frame, position_m, rotation_deg"),
+        ("bias", {"position_m": -0.1}, "bias: position_m is -0.1"),
+        ("bias", {"rotation_deg": math.nan}, "bias: rotation_deg is nan"),
+        ("drift", {"position_m_per_sqrt_s": math.inf}, "drift: position_m_per_sqrt_s is inf"),
+        ("white", {"position_m": "0.3 m"}, "'0.3 m' instead of a number"),
+        ("white", {"position_m": True}, "True instead of a number"),
+        ("bias", {"frame": "camera"}, "'camera' instead of world or body"),
+        ("gauss-markov", {"position_m": 0.5}, "gauss-markov needs correlation_s"),
+        ("gauss-markov", {"correlation_s": 0}, "correlation_s is 0"),
+        ("latency", {}, "latency needs latency_ms"),
+    ],
+)
+def test_nonsense_is_refused_by_name(name: str, parameters: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        build([(name, parameters)], CLASSES)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "white", "white:", "white:position_m", "white:position_m=", ":a=1", "white:a=1,", "white:a=1 +"],
+)
+def test_texts_of_another_form_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="does not read as model:parameter=value"):
+        build(parse(text), CLASSES)
+
+
+def test_a_parameter_given_twice_is_refused() -> None:
+    with pytest.raises(ValueError, match="position_m twice"):
+        parse("white:position_m=1,position_m=2")
+
+
+@given(position=st.floats(0, 1e6), rotation=st.floats(0, 360), frame=st.sampled_from(["world", "body"]))
+def test_what_is_written_is_what_is_read(position: float, rotation: float, frame: str) -> None:
+    text = f"bias:position_m={position!r},rotation_deg={rotation!r},frame={frame}"
+    parameters = {"position_m": position, "rotation_deg": rotation, "frame": frame}
+    assert parse(f"{text} + {text}") == [("bias", parameters)] * 2
