@@ -199,10 +199,28 @@ def interpolate_points(t_ns: Int64, values: Float, at_ns: Int64, *, max_gap_ns: 
     return np.where(between.known.reshape(spread), points, np.nan)
 
 
+def rates(t_ns: Int64, position: Float, quaternion_xyzw: Float) -> tuple[Float, Float]:
+    """Speed [N] in m/s and turn rate [N] in rad/s at each stamp, from its neighbours; 0 for a lone pose."""
+    if len(t_ns) < 2:
+        return np.zeros(len(t_ns)), np.zeros(len(t_ns))
+    step_s = np.diff(t_ns) / 1e9
+    turned = rotation_vector_from_quaternion(multiply(conjugate(quaternion_xyzw[:-1]), quaternion_xyzw[1:]))
+    speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / step_s
+    turn_rate = np.linalg.norm(turned, axis=1) / step_s
+    return _at_stamps(speed), _at_stamps(turn_rate)
+
+
 def gaps(t_ns: Int64, longer_than_ns: int) -> list[tuple[int, int]]:
     """Start and end of every stretch longer than `longer_than_ns` between neighbouring stamps."""
     (before,) = np.nonzero(np.diff(t_ns) > longer_than_ns)
     return [(int(t_ns[i]), int(t_ns[i + 1])) for i in before]
+
+
+def _at_stamps(of_steps: Float) -> Float:
+    """What holds between stamps [N - 1], as the mean of both sides at each stamp [N]."""
+    sides = np.concatenate([of_steps[:1], of_steps, of_steps[-1:]])
+    mean: Float = (sides[:-1] + sides[1:]) / 2
+    return mean
 
 
 class _Bracket(NamedTuple):

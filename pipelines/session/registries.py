@@ -6,12 +6,13 @@ in this package or in a package of the user's own. An entry point names an objec
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar, runtime_checkable
 
+from pipelines.geometry.noise import NoiseModel, build, parse
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera, Detections, JointMotion, Recording, Trajectory
 
@@ -21,9 +22,17 @@ T = TypeVar("T")
 class Format(Protocol):
     """A foreign file format. The reading method depends on what the format holds (below)."""
 
-    name: str  # what the user writes after `format:`
-    title: str  # what `mocap info` calls it
-    suffixes: tuple[str, ...]  # lower case; a quick refusal before `recognises` opens anything
+    @property
+    def name(self) -> str:
+        """What the user writes after `format:`."""
+
+    @property
+    def title(self) -> str:
+        """What `mocap info` calls it."""
+
+    @property
+    def suffixes(self) -> tuple[str, ...]:
+        """Endings of file names, lower case, to be quick; `recognises` decides by content."""
 
     def recognises(self, path: Path) -> bool:
         """Whether this file or folder is of this format, by its content. Never raises on bad content."""
@@ -67,8 +76,13 @@ class JointFormat(Format, Protocol):
 class Export(Protocol):
     """A way out of a session."""
 
-    name: str  # what the user writes after `--to`
-    title: str
+    @property
+    def name(self) -> str:
+        """What the user writes after `--to`."""
+
+    @property
+    def title(self) -> str:
+        """What the help text calls it."""
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
         """Write into an existing empty folder; the paths written, sorted. DataError without content."""
@@ -107,6 +121,7 @@ class Registry(Generic[T]):
 
 FORMATS: Registry[Format] = Registry("mocap.formats", "format")
 EXPORTS: Registry[Export] = Registry("mocap.exports", "export format")
+NOISE_MODELS: Registry[type[NoiseModel]] = Registry("mocap.noise_models", "pose noise model")
 
 F = TypeVar("F")
 
@@ -139,3 +154,33 @@ def recognise(path: Path, protocol: type[F], noun: str, formats: Sequence[Format
         f"could be {' or '.join(sorted(f.name for f in matches))}",
         "say which with `format:`",
     )
+
+
+def noise_models(place: str, parts: Mapping[str, Mapping[str, object]]) -> list[NoiseModel]:
+    """The pose noise models that a manifest names; `place` is said where they cannot be built.
+
+    Raises:
+        DataError: an unknown model or parameter, or a value out of range.
+    """
+    return _built(place, parts.items())
+
+
+def parsed_noise_models(place: str, text: str) -> list[NoiseModel]:
+    """The pose noise models of a text like `white:position_m=0.3,rotation_deg=1 + bias:position_m=0.1`.
+
+    Raises:
+        DataError: the text does not read so, or names what there is not.
+    """
+    try:
+        parts = parse(text)
+    except ValueError as error:
+        raise DataError(place, str(error), "write white:position_m=0.3,rotation_deg=1") from None
+    return _built(place, parts)
+
+
+def _built(place: str, parts: Iterable[tuple[str, Mapping[str, object]]]) -> list[NoiseModel]:
+    classes = dict(zip(NOISE_MODELS.names(), NOISE_MODELS.all(), strict=True))
+    try:
+        return build(parts, classes)
+    except ValueError as error:
+        raise DataError(place, str(error)) from None

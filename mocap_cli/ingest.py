@@ -1,0 +1,107 @@
+"""`mocap ingest`: a flight.yaml into a session."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from mocap_cli.options import (
+    existing_file,
+    folder,
+    force_option,
+    json_option,
+    level,
+    overwrite_option,
+    verbosity_options,
+)
+from mocap_cli.terminal import one_line, print_json, print_table, watching
+
+if TYPE_CHECKING:
+    from pipelines.ingest import Ingested
+
+
+@click.command("ingest")
+@click.argument("flight", type=existing_file, metavar="FLIGHT.yaml")
+@click.option(
+    "-o", "--output", type=folder, help="Session folder [default: the manifest's name with .session]."
+)
+@click.option(
+    "--max-pose-gap",
+    type=click.FloatRange(0, min_open=True),
+    default=0.5,
+    show_default=True,
+    metavar="SECONDS",
+    help="Frames between logged poses further apart than this have no pose.",
+)
+@click.option(
+    "--max-extrapolation",
+    type=click.FloatRange(0),
+    default=0.1,
+    show_default=True,
+    metavar="SECONDS",
+    help="Frames further than this before or after all logged poses have none.",
+)
+@overwrite_option
+@force_option
+@json_option
+@verbosity_options
+def ingest_command(
+    flight: Path,
+    output: Path | None,
+    max_pose_gap: float,
+    max_extrapolation: float,
+    overwrite: bool,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+    verbose: int,
+) -> None:
+    """Read logs, keypoints, calibration and truth of one flight into a session."""
+    from pipelines.ingest import ingest
+
+    with watching(level(quiet, verbose)) as progress:
+        result = ingest(
+            flight,
+            output,
+            max_pose_gap_s=max_pose_gap,
+            max_extrapolation_s=max_extrapolation,
+            overwrite=overwrite,
+            force=force,
+            progress=progress,
+        )
+    if as_json:
+        print_json(result.description.model_dump(mode="json", by_alias=True))
+    else:
+        _print(result)
+
+
+def _print(result: Ingested) -> None:
+    description = result.description
+    span = [
+        min(camera.frames.first_t_ns for camera in description.cameras.values()),
+        max(camera.frames.last_t_ns for camera in description.cameras.values()),
+    ]
+    click.echo(f"{one_line(description.flight)}: {(span[1] - span[0]) / 1e9:.2f} s")
+    print_table(
+        ("camera", "picture", "frames", "Hz", "poses", "Hz", "no pose", "gaps", "keypoints", "people"),
+        [
+            (
+                name,
+                f"{camera.intrinsics.width}x{camera.intrinsics.height}",
+                camera.frames.count,
+                camera.frames.rate_hz,
+                "still" if camera.poses.static else camera.poses.count,
+                camera.poses.rate_hz,
+                camera.poses.frames_without_pose,
+                len(camera.poses.gaps_ns),
+                camera.keypoints.format if camera.keypoints else None,
+                camera.keypoints.people_at_once if camera.keypoints else None,
+            )
+            for name, camera in description.cameras.items()
+        ],
+    )
+    for warning in description.warnings:
+        click.echo(f"warning: {one_line(warning)}", err=True)
+    click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder}")

@@ -1,0 +1,62 @@
+"""The `mocap` command: its group, and the one place where errors become a line and an exit status."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Any
+
+import click
+
+from mocap_cli.export import export_command
+from mocap_cli.info import info_command
+from mocap_cli.ingest import ingest_command
+from mocap_cli.reconstruct import reconstruct_command
+from mocap_cli.report import report_command
+from mocap_cli.terminal import one_line
+from pipelines.session.errors import MocapError
+
+_INTERRUPTED = 130  # what shells expect after Ctrl-C
+
+
+class Mocap(click.Group):
+    """Lists commands in the order in which they are used, and tells errors in one line."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  # click calls it so
+        """The commands, in the order of their work."""
+        return list(self.commands)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command; what a user can mend is one line on stderr and exit status 1."""
+        try:
+            return super().invoke(ctx)
+        except MocapError as error:
+            click.echo(f"mocap: {one_line(str(error))}", err=True)
+            ctx.exit(1)
+        except KeyboardInterrupt:
+            click.echo("mocap: interrupted; nothing is lost, the same command continues", err=True)
+            ctx.exit(_INTERRUPTED)
+
+
+@click.group(cls=Mocap, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(package_name="mocap-pipeline", prog_name="mocap")
+def mocap() -> None:
+    """From the flight logs and keypoints of a drone team to the 3D motion of the person it filmed.
+
+    A flight is described by a flight.yaml. `ingest` turns it into a session, a folder of plain tables;
+    `reconstruct` measures the skeleton; `report` shows how far it can be trusted; `export` carries on.
+    """
+
+
+for command in (ingest_command, reconstruct_command, report_command, export_command, info_command):
+    mocap.add_command(command)
+
+
+def run() -> None:
+    """Entry point of the `mocap` script."""
+    try:
+        mocap()
+    except BrokenPipeError:
+        # The reader of our output (head, a pager) went away: no reason for a traceback at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)

@@ -1,0 +1,116 @@
+"""`mocap reconstruct`: the skeleton of the actor, joint by joint, with its errors."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mocap_cli.options import force_option, json_option, level, session_argument, verbosity_options
+from mocap_cli.terminal import one_line, print_json, print_table, watching
+
+if TYPE_CHECKING:
+    from pipelines.reconstruct import Reconstructed
+
+
+@click.command("reconstruct")
+@session_argument
+@click.option(
+    "--method",
+    type=click.Choice(["dlt", "midpoint", "robust"]),
+    default="robust",
+    show_default=True,
+    help="dlt: linear triangulation; midpoint: the point closest to the rays; robust: outlier views"
+    " rejected, then least squares on the reprojection.",
+)
+@click.option(
+    "--rate",
+    type=click.FloatRange(0, 10_000, min_open=True),
+    metavar="HZ",
+    help="Rate of the skeleton [default: the frames of the camera with the most].",
+)
+@click.option("--persons", type=click.IntRange(1, 20), default=1, show_default=True, help="How many people.")
+@click.option(
+    "--min-confidence",
+    type=click.FloatRange(0, 1),
+    default=0.3,
+    show_default=True,
+    help="Keypoints below this are not used.",
+)
+@click.option(
+    "--pixel-noise",
+    type=click.FloatRange(0, min_open=True),
+    default=3.0,
+    show_default=True,
+    metavar="PX",
+    help="Standard deviation of a good keypoint; more is found from the data.",
+)
+@click.option(
+    "--pose-noise",
+    metavar="MODEL",
+    help="What is known of the camera poses' errors, instead of what flight.yaml says; for example"
+    ' "white:position_m=0.3,rotation_deg=1 + drift:position_m_per_sqrt_s=0.05".',
+)
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 256),
+    default=lambda: os.cpu_count() or 1,
+    show_default="all cores",
+    help="Threads; the result does not depend on them.",
+)
+@force_option
+@json_option
+@verbosity_options
+def reconstruct_command(
+    session: Path,
+    method: str,
+    rate: float | None,
+    persons: int,
+    min_confidence: float,
+    pixel_noise: float,
+    pose_noise: str | None,
+    workers: int,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+    verbose: int,
+) -> None:
+    """Triangulate the actor's joints and measure the errors."""
+    from pipelines.reconstruct import Settings, reconstruct
+
+    settings = Settings(
+        method=method,
+        rate_hz=rate,
+        people=persons,
+        min_confidence=min_confidence,
+        pixel_sigma=pixel_noise,
+        pose_noise=pose_noise,
+    )
+    with watching(level(quiet, verbose)) as progress:
+        result = reconstruct(session, settings, workers=workers, force=force, progress=progress)
+    if as_json:
+        print_json(result.metrics)
+    else:
+        _print(result)
+
+
+def _print(result: Reconstructed) -> None:
+    metrics: dict[str, Any] = result.metrics
+    click.echo(
+        f"{metrics['method']}: {metrics['joint_frames']['ok']} of {metrics['joint_frames']['all']}"
+        f" joint-frames reconstructed"
+    )
+    has_truth = metrics["mpjpe_mm"] is not None
+    header = ["joint", "ok %", "reproj px"] + (["MPJPE mm", "root mm", "PA mm"] if has_truth else [])
+    rows = []
+    for name, joint in [*metrics["per_joint"].items(), ("all", metrics)]:
+        row = [name, joint["ok_percent"], joint["reprojection_px"]["median"]]
+        if has_truth:
+            row += [joint.get("mpjpe_mm"), joint.get("root_mpjpe_mm"), joint.get("pa_mpjpe_mm")]
+        rows.append(row)
+    print_table(header, rows)
+    for warning in result.record.warnings:
+        click.echo(f"warning: {one_line(warning)}", err=True)
+    click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'reconstruct'}")

@@ -1,0 +1,106 @@
+"""What the terminal shows: progress and notes on stderr, results on stdout."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bars
+    from rich.progress import TaskID
+
+    from pipelines.session.progress import Progress
+
+_LONGEST_LINE = 2000
+
+
+def one_line(text: str) -> str:
+    """The text without line breaks and control characters: names from files must not steer a terminal."""
+    printable = "".join(c if c.isprintable() else " " for c in text)
+    shown = " ".join(printable.split())
+    return shown if len(shown) <= _LONGEST_LINE else shown[:_LONGEST_LINE] + " ..."
+
+
+class _Notes:
+    """Progress without bars: notes only, and none at all when quiet."""
+
+    def __init__(self, verbosity: int) -> None:
+        self._verbosity = verbosity
+
+    def start(self, task: str, total: int) -> None:
+        if self._verbosity > 0:
+            click.echo(f"{task} ({total})", err=True)
+
+    def advance(self, steps: int = 1) -> None:
+        """Nothing moves without a bar."""
+
+    def note(self, message: str) -> None:
+        if self._verbosity >= 0:
+            click.echo(one_line(message), err=True)
+
+
+class _BarsOnStderr(_Notes):
+    """Progress as one bar for each task."""
+
+    def __init__(self, verbosity: int, bars: Bars) -> None:
+        super().__init__(verbosity)
+        self._bars = bars
+        self._task: TaskID | None = None
+
+    def start(self, task: str, total: int) -> None:
+        self._task = self._bars.add_task(task, total=total)
+
+    def advance(self, steps: int = 1) -> None:
+        if self._task is not None:
+            self._bars.advance(self._task, steps)
+
+    def note(self, message: str) -> None:
+        if self._verbosity >= 0:
+            self._bars.console.print(one_line(message), markup=False, highlight=False)
+
+
+@contextmanager
+def watching(verbosity: int) -> Iterator[Progress]:
+    """Someone who watches a stage: bars when stderr is a terminal, notes otherwise, silence with -q."""
+    if verbosity < 0 or not sys.stderr.isatty():
+        yield _Notes(verbosity)
+        return
+    from rich.console import Console
+    from rich.progress import Progress as Bars
+
+    with Bars(console=Console(stderr=True), transient=True) as bars:
+        yield _BarsOnStderr(verbosity, bars)
+
+
+def print_json(result: Mapping[str, object]) -> None:
+    """The machine-readable result."""
+    click.echo(json.dumps(result, indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def print_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """A plain table: text to the left, numbers to the right; empty where there is nothing."""
+    texts = [[_cell(value) for value in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(header, *texts, strict=True)]
+    numeric = [
+        all(isinstance(row[k], int | float | None) for row in rows) if rows else False
+        for k in range(len(header))
+    ]
+    for line in [list(header), *texts]:
+        cells = [
+            cell.rjust(width) if right else cell.ljust(width)
+            for cell, width, right in zip(line, widths, numeric, strict=True)
+        ]
+        click.echo("  ".join(cells).rstrip())
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.1f}"
+    return one_line(str(value))

@@ -1,0 +1,227 @@
+"""From the tables of a session to arrays over one time base: what every camera saw, from where.
+
+Cameras keep their own frames until somebody has said which detection is the person; only then are the
+person's keypoints interpolated to the common times, and never across a frame that misses them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.cameras import Intrinsics, undistort
+from pipelines.geometry.poses import interpolate_points, interpolate_poses, matrix_from_quaternion
+from pipelines.session.records import Detections, Float, Int64, Trajectory
+
+_FRAME_GAP = 1.5  # frame periods: keypoints further apart are not neighbours
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera of a session.
+
+    `sigma` is the standard deviation per axis of position (m) and rotation (rad) at each pose of the
+    trajectory, as a prior or the log's covariance states it; None when nobody does.
+    """
+
+    name: str
+    intrinsics: Intrinsics
+    frame_t_ns: Int64  # [F]
+    trajectory: Trajectory
+    static: bool
+    sigma: Float | None  # [N, 2]
+    detections: Detections
+
+    @cached_property
+    def focal_px(self) -> float:
+        """Mean focal length, to turn pixels into angles."""
+        return (self.intrinsics.fx + self.intrinsics.fy) / 2
+
+    @cached_property
+    def rays(self) -> Float:
+        """Keypoints [F, D, J, 2] as undistorted normalised image coordinates; NaN where nothing was found."""
+        found = self.detections
+        dense = np.full((len(self.frame_t_ns), self._most_people, len(found.joints), 2), np.nan)
+        dense[found.frame, self._rank] = undistort(found.xy, self.intrinsics)
+        return dense
+
+    @cached_property
+    def confidence(self) -> Float:
+        """Confidence [F, D, J] of those keypoints, 0 where nothing was found."""
+        found = self.detections
+        dense = np.zeros((len(self.frame_t_ns), self._most_people, len(found.joints)))
+        dense[found.frame, self._rank] = found.confidence
+        return np.where(np.isnan(self.rays[..., 0]), 0.0, dense)
+
+    @cached_property
+    def _rank(self) -> NDArray[np.intp]:
+        """The place of every detection among those of its frame; detections are sorted by frame."""
+        frame = self.detections.frame
+        first_of_frame = np.searchsorted(frame, frame, side="left")
+        return np.arange(len(frame)) - first_of_frame
+
+    @cached_property
+    def _most_people(self) -> int:
+        return int(self._rank.max(initial=0)) + 1
+
+    def poses_at(self, t_ns: Int64, *, max_gap_ns: int, max_extrapolation_ns: int) -> tuple[Float, Float]:
+        """world_from_camera at given times: position [T, 3] and rotation [T, 3, 3], NaN without a pose."""
+        if self.static:
+            position = np.repeat(self.trajectory.position, len(t_ns), axis=0)
+            quaternion = np.repeat(self.trajectory.quaternion_xyzw, len(t_ns), axis=0)
+        else:
+            position, quaternion = interpolate_poses(
+                self.trajectory.t_ns,
+                self.trajectory.position,
+                self.trajectory.quaternion_xyzw,
+                t_ns,
+                max_gap_ns=max_gap_ns,
+                max_extrapolation_ns=max_extrapolation_ns,
+            )
+        return position, matrix_from_quaternion(quaternion)
+
+    def sigma_at(self, t_ns: Int64) -> Float | None:
+        """The stated pose noise [T, 2] at given times, of the logged pose before each."""
+        if self.sigma is None:
+            return None
+        before = np.searchsorted(self.trajectory.t_ns, t_ns, side="right") - 1
+        return self.sigma[np.clip(before, 0, len(self.sigma) - 1)]
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Every detection at the times where the cameras are compared: who is who is still open."""
+
+    t_ns: Int64  # [T]
+    frame: Int64  # [T, C] the camera's frame nearest in time, -1 if none is near
+    xy: Float  # [T, C, D, J, 2]
+    confidence: Float  # [T, C, D, J]
+    position: Float  # [T, C, 3]
+    rotation: Float  # [T, C, 3, 3]
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What every camera saw of each person at the common times."""
+
+    t_ns: Int64  # [T]
+    joints: tuple[str, ...]
+    xy: Float  # [T, P, J, C, 2] undistorted normalised image coordinates, NaN where not seen
+    confidence: Float  # [T, P, J, C]
+    position: Float  # [T, C, 3]
+    rotation: Float  # [T, C, 3, 3]
+    pose_sigma: Float | None  # [T, C, 2]; None when nobody stated the pose noise of any camera
+
+
+def time_base(cameras: list[Camera], rate_hz: float | None) -> Int64:
+    """The times of the skeleton: the frames of the camera with the most of them, or a stated rate.
+
+    Ties go to the first listed. With a rate, the times fill the span of all cameras' frames.
+    """
+    if rate_hz is None:
+        return max(cameras, key=lambda camera: len(camera.frame_t_ns)).frame_t_ns
+    first = min(int(camera.frame_t_ns[0]) for camera in cameras)
+    last = max(int(camera.frame_t_ns[-1]) for camera in cameras)
+    steps = int((last - first) * rate_hz / 1e9) + 1
+    return first + np.round(np.arange(steps) * (1e9 / rate_hz)).astype(np.int64)
+
+
+def candidates(cameras: list[Camera], *, max_gap_ns: int, max_extrapolation_ns: int) -> Candidates:
+    """All detections of all cameras on one timeline on which every frame of every camera appears."""
+    t_ns = _timeline(cameras)
+    frame = np.stack([_nearest_frame(camera.frame_t_ns, t_ns) for camera in cameras], axis=1)
+    people = max(camera.rays.shape[1] for camera in cameras)
+    joints = cameras[0].rays.shape[2]
+    xy = np.full((len(t_ns), len(cameras), people, joints, 2), np.nan)
+    confidence = np.zeros(xy.shape[:-1])
+    poses = []
+    for c, camera in enumerate(cameras):
+        (near,) = np.nonzero(frame[:, c] >= 0)
+        seen = camera.rays.shape[1]
+        xy[near, c, :seen] = camera.rays[frame[near, c]]
+        confidence[near, c, :seen] = camera.confidence[frame[near, c]]
+        poses.append(camera.poses_at(t_ns, max_gap_ns=max_gap_ns, max_extrapolation_ns=max_extrapolation_ns))
+    position, rotation = (np.stack(part, axis=1) for part in zip(*poses, strict=True))
+    return Candidates(t_ns, frame, xy, confidence, position, rotation)
+
+
+def observe(
+    cameras: list[Camera],
+    found: Candidates,
+    choice: Int64,
+    t_ns: Int64,
+    *,
+    max_gap_ns: int,
+    max_extrapolation_ns: int,
+) -> Observations:
+    """The chosen people's keypoints, interpolated to the common times together with the cameras' poses.
+
+    Args:
+        cameras: all of them, in order.
+        found: where `choice` was made.
+        choice: [T', C, P] index of each person's detection in the camera's frame, -1 for none.
+        t_ns: [T] the common times.
+        max_gap_ns: the longest stretch between two logged poses that is bridged.
+        max_extrapolation_ns: how far outside its log a pose is trusted.
+    """
+    views, weights, poses, sigmas = [], [], [], []
+    for c, camera in enumerate(cameras):
+        xy, confidence = _of_people(camera, found.frame[:, c], choice[:, c])
+        period = int(np.median(np.diff(camera.frame_t_ns))) if len(camera.frame_t_ns) > 1 else 0
+        gap_ns = int(_FRAME_GAP * period)
+        views.append(interpolate_points(camera.frame_t_ns, xy, t_ns, max_gap_ns=gap_ns))
+        weights.append(interpolate_points(camera.frame_t_ns, confidence, t_ns, max_gap_ns=gap_ns))
+        poses.append(camera.poses_at(t_ns, max_gap_ns=max_gap_ns, max_extrapolation_ns=max_extrapolation_ns))
+        sigmas.append(camera.sigma_at(t_ns))
+    position, rotation = (np.stack(part, axis=1) for part in zip(*poses, strict=True))
+    stated = [sigma for sigma in sigmas if sigma is not None]
+    return Observations(
+        t_ns=t_ns,
+        joints=cameras[0].detections.joints,
+        xy=np.stack(views, axis=3),
+        confidence=np.nan_to_num(np.stack(weights, axis=3)),
+        position=position,
+        rotation=rotation,
+        pose_sigma=np.stack([np.zeros((len(t_ns), 2)) if s is None else s for s in sigmas], axis=1)
+        if stated
+        else None,
+    )
+
+
+def _timeline(cameras: list[Camera]) -> Int64:
+    """The frames of the fastest camera, and of the others those that would not be nearest to any of them."""
+    t_ns = time_base(cameras, None)
+    for camera in cameras:
+        visited = np.unique(_nearest_frame(camera.frame_t_ns, t_ns))
+        unvisited = np.setdiff1d(np.arange(len(camera.frame_t_ns)), visited)
+        t_ns = np.union1d(t_ns, camera.frame_t_ns[unvisited])
+    return t_ns
+
+
+def _nearest_frame(frame_t_ns: Int64, t_ns: Int64) -> Int64:
+    """The frame [T] nearest to each time, -1 where none lies within a frame period."""
+    after = np.clip(np.searchsorted(frame_t_ns, t_ns), 1, max(len(frame_t_ns) - 1, 1))
+    after = np.minimum(after, len(frame_t_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(t_ns - frame_t_ns[before] <= frame_t_ns[after] - t_ns, before, after)
+    period = int(np.median(np.diff(frame_t_ns))) if len(frame_t_ns) > 1 else 0
+    return np.where(np.abs(frame_t_ns[nearest] - t_ns) <= period, nearest, -1)
+
+
+def _of_people(camera: Camera, frame: Int64, choice: Int64) -> tuple[Float, Float]:
+    """Rays [F, P, J, 2] and confidence [F, P, J] of each person in the camera's own frames.
+
+    A frame may stand at several times of the timeline (clocks are never quite equal): the last decides.
+    """
+    shape = (len(camera.frame_t_ns), choice.shape[1], camera.rays.shape[2])
+    xy = np.full((*shape, 2), np.nan)
+    confidence = np.full(shape, np.nan)
+    for person in range(choice.shape[1]):
+        (rows,) = np.nonzero((frame >= 0) & (choice[:, person] >= 0))
+        xy[frame[rows], person] = camera.rays[frame[rows], choice[rows, person]]
+        confidence[frame[rows], person] = camera.confidence[frame[rows], choice[rows, person]]
+    confidence[np.isnan(xy[..., 0])] = np.nan
+    return xy, confidence

@@ -1,0 +1,132 @@
+"""How good a reconstruction is: against the truth where there is one, and in itself.
+
+Everything here is JSON-able, with null for what could not be measured.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.metrics import measure, measure_shape
+from pipelines.geometry.triangulation import STATUS, Method, Triangulation, Views, triangulate
+from pipelines.reconstruction.observations import Observations
+from pipelines.session.records import Float
+from pipelines.session.skeletons import bones_of
+
+_ERRORS = ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm", "e_recon_m2", "pck150", "pck150_auc")
+
+
+def assess(
+    observations: Observations,
+    views: Views,
+    result: Triangulation,
+    *,
+    cameras: Sequence[str],
+    method: Method,
+    truth: Float | None,
+    threads: int,
+) -> dict[str, Any]:
+    """Every figure of metrics.json.
+
+    Args:
+        observations: what was triangulated.
+        views: the same, one row for each joint-frame.
+        result: what came out.
+        cameras: their names.
+        method: how it was triangulated.
+        truth: [T, P', J, 3] the true joints at the same times, in any order of people.
+        threads: for the triangulations that leave one camera out.
+    """
+    shape = observations.confidence.shape[:3]
+    position = result.points.reshape(*shape, 3)
+    status = result.status.reshape(shape)
+    residual = result.residual_px.reshape(*shape, -1)
+    per_joint = {
+        name: _figures(status[:, :, j], residual[:, :, j]) for j, name in enumerate(observations.joints)
+    }
+    errors: dict[str, Any] = dict.fromkeys(_ERRORS)
+    if truth is not None:
+        errors |= measure(position, _own_truth(position, truth), observations.joints, observations.t_ns)
+        for name, figures in errors.pop("per_joint").items():
+            per_joint[name] |= figures
+    overall = _figures(status, residual)
+    return {
+        "method": method,
+        "reconstructed_share": overall["joint_frames"]["ok"] / max(overall["joint_frames"]["all"], 1),
+        **errors,
+        **overall,
+        "reprojection_px_per_camera": {name: _spread(residual[..., c]) for c, name in enumerate(cameras)},
+        "leave_one_camera_out_px": _leave_one_out(views, method, cameras, threads),
+        "shape": measure_shape(
+            position, observations.joints, bones_of(observations.joints), observations.t_ns
+        ),
+        "clock_offsets_s": {},
+        "intervals": {},
+        "per_joint": per_joint,
+    }
+
+
+def _figures(status: NDArray[np.int8], residual: Float) -> dict[str, Any]:
+    counts = Counter({STATUS[code]: int((status == code).sum()) for code in np.unique(status)})
+    return {
+        "joint_frames": {"all": status.size, "ok": counts["ok"]}
+        | {name: counts[name] for name in STATUS if name != "ok" and counts[name]},
+        "reprojection_px": _spread(residual),
+    }
+
+
+def _spread(residual: Float) -> dict[str, float | None]:
+    """Median and mean over all views that saw a reconstructed joint, rejected views included."""
+    distances = residual[np.isfinite(residual)]
+    if not len(distances):
+        return {"median": None, "mean": None}
+    return {"median": float(np.median(distances)), "mean": float(distances.mean())}
+
+
+def _own_truth(position: Float, truth: Float) -> Float:
+    """For each reconstructed person [T, P, J, 3] the true person that is nearest, each taken once."""
+    from scipy.optimize import linear_sum_assignment
+
+    distance = np.linalg.norm(position[:, :, None] - truth[:, None, :], axis=-1)
+    seen = np.isfinite(distance)
+    cost = np.where(seen, np.minimum(distance, 1e3), 0).sum(axis=(0, 3)) / np.maximum(
+        seen.sum(axis=(0, 3)), 1
+    )
+    cost[seen.sum(axis=(0, 3)) == 0] = 1e6
+    person, match = linear_sum_assignment(cost)
+    own = np.full_like(position, np.nan)
+    own[:, person] = truth[:, match]
+    return own
+
+
+def _leave_one_out(
+    views: Views, method: Method, cameras: Sequence[str], threads: int
+) -> dict[str, dict[str, float | None]] | None:
+    """How far each camera's keypoints lie from the skeleton of the others; needs three cameras."""
+    if len(cameras) < 3:
+        return None
+    figures = {}
+    for c, name in enumerate(cameras):
+        weight = views.weight.copy()
+        weight[:, c] = 0
+        points = triangulate(replace(views, weight=weight), method=method, threads=threads).points
+        figures[name] = _spread(_residual(views, points, c))
+    return figures
+
+
+def _residual(views: Views, points: Float, camera: int) -> Float:
+    """Reprojection distance [N] in px of points in one camera; NaN behind it and where it saw nothing."""
+    rotation = views.rotation[views.pose_index, camera]
+    x, y, z = np.einsum("nij,ni->jn", rotation, points - views.position[views.pose_index, camera])
+    front = z > 0
+    depth = np.where(front, z, 1.0)
+    seen = views.xy[:, camera]
+    distance = views.focal[camera] * np.hypot(x / depth - seen[:, 0], y / depth - seen[:, 1])
+    used = front & (views.weight[:, camera] > 0)
+    return np.where(used, distance, np.nan)

@@ -1,0 +1,137 @@
+"""Records as rows of a session's tables, and back.
+
+A table has one row per thing that was measured: a joint that was not found has no row, and comes back
+as NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.session.records import Detections, Int64, JointMotion, Trajectory
+from pipelines.session.tables import COVARIANCE_COLUMNS
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_POSITION = ["x", "y", "z"]
+_QUATERNION = ["qx", "qy", "qz", "qw"]
+
+
+def frames_table(t_ns: Int64) -> pd.DataFrame:
+    """Frames 0, 1, ... and their world times, as rows of `tables.FRAMES`."""
+    import pandas as pd
+
+    return pd.DataFrame({"frame": np.arange(len(t_ns)), "t_ns": t_ns, "pts_ns": t_ns - t_ns[0]})
+
+
+def pose_table(trajectory: Trajectory) -> pd.DataFrame:
+    """A trajectory as rows of `tables.POSES`, with its covariance where it has one."""
+    import pandas as pd
+
+    table = pd.DataFrame({"t_ns": trajectory.t_ns})
+    table[_POSITION] = trajectory.position
+    table[_QUATERNION] = trajectory.quaternion_xyzw
+    if trajectory.covariance is not None:
+        table[list(COVARIANCE_COLUMNS)] = trajectory.covariance[:, *np.triu_indices(6)]
+    return table
+
+
+def trajectory_from(table: pd.DataFrame) -> Trajectory:
+    """The trajectory that `pose_table` stored."""
+    covariance = None
+    if set(COVARIANCE_COLUMNS) <= set(table.columns):
+        covariance = np.zeros((len(table), 6, 6))
+        rows, columns = np.triu_indices(6)
+        covariance[:, rows, columns] = table[list(COVARIANCE_COLUMNS)].to_numpy()
+        covariance[:, columns, rows] = covariance[:, rows, columns]
+    return Trajectory(
+        t_ns=table["t_ns"].to_numpy(np.int64),
+        position=table[_POSITION].to_numpy(np.float64),
+        quaternion_xyzw=table[_QUATERNION].to_numpy(np.float64),
+        covariance=covariance,
+    )
+
+
+def keypoints_table(detections: Detections, frames_t_ns: Int64) -> pd.DataFrame:
+    """The joints that were found, as rows of `tables.KEYPOINTS`; `frames_t_ns[k]` is the time of frame k."""
+    import pandas as pd
+
+    row, joint = np.nonzero(~np.isnan(detections.xy[..., 0]))
+    frame = detections.frame[row]
+    return pd.DataFrame(
+        {
+            "frame": frame,
+            "t_ns": frames_t_ns[frame],
+            "person": detections.person[row],
+            "joint": np.array(detections.joints, dtype=object)[joint],
+            "x": detections.xy[row, joint, 0],
+            "y": detections.xy[row, joint, 1],
+            "confidence": detections.confidence[row, joint],
+        }
+    )
+
+
+def detections_from(table: pd.DataFrame, joints: tuple[str, ...]) -> Detections:
+    """The detections that `keypoints_table` stored, with these joints in this order; others are left out."""
+    joint = _index_of(table["joint"], joints)
+    table, joint = table[joint >= 0], joint[joint >= 0]
+    keys = table[["frame", "person"]].to_numpy(np.int64)
+    people, row = np.unique(keys, axis=0, return_inverse=True)
+    xy = np.full((len(people), len(joints), 2), np.nan)
+    confidence = np.zeros((len(people), len(joints)))
+    xy[row, joint] = table[["x", "y"]].to_numpy(np.float64)
+    confidence[row, joint] = table["confidence"].to_numpy(np.float64)
+    return Detections(
+        joints=joints,
+        frame=people[:, 0],
+        person=people[:, 1],
+        xy=xy,
+        confidence=confidence,
+        frames_listed=np.unique(people[:, 0]),
+    )
+
+
+def motion_table(motion: JointMotion) -> pd.DataFrame:
+    """The joints that are there, as rows of `tables.TRUTH`."""
+    import pandas as pd
+
+    t, person, joint = np.nonzero(~np.isnan(motion.position[..., 0]))
+    table = pd.DataFrame(
+        {
+            "t_ns": motion.t_ns[t],
+            "person": person,
+            "joint": np.array(motion.joints, dtype=object)[joint],
+        }
+    )
+    table[_POSITION] = motion.position[t, person, joint]
+    return table
+
+
+def motion_from(table: pd.DataFrame, joints: tuple[str, ...]) -> JointMotion:
+    """The motion of these joints in a table of `tables.TRUTH` or `tables.SKELETON`; the rest is left out."""
+    joint = _index_of(table["joint"], joints)
+    table, joint = table[joint >= 0], joint[joint >= 0]
+    t_ns, row = np.unique(table["t_ns"].to_numpy(np.int64), return_inverse=True)
+    person = table["person"].to_numpy(np.int64)
+    shape = (len(t_ns), int(person.max(initial=0)) + 1, len(joints))
+    position = np.full((*shape, 3), np.nan)
+    position[row, person, joint] = table[_POSITION].to_numpy(np.float64)
+    status = reprojection = None
+    if "status" in table:
+        status = np.full(shape, "not_detected", dtype="U16")
+        status[row, person, joint] = table["status"].to_numpy(str)
+        reprojection = np.full(shape, np.nan)
+        reprojection[row, person, joint] = table["reprojection_px"].to_numpy(np.float64)
+    return JointMotion(t_ns, joints, position, status, reprojection)
+
+
+def _index_of(names: pd.Series[str], wanted: Sequence[str]) -> NDArray[np.intp]:
+    """The place of every name among the wanted ones, -1 for those that are not."""
+    import pandas as pd
+
+    return pd.Index(wanted).get_indexer(pd.Index(names))
