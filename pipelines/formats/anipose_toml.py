@@ -29,7 +29,7 @@ class AniposeToml:
 
     name = "anipose"
     title = "anipose, Pose2Sim or caliscope calibration"
-    suffixes = (".toml",)
+    suffixes: tuple[str, ...] = (".toml",)
 
     def recognises(self, path: Path) -> bool:
         """Whether a TOML file speaks of a matrix and distortions."""

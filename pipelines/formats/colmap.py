@@ -83,7 +83,7 @@ class ColmapModel:
 
     name = "colmap"
     title = "COLMAP model"
-    suffixes = ("",)
+    suffixes: tuple[str, ...] = ("",)
 
     def recognises(self, path: Path) -> bool:
         """Whether it is a folder that holds cameras and images, both as text or both binary."""

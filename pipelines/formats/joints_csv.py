@@ -34,7 +34,7 @@ class JointsCsvFormat:
 
     name = "joints_csv"
     title = "3D joints as CSV"
-    suffixes = (".csv", ".txt")
+    suffixes: tuple[str, ...] = (".csv", ".txt")
 
     def recognises(self, path: Path) -> bool:
         """Whether its header names a time, a joint and x y z."""

@@ -33,7 +33,7 @@ class OpencvStorage:
 
     name = "opencv"
     title = "OpenCV calibration"
-    suffixes = (".yaml", ".yml", ".xml")
+    suffixes: tuple[str, ...] = (".yaml", ".yml", ".xml")
 
     def recognises(self, path: Path) -> bool:
         """Whether FileStorage wrote it and it names a camera matrix."""

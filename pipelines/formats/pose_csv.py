@@ -15,7 +15,6 @@ from pipelines.formats.summaries import describe_trajectory
 from pipelines.formats.text_tables import TextTable, parse_table, read_head, read_text
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Trajectory
-from pipelines.session.tables import COVARIANCE_COLUMNS
 
 _POSITION = ("x", "y", "z")
 _QUATERNION = ("qx", "qy", "qz", "qw")
@@ -46,7 +45,7 @@ class PoseCsvFormat:
 
     name = "csv"
     title = "poses as CSV"
-    suffixes = (".csv", ".txt", ".tsv")
+    suffixes: tuple[str, ...] = (".csv", ".txt", ".tsv")
 
     def recognises(self, path: Path) -> bool:
         """Whether its header names a time, a position and a quaternion."""
@@ -65,6 +64,8 @@ class PoseCsvFormat:
             DataError: not text, no such header, some covariance columns but not all, a line with another
                 number of columns, stamps too large for their unit, or no usable row.
         """
+        from pipelines.session.tables import COVARIANCE_COLUMNS
+
         text = read_text(path)
         header = find_header(text)
         if header is None:
@@ -131,7 +132,8 @@ def _parse_header(line: int, cells: Sequence[str], delimiter: str) -> Header | N
 
 def _pose_column(name: str) -> str | None:
     """The table column that a heading means."""
-    if name in _POSITION or name in COVARIANCE_COLUMNS:
+    covariance = re.fullmatch(r"c([0-5])([0-5])", name)
+    if name in _POSITION or (covariance and covariance[1] <= covariance[2]):
         return name
     if match := re.fullmatch(rf"(?:{_POSITION_PREFIX})([xyz])", name):
         return match[1]
@@ -142,6 +144,8 @@ def _pose_column(name: str) -> str | None:
 
 def _covariance(table: TextTable) -> Float:
     """The symmetric matrices [N, 6, 6] of the upper triangles."""
+    from pipelines.session.tables import COVARIANCE_COLUMNS
+
     upper = table.stack(COVARIANCE_COLUMNS)
     rows, columns = np.triu_indices(6)
     covariance = np.zeros((len(upper), 6, 6))
@@ -153,6 +157,8 @@ def _covariance(table: TextTable) -> Float:
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     """Write `t_ns,x,y,z,qx,qy,qz,qw` and the covariance, if there is one, so that reading gives the same."""
     import pandas as pd
+
+    from pipelines.session.tables import COVARIANCE_COLUMNS
 
     columns: dict[str, object] = {"t_ns": trajectory.t_ns}
     columns |= dict(zip(_POSITION, trajectory.position.T, strict=True))

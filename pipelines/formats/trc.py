@@ -77,7 +77,7 @@ class TrcFormat:
 
     name = "trc"
     title = "OpenSim markers (TRC)"
-    suffixes = (".trc",)
+    suffixes: tuple[str, ...] = (".trc",)
 
     def recognises(self, path: Path) -> bool:
         """Whether it begins as every TRC does."""

@@ -25,7 +25,7 @@ class TumFormat:
 
     name = "tum"
     title = "TUM trajectory"
-    suffixes = (".tum", ".txt", ".csv", ".log")
+    suffixes: tuple[str, ...] = (".tum", ".txt", ".csv", ".log")
 
     def recognises(self, path: Path) -> bool:
         """Whether the first line that is no comment holds eight numbers and no header names the columns."""
