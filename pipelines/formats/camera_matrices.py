@@ -15,9 +15,9 @@ from pipelines.geometry.cameras import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float
 
-_MOST_COEFFICIENTS = (
-    8  # k1 k2 p1 p2 k3 k4 k5 k6; OpenCV's further ones (prism, tilt) are rare and mostly zero
-)
+# k1 k2 p1 p2 k3 k4 k5 k6; the further ones of OpenCV (prism, tilt) are rare and mostly zero.
+_MOST_COEFFICIENTS = 8
+_LARGEST = 1e12  # numbers beyond any length or angle, which overflow further on
 
 
 def intrinsics(
@@ -86,12 +86,14 @@ def invert_pose(source: Path, camera: str, quaternion_xyzw: Float, translation: 
     """Position [3] and quaternion [4] of world_from_camera, given camera_from_world.
 
     Raises:
-        DataError: not finite, or a quaternion of length zero.
+        DataError: not finite, absurdly large, or a quaternion of length zero.
     """
     from scipy.spatial.transform import Rotation
 
     numbers = np.concatenate([quaternion_xyzw, translation])
-    if numbers.shape != (7,) or not np.isfinite(numbers).all() or np.linalg.norm(quaternion_xyzw) < 1e-9:
+    # NaN fails the comparison too.
+    usable = numbers.shape == (7,) and bool((np.abs(numbers) < _LARGEST).all())
+    if not usable or np.linalg.norm(quaternion_xyzw) < 1e-9:
         raise DataError(source, f"camera {camera}: its rotation and translation are no pose")
     world_from_camera = Rotation.from_quat(quaternion_xyzw).inv()
     return -world_from_camera.apply(translation), world_from_camera.as_quat()
@@ -101,7 +103,7 @@ def invert_rodrigues(source: Path, camera: str, rotation: Float, translation: Fl
     """`invert_pose` for a rotation vector [3] (Rodrigues, rad)."""
     from scipy.spatial.transform import Rotation
 
-    if rotation.shape != (3,) or not np.isfinite(rotation).all():
+    if rotation.shape != (3,) or not (np.abs(rotation) < _LARGEST).all():
         raise DataError(source, f"camera {camera}: its rotation is no vector of three numbers")
     return invert_pose(source, camera, Rotation.from_rotvec(rotation).as_quat(), translation)
 

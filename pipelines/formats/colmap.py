@@ -123,7 +123,10 @@ def _suffix_of(path: Path) -> str | None:
 
 
 def _named(source: Path, images: list[_Image]) -> Iterator[tuple[str, _Image]]:
-    paths = [PurePosixPath(image.name.replace("\\", "/")).with_suffix("") for image in images]
+    paths = [PurePosixPath(image.name.replace("\\", "/")) for image in images]
+    if not all(path.name for path in paths):
+        raise DataError(source, "holds an image without a name", "export the model again")
+    paths = [path.with_suffix("") for path in paths]
     shared = Counter(path.name for path in paths)
     names = [path.name if shared[path.name] == 1 else str(path) for path in paths]
     twice = [name for name, count in Counter(names).items() if count > 1]
@@ -191,8 +194,6 @@ def _text_images(path: Path) -> Iterator[_Image]:
             image = _Image(" ".join(cells[9:]), int(cells[8]), tuple(float(cell) for cell in cells[1:8]))
         except (ValueError, IndexError) as error:
             raise _bad_line(path, number, "an image: id, qw qx qy qz, tx ty tz, camera, name") from error
-        if not image.name:
-            raise _bad_line(path, number, "an image with a name")
         yield image
         # The line below holds the image's points; it is there even when it is blank.
         points_number, points = next(lines, (number + 1, []))

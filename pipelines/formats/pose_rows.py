@@ -48,7 +48,8 @@ def clean_poses(
     if covariance is not None:
         blank: Bool = np.asarray(np.isnan(covariance).all(axis=(1, 2)))
         covariance = np.where(blank[:, None, None], 0.0, covariance)
-    norm = np.linalg.norm(quaternion_xyzw, axis=1)
+    with np.errstate(over="ignore"):  # what overflows becomes infinite and is dropped as such
+        norm = np.linalg.norm(quaternion_xyzw, axis=1)
     causes = {
         "not finite": ~(readable & np.isfinite(position).all(axis=1) & np.isfinite(norm)),
         "zero quaternion": norm < 1e-9,

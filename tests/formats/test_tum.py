@@ -62,6 +62,7 @@ def test_rows_are_dropped_by_cause(tmp_path: Path) -> None:
             "99 0 0 inf 0 0 0 1",  # its stamp must not make those below look backward
             "3 0 0 0 0 0 0 0",
             "4 0 0 0 0 0 0 1.2",
+            "4 0 0 0 0 0 0 1e200",
             "5 0 0 0 0 0 0 1.09",
             f"5.000 0 0 7 {IDENTITY}",
             f"4.5 0 0 0 {IDENTITY}",
@@ -73,7 +74,7 @@ def test_rows_are_dropped_by_cause(tmp_path: Path) -> None:
     assert poses.t_ns.tolist() == [10**9, 5 * 10**9, 6 * 10**9]
     assert poses.dropped == {
         "truncated last line": 1,
-        "not finite": 3,
+        "not finite": 4,
         "zero quaternion": 1,
         "quaternion not unit": 1,
         "duplicate stamp": 1,
