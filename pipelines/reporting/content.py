@@ -1,0 +1,47 @@
+"""What a page shows, as the stage loads it from a session, and how loose JSON is read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class SessionContent:
+    """Everything the page of one session needs; what a session does not hold is None or empty."""
+
+    name: str
+    session: dict[str, object]  # session.json
+    skeleton: pd.DataFrame | None  # tables.SKELETON
+    metrics: dict[str, object] | None  # reconstruct/metrics.json
+    truth: pd.DataFrame | None  # tables.TRUTH
+    poses: dict[str, pd.DataFrame]  # camera: tables.POSES
+    stages: dict[str, dict[str, object]]  # stage: its stage.json
+
+
+def section(mapping: Mapping[str, object], key: str) -> dict[str, object]:
+    """The mapping under a key; empty when it is absent or something else."""
+    value = mapping.get(key)
+    return {str(k): v for k, v in value.items()} if isinstance(value, Mapping) else {}
+
+
+def items(mapping: Mapping[str, object], key: str) -> list[object]:
+    """The list under a key; empty when it is absent or something else."""
+    value = mapping.get(key)
+    return list(value) if isinstance(value, list | tuple) else []
+
+
+def number(mapping: Mapping[str, object], key: str) -> float | None:
+    """The number under a key; None when it is absent, null or something else."""
+    value = mapping.get(key)
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def text(mapping: Mapping[str, object], key: str) -> str:
+    """The text under a key; empty when it is absent or something else."""
+    value = mapping.get(key)
+    return value if isinstance(value, str) else ""

@@ -1,0 +1,134 @@
+"""The skeleton's long table as dense arrays, and its distance from truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.poses import interpolate_points
+from pipelines.session.records import Float, Int64
+from pipelines.session.tables import STATUS
+from pipelines.session.tabular import motion_from
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+COVARIANCE = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
+
+# A hole in the truth of more than this many usual steps is not interpolated across.
+LONGEST_TRUTH_STEP = 2.5
+_NEVER_TOGETHER_M = 1e9  # people who share no time are matched last
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Joints over time: T stamps, P people, J joints, in the order in which the table first names them."""
+
+    t_ns: Int64  # [T], strictly increasing
+    joints: tuple[str, ...]
+    position: Float  # [T, P, J, 3] m
+    covariance: Float  # [T, P, J, 6] m^2, upper triangle as in COVARIANCE
+    reprojection_px: Float  # [T, P, J]
+    status: NDArray[np.int8]  # [T, P, J] index into tables.STATUS, -1 where the table has no row
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Where a joint was reconstructed from pictures ([T, P, J]; a filled joint was not)."""
+        measured: NDArray[np.bool_] = self.status == STATUS.index("ok")
+        return measured
+
+    @property
+    def measured_position(self) -> Float:
+        """Positions [T, P, J, 3] of measured joints, NaN elsewhere."""
+        return np.where(self.measured[..., None], self.position, np.nan)
+
+    @property
+    def sigma_m(self) -> Float:
+        """Standard deviation per axis of measured joints, sqrt(trace / 3), [T, P, J]; NaN if not stated."""
+        trace = self.covariance[..., [0, 3, 5]].sum(axis=-1)
+        return np.where(self.measured, np.sqrt(trace / 3), np.nan)
+
+
+def motion_from_skeleton(table: pd.DataFrame) -> Motion:
+    """Make dense arrays of a skeleton table (tables.SKELETON), in any order of its rows."""
+    import pandas as pd
+
+    t_ns, time = np.unique(table["t_ns"].to_numpy(dtype=np.int64), return_inverse=True)
+    persons, person = np.unique(table["person"].to_numpy(dtype=np.int64), return_inverse=True)
+    joint, joints = pd.factorize(table["joint"])
+    shape = (len(t_ns), len(persons), len(joints))
+    cell = (time, person, joint)
+
+    def dense(*columns: str) -> Float:
+        values = np.full((*shape, len(columns)), np.nan)
+        values[cell] = table[list(columns)].to_numpy(dtype=np.float64)
+        return values
+
+    status = np.full(shape, -1, dtype=np.int8)
+    status[cell] = pd.Index(STATUS).get_indexer(pd.Index(table["status"]))
+    return Motion(
+        t_ns=t_ns,
+        joints=tuple(str(name) for name in joints),
+        position=dense("x", "y", "z"),
+        covariance=dense(*COVARIANCE),
+        reprojection_px=dense("reprojection_px")[..., 0],
+        status=status,
+    )
+
+
+def truth_at(truth: pd.DataFrame, motion: Motion) -> Float:
+    """True positions at the motion's times and joints, [T, P, J, 3].
+
+    Each person is compared with the nearest true one. Interpolated linearly; NaN outside the stamps of
+    the truth, beside a missing sample, across a hole of more than `LONGEST_TRUTH_STEP` usual steps, and
+    for joints and people that truth does not hold.
+    """
+    known = motion_from(truth, motion.joints)
+    usual_ns = float(np.median(np.diff(known.t_ns))) if len(known.t_ns) > 1 else 0.0
+    sampled = interpolate_points(
+        known.t_ns, known.position, motion.t_ns, max_gap_ns=round(LONGEST_TRUTH_STEP * usual_ns)
+    )
+    return _own_truth(motion.measured_position, sampled)
+
+
+def _own_truth(position: Float, truth: Float) -> Float:
+    """For each measured person of [T, P, J, 3] the true one that is nearest on average, each taken once."""
+    from scipy.optimize import linear_sum_assignment
+
+    distance = np.linalg.norm(position[:, :, None] - truth[:, None], axis=-1)
+    shared = np.isfinite(distance)
+    count = shared.sum(axis=(0, 3))
+    total = np.where(shared, distance, 0.0).sum(axis=(0, 3))
+    person, match = linear_sum_assignment(
+        np.where(count > 0, total / np.maximum(count, 1), _NEVER_TOGETHER_M)
+    )
+    own: Float = np.full(position.shape, np.nan)
+    own[:, person] = truth[:, match]
+    return own
+
+
+def errors_mm(motion: Motion, truth: Float) -> Float:
+    """Distance of every measured joint from truth in mm, [T, P, J]; NaN where either is missing."""
+    distance: Float = 1000 * np.linalg.norm(motion.measured_position - truth, axis=-1)
+    return distance
+
+
+def share_inside_95(motion: Motion, truth: Float) -> float | None:
+    """Share of true joints inside the stated 95 % ellipsoid; None where nothing can be compared.
+
+    e' S^-1 e of a Gaussian in three dimensions is chi-square with 3 degrees of freedom, whose 95 %
+    quantile is 7.815: a calibrated covariance gives a share of 0.95.
+    """
+    error = motion.measured_position - truth
+    usable = np.isfinite(error).all(axis=-1) & np.isfinite(motion.covariance).all(axis=-1)
+    covariance = motion.covariance[usable][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    positive = np.linalg.eigvalsh(covariance)[:, 0] > 0
+    if not positive.any():
+        return None
+    e = error[usable][positive]
+    weighted = np.linalg.solve(covariance[positive], e[:, :, np.newaxis])[:, :, 0]
+    squared = (e * weighted).sum(axis=1)
+    return float(np.mean(squared < 7.815))

@@ -1,0 +1,398 @@
+"""What the session amounts to: the numbers of the page's tables, and the verdict in plain sentences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pipelines.reporting.bones import Bone, watched_bones
+from pipelines.reporting.content import SessionContent, items, number, section
+from pipelines.reporting.motion import Motion, errors_mm, motion_from_skeleton, share_inside_95, truth_at
+from pipelines.reporting.wording import (
+    STATUS_LABELS,
+    STATUS_REASONS,
+    STATUS_REMEDIES,
+    fixed,
+    joint_label,
+    listing,
+    percent,
+    plural,
+    quantity,
+    significant,
+    whole,
+)
+from pipelines.session.description import CameraEntry, Description
+from pipelines.session.records import Float
+from pipelines.session.tables import STATUS
+
+# Below this share of measured times a joint is named among the doubts.
+DOUBTFUL_COVERAGE = 0.8
+# A status is named among the doubts from this share of joint-frames on.
+NOTABLE_LOSS = 0.01
+# A calibrated 95 % ellipsoid holds 95 % of the truths; outside these shares the page says so.
+BELIEVABLE_SHARES = (0.90, 0.99)
+# Root-relative error below this part of the absolute one: the cameras' poses carry most of the error.
+MOSTLY_SHARED = 0.6
+
+
+@dataclass(frozen=True)
+class CameraRow:
+    """One camera as it was ingested. Times in seconds since the page's zero."""
+
+    name: str
+    entry: CameraEntry
+    first_s: float
+    last_s: float
+    gaps_s: tuple[tuple[float, float], ...]
+
+    @property
+    def gap_total_s(self) -> float:
+        """How long the gaps in the poses last together."""
+        return sum(end - start for start, end in self.gaps_s)
+
+
+@dataclass(frozen=True)
+class JointRow:
+    """One joint over the whole recording; None where there is nothing to state."""
+
+    name: str
+    share: float
+    mpjpe_mm: float | None
+    root_mpjpe_mm: float | None
+    reprojection_px: float | None
+    sigma_mm: float | None
+    counts: dict[str, int]  # by status
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A number of the error table, with what it means."""
+
+    label: str
+    value: str
+    meaning: str
+
+
+@dataclass(frozen=True)
+class CameraErrors:
+    """How well one camera's keypoints agree with the skeleton, in px; None where it was not measured."""
+
+    name: str
+    median_px: float | None
+    mean_px: float | None
+    left_out_median_px: float | None  # against joints that were reconstructed without this camera
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The page's first words."""
+
+    lead: str
+    quality: tuple[str, ...] = ()
+    certainty: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A session in numbers."""
+
+    origin_ns: int  # the page's zero of time: the first frame of all cameras
+    description: Description
+    cameras: tuple[CameraRow, ...]
+    motion: Motion | None
+    errors_mm: Float | None  # [T, P, J]
+    share: float | None
+    counts: dict[str, int]
+    inside_95: float | None
+    joints: tuple[JointRow, ...]
+    bones: tuple[Bone, ...]
+    metrics: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def total(self) -> int:
+        """How many joint-frames there are."""
+        return sum(self.counts.values())
+
+    @property
+    def nothing_measured(self) -> bool:
+        """Whether a reconstruction ran and gave no joint at all."""
+        return self.motion is not None and not self.counts.get("ok", 0)
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last frame of all cameras."""
+        return max(camera.last_s for camera in self.cameras) - min(camera.first_s for camera in self.cameras)
+
+
+def summarise(content: SessionContent) -> Summary:
+    """Every number that the page shows."""
+    description = Description.model_validate(content.session)
+    origin_ns = min(camera.frames.first_t_ns for camera in description.cameras.values())
+    has_rows = content.skeleton is not None and len(content.skeleton) > 0
+    motion = motion_from_skeleton(content.skeleton) if content.skeleton is not None and has_rows else None
+    truth = truth_at(content.truth, motion) if motion is not None and content.truth is not None else None
+    error = errors_mm(motion, truth) if motion is not None and truth is not None else None
+    counts = _status_counts(motion) if motion is not None else {}
+    metrics = content.metrics or {}
+    total = sum(counts.values())
+    return Summary(
+        origin_ns=origin_ns,
+        description=description,
+        cameras=tuple(_camera_row(name, entry, origin_ns) for name, entry in description.cameras.items()),
+        motion=motion,
+        errors_mm=error if error is not None and np.isfinite(error).any() else None,
+        share=counts.get("ok", 0) / total if total else None,
+        counts=counts,
+        inside_95=share_inside_95(motion, truth) if motion is not None and truth is not None else None,
+        joints=tuple(_joint_rows(motion, error, metrics)) if motion is not None else (),
+        bones=tuple(watched_bones(motion)) if motion is not None else (),
+        metrics=metrics,
+    )
+
+
+def _status_counts(motion: Motion) -> dict[str, int]:
+    counted = np.bincount(motion.status[motion.status >= 0], minlength=len(STATUS))
+    return {word: int(n) for word, n in zip(STATUS, counted, strict=True) if n}
+
+
+def _camera_row(name: str, entry: CameraEntry, origin_ns: int) -> CameraRow:
+    return CameraRow(
+        name=name,
+        entry=entry,
+        first_s=(entry.frames.first_t_ns - origin_ns) / 1e9,
+        last_s=(entry.frames.last_t_ns - origin_ns) / 1e9,
+        gaps_s=tuple(
+            ((start - origin_ns) / 1e9, (end - origin_ns) / 1e9) for start, end in entry.poses.gaps_ns
+        ),
+    )
+
+
+def _joint_rows(motion: Motion, error: Float | None, metrics: dict[str, object]) -> list[JointRow]:
+    per_joint = section(metrics, "per_joint")
+    sigma = 1000 * motion.sigma_m
+    rows = []
+    for j, name in enumerate(motion.joints):
+        stated = section(per_joint, name)
+        status = motion.status[..., j]
+        measured = motion.measured[..., j]
+        counted = np.bincount(status[status >= 0], minlength=len(STATUS))
+        computed = _mean(error[..., j]) if error is not None else None
+        mpjpe = number(stated, "mpjpe_mm")
+        reprojection = number(section(stated, "reprojection_px"), "median")
+        seen = _median(motion.reprojection_px[..., j][measured])
+        rows.append(
+            JointRow(
+                name=name,
+                share=float(measured.sum() / max(counted.sum(), 1)),
+                mpjpe_mm=computed if mpjpe is None else mpjpe,
+                root_mpjpe_mm=number(stated, "root_mpjpe_mm"),
+                reprojection_px=seen if reprojection is None else reprojection,
+                sigma_mm=_median(sigma[..., j][measured]),
+                counts={word: int(n) for word, n in zip(STATUS, counted, strict=True)},
+            )
+        )
+    return rows
+
+
+def _mean(values: Float) -> float | None:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else None
+
+
+def _median(values: Float) -> float | None:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else None
+
+
+def measures(summary: Summary) -> list[Measure]:
+    """The rows of the error table: every overall number of the metrics, known ones explained."""
+    reprojection = section(summary.metrics, "reprojection_px")
+    rows = []
+    if summary.share is not None:
+        rows.append(Measure("Reconstructed", percent(summary.share), "share of joint-frames measured"))
+    for key, label, unit, digits, meaning in _KNOWN_MEASURES:
+        value = number(summary.metrics | section(summary.metrics, "shape"), key)
+        if value is not None:
+            shown = percent(value) if unit == "%" else f"{fixed(value, digits)} {unit}".strip()
+            rows.append(Measure(label, shown, meaning))
+    for key, label in (("median", "Reprojection, median"), ("mean", "Reprojection, mean")):
+        value = number(reprojection, key)
+        if value is not None:
+            meaning = "distance in the picture from the keypoints, over all views"
+            rows.append(Measure(label, quantity(value, "px", 2), meaning))
+    explained = {key for key, *_ in _KNOWN_MEASURES} | _STATED_ELSEWHERE
+    rows += [
+        Measure(key, significant(number(summary.metrics, key)), "")
+        for key in summary.metrics
+        if key not in explained and number(summary.metrics, key) is not None
+    ]
+    return rows
+
+
+def errors_per_camera(summary: Summary) -> list[CameraErrors]:
+    """The rows of the table of reprojection errors; none where the metrics do not tell cameras apart."""
+    own = section(summary.metrics, "reprojection_px_per_camera")
+    left_out = section(summary.metrics, "leave_one_camera_out_px")
+    return [
+        CameraErrors(
+            name=name,
+            median_px=number(section(own, name), "median"),
+            mean_px=number(section(own, name), "mean"),
+            left_out_median_px=number(section(left_out, name), "median"),
+        )
+        for name in own
+    ]
+
+
+_KNOWN_MEASURES = (
+    ("mpjpe_mm", "MPJPE", "mm", 1, "mean distance of joints from truth, in the world"),
+    ("root_mpjpe_mm", "Root-relative MPJPE", "mm", 1, "the same with the hips laid on each other"),
+    ("pa_mpjpe_mm", "PA-MPJPE", "mm", 1, "after the best shift, turn and scale of each frame"),
+    (
+        "pck150",
+        "PCK at 150 mm",
+        "%",
+        1,
+        "share of joints within 150 mm of truth; missing ones count as wrong",
+    ),
+    ("pck150_auc", "PCK area", "%", 1, "mean of PCK over all thresholds from 0 to 150 mm"),
+    ("acceleration_error_mm_s2", "Acceleration error", "mm/s²", 0, "mean difference of accelerations"),
+    ("jerk_m_s3", "Jerk", "m/s³", 0, "median length of the third derivative of the joints' motion"),
+    ("bone_spread_mm", "Bone length spread", "mm", 1, "median over the bones of each one's spread"),
+    ("e_recon_m2", "E_recon", "m²", 3, "sum of squared distances over all joint-frames with truth"),
+    ("e_recon_terms", "E_recon, terms", "", 0, "joint-frames in that sum"),
+    ("e_recon_per_joint_frame_m2", "E_recon per joint-frame", "m²", 6, "the sum divided by its terms"),
+    ("root_frames_left_out", "Frames without root", "", 0, "left out of the root-relative error"),
+    ("pa_frames_left_out", "Frames not aligned", "", 0, "too few joints in common for PA-MPJPE"),
+)
+_STATED_ELSEWHERE = {"reconstructed_share", "joint_frames", "schema"}
+
+
+def give_verdict(content: SessionContent, summary: Summary) -> Verdict:
+    """How good, how sure, and what is doubtful, in sentences that state their numbers."""
+    if content.skeleton is None:
+        lead = "This session was ingested, but not reconstructed yet: run mocap reconstruct on it."
+        return Verdict(lead, doubts=tuple(_doubts(content, summary)))
+    if summary.motion is None or summary.nothing_measured:
+        return Verdict(_why_nothing(summary), doubts=tuple(_doubts(content, summary)))
+    return Verdict(
+        _lead(summary),
+        quality=tuple(_quality(summary)),
+        certainty=tuple(_certainty(summary)),
+        doubts=tuple(_doubts(content, summary)),
+    )
+
+
+def _why_nothing(summary: Summary) -> str:
+    if not summary.counts:
+        return "Nothing was reconstructed: the skeleton has no rows."
+    word, count = max(summary.counts.items(), key=lambda item: item[1])
+    reason = STATUS_REASONS.get(word, STATUS_LABELS[word])
+    where = "In all of them" if count == summary.total else f"In {percent(count / summary.total)} of them"
+    return (
+        f"Nothing was reconstructed: none of {plural(summary.total, 'joint-frame')} passed. "
+        f"{where} {reason} ({word}). {STATUS_REMEDIES.get(word, '')}".rstrip()
+    )
+
+
+def _lead(summary: Summary) -> str:
+    share = summary.share or 0.0
+    amount = next(
+        words
+        for least, words in (
+            (1.0, "All of the motion was"),
+            (0.95, "Nearly all of the motion was"),
+            (0.7, "Most of the motion was"),
+            (0.4, "About half of the motion was"),
+            (0.0, "Only a small part of the motion was"),
+        )
+        if share >= least
+    )
+    return f"{amount} reconstructed: {percent(share)} of {plural(summary.total, 'joint-frame')}."
+
+
+def _quality(summary: Summary) -> list[str]:
+    absolute, root, aligned = (
+        number(summary.metrics, k) for k in ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm")
+    )
+    reprojection = number(section(summary.metrics, "reprojection_px"), "median")
+    sentences = []
+    if absolute is not None:
+        finer = [f"{quantity(root, 'mm')} relative to the hips"] if root is not None else []
+        finer += (
+            [f"{quantity(aligned, 'mm')} after aligning each frame with truth"] if aligned is not None else []
+        )
+        sentences.append(
+            f"Compared with truth, the joints are off by {quantity(absolute, 'mm')} on average"
+            + (f"; by {listing(finer)}." if finer else ".")
+        )
+        if root is not None and root < MOSTLY_SHARED * absolute:
+            sentences.append(
+                "Most of that is a shift common to all joints, as wrong camera poses make it, "
+                "rather than a wrong shape of the body."
+            )
+    else:
+        sentences.append("There is no truth to compare with, so the error in the world is not known.")
+    if reprojection is not None:
+        sentences.append(
+            f"The joints fall {quantity(reprojection, 'px')} from the keypoints (median over all views)."
+        )
+    if absolute is None and summary.bones:
+        worst = max(summary.bones, key=lambda bone: bone.spread)
+        typical = float(np.median([bone.spread for bone in summary.bones]))
+        sentences.append(
+            f"Bone lengths, which should not change, vary by {percent(typical)} (median over the bones), "
+            f"most of all the {f'{worst.side} {worst.name}'.strip()} with {percent(worst.spread)}."
+        )
+    return sentences
+
+
+def _certainty(summary: Summary) -> list[str]:
+    motion = summary.motion
+    sigma = _median(motion.sigma_m[motion.measured]) if motion is not None else None
+    if sigma is None:
+        return ["The method states no uncertainty for its positions."]
+    sentences = [f"The stated uncertainty of a joint is {quantity(1000 * sigma, 'mm')} per axis (median)."]
+    if summary.inside_95 is not None:
+        low, high = BELIEVABLE_SHARES
+        judgement = (
+            "too small: do not rely on it"
+            if summary.inside_95 < low
+            else "larger than need be"
+            if summary.inside_95 > high
+            else "about right"
+        )
+        sentences.append(
+            f"{percent(summary.inside_95)} of the true positions lie inside the stated 95{chr(0x202F)}% "
+            f"ellipsoids, so it is {judgement}."
+        )
+    return sentences
+
+
+def _doubts(content: SessionContent, summary: Summary) -> list[str]:
+    doubts = []
+    losses = sorted(((n, word) for word, n in summary.counts.items() if word != "ok"), reverse=True)
+    if not summary.nothing_measured:
+        doubts += [
+            f"{percent(n / summary.total)} of the joint-frames: {STATUS_REASONS[word]} ({word})."
+            for n, word in losses
+            if n / summary.total >= NOTABLE_LOSS
+        ]
+        thin = sorted((row.share, row.name) for row in summary.joints if row.share < DOUBTFUL_COVERAGE)
+        if thin:
+            named = listing(f"{joint_label(name)} ({percent(share)})" for share, name in thin[:5])
+            more = f", and {len(thin) - 5} more" if len(thin) > 5 else ""
+            doubts.append(f"Seldom measured: {named}{more}.")
+    doubts += [
+        f"{camera.name}: no person was detected in {whole(missed)} of {plural(count, 'frame')}."
+        for camera in summary.cameras
+        if camera.entry.keypoints
+        and (missed := camera.entry.keypoints.frames_without_person)
+        >= NOTABLE_LOSS * (count := camera.entry.frames.count)
+    ]
+    doubts += summary.description.warnings
+    for record in content.stages.values():
+        doubts += [str(warning) for warning in items(record, "warnings")]
+    return list(dict.fromkeys(doubts))  # a stage repeats what ingest said

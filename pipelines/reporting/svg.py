@@ -1,0 +1,137 @@
+"""Matplotlib figures as inline SVG that takes its colours and fonts from the page.
+
+Each colour of the palette is replaced by a CSS variable, so that one drawing serves light and dark
+mode and paper; text stays text. The same figure gives the same bytes, and its ids carry a prefix of
+their own, so that the figures of one page do not clash.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+from xml.sax.saxutils import escape
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from matplotlib.typing import RcKeyType
+
+INK, MUTED, GRID, PAPER = "#22262a", "#666d74", "#dddcd6", "#fefdfb"
+LEFT, RIGHT, MIDDLE = "#1f78b5", "#c8561b", "#4a4f55"
+CAMERAS = ("#0072b2", "#d55e00", "#009e73", "#b0528f", "#a87900", "#4f8fc4")
+"""After Okabe and Ito's colours for every kind of sight, darkened to be seen as thin lines on paper."""
+STATUS_COLOURS = {
+    "ok": "#2f6f92",
+    "filled": "#9fc6d8",
+    "few_views": "#edca6e",
+    "low_parallax": "#e08f43",
+    "rejected": "#b3422a",
+    "not_detected": "#cbcbc6",
+    "no_pose": "#74777b",
+}
+PALETTE = {
+    INK: "--ink",
+    MUTED: "--muted",
+    GRID: "--grid",
+    PAPER: "--paper",
+    LEFT: "--left",
+    RIGHT: "--right",
+    MIDDLE: "--middle",
+    **{colour: f"--camera-{k}" for k, colour in enumerate(CAMERAS)},
+    **{colour: f"--status-{word.replace('_', '-')}" for word, colour in STATUS_COLOURS.items()},
+}
+
+WIDTH_IN = 9.0
+"""A figure as wide as the page; CSS scales it to the window."""
+
+_STYLE: dict[RcKeyType, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "mocap",
+    "text.parse_math": False,  # a name may hold a dollar sign
+    "font.size": 7.6,
+    "text.color": INK,
+    "axes.edgecolor": MUTED,
+    "axes.labelcolor": MUTED,
+    "axes.linewidth": 0.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.formatter.useoffset": False,
+    "axes.axisbelow": True,
+    "axes.labelsize": 7.6,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.major.width": 0.5,
+    "ytick.major.width": 0.5,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "xtick.labelsize": 7.2,
+    "ytick.labelsize": 7.2,
+    "grid.color": GRID,
+    "grid.linewidth": 0.5,
+    "legend.frameon": False,
+    "legend.fontsize": 7.2,
+    "legend.handlelength": 1.4,
+    "legend.borderpad": 0.0,
+    "lines.linewidth": 1.1,
+    "lines.solid_capstyle": "round",
+}
+
+
+@contextmanager
+def page_style() -> Iterator[None]:
+    """Draw in the page's style, whatever matplotlibrc says; names in any script raise no warning."""
+    import matplotlib as mpl
+
+    with mpl.rc_context(), warnings.catch_warnings():
+        # The page's own fonts show the text; matplotlib's are used for measuring it alone.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        mpl.rcdefaults()
+        mpl.rcParams.update(_STYLE)
+        yield
+
+
+def inline_svg(figure: Figure, key: str, title: str, description: str) -> str:
+    """The figure as an `<svg>` element for the inside of a page; call it within `page_style`.
+
+    Args:
+        figure: what is drawn.
+        key: prefix of every id, one of its own for each figure of a page.
+        title: what it shows, for readers who do not see it.
+        description: what is to be seen, with its numbers.
+    """
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    drawing = buffer.getvalue()
+    view = re.search(r'viewBox="([^"]+)"', drawing)
+    if view is None:
+        raise ValueError("matplotlib wrote an SVG without a viewBox")
+    body = drawing[drawing.index("</metadata>") + len("</metadata>") :]
+    body = re.sub(r"<defs>\s*<style[^>]*>[^<]*</style>\s*</defs>", "", body, count=1)
+    referenced = set(re.findall(r'(?:url\(#|href="#)([^")]+)', body))
+    # Names stand between tags and are escaped there, so that a tag is whatever lies between < and >.
+    body = re.sub(r"<[^<>]+>", lambda tag: _page_tag(tag.group(), key, referenced), body)
+    body = re.sub(r">\s+<", "><", body)
+    return (
+        f'<svg viewBox="{view.group(1)}" role="img" aria-labelledby="{key}-title" '
+        f'aria-describedby="{key}-desc"><title id="{key}-title">{escape(title)}</title>'
+        f'<desc id="{key}-desc">{escape(description)}</desc>{body.strip()}'
+    )
+
+
+def _page_tag(tag: str, key: str, referenced: set[str]) -> str:
+    tag = re.sub(
+        r' id="([^"]+)"', lambda m: f' id="{key}-{m.group(1)}"' if m.group(1) in referenced else "", tag
+    )
+    tag = tag.replace("url(#", f"url(#{key}-").replace('xlink:href="#', f'href="#{key}-')
+    tag = re.sub(r" font-family: [^;\"]+;?", "", tag)
+    tag = re.sub(r' transform="rotate\(-0 [^"]*"', "", tag)
+    tag = re.sub(r"\d+\.\d{3,}", lambda m: f"{float(m.group()):.2f}".rstrip("0").rstrip("."), tag)
+    tag = re.sub(r"#[0-9a-f]{6}\b", lambda m: _page_colour(m.group()), tag)
+    return re.sub(r"\s*\n\s*", " ", tag)
+
+
+def _page_colour(colour: str) -> str:
+    return f"var({PALETTE[colour]})" if colour in PALETTE else colour

@@ -1,0 +1,136 @@
+"""Numbers and words as the page prints them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+
+THIN = "\u202f"  # narrow no-break space: between a number and its unit, and between thousands
+ABSENT = "–"
+
+# A stamp after this one counts from the epoch: no log counts 30 years since its own start.
+_EPOCH_SINCE_NS = 946_684_800_000_000_000  # 2000-01-01
+
+STATUS_LABELS = {
+    "ok": "measured",
+    "filled": "filled",
+    "few_views": "few views",
+    "low_parallax": "low parallax",
+    "rejected": "rejected",
+    "not_detected": "not detected",
+    "no_pose": "no camera pose",
+}
+STATUS_REASONS = {
+    "ok": "reconstructed from at least two views that agree",
+    "filled": "the position was filled in between measured ones",
+    "few_views": "fewer than two cameras saw the joint at the same time",
+    "low_parallax": "the cameras looked along nearly the same line, so the distance is open",
+    "rejected": "the views disagreed by more than pixel and pose noise explain",
+    "not_detected": "the keypoint detector found the joint in no camera",
+    "no_pose": "the cameras had no pose at these times",
+}
+STATUS_REMEDIES = {
+    "few_views": "Check that the cameras overlap in time and see the same person.",
+    "low_parallax": "The cameras must see the actor from more different directions.",
+    "rejected": "Check clocks, mounts and intrinsics, or state a larger pose noise.",
+    "not_detected": "Check that the keypoint files belong to these videos, and their first frame number.",
+    "no_pose": "Check that the pose logs cover the time of the videos, and the clock offsets.",
+}
+
+
+def fixed(value: float | None, digits: int = 1) -> str:
+    """A number with fixed decimals and grouped thousands; a dash for None."""
+    return ABSENT if value is None else f"{value:,.{digits}f}".replace(",", THIN).replace("-", "−")
+
+
+def whole(value: float | None) -> str:
+    """A count with grouped thousands; a dash for None."""
+    return fixed(value, 0)
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """A number of about `digits` significant digits, never in powers of ten above 0.001."""
+    if value is None:
+        return ABSENT
+    if value == 0:
+        return "0"
+    if not 1e-3 <= abs(value) < 1e9:
+        return f"{value:.{digits}g}".replace("-", "−")
+    before = len(str(int(abs(value)))) if abs(value) >= 1 else 0
+    return fixed(value, max(digits - max(before, 1), 0))
+
+
+def quantity(value: float | None, unit: str, digits: int = 1) -> str:
+    """A number and its unit; a dash for None."""
+    return ABSENT if value is None else f"{fixed(value, digits)}{THIN}{unit}"
+
+
+def percent(share: float | None) -> str:
+    """A share as percent with one decimal; neither 0 nor 100 unless it is exactly that."""
+    if share is None:
+        return ABSENT
+    if 0 < share < 0.0005:
+        return f"<{THIN}0.1{THIN}%"
+    if 0.9995 <= share < 1:
+        return f">{THIN}99.9{THIN}%"
+    return quantity(100 * share, "%", 0 if share in {0, 1} else 1)
+
+
+def plural(count: float, noun: str, nouns: str = "") -> str:
+    """A count with its noun: `1 frame`, `2 frames`."""
+    return f"{whole(count)} {noun if count == 1 else nouns or noun + 's'}"
+
+
+def listing(words: Iterable[str]) -> str:
+    """`a`, `a and b`, `a, b and c`."""
+    *most, last = list(words) or [""]
+    return f"{', '.join(most)} and {last}" if most else last
+
+
+def shortened(label: str, length: int = 24) -> str:
+    """A name for a figure's label: printable, on one line, cut in the middle if it is long."""
+    clean = "".join(c if c.isprintable() else " " for c in label).strip()
+    half = (length - 1) // 2
+    return clean if len(clean) <= length else f"{clean[:half]}…{clean[-half:]}"
+
+
+def joint_label(name: str) -> str:
+    """`left_big_toe` as `left big toe`."""
+    return name.replace("_", " ")
+
+
+def moment(t_ns: int | None) -> str:
+    """A stamp as a date in UTC if it counts from the epoch, else as seconds of the log's own clock."""
+    if t_ns is None:
+        return ABSENT
+    if t_ns < _EPOCH_SINCE_NS:
+        return f"{fixed(t_ns / 1e9, 3)}{THIN}s on the log's own clock"
+    seconds, rest = divmod(t_ns, 1_000_000_000)
+    stamp = datetime.fromtimestamp(seconds, UTC)
+    return f"{stamp:%Y-%m-%d %H:%M:%S}.{rest // 1_000_000:03d} UTC"
+
+
+def flattened(value: object, prefix: str = "") -> list[tuple[str, str]]:
+    """Nested settings as rows of a dotted name and a text, in their own order."""
+    if isinstance(value, Mapping):
+        if not value:
+            return [(prefix, "none")] if prefix else []
+        return [
+            row
+            for key, inner in value.items()
+            for row in flattened(inner, f"{prefix}.{key}" if prefix else str(key))
+        ]
+    return [(prefix, plain(value))]
+
+
+def plain(value: object) -> str:
+    """A value of JSON as a reader expects it."""
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return ", ".join(plain(v) for v in value) or "none"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key}: {plain(inner)}" for key, inner in value.items()) or "none"
+    return str(value)
