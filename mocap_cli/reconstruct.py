@@ -12,6 +12,7 @@ from mocap_cli.options import force_option, json_option, level, session_argument
 from mocap_cli.terminal import one_line, print_json, print_table, watching
 
 if TYPE_CHECKING:
+    from pipelines.geometry.triangulation import Method
     from pipelines.reconstruct import Reconstructed
 
 
@@ -65,7 +66,7 @@ if TYPE_CHECKING:
 @verbosity_options
 def reconstruct_command(
     session: Path,
-    method: str,
+    method: Method,
     rate: float | None,
     persons: int,
     min_confidence: float,

@@ -116,7 +116,7 @@ def ingest(
     interpolation = Interpolation(max_gap_s=max_pose_gap_s, max_extrapolation_s=max_extrapolation_s)
     sources = _hash_sources(flight, flight_path.parent)
     settings = {
-        "flight": flight.model_dump(mode="json", by_alias=True),
+        "flight": flight.model_dump(mode="json"),
         "pose_interpolation": interpolation.model_dump(),
     }
 
@@ -239,7 +239,7 @@ def _check_overlap(flight_path: Path, entries: Mapping[str, CameraEntry]) -> Non
                 flight_path,
                 f"cameras.{name}: its frames ({_span(first, last)}) overlap in time with no other camera's"
                 f" ({_span(min(o.first_t_ns for o in others), max(o.last_t_ns for o in others))})",
-                "check frame_times.start and clock.offset_s",
+                "check frame_times.start_ns and clock.offset_s",
             )
 
 
@@ -307,7 +307,7 @@ class _Reader:
                 dropped=detections.dropped,
             ),
             clock=ClockEntry(
-                offset_s=(clock.offset_s if clock else 0) / 1e9, sigma_s=clock.sigma_s if clock else 0.0
+                offset_s=(clock.offset_ns if clock else 0) / 1e9, sigma_s=clock.sigma_s if clock else 0.0
             ),
             pose_noise=camera.pose_noise,
             media=None,
@@ -424,8 +424,8 @@ class _Reader:
                 f"numbers its frames up to {count - 1}",
                 "say with first_frame which number the first frame bears",
             )
-        offset_ns = camera.clock.offset_s if camera.clock else 0
-        return times.start + offset_ns + _ticks_ns(count, times.fps)
+        offset_ns = camera.clock.offset_ns if camera.clock else 0
+        return times.start_ns + offset_ns + _ticks_ns(count, times.fps)
 
     def _read_trajectory(self, name: str, camera: Camera, frames_t_ns: np.ndarray) -> Trajectory:
         path = self._base / _pose_path(camera)

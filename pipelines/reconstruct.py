@@ -7,8 +7,9 @@ status that says why.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,7 @@ from pipelines.geometry.triangulation import (
 from pipelines.keypoints.association import Association, associate
 from pipelines.reconstruction.observations import Camera, Observations, candidates, observe, time_base
 from pipelines.reconstruction.quality import assess
+from pipelines.reconstruction.reweighting import triangulate_heavy_tailed
 from pipelines.session.description import CameraEntry, Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
@@ -113,7 +115,8 @@ def reconstruct(
         observations, association = _observe(cameras, description, settings)
         progress.advance()
         views = _views(cameras, observations, settings, workers)
-        result = triangulate(views, method=settings.method, threads=workers)
+        solve = _solver(cameras, observations, settings, workers)
+        result = solve(views)
         _refuse_nothing(folder, result, association)
         progress.advance()
         metrics = jsonable(
@@ -124,7 +127,7 @@ def reconstruct(
                 cameras=[camera.name for camera in cameras],
                 method=settings.method,
                 truth=_load_truth(folder, description, observations),
-                threads=workers,
+                solve=solve,
             )
         )
         write_table(run.folder / "skeleton.parquet", _skeleton_table(observations, result), SKELETON)
@@ -276,6 +279,16 @@ def _views(cameras: list[Camera], observations: Observations, settings: Settings
         pose_sigma=np.zeros((times, count, 2)) if stated is None else stated,
     )
     return replace(views, pixel_sigma=estimate_noise(views, threads=workers))
+
+
+def _solver(
+    cameras: list[Camera], observations: Observations, settings: Settings, workers: int
+) -> Callable[[Views], Triangulation]:
+    """How views become points; robust has a loss for calibrated cameras and one for logged poses."""
+    calibrated = observations.pose_sigma is None and all(camera.static for camera in cameras)
+    if settings.method == "robust" and calibrated:
+        return partial(triangulate_heavy_tailed, threads=workers)
+    return partial(triangulate, method=settings.method, threads=workers)
 
 
 def _refuse_nothing(folder: Path, result: Triangulation, association: Association) -> None:

@@ -6,7 +6,7 @@ Everything here is JSON-able, with null for what could not be measured.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.metrics import measure, measure_shape
-from pipelines.geometry.triangulation import STATUS, Method, Triangulation, Views, triangulate
+from pipelines.geometry.triangulation import STATUS, Method, Triangulation, Views
 from pipelines.reconstruction.observations import Observations
 from pipelines.session.records import Float
 from pipelines.session.skeletons import bones_of
@@ -30,7 +30,7 @@ def assess(
     cameras: Sequence[str],
     method: Method,
     truth: Float | None,
-    threads: int,
+    solve: Callable[[Views], Triangulation],
 ) -> dict[str, Any]:
     """Every figure of metrics.json.
 
@@ -41,7 +41,7 @@ def assess(
         cameras: their names.
         method: how it was triangulated.
         truth: [T, P', J, 3] the true joints at the same times, in any order of people.
-        threads: for the triangulations that leave one camera out.
+        solve: the same way again, for the triangulations that leave one camera out.
     """
     shape = observations.confidence.shape[:3]
     position = result.points.reshape(*shape, 3)
@@ -62,7 +62,7 @@ def assess(
         **errors,
         **overall,
         "reprojection_px_per_camera": {name: _spread(residual[..., c]) for c, name in enumerate(cameras)},
-        "leave_one_camera_out_px": _leave_one_out(views, method, cameras, threads),
+        "leave_one_camera_out_px": _leave_one_out(views, cameras, solve),
         "shape": measure_shape(
             position, observations.joints, bones_of(observations.joints), observations.t_ns
         ),
@@ -106,7 +106,7 @@ def _own_truth(position: Float, truth: Float) -> Float:
 
 
 def _leave_one_out(
-    views: Views, method: Method, cameras: Sequence[str], threads: int
+    views: Views, cameras: Sequence[str], solve: Callable[[Views], Triangulation]
 ) -> dict[str, dict[str, float | None]] | None:
     """How far each camera's keypoints lie from the skeleton of the others; needs three cameras."""
     if len(cameras) < 3:
@@ -115,7 +115,7 @@ def _leave_one_out(
     for c, name in enumerate(cameras):
         weight = views.weight.copy()
         weight[:, c] = 0
-        points = triangulate(replace(views, weight=weight), method=method, threads=threads).points
+        points = solve(replace(views, weight=weight)).points
         figures[name] = _spread(_residual(views, points, c))
     return figures
 

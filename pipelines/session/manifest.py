@@ -144,7 +144,7 @@ class Video(Part):
 class FrameTimes(Part):
     """When each frame was taken; container stamps from `start` on where nothing else is said."""
 
-    start: SecondsAsNs = 0
+    start_ns: SecondsAsNs = Field(0, alias="start")
     fps: Fps | None = None
     csv: str | None = None
     log: str | None = None
@@ -155,7 +155,7 @@ class FrameTimes(Part):
 class Clock(Part):
     """World time = video time + offset; sigma 0 means that it is known."""
 
-    offset_s: SecondsAsNs = 0
+    offset_ns: SecondsAsNs = Field(0, alias="offset_s")
     sigma_s: float = Field(0.2, ge=0)
 
 

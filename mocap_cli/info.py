@@ -1,0 +1,54 @@
+"""`mocap info`: what is in this file or folder?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import click
+
+from mocap_cli.options import existing_path, json_option
+from mocap_cli.terminal import one_line, print_json
+
+_LONGEST_LIST = 12
+
+
+@click.command("info")
+@click.argument("path", type=existing_path)
+@json_option
+def info_command(path: Path, as_json: bool) -> None:
+    """Say what a session, manifest, trajectory, calibration or keypoint file holds."""
+    from pipelines.session.storage import jsonable
+    from pipelines.survey import survey
+
+    readings = survey(path)
+    if as_json:
+        print_json(
+            {"path": str(path), "readings": [{"kind": r.title, **jsonable(r.facts)} for r in readings]}
+        )
+        return
+    for reading in readings:
+        click.echo(f"{reading.path}: {reading.title}")
+        _print_facts(reading.facts, indent=2)
+
+
+def _print_facts(facts: Mapping[str, object], indent: int) -> None:
+    width = max((len(name) for name in facts), default=0)
+    for name, value in facts.items():
+        label = " " * indent + one_line(name)
+        if isinstance(value, Mapping) and value:
+            click.echo(label)
+            _print_facts(value, indent + 2)
+        else:
+            click.echo(f"{label.ljust(indent + width)}  {_text(value)}")
+
+
+def _text(value: object) -> str:
+    if value is None or value in ([], {}):
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list | tuple):
+        shown = ", ".join(_text(item) for item in value[:_LONGEST_LIST])
+        return f"{shown}, ... ({len(value)})" if len(value) > _LONGEST_LIST else shown
+    return one_line(str(value))
