@@ -7,6 +7,7 @@ quaternions xyzw, transforms named target_from_source, missing is NaN and never 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,3 +81,82 @@ class Recording:
     name: str
     motion: JointMotion | None
     cameras: dict[str, Trajectory]
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A channel of a log."""
+
+    name: str
+    type: str  # in the spelling of ROS 2 (nav_msgs/msg/Odometry) or the schema's own (foxglove.PoseInFrame)
+    encoding: str  # ros1, cdr, json, protobuf
+    count: int
+    first_ns: int | None  # receive stamps; None without messages
+    last_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One decoded message: `value` has the schema's fields as attributes, whatever the encoding was."""
+
+    topic: Topic
+    receive_ns: int
+    value: Any
+
+
+@dataclass(frozen=True, slots=True)
+class PoseSample:
+    """target_from_source at one moment: poses, odometry, transforms."""
+
+    stamp_ns: int  # header
+    receive_ns: int
+    target: str  # frame ids, as the message states them
+    source: str
+    position: tuple[float, float, float]
+    quaternion_xyzw: tuple[float, float, float, float]
+    covariance: Float | None = None  # [6, 6] as ROS orders it: x y z, then rotation about fixed x y z axes
+
+
+@dataclass(frozen=True, slots=True)
+class AngleSample:
+    """A gimbal's attitude at one moment: three angles in the order and unit of the log, or a quaternion."""
+
+    stamp_ns: int
+    receive_ns: int
+    angles: tuple[float, float, float] | None
+    quaternion_xyzw: tuple[float, float, float, float] | None
+
+
+@dataclass(frozen=True, slots=True)
+class IntrinsicsSample:
+    """What a CameraInfo says."""
+
+    stamp_ns: int
+    receive_ns: int
+    intrinsics: Intrinsics
+
+
+@dataclass(frozen=True, slots=True)
+class PictureSample:
+    """A picture in a log, still encoded; `data` may be a view into the message."""
+
+    stamp_ns: int
+    receive_ns: int
+    encoding: str  # jpeg, png, or the pixel layout of a raw image: rgb8, bgr8, mono8, bayer_rggb8, ...
+    width: int | None  # None for compressed pictures
+    height: int | None
+    step: int | None  # bytes of a row
+    data: NDArray[np.uint8]
+
+
+Sample = PoseSample | AngleSample | IntrinsicsSample | PictureSample
+
+
+@dataclass(frozen=True)
+class Occupancy:
+    """A voxel map: probability of being occupied, NaN where nothing is known."""
+
+    probability: NDArray[np.float32]  # [X, Y, Z]
+    origin: Float  # [3] m, the corner of voxel (0, 0, 0), world
+    resolution_m: float
+    from_ns: int = 0  # the time from which it holds

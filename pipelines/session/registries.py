@@ -6,7 +6,7 @@ in this package or in a package of the user's own. An entry point names an objec
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -14,7 +14,16 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 from pipelines.geometry.noise import NoiseModel, build, parse
 from pipelines.session.errors import DataError
-from pipelines.session.records import CalibratedCamera, Detections, JointMotion, Recording, Trajectory
+from pipelines.session.records import (
+    CalibratedCamera,
+    Detections,
+    JointMotion,
+    Message,
+    Occupancy,
+    Recording,
+    Topic,
+    Trajectory,
+)
 
 T = TypeVar("T")
 
@@ -71,6 +80,43 @@ class JointFormat(Format, Protocol):
 
     def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
         """Read them as metres, z up; `unit` (m, cm, mm), `axes` (z-up, y-up) where the user states them."""
+
+
+class Log(Protocol):
+    """An open recording of one or more files; a context manager that closes them."""
+
+    @property
+    def topics(self) -> Sequence[Topic]:
+        """The channels, by name."""
+
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """What could not be read so far, counted by cause."""
+
+    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """The messages of some channels in the order of receipt, one at a time; others are not decoded."""
+
+    def __enter__(self) -> Log:
+        """The log itself."""
+
+    def __exit__(self, *exception: object) -> None:
+        """Close the files."""
+
+
+@runtime_checkable
+class LogFormat(Format, Protocol):
+    """Recordings of messages."""
+
+    def open_log(self, paths: Sequence[Path]) -> Log:
+        """Open a recording: one file, the parts of a split one in order, or a bag's folder."""
+
+
+@runtime_checkable
+class MapFormat(Format, Protocol):
+    """What stands around."""
+
+    def read_map(self, path: Path) -> Occupancy:
+        """Read it as voxels, in the axes of the file."""
 
 
 class Export(Protocol):

@@ -1,0 +1,50 @@
+# The doors of this house. `make demo` and `make test` set up all they need by themselves.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+DEMO := demo
+
+.PHONY: setup demo test lint bench sample lock clean
+.DELETE_ON_ERROR:
+
+setup: $(STAMP)
+
+# The stamp is younger than the lock file only after everything in it was installed.
+$(STAMP): requirements.lock pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	touch $(STAMP)
+
+demo: setup
+	mkdir -p $(DEMO)
+	$(BIN)/mocap ingest sample_data/ring_walk/flight.yaml -o $(DEMO)/ring_walk.session
+	$(BIN)/mocap reconstruct $(DEMO)/ring_walk.session
+	$(BIN)/mocap report $(DEMO)/ring_walk.session
+	$(BIN)/mocap export $(DEMO)/ring_walk.session --to trc,csv,tum --overwrite
+	@echo "Open $(DEMO)/ring_walk.session/report/index.html in a browser."
+
+test: setup
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+lint: setup
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: setup
+	$(BIN)/python -m benchmarks.triangulation
+
+# Write the sample flight again: the same bytes as in the repository.
+sample: setup
+	$(BIN)/python sample_data/make_sample.py
+
+# Pin the newest versions that pyproject.toml allows (needs uv).
+lock:
+	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --upgrade \
+	    --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate --no-header -o requirements.lock
+
+clean:
+	rm -rf $(VENV) $(DEMO) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
