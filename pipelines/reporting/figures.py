@@ -54,7 +54,8 @@ MOST_BINS = 300
 SNAPSHOTS = 7
 _LINE_STYLES = ("-", (0, (4, 1.5)), (0, (1, 1.2)))
 _STRIDE_M = 1.3  # between two snapshots of the body
-_TALLEST_M = 2.6  # higher than a raised hand; what lies above is cut off
+# Above a raised hand, and below the ground by more than errors explain: what lies beyond is cut off.
+_TALLEST_M, _DEEPEST_M = 2.6, 0.5
 # World coordinates beyond this are shown relative to a round number near them.
 _FAR_M = 10_000.0
 
@@ -108,7 +109,7 @@ def _timeline(cameras: tuple[CameraRow, ...]) -> Plate:
         _quiet(axes)
         title = "When each camera had frames and poses"
         told = [_spoken(camera) for camera in cameras]
-        svg = inline_svg(figure, "timeline", title, " ".join(told))
+        svg = inline_svg(figure, "figure-timeline", title, " ".join(told))
     gaps = any(camera.gaps_s for camera in cameras)
     caption = "A bar spans the frames of a camera" + (
         "; where it is cut to a thin line, its pose log has a gap." if gaps else "; no pose log has a gap."
@@ -173,7 +174,7 @@ def _top_view(
         title = "Seen from above"
         paths = [f"{name} over {quantity(_length_m(t.position), 'm')}" for name, t in tracks.items()]
         paths += [f"the actor over {quantity(_length_m(person), 'm')}" for person in people]
-        svg = inline_svg(figure, "top", title, f"Paths on the ground plane: {listing(paths)}.")
+        svg = inline_svg(figure, "figure-top", title, f"Paths on the ground plane: {listing(paths)}.")
     caption = "Paths of the cameras" + (" and of the actor (middle of the measured joints)" if people else "")
     caption += "; an open circle marks the start, short strokes the direction of view."
     return Plate("top", title, caption + _decimation(step, "pose"), svg)
@@ -281,7 +282,7 @@ def _over_time(summary: Summary, motion: Motion) -> Plate:
             else f"The median over joints lies between {quantity(float(np.nanmin(middle)), unit)} and "
             f"{quantity(float(middle[worst]), unit)}, the largest at {quantity(float(centres[worst]), 's')}."
         )
-        svg = inline_svg(figure, "time", title, told)
+        svg = inline_svg(figure, "figure-time", title, told)
     caption = (
         f"Above: {what} of the measured joints, median and the range from the 10th to the 90th percentile. "
         "Below: the share of joints measured, and why the others were not."
@@ -349,7 +350,7 @@ def _joint_bars(summary: Summary) -> Plate:
         axes.tick_params(axis="y", length=0)
         title = "What became of every joint"
         told = listing(f"{joint_label(row.name)} {percent(row.share)}" for row in rows)
-        svg = inline_svg(figure, "joints", title, f"Share measured: {told}.")
+        svg = inline_svg(figure, "figure-joints", title, f"Share measured: {told}.")
     return Plate("joints", title, "Colours as in the figure of errors over time.", svg)
 
 
@@ -384,7 +385,7 @@ def _bone_lengths(summary: Summary) -> Plate:
             f"{f'{b.side} {b.name}'.strip()} {quantity(100 * b.median_m, 'cm')} ± {percent(b.spread)}"
             for b in bones
         )
-        svg = inline_svg(figure, "bones", title, f"Median and relative spread: {told}.")
+        svg = inline_svg(figure, "figure-bones", title, f"Median and relative spread: {told}.")
     caption = (
         "Median and the range from the 10th to the 90th percentile; left in blue, above, right in orange."
     )
@@ -402,9 +403,10 @@ def _snapshots(summary: Summary, motion: Motion) -> Plate:
     # The median over the snapshots: a joint far below the ground must not lift every body.
     ground = float(np.median(np.nanmin(position[..., 2], axis=1)))
     top = float(np.clip(np.nanmax(position[..., 2]) - ground + 0.1, 1.0, _TALLEST_M))
+    bottom = float(np.clip(np.nanmin(position[..., 2]) - ground, -_DEEPEST_M, 0.0)) - 0.05
     width = _STRIDE_M * SNAPSHOTS
     with page_style():
-        figure = Figure((WIDTH_IN, 0.5 + (WIDTH_IN - 0.6) * (top + 0.05) / width), layout="constrained")
+        figure = Figure((WIDTH_IN, 0.5 + (WIDTH_IN - 0.6) * (top - bottom) / width), layout="constrained")
         axes = figure.subplots()
         labels = []
         for k, body in enumerate(position):
@@ -412,7 +414,8 @@ def _snapshots(summary: Summary, motion: Motion) -> Plate:
             _draw_body(axes, aside + _STRIDE_M * k, up - ground, joints)
             labels.append(f"{fixed((int(motion.t_ns[chosen[k]]) - summary.origin_ns) / 1e9)} s")
         axes.set_xlim(-_STRIDE_M / 2, width - _STRIDE_M / 2)
-        axes.set_ylim(-0.05, top)
+        axes.set_ylim(bottom, top)
+        axes.set_yticks(np.arange(0.0, top, 0.5))
         axes.set_aspect("equal")
         axes.set_xticks(_STRIDE_M * np.arange(len(chosen)), labels)
         axes.set_ylabel("height (m)")
@@ -422,11 +425,12 @@ def _snapshots(summary: Summary, motion: Motion) -> Plate:
         axes.tick_params(axis="x", length=0)
         title = "The body at a few moments"
         told = f"{plural(len(chosen), 'snapshot')} at {listing(labels)}."
-        svg = inline_svg(figure, "body", title, told)
+        svg = inline_svg(figure, "figure-body", title, told)
     whose = "" if motion.position.shape[1] == 1 else " of the first person"
     caption = (
         f"The fullest skeleton{whose} in each stretch of time, facing right and seen from its right, "
-        "half from the front; left limbs in blue, right limbs in orange. Heights count from the lowest joint."
+        "half from the front; left limbs in blue, right limbs in orange. "
+        "Heights count from where the feet stand."
     )
     return Plate("body", title, caption, svg)
 

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipelines.reporting.motion import errors_mm, motion_from_skeleton, share_inside_95, truth_at
+from pipelines.session.tables import STATUS
+
+from .conftest import FRAMES, JOINTS, OFFSET_M, make_skeleton, make_truth, statuses
+
+
+def test_rows_in_any_order_give_the_same_arrays() -> None:
+    table = make_skeleton(30)
+    motion = motion_from_skeleton(table)
+    shuffled = motion_from_skeleton(table.sample(frac=1, random_state=1))
+    order = [shuffled.joints.index(name) for name in motion.joints]
+    assert motion.joints == JOINTS
+    assert np.array_equal(motion.t_ns, shuffled.t_ns)
+    np.testing.assert_array_equal(motion.position, shuffled.position[:, :, order])
+    np.testing.assert_array_equal(motion.status, shuffled.status[:, :, order])
+
+
+def test_a_cell_without_a_row_has_no_status() -> None:
+    motion = motion_from_skeleton(make_skeleton(10).drop(index=3))
+    assert motion.status[0, 0, motion.joints.index(JOINTS[3])] == -1
+    assert np.count_nonzero(motion.status == -1) == 1
+
+
+def test_error_is_the_offset_wherever_the_joint_was_measured() -> None:
+    motion = motion_from_skeleton(make_skeleton())
+    error = errors_mm(motion, truth_at(make_truth(), motion))
+    measured = statuses(FRAMES) == "ok"
+    assert np.array_equal(np.isfinite(error[:, 0]), measured)
+    # sqrt(20^2 + 10^2) mm, to the rounding of metres at a distance of some metres.
+    np.testing.assert_allclose(error[:, 0][measured], 1000 * np.linalg.norm(OFFSET_M), atol=1e-9)
+
+
+def test_truth_is_interpolated_but_not_beside_a_hole_nor_outside() -> None:
+    motion = motion_from_skeleton(make_skeleton(20))
+    truth = make_truth(20)
+    # Every second stamp: those between are the mean of their neighbours, a straight line in time.
+    stamps = motion.t_ns
+    coarse = truth[truth["t_ns"].isin(stamps[::2])]
+    between = truth_at(coarse, motion)
+    dense = truth_at(truth, motion)
+    np.testing.assert_allclose(between[1], (dense[0] + dense[2]) / 2, atol=1e-9)
+    assert np.isnan(between[-1]).all()  # after the last stamp
+    # Without the stamps 6, 8 and 10 the hole is four usual steps of two.
+    holed = coarse[~coarse["t_ns"].isin(stamps[[6, 8, 10]])]
+    assert np.isnan(truth_at(holed, motion)[5:12]).all()
+    # A joint that is missing at one stamp is missing on both sides of it.
+    nose = coarse[~((coarse["joint"] == "nose") & (coarse["t_ns"] == stamps[6]))]
+    result = truth_at(nose, motion)[:, 0, JOINTS.index("nose"), 0]
+    assert np.array_equal(np.isnan(result), np.isin(np.arange(20), [5, 6, 7, 19]))
+
+
+def test_people_are_compared_with_the_nearest_truth() -> None:
+    def shifted(table: pd.DataFrame, person: int, metres: float) -> pd.DataFrame:
+        return table.assign(person=person, x=table["x"] + metres)
+
+    skeleton = make_skeleton(20)
+    truth = make_truth(20)
+    motion = motion_from_skeleton(pd.concat([shifted(skeleton, 0, 0), shifted(skeleton, 1, 5)]))
+    swapped = pd.concat([shifted(truth, 0, 5), shifted(truth, 1, 0)])
+    error = errors_mm(motion, truth_at(swapped, motion))
+    assert np.nanmax(error) == pytest.approx(1000 * np.linalg.norm(OFFSET_M), abs=1e-6)
+
+
+def test_truth_of_other_joints_compares_with_nothing() -> None:
+    motion = motion_from_skeleton(make_skeleton(5))
+    assert np.isnan(truth_at(make_truth(5).assign(joint="tail"), motion)).all()
+
+
+def test_a_calibrated_covariance_holds_95_percent_of_the_truth() -> None:
+    motion = motion_from_skeleton(make_skeleton(400))
+    rng = np.random.default_rng(7)
+    factor = np.array([[0.03, 0.0, 0.0], [0.01, 0.02, 0.0], [-0.02, 0.005, 0.05]])
+    covariance = (factor @ factor.T)[np.triu_indices(3)]
+    motion = replace(
+        motion,
+        status=np.full(motion.status.shape, STATUS.index("ok"), dtype=np.int8),
+        position=np.zeros(motion.position.shape),
+        covariance=np.broadcast_to(covariance, motion.covariance.shape),
+    )
+    truth = rng.standard_normal(motion.position.shape) @ factor.T
+    share = share_inside_95(motion, truth)
+    # 6 800 draws: the standard deviation of the share is sqrt(.95 * .05 / 6800) = 0.0026; 4 of them.
+    assert share == pytest.approx(0.95, abs=0.011)
+
+
+@pytest.mark.parametrize("value", [np.nan, 0.0])
+def test_no_share_without_a_usable_covariance(value: float) -> None:
+    motion = motion_from_skeleton(make_skeleton(10))
+    motion = replace(motion, covariance=np.full(motion.covariance.shape, value))
+    assert share_inside_95(motion, truth_at(make_truth(10), motion)) is None

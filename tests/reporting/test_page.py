@@ -1,0 +1,296 @@
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipelines.reporting.content import SessionContent
+from pipelines.reporting.page import render_page
+from pipelines.reporting.svg import PALETTE
+from pipelines.reporting.wording import THIN
+
+from .conftest import (
+    FRAMES,
+    JOINTS,
+    START_NS,
+    make_metrics,
+    make_poses,
+    make_session,
+    make_skeleton,
+    make_truth,
+)
+
+_VOID = {"meta", "br", "hr", "img", "input", "link"}
+
+
+class _Outline(HTMLParser):
+    """Every element with the names of its attributes, ids, references and text; checks the nesting."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.elements: list[tuple[str, tuple[str, ...]]] = []
+        self.ids: list[str] = []
+        self.references: list[str] = []
+        self.links: list[str] = []
+        self.words: list[str] = []
+        self._open: list[str] = []
+        self.feed(page)
+        self.close()
+        assert not self._open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, tuple(name for name, _ in attrs)))
+        if tag not in _VOID:
+            self._open.append(tag)
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            elif name in {"aria-labelledby", "aria-describedby"}:
+                self.references.append(value or "")
+            elif name in {"href", "src", "xlink:href"}:
+                self.links.append(value or "")
+            self.references += re.findall(r"url\(#([^)]+)\)", value or "")
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        self._open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split()).replace(THIN, " ")
+
+    @property
+    def outside_drawings(self) -> list[tuple[str, tuple[str, ...]]]:
+        kept, drawing = [], False
+        for element in self.elements:
+            drawing = drawing or element[0] == "svg"
+            drawing = drawing and element[0] != "figcaption"
+            if not drawing:
+                kept.append(element)
+        return kept
+
+    def count(self, tag: str) -> int:
+        return sum(name == tag for name, _ in self.elements)
+
+
+@pytest.fixture(scope="module")
+def page(content: SessionContent) -> str:
+    return render_page(content)
+
+
+def test_page_is_whole_and_small(page: str) -> None:
+    outline = _Outline(page)
+    assert page.startswith("<!doctype html>")
+    assert outline.count("figure") == outline.count("svg") == 6
+    assert outline.count("h1") == 1
+    assert len(page.encode()) < 1_000_000
+
+
+def test_ids_are_unique_and_references_lead_somewhere(page: str) -> None:
+    outline = _Outline(page)
+    assert [name for name, count in Counter(outline.ids).items() if count > 1] == []
+    wanted = outline.references + [link.removeprefix("#") for link in outline.links]
+    assert set(wanted) <= set(outline.ids)
+
+
+def test_page_loads_nothing_and_runs_nothing(page: str) -> None:
+    outline = _Outline(page)
+    assert all(link.startswith("#") for link in outline.links)
+    assert not {"script", "iframe", "object", "embed", "link", "img"} & {tag for tag, _ in outline.elements}
+    assert not [name for _, names in outline.elements for name in names if name.startswith("on")]
+    assert not re.search(r"@import|url\((?!#)", page)
+
+
+def test_every_header_cell_has_a_scope(page: str) -> None:
+    headers = [names for tag, names in _Outline(page).elements if tag == "th"]
+    assert headers
+    assert all("scope" in names for names in headers)
+
+
+def test_figures_take_their_colours_from_the_page(page: str) -> None:
+    drawings = re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)
+    assert not re.search(r"#[0-9a-f]{6}\b", "".join(re.findall(r"<[^>]+>", "".join(drawings))))
+    for variable in re.findall(r"var\((--[a-z0-9-]+)\)", "".join(drawings)):
+        assert f"{variable}: #" in page
+    # Light and dark both define the whole palette.
+    for variable in PALETTE.values():
+        assert page.count(f"{variable}: #") == 2, variable
+
+
+def test_same_content_gives_the_same_bytes_whatever_was_drawn_before(
+    content: SessionContent, page: str
+) -> None:
+    with mpl.rc_context({"font.size": 20, "axes.facecolor": "red", "svg.fonttype": "path"}):
+        again = render_page(content)
+        assert mpl.rcParams["font.size"] == 20
+    assert again == page
+
+
+def test_numbers_of_the_page_are_those_of_the_data(page: str) -> None:
+    text = _Outline(page).text
+    assert "81.1 % of 10 200 joint-frames" in text
+    assert "left wrist 45.0 % 22.4 0.0" in text  # the row of the table
+    assert "left wrist 45.0 %," in text  # the description of the figure
+    assert "the largest at" in text
+    # The actor's arc: 1.2 m/s for 19 s (the last second has no pose), less the 2 s nobody saw.
+    arc = re.search(r"the actor over ([\d.]+) m", text)
+    assert arc is not None
+    # Two hops of 1/30 s are lost to the hole, and the median of the swinging joints wobbles a little.
+    assert float(arc.group(1)) == pytest.approx(1.2 * 17, rel=0.05)
+
+
+def test_page_without_truth(content: SessionContent) -> None:
+    metrics: dict[str, object] = {
+        "method": "dlt",
+        "reprojection_px": {"median": 4.4, "mean": 4.2},
+        "per_joint": {},
+    }
+    text = _Outline(render_page(replace(content, truth=None, metrics=metrics))).text
+    assert "Reprojection error over time" in text
+    assert "MPJPE" not in text
+
+
+def test_page_before_the_reconstruction(content: SessionContent) -> None:
+    ingested = replace(content, skeleton=None, metrics=None, truth=None, stages={})
+    outline = _Outline(render_page(ingested))
+    assert "not reconstructed yet" in outline.text
+    assert outline.count("figure") == 2
+
+
+def test_page_with_nothing_reconstructed(content: SessionContent) -> None:
+    skeleton = make_skeleton(50).assign(status="rejected")
+    skeleton[["x", "y", "z", "reprojection_px"]] = np.nan
+    text = _Outline(render_page(replace(content, skeleton=skeleton, metrics={}, truth=None))).text
+    assert "Nothing was reconstructed: none of 850 joint-frames passed." in text
+    assert "disagreed by more than pixel and pose noise explain (rejected)" in text
+
+
+def test_page_of_an_empty_skeleton(content: SessionContent) -> None:
+    empty = replace(content, skeleton=make_skeleton(5)[:0], metrics={}, truth=None)
+    assert "the skeleton has no rows" in _Outline(render_page(empty)).text
+
+
+def test_page_of_a_single_frame(content: SessionContent) -> None:
+    single = replace(
+        content,
+        session=make_session(1),
+        skeleton=make_skeleton(1).assign(status="ok", x=1.0, y=2.0, z=3.0, reprojection_px=1.0),
+        truth=make_truth(1),
+        poses={name: table[:1] for name, table in make_poses().items()},
+    )
+    assert _Outline(render_page(single)).count("figure") == 6
+
+
+def test_page_of_unknown_joints_and_two_people(content: SessionContent) -> None:
+    markers = {name: f"M{k}" for k, name in enumerate(JOINTS)}
+    first = make_skeleton(40)
+    first["joint"] = first["joint"].map(markers)
+    both = pd.concat([first, first.assign(person=1, x=first["x"] + 3)])
+    outline = _Outline(render_page(replace(content, skeleton=both, metrics={}, truth=None)))
+    assert outline.count("figure") == 5  # no bone is known
+    assert "2 people" in outline.text
+    assert "person 1" in outline.text
+
+
+HOSTILE = [
+    "<script>alert(1)</script>",
+    "\"'><img src=x onerror=alert(1)>",
+    "</desc></svg></style></title><script>1</script>",
+    "{{ 7 * 7 }} ${x} $a_b^c$ %s &lt;b&gt; &#60;i&#62;",
+    'id="figure-top" url(#a) #22262a href="#x"',
+    "مشي على التل – 丘を歩く – Ходьба 🚁",
+    "long " * 40,
+    "line\nbreak\ttab\x00nul\x1besc\u202e",
+]
+
+
+def _named(content: SessionContent, name: str) -> SessionContent:
+    session = make_session(60)
+    session |= {"flight": name, "warnings": [f"w {name}"], "sources": {name: "0" * 64}}
+    cameras = session["cameras"]
+    assert isinstance(cameras, dict)
+    session["cameras"] = {name if key == "drone1" else key: camera for key, camera in cameras.items()}
+    skeleton = make_skeleton(60)
+    skeleton["joint"] = skeleton["joint"].replace("nose", name)
+    metrics = make_metrics() | {name: 3.0, "method": name}
+    return replace(
+        content,
+        name=f"s {name}",
+        session=session,
+        skeleton=skeleton,
+        metrics=metrics,
+        truth=make_truth(60),
+        poses={name if key == "drone1" else key: table for key, table in make_poses(60).items()},
+        stages={
+            name: {"key": name, "settings": {name: name}, "counts": {name: 1}, "warnings": [f"x {name}"]}
+        },
+    )
+
+
+@pytest.fixture(scope="module")
+def tame(content: SessionContent) -> _Outline:
+    return _Outline(render_page(_named(content, "tame")))
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_names_from_files_stay_text(content: SessionContent, tame: _Outline, name: str) -> None:
+    page = render_page(_named(content, name))
+    outline = _Outline(page)
+    # Not one element or attribute more than with a harmless name; in the figures, where a longer label
+    # leaves room for other ticks, none of another kind.
+    assert outline.outside_drawings == tame.outside_drawings
+    assert set(outline.elements) <= set(tame.elements)
+    assert " ".join(name.replace("\x00", "\ufffd").split())[:30] in outline.text.replace("\x00", "\ufffd")
+
+
+def test_long_flight_stays_small_and_says_what_is_left_out(content: SessionContent) -> None:
+    frames = 10 * 60 * 30
+    long_flight = replace(
+        content,
+        session=make_session(frames),
+        skeleton=make_skeleton(frames),
+        truth=make_truth(frames),
+        poses=make_poses(frames),
+    )
+    page = render_page(long_flight)
+    text = _Outline(page).text
+    assert len(page.encode()) < 2_000_000
+    # 600 s at 50 Hz are 30 000 poses: one in 50 leaves 600 of them.
+    assert "One pose in 50 is drawn." in text
+    assert "Each point stands for 2 s." in text
+
+
+def test_far_world_coordinates_are_told_from_a_round_number(content: SessionContent) -> None:
+    shift = {"x": 691_234.5, "y": 5_335_678.9}
+    assert content.skeleton is not None
+    far = replace(
+        content,
+        skeleton=content.skeleton.assign(**{axis: content.skeleton[axis] + d for axis, d in shift.items()}),
+        poses={
+            name: table.assign(**{axis: table[axis] + d for axis, d in shift.items()})
+            for name, table in content.poses.items()
+        },
+        truth=None,
+    )
+    text = _Outline(render_page(far)).text
+    assert "east of 691 000 m (m)" in text
+    assert "north of 5 335 000 m (m)" in text
+
+
+def test_frames_and_start_are_told(page: str) -> None:
+    text = _Outline(page).text
+    assert START_NS == 1_700_000_000_000_000_000
+    assert "2023-11-14 22:13:20.000 UTC" in text
+    assert f"17 joints at {FRAMES} times" in text

@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipelines.reporting.wording import (
+    THIN,
+    fixed,
+    flattened,
+    listing,
+    moment,
+    percent,
+    plain,
+    plural,
+    shortened,
+    significant,
+)
+
+
+@pytest.mark.parametrize(
+    ("share", "said"),
+    [
+        (0.0, "0"),
+        (1.0, "100"),
+        (0.9999, f">{THIN}99.9"),
+        (0.0001, f"<{THIN}0.1"),
+        (0.8105, "81.0"),
+        (0.5, "50.0"),
+    ],
+)
+def test_percent_says_all_or_nothing_only_of_all_or_nothing(share: float, said: str) -> None:
+    assert percent(share) == f"{said}{THIN}%"
+
+
+@given(st.floats(0, 1))
+def test_percent_is_never_rounded_to_an_end(share: float) -> None:
+    assert (percent(share) in {f"0{THIN}%", f"100{THIN}%"}) == (share in {0, 1})
+
+
+@given(st.text())
+def test_shortened_fits_a_label(name: str) -> None:
+    label = shortened(name)
+    assert len(label) <= 24
+    assert label.isprintable()
+
+
+def test_numbers() -> None:
+    assert fixed(1234567.89) == f"1{THIN}234{THIN}567.9"
+    assert fixed(-0.5) == "−0.5"
+    assert fixed(None) == "–"
+    assert significant(12345.6) == f"12{THIN}346"
+    assert significant(0.0123) == "0.01"
+    assert significant(1.5e-7) == "1.5e−07"
+    assert plural(1, "frame") == "1 frame"
+    assert plural(2000, "frame") == f"2{THIN}000 frames"
+    assert listing(["a", "b", "c"]) == "a, b and c"
+    assert listing([]) == ""
+
+
+def test_moment_tells_the_epoch_from_a_clock_of_its_own() -> None:
+    assert moment(1_700_000_000_123_000_000) == "2023-11-14 22:13:20.123 UTC"
+    assert moment(12_500_000_000) == f"12.500{THIN}s on the log's own clock"
+
+
+def test_settings_are_flattened_in_their_order() -> None:
+    settings: dict[str, object] = {
+        "method": "robust",
+        "gates": {"chi2": 9.21, "on": True},
+        "cameras": [],
+        "noise": None,
+    }
+    assert flattened(settings) == [
+        ("method", "robust"),
+        ("gates.chi2", "9.21"),
+        ("gates.on", "yes"),
+        ("cameras", "none"),
+        ("noise", "none"),
+    ]
+    assert plain([{"a": 1}, 2]) == "a: 1, 2"
