@@ -38,7 +38,6 @@ def render_page(content: SessionContent) -> str:
     The same content gives the same bytes: no dates of making, no versions, no paths of this machine.
     Whatever stands in the session's files is escaped; the page loads nothing and runs nothing.
     """
-    # Imported here: the templates are needed by reports alone.
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 

@@ -30,6 +30,8 @@ from pipelines.session.tables import STATUS
 DOUBTFUL_COVERAGE = 0.8
 # A status is named among the doubts from this share of joint-frames on.
 NOTABLE_LOSS = 0.01
+# A camera is named among the doubts when its reprojection error is this many times the usual one.
+ODD_CAMERA = 2.0
 # A calibrated 95 % ellipsoid holds 95 % of the truths; outside these shares the page says so.
 BELIEVABLE_SHARES = (0.90, 0.99)
 # Root-relative error below this part of the absolute one: the cameras' poses carry most of the error.
@@ -371,6 +373,20 @@ def _certainty(summary: Summary) -> list[str]:
     return sentences
 
 
+def _odd_cameras(summary: Summary) -> list[str]:
+    """Cameras that agree far worse with the skeleton than the others do; three at least can tell."""
+    medians = {row.name: row.median_px for row in errors_per_camera(summary) if row.median_px is not None}
+    if len(medians) < 3:
+        return []
+    usual = float(np.median(list(medians.values())))
+    return [
+        f"{name}: its keypoints lie {quantity(median, 'px')} from the joints, those of the usual camera "
+        f"{quantity(usual, 'px')}; its calibration, poses or clock may be wrong."
+        for name, median in medians.items()
+        if median > ODD_CAMERA * usual
+    ]
+
+
 def _doubts(content: SessionContent, summary: Summary) -> list[str]:
     doubts = []
     losses = sorted(((n, word) for word, n in summary.counts.items() if word != "ok"), reverse=True)
@@ -392,6 +408,7 @@ def _doubts(content: SessionContent, summary: Summary) -> list[str]:
         and (missed := camera.entry.keypoints.frames_without_person)
         >= NOTABLE_LOSS * (count := camera.entry.frames.count)
     ]
+    doubts += _odd_cameras(summary)
     doubts += summary.description.warnings
     for record in content.stages.values():
         doubts += [str(warning) for warning in items(record, "warnings")]

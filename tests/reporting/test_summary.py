@@ -164,6 +164,16 @@ def test_measures_state_every_overall_number(content: SessionContent) -> None:
     assert (row.name, row.median_px, row.mean_px, row.left_out_median_px) == ("drone1", 2.0, 3.0, 9.0)
 
 
+def test_a_camera_that_disagrees_with_the_others_is_doubtful(content: SessionContent) -> None:
+    medians = {"drone1": 5.0, "drone2": 6.0, "mast": 20.0}
+    metrics = (content.metrics or {}) | {
+        "reprojection_px_per_camera": {name: {"median": m, "mean": m} for name, m in medians.items()}
+    }
+    said = _said(replace(content, metrics=metrics))
+    assert "mast: its keypoints lie 20.0 px from the joints, those of the usual camera 6.0 px" in said
+    assert said.count("its keypoints lie") == 1
+
+
 def test_no_warnings_no_doubts(content: SessionContent) -> None:
     session = make_session() | {"warnings": []}
     cameras = session["cameras"]
