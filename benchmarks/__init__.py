@@ -1,0 +1,1 @@
+"""Measurements beside what others use; docs/benchmarks.md holds their figures."""

@@ -1,0 +1,356 @@
+"""From image points and camera poses to 3D points, over all frames, people and joints in one call.
+
+Three methods, all weighted by the square of the detector's confidence w: a view of confidence w counts as
+one whose standard deviation is pixel_sigma / w (which is what multiplying its rows by w means).
+
+- `dlt`: homogeneous linear triangulation (Hartley & Zisserman, Multiple View Geometry, 12.2) with rows in
+  pixels. The world is moved to the mean centre of the cameras that see the point and its unit is their RMS
+  distance from it; without that the result depends on the origin and collapses under pose noise.
+- `midpoint`: the point closest to the viewing lines, sum w^2 (I - d d')(X - c) = 0.
+- `robust`: least squares of the reprojection errors whitened by pixel and pose noise together. Where every
+  view stays within `gate` standard deviations, that is all. Otherwise every pair of views (above 8 cameras
+  a fixed 28 of them) proposes a point, the lowest truncated cost over all views wins (MSAC: Torr &
+  Zisserman 2000), its inliers are refined by Gauss-Newton and chosen again until they stay the same.
+
+Two views agree by their epipolar distance alone. If only two of three or more views agree and another
+pair agrees on a different place, chance cannot be told from truth and the joint is `rejected`: on the walk
+of docs/benchmarks.md this costs 0.1 % of the joint-frames and takes the mean error from 13.6 to 13.0 mm.
+
+A gate in pixels would throw out good views as soon as poses are noisy: 1 deg is 26 px at f = 1500. State
+the pose noise in `Views.pose_sigma`, and let `estimate_noise` raise the pixel noise to what the views show.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import combinations, islice
+from itertools import count as count_up
+from math import comb, cos, gcd, radians
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Int8 = NDArray[np.int8]
+Bool = NDArray[np.bool_]
+Method = Literal["dlt", "midpoint", "robust"]
+
+MIN_PARALLAX_DEG = 2.0
+"""Below it depth is some thirty times as uncertain as the rest."""
+
+GATE = 4.0
+"""In standard deviations of a view's image point: one good view in 3000 falls outside."""
+
+STATUS = ("ok", "filled", "few_views", "low_parallax", "rejected", "not_detected", "no_pose")
+"""Meaning of `Triangulation.status`; the words of a session's skeleton."""
+
+_MAX_PAIRS = 28  # all of 8 views; above, enough that with half the views bad one pair in 1000 cases is clean
+_BLOCK = 4096  # joint-frames that a thread takes at once
+_NOISE_SAMPLE = 20_000  # joint-frames; a median over them is good to one per cent
+_NOISE_ROUNDS = 2
+_START_WIDTH = (
+    2.0  # a constant pose error gives few different pairs: undoubled, 2 % of draws at n = 3 lost all
+)
+
+
+@dataclass(frozen=True)
+class Views:
+    """What C cameras saw of N joint-frames, and where they were at F instants.
+
+    A view is absent where `xy` or the pose is NaN or `weight` is 0. Image points are normalised and free of
+    distortion, (x/z, y/z) in the camera's frame. Joints of one instant share its row of poses; N is fastest
+    when they stand together.
+    """
+
+    xy: Float  # [N, C, 2]
+    weight: Float  # [N, C] confidence
+    pose_index: Int64  # [N] row of the three arrays below
+    position: Float  # [F, C, 3] m, camera centre in the world
+    rotation: Float  # [F, C, 3, 3] world_from_camera
+    focal: Float  # [C] px, mean of fx and fy
+    pixel_sigma: Float  # [C] px, per axis, of a view of confidence 1
+    pose_sigma: Float  # [F, C, 2] per axis: centre in m, rotation in rad; 0 where exact
+
+    def __post_init__(self) -> None:
+        """Check the shapes against each other and that every pose row exists."""
+        n, cameras = self.weight.shape
+        instants = self.position.shape[0]
+        expected = {
+            "xy": (n, cameras, 2),
+            "pose_index": (n,),
+            "position": (instants, cameras, 3),
+            "rotation": (instants, cameras, 3, 3),
+            "focal": (cameras,),
+            "pixel_sigma": (cameras,),
+            "pose_sigma": (instants, cameras, 2),
+        }
+        for name, shape in expected.items():
+            actual = getattr(self, name).shape
+            if actual != shape:
+                raise ValueError(f"{name} has the shape {actual}, not {shape}")
+        if n and (self.pose_index.min() < 0 or self.pose_index.max() >= instants):
+            raise ValueError(f"pose_index leaves 0..{instants - 1}")
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points alone; NaN, and no inliers, wherever `status` is not "ok"."""
+
+    points: Float  # [N, 3] m, world
+    inlier: Bool  # [N, C]
+    status: Int8  # [N] index into STATUS
+
+
+@dataclass(frozen=True)
+class Triangulation(Points):
+    """Points with their uncertainty and residuals, NaN wherever `status` is not "ok".
+
+    `covariance` is first order: pixel and pose noise of the inlier views, independent between cameras. It
+    holds the part of a pose error that all joints share, so it speaks for the absolute position.
+    """
+
+    covariance: Float  # [N, 3, 3] m^2
+    views: Int64  # [N] inlier views
+    residual_px: Float  # [N, C] reprojection distance of every view, rejected ones too; inf behind a camera
+
+
+def triangulate(
+    views: Views,
+    *,
+    method: Method,
+    min_views: int = 2,
+    min_parallax_deg: float = MIN_PARALLAX_DEG,
+    gate: float = GATE,
+    threads: int = 1,
+) -> Triangulation:
+    """Triangulate every joint-frame; the same bytes for any number of threads.
+
+    Statuses besides "ok": `not_detected` by any camera; `few_views` detect it; `no_pose` leaves fewer than
+    `min_views` of the detections; `low_parallax`: no two viewing lines differ by `min_parallax_deg` (facing
+    each other counts as none); `rejected`: fewer than `min_views` views agree within `gate` (`robust`), or
+    the point lies behind one of its cameras (`dlt` and `midpoint`, which reject no view).
+
+    Args:
+        views: what was seen.
+        method: see the module; `min_views` and the parallax hold for all three, `gate` for `robust`.
+        min_views: views needed, and inliers needed; at least 2.
+        min_parallax_deg: least angle between two viewing lines.
+        gate: in standard deviations of a view's image point, pixel and pose noise together.
+        threads: at most this many, and no more than there are processors.
+
+    Raises:
+        ValueError: min_views below 2, a parallax or gate out of range.
+    """
+    n, cameras = views.weight.shape
+    covariance, count, residual_px = np.empty((n, 3, 3)), np.empty(n, np.int64), np.empty((n, cameras))
+    found = _run(views, method, min_views, min_parallax_deg, gate, threads, covariance, count, residual_px)
+    return Triangulation(found.points, found.inlier, found.status, covariance, count, residual_px)
+
+
+def locate(
+    views: Views,
+    *,
+    method: Method,
+    min_views: int = 2,
+    min_parallax_deg: float = MIN_PARALLAX_DEG,
+    gate: float = GATE,
+    threads: int = 1,
+) -> Points:
+    """What `triangulate` does without covariances and residuals: for studies over many draws of noise."""
+    nothing = np.empty((0, 3, 3)), np.empty(0, np.int64), np.empty((0, 0))
+    return _run(views, method, min_views, min_parallax_deg, gate, threads, *nothing)
+
+
+def _run(
+    views: Views,
+    method: Method,
+    min_views: int,
+    min_parallax_deg: float,
+    gate: float,
+    threads: int,
+    covariance: Float,
+    count: Int64,
+    residual_px: Float,
+) -> Points:
+    """Run the kernel over blocks of joint-frames; fills the last three arrays unless they are empty."""
+    if min_views < 2 or not 0 < min_parallax_deg < 90 or not gate > 0:
+        raise ValueError(
+            f"min_views={min_views}, min_parallax_deg={min_parallax_deg}, gate={gate}: out of range"
+        )
+    from pipelines.geometry import triangulation_kernels as kernels
+
+    n, cameras = views.weight.shape
+    found = Points(np.empty((n, 3)), np.empty((n, cameras), np.bool_), np.empty(n, np.int8))
+    code = {"dlt": kernels.DLT, "midpoint": kernels.MIDPOINT, "robust": kernels.ROBUST}[method]
+    xy, weight, position, rotation, focal, pixel_sigma, pose_sigma = (
+        np.ascontiguousarray(array, np.float64)
+        for array in (
+            views.xy,
+            views.weight,
+            views.position,
+            views.rotation,
+            views.focal,
+            views.pixel_sigma,
+            views.pose_sigma,
+        )
+    )
+    pose_index = np.ascontiguousarray(views.pose_index, np.int64)
+    pairs, pair_count = _pair_table(cameras)
+    cos2_min = cos(radians(min_parallax_deg)) ** 2
+
+    def block(first: int, last: int) -> None:
+        kernels.triangulate_range(
+            first,
+            last,
+            code,
+            xy,
+            weight,
+            pose_index,
+            position,
+            rotation,
+            focal,
+            pixel_sigma,
+            pose_sigma,
+            pairs,
+            pair_count,
+            min_views,
+            cos2_min,
+            float(gate) ** 2,
+            found.points,
+            covariance,
+            count,
+            found.inlier,
+            residual_px,
+            found.status,
+        )
+
+    starts = range(0, n, _BLOCK)
+    workers = min(threads, os.cpu_count() or 1, len(starts))
+    if workers <= 1:
+        block(0, n)
+        return found
+    # The kernel releases the interpreter and each block writes its own rows: plain threads do, and unlike
+    # numba's own they may be started from several threads at once.
+    with ThreadPoolExecutor(workers) as pool:
+        for done in [pool.submit(block, first, min(first + _BLOCK, n)) for first in starts]:
+            done.result()
+    return found
+
+
+def estimate_noise(
+    views: Views,
+    *,
+    min_parallax_deg: float = MIN_PARALLAX_DEG,
+    gate: float = GATE,
+    threads: int = 1,
+) -> Float:
+    """Pixel noise per axis [C] that explains how far the views disagree; the stated one is the floor.
+
+    Whatever the stated pixel and pose noise leave unexplained - poses worse than their log says, a detector
+    less sharp than assumed - is added as pixel noise by one factor k for all cameras: k^2 is the median over
+    joint-frames of the whitened squared residuals over the median of their chi-square distribution with
+    2m - 3 degrees of freedom. The first k comes from one pair of views per joint-frame, which holds up to
+    29 % bad views however many cameras there are; then from the inliers that `robust` finds with it.
+
+    One factor, not one per camera: under constant pose errors a camera's residuals are a single draw, and
+    weighting by them costs 3 to 7 % (docs/benchmarks.md).
+
+    Use it as `replace(views, pixel_sigma=estimate_noise(views))` wherever poses come from a log, also one
+    that states its noise: where that was true, little changes. For still, calibrated cameras state the
+    detector's pixel noise instead: their disagreement is the detector's, and a gate widened by it would
+    keep its errors.
+    """
+    n, cameras = views.weight.shape
+    if cameras < 2:
+        return views.pixel_sigma
+    chosen = np.linspace(0, n - 1, min(n, _NOISE_SAMPLE)).astype(np.int64)
+    sample = replace(
+        views, xy=views.xy[chosen], weight=views.weight[chosen], pose_index=views.pose_index[chosen]
+    )
+
+    def explain(seen: Views, method: Method, sigma: Float) -> Float:
+        result = triangulate(
+            replace(seen, pixel_sigma=sigma),
+            method=method,
+            min_parallax_deg=min_parallax_deg,
+            gate=gate,
+            threads=threads,
+        )
+        return _explaining_sigma(sample, result)
+
+    table, count = _pair_table(cameras)
+    pair = table[cameras, np.arange(len(chosen)) % count[cameras]]
+    in_pair = np.zeros_like(sample.weight)
+    np.put_along_axis(in_pair, pair, 1.0, axis=1)
+    in_pairs = replace(sample, weight=sample.weight * in_pair)
+    sigma = _START_WIDTH * explain(in_pairs, "midpoint", views.pixel_sigma)
+    for _ in range(_NOISE_ROUNDS):
+        sigma = explain(sample, "robust", sigma)
+    return sigma
+
+
+def _explaining_sigma(views: Views, result: Triangulation) -> Float:
+    """Pixel noise per axis [C] under which the inliers' residuals have their median size."""
+    seen = np.where(result.inlier, views.weight, np.nan)
+    variance = views.pixel_sigma**2 + seen**2 * _pose_variance_px(views, result.points)  # of confidence 1
+    whitened = np.nansum((seen * result.residual_px) ** 2 / variance, axis=1)
+    freedom = 2.0 * result.views - 3.0
+    ok = freedom > 0
+    if not ok.any():
+        return views.pixel_sigma
+    # Median of the chi-square distribution by Wilson and Hilferty (1931).
+    factor = np.median(whitened[ok] / (freedom[ok] * (1 - 2 / (9 * freedom[ok])) ** 3))
+    typical = np.array(
+        [np.median(of[np.isfinite(of)]) if np.isfinite(of).any() else 0.0 for of in variance.T]
+    )
+    sigma: Float = np.sqrt(views.pixel_sigma**2 + max(factor - 1.0, 0.0) * typical)
+    return sigma
+
+
+def _pose_variance_px(views: Views, points: Float) -> Float:
+    """What pose noise adds to the variance of every image point [N, C], px^2 per axis near the axis."""
+    position, rotation = views.position[views.pose_index], views.rotation[views.pose_index]
+    depth = np.einsum("nci,nci->nc", rotation[..., 2], points[:, None] - position)
+    shift, turn = np.moveaxis(views.pose_sigma[views.pose_index], -1, 0)
+    variance: Float = views.focal**2 * ((shift / depth) ** 2 + turn**2)
+    return variance
+
+
+@cache
+def _pair_table(cameras: int) -> tuple[Int64, Int64]:
+    """Pairs of views that propose a point: [m, k] for m views in order of trial, and how many [m]."""
+    table = np.zeros((cameras + 1, _MAX_PAIRS, 2), np.int64)
+    count = np.zeros(cameras + 1, np.int64)
+    for m in range(2, cameras + 1):
+        pairs = (
+            list(islice(_spread_pairs(m), _MAX_PAIRS))
+            if comb(m, 2) > _MAX_PAIRS
+            else combinations(range(m), 2)
+        )
+        for i, j in pairs:
+            table[m, count[m]] = i, j
+            count[m] += 1
+    return table, count
+
+
+def _spread_pairs(m: int) -> Iterator[tuple[int, int]]:
+    """Distinct pairs of m views, spread over views and distances by golden section steps."""
+    seen = set()
+    for trial in count_up():
+        i = trial * _golden_step(m) % m
+        j = (i + 1 + trial * _golden_step(m - 1) % (m - 1)) % m
+        pair = (min(i, j), max(i, j))
+        if pair not in seen:
+            seen.add(pair)
+            yield pair
+
+
+def _golden_step(n: int) -> int:
+    """The first step from 0.618 n on that visits all of 0..n-1."""
+    return next(step for step in count_up(max(round(0.618 * n), 1)) if gcd(step, n) == 1)
