@@ -100,14 +100,14 @@ def reconstruct_command(
 def _print(result: Reconstructed) -> None:
     metrics: dict[str, Any] = result.metrics
     click.echo(
-        f"{metrics['method']}: {metrics['joint_frames']['ok']} of {metrics['joint_frames']['all']}"
+        f"{metrics['method']}: {metrics['status_counts']['ok']} of {metrics['status_counts']['all']}"
         f" joint-frames reconstructed"
     )
     has_truth = metrics["mpjpe_mm"] is not None
     header = ["joint", "ok %", "reproj px"] + (["MPJPE mm", "root mm", "PA mm"] if has_truth else [])
     rows = []
     for name, joint in [*metrics["per_joint"].items(), ("all", metrics)]:
-        row = [name, joint["ok_percent"], joint["reprojection_px"]["median"]]
+        row = [name, 100 * joint["reconstructed_share"], joint["reprojection_px"]["median"]]
         if has_truth:
             row += [joint.get("mpjpe_mm"), joint.get("root_mpjpe_mm"), joint.get("pa_mpjpe_mm")]
         rows.append(row)

@@ -133,7 +133,7 @@ def reconstruct(
         write_table(run.folder / "skeleton.parquet", _skeleton_table(observations, result), SKELETON)
         write_json(run.folder / "metrics.json", metrics)
         record = run.publish(
-            counts={**metrics["joint_frames"], "association": _association_counts(association)},
+            counts={**metrics["status_counts"], "association": _association_counts(association)},
             warnings=association.reasons,
         )
         progress.advance()

@@ -39,7 +39,7 @@ def report(folder: Path, *, force: bool = False) -> Reported:
     with locked(folder) as session:
         records = _finished_stages(session)
         inputs = {name: digest for record in records.values() for name, digest in record.outputs.items()}
-        run = session.begin(REPORT, settings={}, inputs=inputs, force=force)
+        run = session.begin(REPORT, settings={"name": folder.stem}, inputs=inputs, force=force)
         page = folder / "report" / "index.html"
         if run.finished:
             return Reported(page, run.record, skipped=True)

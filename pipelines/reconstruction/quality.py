@@ -58,9 +58,8 @@ def assess(
     overall = _figures(status, residual)
     return {
         "method": method,
-        "reconstructed_share": overall["joint_frames"]["ok"] / max(overall["joint_frames"]["all"], 1),
-        **errors,
         **overall,
+        **errors,
         "reprojection_px_per_camera": {name: _spread(residual[..., c]) for c, name in enumerate(cameras)},
         "leave_one_camera_out_px": _leave_one_out(views, cameras, solve),
         "shape": measure_shape(
@@ -75,7 +74,8 @@ def assess(
 def _figures(status: NDArray[np.int8], residual: Float) -> dict[str, Any]:
     counts = Counter({STATUS[code]: int((status == code).sum()) for code in np.unique(status)})
     return {
-        "joint_frames": {"all": status.size, "ok": counts["ok"]}
+        "reconstructed_share": counts["ok"] / max(status.size, 1),
+        "status_counts": {"all": status.size, "ok": counts["ok"]}
         | {name: counts[name] for name in STATUS if name != "ok" and counts[name]},
         "reprojection_px": _spread(residual),
     }

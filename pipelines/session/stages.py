@@ -29,7 +29,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from pipelines.session.errors import BusyError, DataError
+from pipelines.session.errors import BusyError, DataError, MocapError
 from pipelines.session.storage import (
     as_data_error,
     canonical_json,
@@ -317,10 +317,14 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
                 if not create:
                     _check_session(folder)
                 yield WritableSession(folder)
-            except BaseException:
+            except BaseException as error:
                 # What cannot be tidied now is tidied by whoever opens the session next.
                 with suppress(OSError):
                     _repair(folder)
+                    if is_new and isinstance(error, MocapError):
+                        # The user will change something, and then nothing of this is of use; after an
+                        # interrupt it is.
+                        remove_tree(folder / ".partial")
                 raise
             finally:
                 if is_new and not (folder / "session.json").exists():

@@ -1,0 +1,139 @@
+"""The whole way from files to a measured skeleton, as commands."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from tests.commands.runner import content, mocap, refused, succeeds
+from tests.synthetic.flights import write_flight
+
+METHODS = ("dlt", "midpoint", "robust")
+
+
+def metrics(session: Path, *options: str) -> dict[str, Any]:
+    result: dict[str, Any] = json.loads(succeeds("reconstruct", session, "--json", "-q", *options))
+    return result
+
+
+@pytest.mark.parametrize(
+    ("cameras", "static", "keypoints", "poses"),
+    [
+        (2, False, "alphapose", "tum"),
+        (3, False, "openpose", "csv"),
+        (5, False, "coco", "tum"),
+        (3, True, "coco", "tum"),
+    ],
+)
+def test_flight_without_noise_is_reconstructed_below_half_a_millimetre(
+    tmp_path: Path, cameras: int, static: bool, keypoints: str, poses: str
+) -> None:
+    # What is left is rounding of pixels to 0.001 px (0.01 mm at 10 m) and pose interpolation (3 um).
+    flight = write_flight(
+        tmp_path,
+        cameras=cameras,
+        static=static,
+        clean=True,
+        keypoint_format=keypoints,
+        pose_format=poses,
+    )
+    session = tmp_path / "flight.session"
+    succeeds("ingest", flight.manifest)
+    for method in METHODS:
+        result = metrics(session, "--method", method)
+        assert result["method"] == method
+        assert result["mpjpe_mm"] < 0.5
+        assert result["reconstructed_share"] == 1.0
+        assert result["reprojection_px"]["median"] < 0.05
+
+
+def test_same_bytes_twice_and_with_one_or_two_workers(tmp_path: Path) -> None:
+    sessions = []
+    for place, workers in (("first", "1"), ("second", "2")):
+        flight = write_flight(tmp_path / place, cameras=3, bystander=True)
+        session = tmp_path / place / "flight.session"
+        succeeds("ingest", flight.manifest)
+        succeeds("reconstruct", session, "--workers", workers)
+        succeeds("report", session)
+        sessions.append(content(session))
+    assert sessions[0] == sessions[1]
+    assert {"session.json", "reconstruct/skeleton.parquet", "report/index.html"} <= set(sessions[0])
+
+
+def test_bystander_who_stands_first_in_every_frame_is_not_the_actor(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=4, bystander=True, clean=True)
+    succeeds("ingest", flight.manifest)
+    # Both people are seen by all cameras: the same one must be taken by all, whichever it is.
+    result = metrics(tmp_path / "flight.session", "--persons", "2")
+    assert result["mpjpe_mm"] < 0.5
+
+
+def test_unchanged_stages_are_skipped_and_changed_settings_replace(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path)
+    session = tmp_path / "flight.session"
+    succeeds("ingest", flight.manifest)
+    succeeds("reconstruct", session)
+    assert "unchanged" in succeeds("ingest", flight.manifest)
+    assert "unchanged" in succeeds("reconstruct", session)
+    assert "written" in succeeds("reconstruct", session, "--force")
+    replaced = mocap("reconstruct", session, "--method", "dlt")
+    assert "method = robust (now dlt)" in replaced.stderr
+    assert "written" in replaced.stdout
+
+
+def test_tables_are_read_by_pandas_alone(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=3)
+    session = tmp_path / "flight.session"
+    succeeds("ingest", flight.manifest)
+    succeeds("reconstruct", session)
+    skeleton = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
+    assert len(skeleton) == len(flight.t_ns) * len(flight.joints)
+    assert list(skeleton["t_ns"].unique()) == list(flight.t_ns)
+    missing = skeleton["status"] != "ok"
+    assert skeleton.loc[missing, ["x", "y", "z", "czz"]].isna().all(axis=None)
+    assert skeleton.loc[~missing, ["x", "y", "z", "czz", "reprojection_px"]].notna().all(axis=None)
+    assert (skeleton.loc[~missing, "views"] >= 2).all()
+    frames = pd.read_parquet(session / "cameras" / "drone1" / "frames.parquet")
+    assert list(frames.columns) == ["frame", "t_ns", "pts_ns"]
+
+
+def test_exports_lie_beside_the_session_and_are_not_overwritten(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path)
+    session = tmp_path / "flight.session"
+    succeeds("ingest", flight.manifest)
+    succeeds("reconstruct", session)
+    result = json.loads(succeeds("export", session, "--to", "trc,csv,tum", "--json"))
+    names = {Path(path).suffix for path in result["written"]}
+    assert names == {".trc", ".csv", ".tum"}
+    assert json.loads(succeeds("export", session, "--to", "trc", "--json"))["written"] == []
+    trc = next(Path(path) for path in result["written"] if path.endswith(".trc"))
+    trc.write_text("changed by hand", encoding="utf-8")
+    assert "--overwrite" in refused("export", session, "--to", "trc")
+    succeeds("export", session, "--to", "trc", "--overwrite")
+    assert trc.read_text(encoding="utf-8").startswith("PathFileType")
+
+
+def test_info_knows_what_it_wrote_and_what_it_reads(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path)
+    succeeds("ingest", flight.manifest)
+    for path, kind in (
+        (tmp_path / "flight.session", "session"),
+        (flight.manifest, "manifest"),
+        (tmp_path / "drone1.json", "AlphaPose"),
+        (tmp_path / "drone1.tum", "TUM"),
+    ):
+        reading = json.loads(succeeds("info", path, "--json"))["readings"]
+        assert len(reading) == 1
+        assert kind in reading[0]["kind"]
+        assert kind in succeeds("info", path)
+
+
+def test_help_of_every_command() -> None:
+    for command in ("ingest", "reconstruct", "report", "export", "info"):
+        assert "Usage: mocap" in succeeds(command, "--help")
+    assert mocap("ingest").returncode == 2
+    assert mocap("reconstruct", "/nowhere", "--method", "magic").returncode == 2

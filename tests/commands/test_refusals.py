@@ -1,0 +1,182 @@
+"""Input that cannot be used: one line with the file, what is wrong and what to do, and exit status 1."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from tests.commands.runner import content, mocap, refused, succeeds
+from tests.synthetic.flights import SyntheticFlight, write_flight
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> SyntheticFlight:
+    return write_flight(tmp_path, cameras=3, seconds=0.5)
+
+
+def test_unknown_key_names_the_nearest(flight: SyntheticFlight) -> None:
+    flight.settings["cameras"]["drone2"]["keypoint"] = "d.json"
+    flight.settings["wrold"] = {}
+    flight.save()
+    line = refused("ingest", flight.manifest)
+    assert "cameras.drone2.keypoint: unknown key, did you mean 'keypoints'?" in line
+    assert "wrold: unknown key, did you mean 'world'?" in line
+
+
+@pytest.mark.parametrize(
+    ("change", "part"),
+    [
+        ({"map": "site.bt"}, "map"),
+        ({"plan": {"log": "d1"}}, "plan"),
+        ({"actor": {"log": "d1", "topic": "/actor"}}, "actor"),
+    ],
+)
+def test_parts_whose_readers_come_later_are_refused(
+    flight: SyntheticFlight, change: dict[str, object], part: str
+) -> None:
+    flight.settings.update(change)
+    flight.save()
+    line = refused("ingest", flight.manifest)
+    assert f"{part}: this version has no reader for it yet" in line
+
+
+def test_nan_poses_are_counted_and_the_rest_is_used(flight: SyntheticFlight, tmp_path: Path) -> None:
+    log = tmp_path / "drone1.tum"
+    rows = log.read_text(encoding="utf-8").splitlines()
+    for k in (20, 21, 22):
+        stamp, *_ = rows[k].split()
+        rows[k] = f"{stamp} nan nan nan 0 0 0 1"
+    log.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    done = mocap("ingest", flight.manifest)
+    assert done.returncode == 0
+    assert "drone1: poses dropped: 3 not finite" in done.stderr
+    stored = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
+    assert stored["cameras"]["drone1"]["poses"]["dropped"] == {"not finite": 3}
+
+
+def test_log_of_nothing_but_nan(flight: SyntheticFlight, tmp_path: Path) -> None:
+    (tmp_path / "drone1.tum").write_text("1700000000.0 nan nan nan 0 0 0 1\n", encoding="utf-8")
+    assert "drone1.tum: holds no usable pose" in refused("ingest", flight.manifest)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", "no JSON"])
+def test_empty_keypoint_file(flight: SyntheticFlight, tmp_path: Path, text: str) -> None:
+    (tmp_path / "drone2.json").write_text(text, encoding="utf-8")
+    assert "drone2.json: " in refused("ingest", flight.manifest)
+    assert not (tmp_path / "flight.session").exists()
+
+
+def test_camera_without_overlap_in_time(flight: SyntheticFlight) -> None:
+    flight.settings["cameras"]["drone3"]["frame_times"]["start"] = 1_700_000_600
+    flight.save()
+    line = refused("ingest", flight.manifest)
+    assert "drone3" in line
+    assert "frame_times.start" in line or "clocks" in line
+
+
+def test_static_camera_without_overlap_in_time(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=3, static=True, seconds=0.5)
+    flight.settings["cameras"]["drone3"]["frame_times"]["start"] = 1_700_000_600
+    flight.save()
+    line = refused("ingest", flight.manifest)
+    assert "cameras.drone3: its frames" in line
+    assert "overlap in time with no other camera's" in line
+
+
+def test_picture_size_that_disagrees_with_the_calibration(flight: SyntheticFlight) -> None:
+    flight.settings["cameras"]["drone1"]["keypoints"]["image_size"] = [1920, 1200]
+    flight.save()
+    line = refused("ingest", flight.manifest)
+    assert "cameras.drone1.intrinsics" in line
+    assert "1920" in line
+
+
+def test_same_shape_at_another_size_is_rescaled_with_a_warning(flight: SyntheticFlight) -> None:
+    inline = flight.settings["cameras"]["drone1"]["intrinsics"]
+    for key in ("width", "height"):
+        inline[key] = inline[key] // 2
+    for key in ("fx", "fy", "cx", "cy"):
+        inline[key] = inline[key] / 2
+    flight.settings["cameras"]["drone1"]["keypoints"]["image_size"] = [1280, 720]
+    flight.save()
+    done = mocap("ingest", flight.manifest)
+    assert done.returncode == 0
+    assert "warning: drone1: " in done.stderr
+
+
+def test_keypoints_outside_the_calibrated_picture(flight: SyntheticFlight) -> None:
+    for name in flight.cameras:
+        inline = flight.settings["cameras"][name]["intrinsics"]
+        inline.update(width=640, height=360, cx=320, cy=180)
+    flight.save()
+    assert "lie outside" in refused("ingest", flight.manifest)
+
+
+def test_joints_that_nobody_sees_have_a_status(flight: SyntheticFlight, tmp_path: Path) -> None:
+    nose = 0
+    for name in flight.cameras:
+        path = tmp_path / f"{name}.json"
+        people = json.loads(path.read_text(encoding="utf-8"))
+        for person in people:
+            person["keypoints"][3 * nose : 3 * nose + 3] = [0, 0, 0]
+        path.write_text(json.dumps(people), encoding="utf-8")
+    succeeds("ingest", flight.manifest)
+    succeeds("reconstruct", tmp_path / "flight.session")
+    skeleton = pd.read_parquet(tmp_path / "flight.session" / "reconstruct" / "skeleton.parquet")
+    assert set(skeleton.loc[skeleton["joint"] == "nose", "status"]) == {"not_detected"}
+
+
+def test_when_nothing_is_reconstructed_the_gate_is_named(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=2, seconds=0.5)
+    # Cameras a year apart in calibration: the second one's poses are the first one's.
+    (tmp_path / "drone2.tum").write_bytes((tmp_path / "drone1.tum").read_bytes())
+    flight.save()
+    succeeds("ingest", flight.manifest)
+    line = refused("reconstruct", tmp_path / "flight.session")
+    assert "no joint could be reconstructed" in line
+    assert not (tmp_path / "flight.session" / "reconstruct").exists()
+
+
+def test_hostile_names_do_not_reach_the_terminal(tmp_path: Path) -> None:
+    path = tmp_path / "evil\x1b[31m\nname.yaml"
+    path.write_text("schema: 1\ncameras: 3\n", encoding="utf-8")
+    line = refused("ingest", path)
+    assert "\x1b" not in line
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "report"])
+def test_folder_that_is_no_session(tmp_path: Path, command: str) -> None:
+    assert "is not a session" in refused(command, tmp_path)
+
+
+def test_target_that_holds_something_else_is_refused(flight: SyntheticFlight, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "thesis.tex").write_text("years of work", encoding="utf-8")
+    assert "--overwrite" in refused("ingest", flight.manifest, "-o", other)
+    succeeds("ingest", flight.manifest, "-o", other, "--overwrite")
+    assert (other / "thesis.tex").read_text(encoding="utf-8") == "years of work"
+
+
+def test_session_of_another_flight_is_not_replaced_silently(flight: SyntheticFlight, tmp_path: Path) -> None:
+    succeeds("ingest", flight.manifest)
+    before = content(tmp_path / "flight.session")
+    flight.settings["name"] = "Another flight"
+    flight.save()
+    assert "holds the flight" in refused("ingest", flight.manifest)
+    assert content(tmp_path / "flight.session") == before
+
+
+def test_unknown_export_lists_those_there_are(flight: SyntheticFlight, tmp_path: Path) -> None:
+    succeeds("ingest", flight.manifest)
+    assert "csv, trc, tum" in refused("export", tmp_path / "flight.session", "--to", "fbx")
+    assert "reconstruct" in refused("export", tmp_path / "flight.session", "--to", "trc")
+
+
+def test_unknown_noise_model_lists_those_there_are(flight: SyntheticFlight, tmp_path: Path) -> None:
+    succeeds("ingest", flight.manifest)
+    line = refused("reconstruct", tmp_path / "flight.session", "--pose-noise", "pink:position_m=1")
+    assert "bias, drift, gauss-markov, latency, white" in line
