@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.noise import Bias, White, disturb
 from pipelines.simulation.drone_paths import orbit
 from pipelines.simulation.flight_files import Sighting, write_alphapose, write_joints, write_tum
-from pipelines.simulation.observe import KeypointNoise, PoseNoise, detect, log_poses, see
+from pipelines.simulation.observe import KeypointNoise, detect, see
 from pipelines.simulation.walk import COCO17, route, walk
 
 Float = NDArray[np.float64]
@@ -45,9 +46,9 @@ DROPOUT = ("drone3", 5.0, 5.6)  # seconds after the start without a row in the p
 BYSTANDER = ("drone2", 7.0, 8.0)  # seconds in which the detector sees somebody else as well
 
 KEYPOINT_NOISE = KeypointNoise(pixel_px=3.0, missed_share=0.03, outlier_share=0.02)
-POSE_NOISE = PoseNoise(  # of a drone with an RTK receiver and a calibrated gimbal
-    white_position_m=0.02, white_rotation_deg=0.2, bias_position_m=0.05, bias_rotation_deg=0.3
-)
+# Of a drone with an RTK receiver and a calibrated gimbal.
+WHITE = White(position_m=0.02, rotation_deg=0.2)
+BIAS = Bias(position_m=0.05, rotation_deg=0.3)
 
 WALK_RADIUS_M, WALK_SPEED_MPS = 4.0, 1.2
 
@@ -91,7 +92,7 @@ def write_drone(folder: Path, index: int) -> None:
     position, quaternion = (values[index] for values in drones(since_start(log_ns)))
     write_tum(folder / f"{name}_true_poses.tum", log_ns, position, quaternion)
     logged = ~within(DROPOUT, name, log_ns)
-    position, quaternion = log_poses(position, quaternion, POSE_NOISE, rng)
+    position, quaternion = disturb([BIAS, WHITE], log_ns, position, quaternion, rng)
     write_tum(folder / f"{name}_poses.tum", log_ns[logged], position[logged], quaternion[logged])
 
     frames_ns = stamps(FRAMES_START_NS[index], SECONDS, FPS)
@@ -127,10 +128,9 @@ def manifest() -> str:
             f"    intrinsics: {{{size}, {numbers}, distortion: {list(lens.distortion)}}}",
             f"    keypoints: {{path: {name}_keypoints.json, format: alphapose, skeleton: coco17}}",
             "    pose_noise:",
-            f"      white: {{position_m: {POSE_NOISE.white_position_m},"
-            f" rotation_deg: {POSE_NOISE.white_rotation_deg}}}",
-            f"      bias: {{frame: world, position_m: {POSE_NOISE.bias_position_m},"
-            f" rotation_deg: {POSE_NOISE.bias_rotation_deg}}}",
+            f"      white: {{position_m: {WHITE.position_m}, rotation_deg: {WHITE.rotation_deg}}}",
+            f"      bias: {{frame: {BIAS.frame}, position_m: {BIAS.position_m},"
+            f" rotation_deg: {BIAS.rotation_deg}}}",
         ]
     poses = ", ".join(f"{name}: {name}_true_poses.tum" for name in DRONES)
     return "\n".join([*lines, "truth:", "  joints: true_joints.csv", f"  poses: {{{poses}}}", ""])

@@ -1,4 +1,4 @@
-"""What instruments make of the truth: keypoints of a detector, and the poses that a log holds."""
+"""What a keypoint detector makes of the truth; what a log makes of poses is `geometry.noise`."""
 
 from __future__ import annotations
 
@@ -8,12 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics, project
-from pipelines.geometry.poses import (
-    invert,
-    multiply,
-    quaternion_from_rotation_vector,
-    transform,
-)
+from pipelines.geometry.poses import invert, transform
 
 Float = NDArray[np.float64]
 
@@ -27,20 +22,6 @@ class KeypointNoise:
     pixel_px: float = 3.0  # sigma of each coordinate
     missed_share: float = 0.0
     outlier_share: float = 0.0  # of the joints that are not missed
-
-
-@dataclass(frozen=True)
-class PoseNoise:
-    """Errors of a camera's pose log; sigmas per axis.
-
-    White errors are new in every row of the log, a bias is drawn once per camera. Positions are
-    disturbed along the world's axes, orientations by a rotation vector in the camera's frame.
-    """
-
-    white_position_m: float = 0.0
-    white_rotation_deg: float = 0.0
-    bias_position_m: float = 0.0
-    bias_rotation_deg: float = 0.0
 
 
 def see(joints: Float, position: Float, quaternion_xyzw: Float, intrinsics: Intrinsics) -> Float:
@@ -86,25 +67,3 @@ def detect(pixels: Float, noise: KeypointNoise, rng: np.random.Generator) -> tup
     found = np.where(missed[..., None], np.nan, found)
     confidence = np.where(outlier, 0.3 + 0.6 * sureness, 0.7 + 0.3 * sureness)
     return found, np.where(np.isnan(found).any(axis=-1), 0.0, confidence)
-
-
-def log_poses(
-    position: Float, quaternion_xyzw: Float, noise: PoseNoise, rng: np.random.Generator
-) -> tuple[Float, Float]:
-    """Poses of one camera as its log states them.
-
-    Args:
-        position: [T, 3] metres, world_from_camera.
-        quaternion_xyzw: [T, 4] unit.
-        noise: the errors; all sigmas 0 gives the poses back exactly.
-        rng: draws one bias, then the white errors.
-
-    Returns:
-        Positions [T, 3] and unit quaternions [T, 4].
-    """
-    moved = noise.bias_position_m * rng.standard_normal(3)
-    turned_deg = noise.bias_rotation_deg * rng.standard_normal(3)
-    moved = moved + noise.white_position_m * rng.standard_normal(position.shape)
-    turned_deg = turned_deg + noise.white_rotation_deg * rng.standard_normal(position.shape)
-    turn = quaternion_from_rotation_vector(np.radians(turned_deg))
-    return position + moved, multiply(quaternion_xyzw, turn)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import camera_matrix
-from pipelines.geometry.poses import conjugate, invert, multiply, rotation_vector_from_quaternion
+from pipelines.geometry.poses import invert, rotation_vector_from_quaternion
 from pipelines.simulation.drone_paths import look_at, orbit
-from pipelines.simulation.observe import KeypointNoise, PoseNoise, detect, log_poses, see
+from pipelines.simulation.observe import KeypointNoise, detect, see
 from pipelines.simulation.walk import walk
 from tests.synthetic.flights import LENS
 
@@ -80,34 +79,3 @@ def test_the_same_seed_gives_the_same_keypoints() -> None:
     first, second = (detect(pixels, noise, np.random.default_rng(4)) for _ in range(2))
     assert np.array_equal(first[0], second[0], equal_nan=True)
     assert np.array_equal(first[1], second[1])
-
-
-def test_a_log_without_noise_is_exact() -> None:
-    position, quaternion = (rows[0] for rows in orbit(T_S, TARGET, cameras=1))
-    logged = log_poses(position, quaternion, PoseNoise(), np.random.default_rng(5))
-    assert (logged[0] == position).all()
-    assert logged[1] == pytest.approx(quaternion, abs=1e-15)
-
-
-def test_pose_errors_are_of_the_stated_size() -> None:
-    """15,000 white numbers of each kind: the standard error of their sigma is 0.6 %."""
-    t_s = np.linspace(0, 50, 5000)
-    target = np.stack([1.2 * t_s, 0 * t_s, 1.0 + 0 * t_s], axis=1)
-    position, quaternion = (rows[0] for rows in orbit(t_s, target, cameras=1))
-    noise = PoseNoise(0.02, 0.2, 0.05, 0.3)
-    logged = log_poses(position, quaternion, noise, np.random.default_rng(6))
-    moved = logged[0] - position
-    # Errors of rotation are right factors: world_from_camera = true times camera_from_erring_camera.
-    turned = np.degrees(rotation_vector_from_quaternion(multiply(conjugate(quaternion), logged[1])))
-    assert moved.std(axis=0) == pytest.approx(0.02, rel=0.04)
-    assert turned.std(axis=0) == pytest.approx(0.2, rel=0.04)
-
-    def biases(seed: int) -> NDArray[np.float64]:
-        only_bias = PoseNoise(bias_position_m=0.05, bias_rotation_deg=0.3)
-        shifted, _ = log_poses(position[:2], quaternion[:2], only_bias, np.random.default_rng(seed))
-        assert shifted[0] - position[0] == pytest.approx(shifted[1] - position[1], abs=1e-12)
-        bias: NDArray[np.float64] = shifted[0] - position[0]
-        return bias
-
-    # 1200 numbers: 2 %.
-    assert np.stack([biases(seed) for seed in range(400)]).std() == pytest.approx(0.05, rel=0.08)

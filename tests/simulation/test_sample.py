@@ -39,7 +39,7 @@ def test_the_manifest_is_valid_and_names_files_that_exist() -> None:
     flight = read_flight(COMMITTED / "flight.yaml")
     assert flight.name == "Ring walk"
     assert list(flight.cameras) == ["drone1", "drone2", "drone3"]
-    assert [c.frame_times.start - START_NS for c in flight.cameras.values() if c.frame_times] == [
+    assert [c.frame_times.start_ns - START_NS for c in flight.cameras.values() if c.frame_times] == [
         0,
         11_000_000,
         22_000_000,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
+from pipelines.geometry.noise import disturb
 from pipelines.geometry.poses import invert, rotation_vector_from_quaternion
+from pipelines.session.registries import noise_models
 from pipelines.simulation.drone_paths import look_at, orbit
 from pipelines.simulation.flight_files import Sighting, write_alphapose, write_joints, write_tum
-from pipelines.simulation.observe import KeypointNoise, PoseNoise, detect, log_poses, see
+from pipelines.simulation.observe import KeypointNoise, detect, see
 from pipelines.simulation.walk import COCO17, route, walk
 
 Float = NDArray[np.float64]
@@ -25,9 +27,12 @@ Int64 = NDArray[np.int64]
 START_NS = 1_700_000_000_000_000_000
 LOG_HZ = 200  # a camera accelerates at most by 1 m/s^2: interpolation errs by 1/8 / 200^2 = 3 micrometres
 LENS = Intrinsics(1280, 720, 762.0, 763.0, 641.0, 358.0, "radtan", (-0.031, 0.012, 0.0004, -0.0003))
-CLEAN_KEYPOINTS, CLEAN_POSES = KeypointNoise(pixel_px=0.0), PoseNoise()
+CLEAN_KEYPOINTS = KeypointNoise(pixel_px=0.0)
 USUAL_KEYPOINTS = KeypointNoise(pixel_px=2.0, missed_share=0.02, outlier_share=0.02)
-USUAL_POSES = PoseNoise(0.02, 0.2, 0.05, 0.3)
+USUAL_POSES: dict[str, dict[str, float | str]] = {
+    "white": {"position_m": 0.02, "rotation_deg": 0.2},
+    "bias": {"frame": "world", "position_m": 0.05, "rotation_deg": 0.3},
+}
 _CIRCLE_M, _SPEED_MPS = 4.0, 1.2
 
 
@@ -68,7 +73,7 @@ def write_flight(
     static: bool = False,
     bystander: bool = False,
     keypoint_noise: KeypointNoise = USUAL_KEYPOINTS,
-    pose_noise: PoseNoise = USUAL_POSES,
+    pose_noise: Mapping[str, Mapping[str, float | str]] = USUAL_POSES,
     keypoint_format: str = "alphapose",
     pose_format: str = "tum",
     seed: int = 0,
@@ -88,14 +93,14 @@ def write_flight(
         static: the cameras stand still, and their poses come from a calibration in Pose2Sim's format.
         bystander: a second person walks through the pictures, and stands first in every frame.
         keypoint_noise: of the detector, unless clean.
-        pose_noise: of the logs, unless clean; a bias alone makes sense for static cameras.
+        pose_noise: of the logs as flight.yaml states it, unless clean; static cameras: a bias alone.
         keypoint_format: alphapose, coco or openpose (with COCO's joints).
         pose_format: tum or csv.
         seed: of all noise.
     """
     folder.mkdir(parents=True, exist_ok=True)
     detector = CLEAN_KEYPOINTS if clean else keypoint_noise
-    noise = CLEAN_POSES if clean else pose_noise
+    noise = [] if clean else noise_models("the tests", pose_noise)
     names = [f"drone{k + 1}" for k in range(cameras)]
     t_ns = _stamps(round(seconds * fps), fps, START_NS)
     joints = _actor(_seconds(t_ns))
@@ -107,7 +112,7 @@ def write_flight(
     pixels, calibrations = [], []
     for k, name in enumerate(names):
         rng = np.random.default_rng([seed, k])
-        logged = log_poses(true_position[k], true_quaternion[k], noise, rng)
+        logged = disturb(noise, log_ns, true_position[k], true_quaternion[k], rng)
         if static:
             calibrations.append(_pose2sim_table(name, *(rows[0] for rows in logged)))
             pose: dict[str, str] = {"static": "calibration.toml"}
@@ -132,7 +137,7 @@ def write_flight(
             "keypoints": {"path": keypoints, "format": keypoint_format, "skeleton": "coco17"},
         }
         if not clean:
-            sources[name]["pose_noise"] = _prior(noise)
+            sources[name]["pose_noise"] = {name: dict(model) for name, model in pose_noise.items()}
 
     if static:
         (folder / "calibration.toml").write_text("\n".join(calibrations), encoding="utf-8")
@@ -182,17 +187,6 @@ def _camera_poses(t_s: Float, cameras: int, static: bool) -> tuple[Float, Float]
 def _inline(lens: Intrinsics) -> dict[str, Any]:
     numbers = {name: getattr(lens, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     return {**numbers, "distortion": list(lens.distortion)}
-
-
-def _prior(noise: PoseNoise) -> dict[str, Any]:
-    return {
-        "white": {"position_m": noise.white_position_m, "rotation_deg": noise.white_rotation_deg},
-        "bias": {
-            "frame": "world",
-            "position_m": noise.bias_position_m,
-            "rotation_deg": noise.bias_rotation_deg,
-        },
-    }
 
 
 def _pose2sim_table(name: str, position: Float, quaternion: Float) -> str:
