@@ -21,7 +21,7 @@ _LARGEST = 1e12  # numbers beyond any length or angle, which overflow further on
 
 
 def intrinsics(
-    source: Path,
+    source: Path | str,
     camera: str,
     *,
     size: Sequence[float],
@@ -66,7 +66,7 @@ def intrinsics(
 
 
 def build_intrinsics(
-    source: Path,
+    source: Path | str,
     camera: str,
     size: Sequence[float],
     matrix: Float,

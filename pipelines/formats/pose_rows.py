@@ -15,7 +15,7 @@ NORM_TOLERANCE = 0.1
 
 
 def clean_poses(
-    source: Path,
+    source: Path | str,
     t_ns: Int64,
     readable: Bool,
     position: Float,

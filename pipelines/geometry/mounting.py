@@ -1,0 +1,176 @@
+"""How a camera sits on the drone: fixed mounts, gimbals and lever arms (docs/frames.md works one out).
+
+The body is FLU (x forward, y left, z up), the camera OpenCV (x right, y down, z forward), the world ENU.
+A gimbal's frame is FLU too: level and at zero angles its x axis is where the camera looks.
+Quaternions are xyzw and unit; NaN in gives NaN out.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.poses import (
+    compose,
+    enu_from_ned,
+    multiply,
+    quaternion_from_rotation_vector,
+    rotate,
+)
+
+Float = NDArray[np.float64]
+Pose = tuple[Float, Float]
+Looks = Literal["forward", "backward", "left", "right", "down", "up"]
+
+# The optical axis along x, the picture's right along -y, its bottom along -z.
+_FLU_FROM_OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])
+# A half turn about x: forward stays, left becomes right, up becomes down. Its own inverse.
+_FLU_FROM_FRD = np.array([1.0, 0.0, 0.0, 0.0])
+
+_AZIMUTH_DEG = {"forward": 0.0, "left": 90.0, "backward": 180.0, "right": -90.0, "down": 0.0, "up": 0.0}
+_STRAIGHT_DEG = {"down": 90.0, "up": -90.0}
+
+# --- fixed mounts --------------------------------------------------------------------------------------
+
+
+def body_from_camera(looks: Looks, down_deg: float = 0.0) -> Float:
+    """The rotation [4] of a camera that looks one way from the body, tilted down by an angle.
+
+    The picture is upright: its top is up. Straight down its top is forward, as of a camera that looks
+    forward and is tilted down by 90 degrees; straight up its top is backward.
+
+    Args:
+        looks: where the optical axis points before the tilt.
+        down_deg: how far the axis is turned below the horizon, -90 to 90.
+
+    Raises:
+        ValueError: a tilt beyond 90 degrees, or one on top of down or up.
+    """
+    if looks in _STRAIGHT_DEG and down_deg != 0:
+        raise ValueError(
+            f"looks {looks} and is tilted by {down_deg:g} deg: say where it looks before the tilt"
+        )
+    if not abs(down_deg) <= 90:
+        raise ValueError(f"down_deg {down_deg:g} is not within -90 to 90")
+    azimuth = _turn("z", np.radians(_AZIMUTH_DEG[looks]))
+    # About the left axis a positive angle turns forward to down.
+    tilt = _turn("y", np.radians(_STRAIGHT_DEG.get(looks, down_deg)))
+    return multiply(multiply(azimuth, tilt), _FLU_FROM_OPTICAL)
+
+
+def compose_mount(world_from_body: Pose, body_from_camera: Pose) -> Pose:
+    """Poses of a camera fixed to the body: its lever arm turns with the body.
+
+    Args:
+        world_from_body: position [N, 3] m and quaternion [N, 4].
+        body_from_camera: position [3] m and quaternion [4].
+
+    Returns:
+        world_from_camera: position [N, 3] and quaternion [N, 4].
+    """
+    return compose(world_from_body, body_from_camera)
+
+
+# --- gimbals -------------------------------------------------------------------------------------------
+
+
+def attitude_from_angles(
+    angles: Float, *, order: Literal["ypr", "rpy"], units: Literal["deg", "rad"]
+) -> Float:
+    """Yaw about z, then pitch about the turned y, then roll about the twice turned x; right-handed.
+
+    Whether that makes a positive pitch look down (FLU) or up (FRD) is for `attitude_in_enu` to say.
+
+    Args:
+        angles: [..., 3].
+        order: how the log lists them; the rotation is the same for both.
+        units: degrees or radians.
+
+    Returns:
+        [..., 4] reference_from_gimbal, in the axes that the angles are stated in.
+    """
+    in_rad = np.radians(angles) if units == "deg" else angles
+    yaw, pitch, roll = np.moveaxis(in_rad if order == "ypr" else in_rad[..., ::-1], -1, 0)
+    return multiply(multiply(_turn("z", yaw), _turn("y", pitch)), _turn("x", roll))
+
+
+def attitude_in_enu(
+    quaternion_xyzw: Float, *, relative_to: Literal["world", "body"], axes: Literal["enu", "ned"]
+) -> Float:
+    """A gimbal's attitude in our axes, from those of its log.
+
+    With `enu` the world is ENU, body and gimbal FLU: yaw is counted from east to north, or from forward to
+    left, a positive pitch looks down, a positive roll lowers the right side. With `ned` the world is
+    NED, body and gimbal FRD: yaw is counted from north to east, or from forward to right, a positive
+    pitch looks up, a positive roll lowers the right side. DJI states angles in NED: pitch -90 is
+    straight down.
+
+    Args:
+        quaternion_xyzw: [..., 4] world_from_gimbal or body_from_gimbal.
+        relative_to: which of the two.
+        axes: the axes of the log.
+
+    Returns:
+        [..., 4] the same, of an FLU gimbal in an ENU world or an FLU body.
+    """
+    if axes == "enu":
+        return quaternion_xyzw
+    of_flu_gimbal = multiply(quaternion_xyzw, _FLU_FROM_FRD)
+    if relative_to == "body":
+        return multiply(_FLU_FROM_FRD, of_flu_gimbal)
+    return enu_from_ned(np.zeros(3), of_flu_gimbal)[1]
+
+
+def compose_gimbal(
+    world_from_body: Pose,
+    lever_arm: Float,
+    attitude_xyzw: Float,
+    gimbal_from_camera_xyzw: Float,
+    *,
+    relative_to: Literal["world", "body"],
+) -> Pose:
+    """Poses of a camera on a gimbal.
+
+    An attitude in the world replaces the body's rotation, one relative to the body composes with it. The
+    lever arm, from the body's origin to the camera, turns with the body either way: the arm of the
+    gimbal's own joints is taken as part of it.
+
+    Args:
+        world_from_body: position [N, 3] m and quaternion [N, 4], ENU from FLU.
+        lever_arm: [3] m, in the body.
+        attitude_xyzw: [N, 4] the gimbal's attitude at the stamps of the body's poses (`attitude_in_enu`).
+        gimbal_from_camera_xyzw: [4]; `body_from_camera("forward")` unless the camera is tilted in its gimbal.
+        relative_to: what the attitude is relative to.
+
+    Returns:
+        world_from_camera: position [N, 3] and quaternion [N, 4].
+    """
+    position, world_from_body_xyzw = world_from_body
+    attitude = attitude_xyzw if relative_to == "world" else multiply(world_from_body_xyzw, attitude_xyzw)
+    return position + rotate(world_from_body_xyzw, lever_arm), multiply(attitude, gimbal_from_camera_xyzw)
+
+
+# --- axes of the body ----------------------------------------------------------------------------------
+
+
+def flu_body_from_frd(quaternion_xyzw: Float, covariance: Float | None = None) -> tuple[Float, Float | None]:
+    """Poses of a body logged as FRD (x forward, y right, z down), as of the same body in FLU.
+
+    Args:
+        quaternion_xyzw: [..., 4] world_from_frd.
+        covariance: [..., 6, 6] position in world, rotation vector in the body.
+
+    Returns:
+        world_from_flu, and the covariance with its rotation vector in FLU.
+    """
+    signs = np.array([1.0, 1.0, 1.0, 1.0, -1.0, -1.0])
+    turned = None if covariance is None else covariance * np.outer(signs, signs)
+    return multiply(quaternion_xyzw, _FLU_FROM_FRD), turned
+
+
+def _turn(axis: Literal["x", "y", "z"], angle: Float | np.float64) -> Float:
+    """Quaternions [..., 4] of turns about one axis by angles [...] in rad."""
+    direction = np.eye(3)["xyz".index(axis)]
+    return quaternion_from_rotation_vector(np.asarray(angle)[..., None] * direction)

@@ -1,0 +1,139 @@
+"""The pose of one frame in another, along a log's tree of transforms.
+
+Every link states target_from_source over time; it may be followed both ways.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections import deque
+from collections.abc import Collection, Iterable, Mapping
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.poses import compose, interpolate_poses, invert
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+
+class Link(NamedTuple):
+    """One edge of the tree: target_from_source, at least one row."""
+
+    t_ns: Int64  # [N] strictly increasing
+    position: Float  # [N, 3] m
+    quaternion_xyzw: Float  # [N, 4] unit
+    static: bool = False  # holds always, as its last row states it
+
+
+class Chain(NamedTuple):
+    """parent_from_child at some times; NaN where a link on the way says nothing."""
+
+    t_ns: Int64  # [M]
+    position: Float  # [M, 3] m
+    quaternion_xyzw: Float  # [M, 4] unit
+
+
+class Route(NamedTuple):
+    """A way through the tree."""
+
+    frames: tuple[str, ...]  # parent first, child last
+    edges: tuple[tuple[str, str], ...]  # (target, source) as the tree has them, one between two frames each
+
+
+def chain(
+    links: Mapping[tuple[str, str], Link],
+    parent: str,
+    child: str,
+    at_ns: Int64 | None = None,
+    *,
+    max_gap_ns: int,
+    max_extrapolation_ns: int = 0,
+) -> Chain:
+    """The pose of `child` in `parent`: every link on the shortest way interpolated, then composed.
+
+    Args:
+        links: (target, source) to target_from_source.
+        parent: the frame in which the pose is wanted.
+        child: the frame whose pose is wanted.
+        at_ns: [M] times; by default the stamps of the link on the way that has the most of them (the one
+            nearest to the child among equals), so that nothing of the fastest motion is lost. A way of
+            static links alone has one row, at its latest stamp.
+        max_gap_ns: a link whose stamps are further apart than this says nothing between them.
+        max_extrapolation_ns: how far before its first and after its last stamp a link is held.
+
+    Raises:
+        ValueError: an unknown frame (the nearest known names are told), no way between the two, or the
+            same frame twice.
+    """
+    route = find_route(links, parent, child)
+    on_the_way = [links[edge] for edge in route.edges]
+    t_ns = _default_stamps(on_the_way) if at_ns is None else at_ns
+    position, quaternion = np.zeros((len(t_ns), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (len(t_ns), 1))
+    for step, edge, link in zip(pairwise(route.frames), route.edges, on_the_way, strict=True):
+        stated = _at(link, t_ns, max_gap_ns, max_extrapolation_ns)
+        position, quaternion = compose((position, quaternion), stated if step == edge else invert(*stated))
+    return Chain(t_ns, position, quaternion)
+
+
+def find_route(edges: Collection[tuple[str, str]], parent: str, child: str) -> Route:
+    """The shortest way from one frame to another, breadth first; alphabetical among equally short ones.
+
+    Raises:
+        ValueError: as `chain` does.
+    """
+    neighbours: dict[str, set[str]] = {}
+    for target, source in edges:
+        neighbours.setdefault(target, set()).add(source)
+        neighbours.setdefault(source, set()).add(target)
+    for frame in (parent, child):
+        if frame not in neighbours:
+            raise ValueError(f"there is no frame {frame!r} ({_nearest(frame, neighbours)})")
+    if parent == child:
+        raise ValueError(f"parent and child are both {parent!r}")
+    came_from: dict[str, str] = {parent: ""}
+    waiting = deque([parent])
+    while waiting and child not in came_from:
+        frame = waiting.popleft()
+        for neighbour in sorted(neighbours[frame] - came_from.keys()):
+            came_from[neighbour] = frame
+            waiting.append(neighbour)
+    if child not in came_from:
+        connected = ", ".join(sorted(came_from.keys() - {parent})[:10])
+        raise ValueError(f"no transforms connect {parent!r} with {child!r} ({parent!r} has {connected})")
+    frames = [child]
+    while frames[-1] != parent:
+        frames.append(came_from[frames[-1]])
+    frames.reverse()
+    return Route(tuple(frames), tuple((a, b) if (a, b) in edges else (b, a) for a, b in pairwise(frames)))
+
+
+def _at(link: Link, t_ns: Int64, max_gap_ns: int, max_extrapolation_ns: int) -> tuple[Float, Float]:
+    if link.static:
+        return link.position[-1:], link.quaternion_xyzw[-1:]
+    return interpolate_poses(
+        link.t_ns,
+        link.position,
+        link.quaternion_xyzw,
+        t_ns,
+        max_gap_ns=max_gap_ns,
+        max_extrapolation_ns=max_extrapolation_ns,
+    )
+
+
+def _default_stamps(links: Iterable[Link]) -> Int64:
+    links = list(links)
+    moving = [link for link in reversed(links) if not link.static]
+    if not moving:
+        return np.array([max(int(link.t_ns[-1]) for link in links)], dtype=np.int64)
+    return max(moving, key=lambda link: len(link.t_ns)).t_ns
+
+
+def _nearest(frame: str, known: Collection[str]) -> str:
+    close = difflib.get_close_matches(frame, known, n=3, cutoff=0.5)
+    if close:
+        return f"nearest: {', '.join(close)}"
+    return f"there are {', '.join(sorted(known)[:10])}" if known else "there are no transforms"
