@@ -1,7 +1,7 @@
 """A heavy-tailed loss for still, calibrated cameras, where what disagrees is the detector.
 
 Noisy poses move all joints of a view together and by a normal amount: least squares is right for them,
-and weighting views by their own residuals costs 15 % at five cameras. Where poses were calibrated and
+and weighting views by their own residuals costs 11 % at five cameras. Where poses were calibrated and
 nobody states noise, a view that disagrees has mistaken its joint, and how far off it is says little:
 its weight should fall with its residual (docs/decisions/0002-loss-of-still-cameras.md).
 """
