@@ -376,7 +376,9 @@ def _covariance(value: Any) -> Float:
 def _bytes(data: Any) -> NDArray[np.uint8]:
     """An array as it is, bytes viewed, base64 (JSON) decoded."""
     if isinstance(data, np.ndarray):
-        return data
+        if data.dtype.itemsize != 1:
+            raise ValueError(f"its data are {data.dtype}, not bytes")
+        return data.view(np.uint8)
     if isinstance(data, str):
         data = base64.b64decode(data, validate=True)
     if isinstance(data, list):

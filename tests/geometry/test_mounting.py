@@ -1,0 +1,298 @@
+"""Mounts and gimbals against the worked example of docs/frames.md, axis by axis, and by their algebra."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.spatial.transform import Rotation
+
+from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.geometry.mounting import (
+    Float,
+    Looks,
+    Pose,
+    attitude_from_angles,
+    attitude_in_enu,
+    body_from_camera,
+    compose_gimbal,
+    compose_mount,
+    flu_body_from_frd,
+)
+from pipelines.geometry.pose_covariance import mounted_covariance, pose_covariance_in_body
+from pipelines.geometry.poses import (
+    conjugate,
+    enu_from_ned,
+    invert,
+    matrix_from_quaternion,
+    multiply,
+    quaternion_from_rotation_vector,
+    rotate,
+    transform,
+)
+
+FORWARD, LEFT, UP = np.eye(3)
+EAST, NORTH, _ = np.eye(3)
+RIGHT_OF_PICTURE, BOTTOM_OF_PICTURE, AXIS = np.eye(3)
+angles_deg = hnp.arrays(np.float64, (3,), elements=st.floats(-180, 180))
+
+PAPER = (Path(__file__).resolve().parents[2] / "docs" / "frames.md").read_text(encoding="utf-8")
+LEVER_ARM = np.array([0.10, 0.0, -0.05])
+HEADING_NORTH = quaternion_from_rotation_vector(np.radians([0, 0, 90]))
+LEVEL: Pose = (np.array([[10.0, 20.0, 30.0]]), HEADING_NORTH[None])
+NOSE_DOWN: Pose = (
+    LEVEL[0],
+    multiply(HEADING_NORTH, quaternion_from_rotation_vector(np.radians([0, 10, 0])))[None],
+)
+
+
+def on_paper(vector: Float, decimals: int = 4) -> str:
+    """A vector as the worked example writes it."""
+    rounded = np.round(np.ravel(vector), decimals) + 0.0  # no negative zero
+    return "(" + ", ".join(f"{value:.{decimals}f}" for value in rounded) + ")"
+
+
+def gimbal_on_paper(
+    world_from_body: Pose,
+    angles: tuple[float, float, float],
+    relative_to: Literal["world", "body"],
+    axes: Literal["enu", "ned"],
+) -> Pose:
+    attitude = attitude_from_angles(np.array([angles]), order="ypr", units="deg")
+    attitude = attitude_in_enu(attitude, relative_to=relative_to, axes=axes)
+    return compose_gimbal(
+        world_from_body, LEVER_ARM, attitude, body_from_camera("forward"), relative_to=relative_to
+    )
+
+
+def same_rotation(a: Float, b: Float) -> None:
+    np.testing.assert_allclose(matrix_from_quaternion(a), matrix_from_quaternion(b), rtol=0, atol=1e-12)
+
+
+# --- the worked example --------------------------------------------------------------------------------
+
+
+def test_paper_case_1_fixed_mount() -> None:
+    camera = compose_mount(LEVEL, (LEVER_ARM, body_from_camera("forward", 30)))
+    assert f"= {on_paper(camera[0])}\n\nThe optical axis" in PAPER
+    for name, direction in (("axis ", AXIS), ("right", RIGHT_OF_PICTURE), ("bottom", BOTTOM_OF_PICTURE)):
+        line = next(line for line in PAPER.splitlines() if line.strip().startswith(name) and "= (" in line)
+        assert line.endswith(f"= {on_paper(rotate(camera[1], direction))}")
+    hip = transform(invert(*camera), np.array([12.0, 40.1, 18.0]))
+    assert f"bottom -10 + 11.95 cos 30 = {hip[0, 1]:.4f}; axis 20 cos 30 + 5.975 = {hip[0, 2]:.4f}" in PAPER
+    assert hip[0, 0] == pytest.approx(2, abs=1e-12)
+    pixel = project(hip, Intrinsics(1280, 720, 1000, 1000, 640, 360))
+    assert f"= {on_paper(pixel, 2)}" in PAPER
+
+
+def test_paper_case_2_gimbal_in_the_world() -> None:
+    position, quaternion = gimbal_on_paper(NOSE_DOWN, (45, -20, 0), "world", "ned")
+    case = PAPER.split("**2.")[1].split("**3.")[0]
+    for vector in (position, rotate(quaternion, AXIS), rotate(quaternion, RIGHT_OF_PICTURE)):
+        assert f"= {on_paper(vector)}\n" in case
+
+
+def test_paper_case_3_gimbal_on_the_body() -> None:
+    _, quaternion = gimbal_on_paper(LEVEL, (90, 20, 0), "body", "enu")
+    case = PAPER.split("**3.")[1].split("**4.")[0]
+    for direction in (AXIS, RIGHT_OF_PICTURE):
+        assert f"= {on_paper(rotate(quaternion, direction))}\n" in case
+
+
+def test_paper_case_4_uncertainty() -> None:
+    logged = np.zeros((1, 6, 6))
+    logged[0, 5, 5] = np.radians(2) ** 2  # about the fixed vertical
+    body = pose_covariance_in_body(logged, LEVEL[1])
+    _, quaternion = compose_mount(LEVEL, (LEVER_ARM, body_from_camera("forward", 30)))
+    sigma = np.sqrt(np.diagonal(mounted_covariance(body, LEVEL[1], LEVER_ARM, quaternion)[0]))
+    east, north, up, right, bottom, axis = sigma
+    assert f"across: {east:.4f} m." in PAPER
+    assert (
+        f"2 cos 30 = {np.degrees(bottom):.4f} deg;   about the axis  2 sin 30 = {np.degrees(axis):.4f}"
+        in PAPER
+    )
+    np.testing.assert_allclose([north, up, right], 0, atol=1e-9)
+
+
+# --- axis by axis --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("looks", "axis", "top"),
+    [
+        ("forward", FORWARD, UP),
+        ("backward", -FORWARD, UP),
+        ("left", LEFT, UP),
+        ("right", -LEFT, UP),
+        ("down", -UP, FORWARD),
+        ("up", UP, -FORWARD),
+    ],
+)
+def test_where_a_mount_looks_and_where_the_top_of_its_picture_is(
+    looks: Looks, axis: Float, top: Float
+) -> None:
+    mount = body_from_camera(looks)
+    np.testing.assert_allclose(rotate(mount, AXIS), axis, atol=1e-15)
+    np.testing.assert_allclose(rotate(mount, -BOTTOM_OF_PICTURE), top, atol=1e-15)
+    assert np.linalg.det(matrix_from_quaternion(mount)) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("looks", ["forward", "backward", "left", "right"])
+@pytest.mark.parametrize("down_deg", [-90, -15, 0, 30, 90])
+def test_a_tilt_lowers_the_axis_and_keeps_the_picture_level(looks: Looks, down_deg: float) -> None:
+    mount, level = body_from_camera(looks, down_deg), body_from_camera(looks)
+    axis = rotate(mount, AXIS)
+    assert axis[2] == pytest.approx(-np.sin(np.radians(down_deg)), abs=1e-15)
+    assert axis @ rotate(level, AXIS) == pytest.approx(np.cos(np.radians(down_deg)), abs=1e-15)
+    np.testing.assert_allclose(
+        rotate(mount, RIGHT_OF_PICTURE), rotate(level, RIGHT_OF_PICTURE), rtol=0, atol=1e-15
+    )
+
+
+def test_down_is_forward_tilted_by_a_right_angle() -> None:
+    same_rotation(body_from_camera("down"), body_from_camera("forward", 90))
+    same_rotation(body_from_camera("up"), body_from_camera("forward", -90))
+
+
+@pytest.mark.parametrize(("looks", "down_deg"), [("down", 10), ("up", -1), ("forward", 91), ("left", np.nan)])
+def test_tilts_without_meaning_are_refused(looks: Looks, down_deg: float) -> None:
+    with pytest.raises(ValueError, match="deg"):
+        body_from_camera(looks, down_deg)
+
+
+def test_a_level_drone_heading_east_sees_what_lies_east_below_and_right_of_it() -> None:
+    world_from_body = (np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]))
+    camera = compose_mount(world_from_body, (np.zeros(3), body_from_camera("forward", 30)))
+    lens = Intrinsics(1280, 720, 1000, 1000, 640, 360)
+
+    def seen(point: Float) -> Float:
+        pixel: Float = project(transform(invert(*camera), point), lens)[0]
+        return pixel
+
+    on_axis = 20 * (np.cos(np.radians(30)) * EAST - np.sin(np.radians(30)) * UP)
+    np.testing.assert_allclose(seen(on_axis), [640, 360], atol=1e-9)
+    assert seen(on_axis - NORTH)[0] > 640  # south is right of someone who faces east
+    assert seen(on_axis - UP)[1] > 360  # lower in the world is lower in the picture
+    assert seen(on_axis + 5 * EAST)[1] < 360  # farther along the ground is higher up
+    assert np.isnan(seen(-10 * EAST)).all()
+
+
+@pytest.mark.parametrize(
+    ("angles", "axis", "right"),
+    [
+        ((0, 0, 0), NORTH, EAST),
+        ((90, 0, 0), EAST, -NORTH),
+        ((-90, 0, 0), -EAST, NORTH),
+        ((0, -90, 0), -UP, EAST),  # DJI: pitch -90 is straight down
+        ((0, 90, 0), UP, EAST),
+        ((0, 0, 90), NORTH, -UP),  # rolled: its right side lowered
+    ],
+)
+def test_dji_angles_in_the_world(angles: tuple[float, float, float], axis: Float, right: Float) -> None:
+    """Yaw clockwise from north, pitch up, roll right side down, whatever the body does."""
+    _, quaternion = gimbal_on_paper(NOSE_DOWN, angles, "world", "ned")
+    np.testing.assert_allclose(rotate(quaternion[0], AXIS), axis, atol=1e-15)
+    np.testing.assert_allclose(rotate(quaternion[0], RIGHT_OF_PICTURE), right, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("axes", "angles", "axis"),
+    [
+        ("enu", (90, 0, 0), LEFT),
+        ("ned", (90, 0, 0), -LEFT),
+        ("enu", (0, 90, 0), -UP),
+        ("ned", (0, -90, 0), -UP),
+    ],
+)
+def test_angles_relative_to_the_body(
+    axes: Literal["enu", "ned"], angles: tuple[float, float, float], axis: Float
+) -> None:
+    _, quaternion = gimbal_on_paper(NOSE_DOWN, angles, "body", axes)
+    np.testing.assert_allclose(rotate(quaternion, AXIS), rotate(NOSE_DOWN[1], axis), atol=1e-15)
+
+
+def test_an_frd_body_in_a_ned_world_is_the_flu_body_in_an_enu_world() -> None:
+    """Heading east, nose 10 degrees up, in PX4's angles: yaw 90, pitch 10."""
+    ned_from_frd = attitude_from_angles(np.array([90.0, 10, 0]), order="ypr", units="deg")
+    covariance = np.diag([1.0, 2, 3, 4, 5, 6])
+    covariance[3, 4] = covariance[4, 3] = 0.5
+    covariance[4, 5] = covariance[5, 4] = 0.25
+    flu, turned = flu_body_from_frd(ned_from_frd, covariance)
+    _, world_from_body = enu_from_ned(np.zeros(3), flu)
+    np.testing.assert_allclose(
+        rotate(world_from_body, FORWARD),
+        np.cos(np.radians(10)) * EAST + np.sin(np.radians(10)) * UP,
+        atol=1e-15,
+    )
+    np.testing.assert_allclose(rotate(world_from_body, LEFT), NORTH, atol=1e-15)
+    assert turned is not None
+    assert (turned[3, 4], turned[4, 5], turned[5, 5]) == (-0.5, 0.25, 6)  # about y and z the signs change
+
+
+# --- algebra -------------------------------------------------------------------------------------------
+
+
+@given(angles_deg)
+def test_angles_agree_with_scipy_whatever_their_order_and_unit(angles: Float) -> None:
+    expected = Rotation.from_euler("ZYX", angles, degrees=True).as_quat()
+    same_rotation(attitude_from_angles(angles, order="ypr", units="deg"), expected)
+    same_rotation(attitude_from_angles(np.radians(angles[::-1]), order="rpy", units="rad"), expected)
+
+
+@given(angles_deg, angles_deg)
+def test_a_gimbal_in_the_world_is_the_one_on_the_body_that_undoes_the_body(
+    body: Float, gimbal: Float
+) -> None:
+    world_from_body = (np.ones((1, 3)), attitude_from_angles(body[None], order="ypr", units="deg"))
+    in_world = attitude_from_angles(gimbal[None], order="ypr", units="deg")
+    on_body = multiply(conjugate(world_from_body[1]), in_world)
+    optical = body_from_camera("forward")
+    held = compose_gimbal(world_from_body, LEVER_ARM, in_world, optical, relative_to="world")
+    carried = compose_gimbal(world_from_body, LEVER_ARM, on_body, optical, relative_to="body")
+    np.testing.assert_allclose(held[0], carried[0], rtol=0, atol=1e-12)
+    same_rotation(held[1], carried[1])
+
+
+@given(angles_deg, st.floats(-90, 90))
+def test_a_gimbal_that_never_moves_is_a_fixed_mount(body: Float, down_deg: float) -> None:
+    world_from_body = (np.ones((1, 3)), attitude_from_angles(body[None], order="ypr", units="deg"))
+    still = attitude_from_angles(np.array([[0.0, down_deg, 0.0]]), order="ypr", units="deg")
+    on_gimbal = compose_gimbal(
+        world_from_body, LEVER_ARM, still, body_from_camera("forward"), relative_to="body"
+    )
+    fixed = compose_mount(world_from_body, (LEVER_ARM, body_from_camera("forward", down_deg)))
+    np.testing.assert_allclose(on_gimbal[0], fixed[0], rtol=0, atol=1e-12)
+    same_rotation(on_gimbal[1], fixed[1])
+
+
+@given(angles_deg)
+def test_axes_of_a_log_change_names_and_not_the_view(angles: Float) -> None:
+    """The same attitude stated in NED (heading 90 - yaw, pitch and yaw mirrored) and in ENU."""
+    yaw, pitch, roll = angles
+    enu = attitude_from_angles(np.array([yaw, pitch, roll]), order="ypr", units="deg")
+    ned = attitude_from_angles(np.array([90 - yaw, -pitch, roll]), order="ypr", units="deg")
+    same_rotation(
+        attitude_in_enu(enu, relative_to="world", axes="enu"),
+        attitude_in_enu(ned, relative_to="world", axes="ned"),
+    )
+    frd = attitude_from_angles(np.array([-yaw, -pitch, roll]), order="ypr", units="deg")
+    same_rotation(
+        attitude_in_enu(enu, relative_to="body", axes="enu"),
+        attitude_in_enu(frd, relative_to="body", axes="ned"),
+    )
+
+
+def test_what_is_missing_stays_missing() -> None:
+    attitude = attitude_from_angles(np.array([[np.nan, 0, 0], [0, 0, 0]]), order="ypr", units="deg")
+    assert np.isnan(attitude[0]).all()
+    bodies = (np.zeros((2, 3)), np.tile([0.0, 0, 0, 1], (2, 1)))
+    _, quaternion = compose_gimbal(
+        bodies, LEVER_ARM, attitude, body_from_camera("forward"), relative_to="world"
+    )
+    assert np.isnan(quaternion[0]).all()
+    assert np.isfinite(quaternion[1]).all()

@@ -1,0 +1,66 @@
+"""Covariances against samples: errors are drawn as the log means them and measured as we mean them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pipelines.geometry.pose_covariance import Float, mounted_covariance, pose_covariance_in_body
+
+SAMPLES = 40_000
+# A sampled covariance has a standard error of at most sqrt(2 / N) sqrt(S_ii S_jj) = 0.7 %: five of them. What
+# is left out to first order is of the size of the angles, 0.01 rad, squared.
+TOLERANCE = 5 * np.sqrt(2 / SAMPLES)
+BODY = Rotation.from_euler("ZYX", [130, 20, -35], degrees=True)
+CAMERA = Rotation.from_euler("ZYX", [-60, 45, 10], degrees=True)
+LEVER_ARM = np.array([0.5, -0.2, 0.3])
+
+
+def logged_covariance() -> Float:
+    """Correlated, 1 to 10 cm and about 0.01 rad."""
+    generator = np.random.default_rng(3)
+    factor = np.diag([0.1, 0.05, 0.01, 0.01, 0.005, 0.02]) @ (np.eye(6) + 0.5 * generator.normal(size=(6, 6)))
+    return np.asarray(factor @ factor.T)
+
+
+def drawn_errors() -> tuple[Float, Rotation]:
+    """Position errors in the world, and rotation errors about the world's fixed axes."""
+    drawn = np.random.default_rng(4).multivariate_normal(np.zeros(6), logged_covariance(), SAMPLES)
+    return drawn[:, :3], Rotation.from_rotvec(drawn[:, 3:])
+
+
+def assert_sampled(position: Float, rotation_vector: Float, stated: Float) -> None:
+    sampled = np.cov(np.hstack([position, rotation_vector]).T)
+    scale = np.sqrt(np.diagonal(stated))
+    np.testing.assert_allclose(
+        sampled / np.outer(scale, scale), stated / np.outer(scale, scale), rtol=0, atol=TOLERANCE
+    )
+
+
+def test_the_rotation_of_a_log_turns_about_the_world_and_ours_about_the_body() -> None:
+    position, rotation = drawn_errors()
+    in_body = (BODY.inv() * (rotation * BODY)).as_rotvec()  # R_true = R exp(in_body)
+    stated = pose_covariance_in_body(logged_covariance(), BODY.as_quat())
+    assert_sampled(position, in_body, stated)
+    assert not np.allclose(stated, logged_covariance(), rtol=0.2)  # the attitude matters
+
+
+@pytest.mark.parametrize("on_gimbal", [False, True])
+def test_a_lever_arm_turns_the_errors_of_attitude_into_errors_of_position(on_gimbal: bool) -> None:
+    """A camera fixed to the body, or held in the world by an attitude that errs as the body's does."""
+    position, rotation = drawn_errors()
+    world_from_camera = CAMERA if on_gimbal else BODY * CAMERA
+    moved = position + (rotation * BODY).apply(LEVER_ARM) - BODY.apply(LEVER_ARM)
+    in_camera = (world_from_camera.inv() * (rotation * world_from_camera)).as_rotvec()
+    body = pose_covariance_in_body(logged_covariance(), BODY.as_quat())
+    stated = mounted_covariance(body, BODY.as_quat(), LEVER_ARM, world_from_camera.as_quat())
+    assert_sampled(moved, in_camera, stated)
+
+
+def test_many_at_once_and_unknown_stays_zero() -> None:
+    covariance = np.stack([logged_covariance(), np.zeros((6, 6))])
+    quaternions = np.stack([BODY.as_quat(), CAMERA.as_quat()])
+    body = pose_covariance_in_body(covariance, quaternions)
+    np.testing.assert_allclose(body[0], pose_covariance_in_body(covariance[0], quaternions[0]), atol=1e-18)
+    assert not mounted_covariance(body, quaternions, LEVER_ARM, quaternions)[1].any()

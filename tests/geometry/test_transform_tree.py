@@ -1,0 +1,152 @@
+"""Chains through a tree of transforms: closed-form motion, both directions, gaps, wrong names."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from pipelines.geometry.poses import Float, Int64, compose, invert, matrix_from_quaternion
+from pipelines.geometry.transform_tree import Link, chain, find_route
+
+S = 1_000_000_000
+EPOCH = 1_700_000_000 * S
+NEVER = 10**18
+
+
+def stamps(rate_hz: float, seconds: float = 2.0, start_s: float = 0.0) -> Int64:
+    return EPOCH + np.round((start_s + np.arange(round(seconds * rate_hz) + 1) / rate_hz) * S).astype(
+        np.int64
+    )
+
+
+def about_z(turned_deg: Float) -> Rotation:
+    return Rotation.from_rotvec(np.radians(turned_deg)[:, None] * [0.0, 0.0, 1.0])
+
+
+def gliding(t_ns: Int64, velocity: tuple[float, float, float], turn_deg_s: float = 0.0) -> Link:
+    """Constant velocity and a constant turn about z: what interpolation reproduces exactly."""
+    seconds = (t_ns - EPOCH) / S
+    turned = about_z(turn_deg_s * seconds)
+    return Link(t_ns, seconds[:, None] * np.array(velocity), turned.as_quat())
+
+
+def still(position: tuple[float, float, float], yaw_deg: float = 0.0) -> Link:
+    turned = about_z(np.array([yaw_deg])).as_quat()
+    return Link(np.array([0]), np.array([position], dtype=np.float64), turned, static=True)
+
+
+def a_drone() -> dict[tuple[str, str], Link]:
+    return {
+        ("map", "odom"): gliding(stamps(5), (0, 1, 0)),
+        ("odom", "base"): gliding(stamps(50, start_s=0.1, seconds=1.5), (10, 0, 0), turn_deg_s=90),
+        ("base", "camera"): still((0.5, 0, 0), yaw_deg=90),
+        ("world", "map"): still((100, 0, 0)),
+    }
+
+
+def test_a_chain_of_moving_and_static_links_at_the_stamps_of_the_fastest() -> None:
+    found = chain(a_drone(), "world", "camera", max_gap_ns=S)
+    np.testing.assert_array_equal(found.t_ns, stamps(50, start_s=0.1, seconds=1.5))
+    seconds = (found.t_ns - EPOCH) / S
+    heading = np.radians(90) * seconds
+    expected = np.stack(
+        [100 + 10 * seconds + 0.5 * np.cos(heading), seconds + 0.5 * np.sin(heading), 0 * seconds], axis=1
+    )
+    np.testing.assert_allclose(found.position, expected, rtol=0, atol=1e-9)
+    camera = about_z(np.degrees(heading) + 90).as_matrix()
+    np.testing.assert_allclose(matrix_from_quaternion(found.quaternion_xyzw), camera, rtol=0, atol=1e-9)
+
+
+def test_the_way_back_is_the_inverse() -> None:
+    t_ns = stamps(20, start_s=0.2, seconds=1.0)
+    there = chain(a_drone(), "world", "camera", t_ns, max_gap_ns=S)
+    back = chain(a_drone(), "camera", "world", t_ns, max_gap_ns=S)
+    position, quaternion = invert(there.position, there.quaternion_xyzw)
+    np.testing.assert_allclose(back.position, position, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        matrix_from_quaternion(back.quaternion_xyzw), matrix_from_quaternion(quaternion), rtol=0, atol=1e-12
+    )
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=6), st.integers(0, 2**31))
+def test_links_may_be_stated_either_way_round(flipped: list[bool], seed: int) -> None:
+    """A chain of random static links; each is put into the tree as it is or inverted."""
+    generator = np.random.default_rng(seed)
+    links: dict[tuple[str, str], Link] = {}
+    expected: tuple[Float, Float] = (np.zeros((1, 3)), np.array([[0.0, 0, 0, 1]]))
+    for k, flip in enumerate(flipped):
+        pose = (generator.normal(size=(1, 3)), Rotation.random(1, rng=generator).as_quat())
+        expected = compose(expected, pose)
+        edge = (f"f{k + 1}", f"f{k}") if flip else (f"f{k}", f"f{k + 1}")
+        links[edge] = Link(np.array([0]), *(invert(*pose) if flip else pose), static=True)
+    found = chain(links, "f0", f"f{len(flipped)}", max_gap_ns=S)
+    np.testing.assert_allclose(found.position, expected[0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        matrix_from_quaternion(found.quaternion_xyzw), matrix_from_quaternion(expected[1]), rtol=0, atol=1e-12
+    )
+
+
+def test_between_siblings_the_way_leads_over_their_parent() -> None:
+    links = {("world", "a"): still((1, 0, 0), yaw_deg=90), ("world", "b"): still((1, 3, 0))}
+    assert find_route(links, "a", "b").frames == ("a", "world", "b")
+    found = chain(links, "a", "b", max_gap_ns=S)
+    np.testing.assert_allclose(found.position, [[3, 0, 0]], atol=1e-12)  # 3 m north is forward of a
+
+
+def test_a_gap_in_one_link_is_a_gap_of_the_chain() -> None:
+    links = a_drone()
+    t_ns, position, quaternion, _ = links["map", "odom"]
+    kept = (t_ns <= EPOCH + S) | (t_ns >= EPOCH + 3 * S // 2)  # 5 Hz: nothing between 1.0 and 1.6 s
+    links["map", "odom"] = Link(t_ns[kept], position[kept], quaternion[kept])
+    found = chain(links, "world", "camera", max_gap_ns=S // 2)
+    unknown = (found.t_ns > EPOCH + S) & (found.t_ns < EPOCH + 8 * S // 5)
+    np.testing.assert_array_equal(np.isnan(found.position[:, 0]), unknown)
+    np.testing.assert_array_equal(np.isnan(found.quaternion_xyzw[:, 0]), unknown)
+    assert not np.isnan(chain(links, "world", "camera", max_gap_ns=S).position).any()
+
+
+def test_a_link_is_held_past_its_ends_no_longer_than_allowed() -> None:
+    links = {("world", "base"): gliding(stamps(10, seconds=1.0), (1, 0, 0))}
+    at = EPOCH + np.array([-S // 10, S + S // 10, S + S // 5])
+    strict = chain(links, "world", "base", at, max_gap_ns=S)
+    assert np.isnan(strict.position).all()
+    held = chain(links, "world", "base", at, max_gap_ns=S, max_extrapolation_ns=S // 10)
+    np.testing.assert_array_equal(held.position[:, 0], [0, 1, np.nan])
+
+
+def test_static_links_hold_always_and_the_last_statement_counts() -> None:
+    moved = Link(
+        np.array([0, 5]), np.array([[1.0, 0, 0], [2.0, 0, 0]]), np.tile([0.0, 0, 0, 1], (2, 1)), static=True
+    )
+    links = {("world", "mast"): moved}
+    found = chain(links, "world", "mast", np.array([-NEVER, NEVER]), max_gap_ns=1)
+    np.testing.assert_array_equal(found.position, [[2, 0, 0], [2, 0, 0]])
+    alone = chain(links, "world", "mast", max_gap_ns=1)
+    assert alone.t_ns.tolist() == [5]
+
+
+def test_the_shortest_way_is_taken() -> None:
+    links = {
+        ("world", "base"): still((1, 0, 0)),
+        ("world", "odom"): still((5, 0, 0)),
+        ("odom", "base"): still((5, 0, 0)),
+    }
+    assert find_route(links, "world", "base").frames == ("world", "base")
+
+
+@pytest.mark.parametrize(
+    ("parent", "child", "told"),
+    [
+        ("world", "camra", r"no frame 'camra' \(nearest: camera"),
+        ("xyzzy", "camera", r"no frame 'xyzzy' \(there are base, camera, island, map"),
+        ("world", "island", "no transforms connect 'world' with 'island' .'world' has base, camera"),
+        ("base", "base", "both 'base'"),
+    ],
+)
+def test_wrong_frames_are_told_with_those_there_are(parent: str, child: str, told: str) -> None:
+    links = a_drone() | {("sea", "island"): still((0, 0, 0))}
+    with pytest.raises(ValueError, match=told):
+        chain(links, parent, child, max_gap_ns=S)
