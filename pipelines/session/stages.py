@@ -144,6 +144,7 @@ class WritableSession(Session):
         if force:
             _remove_partials(self.folder, stage.name)
         elif before is not None and before.key == key and self._intact(before):
+            _remove_partials(self.folder, stage.name)  # of a --force that was interrupted
             return Run(self.folder, stage, key, settings, inputs, before=before, finished=True)
         new = _new(self.folder, stage.name)
         remove_tree(new)
