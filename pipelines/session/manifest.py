@@ -289,6 +289,7 @@ class Map(Part):
     log: str | None = None
     topic: str | None = None
     unknown: Literal["free", "occupied"] = "free"
+    resolution_m: float | None = Field(None, gt=0)
 
 
 class TruthJoints(Part):

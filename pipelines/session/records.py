@@ -154,9 +154,14 @@ Sample = PoseSample | AngleSample | IntrinsicsSample | PictureSample
 
 @dataclass(frozen=True)
 class Occupancy:
-    """A voxel map: probability of being occupied, NaN where nothing is known."""
+    """A voxel map: probability of being occupied, 0.5 and above is occupied, NaN where nothing is known.
+
+    What a reader left out of the file is counted by cause in `dropped`; it is not part of the map and not
+    stored with it.
+    """
 
     probability: NDArray[np.float32]  # [X, Y, Z]
     origin: Float  # [3] m, the corner of voxel (0, 0, 0), world
     resolution_m: float
     from_ns: int = 0  # the time from which it holds
+    dropped: dict[str, int] = field(default_factory=dict)

@@ -115,8 +115,8 @@ class LogFormat(Format, Protocol):
 class MapFormat(Format, Protocol):
     """What stands around."""
 
-    def read_map(self, path: Path) -> Occupancy:
-        """Read it as voxels, in the axes of the file."""
+    def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
+        """Read it as voxels, in the axes of the file; `resolution_m` where the user states their size."""
 
 
 class Export(Protocol):

@@ -1,0 +1,61 @@
+"""Reading files that are numbers below a few lines of text."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.session.errors import DataError
+from pipelines.session.storage import as_data_error
+
+LONGEST_HEADER = 64 * 1024
+
+Bytes = NDArray[np.uint8]
+
+
+def read_bytes(path: Path) -> bytes:
+    """The whole file.
+
+    Raises:
+        DataError: missing or unreadable.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise as_data_error(error, path) from error
+
+
+def first_bytes(path: Path, count: int = LONGEST_HEADER) -> bytes:
+    """The beginning of a file, for recognising it; empty when it cannot be read. Never raises."""
+    try:
+        with path.open("rb") as file:
+            return file.read(count)
+    except OSError:
+        return b""
+
+
+def split_header(path: Path, content: bytes, last: str) -> tuple[list[list[str]], Bytes]:
+    """The words of every line of a text header, and the bytes below it.
+
+    Args:
+        path: the file, for messages.
+        content: all of it.
+        last: the word with which the header's last line begins.
+
+    Raises:
+        DataError: no such line within the first 64 KiB.
+    """
+    lines: list[list[str]] = []
+    start = 0
+    while start < min(len(content), LONGEST_HEADER):
+        end = content.find(b"\n", start, LONGEST_HEADER)
+        end = end if end >= 0 else min(len(content), LONGEST_HEADER)
+        words = content[start:end].decode("ascii", "replace").split()
+        if words:
+            lines.append(words)
+        start = end + 1
+        if words and words[0] == last:
+            return lines, np.frombuffer(content, np.uint8)[start:]
+    raise DataError(path, f"its header has no line {last!r}", "export the file again")

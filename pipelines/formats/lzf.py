@@ -1,0 +1,48 @@
+"""LZF decompression, compiled; `pcd` is its only user.
+
+The stream (liblzf by Marc Lehmann, lzf_d.c) is a row of instructions that begin with a control byte c:
+
+- c < 32: copy the c + 1 bytes that follow;
+- else: repeat (c >> 5) + 2 bytes of the output (if c >> 5 is 7, a byte to add to the length follows) from
+  ((c & 31) << 8) + next byte + 1 bytes back; the two may overlap.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.compilation import cached
+
+MOST_EXPANSION = 88
+"""Three bytes stand for 264 at most: a stated size beyond this is not believed."""
+
+
+@cached
+def decompress(packed: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
+    """Fill `target`; the bytes written, or -1 where the stream breaks off, points outside or is too long."""
+    read, written = 0, 0
+    while read < len(packed):
+        control = int(packed[read])
+        read += 1
+        if control < 32:
+            length = control + 1
+            if read + length > len(packed) or written + length > len(target):
+                return -1
+            target[written : written + length] = packed[read : read + length]
+            read += length
+        else:
+            length = (control >> 5) + 2
+            if length == 9 and read < len(packed):
+                length += int(packed[read])
+                read += 1
+            if read >= len(packed):
+                return -1
+            source = written - ((control & 31) << 8) - int(packed[read]) - 1
+            read += 1
+            if source < 0 or written + length > len(target):
+                return -1
+            for k in range(length):  # one by one: the two may overlap
+                target[written + k] = target[source + k]
+        written += length
+    return written

@@ -1,0 +1,125 @@
+"""The compiled walks of `octomap`, which explains the formats and is the only user.
+
+All kernels stand in this one module: numba's cache watches the file of the outermost function only.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.compilation import cached
+
+DEPTH = 16
+FREE, OCCUPIED, INNER = 1, 2, 3  # of the two bits that a .bt has for every child
+BREAKS_OFF, TOO_DEEP = -1, -2
+
+Int32 = NDArray[np.int32]
+Float32 = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+
+# Nodes wait on a stack with at most seven siblings of every level above them, and eight children.
+_STACK = 8 * (DEPTH + 1)
+
+
+@cached
+def walk_binary(
+    words: NDArray[np.uint16], key: Int32, depth: Bytes, log_odds: Float32, free: float, occupied: float
+) -> int:
+    """Write the leaves of a .bt tree, one word per inner node, depth first.
+
+    `key` [L, 3], `depth` [L] and `log_odds` [L] have room for exactly the leaves that all words name.
+    Returns the number of words that the tree has, or `BREAKS_OFF` or `TOO_DEEP`.
+    """
+    stack = np.empty((_STACK, 4), dtype=np.int64)
+    stack[0] = 0
+    waiting, read, leaves = 1, 0, 0
+    while waiting:
+        waiting -= 1
+        x, y, z, level = stack[waiting]
+        if read == len(words):
+            return BREAKS_OFF
+        word = np.int64(words[read])
+        read += 1
+        half = 1 << (DEPTH - 1 - level)
+        for child in range(7, -1, -1):  # the first child is then on top
+            state = (word >> (2 * child)) & 3
+            if state == 0:
+                continue
+            child_x = x + half * (child & 1)
+            child_y = y + half * ((child >> 1) & 1)
+            child_z = z + half * (child >> 2)
+            if state == INNER:
+                if level + 1 == DEPTH:
+                    return TOO_DEEP
+                stack[waiting, 0] = child_x
+                stack[waiting, 1] = child_y
+                stack[waiting, 2] = child_z
+                stack[waiting, 3] = level + 1
+                waiting += 1
+            else:
+                key[leaves, 0] = child_x
+                key[leaves, 1] = child_y
+                key[leaves, 2] = child_z
+                depth[leaves] = level + 1
+                log_odds[leaves] = occupied if state == OCCUPIED else free
+                leaves += 1
+    return read
+
+
+@cached
+def walk_full(children: Bytes, node: Int32, key: Int32, depth: Bytes) -> int:
+    """Find the leaves of a .ot tree: which record each one is, and where it lies.
+
+    `children` [N] are the bit masks of the records, depth first; `node`, `key` [L, 3] and `depth` have
+    room for exactly the records without children. Returns as `walk_binary`.
+    """
+    stack = np.empty((_STACK, 4), dtype=np.int64)
+    stack[0] = 0
+    waiting, read, leaves = 1, 0, 0
+    while waiting:
+        waiting -= 1
+        x, y, z, level = stack[waiting]
+        if read == len(children):
+            return BREAKS_OFF
+        mask = np.int64(children[read])
+        if mask == 0:
+            node[leaves] = read
+            key[leaves, 0] = x
+            key[leaves, 1] = y
+            key[leaves, 2] = z
+            depth[leaves] = level
+            leaves += 1
+        elif level == DEPTH:
+            return TOO_DEEP
+        read += 1
+        half = 1 << max(DEPTH - 1 - level, 0)
+        for child in range(7, -1, -1):
+            if (mask >> child) & 1:
+                stack[waiting, 0] = x + half * (child & 1)
+                stack[waiting, 1] = y + half * ((child >> 1) & 1)
+                stack[waiting, 2] = z + half * (child >> 2)
+                stack[waiting, 3] = level + 1
+                waiting += 1
+    return read
+
+
+@cached
+def fill(
+    grid: Float32, key: Int32, depth: Bytes, probability: Float32, low: NDArray[np.int64], halvings: int
+) -> None:
+    """Give every voxel of `grid` (NaN before) the largest probability of the leaves within it.
+
+    A voxel is 2 ** halvings finest voxels wide; the first one's key, counted in such voxels, is `low`.
+    """
+    for leaf in range(len(depth)):
+        side = max(1, (1 << (DEPTH - np.int64(depth[leaf]))) >> halvings)
+        x0 = (np.int64(key[leaf, 0]) >> halvings) - low[0]
+        y0 = (np.int64(key[leaf, 1]) >> halvings) - low[1]
+        z0 = (np.int64(key[leaf, 2]) >> halvings) - low[2]
+        value = probability[leaf]
+        for x in range(x0, x0 + side):
+            for y in range(y0, y0 + side):
+                for z in range(z0, z0 + side):
+                    if not grid[x, y, z] >= value:  # also where nothing was known
+                        grid[x, y, z] = value

@@ -1,0 +1,200 @@
+"""Maps of a session: what is stored comes back, byte for byte the same, and nothing bad is believed."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+from numpy.typing import NDArray
+
+from pipelines.session import maps
+from pipelines.session.errors import DataError
+from pipelines.session.records import Occupancy
+
+probabilities = st.just(np.float32(np.nan)) | st.floats(0, 1, width=32)
+grids = arrays(np.float32, array_shapes(min_dims=3, max_dims=3, max_side=4), elements=probabilities)
+
+
+def occupancy(from_ns: int = 0, resolution_m: float = 0.2) -> Occupancy:
+    grid = np.full((3, 4, 5), np.nan, dtype=np.float32)
+    grid[1, 2, 3], grid[0, 0, 4] = 0.971, 0.1192
+    return Occupancy(grid, np.array([-69.8, 1e-7, 3.0]), resolution_m, from_ns)
+
+
+def same(a: Occupancy, b: Occupancy) -> None:
+    np.testing.assert_array_equal(a.probability, b.probability)
+    assert a.probability.dtype == b.probability.dtype == np.float32
+    np.testing.assert_array_equal(a.origin, b.origin)
+    assert (a.resolution_m, a.from_ns) == (b.resolution_m, b.from_ns)
+
+
+@given(grids, st.floats(1e-4, 1e4), st.integers(0, 2**63 - 1))
+def test_grids_come_back(
+    tmp_path_factory: pytest.TempPathFactory, grid: NDArray[np.float32], side: float, from_ns: int
+) -> None:
+    path = tmp_path_factory.mktemp("grid") / "a.npz"
+    stored = Occupancy(grid, np.array([1e6, -0.3, 2.0]), side, from_ns)
+    maps.write_grid(path, stored)
+    same(maps.read_grid(path), stored)
+    with np.load(path, allow_pickle=False) as arrays_of:  # without this program
+        np.testing.assert_array_equal(arrays_of["probability"], grid)
+        assert float(arrays_of["resolution_m"]) == side
+
+
+def test_a_session_keeps_its_maps_in_order(tmp_path: Path) -> None:
+    first, second = occupancy(5), occupancy(7, 0.4)
+    maps.store_map(tmp_path, iter([first, second]))
+    loaded = maps.load_maps(tmp_path)
+    assert len(loaded) == 2
+    same(loaded[0], first)
+    same(loaded[1], second)
+    index = json.loads((tmp_path / "map/index.json").read_text())["maps"]
+    assert index[1] == {
+        "file": "1.npz",
+        "from_ns": 7,
+        "shape": [3, 4, 5],
+        "origin": [-69.8, 1e-7, 3.0],
+        "resolution_m": 0.4,
+    }
+
+
+def test_equal_maps_are_equal_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    maps.write_grid(tmp_path / "a.npz", occupancy())
+    monkeypatch.setattr(time, "time", lambda: 2e9)
+    monkeypatch.setattr(time, "localtime", lambda *_: time.gmtime(2e9))
+    in_columns = occupancy()
+    in_columns = Occupancy(np.asfortranarray(in_columns.probability), in_columns.origin, 0.2)
+    maps.write_grid(tmp_path / "b.npz", in_columns)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_a_session_without_a_map_has_none(tmp_path: Path) -> None:
+    assert maps.load_maps(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("index", "problem"),
+    [("{}", "no list of maps"), ("[", "is damaged"), ('{"maps": [{}, {}]}', r"1\.npz: No such file")],
+)
+def test_damaged_sessions_are_refused(tmp_path: Path, index: str, problem: str) -> None:
+    maps.store_map(tmp_path, [occupancy()])
+    (tmp_path / "map/index.json").write_text(index)
+    with pytest.raises(DataError, match=problem):
+        maps.load_maps(tmp_path)
+
+
+def archive(path: Path, **members: bytes | NDArray[Any] | list[Any] | float) -> Path:
+    """An npz of arrays, or of bytes that claim to be some; None leaves one out."""
+    content: dict[str, Any] = {"origin": [0.0, 0, 0], "resolution_m": 0.2, **members}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, value in content.items():
+            if value is not None:
+                file.writestr(f"{name}.npy", value if isinstance(value, bytes) else npy(value))
+    return path
+
+
+def npy(value: object) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, np.asarray(value), allow_pickle=True)
+    return buffer.getvalue()
+
+
+def claiming(shape: object, descr: str = "<f4", body: bytes = b"\0" * 64) -> bytes:
+    """An npy whose header says what it likes."""
+    text = f"{{'descr': {descr!r}, 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode() + body
+
+
+GRID = np.full((2, 3, 4), 0.25)
+
+
+@pytest.mark.parametrize(
+    ("members", "problem"),
+    [
+        ({}, "lacks either probability or occupancy"),
+        ({"probability": GRID, "occupancy": GRID > 1}, "either probability or occupancy"),
+        ({"probability": GRID, "origin": None}, "lacks origin"),
+        ({"probability": GRID, "resolution_m": None}, "lacks resolution_m"),
+        ({"probability": GRID, "resolution_m": 0.0}, "voxels of 0 m"),
+        ({"probability": GRID, "resolution_m": np.nan}, "voxels of nan m"),
+        ({"probability": GRID, "resolution_m": [0.2]}, r"resolution_m is float64 \[1\]"),
+        ({"probability": GRID, "origin": [0.0, np.inf, 0]}, "origin is not finite"),
+        ({"probability": GRID, "origin": [0.0, 1]}, r"origin is float64 \[2\]"),
+        ({"probability": GRID, "origin": np.zeros(5000)}, "larger than 4096 bytes"),
+        ({"probability": GRID, "origin": np.array([{}, 1, 2])}, "no readable npz"),
+        ({"probability": GRID, "from_ns": 0.5}, "from_ns is float64"),
+        ({"probability": GRID[0]}, r"probability is float64 \[3, 4\]"),
+        ({"probability": GRID.astype(str)}, r"probability is <U32"),
+        ({"probability": GRID.astype(object)}, r"probability is object"),
+        ({"probability": GRID[:0]}, r"is empty, \[0, 3, 4\]"),
+        ({"probability": GRID * 5}, r"probability holds 1\.25"),
+        ({"probability": -GRID}, r"probability holds -0\.25"),
+        ({"occupancy": np.full((1, 1, 1), 101, np.uint8)}, "occupancy holds 101"),
+        ({"occupancy": np.full((1, 1, 1), -2, np.int8)}, "occupancy holds -2"),
+        ({"probability": claiming((10**4, 10**4, 10**4))}, r"10000 x 10000 x 10000 voxels of 0\.2 m"),
+        ({"probability": claiming((10**300, 10, 10))}, r"1e\+300 x 10 x 10 voxels"),
+        ({"probability": claiming((-1, 4, 4))}, r"is empty, \[-1, 4, 4\]"),
+        ({"probability": claiming((400, 400, 400))}, "do not hold"),
+        ({"probability": claiming((2, 2, 2), "|O")}, "probability is object"),
+        ({"probability": claiming((2, 2, 2), "nonsense")}, "no readable npz"),
+        ({"probability": claiming("((" * 50)}, "no readable npz"),
+        ({"probability": b"not an array"}, "no readable npz"),
+    ],
+)
+def test_unusable_grids_are_one_clear_line(tmp_path: Path, members: dict[str, Any], problem: str) -> None:
+    path = archive(tmp_path / "bad.npz", **members)
+    for read in (maps.read_grid, maps.describe_stored):
+        with pytest.raises(DataError, match=problem) as caught:
+            read(path)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\5\6" + b"\0" * 30, b"\0" * 100])
+def test_what_is_no_zip_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "bad.npz"
+    path.write_bytes(content)
+    with pytest.raises(DataError):
+        maps.read_grid(path)
+
+
+def test_arrays_of_other_scripts_are_read(tmp_path: Path) -> None:
+    asymmetric = np.arange(24).reshape(2, 3, 4) / 24
+    for name, value in {
+        "columns": np.asfortranarray(asymmetric),
+        "big endian": asymmetric.astype(">f8"),
+        "half": asymmetric.astype(np.float16),
+    }.items():
+        path = archive(tmp_path / f"{name}.npz", probability=value, origin=[1, 2, 3], resolution_m=1)
+        found = maps.read_grid(path)
+        assert found.origin.tolist() == [1, 2, 3]
+        np.testing.assert_allclose(found.probability, asymmetric, rtol=0, atol=1e-3)  # half: 2 ** -11
+        assert maps.describe_stored(path)["occupied_voxels"] == 12
+
+
+def test_percent_and_yes_or_no_become_probabilities(tmp_path: Path) -> None:
+    percent = np.array([[[-1, 0, 50, 100]]], dtype=np.int8)
+    found = maps.read_grid(archive(tmp_path / "a.npz", occupancy=percent))
+    np.testing.assert_array_equal(found.probability, np.array([[[np.nan, 0, 0.5, 1]]], dtype=np.float32))
+    said = maps.describe_stored(tmp_path / "a.npz")
+    assert (said["occupied_voxels"], said["free_voxels"], said["unknown_voxels"]) == (2, 1, 1)
+    found = maps.read_grid(archive(tmp_path / "b.npz", occupancy=percent > 0))
+    assert found.probability.ravel().tolist() == [0, 0, 1, 1]
+
+
+def test_large_grids_are_read_in_slabs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(maps, "_SLAB_BYTES", 100)
+    rng = np.random.default_rng(4)
+    grid = rng.random((7, 5, 3), dtype=np.float32)
+    for order in ("C", "F"):
+        path = archive(tmp_path / f"{order}.npz", probability=np.array(grid, order=order))
+        np.testing.assert_array_equal(maps.read_grid(path).probability, grid)
+        assert maps.describe_stored(path)["occupied_voxels"] == int((grid >= 0.5).sum())
