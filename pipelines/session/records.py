@@ -153,6 +153,40 @@ Sample = PoseSample | AngleSample | IntrinsicsSample | PictureSample
 
 
 @dataclass(frozen=True)
+class VideoIndex:
+    """When the frames of a video are shown. Frame k is the k-th in the order of showing, from 0.
+
+    Every frame that the container lists has its row, whether or not a decoder can make a picture of it:
+    a frame that turns out damaged is missing, the others keep their numbers. What the container lists
+    but the file no longer holds is counted in `dropped`.
+    """
+
+    pts_ns: Int64  # [N] strictly increasing, since the first frame: pts_ns[0] is 0
+    start_ns: int  # the first frame's own stamp in the container, often 0
+    width: int  # px, as shown: turned by rotation_deg, as OpenCV and players do
+    height: int
+    rotation_deg: int  # 0, 90, 180 or 270: how far the coded picture is turned counter-clockwise to show it
+    codec: str
+    variable: bool  # whether k / rate_hz is further from pts_ns[k] than the container's clock explains
+    dropped: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def count(self) -> int:
+        """How many frames."""
+        return len(self.pts_ns)
+
+    @property
+    def span_s(self) -> float:
+        """From the first frame's stamp to the last one's."""
+        return int(self.pts_ns[-1]) / 1e9
+
+    @property
+    def rate_hz(self) -> float | None:
+        """The average rate; None for a single frame."""
+        return (self.count - 1) / self.span_s if self.count > 1 else None
+
+
+@dataclass(frozen=True)
 class Occupancy:
     """A voxel map: probability of being occupied, 0.5 and above is occupied, NaN where nothing is known.
 

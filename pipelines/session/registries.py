@@ -23,6 +23,7 @@ from pipelines.session.records import (
     Recording,
     Topic,
     Trajectory,
+    VideoIndex,
 )
 
 T = TypeVar("T")
@@ -109,6 +110,14 @@ class LogFormat(Format, Protocol):
 
     def open_log(self, paths: Sequence[Path]) -> Log:
         """Open a recording: one file, the parts of a split one in order, or a bag's folder."""
+
+
+@runtime_checkable
+class VideoFormat(Format, Protocol):
+    """Pictures over time."""
+
+    def index(self, path: Path) -> VideoIndex:
+        """When its frames are shown, from the container alone: no picture but the first is decoded."""
 
 
 @runtime_checkable

@@ -1,0 +1,101 @@
+"""Small videos whose frames say their own number: a bar code of 16 blocks, white for a set bit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+Picture = NDArray[np.uint8]
+
+_BLOCK = 20
+SIZE = (16 * _BLOCK, 96)  # width, height of the pictures, as coded
+TICK_S = Fraction(1, 90_000)
+
+
+def even_ticks(count: int, step: int = 3000, first: int = 0) -> list[int]:
+    """Stamps at a constant rate; 3000 ticks of TICK_S are 30 frames a second."""
+    return [first + step * k for k in range(count)]
+
+
+def uneven_ticks(count: int, seed: int = 0) -> list[int]:
+    """Stamps of a rate that wanders between 15 and 60 Hz, with a pause of a second in the middle."""
+    steps = np.random.default_rng(seed).integers(1500, 6000, count - 1)
+    steps[count // 2] = 90_000
+    return [0, *np.cumsum(steps).tolist()]
+
+
+def bar_code(number: int) -> Picture:
+    """The picture of a frame: its bar code above a grey ramp that moves."""
+    width, height = SIZE
+    picture = np.empty((height, width, 3), dtype=np.uint8)
+    picture[:] = ((np.arange(width) + 3 * number) % 128)[:, None]
+    bits = np.repeat([255 * (number >> bit & 1) for bit in range(16)], _BLOCK)
+    picture[: height // 2] = bits[:, None]
+    return picture
+
+
+def read_bar_code(picture: Picture) -> int:
+    """The number in a picture; halfway between black and white decides, which no codec here blurs over."""
+    row = picture[SIZE[1] // 4, _BLOCK // 2 :: _BLOCK].mean(axis=-1)
+    return sum(1 << bit for bit, value in enumerate(row) if value > 128)
+
+
+def write_video(
+    path: Path,
+    ticks: Sequence[int],
+    *,
+    codec: str = "libx264",
+    tick_s: Fraction = TICK_S,
+    key_every: int = 12,
+    b_frames: int = 2,
+    turned_deg: int = 0,
+) -> Path:
+    """Write one frame for each stamp; the suffix of the path is the container, MP4 with its table in front.
+
+    Args:
+        path: the file.
+        ticks: strictly increasing stamps.
+        codec: FFmpeg's name of the encoder.
+        tick_s: the unit of the stamps.
+        key_every: frames from one key frame to the next.
+        b_frames: how many frames in a row refer to later ones.
+        turned_deg: counter-clockwise rotation that the container states.
+    """
+    mp4 = path.suffix in {".mp4", ".mov"}
+    with av.open(str(path), "w", options={"movflags": "faststart"} if mp4 else {}) as container:
+        stream = container.add_stream(codec, rate=30)
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height = SIZE
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        stream.time_base = stream.codec_context.time_base = tick_s
+        options = {"g": str(key_every), "bf": str(b_frames)}
+        if codec == "libx264":
+            options |= {"preset": "ultrafast", "sc_threshold": "0"}
+        stream.codec_context.options = options if codec != "mjpeg" else {}
+        if turned_deg:
+            stream.set_display_rotation(turned_deg)
+        container.start_encoding()  # also without a frame
+        for number, pts in enumerate(ticks):
+            frame = av.VideoFrame.from_ndarray(bar_code(number), format="bgr24")
+            frame.pts, frame.time_base = pts, tick_s
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+def write_sound(path: Path) -> Path:
+    """A tenth of a second of silence, without a picture."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("aac", rate=48_000)
+        frame = av.AudioFrame(format="fltp", layout="mono", samples=4800)
+        frame.sample_rate, frame.pts = 48_000, 0
+        for plane in frame.planes:
+            plane.update(bytes(plane.buffer_size))
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
