@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 Picture = NDArray[np.uint8]  # [height, width, 3] blue, green, red
 
 _MOST_PIXELS = 1 << 27  # 16384 x 8192; a header that states more is damaged, and memory is finite
+_LATEST_S = 4 * 10**9  # after the year 2096, counted from the epoch; int64 ns hold 292 years
 _MOST_KEY_FRAMES = 3  # to seek before a frame counts as undecodable
 _MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
 _PACKET_TS, _PACKET_M2TS = 188, 192
@@ -274,6 +275,9 @@ def _scan(path: Path) -> _Scan:
             problem = f"is cut off before its first frame ends ({len(lost)} are lost)"
         raise DataError(path, problem, "copy it from the camera again, or export it as MP4")
     ticks = np.unique(np.array([pts for pts, _ in sure], dtype=np.int64))
+    furthest_s = max(abs(int(ticks[0])), abs(int(ticks[-1]))) * tick_s
+    if tick_s <= 0 or furthest_s > _LATEST_S:
+        raise DataError(path, f"stamps its frames up to {float(furthest_s):.3g} s", "its header is damaged")
     counts = {
         "cut off": len(lost) + len(stamped) - len(sure),
         "no stamp": len(whole) - len(stamped),

@@ -282,6 +282,12 @@ def test_a_stated_size_beyond_reason_is_not_believed(tmp_path: Path) -> None:
         index_video(path)
 
 
+def test_stamps_beyond_reason_are_refused(tmp_path: Path) -> None:
+    ticks = even_ticks(3, step=40, first=5 * 10**12)
+    with pytest.raises(DataError, match=r"stamps its frames up to 5e\+09 s"):
+        index_video(write_video(tmp_path / "v.mkv", ticks, tick_s=Fraction(1, 1000), b_frames=0))
+
+
 def test_pictures_that_change_their_size(tmp_path: Path) -> None:
     small = write_video(tmp_path / "a.mov", even_ticks(3), codec="mjpeg", b_frames=0)
     width, height = SIZE
