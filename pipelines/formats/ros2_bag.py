@@ -38,6 +38,7 @@ from pipelines.session.records import Int64
 _MAGIC = b"SQLite format 3\0"
 _INFORMATION = "rosbag2_bagfile_information"
 _METADATA_LIMIT = 16 << 20  # bytes of a metadata.yaml
+_LARGEST_ROWID = 1 << 48
 _SUFFIXES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 
 
@@ -108,11 +109,11 @@ class _Sqlite3Part(LogPart):
     def __init__(self, path: Path, database: Path, file_size: int) -> None:
         super().__init__(path, file_size)
         self.storage = ["sqlite3"]
-        # Immutable: sqlite neither locks nor writes beside the user's file.
-        self.database = sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
+        self.database = _connect(database)
         try:
             self._read_topics()
             self.take(self._list_messages())
+            self._check_length(database)
             self._count_unmerged()
             require_content(self)
         except sqlite3.Error as error:
@@ -165,16 +166,33 @@ class _Sqlite3Part(LogPart):
         query = (
             "SELECT rowid, CASE typeof(timestamp) WHEN 'integer' THEN ifnull(CAST(topic_id AS INTEGER), -1) "
             "ELSE -1 END, ifnull(CAST(timestamp AS INTEGER), 0), ifnull(length(data), 0) "
-            "FROM messages ORDER BY rowid"
+            "FROM messages WHERE rowid > ? ORDER BY rowid"
         )
         numbers = array("q")
-        try:
-            for row in self.database.execute(query):
-                numbers.extend(row)
-        except sqlite3.DatabaseError:
-            self.lost[TRUNCATED] += 1
+        last, step, whole = -1, 1, False
+        while not whole and last < _LARGEST_ROWID:
+            try:
+                for row in self.database.execute(query, (last,)):
+                    if row[0] <= last:  # pages that lead in a circle
+                        raise sqlite3.DatabaseError
+                    numbers.extend(row)
+                    last, step = row[0], 1
+                whole = True
+            except sqlite3.DatabaseError:
+                # A page is missing or damaged: go on behind it, in growing steps.
+                self.lost["gaps in the table of messages"] += step == 1
+                last, step = last + step, 2 * step
         rows = np.array(numbers, np.int64).reshape(-1, 4)
         return MessageTable(rows[:, 1], rows[:, 2], np.zeros(len(rows), np.int64), rows[:, 0], rows[:, 3])
+
+    def _check_length(self, database: Path) -> None:
+        """Compare the file with the size its header states (sqlite.org/fileformat2.html, section 1.3)."""
+        with database.open("rb") as file:
+            header = file.read(100)
+        page_size = int.from_bytes(header[16:18], "big")
+        pages = int.from_bytes(header[28:32], "big")
+        if pages * (65536 if page_size == 1 else page_size) > self.file_size:
+            self.lost[TRUNCATED] = 1
 
     def _count_unmerged(self) -> None:
         log = self.path.with_name(self.path.name + "-wal")
@@ -270,10 +288,12 @@ def _storage_files(folder: Path) -> list[Path]:
 
 
 def _is_one_bag(files: Sequence[Path]) -> bool:
-    """Whether names say that files are the parts of one bag: NAME_0, NAME_1, ... or FOLDER_n.
+    """Whether names say that files are the parts of one bag: NAME_0, NAME_1, ... or FOLDER_n, or one file.
 
     The logs of several drones in one folder, each a file, must not pass for one recording.
     """
+    if len(files) == 1:
+        return True
     numbered = [_numbered(file) for file in files]
     stems = {entry[0] if entry else "" for entry in numbered}
     if len(stems) != 1 or None in numbered:
@@ -287,10 +307,18 @@ def _numbered(file: Path) -> tuple[str, int] | None:
     return (match[1], int(match[2])) if match else None
 
 
+def _connect(path: Path) -> sqlite3.Connection:
+    # Immutable: sqlite neither locks nor writes beside the user's file.
+    database = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
+    # Read only all the same; but now sqlite opens a file that is shorter than its header says.
+    database.execute("PRAGMA writable_schema = ON")
+    return database
+
+
 def _has_tables(path: Path) -> bool:
     """Whether a sqlite3 file has the tables of a bag; one that cannot be asked goes by its name."""
     query = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('messages', 'topics')"
-    database = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
+    database = _connect(path)
     try:
         return bool(database.execute(query).fetchone()[0] == 2)
     except sqlite3.Error:

@@ -1,0 +1,121 @@
+"""Real logs: `describe` and `messages` say what the ordinary readers said of the same files."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from pipelines.session.errors import DataError
+from pipelines.session.registries import FORMATS, Format, LogFormat, recognise
+from tests.real_data import real_data
+
+LOGS = {
+    "logs/ros1/husky_gps_imu_odom.bag": "ros1",
+    "logs/ros1/foxglove_example.bag": "ros1",
+    "logs/ros1/foxglove_example-bz2.bag": "ros1",
+    "logs/ros1/foxglove_no-messages.bag": "ros1",
+    "logs/ros1/cruise_example-unsorted-chunks.bag": "ros1",
+    "logs/ros1/embag_pointcloud2_lidar.bag": "ros1",
+    "logs/ros2/plotjuggler_rosbag2_test": "ros2",
+    "logs/ros2/rosbag2_wbag_sqlite3": "ros2",
+    "logs/ros2/rosbag2_wbag_mcap": "ros2",
+    "logs/ros2/rosbag2_empty_bag": "ros2",
+    "logs/mcap/json_camera_calibration_images.mcap": "mcap",
+    "logs/mcap/conformance_TenMessages.mcap": "mcap",
+    "logs/mcap/edge_bad_schema.mcap": "mcap",
+    "logs/mcap/edge_publish_vs_log_time.mcap": "mcap",
+    "logs/mcap/edge_unsupported_encoding.mcap": "mcap",
+}
+# Written so that they cannot be decoded: encoding "a", a definition that is none, protobuf as text.
+UNDEFINED = {
+    "logs/mcap/conformance_TenMessages.mcap": {"example"},
+    "logs/mcap/edge_bad_schema.mcap": {"/bad/data"},
+    "logs/mcap/edge_unsupported_encoding.mcap": {"/proto/data"},
+}
+# Their metadata.yaml states another time than their messages have; the ordinary reader repeats it.
+WRONG_METADATA = {"logs/ros2/rosbag2_wbag_sqlite3", "logs/ros2/rosbag2_wbag_mcap"}
+
+
+def facts(path: str) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(real_data("facts.json").read_text(encoding="utf-8"))[path]
+    return content
+
+
+def ros2_spelling(name: str) -> str:
+    return name if "/msg/" in name else name.replace("/", "/msg/")
+
+
+@pytest.mark.parametrize("path", LOGS)
+def test_counts_spans_and_topics(path: str) -> None:
+    expected = facts(path)
+    described = FORMATS.get(LOGS[path]).describe(real_data(path))
+    assert described["messages"] == expected["messages"]
+    topics = described["topics"]
+    assert isinstance(topics, dict)
+    assert {name: (topic["type"], topic["messages"]) for name, topic in topics.items()} == {
+        name: (ros2_spelling(topic["type"]), topic["count"]) for name, topic in expected["topics"].items()
+    }
+    times = described["metadata.yaml states"] if path in WRONG_METADATA else described
+    assert isinstance(times, dict)
+    if expected["messages"]:
+        assert times["first_ns"] == expected["start_ns"]
+        assert times["span_s"] == pytest.approx(expected["duration_s"], abs=1e-12)
+    else:
+        assert "first_ns" not in times
+    assert not any(key.startswith("dropped") for key in described)
+    undecodable = {name for name, topic in topics.items() if "cannot be decoded" in topic}
+    assert undecodable == UNDEFINED.get(path, set())
+
+
+@pytest.mark.parametrize("path", LOGS)
+def test_every_message_comes_in_the_order_of_receipt(path: str) -> None:
+    log_format = FORMATS.get(LOGS[path])
+    assert isinstance(log_format, LogFormat)
+    with log_format.open_log([real_data(path)]) as log:
+        stamps = []
+        counts = dict.fromkeys((topic.name for topic in log.topics), 0)
+        for message in log.messages(counts):
+            stamps.append(message.receive_ns)
+            counts[message.topic.name] += 1
+        assert stamps == sorted(stamps)
+        undefined = UNDEFINED.get(path, set())
+        assert counts == {t.name: 0 if t.name in undefined else t.count for t in log.topics}
+        lost = sum(topic.count for topic in log.topics if topic.name in undefined)
+        assert log.dropped == ({"messages without a usable definition": lost} if lost else {})
+
+
+@pytest.mark.parametrize("path", LOGS)
+def test_one_format_alone_recognises_a_log(path: str) -> None:
+    everything: list[Format] = FORMATS.all()
+    assert [f.name for f in everything if f.recognises(real_data(path))] == [LOGS[path]]
+
+
+def test_values_are_those_the_ordinary_reader_saw() -> None:
+    path = "logs/ros1/husky_gps_imu_odom.bag"
+    expected = facts(path)["topics"]["/husky_velocity_controller/odom"]
+    with recognise(real_data(path), LogFormat, "log").open_log([real_data(path)]) as log:
+        first, *_, last = log.messages(["/husky_velocity_controller/odom"])
+    for message, position in ((first, expected["position_first"]), (last, expected["position_last"])):
+        point = message.value.pose.pose.position
+        assert [point.x, point.y, point.z] == pytest.approx(position, abs=1e-6)
+    stamps = [m.value.header.stamp for m in (first, last)]
+    assert [s.sec + s.nanosec * 1e-9 for s in stamps] == pytest.approx(
+        expected["header_stamp_range"], abs=1e-6
+    )
+
+
+def test_pictures_in_json_are_bytes() -> None:
+    path = real_data("logs/mcap/json_camera_calibration_images.mcap")
+    with recognise(path, LogFormat, "log").open_log([path]) as log:
+        picture = next(log.messages(["/image/compressed"])).value
+        lens = next(log.messages(["/camera_calibration"])).value
+    assert picture.data[:3] == b"\xff\xd8\xff"  # a JPEG begins so
+    assert (lens.width, lens.K[:3]) == (640, [800, 0, 320])
+
+
+def test_an_empty_file_is_refused_in_one_line() -> None:
+    path = real_data("logs/ros1/foxglove_empty-file.bag")
+    with pytest.raises(DataError, match=r"foxglove_empty-file\.bag: is empty \(0 bytes\)"):
+        recognise(path, LogFormat, "log").open_log([path])
