@@ -11,6 +11,7 @@ import click
 from mocap_cli.export import export_command
 from mocap_cli.info import info_command
 from mocap_cli.ingest import ingest_command
+from mocap_cli.init import init_command
 from mocap_cli.reconstruct import reconstruct_command
 from mocap_cli.report import report_command
 from mocap_cli.terminal import one_line
@@ -43,12 +44,20 @@ class Mocap(click.Group):
 def mocap() -> None:
     """From the flight logs and keypoints of a drone team to the 3D motion of the person it filmed.
 
-    A flight is described by a flight.yaml. `ingest` turns it into a session, a folder of plain tables;
-    `reconstruct` measures the skeleton; `report` shows how far it can be trusted; `export` carries on.
+    A flight is described by a flight.yaml, which `init` drafts from what was brought home. `ingest` turns
+    it into a session, a folder of plain tables; `reconstruct` measures the skeleton; `report` shows how far
+    it can be trusted; `export` carries on.
     """
 
 
-for command in (ingest_command, reconstruct_command, report_command, export_command, info_command):
+for command in (
+    init_command,
+    ingest_command,
+    reconstruct_command,
+    report_command,
+    export_command,
+    info_command,
+):
     mocap.add_command(command)
 
 

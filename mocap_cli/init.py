@@ -1,0 +1,81 @@
+"""`mocap init`: what was brought home into a flight.yaml."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from mocap_cli.options import existing_path, json_option, level, overwrite_option, verbosity_options
+from mocap_cli.terminal import one_line, print_json, watching
+
+if TYPE_CHECKING:
+    from pipelines.draft import LeftOut
+
+_MANY = 5  # files of one kind in one folder that are told one by one
+
+
+@click.command("init")
+@click.argument("paths", type=existing_path, nargs=-1, required=True, metavar="PATHS...")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Manifest to write [default: flight.yaml in the folder that all PATHS have in common].",
+)
+@overwrite_option
+@json_option
+@verbosity_options
+def init_command(
+    paths: tuple[Path, ...], output: Path | None, overwrite: bool, as_json: bool, quiet: bool, verbose: int
+) -> None:
+    """Look into logs, videos, keypoints, calibrations and maps, and draft the flight.yaml that names them.
+
+    PATHS are files and folders; folders are looked through. What belongs to which camera is told by names
+    (drone1.mp4, drone1_poses.tum, /drone1/odometry, a camera of a calibration) and by times. What no file
+    says - a frame rate, a clock, how a camera is mounted - is assumed and marked in a comment, or named as
+    missing: read the manifest before you ingest it.
+    """
+    from pipelines.draft import draft
+
+    with watching(level(quiet, verbose)) as progress:
+        result = draft(paths, output, overwrite=overwrite, progress=progress)
+    if not quiet:
+        for line in _left_out(result.left_out):
+            click.echo(line, err=True)
+        for word, remarks in (("missing", result.missing), ("assumed", result.assumed)):
+            for remark in remarks:
+                click.echo(f"{word}: {one_line(remark)}", err=True)
+    if as_json:
+        print_json(
+            {
+                "flight": str(result.path),
+                "cameras": result.cameras,
+                "missing": result.missing,
+                "assumed": result.assumed,
+                "left_out": {str(left.path): left.reason for left in result.left_out},
+            }
+        )
+    else:
+        click.echo(f"cameras: {', '.join(result.cameras) or 'none'}")
+        click.echo(f"written: {_from_here(result.path)}")
+
+
+def _from_here(path: Path) -> Path:
+    """The path as one would type it."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+def _left_out(left_out: Sequence[LeftOut]) -> Iterator[str]:
+    """A line for each file, or for all of one kind in a folder where they are many."""
+    alike: dict[tuple[Path, str, str], list[LeftOut]] = defaultdict(list)
+    for left in left_out:
+        alike[left.path.parent, left.path.suffix, left.reason].append(left)
+    for (folder, suffix, reason), group in alike.items():
+        if len(group) > _MANY:
+            yield one_line(f"{_from_here(folder) / f'*{suffix}'}: {len(group)} files {reason}")
+        else:
+            yield from (one_line(f"{_from_here(left.path)}: {left.reason}") for left in group)

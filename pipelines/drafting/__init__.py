@@ -1,0 +1,1 @@
+"""Drafting a flight.yaml: what belongs to which camera, and how to say it. Descriptions in, text out."""

@@ -1,0 +1,321 @@
+"""One camera of a drafted manifest: what it has, the other candidates beside it, and what was assumed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from decimal import Decimal
+from pathlib import Path
+
+from pipelines.drafting.candidates import Candidate
+from pipelines.drafting.found import (
+    Calibration,
+    Found,
+    FrameTimes,
+    Keypoints,
+    Poses,
+    Recording,
+    Span,
+    Video,
+)
+from pipelines.drafting.matching import CameraDraft, Draft
+from pipelines.drafting.yaml_text import entry, flow, scalar
+
+ASSUMED_FPS = 30
+_MOST_OTHERS = 8  # candidates that are named beside the one taken
+
+
+@dataclass
+class Remarks:
+    """What is to be said of the whole in short: each thing, and the cameras that it concerns."""
+
+    missing: dict[str, list[str]] = field(default_factory=dict)  # without it nothing can be ingested
+    assumed: dict[str, list[str]] = field(default_factory=dict)  # the result depends on it
+
+
+class CameraText:
+    """Says one camera, key by key.
+
+    Args:
+        camera: what belongs to it.
+        draft: the flight that it is of.
+        relative: a path as the manifest is to state it.
+        remarks: where what is missing and what is assumed is added.
+    """
+
+    def __init__(
+        self, camera: CameraDraft, draft: Draft, relative: Callable[[Path], str], remarks: Remarks
+    ) -> None:
+        self._camera = camera
+        self._draft = draft
+        self._relative = relative
+        self._remarks = remarks
+
+    def lines(self) -> list[str]:
+        """The lines below its name, without indentation."""
+        return [
+            *self._video(),
+            *self._keypoints(),
+            *self._frame_times(),
+            *self._clock(),
+            *self._pose(),
+            *self._mount(),
+            *self._intrinsics(),
+            *self._noise(),
+        ]
+
+    # --- pictures --------------------------------------------------------------------------------------
+
+    def _video(self) -> list[str]:
+        videos = self._camera.videos
+        if not videos and self._camera.keypoints:
+            return []
+        if not videos:
+            self._miss("a video or keypoints")
+            return [
+                f"# video: {self._camera.name}.mp4  # missing: or {{log, topic}} of pictures, or keypoints"
+            ]
+        remark = told(videos[0])
+        if self._camera.paired:
+            remark += "; assumed: of the same camera as the keypoints"
+            self._assume("that video and keypoints are of one camera")
+        return self._said("video", videos, remark)
+
+    def _keypoints(self) -> list[str]:
+        if not self._camera.keypoints:
+            return []
+        taken, *others = self._camera.keypoints
+        found = taken.found
+        settings = dict(taken.settings)
+        remarks = [told(taken)]
+        if isinstance(found, Keypoints) and found.ambiguous:
+            settings["format"] = found.format
+            remarks.append("assumed: other formats recognise it too")
+            self._assume(f"keypoints: that they are {found.format}'s")
+        if isinstance(found, Keypoints) and (first := _first_frame(found, self._film)):
+            settings["first_frame"] = first
+            remarks.append(f"assumed: frame {first} of it is the first")
+            self._assume(f"keypoints: first_frame {first}")
+        return self._said("keypoints", [replace(taken, settings=settings), *others], "; ".join(remarks))
+
+    @property
+    def _film(self) -> Video | None:
+        """The video file, if its pictures are in one."""
+        found = self._camera.videos[0].found if self._camera.videos else None
+        return found if isinstance(found, Video) else None
+
+    # --- time ------------------------------------------------------------------------------------------
+
+    def _frame_times(self) -> list[str]:
+        choice = self._camera.frame_times
+        if choice:
+            return self._said("frame_times", choice.all, told(choice.taken))
+        if self._camera.videos and self._film is None:
+            return []  # the log's own stamps
+        start, reason = self._start()
+        if self._film:
+            if start is None:
+                return ["# frame_times: {start: SECONDS}  # when the first frame was taken, if not at 0"]
+            self._assume("frame_times: start, when the first frame was taken")
+            return [entry("frame_times", {"start": start}, f"assumed: the first frame {reason}")]
+        if not self._camera.keypoints:
+            return []
+        fps = {"fps": ASSUMED_FPS}
+        if start is None:
+            self._assume(f"frame_times: fps {ASSUMED_FPS}, the first frame at 0 s")
+            return [entry("frame_times", fps, f"assumed: {ASSUMED_FPS} frames a second, the first at 0 s")]
+        self._assume(f"frame_times: fps {ASSUMED_FPS}; start, when the first frame was taken")
+        remark = f"assumed: {ASSUMED_FPS} frames a second, the first {reason}"
+        return [entry("frame_times", {"start": start, **fps}, remark)]
+
+    def _start(self) -> tuple[Decimal | None, str]:
+        """When the first frame was taken, in seconds: as soon as poses and truth begin; None for 0."""
+        poses = self._camera.poses.taken.span if self._camera.poses else None
+        truth = next((joints.span for joints in self._draft.true_joints), None)
+        known = {"its poses": poses, "the truth": truth}
+        spans = {what: span for what, span in known.items() if span}
+        if poses and truth and poses.overlap_ns(truth) < 0:
+            spans = {"its poses": poses}  # the truth counts from elsewhere
+        filmed = Span(0, self._length_ns())
+        if not spans or all(filmed.overlap_ns(span) >= 0 for span in spans.values()):
+            return None, ""
+        first_ns = max(span.first_ns for span in spans.values())
+        return Decimal(-(-first_ns // 10**6)) / 1000, f"when {' and '.join(spans)} begin"
+
+    def _length_ns(self) -> int:
+        if self._film:
+            return self._film.length_ns
+        frames = (c.found.frames for c in self._camera.keypoints[:1] if isinstance(c.found, Keypoints))
+        return next(frames, 0) * 10**9 // ASSUMED_FPS
+
+    def _clock(self) -> list[str]:
+        if not self._film and not self._camera.keypoints:
+            return []
+        return ["# clock: {offset_s: 0, sigma_s: 0.2}  # if its clock is off against the poses', or unsure"]
+
+    # --- poses -----------------------------------------------------------------------------------------
+
+    def _pose(self) -> list[str]:
+        choice = self._camera.poses
+        if choice is None:
+            self._miss("pose: nothing of that name has poses")
+            loose = self._loose(Poses, Recording, Calibration)
+            return [
+                f"# pose: {{tum: {self._camera.name}.tum}}  # missing: nothing of that name has poses{loose}",
+                "#   or {csv: FILE}, {static: CALIBRATION}, {log: LOG, topic: TOPIC}, {log, parent, child}",
+            ]
+        taken = choice.taken
+        remarks = [told(taken)]
+        if not choice.named:
+            remarks.append("assumed: they are its own")
+            self._assume("pose: that these poses are its own")
+        filmed = self._camera.filmed
+        if filmed and taken.span and filmed.overlap_ns(taken.span) < 0:
+            remarks.append(f"missing: it was filmed at other times, {spanned(filmed)}")
+            self._miss("pose: there are no poses of the time when it filmed")
+        if isinstance(taken.found, Poses):
+            remarks.append("if of the body, not the camera: add of: body, and a mount")
+        if taken.ned_hint:
+            remarks.append(f"{scalar(taken.ned_hint)} sounds like north-east-down: then add axes: ned")
+            self._assume("pose: axes enu, although a name sounds like ned")
+        return self._said("pose", choice.all, "; ".join(remarks), self._pose_settings)
+
+    def _pose_settings(self, candidate: Candidate) -> object:
+        if isinstance(candidate.found, Calibration):
+            return {"static": self._of_calibration(candidate)}
+        if "log" in candidate.settings:
+            return {**candidate.settings, "of": "body" if candidate.of_body else "camera"}
+        return candidate.settings
+
+    def _mount(self) -> list[str]:
+        if self._camera.poses is None or not self._camera.poses.taken.of_body:
+            return []
+        choice = self._camera.gimbal
+        if choice is None:
+            self._assume("mount: the camera looks forward, level, from the body's origin")
+            settings = {"looks": "forward", "down_deg": 0, "translation": [0, 0, 0]}
+            return [entry("mount", settings, "assumed: along the body's x axis, level, no lever arm (m)")]
+        self._miss("gimbal: relative_to, what its angles are relative to")
+        lines = ["gimbal:", *(f"  {entry(key, value)}" for key, value in choice.taken.settings.items())]
+        lines.append(
+            "  # relative_to: world  # missing: world (as DJI's: it replaces the body's turn) or body"
+        )
+        if choice.taken.topic and "Quaternion" not in choice.taken.topic.type:
+            lines.append("  # order: ypr  # assumed: yaw, pitch, roll as they stand in the message; or rpy")
+            lines.append("  # units: deg  # assumed; or rad")
+            self._assume("gimbal: order ypr, units deg")
+        lines.append("# mount: {looks: forward, translation: [0, 0, 0]}  # the lever arm to the gimbal, m")
+        return [*lines, *self._others("gimbal", choice.others)]
+
+    def _noise(self) -> list[str]:
+        if self._camera.poses is None or self._camera.poses.taken.span is None:
+            return []
+        return ["# pose_noise: {white: {position_m: 0.1, rotation_deg: 0.5}}  # how good they are, if known"]
+
+    # --- intrinsics ------------------------------------------------------------------------------------
+
+    def _intrinsics(self) -> list[str]:
+        choice = self._camera.intrinsics
+        if choice is None:
+            self._miss("intrinsics: nothing of that name has them")
+            return [
+                "# intrinsics: {width: 1920, height: 1080, fx: 1400, fy: 1400, cx: 959.5, cy: 539.5}"
+                f"  # missing: nothing of that name has them{self._loose(Calibration)}",
+                "#   or a calibration file, or {log: LOG, topic: TOPIC}",
+            ]
+        remark = told(choice.taken)
+        if not choice.named:
+            remark += "; assumed: it holds for this camera"
+            self._assume("intrinsics: that one calibration holds for them")
+        return self._said("intrinsics", choice.all, remark, self._of_calibration)
+
+    def _of_calibration(self, candidate: Candidate) -> object:
+        """The path alone where the camera goes without saying: its name, or the only one."""
+        if candidate.settings.get("camera") in {None, self._camera.name} and "path" in candidate.settings:
+            return candidate.found.path
+        return candidate.settings
+
+    # --- sentences -------------------------------------------------------------------------------------
+
+    def _said(
+        self,
+        key: str,
+        candidates: Sequence[Candidate],
+        remark: str,
+        settings: Callable[[Candidate], object] = lambda candidate: candidate.settings,
+    ) -> list[str]:
+        """The first candidate, and the others as comments below."""
+        line = entry(key, stated(settings(candidates[0]), self._relative), remark)
+        return [line, *self._others(key, candidates[1:], settings)]
+
+    def _others(
+        self,
+        key: str,
+        candidates: Sequence[Candidate],
+        settings: Callable[[Candidate], object] = lambda candidate: candidate.settings,
+    ) -> list[str]:
+        lines = [
+            f"# or {entry(key, stated(settings(candidate), self._relative), told(candidate))}"
+            for candidate in candidates[:_MOST_OTHERS]
+        ]
+        more = len(candidates) - len(lines)
+        return [*lines, f"#   and {more} more"] if more else lines
+
+    def _loose(self, *kinds: type[Found]) -> str:
+        """What lies around without a use."""
+        paths = [self._relative(found.path) for found in self._draft.unused if isinstance(found, kinds)]
+        return f"; there is {', '.join(map(scalar, paths[:_MOST_OTHERS]))}" if paths else ""
+
+    def _assume(self, what: str) -> None:
+        self._remarks.assumed.setdefault(what, []).append(self._camera.name)
+
+    def _miss(self, what: str) -> None:
+        self._remarks.missing.setdefault(what, []).append(self._camera.name)
+
+
+def stated(settings: object, relative: Callable[[Path], str]) -> object:
+    """Settings as the manifest states them: relative paths, nothing that is None, a bare path by itself."""
+    if isinstance(settings, Path):
+        return relative(settings)
+    if not isinstance(settings, dict):
+        return settings
+    said = {key: stated(value, relative) for key, value in settings.items() if value is not None}
+    return said["path"] if said.keys() == {"path"} else said
+
+
+def told(candidate: Candidate) -> str:
+    """What it is, in a few words."""
+    found, topic = candidate.found, candidate.topic
+    if topic:
+        type_ = topic.type.rpartition("/")[2]
+        return f"{topic.count} {type_}, {spanned(topic.span)}"
+    match found:
+        case Video():
+            return f"{found.frames} frames, {found.length_ns / 1e9:.6g} s"
+        case Keypoints():
+            return f"{found.title}, {found.frames} frames"
+        case FrameTimes():
+            return f"{found.rows} times" + (", local time taken as UTC" if found.key == "srt" else "")
+        case Poses():
+            return f"{found.title}, {spanned(found.span)}"
+        case Recording():
+            return "transforms" + (f", {spanned(candidate.span)}" if candidate.span else "")
+    return found.title
+
+
+def spanned(span: Span) -> str:
+    """How long, and from when on."""
+    return f"{(span.last_ns - span.first_ns) / 1e9:.6g} s from {span.first_ns / 1e9:.3f}"
+
+
+def _first_frame(found: Keypoints, video: Video | None) -> int:
+    """The number that the first frame bears, where the numbers cannot count from 0; else 0."""
+    if video is None:
+        return found.first_frame if found.first_frame > found.frames else 0
+    fits = found.last_frame - found.first_frame < video.frames
+    return found.first_frame if found.last_frame >= video.frames and fits else 0
+
+
+def flowing(settings: object, relative: Callable[[Path], str]) -> str:
+    """Settings in one line of YAML."""
+    return flow(stated(settings, relative))

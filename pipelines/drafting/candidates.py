@@ -1,0 +1,238 @@
+"""What of everything found could be said of a camera: each with its name, its times and its rank."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+from pipelines.drafting.found import (
+    Calibration,
+    Findings,
+    Found,
+    Poses,
+    Recording,
+    Span,
+    TopicFound,
+    TopicKind,
+)
+from pipelines.drafting.labels import (
+    TRUTH_WORDS,
+    Label,
+    affinity,
+    is_called,
+    label_of,
+    label_of_place,
+)
+from pipelines.drafting.recordings import (
+    chains,
+    hints_at_ned,
+    is_actor,
+    is_commanded,
+    is_of_camera,
+    is_truth,
+    label_of_topic,
+    shows_colours,
+)
+from pipelines.session.manifest import PoseSource
+
+_POSE_TYPES = ("Odometry", "PoseWithCovarianceStamped", "PoseStamped", "PoseInFrame", "TransformStamped")
+"""The likelier first: odometry says how sure it is. A Path comes last, it repeats what others say."""
+_GIMBAL = frozenset({"gimbal", "mount", "pan", "tilt", "ptz", "camera", "cam"})
+_MANY_CAMERAS = 200  # of one calibration: more are the pictures of a moving camera
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Something a manifest can say, whose it is, and how it is rated among its like."""
+
+    settings: dict[str, object]  # what the manifest says; paths are Path objects
+    labels: tuple[Label, ...]  # what it is called after, one or more
+    found: Found
+    rank: tuple[object, ...] = ()  # the smaller the likelier, at equal names
+    span: Span | None = None
+    topic: TopicFound | None = None
+    of_body: bool = False  # poses of the body; else of the camera
+    ned_hint: str = ""  # a name that sounds like north-east-down
+
+    def affinity(self, label: Label) -> int:
+        """How well it goes with a camera's label."""
+        return max(affinity(own, label) for own in self.labels)
+
+
+def videos(findings: Findings) -> list[Candidate]:
+    """Video files."""
+    return [_of_file(video, {"path": video.path}) for video in findings.videos]
+
+
+def picture_topics(logs: Mapping[str, Recording]) -> list[Candidate]:
+    """Topics with what cameras see; depth and masks only where there is nothing else."""
+    found = list(_topics(logs, "pictures", _of_topic))
+    return [c for c in found if c.topic and shows_colours(c.topic)] or found
+
+
+def keypoints(findings: Findings) -> list[Candidate]:
+    """Keypoint files; first those of a folder that holds them for most cameras."""
+    together = Counter(found.path.parent for found in findings.keypoints)
+    return [
+        replace(_of_file(found, {"path": found.path}), rank=(-together[found.path.parent], found.place))
+        for found in findings.keypoints
+    ]
+
+
+def moving_poses(findings: Findings, logs: Mapping[str, Recording]) -> list[Candidate]:
+    """Trajectories, topics and chains of transforms that no name calls the truth, a command or the actor."""
+    files = [_trajectory(found) for found in findings.poses if not _is_true(found)]
+    topics = [
+        candidate
+        for candidate in _topics(logs, "poses", _of_pose_topic)
+        if candidate.topic
+        and not (is_truth(candidate.topic) or is_actor(candidate.topic) or is_commanded(candidate.topic))
+    ]
+    return [*(c for c in files if c), *topics, *_of_transforms(logs)]
+
+
+def true_poses(findings: Findings) -> list[Candidate]:
+    """Trajectories that are called the truth."""
+    return [c for c in (_trajectory(found) for found in findings.poses if _is_true(found)) if c]
+
+
+def true_topics(logs: Mapping[str, Recording]) -> list[Candidate]:
+    """Topics of poses that are called the truth."""
+    return [c for c in _topics(logs, "poses", _of_pose_topic) if c.topic and is_truth(c.topic)]
+
+
+def actors(logs: Mapping[str, Recording]) -> list[Candidate]:
+    """Topics that say where the person was."""
+    return [c for c in _topics(logs, "poses", _of_pose_topic) if c.topic and is_actor(c.topic)]
+
+
+def still_poses(findings: Findings) -> list[Candidate]:
+    """Poses of cameras in calibrations."""
+    return [
+        _of_calibration(found, name)
+        for found in findings.calibrations
+        if len(found.cameras) <= _MANY_CAMERAS
+        for name, lens in found.cameras.items()
+        if lens.pose
+    ]
+
+
+def lenses(findings: Findings, logs: Mapping[str, Recording]) -> list[Candidate]:
+    """Intrinsics in calibrations and topics."""
+    files = [
+        _of_calibration(found, name)
+        for found in findings.calibrations
+        if len(found.cameras) <= _MANY_CAMERAS
+        for name, lens in found.cameras.items()
+        if lens.intrinsics
+    ]
+    return [*files, *_topics(logs, "intrinsics", _of_topic)]
+
+
+def gimbals(logs: Mapping[str, Recording]) -> list[Candidate]:
+    """Topics of angles that are called after a gimbal; others are magnetic fields, velocities, attitudes."""
+    return [c for c in _topics(logs, "angles", _of_topic) if c.topic and is_called(c.topic.name, _GIMBAL)]
+
+
+def joints(findings: Findings) -> list[Candidate]:
+    """3D joints, for when they were."""
+    return [replace(_of_file(found, {"path": found.path}), span=found.span) for found in findings.joints]
+
+
+def frame_times(findings: Findings) -> list[Candidate]:
+    """Files with the times of frames."""
+    stamps = findings.frame_times
+    stamps = findings.frame_times
+    return [replace(_of_file(found, {found.key: found.path}), span=found.span) for found in stamps]
+
+
+def near(candidate: Candidate, topic: str) -> int:
+    """How many parts the topic's name shares with another's, from the left (/drone1/camera/...)."""
+    name = candidate.topic.name if candidate.topic else ""
+    parts = zip(name.strip("/").split("/"), topic.strip("/").split("/"), strict=False)
+    shared = 0
+    for ours, theirs in parts:
+        if not ours or ours != theirs:
+            break
+        shared += 1
+    return shared
+
+
+def _of_file(found: Found, settings: dict[str, object]) -> Candidate:
+    return Candidate(settings, (label_of_place(found.place),), found, (0, found.place))
+
+
+def _trajectory(found: Poses) -> Candidate | None:
+    """A trajectory file, if manifests have a key for its format."""
+    if found.format not in PoseSource.one_of:
+        return None
+    return replace(_of_file(found, {found.format: found.path}), rank=(0, 0, found.place), span=found.span)
+
+
+def _is_true(found: Found) -> bool:
+    return is_called(found.place[-1], TRUTH_WORDS)
+
+
+def _of_calibration(found: Calibration, camera: str) -> Candidate:
+    """One camera of a calibration; `camera` is left out of the settings where it goes without saying."""
+    of_file, own = label_of_place(found.place), label_of(camera)
+    alone = len(found.cameras) == 1
+    both = tuple({word.key: word for word in (*of_file, *own)}.values())
+    labels = [of_file, own] if alone else [own, both]
+    return Candidate(
+        {"path": found.path, "camera": None if alone else camera},
+        tuple(label for label in labels if label) or ((),),
+        found,
+        (0, found.place, camera),
+    )
+
+
+def _topics(
+    logs: Mapping[str, Recording],
+    kind: TopicKind,
+    candidate: Callable[[str, Recording, TopicFound], Candidate],
+) -> Iterator[Candidate]:
+    for log, recording in logs.items():
+        for topic in recording.topics:
+            if topic.kind == kind and topic.count:
+                yield candidate(log, recording, topic)
+
+
+def _of_topic(log: str, recording: Recording, topic: TopicFound) -> Candidate:
+    return Candidate(
+        {"log": log, "topic": topic.name},
+        (label_of_topic(recording, topic.name),),
+        recording,
+        (1, -topic.count, topic.name),
+        topic.span,
+        topic,
+    )
+
+
+def _of_pose_topic(log: str, recording: Recording, topic: TopicFound) -> Candidate:
+    type_ = topic.type.rpartition("/")[2].rpartition(".")[2]
+    likelihood = _POSE_TYPES.index(type_) if type_ in _POSE_TYPES else len(_POSE_TYPES)
+    of_body = not is_of_camera(topic.source or topic.name)
+    return replace(
+        _of_topic(log, recording, topic),
+        rank=(1, int(of_body), likelihood, -topic.count, topic.name),
+        of_body=of_body,
+        ned_hint=hints_at_ned(topic.target, topic.source, topic.name),
+    )
+
+
+def _of_transforms(logs: Mapping[str, Recording]) -> Iterator[Candidate]:
+    for log, recording in logs.items():
+        spans = [topic.span for topic in recording.topics if topic.kind == "transforms" and topic.count]
+        for parent, child in chains(recording):
+            of_body = not is_of_camera(child)
+            yield Candidate(
+                {"log": log, "parent": parent, "child": child},
+                (label_of_topic(recording, child),),
+                recording,
+                (1, int(of_body), len(_POSE_TYPES) + 1, 0, child),
+                Span(min(s.first_ns for s in spans), max(s.last_ns for s in spans)) if spans else None,
+                of_body=of_body,
+                ned_hint=hints_at_ned(parent, child),
+            )

@@ -1,0 +1,157 @@
+"""What files and topics are called, and whether two of them are called after the same camera.
+
+A name is cut into words with their numbers (drone_1_poses: drone 1, poses). Words that say what a thing
+is, not whose (poses, camera, json), do not count; the rest is its label. `drone1.mp4`, `drone1_poses.tum`,
+`/drone1/odometry` and `drone-01/calib.yaml` all bear the label drone 1.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from pipelines.drafting.found import Place
+
+EQUAL, PART, NUMBER, UNNAMED, OTHER = 4, 3, 2, 1, 0
+"""How two labels go together: the same; one within the other; only the numbers agree (d1, drone1); one of
+them says nothing; they speak of different things."""
+
+TRUTH_WORDS = frozenset({"truth", "true", "gt", "groundtruth"})
+_GENERIC_TEXT = """
+    cam camera cameras video videos vid movie clip image images img picture pictures frame frames photo
+    rgb bgr color colour mono gray raw compressed rect rectified info odometry odom pose poses trajectory
+    traj path paths tf transform transforms tum csv json toml yaml yml txt log logs bag bags rosbag mcap
+    data dataset recording record keypoints keypoint kpts kp joints skeleton openpose alphapose mmpose coco
+    detections detection detector results result predictions calib calibration calibrations intrinsic
+    intrinsics extrinsic extrinsics camchain kalibr opencv ost ground gimbal attitude angles angle local
+    position orientation mavros state estimator estimate filtered fused global world map time times
+    timestamp timestamps stamps stamp static base link body optical imu vio slam the of and
+"""
+_GENERIC = TRUTH_WORDS | frozenset(_GENERIC_TEXT.split())
+"""Words that say what a thing is, not whose. With a number (cam01) they do name a camera."""
+_GENERIC_NUMBERED = re.compile(
+    r"(?i)(?<![^\W_])(?:rosbag2|halpe26|coco17|coco133|body25b?|blazepose33|[hx]26[45]|[23]d|\d{3,4}p|\d+fps)"
+    r"(?![^\W_])"
+)
+_WORD = re.compile(r"[^\W\d_]+[0-9]*|[0-9]+")
+_MOST_DIGITS = 18  # of a number that is compared as one
+
+
+class Word(NamedTuple):
+    """A word of a name, with the number that follows it."""
+
+    text: str  # as it is spelled
+    word: str  # lower case
+    number: int | None
+
+    @property
+    def key(self) -> tuple[str, int | None]:
+        """What makes two words the same: drone_1, Drone01."""
+        return self.word, self.number
+
+
+Label = tuple[Word, ...]
+
+
+def words(text: str) -> list[Word]:
+    """The words of a name in their order; a number belongs to the word before it."""
+    found: list[Word] = []
+    start = end = 0  # of the word found last
+    for match in _WORD.finditer(_GENERIC_NUMBERED.sub(lambda generic: " " * len(generic[0]), text)):
+        letters = match[0].rstrip("0123456789")
+        number = int(match[0][len(letters) :][-_MOST_DIGITS:] or -1)
+        if not letters and found and found[-1].number is None and match.start() == end + 1:
+            found[-1] = Word(text[start : match.end()], found[-1].word, number)
+        else:
+            start = match.start()
+            found.append(Word(match[0], letters.lower(), None if number < 0 else number))
+        end = match.end()
+    return found
+
+
+def label_of(text: str) -> Label:
+    """The words of a name that say whose it is."""
+    kept = {word.key: word for word in words(text) if word.number is not None or word.word not in _GENERIC}
+    return tuple(kept.values())
+
+
+def label_of_place(place: Place) -> Label:
+    """The label of a file: of its name, with numbered folders above it (drone1/DJI_0001.mp4).
+
+    Where the name says nothing (drone1/video.mp4) it is the nearest folder's that does.
+    """
+    *folders, name = place
+    own = label_of(name)
+    above = [label_of(folder) for folder in folders]
+    if not own:
+        return next((label for label in reversed(above) if label), ())
+    numbered = [word for label in above for word in label if word.word and word.number is not None]
+    return tuple({word.key: word for word in (*numbered, *own)}.values())
+
+
+def is_called(text: str, wanted: frozenset[str]) -> bool:
+    """Whether a name holds one of some words."""
+    return any(word.word in wanted for word in words(text))
+
+
+def affinity(one: Label, other: Label) -> int:
+    """How two labels go together, from `OTHER` to `EQUAL`."""
+    if not one or not other:
+        return UNNAMED
+    ours, theirs = {word.key for word in one}, {word.key for word in other}
+    if ours == theirs:
+        return EQUAL
+    if ours < theirs or theirs < ours:
+        return PART
+    numbers = [{word.number for word in label if word.number is not None} for label in (one, other)]
+    return NUMBER if numbers[0] and numbers[0] == numbers[1] else OTHER
+
+
+def order(label: Label) -> list[tuple[str, int]]:
+    """Sorts drone2 before drone10."""
+    return [(word.word, -1 if word.number is None else word.number) for word in label]
+
+
+def camera_names(labels: Sequence[Label]) -> list[str]:
+    """A name for each camera, [A-Za-z0-9_-]{1,64}, no two of them equal but for case.
+
+    Numbered words that all share (a date, a take) are left out; of the rest as many as it takes to tell
+    the cameras apart.
+    """
+    if len(labels) > 1:
+        shared = Counter(word.key for label in labels for word in label if word.number is not None)
+        common = {key for key, count in shared.items() if count == len(labels)}
+        told = [tuple(word for word in label if word.key not in common) for label in labels]
+        labels = told if all(told) else labels
+        longest = max(len(label) for label in labels)
+        enough = (k for k in range(1, longest) if len({_keys(label[:k]) for label in labels}) == len(labels))
+        length = next(enough, longest)
+        labels = [label[:length] for label in labels]
+    names: list[str] = []
+    for label in labels:
+        names.append(unique(fitting("_".join(word.text for word in label), f"camera{len(names) + 1}"), names))
+    return names
+
+
+def _keys(label: Label) -> tuple[tuple[str, int | None], ...]:
+    return tuple(word.key for word in label)
+
+
+def fitting(text: str, otherwise: str) -> str:
+    """A text made to fit [A-Za-z0-9_-]{1,64}; `otherwise` where no letter is left of it."""
+    plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
+    name = re.sub(r"[^A-Za-z0-9_-]+", "_", plain).strip("_-")[:64]
+    return name if re.search("[A-Za-z]", name) else otherwise
+
+
+def unique(name: str, taken: Sequence[str]) -> str:
+    """The name, with a number where it is taken."""
+    folded = {other.lower() for other in taken}
+    candidate, number = name, 2
+    while candidate.lower() in folded:
+        candidate = f"{name[:58]}_{number}"
+        number += 1
+    return candidate
