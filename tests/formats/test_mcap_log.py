@@ -1,0 +1,301 @@
+"""MCAP in every encoding and layout: whole, without its end or index, cut, hurt, and with absurd lengths."""
+
+from __future__ import annotations
+
+import resource
+import shutil
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+from pipelines.session.errors import DataError
+from tests.formats.log_entries import (
+    PICTURE,
+    POSE,
+    START_NS,
+    entries,
+    everything,
+    everything_or_one_line,
+    log_format,
+    positions,
+    recognised_by,
+)
+from tests.synthetic.logs import Entry, McapCompression, cut, write_mcap
+
+FLIGHT = entries()
+ALL = [(e.topic, e.stamp_ns) for e in FLIGHT]
+_CHUNK, _MESSAGE, _MESSAGE_INDEX = 6, 5, 7
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1"])
+@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
+@pytest.mark.parametrize("summary", [True, False])
+def test_encodings_and_compressions(
+    tmp_path: Path, encoding: Literal["cdr", "ros1"], compression: McapCompression, summary: bool
+) -> None:
+    path = write_mcap(
+        tmp_path / "a.mcap", FLIGHT, encoding, compression=compression, chunk_size=9_000, summary=summary
+    )
+    assert everything(path) == (ALL, {})
+    assert positions(path)[0] == [float(k) for k in range(100)]
+    described = log_format(path).describe(path)
+    assert described["storage"] == ["uncompressed" if compression == "none" else compression]
+
+
+@pytest.mark.parametrize("summary", [True, False])
+def test_messages_outside_chunks(tmp_path: Path, summary: bool) -> None:
+    # Out of order, and more than one run of 1 MB.
+    shuffled = [e for k in range(3) for e in entries(20.0)[k::3]]
+    path = write_mcap(tmp_path / "a.mcap", shuffled, chunked=False, summary=summary)
+    found, dropped = everything(path)
+    assert [stamp for _, stamp in found] == sorted(e.stamp_ns for e in shuffled)
+    assert not dropped
+
+
+def test_sizes_are_those_of_the_messages(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", FLIGHT, "cdr", chunk_size=9_000)
+    topics = log_format(path).describe(path)["topics"]
+    assert isinstance(topics, dict)
+    # CDR: 4 of encapsulation, 8 of stamp, 4 + 5 of "odom", 3 of padding, 4 + 5 of "jpeg", 3 + 4, 2000.
+    assert topics[PICTURE]["size_bytes"] == 10 * 2040
+
+
+def test_foxglove_as_json(tmp_path: Path) -> None:
+    data = bytes(range(256))
+    fields = {"timestamp": {"sec": 5, "nsec": 7}, "frame_id": "camera", "format": "png", "data": data}
+    path = write_mcap(tmp_path / "a.mcap", [Entry("/c", "foxglove.CompressedImage", 9, fields)], "json")
+    with log_format(path).open_log([path]) as log:
+        assert [(t.type, t.encoding) for t in log.topics] == [("foxglove.CompressedImage", "json")]
+        (message,) = log.messages(["/c"])
+    assert (message.value.data, message.value.timestamp.nsec, message.receive_ns) == (data, 7, 9)
+
+
+def test_foxglove_as_protobuf(tmp_path: Path) -> None:
+    pose = {"position": {"x": 1.5}, "orientation": {"w": 1.0}}
+    rows = [
+        Entry("/p", "foxglove.PoseInFrame", 9, {"timestamp": {"seconds": 5, "nanos": 7}, "pose": pose}),
+        Entry("/c", "foxglove.CompressedImage", 10, {"format": "png", "data": b"\x00\xff"}),
+    ]
+    path = write_mcap(tmp_path / "a.mcap", rows, "protobuf")
+    with log_format(path).open_log([path]) as log:
+        first, second = log.messages(["/p", "/c"])
+    assert (first.value.timestamp.seconds, first.value.timestamp.nanos) == (5, 7)
+    assert (first.value.pose.position.x, first.value.pose.orientation.w) == (1.5, 1.0)
+    assert second.value.data == b"\x00\xff"
+
+
+def raw_mcap(path: Path, encoding: str, schema: tuple[str, str, bytes] | None, *messages: bytes) -> Path:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema_id = writer.register_schema(*schema) if schema else 0
+        channel = writer.register_channel("/t", encoding, schema_id)
+        for stamp, message in enumerate(messages):
+            writer.add_message(channel, stamp, message, stamp)
+        writer.finish()  # type: ignore[no-untyped-call]  # the library left this one without annotations
+    return path
+
+
+def test_a_type_of_the_user_is_decoded_by_its_definition(tmp_path: Path) -> None:
+    definition = (
+        b"my_msgs/Inner inner\nuint8 mode\n" + b"=" * 80 + b"\nMSG: my_msgs/Inner\nfloat64[2] range\n"
+    )
+    schema = ("my_msgs/msg/Outer", "ros2msg", definition)
+    message = bytes([0, 1, 0, 0]) + bytes(8) + b"\0\0\0\0\0\0\xf0\x3f" + b"\x07"
+    path = raw_mcap(tmp_path / "a.mcap", "cdr", schema, message)
+    with log_format(path).open_log([path]) as log:
+        (value,) = (m.value for m in log.messages(["/t"]))
+    assert (value.inner.range.tolist(), value.mode) == ([0.0, 1.0], 7)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "schema", "reason"),
+    [
+        (
+            "cdr",
+            ("my_msgs/msg/A", "ros2msg", b"my_msgs/Missing b\n"),
+            "does not define 'my_msgs/msg/Missing'",
+        ),
+        (
+            "cdr",
+            ("my_msgs/msg/A", "ros2msg", b"my_msgs/A again\n"),
+            "definition of my_msgs/msg/A cannot be used",
+        ),
+        ("cdr", ("my_msgs/msg/A", "ros2msg", b"string[99999999] s\n"), "s has 99999999 entries"),
+        ("cdr", ("my_msgs/msg/A", "ros2msg", b"\xff\xfe"), "definition of my_msgs/msg/A cannot be used"),
+        ("cdr", ("A\nimport os", "ros2msg", b"uint8 a\n"), "is no type of ROS"),
+        ("cdr", None, "'' is no type of ROS"),
+        ("protobuf", ("a.B", "protobuf", b"\xff\xff"), "definition of a.B cannot be used"),
+        ("protobuf", ("a.B", "protobuf", b""), "definition of a.B cannot be used"),
+        ("flatbuffer", ("a.B", "flatbuffer", b""), "messages in encoding 'flatbuffer' are not read"),
+    ],
+)
+def test_definitions_that_cannot_be_used(
+    tmp_path: Path, encoding: str, schema: tuple[str, str, bytes] | None, reason: str
+) -> None:
+    path = raw_mcap(tmp_path / "a.mcap", encoding, schema, bytes(40), bytes(40))
+    assert everything(path) == ([], {"messages without a usable definition": 2})
+    topics = log_format(path).describe(path)["topics"]
+    assert isinstance(topics, dict)
+    assert reason in topics["/t"]["cannot be decoded"]
+
+
+@pytest.mark.parametrize(
+    ("encoding", "schema", "message"),
+    [
+        ("json", ("a", "jsonschema", b"{}"), b"{"),
+        ("json", ("a", "jsonschema", b"[1]"), b"[1]"),
+        ("json", ("a", "", b""), b"[" * 100_000),
+        ("json", ("foxglove.CompressedImage", "", b""), b'{"data": "no*base64"}'),
+        ("json", ("a", "jsonschema", b"{}"), b"\xff"),
+        ("cdr", ("std_msgs/msg/String", "ros2msg", b"string data\n"), b"\0\1\0\0\xff\xff\xff\xff"),
+        ("cdr", ("std_msgs/msg/String", "ros2msg", b"string data\n"), b"\x28\xb5\x2f\xfd\0\0"),
+        ("ros1", ("std_msgs/String", "ros1msg", b"uint8[] data\n"), b"\xff\xff\xff\xff"),
+    ],
+)
+def test_messages_that_do_not_fit_their_definition(
+    tmp_path: Path, encoding: str, schema: tuple[str, str, bytes], message: bytes
+) -> None:
+    path = raw_mcap(tmp_path / "a.mcap", encoding, schema, message)
+    assert everything(path) == ([], {"messages that cannot be decoded": 1})
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(share=st.floats(0, 0.999))
+def test_a_cut_file_gives_its_beginning(tmp_path: Path, compression: McapCompression, share: float) -> None:
+    whole = tmp_path / "whole.mcap"
+    if not whole.exists():
+        write_mcap(whole, FLIGHT, compression=compression, chunk_size=8_000)
+    path = cut(Path(shutil.copy(whole, tmp_path / "cut.mcap")), share)
+    found, dropped = everything_or_one_line(path)
+    if not found:
+        # Before the first message stand the definitions, some 5 kB.
+        assert path.stat().st_size < 5_000 + 10_000
+        return
+    assert found == ALL[: len(found)]
+    assert dropped.keys() <= {
+        "file truncated",
+        "recording not closed",
+        "bytes after the last complete record",
+    }
+    assert ("file truncated" in dropped) != ("recording not closed" in dropped)
+    if compression == "none":
+        # Before the first message 5 kB, behind the last one 5 kB of summary; at the cut at most 3 messages.
+        assert len(found) >= len(ALL) * share * (1 - 10_000 / whole.stat().st_size) - 10
+
+
+def test_a_file_without_its_end_is_read_whole(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", FLIGHT)
+    content = path.read_bytes()
+    path.write_bytes(content[: records(content)[0x0F][0]])  # up to the end of the data section
+    assert everything(path) == (ALL, {"recording not closed": 1})
+
+
+def test_a_wrong_checksum_costs_its_chunk(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", FLIGHT, compression="none", chunk_size=9_000)
+    content = bytearray(path.read_bytes())
+    third = records(bytes(content))[_CHUNK][2]
+    content[third + 2_000] ^= 1
+    path.write_bytes(content)
+    found, dropped = everything(path)
+    lost = dropped.pop("messages in damaged blocks")
+    assert 0 < lost < 20
+    assert not dropped
+    assert len(found) == len(ALL) - lost
+    # Of the topic asked for alone.
+    pose, dropped = positions(path)
+    assert dropped == {"messages in damaged blocks": 100 - len(pose)}
+
+
+def test_an_index_that_points_nowhere_costs_its_messages(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", FLIGHT, chunk_size=9_000)
+    content = bytearray(path.read_bytes())
+    first = records(bytes(content))[_MESSAGE_INDEX][0]
+    content[first + 9 + 6 + 8] ^= 3  # the place of the first message
+    path.write_bytes(content)
+    found, dropped = everything(path)
+    assert dropped == {"messages that are not where the index says": 1}
+    assert len(found) == len(ALL) - 1
+
+
+def records(content: bytes) -> dict[int, list[int]]:
+    """Where the records of each kind begin, outside chunks."""
+    found: dict[int, list[int]] = {}
+    position = 8
+    while position < len(content) - 8:
+        found.setdefault(content[position], []).append(position)
+        position += 9 + int.from_bytes(content[position + 1 : position + 9], "little")
+    return found
+
+
+@pytest.mark.parametrize("kind", [_CHUNK, _MESSAGE_INDEX, _MESSAGE, 3, 4])
+@pytest.mark.parametrize("claim", [10**12, 2**63 - 10, 2**64 - 1])
+def test_a_record_of_terabytes_does_not_exhaust_memory(tmp_path: Path, kind: int, claim: int) -> None:
+    chunked = kind in {_CHUNK, _MESSAGE_INDEX}
+    path = write_mcap(tmp_path / "a.mcap", FLIGHT, chunk_size=9_000, chunked=chunked)
+    content = bytearray(path.read_bytes())
+    at = records(bytes(content))[kind][-3]
+    content[at + 1 : at + 9] = claim.to_bytes(8, "little")
+    path.write_bytes(content)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    _, dropped = everything_or_one_line(path)
+    assert dropped
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+
+
+@pytest.mark.parametrize("offset", [16, 16 + 8 + 4 + 4 + 4])
+def test_a_chunk_that_claims_terabytes_is_damage(tmp_path: Path, offset: int) -> None:
+    # Its size once decompressed, and the length of the compressed bytes behind the word zstd.
+    path = write_mcap(tmp_path / "a.mcap", FLIGHT, chunk_size=9_000)
+    content = bytearray(path.read_bytes())
+    at = records(bytes(content))[_CHUNK][1] + 9 + offset
+    content[at : at + 8] = (10**12).to_bytes(8, "little")
+    path.write_bytes(content)
+    found, dropped = everything(path)
+    assert 0 < len(found) < len(ALL)
+    assert dropped
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_flipped_bytes_are_a_loss_or_one_line(tmp_path: Path, data: st.DataObject) -> None:
+    whole = tmp_path / "whole.mcap"
+    if not whole.exists():
+        write_mcap(whole, FLIGHT[:40], compression="none", chunk_size=8_000)
+    content = bytearray(whole.read_bytes())
+    for _ in range(data.draw(st.integers(1, 8))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path / "hurt.mcap"
+    path.write_bytes(content)
+    _, dropped = everything_or_one_line(path)
+    assert all(len(cause.splitlines()) == 1 for cause in dropped)
+
+
+def test_split_files_are_one_recording(tmp_path: Path) -> None:
+    paths = [write_mcap(tmp_path / f"d1_{k}.mcap", FLIGHT[k::3]) for k in range(3)]
+    with log_format(paths[0]).open_log(paths) as log:
+        stamps = [m.receive_ns for m in log.messages([POSE, PICTURE])]
+    assert stamps == sorted(e.stamp_ns for e in FLIGHT if e.topic in {POSE, PICTURE})
+
+
+def test_what_is_no_mcap_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"hello")
+    assert recognised_by(path) == []
+    format_ = log_format(write_mcap(tmp_path / "b.mcap", FLIGHT[:1]))
+    with pytest.raises(DataError, match=r"a\.mcap: is no MCAP file"):
+        format_.open_log([path])
+    path.write_bytes(b"\x89MCAP0\r\n")
+    with pytest.raises(DataError, match=r"a\.mcap: holds no message that can be read"):
+        format_.open_log([path])
+
+
+def test_the_first_stamp_is_that_of_the_first_message(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", FLIGHT)
+    with log_format(path).open_log([path]) as log:
+        assert {t.first_ns for t in log.topics} == {START_NS + 3_000_000, START_NS + 4_000_000}
