@@ -11,9 +11,9 @@ from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
 from pipelines.session.stages import Stage, StageRecord, WritableSession, locked
 from pipelines.session.storage import read_json
-from pipelines.session.tables import POSES, SKELETON, TRUTH, read_table
+from pipelines.session.tables import FRAMES, KEYPOINTS, POSES, SKELETON, TRUTH, read_table
 
-REPORT = Stage("report", revision=1)
+REPORT = Stage("report", revision=2)
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,8 @@ def report(folder: Path, *, force: bool = False) -> Reported:
         page = folder / "report" / "index.html"
         if run.finished:
             return Reported(page, run.record, skipped=True)
-        (run.folder / "index.html").write_text(render_page(_load(folder, records)), encoding="utf-8")
+        html = render_page(_load(folder, records), read_frame=None)
+        (run.folder / "index.html").write_text(html, encoding="utf-8")
         record = run.publish(counts={}, warnings=[])
     return Reported(page, record, skipped=False)
 
@@ -59,6 +60,7 @@ def _load(folder: Path, records: dict[str, StageRecord]) -> SessionContent:
     description = read_description(folder)
     reconstructed = "reconstruct" in records
     has_truth = description.truth is not None and bool(description.truth.joints)
+    with_keypoints = [name for name, entry in description.cameras.items() if entry.keypoints]
     return SessionContent(
         name=folder.stem,
         session=description.model_dump(mode="json", by_alias=True),
@@ -68,6 +70,14 @@ def _load(folder: Path, records: dict[str, StageRecord]) -> SessionContent:
         poses={
             name: read_table(folder / "cameras" / name / "poses.parquet", POSES)
             for name in description.cameras
+        },
+        frames={
+            name: read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
+            for name in description.cameras
+        },
+        keypoints={
+            name: read_table(folder / "cameras" / name / "keypoints.parquet", KEYPOINTS)
+            for name in with_keypoints
         },
         stages={name: asdict(record) for name, record in records.items()},
     )

@@ -27,6 +27,12 @@ _WATCHED = (
 )
 
 
+def side_of(*joints: str) -> str:
+    """`left` or `right` if all joints lie on that side of the body, else an empty word."""
+    sides = {joint.partition("_")[0] for joint in joints}
+    return side if len(sides) == 1 and (side := sides.pop()) in {"left", "right"} else ""
+
+
 @dataclass(frozen=True)
 class Bone:
     """The length of one bone over a recording, in metres."""

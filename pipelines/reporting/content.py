@@ -20,6 +20,8 @@ class SessionContent:
     metrics: dict[str, object] | None  # reconstruct/metrics.json
     truth: pd.DataFrame | None  # tables.TRUTH
     poses: dict[str, pd.DataFrame]  # camera: tables.POSES
+    frames: dict[str, pd.DataFrame]  # camera: tables.FRAMES
+    keypoints: dict[str, pd.DataFrame]  # camera: tables.KEYPOINTS, of cameras that have any
     stages: dict[str, dict[str, object]]  # stage: its stage.json
 
 

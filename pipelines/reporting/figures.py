@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.geometry.poses import rotate
+from pipelines.reporting.bones import side_of
 from pipelines.reporting.motion import Motion
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.svg import (
@@ -468,8 +469,7 @@ def _three_quarter_view(body: Float, joints: tuple[str, ...]) -> tuple[Float, Fl
 def _draw_body(axes: Axes, aside: Float, up: Float, joints: tuple[str, ...]) -> None:
     place = {name: (aside[j], up[j]) for j, name in enumerate(joints)}
     for start, end in bones_of(joints):
-        sides = {start.partition("_")[0], end.partition("_")[0]}
-        colour, order = {"left": (LEFT, 2), "right": (RIGHT, 4)}.get("".join(sorted(sides)), (MIDDLE, 3))
+        colour, order = {"left": (LEFT, 2), "right": (RIGHT, 4), "": (MIDDLE, 3)}[side_of(start, end)]
         axes.plot(*zip(place[start], place[end], strict=True), color=colour, linewidth=1.7, zorder=order)
     axes.plot(aside, up, "o", color=MUTED, markersize=1.6, zorder=5)
 

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import files
+
+from markupsafe import Markup
 
 from pipelines.reporting import wording
 from pipelines.reporting.content import SessionContent, number, section, text
 from pipelines.reporting.figures import draw_all
+from pipelines.reporting.overlays import Moment, ReadFrame, collect_moments
+from pipelines.reporting.panels import draw_panel, picture_width
 from pipelines.reporting.summary import Summary, errors_per_camera, give_verdict, measures, summarise
+from pipelines.reporting.viewer import make_scene
 from pipelines.session.tables import STATUS
 
 
@@ -32,14 +40,30 @@ class StageNote:
     counts: list[tuple[str, str]]
 
 
-def render_page(content: SessionContent) -> str:
+@dataclass(frozen=True)
+class Overlays:
+    """The skeleton in the pictures: the moments, a drawing of every view, and what is to be said of all."""
+
+    moments: tuple[Moment, ...]
+    drawings: dict[tuple[int, str], Markup]  # (moment, camera)
+    pictures: int  # how many drawings show a picture
+    rejected: bool  # whether any joint is marked so
+    unmeasured: bool
+    others: bool  # whether anybody beside the skeleton's people is drawn
+
+
+def render_page(content: SessionContent, read_frame: ReadFrame | None = None) -> str:
     """The complete HTML of a session's report.
 
     The same content gives the same bytes: no dates of making, no versions, no paths of this machine.
-    Whatever stands in the session's files is escaped; the page loads nothing and runs nothing.
+    Whatever stands in the session's files is escaped. The page loads nothing; it runs the one script of
+    its 3D viewer, which its policy names by hash, and nothing else.
+
+    Args:
+        content: what the session holds.
+        read_frame: gives the pictures behind the overlays; without it they are drawn on plain ground.
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
-    from markupsafe import Markup
 
     summary = summarise(content)
     environment = Environment(
@@ -57,6 +81,8 @@ def render_page(content: SessionContent) -> str:
         joint=wording.joint_label,
     )
     plates = draw_all(summary, content.poses)
+    script = (files("pipelines.reporting") / "templates" / "viewer.js").read_text(encoding="utf-8")
+    overlays = _overlays(content, summary, read_frame)
     return environment.get_template("page.html.j2").render(
         name=content.name,
         title=summary.description.flight or content.name,
@@ -69,12 +95,40 @@ def render_page(content: SessionContent) -> str:
         measures=measures(summary),
         errors_per_camera=errors_per_camera(summary),
         plates=plates,
+        scene=make_scene(summary, content.poses),
+        viewer_script=Markup(script),  # noqa: S704 - our own file
+        policy=_policy(script, pictures=overlays is not None and overlays.pictures > 0),
+        overlays=overlays,
         # Our own drawing, in which every name was escaped when it was written.
         drawings={key: Markup(plate.svg) for key, plate in plates.items()},  # noqa: S704
         statuses=[word for word in STATUS if summary.counts.get(word)],
         status_labels=wording.STATUS_LABELS,
         status_reasons=wording.STATUS_REASONS,
         stages=[_stage_note(stage, record) for stage, record in content.stages.items()],
+    )
+
+
+def _policy(script: str, *, pictures: bool) -> str:
+    """What the page may do: its own styles, its own script, and pictures that it holds itself."""
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+    rules = ["default-src 'none'", "style-src 'unsafe-inline'", f"script-src 'sha256-{digest}'"]
+    return "; ".join(rules + ["img-src data:"] * pictures)
+
+
+def _overlays(content: SessionContent, summary: Summary, read_frame: ReadFrame | None) -> Overlays | None:
+    moments = collect_moments(content, summary, read_frame)
+    views = {(m, view.camera): view for m, moment in enumerate(moments) for view in moment.views}
+    if not views:
+        return None
+    width_px = picture_width(len(views))
+    return Overlays(
+        moments=moments,
+        # Our own drawing, without a word from the session's files.
+        drawings={key: Markup(draw_panel(view, width_px)) for key, view in views.items()},  # noqa: S704
+        pictures=sum(view.picture is not None for view in views.values()),
+        rejected=any(view.rejected.any() for view in views.values()),
+        unmeasured=any(view.unmeasured.any() for view in views.values()),
+        others=any(len(view.others) for view in views.values()),
     )
 
 

@@ -104,6 +104,7 @@ class Summary:
     description: Description
     cameras: tuple[CameraRow, ...]
     motion: Motion | None
+    truth: Float | None  # [T, P, J, 3] m at the motion's times and joints
     errors_mm: Float | None  # [T, P, J]
     share: float | None
     counts: dict[str, int]
@@ -144,6 +145,7 @@ def summarise(content: SessionContent) -> Summary:
         description=description,
         cameras=tuple(_camera_row(name, entry, origin_ns) for name, entry in description.cameras.items()),
         motion=motion,
+        truth=truth,
         errors_mm=error if error is not None and np.isfinite(error).any() else None,
         share=counts.get("ok", 0) / total if total else None,
         counts=counts,

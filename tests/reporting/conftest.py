@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from pipelines.reporting.content import SessionContent
-from pipelines.session.tables import SKELETON, STATUS
+from pipelines.session.tables import KEYPOINTS, SKELETON, STATUS
 
 START_NS = 1_700_000_000_000_000_000
 FRAMES = 600
@@ -47,6 +47,8 @@ INTRINSICS = {
 }
 OFFSET_M = np.array([0.02, 0.0, 0.01])
 """What the skeleton is off by, everywhere: sqrt(500) mm = 22.36 mm."""
+ASIDE_PX = np.array([3.0, -4.0])
+"""Where the keypoints lie beside the reprojected skeleton: 5 px."""
 
 
 def _swing(joint: str, phase: np.ndarray) -> np.ndarray:
@@ -126,20 +128,61 @@ def _looking_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
     return quaternion
 
 
+def _camera_at(k: int, t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position [T, 3] and quaternion [T, 4]: the drones look at the actor, the mast stands still."""
+    hip = np.column_stack([2 + 6 * np.cos(0.2 * t_s), 1 + 6 * np.sin(0.2 * t_s), np.ones_like(t_s)])
+    if CAMERAS[k] == "mast":
+        position = np.tile([11.0, -7.0, 3.0], (len(t_s), 1))
+        return position, _looking_at(position, np.tile([2.0, 1.0, 1.0], (len(t_s), 1)))
+    bearing = 0.2 * t_s + 2.1 * k + 0.4 * np.sin(0.3 * t_s + k)
+    position = hip + np.column_stack([9 * np.cos(bearing), 9 * np.sin(bearing), np.full_like(t_s, 4.0 + k)])
+    return position, _looking_at(position, hip)
+
+
 def make_poses(frames: int = FRAMES, rate_hz: float = RATE_HZ) -> dict[str, pd.DataFrame]:
     t_s = np.arange(0, frames / rate_hz, 0.02)
-    hip = np.column_stack([2 + 6 * np.cos(0.2 * t_s), 1 + 6 * np.sin(0.2 * t_s), np.ones_like(t_s)])
     poses = {}
     for k, name in enumerate(CAMERAS):
-        bearing = 0.2 * t_s + 2.1 * k + 0.4 * np.sin(0.3 * t_s + k)
-        away = np.column_stack([9 * np.cos(bearing), 9 * np.sin(bearing), np.full_like(t_s, 4.0 + k)])
-        position = np.tile([11.0, -7.0, 3.0], (len(t_s), 1)) if name == "mast" else hip + away
+        position, quaternion = _camera_at(k, t_s)
         table = pd.DataFrame({"t_ns": START_NS + np.round(t_s * 1e9).astype(np.int64)})
         table[["x", "y", "z"]] = position
-        table[["qx", "qy", "qz", "qw"]] = _looking_at(position, hip)
+        table[["qx", "qy", "qz", "qw"]] = quaternion
         hole = (t_s > t_s[-1] * 0.6) & (t_s < t_s[-1] * 0.66) & (name == "drone2")
         poses[name] = table[:1] if name == "mast" else table[~hole].reset_index(drop=True)
     return poses
+
+
+def make_frames(frames: int = FRAMES, rate_hz: float = RATE_HZ) -> dict[str, pd.DataFrame]:
+    pts_ns = np.round(np.arange(frames) / rate_hz * 1e9).astype(np.int64)
+    table = pd.DataFrame({"frame": np.arange(frames), "t_ns": START_NS + pts_ns, "pts_ns": pts_ns})
+    return dict.fromkeys(CAMERAS, table)
+
+
+def true_pixels(k: int, t_s: np.ndarray) -> np.ndarray:
+    """Where camera k sees the skeleton of `make_skeleton`, [T, J, 2] px: a pinhole without distortion."""
+    from scipy.spatial.transform import Rotation
+
+    position, quaternion = _camera_at(k, t_s)
+    camera_from_world = Rotation.from_quat(quaternion).inv().as_matrix()
+    offset = true_positions(t_s) + OFFSET_M - position[:, None]
+    x, y, z = np.moveaxis(np.einsum("tij,tkj->tki", camera_from_world, offset), -1, 0)
+    return np.stack([1400 * x / z + 959.5, 1400 * y / z + 539.5], axis=-1)
+
+
+def make_keypoints(frames: int = FRAMES, rate_hz: float = RATE_HZ) -> dict[str, pd.DataFrame]:
+    """What every camera found: each joint `ASIDE_PX` beside the skeleton; drone2 sees a bystander as well."""
+    t_s = np.arange(frames) / rate_hz
+    tables = {}
+    for k, name in enumerate(CAMERAS):
+        table = _long(START_NS + np.round(t_s * 1e9).astype(np.int64), np.zeros((frames, len(JOINTS), 3)))
+        table["frame"] = np.repeat(np.arange(frames), len(JOINTS))
+        table[["x", "y"]] = (true_pixels(k, t_s) + ASIDE_PX).reshape(-1, 2)
+        table["confidence"] = 0.9
+        if name == "drone2":
+            # The detector's own numbers, not the skeleton's: the bystander comes first.
+            table = pd.concat([table.assign(person=0, x=table["x"] - 500), table.assign(person=1)])
+        tables[name] = table[KEYPOINTS.names]
+    return tables
 
 
 def make_session(frames: int = FRAMES, rate_hz: float = RATE_HZ) -> dict[str, object]:
@@ -226,6 +269,8 @@ def content() -> SessionContent:
         metrics=make_metrics(),
         truth=make_truth(),
         poses=make_poses(),
+        frames=make_frames(),
+        keypoints=make_keypoints(),
         stages=STAGES,
     )
 

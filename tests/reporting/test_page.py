@@ -1,24 +1,33 @@
 from __future__ import annotations
 
+import base64
+import hashlib
+import json
 import re
 from collections import Counter
 from dataclasses import replace
+from html import unescape
 from html.parser import HTMLParser
 
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.typing import NDArray
 
 from pipelines.reporting.content import SessionContent
+from pipelines.reporting.overlays import MOMENTS
 from pipelines.reporting.page import render_page
 from pipelines.reporting.svg import PALETTE
 from pipelines.reporting.wording import THIN
 
 from .conftest import (
+    CAMERAS,
     FRAMES,
     JOINTS,
     START_NS,
+    make_frames,
+    make_keypoints,
     make_metrics,
     make_poses,
     make_session,
@@ -39,13 +48,17 @@ class _Outline(HTMLParser):
         self.references: list[str] = []
         self.links: list[str] = []
         self.words: list[str] = []
+        self.data: list[str] = []
+        self.scripts: list[str] = []
         self._open: list[str] = []
+        self._is_data = False
         self.feed(page)
         self.close()
         assert not self._open
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.elements.append((tag, tuple(name for name, _ in attrs)))
+        self._is_data = ("type", "application/json") in attrs
         if tag not in _VOID:
             self._open.append(tag)
         for name, value in attrs:
@@ -65,7 +78,10 @@ class _Outline(HTMLParser):
         assert self._open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        self.words.append(data)
+        if self._open and self._open[-1] == "script":
+            (self.data if self._is_data else self.scripts).append(data)
+        else:
+            self.words.append(data)
 
     @property
     def text(self) -> str:
@@ -93,7 +109,9 @@ def page(content: SessionContent) -> str:
 def test_page_is_whole_and_small(page: str) -> None:
     outline = _Outline(page)
     assert page.startswith("<!doctype html>")
-    assert outline.count("figure") == outline.count("svg") == 6
+    assert outline.count("figure") == 8
+    assert page.count('<svg class="overlay"') == MOMENTS * len(CAMERAS)
+    assert outline.count("canvas") == 2
     assert outline.count("h1") == 1
     assert len(page.encode()) < 1_000_000
 
@@ -101,16 +119,49 @@ def test_page_is_whole_and_small(page: str) -> None:
 def test_ids_are_unique_and_references_lead_somewhere(page: str) -> None:
     outline = _Outline(page)
     assert [name for name, count in Counter(outline.ids).items() if count > 1] == []
-    wanted = outline.references + [link.removeprefix("#") for link in outline.links]
-    assert set(wanted) <= set(outline.ids)
+    links = [link.removeprefix("#") for link in outline.links if not link.startswith("#t=")]
+    assert set(outline.references + links) <= set(outline.ids)
+    moments = [float(link.removeprefix("#t=")) for link in outline.links if link.startswith("#t=")]
+    assert len(moments) == MOMENTS
+    assert moments == sorted(moments)
 
 
-def test_page_loads_nothing_and_runs_nothing(page: str) -> None:
+def test_page_loads_nothing_and_runs_its_own_script_alone(page: str) -> None:
     outline = _Outline(page)
     assert all(link.startswith("#") for link in outline.links)
-    assert not {"script", "iframe", "object", "embed", "link", "img"} & {tag for tag, _ in outline.elements}
+    assert not {"iframe", "object", "embed", "link", "img", "image"} & {tag for tag, _ in outline.elements}
     assert not [name for _, names in outline.elements for name in names if name.startswith("on")]
     assert not re.search(r"@import|url\((?!#)", page)
+    (script,) = outline.scripts
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    policy = f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
+    assert _policy(page) == policy
+    assert not re.search(r"\beval\(|new Function|innerHTML|fetch\(|import\(|XMLHttpRequest", script)
+
+
+def test_pictures_are_held_by_the_page(content: SessionContent) -> None:
+    asked = []
+
+    def read_frame(camera: str, frame: int) -> NDArray[np.uint8] | None:
+        asked.append((camera, frame))
+        return None if camera == "mast" else np.full((1080, 1920, 3), 90, dtype=np.uint8)
+
+    page = render_page(content, read_frame)
+    outline = _Outline(page)
+    pictures = [link for link in outline.links if not link.startswith("#")]
+    assert all(link.startswith("data:image/jpeg;base64,") for link in pictures)
+    # One in a panel and one in its map, of two cameras; without a pose, in drone2's gap, the whole alone.
+    assert len(pictures) == MOMENTS * 2 * 2 - 1
+    assert len(asked) == len(set(asked)) == MOMENTS * len(CAMERAS)
+    assert _policy(page).endswith("; img-src data:")
+    assert "Where the ground is plain, there is no picture." in outline.text
+    assert "No video was ingested, so the ground is plain." in _Outline(render_page(content)).text
+
+
+def _policy(page: str) -> str:
+    found = re.search(r'Content-Security-Policy" content="([^"]*)"', page)
+    assert found is not None
+    return unescape(found.group(1))
 
 
 def test_every_header_cell_has_a_scope(page: str) -> None:
@@ -124,9 +175,10 @@ def test_figures_take_their_colours_from_the_page(page: str) -> None:
     assert not re.search(r"#[0-9a-f]{6}\b", "".join(re.findall(r"<[^>]+>", "".join(drawings))))
     for variable in re.findall(r"var\((--[a-z0-9-]+)\)", "".join(drawings)):
         assert f"{variable}: #" in page
-    # Light and dark both define the whole palette.
+    # Light and dark both define the whole palette; over a picture, parts of it are others.
+    style = re.sub(r"\.on-picture \{[^}]*\}", "", page)
     for variable in PALETTE.values():
-        assert page.count(f"{variable}: #") == 2, variable
+        assert style.count(f"{variable}: #") == 2, variable
 
 
 def test_same_content_gives_the_same_bytes_whatever_was_drawn_before(
@@ -166,7 +218,8 @@ def test_page_before_the_reconstruction(content: SessionContent) -> None:
     ingested = replace(content, skeleton=None, metrics=None, truth=None, stages={})
     outline = _Outline(render_page(ingested))
     assert "not reconstructed yet" in outline.text
-    assert outline.count("figure") == 2
+    assert outline.count("figure") == 3
+    assert outline.count("canvas") == 1  # the cameras alone
 
 
 def test_page_with_nothing_reconstructed(content: SessionContent) -> None:
@@ -190,7 +243,7 @@ def test_page_of_a_single_frame(content: SessionContent) -> None:
         truth=make_truth(1),
         poses={name: table[:1] for name, table in make_poses().items()},
     )
-    assert _Outline(render_page(single)).count("figure") == 6
+    assert _Outline(render_page(single)).count("figure") == 8
 
 
 def test_page_of_unknown_joints_and_two_people(content: SessionContent) -> None:
@@ -198,8 +251,10 @@ def test_page_of_unknown_joints_and_two_people(content: SessionContent) -> None:
     first = make_skeleton(40)
     first["joint"] = first["joint"].map(markers)
     both = pd.concat([first, first.assign(person=1, x=first["x"] + 3)])
-    outline = _Outline(render_page(replace(content, skeleton=both, metrics={}, truth=None)))
-    assert outline.count("figure") == 5  # no bone is known
+    page = render_page(replace(content, skeleton=both, metrics={}, truth=None))
+    outline = _Outline(page)
+    assert outline.count("figure") == 7  # no bone is known
+    assert '<select id="viewer-person">' in page
     assert "2 people" in outline.text
     assert "person 1" in outline.text
 
@@ -225,6 +280,10 @@ def _named(content: SessionContent, name: str) -> SessionContent:
     skeleton = make_skeleton(60)
     skeleton["joint"] = skeleton["joint"].replace("nose", name)
     metrics = make_metrics() | {name: 3.0, "method": name}
+
+    def renamed(tables: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+        return {name if key == "drone1" else key: table for key, table in tables.items()}
+
     return replace(
         content,
         name=f"s {name}",
@@ -232,7 +291,9 @@ def _named(content: SessionContent, name: str) -> SessionContent:
         skeleton=skeleton,
         metrics=metrics,
         truth=make_truth(60),
-        poses={name if key == "drone1" else key: table for key, table in make_poses(60).items()},
+        poses=renamed(make_poses(60)),
+        frames=renamed(make_frames(60)),
+        keypoints=renamed(make_keypoints(60)),
         stages={
             name: {"key": name, "settings": {name: name}, "counts": {name: 1}, "warnings": [f"x {name}"]}
         },
@@ -252,6 +313,9 @@ def test_names_from_files_stay_text(content: SessionContent, tame: _Outline, nam
     # leaves room for other ticks, none of another kind.
     assert outline.outside_drawings == tame.outside_drawings
     assert set(outline.elements) <= set(tame.elements)
+    assert outline.scripts == tame.scripts
+    (data,) = outline.data
+    assert json.loads(data)["cameras"][0]["name"] == name
     assert " ".join(name.replace("\x00", "\ufffd").split())[:30] in outline.text.replace("\x00", "\ufffd")
 
 
@@ -263,13 +327,17 @@ def test_long_flight_stays_small_and_says_what_is_left_out(content: SessionConte
         skeleton=make_skeleton(frames),
         truth=make_truth(frames),
         poses=make_poses(frames),
+        frames=make_frames(frames),
+        keypoints=make_keypoints(frames),
     )
     page = render_page(long_flight)
     text = _Outline(page).text
-    assert len(page.encode()) < 2_000_000
+    # Pictures add about 1.5 MB: 6 million pixels at 1.5 bits, in base64.
+    assert len(page.encode()) < 3_500_000
     # 600 s at 50 Hz are 30 000 poses: one in 50 leaves 600 of them.
     assert "One pose in 50 is drawn." in text
     assert "Each point stands for 2 s." in text
+    assert re.search(r"The page holds one time in \d of 18 000", text)
 
 
 def test_far_world_coordinates_are_told_from_a_round_number(content: SessionContent) -> None:

@@ -1,0 +1,266 @@
+"""The skeleton put back into the pictures: what was found in them, and where its joints would be seen.
+
+A few moments, spread over the flight; the one where the views disagree most is always among them. Each
+camera shows its own frame nearest to the moment, with the skeleton and the logged pose interpolated to
+the time of that frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.geometry.poses import interpolate_points, interpolate_poses, matrix_from_quaternion
+from pipelines.reporting.content import SessionContent, number, section
+from pipelines.reporting.motion import Motion
+from pipelines.reporting.summary import CameraRow, Summary
+from pipelines.session.records import Float, Int64, Trajectory
+from pipelines.session.skeletons import with_derived
+from pipelines.session.tables import STATUS
+from pipelines.session.tabular import detections_from, trajectory_from
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Bool = NDArray[np.bool_]
+Picture = NDArray[np.uint8]  # [height, width, 3] BGR
+ReadFrame = Callable[[str, int], Picture | None]
+"""The picture of a camera's frame; None where there is none."""
+
+MOMENTS = 6
+_LONGEST_STEP = 1.5  # usual steps: the skeleton is not interpolated between times further apart
+_SAME_PERSON = 0.5  # of a body's size in the picture: a detection further away is somebody else
+
+
+@dataclass(frozen=True)
+class View:
+    """What one camera saw at a moment: P people of the skeleton with its J joints."""
+
+    camera: str
+    intrinsics: Intrinsics
+    joints: tuple[str, ...]  # K: the skeleton's, then those derived of it
+    frame: int
+    t_s: float  # of the frame
+    found: Float  # [P, J, 2] px; NaN where a joint was not found
+    reprojected: Float  # [P, K, 2] px; NaN where a joint was not reconstructed, or there is no pose
+    rejected: Bool  # [P, J] found, but the views of it disagreed
+    unmeasured: Bool  # [P, J] found, but not reconstructed for another reason
+    others: Float  # [D, J, 2] px: people who are not part of the skeleton
+    has_pose: bool
+    picture: Picture | None
+
+    @property
+    def residual_px(self) -> Float:
+        """Distance [P, J] between found and reprojected joints; NaN where either is missing."""
+        distance: Float = np.linalg.norm(self.found - self.reprojected[:, : self.found.shape[1]], axis=-1)
+        return distance
+
+    @property
+    def median_px(self) -> float | None:
+        """Median of those distances; None where there are none."""
+        known = self.residual_px[np.isfinite(self.residual_px)]
+        return float(np.median(known)) if known.size else None
+
+
+@dataclass(frozen=True)
+class Moment:
+    """All cameras at one time; those without a frame near it by name alone."""
+
+    t_s: float
+    worst: bool
+    views: tuple[View, ...]
+    without_frame: tuple[str, ...]
+
+
+def collect_moments(
+    content: SessionContent, summary: Summary, read_frame: ReadFrame | None
+) -> tuple[Moment, ...]:
+    """What the cameras saw at a few moments; nothing without a skeleton or without keypoints.
+
+    Args:
+        content: with `frames` and `keypoints` of the cameras that have them.
+        summary: of the same content.
+        read_frame: gives the pictures, where there are any.
+    """
+    motion = summary.motion
+    if motion is None or not motion.measured.any():
+        return ()
+    cameras = [_Camera.of(row, content, summary) for row in summary.cameras if row.name in content.keypoints]
+    if not cameras:
+        return ()
+    chosen, worst = choose_moments(motion)
+    moments = []
+    for row in chosen:
+        t_ns = int(motion.t_ns[row])
+        frames = [(camera, camera.nearest_frame(t_ns)) for camera in cameras]
+        moments.append(
+            Moment(
+                t_s=(t_ns - summary.origin_ns) / 1e9,
+                worst=row == worst,
+                views=tuple(
+                    _view(camera, at, motion, row, summary.origin_ns, read_frame)
+                    for camera, at in frames
+                    if at is not None
+                ),
+                without_frame=tuple(camera.name for camera, at in frames if at is None),
+            )
+        )
+    return tuple(moments)
+
+
+def choose_moments(motion: Motion) -> tuple[list[int], int]:
+    """Rows of the motion to look at, in order, and which of them is the worst.
+
+    Each of `MOMENTS` equal stretches gives one: the stretch with the largest median reprojection error
+    gives that time, every other the time with the most joints, nearest its middle. The worst is sought
+    where at least half of the most joints were measured, just before and after as well: one joint gone
+    astray does not make a moment.
+    """
+    count = motion.measured.sum(axis=(1, 2))
+    around = np.concatenate([count[:1], count, count[-1:]])
+    steady = np.minimum(np.minimum(around[:-2], around[2:]), count)
+    error = _row_median(np.where(motion.measured, motion.reprojection_px, np.nan).reshape(len(count), -1))
+    eligible = np.isfinite(error) & (steady >= steady.max() / 2)
+    worst = int(np.argmax(np.where(eligible, error, -1.0) if eligible.any() else count))
+    chosen = []
+    for rows in np.array_split(np.arange(len(count)), min(MOMENTS, len(count))):
+        fullest = rows[steady[rows] == steady[rows].max()]
+        middle = int(fullest[np.argmin(np.abs(fullest - rows.mean()))])
+        if worst in rows:
+            chosen.append(worst)
+        elif count[middle]:
+            chosen.append(middle)
+    return chosen, worst
+
+
+def match_people(reprojected: Float, found: Float) -> list[int | None]:
+    """Which detection is which person: the nearest one, each taken once, none too far away.
+
+    Args:
+        reprojected: [P, J, 2] px, NaN where a joint is not known.
+        found: [D, J, 2] px, likewise.
+
+    Returns:
+        For each person the index of a detection; None where none lies within half the body's size.
+    """
+    matches: list[int | None] = []
+    for body in reprojected:
+        distance = _row_median(np.linalg.norm(found - body, axis=-1))
+        distance[[match for match in matches if match is not None]] = np.nan
+        seen = body[np.isfinite(body).all(axis=-1)]
+        reach = _SAME_PERSON * float(np.linalg.norm(np.ptp(seen, axis=0))) if len(seen) else 0.0
+        near = np.isfinite(distance) & (distance <= reach)
+        matches.append(int(np.argmin(np.where(near, distance, np.inf))) if near.any() else None)
+    return matches
+
+
+def _row_median(values: Float) -> Float:
+    """Median of the finite numbers in each row; NaN where there are none."""
+    medians = np.full(len(values), np.nan)
+    known = np.isfinite(values).any(axis=1)
+    medians[known] = np.nanmedian(values[known], axis=1)
+    return medians
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """One camera's frames, poses and what was found in its pictures."""
+
+    name: str
+    intrinsics: Intrinsics
+    frame: Int64  # [F]
+    frame_t_ns: Int64  # [F]
+    joints: tuple[str, ...]
+    keypoints: pd.DataFrame  # tables.KEYPOINTS
+    track: Trajectory
+    static: bool
+    max_gap_ns: int
+    max_extrapolation_ns: int
+
+    @classmethod
+    def of(cls, camera: CameraRow, content: SessionContent, summary: Summary) -> _Camera:
+        frames, keypoints = content.frames[camera.name], content.keypoints[camera.name]
+        settings = section(content.stages.get("reconstruct", {}), "settings")
+        # What the reconstruction did not use is no measure of it.
+        used = keypoints["confidence"] >= (number(settings, "min_confidence") or 0.0)
+        between = summary.description.pose_interpolation
+        return cls(
+            name=camera.name,
+            intrinsics=camera.entry.intrinsics.intrinsics(),
+            frame=frames["frame"].to_numpy(np.int64),
+            frame_t_ns=frames["t_ns"].to_numpy(np.int64),
+            joints=summary.motion.joints if summary.motion is not None else (),
+            keypoints=keypoints[used],
+            track=trajectory_from(content.poses[camera.name]),
+            static=camera.entry.poses.static,
+            max_gap_ns=round(between.max_gap_s * 1e9),
+            max_extrapolation_ns=round(between.max_extrapolation_s * 1e9),
+        )
+
+    def nearest_frame(self, t_ns: int) -> int | None:
+        """Row of the frame nearest to a time; None where none lies within a frame period."""
+        nearest = int(np.argmin(np.abs(self.frame_t_ns - t_ns)))
+        period = int(np.median(np.diff(self.frame_t_ns))) if len(self.frame_t_ns) > 1 else 0
+        return nearest if abs(int(self.frame_t_ns[nearest]) - t_ns) <= period else None
+
+    def people_in(self, frame: int) -> Float:
+        """What was found in a frame, [D, J, 2] px; NaN where a joint was not."""
+        return detections_from(self.keypoints[self.keypoints["frame"] == frame], self.joints).xy
+
+    def pose_at(self, t_ns: int) -> tuple[Float, Float]:
+        """world_from_camera: position [3] and rotation [3, 3], NaN without a pose."""
+        position, quaternion = self.track.position[:1], self.track.quaternion_xyzw[:1]
+        if not self.static:
+            position, quaternion = interpolate_poses(
+                self.track.t_ns,
+                self.track.position,
+                self.track.quaternion_xyzw,
+                np.array([t_ns]),
+                max_gap_ns=self.max_gap_ns,
+                max_extrapolation_ns=self.max_extrapolation_ns,
+            )
+        return position[0], matrix_from_quaternion(quaternion[0])
+
+
+def _view(
+    camera: _Camera, at: int, motion: Motion, row: int, origin_ns: int, read_frame: ReadFrame | None
+) -> View:
+    frame, t_ns = int(camera.frame[at]), int(camera.frame_t_ns[at])
+    skeleton = _skeleton_at(motion, t_ns)
+    joints, points = with_derived(motion.joints, skeleton)
+    position, rotation = camera.pose_at(t_ns)
+    reprojected = project((points - position) @ rotation, camera.intrinsics)
+    people = camera.people_in(frame)
+    matches = match_people(reprojected[:, : len(motion.joints)], people)
+    nobody = np.full((len(motion.joints), 2), np.nan)
+    found = np.stack([nobody if match is None else people[match] for match in matches])
+    lost = np.isfinite(found[..., 0]) & np.isnan(skeleton[..., 0])
+    rejected = lost & (motion.status[row] == STATUS.index("rejected"))
+    return View(
+        camera=camera.name,
+        intrinsics=camera.intrinsics,
+        joints=joints,
+        frame=frame,
+        t_s=(t_ns - origin_ns) / 1e9,
+        found=found,
+        reprojected=reprojected,
+        rejected=rejected,
+        unmeasured=lost & ~rejected,
+        others=people[[d for d in range(len(people)) if d not in matches]],
+        has_pose=bool(np.isfinite(position).all()),
+        picture=read_frame(camera.name, frame) if read_frame is not None else None,
+    )
+
+
+def _skeleton_at(motion: Motion, t_ns: int) -> Float:
+    """Measured joints [P, J, 3] at a time, interpolated between neighbours; NaN beside a missing one."""
+    usual_ns = float(np.median(np.diff(motion.t_ns))) if len(motion.t_ns) > 1 else 0.0
+    at_time: Float = interpolate_points(
+        motion.t_ns, motion.measured_position, np.array([t_ns]), max_gap_ns=round(_LONGEST_STEP * usual_ns)
+    )[0]
+    return at_time

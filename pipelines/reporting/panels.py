@@ -1,0 +1,210 @@
+"""Drawing what a camera saw: detections and the reprojected skeleton over the picture, as inline SVG.
+
+A square is cut out around the people, so that a distance of a few pixels can be seen; a small map in its
+corner shows where in the picture it lies. Lengths in a drawing are pixels of the picture; what belongs
+to the drawing itself is measured in its own unit, 1/320 of the panel's width.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from pipelines.reporting.bones import side_of
+from pipelines.reporting.overlays import Picture, View
+from pipelines.session.records import Float
+from pipelines.session.skeletons import bones_of
+
+_MARGIN = 1.3  # a panel is so many times as large as what it shows
+_LEAST_PX = 96.0
+_WHOLE = 0.8  # a panel this wide, by the picture's width, needs no map
+_MAP = 0.27  # width of the map, by the panel's
+_UNITS = 320.0
+_WIDEST_PX, _MAP_WIDTH_PX = 640, 192
+_MOST_PIXELS = 6_000_000
+"""All pictures of a page together: 18 panels of 577 x 577."""
+_JPEG_QUALITY = 80
+
+
+class _Window(NamedTuple):
+    """A rectangle of the picture, in pixels; the centre of the top left pixel is (0, 0)."""
+
+    left: float
+    top: float
+    width: float
+    height: float
+
+
+def picture_width(panels: int) -> int:
+    """How many pixels wide the picture of a panel may be where there are so many panels."""
+    return min(_WIDEST_PX, int(np.sqrt(_MOST_PIXELS / max(panels, 1))))
+
+
+def draw_panel(view: View, width_px: int) -> str:
+    """One view as an `<svg>` without a word from the session's files.
+
+    The same view gives the same bytes, with the same build of OpenCV where there is a picture.
+
+    Args:
+        view: what to draw.
+        width_px: how wide the picture in it may be.
+    """
+    size = (view.intrinsics.width, view.intrinsics.height)
+    window = _window(view, size)
+    unit = window.width / _UNITS
+    joints = view.found.shape[1]
+    compared = np.isfinite(view.residual_px)
+    kept = np.isfinite(view.found[..., 0]) & ~view.rejected & ~view.unmeasured
+    marks = [
+        *_bones(view, unit),
+        _lines(
+            "residual", unit, zip(view.found[compared], view.reprojected[:, :joints][compared], strict=True)
+        ),
+        *_circles("joint", 1.7 * unit, view.reprojected[:, :joints].reshape(-1, 2)),
+        *_circles("found", 3.2 * unit, view.found[kept]),
+        _crosses("rejected", unit, view.found[view.rejected]),
+        _crosses("unmeasured", unit, view.found[view.unmeasured]),
+    ]
+    background = [
+        _rectangle("ground", _Window(-0.5, -0.5, *size), unit),
+        _picture(view.picture, size, window, width_px) if view.picture is not None else "",
+        *_circles("other", 1.7 * unit, view.others.reshape(-1, 2)),
+    ]
+    kind = "overlay on-picture" if view.picture is not None else "overlay"
+    return (
+        f'<svg class="{kind}" viewBox="{_numbers(*window)}" aria-hidden="true">'
+        + "".join(background + marks)
+        + (_map(view, size, window) if window.width < _WHOLE * size[0] else "")
+        + "</svg>"
+    )
+
+
+# --- where to look -------------------------------------------------------------------------------------
+
+
+def _window(view: View, size: tuple[int, int]) -> _Window:
+    """What a panel shows: the people of the skeleton with a margin; without any, the whole picture."""
+    width, height = size
+    points = np.concatenate([view.found.reshape(-1, 2), view.reprojected.reshape(-1, 2)])
+    inside = points[(points >= 0).all(axis=1) & (points < [width, height]).all(axis=1)]
+    whole = float(max(size))
+    if not len(inside):
+        return _centred(np.array([width, height]) / 2 - 0.5, whole, size)
+    low, high = inside.min(axis=0), inside.max(axis=0)
+    wanted = _MARGIN * float((high - low).max())
+    return _centred((low + high) / 2, min(max(wanted, _LEAST_PX), whole), size)
+
+
+def _centred(middle: Float, width: float, size: tuple[int, int]) -> _Window:
+    """A square around a point, on whole pixels, moved into the picture as far as it fits."""
+    extent = np.ceil([width, width])
+    room = np.array(size) - extent
+    corner = np.where(room >= 0, np.clip(np.round(middle - extent / 2), 0, np.maximum(room, 0)), room / 2)
+    return _Window(float(corner[0]) - 0.5, float(corner[1]) - 0.5, float(extent[0]), float(extent[1]))
+
+
+# --- marks ---------------------------------------------------------------------------------------------
+
+
+def _bones(view: View, unit: float) -> list[str]:
+    place = {name: k for k, name in enumerate(view.joints)}
+    bones = [
+        (body[place[a]], body[place[b]], side_of(a, b))
+        for body in view.reprojected
+        for a, b in bones_of(view.joints)
+    ]
+    casing = _lines("casing", unit, ((a, b) for a, b, _ in bones))
+    return [casing] + [
+        _lines(f"bone {side or 'middle'}", unit, ((a, b) for a, b, of in bones if of == side))
+        for side in ("", "left", "right")
+    ]
+
+
+def _lines(kind: str, unit: float, segments: Iterable[tuple[Float, Float]]) -> str:
+    """All segments as one path; those with a missing end are left out."""
+    steps = [f"M{_numbers(*a)}L{_numbers(*b)}" for a, b in segments if np.isfinite([a, b]).all()]
+    if not steps:
+        return ""
+    width = _WIDTHS[kind.partition(" ")[0]] * unit
+    return f'<path class="{kind}" stroke-width="{width:.2f}" d="{"".join(steps)}"/>'
+
+
+_WIDTHS = {"casing": 3.6, "bone": 1.7, "residual": 1.0, "rejected": 2.2, "unmeasured": 1.3}
+
+
+def _circles(kind: str, radius: float, points: Float) -> list[str]:
+    rest = f'r="{radius:.2f}" stroke-width="{radius / 3.2:.2f}"/>'
+    return [
+        f'<circle class="{kind}" cx="{x:.1f}" cy="{y:.1f}" {rest}'
+        for x, y in points[np.isfinite(points).all(axis=1)]
+    ]
+
+
+def _crosses(kind: str, unit: float, points: Float) -> str:
+    arms = 3.6 * unit * np.array([[[-1, -1], [1, 1]], [[-1, 1], [1, -1]]])
+    strokes = [(point + start, point + end) for point in points for start, end in arms]
+    return _lines("casing", unit, strokes) + _lines(kind, unit, strokes)
+
+
+def _rectangle(kind: str, window: _Window, unit: float) -> str:
+    left, top, width, height = (f"{value:g}" for value in window)
+    return (
+        f'<rect class="{kind}" x="{left}" y="{top}" width="{width}" height="{height}" '
+        f'stroke-width="{unit:.2f}"/>'
+    )
+
+
+def _numbers(*values: float) -> str:
+    return " ".join(f"{value:.1f}" for value in values)
+
+
+# --- pictures ------------------------------------------------------------------------------------------
+
+
+def _map(view: View, size: tuple[int, int], window: _Window) -> str:
+    """The whole picture in the upper left corner, with a frame where the panel lies, and other people."""
+    everything = _Window(-0.5, -0.5, *size)
+    width = _MAP * window.width
+    unit = size[0] / (_MAP * _UNITS)
+    gap = 0.02 * window.width
+    return (
+        f'<svg class="map" x="{window.left + gap:.1f}" y="{window.top + gap:.1f}" width="{width:.1f}" '
+        f'height="{width * size[1] / size[0]:.1f}" viewBox="{_numbers(*everything)}">'
+        + _rectangle("ground", everything, unit)
+        + (_picture(view.picture, size, everything, _MAP_WIDTH_PX) if view.picture is not None else "")
+        + "".join(_circles("other", 2 * unit, np.nanmedian(view.others, axis=1)))
+        + _rectangle("where", window, 1.4 * unit)
+        + _rectangle("edge", everything, 2 * unit)
+        + "</svg>"
+    )
+
+
+def _picture(picture: Picture, size: tuple[int, int], window: _Window, width_px: int) -> str:
+    """The part of a picture in a window, as an `<image>` of at most `width_px` for the whole window.
+
+    A picture of another size than the calibration's is the same view at another scale.
+    """
+    import cv2
+
+    scale = np.array([picture.shape[1] / size[0], picture.shape[0] / size[1]])
+    corners = (
+        np.array([[window.left, window.top], [window.left + window.width, window.top + window.height]]) + 0.5
+    )
+    low, high = np.clip(np.round(corners * scale), 0, picture.shape[1::-1]).astype(int)
+    part = picture[low[1] : high[1], low[0] : high[0]]
+    if not part.size:
+        return ""
+    shrink = min(1.0, width_px / (window.width * scale[0]))
+    if shrink < 1:
+        part = cv2.resize(part, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    _, jpeg = cv2.imencode(".jpg", part, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    data = base64.b64encode(jpeg.tobytes()).decode("ascii")
+    left, top = low / scale - 0.5
+    width, height = (high - low) / scale
+    return (
+        f'<image x="{left:.2f}" y="{top:.2f}" width="{width:.2f}" height="{height:.2f}" '
+        f'preserveAspectRatio="none" href="data:image/jpeg;base64,{data}"/>'
+    )

@@ -1,0 +1,662 @@
+"use strict";
+(() => {
+  const scene = JSON.parse(document.getElementById("viewer-data").textContent);
+  const stage = document.getElementById("viewer");
+  const element = (name) => document.getElementById(`viewer-${name}`);
+  const numbers = (text, Kind) => new Kind(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
+
+  // --- the data: millimetres and 0.1 ms in, metres and seconds out ---------------------------------------
+
+  const MISSING = { 2: -32768, 4: -2147483648 };
+  const time = Float64Array.from(numbers(scene.t, Int32Array), (t) => t / 1e4);
+  const last = time.length - 1;
+  const usual = last > 0 ? Array.from(time.subarray(1), (t, k) => t - time[k]).sort((a, b) => a - b)[last >> 1] : 1;
+  const LONGEST_STEP = 2.5; // usual steps: nothing is drawn between times further apart
+  const cameras = scene.cameras.map((camera) => ({
+    ...camera,
+    position: numbers(camera.position, Int32Array),
+    rotation: numbers(camera.rotation, Int16Array),
+  }));
+  const body = scene.body && {
+    ...scene.body,
+    middle: numbers(scene.body.middle, Int32Array),
+    joint: numbers(scene.body.joint, Int16Array),
+    truth: scene.body.truth && numbers(scene.body.truth, Int16Array),
+    root: scene.body.root && numbers(scene.body.root, Int16Array),
+  };
+  const people = body ? body.people : 0;
+  const jointCount = body ? body.joints.length : 0;
+
+  const known = (values, row) => values[3 * row] !== MISSING[values.BYTES_PER_ELEMENT];
+  const triple = (values, row) => [values[3 * row] / 1e3, values[3 * row + 1] / 1e3, values[3 * row + 2] / 1e3];
+  const mix = (a, b, f) => a.map((value, k) => value + f * (b[k] - value));
+  const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
+  const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+
+  /** The stored times around t. `near` is -1 where none is near enough to stand for it. */
+  function bracket(t) {
+    let low = 0;
+    let high = last;
+    while (high - low > 1) {
+      const middle = (low + high) >> 1;
+      if (time[middle] <= t) low = middle;
+      else high = middle;
+    }
+    const step = time[high] - time[low];
+    const fraction = step > 0 ? Math.min(Math.max((t - time[low]) / step, 0), 1) : 0;
+    const near = fraction < 0.5 ? low : high;
+    const bridged = step <= LONGEST_STEP * usual;
+    return { low, high, fraction, bridged, near: bridged || Math.abs(t - time[near]) <= usual ? near : -1 };
+  }
+
+  /** What is known at the nearest time, moved towards the other one where that is known as well. */
+  function between(at, row, isKnown, value, blend = mix) {
+    if (at.near < 0 || !isKnown(row(at.near))) return null;
+    const both = at.bridged && isKnown(row(at.low)) && isKnown(row(at.high));
+    return both ? blend(value(row(at.low)), value(row(at.high)), at.fraction) : value(row(at.near));
+  }
+
+  function jointsAt(values, person, at) {
+    const joints = [];
+    for (let j = 0; j < jointCount; j++) {
+      joints.push(
+        between(
+          at,
+          (k) => (k * people + person) * jointCount + j,
+          (row) => known(values, row),
+          (row) => add(triple(values, row), triple(body.middle, Math.floor(row / jointCount))),
+        ),
+      );
+    }
+    for (const parents of body.derived) {
+      const [a, b] = parents.map((parent) => joints[parent]);
+      joints.push(a && b ? mix(a, b, 0.5) : null);
+    }
+    return joints;
+  }
+
+  const middleAt = (person, at) =>
+    between(at, (k) => k * people + person, (row) => known(body.middle, row), (row) => triple(body.middle, row));
+
+  const cameraPosition = (camera, at) =>
+    between(at, (k) => k, (row) => known(camera.position, row), (row) => triple(camera.position, row));
+
+  function turnedTowards(a, b, f) {
+    const side = a.reduce((sum, value, k) => sum + value * b[k], 0) < 0 ? -1 : 1;
+    const mixed = a.map((value, k) => (1 - f) * value + f * side * b[k]);
+    const length = Math.hypot(...mixed);
+    return mixed.map((value) => value / length);
+  }
+
+  const cameraRotation = (camera, at) =>
+    between(
+      at,
+      (k) => k,
+      (row) => known(camera.position, row),
+      (row) => Array.from(camera.rotation.subarray(4 * row, 4 * row + 4), (value) => value / 32767),
+      turnedTowards,
+    );
+
+  function rotate([x, y, z, w], v) {
+    const t = [2 * (y * v[2] - z * v[1]), 2 * (z * v[0] - x * v[2]), 2 * (x * v[1] - y * v[0])];
+    return [
+      v[0] + w * t[0] + y * t[2] - z * t[1],
+      v[1] + w * t[1] + z * t[0] - x * t[2],
+      v[2] + w * t[2] + x * t[1] - y * t[0],
+    ];
+  }
+
+  /** Where each person is, without the jitter of a median over changing joints: the mean of a second. */
+  function steadyMiddles() {
+    const half = Math.max(1, Math.round(0.5 / usual));
+    return Array.from({ length: people }, (_, person) => {
+      const sums = [[0, 0, 0, 0]];
+      for (let k = 0; k <= last; k++) {
+        const row = k * people + person;
+        const there = known(body.middle, row);
+        const point = there ? triple(body.middle, row) : [0, 0, 0];
+        sums.push(sums[k].map((sum, axis) => sum + (axis < 3 ? point[axis] : Number(there))));
+      }
+      let held = null;
+      const steady = Array.from(time, (_, k) => {
+        const from = sums[Math.max(k - half, 0)];
+        const to = sums[Math.min(k + half, last) + 1];
+        const count = to[3] - from[3];
+        held = count > 0 ? [0, 1, 2].map((axis) => (to[axis] - from[axis]) / count) : held;
+        return held;
+      });
+      const first = steady.find((point) => point) || [0, 0, 0];
+      return steady.map((point) => point || first);
+    });
+  }
+  const steady = body ? steadyMiddles() : [];
+
+  function steadyAt(person, at) {
+    return mix(steady[person][at.low], steady[person][at.high], at.fraction);
+  }
+
+  // --- the two views: one pair of angles, a distance each ------------------------------------------------
+
+  const HALF_HEIGHT = Math.tan(Math.PI / 180 * 16); // of the field of view, at distance 1
+  const START = { azimuth: -1.0, elevation: 0.42 };
+  const angles = { ...START };
+  const lowest = [scene.low[0], scene.low[1], Math.min(scene.low[2], scene.ground)];
+  const centre = mix(lowest, scene.high, 0.5);
+  const extent = scene.high.map((value, k) => Math.max(value - centre[k], 1));
+  const radius = Math.hypot(...extent);
+  const views = [
+    { canvas: element("flight"), whole: true },
+    { canvas: element("body"), whole: false },
+  ].filter((view) => view.canvas);
+  for (const view of views) view.context = view.canvas.getContext("2d");
+  const frustumDepth = Math.min(Math.max(0.09 * radius, 0.25), 5);
+
+  let colours = {};
+  function readColours() {
+    const style = getComputedStyle(document.documentElement);
+    const colour = (name) => style.getPropertyValue(`--${name}`).trim();
+    colours = {
+      paper: colour("paper"), ink: colour("ink"), muted: colour("muted"), grid: colour("grid"),
+      sides: [colour("middle"), colour("left"), colour("right")],
+      cameras: cameras.map((_, k) => colour(`camera-${k % 6}`)),
+      font: `11px ${style.getPropertyValue("--sans")}`,
+    };
+  }
+
+  /** Right, up and forward of the eye, as rows. */
+  function eyeAxes({ azimuth, elevation }) {
+    const [ca, sa, ce, se] = [Math.cos(azimuth), Math.sin(azimuth), Math.cos(elevation), Math.sin(elevation)];
+    return [[-sa, ca, 0], [-se * ca, -se * sa, ce], [-ce * ca, -ce * sa, -se]];
+  }
+
+  // The narrower side decides, so that a tall canvas shows as much as a wide one.
+  const focalOf = ({ clientWidth, clientHeight }) => Math.min(clientHeight, 1.2 * clientWidth) / 2 / HALF_HEIGHT;
+
+  /** The least distance from which the view shows all it is about, at the angles of the start. */
+  function fit(view) {
+    const [right, up, forward] = eyeAxes(START);
+    const [width, height] = [view.canvas.clientWidth, view.canvas.clientHeight];
+    const points = view.whole ? outline() : [[0, 0, 1.3], [0, 0, -1.3]]; // a body, and a little air around it
+    return Math.max(...points.map((point) => {
+      const aside = Math.max(Math.abs(dot(point, right)) / (0.44 * width), Math.abs(dot(point, up)) / (0.42 * height));
+      return aside * focalOf(view.canvas) - dot(point, forward);
+    }));
+  }
+
+  /** A hundred points of every path and what they stand over, from the centre, but for those gone astray. */
+  function outline() {
+    const points = [mix(centre, scene.high, 0.5)];
+    for (let k = 0; k <= last; k += Math.ceil((last + 1) / 100)) {
+      const there = cameras.filter((camera) => known(camera.position, k)).map((camera) => triple(camera.position, k));
+      for (const point of [...there, ...steady.map((middles) => middles[k])]) points.push(point, onGround(point));
+    }
+    const fromCentre = points.map((point) => point.map((value, axis) => value - centre[axis]));
+    return fromCentre.filter((point) => point.every((value, axis) => Math.abs(value) <= 1.2 * extent[axis]));
+  }
+
+  function looking(view, at) {
+    const { canvas, distance } = view;
+    const target = view.whole || !people ? centre : steadyAt(person(), at);
+    const axes = eyeAxes(angles);
+    const eye = target.map((value, k) => value - distance * axes[2][k]);
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    const focal = focalOf(canvas);
+    const near = 0.02 * distance;
+    const inside = (p) => {
+      const q = [p[0] - eye[0], p[1] - eye[1], p[2] - eye[2]];
+      return axes.map((axis) => dot(q, axis));
+    };
+    const flat = (q) => [width / 2 + (focal * q[0]) / q[2], height / 2 - (focal * q[1]) / q[2]];
+    return { target, axes, width, height, focal, near, inside, flat, distance, context: view.context };
+  }
+
+  /** A straight line in space, cut off in front of the eye. */
+  function line(eye, a, b) {
+    let [p, q] = [eye.inside(a), eye.inside(b)];
+    if (p[2] < eye.near && q[2] < eye.near) return;
+    if (p[2] < eye.near) p = mix(q, p, (q[2] - eye.near) / (q[2] - p[2]));
+    if (q[2] < eye.near) q = mix(p, q, (p[2] - eye.near) / (p[2] - q[2]));
+    eye.context.moveTo(...eye.flat(p));
+    eye.context.lineTo(...eye.flat(q));
+  }
+
+  function stroke(eye, style, draw) {
+    const { context } = eye;
+    context.save();
+    Object.assign(context, { lineCap: "round", lineJoin: "round" }, style);
+    context.setLineDash(style.dash || []);
+    context.beginPath();
+    draw();
+    context.stroke();
+    context.restore();
+  }
+
+  function dotAt(eye, point, size, colour) {
+    const q = eye.inside(point);
+    if (q[2] < eye.near) return;
+    const { context } = eye;
+    context.fillStyle = colour;
+    context.beginPath();
+    context.arc(...eye.flat(q), size, 0, 2 * Math.PI);
+    context.fill();
+  }
+
+  function label(eye, text, x, y, colour, align = "center") {
+    const { context } = eye;
+    Object.assign(context, { font: colours.font, textAlign: align, lineJoin: "round", lineWidth: 3 });
+    context.strokeStyle = colours.paper;
+    context.strokeText(text, x, y);
+    context.fillStyle = colour;
+    context.fillText(text, x, y);
+  }
+
+  // --- what is drawn -------------------------------------------------------------------------------------
+
+  function spacing(distance) {
+    const least = distance / 14;
+    const power = 10 ** Math.floor(Math.log10(least));
+    return [1, 2, 5, 10].map((factor) => factor * power).find((step) => step >= least);
+  }
+
+  const REACH = 16;
+  const LEVELS = 6;
+  /** The edges of the ground's squares by how far out they lie: each ring is drawn fainter. */
+  const RINGS = Array.from({ length: LEVELS }, () => []);
+  for (let i = -REACH; i <= REACH; i++) {
+    for (let j = -REACH; j < REACH; j++) {
+      const out = Math.hypot(i, j + 0.5) / REACH;
+      if (out < 1) RINGS[Math.floor(LEVELS * Math.max(1.5 * out - 0.5, 0))].push([i, j]);
+    }
+  }
+
+  function drawGround(eye) {
+    const step = spacing(eye.distance);
+    const snapped = [0, 1].map((axis) => Math.round(eye.target[axis] / step) * step);
+    const at = (i, j) => [snapped[0] + i * step, snapped[1] + j * step, scene.ground];
+    for (let level = 0; level < LEVELS; level++) {
+      const style = { strokeStyle: colours.grid, lineWidth: 1, globalAlpha: 1 - level / LEVELS };
+      stroke(eye, style, () => {
+        for (const [i, j] of RINGS[level]) {
+          line(eye, at(i, j), at(i, j + 1));
+          line(eye, at(j, i), at(j + 1, i));
+        }
+      });
+    }
+    return step;
+  }
+
+  const PATH_POINTS = 1200;
+
+  /** A path up to a time, broken where nothing is known. */
+  function path(eye, until, pointAt) {
+    const stride = Math.max(1, Math.ceil((last + 1) / PATH_POINTS));
+    let before = null;
+    let beforeTime = 0;
+    for (let k = 0; k <= last && time[k] <= until; k += stride) {
+      const point = pointAt(k);
+      const whole = point && before && time[k] - beforeTime <= LONGEST_STEP * usual * stride;
+      if (whole) line(eye, before, point);
+      before = point;
+      beforeTime = time[k];
+    }
+  }
+
+  const onGround = (point) => [point[0], point[1], scene.ground];
+
+  function drawPaths(eye, at, t) {
+    for (let p = 0; p < people; p++) {
+      const pointAt = (k) => (known(body.middle, k * people + p) ? onGround(steady[p][k]) : null);
+      stroke(eye, { strokeStyle: colours.ink, lineWidth: 1, globalAlpha: 0.3 }, () => path(eye, Infinity, pointAt));
+      stroke(eye, { strokeStyle: colours.ink, lineWidth: 1.8, globalAlpha: 0.8 }, () => path(eye, t, pointAt));
+    }
+    cameras.forEach((camera, c) => {
+      const pointAt = (k) => (known(camera.position, k) ? triple(camera.position, k) : null);
+      stroke(eye, { strokeStyle: colours.cameras[c], lineWidth: 1, globalAlpha: 0.35 }, () => path(eye, Infinity, pointAt));
+      stroke(eye, { strokeStyle: colours.cameras[c], lineWidth: 1.6 }, () => path(eye, t, pointAt));
+      const position = cameraPosition(camera, at);
+      if (!position) return;
+      stroke(eye, { strokeStyle: colours.cameras[c], lineWidth: 1, globalAlpha: 0.5, dash: [2, 3] }, () =>
+        line(eye, position, onGround(position)),
+      );
+      dotAt(eye, onGround(position), 1.8, colours.cameras[c]);
+    });
+  }
+
+  function cameraParts(eye, camera, c, at) {
+    const position = cameraPosition(camera, at);
+    if (!position) return [];
+    const rotation = cameraRotation(camera, at);
+    const [left, right, top, bottom] = camera.corners.map((edge) => Math.min(Math.max(edge, -1.2), 1.2));
+    const corner = (x, y) => add(position, rotate(rotation, [x * frustumDepth, y * frustumDepth, frustumDepth]));
+    const corners = [corner(left, top), corner(right, top), corner(right, bottom), corner(left, bottom)];
+    const apex = eye.inside(position);
+    const draw = () => {
+      stroke(eye, { strokeStyle: colours.cameras[c], lineWidth: 1.2 }, () => {
+        corners.forEach((end, k) => {
+          line(eye, position, end);
+          line(eye, end, corners[(k + 1) % 4]);
+        });
+      });
+      // The upper edge tells which way the picture is up.
+      stroke(eye, { strokeStyle: colours.cameras[c], lineWidth: 2.6 }, () => line(eye, corners[0], corners[1]));
+      dotAt(eye, position, 2.4, colours.cameras[c]);
+    };
+    const tag = () => {
+      if (apex[2] < eye.near) return;
+      const [x, y] = eye.flat(apex);
+      label(eye, camera.name, x, y - 8, colours.cameras[c]);
+    };
+    return [{ depth: apex[2], draw }, { depth: -1, draw: tag }];
+  }
+
+  const depthOf = (eye, a, b) => (eye.inside(a)[2] + eye.inside(b)[2]) / 2;
+
+  function drawShadow(eye, joints) {
+    stroke(eye, { strokeStyle: colours.muted, lineWidth: 2, globalAlpha: 0.28 }, () => {
+      for (const [a, b] of body.bones) if (joints[a] && joints[b]) line(eye, onGround(joints[a]), onGround(joints[b]));
+    });
+  }
+
+  function boneParts(eye, joints, style) {
+    const parts = [];
+    for (const [a, b, side] of body.bones) {
+      if (!joints[a] || !joints[b]) continue;
+      const draw = () => stroke(eye, style(side), () => line(eye, joints[a], joints[b]));
+      parts.push({ depth: depthOf(eye, joints[a], joints[b]), draw });
+    }
+    return parts;
+  }
+
+  function jointParts(eye, joints, size) {
+    return joints.slice(0, jointCount).flatMap((joint, j) => {
+      if (!joint) return [];
+      const draw = () => dotAt(eye, joint, size, colours.sides[body.sides[j]]);
+      return [{ depth: eye.inside(joint)[2] - 0.01, draw }];
+    });
+  }
+
+  const CHI2_95 = 7.815; // three degrees of freedom
+
+  /** The outline of a 95 % ellipsoid {x : x' S^-1 x = 7.815}, in perspective to first order: S = L L'. */
+  function ellipsoid(eye, joint, row, side) {
+    const l = Array.from(body.root.subarray(6 * row, 6 * row + 6), (value) => value / 1e4);
+    const q = eye.inside(joint);
+    if (q[2] < eye.near) return;
+    let [xx, xy, yy] = [0, 0, 0];
+    for (const column of [[l[0], l[1], l[3]], [0, l[2], l[4]], [0, 0, l[5]]]) {
+      const v = eye.axes.map((axis) => dot(column, axis));
+      const dx = (eye.focal / q[2]) * (v[0] - (q[0] / q[2]) * v[2]);
+      const dy = (-eye.focal / q[2]) * (v[1] - (q[1] / q[2]) * v[2]);
+      xx += dx * dx;
+      xy += dx * dy;
+      yy += dy * dy;
+    }
+    const middle = (xx + yy) / 2;
+    const spread = Math.hypot((xx - yy) / 2, xy);
+    const radii = [middle + spread, Math.max(middle - spread, 0)].map((value) => Math.sqrt(CHI2_95 * value));
+    const { context } = eye;
+    context.save();
+    context.beginPath();
+    context.ellipse(...eye.flat(q), ...radii, Math.atan2(2 * xy, xx - yy) / 2, 0, 2 * Math.PI);
+    Object.assign(context, { fillStyle: colours.sides[side], strokeStyle: colours.sides[side], globalAlpha: 0.1 });
+    context.fill();
+    context.globalAlpha = 0.55;
+    context.lineWidth = 0.8;
+    context.stroke();
+    context.restore();
+  }
+
+  function ellipsoidParts(eye, joints, person, at) {
+    return joints.slice(0, jointCount).flatMap((joint, j) => {
+      const row = (at.near * people + person) * jointCount + j;
+      if (!joint || body.root[6 * row] === MISSING[2]) return [];
+      return [{ depth: eye.inside(joint)[2] + 0.01, draw: () => ellipsoid(eye, joint, row, body.sides[j]) }];
+    });
+  }
+
+  /** East, north and up in the lower left corner, and how wide the squares of the ground are. */
+  function drawCompass(eye, step) {
+    const [x, y, length] = [30, eye.height - 34, 20];
+    const axes = [["E", [1, 0, 0]], ["N", [0, 1, 0]], ["up", [0, 0, 1]]];
+    for (const [name, axis] of axes) {
+      const [dx, dy] = [dot(axis, eye.axes[0]), -dot(axis, eye.axes[1])];
+      stroke(eye, { strokeStyle: colours.muted, lineWidth: 1.2 }, () => {
+        eye.context.moveTo(x, y);
+        eye.context.lineTo(x + length * dx, y + length * dy);
+      });
+      label(eye, name, x + 1.5 * length * dx, y + 1.5 * length * dy + 4, colours.muted);
+    }
+    const unit = step < 1 ? `${Math.round(step * 100)} cm` : `${step} m`;
+    label(eye, `squares of ${unit}`, eye.width - 10, eye.height - 10, colours.muted, "right");
+  }
+
+  const shown = (name) => Boolean(element(name)?.checked);
+  const person = () => Number(element("person")?.value ?? 0);
+
+  function draw(view, at, t) {
+    const eye = looking(view, at);
+    const { context } = eye;
+    const ratio = window.devicePixelRatio || 1;
+    const size = [Math.round(eye.width * ratio), Math.round(eye.height * ratio)];
+    if (view.canvas.width !== size[0]) view.canvas.width = size[0];
+    if (view.canvas.height !== size[1]) view.canvas.height = size[1];
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    context.clearRect(0, 0, eye.width, eye.height);
+    const step = drawGround(eye);
+    if (shown("paths")) drawPaths(eye, at, t);
+    const parts = [];
+    // Bones as thick as 4 cm, but never lost from afar nor clumsy from near.
+    const width = Math.min(Math.max((0.04 * eye.focal) / eye.distance, 1.6), 5);
+    for (let p = 0; p < people; p++) {
+      const joints = jointsAt(body.joint, p, at);
+      drawShadow(eye, joints);
+      parts.push(...boneParts(eye, joints, (side) => ({ strokeStyle: colours.sides[side], lineWidth: width })));
+      parts.push(...jointParts(eye, joints, 0.75 * width + 0.4));
+      if (body.root && shown("ellipsoids")) parts.push(...ellipsoidParts(eye, joints, p, at));
+      if (body.truth && shown("truth")) {
+        const dash = width > 2.5 ? [4, 3.5] : [];
+        const style = () => ({ strokeStyle: colours.ink, lineWidth: 1.1, globalAlpha: 0.85, dash, lineCap: "butt" });
+        parts.push(...boneParts(eye, jointsAt(body.truth, p, at), style));
+      }
+    }
+    cameras.forEach((camera, c) => parts.push(...cameraParts(eye, camera, c, at)));
+    parts.sort((a, b) => b.depth - a.depth);
+    for (const part of parts) part.draw();
+    drawCompass(eye, step);
+  }
+
+  // --- time ----------------------------------------------------------------------------------------------
+
+  const clock = { t: time[0], playing: false, before: 0 };
+  const slider = element("time");
+  const minus = (text) => text.replace("-", "\u2212");
+  const seconds = (t) => `${minus(t.toFixed(2))}\u202fs`;
+
+  function said(at) {
+    if (!people) return "";
+    const joints = jointsAt(body.joint, person(), at);
+    const measured = joints.slice(0, jointCount).filter((joint) => joint).length;
+    const words = [`${measured} of ${jointCount} joints measured`];
+    if (body.truth) {
+      const truth = jointsAt(body.truth, person(), at);
+      const errors = joints.slice(0, jointCount).flatMap((joint, j) =>
+        joint && truth[j] ? [Math.hypot(...joint.map((value, k) => value - truth[j][k]))] : [],
+      );
+      const mean = errors.reduce((sum, error) => sum + error, 0) / errors.length;
+      if (errors.length) words.push(`${(1000 * mean).toFixed(0)}\u202fmm from truth on average`);
+    }
+    return words.join(", ");
+  }
+
+  function show() {
+    const at = bracket(clock.t);
+    for (const view of views) draw(view, at, clock.t);
+    slider.value = clock.t;
+    slider.setAttribute("aria-valuetext", seconds(clock.t));
+    element("now").textContent = seconds(clock.t);
+    element("said").textContent = said(at);
+  }
+
+  let asked = false;
+  function showSoon() {
+    if (asked) return;
+    asked = true;
+    requestAnimationFrame(() => {
+      asked = false;
+      show();
+    });
+  }
+
+  function seek(t) {
+    clock.t = Math.min(Math.max(t, time[0]), time[last]);
+    showSoon();
+  }
+
+  function play(playing) {
+    clock.playing = playing;
+    element("play").textContent = playing ? "Pause" : "Play";
+    if (!playing) return;
+    if (clock.t >= time[last]) clock.t = time[0];
+    clock.before = performance.now();
+    requestAnimationFrame(advance);
+  }
+
+  function advance(now) {
+    if (!clock.playing) return;
+    clock.t += Math.max(now - clock.before, 0) / 1000 * Number(element("speed").value);
+    clock.before = now;
+    if (clock.t >= time[last]) {
+      clock.t = time[last];
+      play(false);
+    }
+    show();
+    if (clock.playing) requestAnimationFrame(advance);
+  }
+
+  function step(count) {
+    play(false);
+    seek(time[Math.min(Math.max(bracket(clock.t).near + count, 0), last)]);
+  }
+
+  // --- hands ---------------------------------------------------------------------------------------------
+
+  function turn(azimuth, elevation) {
+    angles.azimuth += azimuth;
+    angles.elevation = Math.min(Math.max(angles.elevation + elevation, -0.3), Math.PI / 2);
+    showSoon();
+  }
+
+  function zoom(view, factor) {
+    view.distance = Math.min(Math.max(view.distance * factor, 0.15 * fit(view)), 40 * radius);
+    showSoon();
+  }
+
+  function reset() {
+    Object.assign(angles, START);
+    for (const view of views) view.distance = fit(view);
+    showSoon();
+  }
+
+  function fromAbove() {
+    Object.assign(angles, { azimuth: -Math.PI / 2, elevation: Math.PI / 2 });
+    showSoon();
+  }
+
+  /** One finger or the mouse turns; two fingers zoom, and tilt by moving up and down together. */
+  function grab(view) {
+    const { canvas } = view;
+    const fingers = new Map();
+    const spread = () => {
+      const [a, b] = [...fingers.values()];
+      return { size: Math.hypot(a.x - b.x, a.y - b.y), y: (a.y + b.y) / 2 };
+    };
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.focus({ preventScroll: true });
+      canvas.setPointerCapture(event.pointerId);
+      fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+    });
+    canvas.addEventListener("pointermove", (event) => {
+      const before = fingers.get(event.pointerId);
+      if (!before) return;
+      const now = { x: event.clientX, y: event.clientY };
+      const was = fingers.size === 2 ? spread() : null;
+      fingers.set(event.pointerId, now);
+      if (was) {
+        const is = spread();
+        zoom(view, was.size / Math.max(is.size, 1));
+        turn(0, (is.y - was.y) * 0.008);
+      } else if (fingers.size === 1) {
+        turn((before.x - now.x) * 0.008, (now.y - before.y) * 0.008);
+      }
+    });
+    for (const end of ["pointerup", "pointercancel"]) {
+      canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
+    }
+    // Only the view that was chosen takes the wheel: elsewhere it scrolls the page.
+    canvas.addEventListener("wheel", (event) => {
+      if (document.activeElement !== canvas) return;
+      event.preventDefault();
+      zoom(view, Math.exp(0.0015 * Math.max(-300, Math.min(300, event.deltaY * (event.deltaMode ? 30 : 1)))));
+    }, { passive: false });
+    const keys = {
+      ArrowLeft: () => turn(-0.1, 0), ArrowRight: () => turn(0.1, 0),
+      ArrowUp: () => turn(0, 0.1), ArrowDown: () => turn(0, -0.1),
+      "+": () => zoom(view, 1 / 1.15), "=": () => zoom(view, 1 / 1.15), "-": () => zoom(view, 1.15),
+      " ": () => play(!clock.playing), ",": () => step(-1), ".": () => step(1), "0": reset,
+    };
+    canvas.addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey || !keys[event.key]) return;
+      event.preventDefault();
+      keys[event.key]();
+    });
+  }
+
+  /** #t=3.2 in the address, or in a link of the page, is a moment to show. */
+  function momentIn(hash) {
+    const found = /^#t=(-?\d+(?:\.\d+)?)$/.exec(hash);
+    return found ? Number(found[1]) : null;
+  }
+
+  function goTo(hash) {
+    const t = momentIn(hash);
+    if (t === null) return;
+    play(false);
+    seek(t);
+    stage.scrollIntoView({ block: "nearest" });
+  }
+
+  slider.min = time[0];
+  slider.max = time[last];
+  slider.step = last > 0 ? Math.max(Math.round(usual * 1e4) / 1e4, 1e-4) : 1;
+  slider.addEventListener("input", () => {
+    play(false);
+    seek(Number(slider.value));
+  });
+  element("play").addEventListener("click", () => play(!clock.playing));
+  element("reset").addEventListener("click", reset);
+  element("above").addEventListener("click", fromAbove);
+  for (const name of ["truth", "ellipsoids", "paths", "person"]) element(name)?.addEventListener("change", showSoon);
+  addEventListener("hashchange", () => goTo(location.hash));
+  document.addEventListener("click", (event) => {
+    const link = event.target.closest?.('a[href^="#t="]');
+    // The address does not change by a second click on the same moment.
+    if (link && link.hash === location.hash) goTo(link.hash);
+  });
+  views.forEach(grab);
+  const recolour = () => {
+    readColours();
+    show();
+  };
+  for (const media of ["(prefers-color-scheme: dark)", "print"]) matchMedia(media).addEventListener("change", recolour);
+  addEventListener("beforeprint", recolour);
+  addEventListener("afterprint", recolour);
+
+  stage.hidden = false;
+  readColours();
+  reset();
+  clock.t = time[body ? body.start : 0];
+  goTo(location.hash);
+  show();
+  new ResizeObserver(showSoon).observe(stage);
+  stage.dataset.ready = "true";
+})();

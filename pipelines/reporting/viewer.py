@@ -1,0 +1,280 @@
+"""What the page's 3D viewer plays: the skeleton, its truth and the cameras, packed into a few hundred kB.
+
+Numbers travel as base64 of little-endian integers. A joint is stored relative to the middle of its body, in
+millimetres and 16 bits; the middle and the cameras in millimetres and 32 bits relative to the scene's
+origin. Missing is the smallest integer of either kind, never 0.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines.geometry.poses import interpolate_poses
+from pipelines.reporting.bones import side_of
+from pipelines.reporting.motion import Motion
+from pipelines.reporting.summary import CameraRow, Summary
+from pipelines.reporting.wording import joint_label, plural, whole
+from pipelines.session.records import Float, Int64
+from pipelines.session.skeletons import DERIVED, bones_of
+from pipelines.session.tabular import trajectory_from
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MOST_BYTES = 2_400_000
+"""Longer flights are thinned out to this; a third more in the page, where it is base64."""
+_MOST_TIMES_WITHOUT_SKELETON = 3000
+_FARTHEST_M = 32.767
+_SIDES = ("", "left", "right")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the viewer plays, and what the page says about it."""
+
+    data: dict[str, object]  # JSON
+    people: int
+    truth: bool
+    ellipsoids: bool
+    notes: tuple[str, ...]  # what is not as the tables have it, in whole sentences
+
+
+def make_scene(summary: Summary, poses: Mapping[str, pd.DataFrame]) -> Scene | None:
+    """Pack a session for the viewer; None where there is nothing to be seen.
+
+    Every camera's pose is interpolated to the times of the skeleton, never across what the session calls
+    a gap. Without a measured skeleton the cameras alone are shown.
+
+    Args:
+        summary: the session in numbers.
+        poses: camera: tables.POSES.
+    """
+    motion = summary.motion if summary.motion is not None and summary.motion.measured.any() else None
+    cameras = [camera for camera in summary.cameras if camera.name in poses]
+    if motion is None and not cameras:
+        return None
+    all_t_ns = motion.t_ns if motion is not None else _times_without_skeleton(summary)
+    body = _Body.of(motion, summary.truth) if motion is not None else None
+    every = -(-len(all_t_ns) * _bytes_per_time(body, len(cameras)) // MOST_BYTES)
+    kept = slice(None, None, every)
+    t_ns = all_t_ns[kept]
+    placed = [_placed(camera, poses[camera.name], t_ns, summary) for camera in cameras]
+    everywhere = np.concatenate(
+        [position for position, _ in placed] + ([body.middle[kept].reshape(-1, 3)] if body else [])
+    )
+    low, high = _bounds(everywhere)
+    origin = np.round((low + high) / 2)
+    ground = body.ground_m if body is not None else float(low[2])
+    data: dict[str, object] = {
+        "t": _packed(np.round((t_ns - summary.origin_ns) / 1e5), np.int32),
+        "low": _rounded(low - origin),
+        "high": _rounded(high - origin),
+        "ground": round(ground - float(origin[2]), 3),
+        "cameras": [
+            {
+                "name": camera.name,
+                "corners": _picture_corners(camera),
+                "position": _packed(1000 * (position - origin), np.int32),
+                "rotation": _packed(32767 * quaternion, np.int16),
+            }
+            for camera, (position, quaternion) in zip(cameras, placed, strict=True)
+        ],
+    }
+    notes = []
+    if every > 1:
+        notes.append(
+            f"The page holds one time in {every} of {whole(len(all_t_ns))}, "
+            "and draws straight lines between them."
+        )
+    if body is not None:
+        data["body"] = body.packed(kept, origin)
+        notes += body.notes()
+    return Scene(
+        data=data,
+        people=body.people if body is not None else 0,
+        truth=body is not None and body.truth is not None,
+        ellipsoids=body is not None and body.root is not None,
+        notes=tuple(notes),
+    )
+
+
+# --- bodies --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Body:
+    """The measured people, each joint relative to the middle of its body."""
+
+    joints: tuple[str, ...]
+    middle: Float  # [T, P, 3] m, world; NaN where neither the skeleton nor the truth has a joint
+    joint: Float  # [T, P, J, 3] m from the middle
+    truth: Float | None  # [T, P, J, 3] m from the middle
+    root: Float | None  # [T, P, J, 6] m, lower triangle of the covariance's Cholesky factor, row by row
+    ground_m: float
+
+    @classmethod
+    def of(cls, motion: Motion, truth: Float | None) -> _Body:
+        position = motion.measured_position
+        middle = _middle(position)
+        if truth is not None:
+            middle = np.where(np.isnan(middle), _middle(truth), middle)
+            truth = truth - middle[:, :, None]
+        lowest = _lowest(position)
+        return cls(
+            joints=motion.joints,
+            middle=middle,
+            joint=position - middle[:, :, None],
+            truth=truth if truth is not None and np.isfinite(truth).any() else None,
+            root=_square_root(np.where(motion.measured[..., None], motion.covariance, np.nan)),
+            ground_m=float(np.median(lowest[np.isfinite(lowest)])),
+        )
+
+    @property
+    def people(self) -> int:
+        """How many there are."""
+        return int(self.middle.shape[1])
+
+    def packed(self, kept: slice, origin: Float) -> dict[str, object]:
+        """The body as JSON, at the kept times."""
+        joints = self.joints
+        derived = [
+            (name, parents) for name, parents in DERIVED if name not in joints and set(parents) <= set(joints)
+        ]
+        known = (*joints, *(name for name, _ in derived))
+        place = {name: j for j, name in enumerate(known)}
+        counts = np.isfinite(self.joint[kept, ..., 0]).sum(axis=(1, 2))
+        return {
+            "people": self.people,
+            "joints": [joint_label(name) for name in joints],
+            "sides": [_SIDES.index(side_of(name)) for name in joints],
+            "derived": [[place[parent] for parent in parents] for _, parents in derived],
+            "bones": [[place[a], place[b], _SIDES.index(side_of(a, b))] for a, b in bones_of(known)],
+            # The first time that shows nearly as many joints as any: what the page opens with, and prints.
+            "start": int(np.argmax(counts >= 0.9 * counts.max())),
+            "middle": _packed(1000 * (self.middle[kept] - origin), np.int32),
+            "joint": _packed(1000 * self.joint[kept], np.int16),
+            "truth": None if self.truth is None else _packed(1000 * self.truth[kept], np.int16),
+            # A tenth of a millimetre: the least that anybody states.
+            "root": None if self.root is None else _packed(10_000 * self.root[kept], np.int16),
+        }
+
+    def notes(self) -> list[str]:
+        """How many joints lie too far from their body for 16 bits."""
+        far = [
+            (int((np.abs(values) > _FARTHEST_M).any(axis=-1).sum()), noun)
+            for values, noun in ((self.joint, "joint-frame"), (self.truth, "true joint-frame"))
+            if values is not None
+        ]
+        return [
+            f"{plural(count, noun).capitalize()} more than {_FARTHEST_M:.0f} m from the middle of the body "
+            f"{'is' if count == 1 else 'are'} not drawn."
+            for count, noun in far
+            if count
+        ]
+
+
+def _middle(position: Float) -> Float:
+    """Coordinate-wise median [T, P, 3] over the joints that are there; NaN where there is none."""
+    there = np.isfinite(position[..., 0]).any(axis=-1)
+    middle = np.full((*position.shape[:2], 3), np.nan)
+    middle[there] = np.nanmedian(position[there], axis=1)
+    return middle
+
+
+def _lowest(position: Float) -> Float:
+    """Height of the lowest joint [T, P]; NaN where there is none."""
+    height = position[..., 2]
+    lowest = np.where(np.isnan(height), np.inf, height).min(axis=-1)
+    return np.where(np.isinf(lowest), np.nan, lowest)
+
+
+def _square_root(covariance: Float) -> Float | None:
+    """Cholesky factors [..., 6] of covariances [..., 6] (upper triangles); None where none is positive."""
+    full = covariance[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    known = np.isfinite(full).all(axis=(1, 2))
+    positive = np.zeros(len(full), dtype=np.bool_)
+    positive[known] = np.linalg.eigvalsh(full[known])[:, 0] > 0
+    if not positive.any():
+        return None
+    rows, columns = np.tril_indices(3)
+    root = np.full((len(full), 6), np.nan)
+    root[positive] = np.linalg.cholesky(full[positive])[:, rows, columns]
+    return root.reshape(covariance.shape)
+
+
+# --- cameras -------------------------------------------------------------------------------------------
+
+
+def _placed(camera: CameraRow, table: pd.DataFrame, t_ns: Int64, summary: Summary) -> tuple[Float, Float]:
+    """world_from_camera [T, 3] and [T, 4] at the viewer's times; NaN without a pose."""
+    track = trajectory_from(table)
+    if camera.entry.poses.static:
+        still = np.zeros(len(t_ns), dtype=np.intp)
+        return track.position[still], track.quaternion_xyzw[still]
+    between = summary.description.pose_interpolation
+    return interpolate_poses(
+        track.t_ns,
+        track.position,
+        track.quaternion_xyzw,
+        t_ns,
+        max_gap_ns=round(between.max_gap_s * 1e9),
+        max_extrapolation_ns=round(between.max_extrapolation_s * 1e9),
+    )
+
+
+def _picture_corners(camera: CameraRow) -> list[float]:
+    """Left, right, top and bottom edge of the picture as x/z and y/z of the camera, without distortion."""
+    lens = camera.entry.intrinsics
+    edges = [
+        (-0.5 - lens.cx) / lens.fx,
+        (lens.width - 0.5 - lens.cx) / lens.fx,
+        (-0.5 - lens.cy) / lens.fy,
+        (lens.height - 0.5 - lens.cy) / lens.fy,
+    ]
+    return _rounded(np.array(edges))
+
+
+# --- packing -------------------------------------------------------------------------------------------
+
+
+def _times_without_skeleton(summary: Summary) -> Int64:
+    count = min(max(camera.entry.frames.count for camera in summary.cameras), _MOST_TIMES_WITHOUT_SKELETON)
+    steps = np.round(np.linspace(0, 1e9 * summary.duration_s, count)).astype(np.int64)
+    return summary.origin_ns + np.unique(steps)
+
+
+def _bytes_per_time(body: _Body | None, cameras: int) -> int:
+    per_camera = 3 * 4 + 4 * 2
+    if body is None:
+        return cameras * per_camera
+    channels = 3 + 3 * (body.truth is not None) + 6 * (body.root is not None)
+    return cameras * per_camera + body.people * (3 * 4 + len(body.joints) * channels * 2)
+
+
+def _bounds(points: Float) -> tuple[Float, Float]:
+    """The corners of the box that holds all but the farthest hundredth of the points [N, 3] on each side."""
+    there = points[np.isfinite(points).all(axis=1)]
+    if not len(there):
+        return np.zeros(3), np.zeros(3)
+    low, high = np.percentile(there, [1, 99], axis=0)
+    return low, high
+
+
+def _packed(values: Float, kind: type[np.int16 | np.int32]) -> str:
+    """Base64 of rounded values; those that are NaN or do not fit are missing, in all their coordinates."""
+    limits = np.iinfo(kind)
+    fits = np.abs(values) <= limits.max
+    if values.ndim > 1:
+        fits = np.broadcast_to(fits.all(axis=-1, keepdims=True), values.shape)
+    whole_numbers = np.where(fits, np.round(np.where(fits, values, 0)), limits.min)
+    little_endian = np.dtype(kind).newbyteorder("<")
+    return base64.b64encode(whole_numbers.astype(little_endian).tobytes()).decode("ascii")
+
+
+def _rounded(values: Float) -> list[float]:
+    return [round(float(value), 4) for value in values]

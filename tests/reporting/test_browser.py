@@ -1,0 +1,212 @@
+"""The page in a real browser: it plays, turns and prints without a word on the console."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.reporting.content import SessionContent
+from pipelines.reporting.page import render_page
+
+from .browser import Browser, browser
+
+# Of the pixels that have exactly the colour of the left limbs: how many, and their middle.
+_LEFT_LIMBS = """(() => {
+  const canvas = document.getElementById('viewer-ID');
+  const colour = getComputedStyle(document.documentElement).getPropertyValue('--left').trim();
+  const rgb = [1, 3, 5].map((k) => parseInt(colour.slice(k, k + 2), 16));
+  const { width, height } = canvas;
+  const copy = new OffscreenCanvas(width, height).getContext('2d', { willReadFrequently: true });
+  copy.drawImage(canvas, 0, 0);
+  const data = copy.getImageData(0, 0, width, height).data;
+  let [count, x, y] = [0, 0, 0];
+  for (let k = 0; k < data.length; k += 4) {
+    if (data[k + 3] === 255 && rgb.every((value, c) => data[k + c] === value)) {
+      count += 1; x += (k / 4) % width; y += Math.floor(k / 4 / width);
+    }
+  }
+  return [count, x / Math.max(count, 1), y / Math.max(count, 1)];
+})()"""
+_DRAWN = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))"
+_NOW = "parseFloat(document.getElementById('viewer-now').textContent)"
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browser(tmp_path_factory.mktemp("profile")) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def page(content: SessionContent, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report with pictures behind the overlays, as a file."""
+    path = tmp_path_factory.mktemp("report") / "index.html"
+    picture = np.full((1080, 1920, 3), 90, dtype=np.uint8)
+    path.write_text(render_page(content, lambda _camera, _frame: picture), encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def opened(chromium: Browser, page: Path) -> Iterator[Browser]:
+    """The page, just opened; after the test nothing may stand on its console."""
+    chromium.complaints.clear()
+    chromium.show_as()
+    chromium.open(page)
+    chromium.wait_for("document.getElementById('viewer').dataset.ready === 'true'")
+    yield chromium
+    assert chromium.complaints == []
+
+
+def _limbs(opened: Browser, canvas: str) -> tuple[int, float, float]:
+    assert opened.evaluate(_DRAWN)
+    count, x, y = opened.evaluate(_LEFT_LIMBS.replace("ID", canvas))
+    return int(count), float(x), float(y)
+
+
+def _go_to(opened: Browser, t_s: float) -> None:
+    opened.evaluate(f"location.hash = '#t={t_s}'")
+    opened.wait_for(f"Math.abs({_NOW} - {t_s}) < 0.006")
+
+
+def test_playing_moves_the_skeleton(opened: Browser) -> None:
+    _go_to(opened, 1.0)
+    count, x, y = _limbs(opened, "flight")
+    assert count > 10
+    opened.evaluate("document.getElementById('viewer-speed').value = '5'")
+    opened.click("#viewer-play")
+    opened.wait_for(f"{_NOW} > 4")
+    assert opened.evaluate("document.getElementById('viewer-play').textContent") == "Pause"
+    opened.click("#viewer-play")
+    assert opened.evaluate("document.getElementById('viewer-play').textContent") == "Play"
+    _go_to(opened, 4.0)
+    _, moved_x, moved_y = _limbs(opened, "flight")
+    # The actor walked 3.6 m, where half a canvas shows about 10 m.
+    assert np.hypot(moved_x - x, moved_y - y) > 15
+
+
+def test_playing_stops_at_the_end_and_starts_again(opened: Browser) -> None:
+    _go_to(opened, 19.5)
+    opened.evaluate("document.getElementById('viewer-speed').value = '5'")
+    opened.click("#viewer-play")
+    opened.wait_for("document.getElementById('viewer-play').textContent === 'Play'")
+    assert opened.evaluate(_NOW) == pytest.approx(599 / 30, abs=0.006)
+    opened.click("#viewer-play")
+    opened.wait_for(f"{_NOW} < 19")
+    opened.click("#viewer-play")
+
+
+def test_joints_that_were_not_measured_are_not_drawn(opened: Browser) -> None:
+    _go_to(opened, 7.0)  # between 6 and 8 s nobody was measured
+    opened.click("#viewer-truth")
+    assert _limbs(opened, "body")[0] == 0
+    assert opened.evaluate("document.getElementById('viewer-said').textContent") == "0 of 17 joints measured"
+    _go_to(opened, 9.0)
+    assert _limbs(opened, "body")[0] > 100
+    said = opened.evaluate("document.getElementById('viewer-said').textContent")
+    assert said == "15 of 17 joints measured, 22\u202fmm from truth on average"
+
+
+def test_dragging_turns_and_the_wheel_zooms(opened: Browser) -> None:
+    _go_to(opened, 3.0)
+    before = _limbs(opened, "body")
+    x, y = opened.middle_of("#viewer-body")
+    opened.mouse("mousePressed", x, y)
+    opened.mouse("mouseMoved", x + 180, y)
+    opened.mouse("mouseReleased", x + 180, y)
+    turned = _limbs(opened, "body")
+    assert turned != before
+    opened.mouse("mouseWheel", x, y, deltaX=0, deltaY=-400)
+    assert _limbs(opened, "body")[0] > turned[0]
+    opened.click("#viewer-reset")
+    assert _limbs(opened, "body") == before
+
+
+def test_keys_turn_zoom_step_and_play(opened: Browser) -> None:
+    _go_to(opened, 3.0)
+    opened.evaluate("document.getElementById('viewer-body').focus()")
+    before = _limbs(opened, "body")
+    opened.press(".")
+    opened.wait_for(f"Math.abs({_NOW} - 3.03) < 0.006")
+    opened.press(",")
+    opened.wait_for(f"Math.abs({_NOW} - 3.0) < 0.006")
+    opened.press("ArrowLeft")
+    assert _limbs(opened, "body") != before
+    opened.press("ArrowRight")
+    opened.press("+")
+    assert _limbs(opened, "body")[0] > before[0]
+    opened.press("0")
+    assert _limbs(opened, "body") == before
+    opened.press(" ")
+    opened.wait_for(f"{_NOW} > 3.2")
+    opened.press(" ")
+
+
+def test_switches_change_the_drawing(opened: Browser) -> None:
+    _go_to(opened, 3.0)
+    picture = "document.getElementById('viewer-body').toDataURL()"
+    for name in ("truth", "ellipsoids", "paths"):
+        assert opened.evaluate(_DRAWN)
+        before = opened.evaluate(picture)
+        opened.click(f"#viewer-{name}")
+        assert opened.evaluate(_DRAWN)
+        assert opened.evaluate(picture) != before, name
+
+
+def test_a_moment_leads_to_the_viewer(opened: Browser) -> None:
+    opened.click(".moments label:nth-of-type(5) input")
+    shown = "[...document.querySelectorAll('.moment')].map((m) => getComputedStyle(m).display !== 'none')"
+    assert opened.evaluate(shown) == [False] * 4 + [True, False]
+    opened.click(".moment:nth-of-type(5) a")
+    moment = float(opened.evaluate("document.querySelectorAll('.moment a')[4].hash").removeprefix("#t="))
+    opened.wait_for(f"Math.abs({_NOW} - {moment}) < 0.006")
+    # Away, and by the same link back.
+    opened.evaluate("document.getElementById('viewer-flight').focus()")
+    opened.press(".")
+    opened.wait_for(f"Math.abs({_NOW} - {moment}) > 0.02")
+    opened.click(".moment:nth-of-type(5) a")
+    opened.wait_for(f"Math.abs({_NOW} - {moment}) < 0.006")
+
+
+def test_every_picture_is_shown(opened: Browser) -> None:
+    opened.wait_for("document.querySelectorAll('image').length > 30")
+    # A picture that the policy forbids, or that is damaged, has no size of its own.
+    loaded = opened.evaluate(
+        "Promise.all([...document.querySelectorAll('image')].map((i) => { const p = new Image();"
+        "p.src = i.href.baseVal; return p.decode().then(() => p.naturalWidth); }))"
+    )
+    assert min(loaded) >= 100
+
+
+def test_paper_has_dark_lines_on_white_even_from_a_dark_screen(opened: Browser) -> None:
+    opened.show_as(scheme="dark")
+    assert opened.evaluate(_DRAWN)
+    dark = opened.evaluate("getComputedStyle(document.documentElement).getPropertyValue('--left')")
+    opened.show_as(scheme="dark", media="print")
+    assert opened.evaluate(_DRAWN)
+    assert opened.evaluate("getComputedStyle(document.documentElement).getPropertyValue('--left')") != dark
+    assert _limbs(opened, "body")[0] > 50  # counted by the colour that the page has now
+    visible = "[...document.querySelectorAll('.moment')].every((m) => getComputedStyle(m).display !== 'none')"
+    assert opened.evaluate(visible)
+
+
+def test_a_foreign_script_does_not_run(chromium: Browser, page: Path, tmp_path: Path) -> None:
+    changed = tmp_path / "changed.html"
+    hostile = "<script>document.title = 'taken'</script></body>"
+    changed.write_text(page.read_text(encoding="utf-8").replace("</body>", hostile), encoding="utf-8")
+    chromium.open(changed)
+    assert chromium.evaluate("document.title") != "taken"
+    assert any("Content Security Policy" in complaint for complaint in chromium.complaints)
+    chromium.complaints.clear()
+
+
+def test_without_scripts_a_sentence_says_so(chromium: Browser, page: Path) -> None:
+    chromium.send("Emulation.setScriptExecutionDisabled", value=True)
+    try:
+        chromium.open(page)
+        text = chromium.send("DOM.getDocument", depth=-1)
+        assert "needs JavaScript" in str(text)
+    finally:
+        chromium.send("Emulation.setScriptExecutionDisabled", value=False)

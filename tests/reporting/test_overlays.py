@@ -1,0 +1,174 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipelines.reporting.content import SessionContent
+from pipelines.reporting.motion import motion_from_skeleton
+from pipelines.reporting.overlays import MOMENTS, View, choose_moments, collect_moments, match_people
+from pipelines.reporting.summary import summarise
+
+from .conftest import ASIDE_PX, CAMERAS, FRAMES, JOINTS, START_NS, make_skeleton, true_pixels
+
+
+def _views(content: SessionContent, camera: str) -> list[View]:
+    moments = collect_moments(content, summarise(content), None)
+    return [view for moment in moments for view in moment.views if view.camera == camera]
+
+
+def _with_error(at: int, joints: list[str], px: float) -> pd.DataFrame:
+    """The skeleton, of which some joints are this far from their keypoints at one time."""
+    table = make_skeleton()
+    rows = (table["t_ns"] == START_NS + round(at / 30 * 1e9)) & table["joint"].isin(joints)
+    table.loc[rows & (table["status"] == "ok"), "reprojection_px"] = px
+    return table
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_residuals_are_the_distance_that_the_keypoints_were_put_aside(
+    content: SessionContent, camera: str
+) -> None:
+    views = [view for view in _views(content, camera) if view.has_pose]
+    assert len(views) == MOMENTS - (camera == "drone2")  # one lies in its gap
+    for view in views:
+        # Poses 20 ms apart, linear between them: errors below 0.1 mm and 0.1 mrad, that is 0.15 px.
+        assert view.residual_px[np.isfinite(view.residual_px)] == pytest.approx(5.0, abs=0.15)
+        expected = true_pixels(CAMERAS.index(camera), np.array([view.t_s]))[0]
+        seen = np.isfinite(view.reprojected[0, : len(JOINTS), 0])
+        assert seen.sum() >= 15
+        assert view.reprojected[0, : len(JOINTS)][seen] == pytest.approx(expected[seen], abs=0.15)
+        assert view.found[0][seen] == pytest.approx(expected[seen] + ASIDE_PX, abs=0.15)
+
+
+def test_bystander_is_another_person(content: SessionContent) -> None:
+    for view in _views(content, "drone2"):
+        if view.has_pose:
+            assert len(view.others) == 1
+            assert np.nanmedian(view.found[0, :, 0] - view.others[0, :, 0]) == pytest.approx(500)
+        else:
+            assert len(view.others) == 2  # nobody can tell who is who without a pose
+
+
+def test_camera_in_a_gap_has_pictures_but_no_residuals(content: SessionContent) -> None:
+    (view,) = [view for view in _views(content, "drone2") if not view.has_pose]
+    assert view.median_px is None
+    assert np.isnan(view.reprojected).all()
+
+
+def test_a_rejected_joint_is_marked_and_has_no_residual(content: SessionContent) -> None:
+    wrist = JOINTS.index("left_wrist")
+    early = [view for view in _views(content, "mast") if view.t_s < 10]
+    late = [view for view in _views(content, "mast") if view.t_s >= 10]
+    assert len(early) == len(late) == 3
+    assert all(view.rejected[0, wrist] and np.isnan(view.residual_px[0, wrist]) for view in early)
+    assert not any(view.rejected.any() for view in late)
+
+
+def test_a_joint_that_was_lost_otherwise_is_no_rejected_one(content: SessionContent) -> None:
+    assert content.skeleton is not None
+    lost = content.skeleton.copy()
+    nose = lost["joint"] == "nose"
+    lost.loc[nose, ["x", "y", "z"]] = np.nan
+    lost.loc[nose, "status"] = "few_views"
+    for view in _views(replace(content, skeleton=lost), "drone1"):
+        assert view.unmeasured[0, JOINTS.index("nose")]
+        assert not view.rejected[0, JOINTS.index("nose")]
+
+
+def test_keypoints_that_were_not_used_are_left_out(content: SessionContent) -> None:
+    doubted = content.keypoints["mast"].copy()
+    doubted.loc[doubted["joint"] == "nose", "confidence"] = 0.2
+    unsure = replace(
+        content,
+        keypoints={**content.keypoints, "mast": doubted},
+        stages={"reconstruct": {"settings": {"min_confidence": 0.3}}},
+    )
+    nose = JOINTS.index("nose")
+    assert all(np.isnan(view.found[0, nose]).all() for view in _views(unsure, "mast"))
+    assert not any(np.isnan(view.found[0, nose]).any() for view in _views(content, "mast"))
+
+
+def test_camera_that_saw_nobody_still_shows_the_skeleton(content: SessionContent) -> None:
+    empty = content.keypoints["mast"][:0]
+    blind = replace(content, keypoints={**content.keypoints, "mast": empty})
+    views = _views(blind, "mast")
+    assert len(views) == MOMENTS
+    assert all(view.median_px is None and np.isnan(view.found).all() for view in views)
+    assert all(np.isfinite(view.reprojected).any() for view in views)
+
+
+def test_camera_that_had_stopped_is_named(content: SessionContent) -> None:
+    short = content.frames["mast"][: FRAMES // 2]
+    stopped = replace(content, frames={**content.frames, "mast": short})
+    moments = collect_moments(stopped, summarise(stopped), None)
+    assert [moment.without_frame for moment in moments] == [()] * 3 + [("mast",)] * 3
+
+
+def test_pictures_are_asked_for_by_camera_and_frame(content: SessionContent) -> None:
+    moments = collect_moments(
+        content,
+        summarise(content),
+        lambda camera, frame: np.full((2, 2, 3), frame % 256, dtype=np.uint8) if camera == "mast" else None,
+    )
+    views = [view for moment in moments for view in moment.views]
+    assert all((view.picture is not None) == (view.camera == "mast") for view in views)
+    for view in views:
+        assert view.frame == round(view.t_s * 30)
+        if view.picture is not None:
+            assert view.picture[0, 0, 0] == view.frame % 256
+
+
+def test_without_a_skeleton_or_keypoints_there_is_nothing_to_compare(content: SessionContent) -> None:
+    for poorer in (replace(content, skeleton=None, truth=None), replace(content, keypoints={})):
+        assert collect_moments(poorer, summarise(poorer), None) == ()
+
+
+def test_moments_are_spread_and_hold_the_worst() -> None:
+    motion = motion_from_skeleton(_with_error(433, list(JOINTS), 80.0))
+    chosen, worst = choose_moments(motion)
+    assert worst == 433
+    assert [row // (FRAMES // MOMENTS) for row in chosen] == list(range(MOMENTS))
+    assert 433 in chosen
+
+
+def test_one_joint_gone_astray_makes_no_worst_moment() -> None:
+    # The skeleton's own errors lie between 3 and 5 px.
+    _, worst = choose_moments(motion_from_skeleton(_with_error(433, ["nose"], 5000.0)))
+    assert worst != 433
+
+
+def test_no_moment_is_empty(content: SessionContent) -> None:
+    assert content.skeleton is not None
+    motion = motion_from_skeleton(content.skeleton)
+    chosen, _ = choose_moments(motion)
+    assert (motion.measured[chosen].sum(axis=(1, 2)) >= 15).all()
+
+
+@pytest.mark.parametrize("frames", [1, 2, 5])
+def test_fewer_times_than_moments(frames: int) -> None:
+    table = make_skeleton(frames).assign(status="ok", x=1.0, reprojection_px=1.0)
+    chosen, worst = choose_moments(motion_from_skeleton(table))
+    assert chosen == list(range(frames))
+    assert worst in chosen
+
+
+BODY = np.array([[100.0, 100.0], [140.0, 100.0], [100.0, 300.0], [140.0, 300.0]])
+
+
+def test_somebody_far_away_is_nobody_known() -> None:
+    assert match_people(BODY[None], BODY[None] + [90.0, 0.0]) == [0]  # half the diagonal is 102 px
+    assert match_people(BODY[None], BODY[None] + [120.0, 0.0]) == [None]
+    assert match_people(BODY[None], np.zeros((0, 4, 2))) == [None]
+    assert match_people(np.full((1, 4, 2), np.nan), BODY[None]) == [None]
+
+
+@given(st.permutations(range(4)), st.floats(-9.0, 9.0))
+def test_people_are_found_in_any_order_and_each_once(order: list[int], jitter: float) -> None:
+    people = BODY + 60.0 * np.arange(4)[:, None, None]
+    matches = match_people(people, people[order] + jitter)
+    assert matches == [order.index(person) for person in range(4)]

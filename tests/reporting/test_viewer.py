@@ -1,0 +1,201 @@
+from __future__ import annotations
+
+import base64
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipelines.reporting.content import SessionContent
+from pipelines.reporting.summary import summarise
+from pipelines.reporting.viewer import MOST_BYTES, Scene, make_scene
+
+from .conftest import (
+    CAMERAS,
+    FRAMES,
+    JOINTS,
+    OFFSET_M,
+    START_NS,
+    make_poses,
+    make_session,
+    make_skeleton,
+    make_truth,
+    statuses,
+    true_positions,
+)
+
+# Half a millimetre of the middle and half of the joint, and double precision.
+ROUNDING_M = 0.001001
+
+
+def _scene(content: SessionContent) -> Scene:
+    scene = make_scene(summarise(content), content.poses)
+    assert scene is not None
+    return scene
+
+
+def _numbers(text: Any, kind: type[np.int16 | np.int32], columns: int) -> np.ndarray:
+    """What a page decodes, [N, columns]; NaN where it is missing."""
+    raw = np.frombuffer(base64.b64decode(text), dtype=np.dtype(kind).newbyteorder("<"))
+    values = raw.astype(np.float64).reshape(-1, columns)
+    missing = values == np.iinfo(kind).min
+    assert (missing.all(axis=1) == missing.any(axis=1)).all()
+    return np.where(missing, np.nan, values)
+
+
+def _joints(scene: Scene, which: str = "joint") -> np.ndarray:
+    """Positions [T, P, J, 3] in the world, but for the scene's origin."""
+    body: Any = scene.data["body"]
+    middle = _numbers(body["middle"], np.int32, 3) / 1000
+    people, joints = body["people"], len(body["joints"])
+    offset = _numbers(body[which], np.int16, 3).reshape(-1, people, joints, 3) / 1000
+    return middle.reshape(-1, people, 1, 3) + offset
+
+
+def _origin(scene: Scene, content: SessionContent) -> np.ndarray:
+    """The scene's origin, from the camera that stands still."""
+    cameras: Any = scene.data["cameras"]
+    mast = _numbers(cameras[CAMERAS.index("mast")]["position"], np.int32, 3) / 1000
+    origin: np.ndarray = content.poses["mast"][["x", "y", "z"]].to_numpy()[0] - mast[0]
+    return origin
+
+
+def test_skeleton_and_truth_come_back_to_the_millimetre(content: SessionContent) -> None:
+    scene = _scene(content)
+    origin = _origin(scene, content)
+    t_s = _numbers(scene.data["t"], np.int32, 1)[:, 0] / 1e4
+    assert t_s == pytest.approx(np.arange(FRAMES) / 30, abs=1e-4)
+    true = true_positions(np.arange(FRAMES) / 30)
+    measured = _joints(scene)[:, 0]
+    # Every joint that was not measured is missing, and no other.
+    assert np.array_equal(np.isfinite(measured[..., 0]), statuses(FRAMES) == "ok")
+    assert np.nanmax(np.abs(measured + origin - true - OFFSET_M)) < ROUNDING_M
+    assert np.nanmax(np.abs(_joints(scene, "truth")[:, 0] + origin - true)) < ROUNDING_M
+
+
+def test_cameras_are_where_their_poses_say_and_nowhere_in_a_gap(content: SessionContent) -> None:
+    scene = _scene(content)
+    cameras: Any = scene.data["cameras"]
+    assert [camera["name"] for camera in cameras] == list(CAMERAS)
+    t_ns = START_NS + np.round(np.arange(FRAMES) / 30 * 1e9).astype(np.int64)
+    table = content.poses["drone2"]
+    position = _numbers(cameras[1]["position"], np.int32, 3) / 1000 + _origin(scene, content)
+    rotation = _numbers(cameras[1]["rotation"], np.int16, 4)
+    hole = table["t_ns"].to_numpy()[:-1][np.diff(table["t_ns"]) > 500_000_000][0]
+    inside = (t_ns > hole) & (t_ns < hole + round(0.06 * 20 * 1e9) - 1)
+    assert np.array_equal(np.isnan(position[:, 0]), inside)
+    # Linear between poses 20 ms apart: an acceleration below 2 m/s^2 errs by 0.1 mm.
+    for k, axis in enumerate("xyz"):
+        expected = np.interp(t_ns - START_NS, table["t_ns"] - START_NS, table[axis])
+        assert np.nanmax(np.abs(position[:, k] - expected)) < ROUNDING_M
+    assert np.linalg.norm(rotation[~inside], axis=1) == pytest.approx(32767, rel=1e-4)
+    assert cameras[0]["corners"] == pytest.approx(
+        [-960 / 1400, 960 / 1400, -540 / 1400, 540 / 1400], abs=1e-4
+    )
+
+
+def test_uncertainty_comes_back_as_its_square_root(content: SessionContent) -> None:
+    assert content.skeleton is not None
+    rng = np.random.default_rng(5)
+    factor = np.diag([0.05, 0.03, 0.02]) @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    covariance = factor.T @ factor
+    upper = dict(zip(("cxx", "cxy", "cxz", "cyy", "cyz", "czz"), covariance[np.triu_indices(3)], strict=True))
+    scene = _scene(replace(content, skeleton=content.skeleton.assign(**upper)))
+    body: Any = scene.data["body"]
+    root = _numbers(body["root"], np.int16, 6) / 1e4
+    assert np.array_equal(np.isfinite(root[:, 0]), (statuses(FRAMES) == "ok").reshape(-1))
+    lower = np.zeros((3, 3))
+    lower[np.tril_indices(3)] = root[np.isfinite(root[:, 0])][0]
+    # Entries rounded to 0.05 mm, times two of at most 50 mm.
+    assert lower @ lower.T == pytest.approx(covariance, abs=2 * 0.05 * 5e-5 * 3)
+
+
+def test_without_truth_and_covariance_there_is_nothing_to_switch_on(content: SessionContent) -> None:
+    assert content.skeleton is not None
+    unknown = content.skeleton.assign(cxx=np.nan)
+    scene = _scene(replace(content, truth=None, skeleton=unknown))
+    assert not scene.truth
+    assert not scene.ellipsoids
+    assert scene.notes == ()
+
+
+def test_long_flight_is_thinned_and_says_so(content: SessionContent) -> None:
+    frames = 12_000
+    long_flight = replace(
+        content,
+        session=make_session(frames),
+        skeleton=make_skeleton(frames),
+        truth=make_truth(frames),
+        poses=make_poses(frames),
+    )
+    scene = _scene(long_flight)
+    joints = _joints(scene)
+    # Per time: 17 joints of 3 + 3 + 6 numbers of 2 bytes, a middle of 12, three cameras of 20 each.
+    every = -(-frames * (17 * 12 * 2 + 12 + 60) // MOST_BYTES)
+    assert every == 3
+    assert len(joints) == frames // every
+    assert scene.notes[0].replace("\u202f", " ").startswith("The page holds one time in 3 of 12 000")
+    expected = true_positions(np.arange(0, frames, every) / 30)[:, JOINTS.index("left_hip")]
+    hip = joints[:, 0, JOINTS.index("left_hip")] + _origin(scene, long_flight)
+    assert np.nanmax(np.abs(hip - expected - OFFSET_M)) < ROUNDING_M
+
+
+def test_a_joint_gone_far_astray_is_left_out_and_counted(content: SessionContent) -> None:
+    assert content.skeleton is not None
+    far = content.skeleton.copy()
+    astray = (far["joint"] == "nose") & (far["status"] == "ok")
+    first = far.index[astray][:3]
+    far.loc[first, "x"] += 40.0
+    scene = _scene(replace(content, skeleton=far))
+    lost = np.isfinite(_joints(_scene(content))[..., 0]) & np.isnan(_joints(scene)[..., 0])
+    assert lost.sum() == 3
+    assert lost[..., JOINTS.index("nose")].sum() == 3
+    assert scene.notes == ("3 joint-frames more than 33 m from the middle of the body are not drawn.",)
+
+
+def test_bones_know_their_side_and_join_what_is_derived(content: SessionContent) -> None:
+    body: Any = _scene(content).data["body"]
+    names = [*body["joints"], "neck", "hip"]
+    bones = {(names[a], names[b]): ("", "left", "right")[side] for a, b, side in body["bones"]}
+    assert bones["left shoulder", "left elbow"] == "left"
+    assert bones["right knee", "right ankle"] == "right"
+    assert bones["left hip", "right hip"] == ""
+    assert bones["hip", "neck"] == ""
+    assert [[body["joints"][parent] for parent in parents] for parents in body["derived"]] == [
+        ["left shoulder", "right shoulder"],
+        ["left hip", "right hip"],
+    ]
+
+
+def test_opens_with_a_time_that_shows_a_body(content: SessionContent) -> None:
+    assert content.skeleton is not None
+    late = content.skeleton.copy()
+    empty = late["t_ns"] < START_NS + 2_000_000_000
+    late.loc[empty, ["x", "y", "z"]] = np.nan
+    late.loc[empty, "status"] = "few_views"
+    body: Any = _scene(replace(content, skeleton=late)).data["body"]
+    assert body["start"] == 61  # at frame 60 two joints of 17 are missing
+
+
+def test_two_people_keep_apart(content: SessionContent) -> None:
+    first = make_skeleton(40)
+    both = pd.concat([first, first.assign(person=1, x=first["x"] + 3)])
+    scene = _scene(replace(content, skeleton=both, truth=None))
+    assert scene.people == 2
+    joints = _joints(scene)
+    apart = joints[:, 1] - joints[:, 0]
+    assert np.nanmax(np.abs(apart - [3.0, 0.0, 0.0])) < 2 * ROUNDING_M
+
+
+def test_cameras_alone_before_the_reconstruction(content: SessionContent) -> None:
+    scene = _scene(replace(content, skeleton=None, truth=None))
+    assert scene.people == 0
+    assert "body" not in scene.data
+    t_s = _numbers(scene.data["t"], np.int32, 1)[:, 0] / 1e4
+    assert t_s == pytest.approx(np.arange(FRAMES) / 30, abs=1e-4)
+
+
+def test_nothing_to_show(content: SessionContent) -> None:
+    assert make_scene(summarise(replace(content, skeleton=None, truth=None)), {}) is None
