@@ -149,7 +149,7 @@ class CameraText:
         return next(frames, 0) * 10**9 // ASSUMED_FPS
 
     def _clock(self) -> list[str]:
-        if not self._film and not self._camera.keypoints:
+        if self._camera.videos and self._film is None:
             return []
         return ["# clock: {offset_s: 0, sigma_s: 0.2}  # if its clock is off against the poses', or unsure"]
 

@@ -147,14 +147,13 @@ def frame_times(findings: Findings) -> list[Candidate]:
     return [replace(_of_file(found, {found.key: found.path}), span=found.span) for found in stamps]
 
 
-def near(candidate: Candidate, topic: str) -> int:
-    """How many parts the topic's name shares with another's, from the left (/drone1/camera/...)."""
-    name = candidate.topic.name if candidate.topic else ""
-    parts = zip(name.strip("/").split("/"), topic.strip("/").split("/"), strict=False)
+def near(candidate: Candidate, pictures: str) -> int:
+    """How many parts of its name, from the left, a camera info shares with a topic of pictures; else 0."""
+    if candidate.topic is None or candidate.topic.kind != "intrinsics":
+        return 0
+    ours, theirs = (name.strip("/").split("/") for name in (candidate.topic.name, pictures))
     shared = 0
-    for ours, theirs in parts:
-        if not ours or ours != theirs:
-            break
+    while shared < min(len(ours), len(theirs)) and ours[shared] == theirs[shared] != "":
         shared += 1
     return shared
 

@@ -1,0 +1,379 @@
+"""Matching by names and times, on descriptions alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from pipelines.drafting.found import (
+    Calibration,
+    Edge,
+    Findings,
+    FrameTimes,
+    Joints,
+    Keypoints,
+    Lens,
+    Poses,
+    Recording,
+    Span,
+    TopicFound,
+    TopicKind,
+    Video,
+)
+from pipelines.drafting.matching import CameraDraft, Choice, Draft, match
+from pipelines.drafting.recordings import chains, joined
+
+SECOND = 10**9
+
+
+def span(first_s: float, last_s: float) -> Span:
+    return Span(round(first_s * SECOND), round(last_s * SECOND))
+
+
+def place(path: str) -> tuple[Path, tuple[str, ...]]:
+    file = Path("/flight") / path
+    return file, (*Path(path).parent.parts, Path(path).stem)
+
+
+def keypoints(path: str) -> Keypoints:
+    return Keypoints(*place(path), "alphapose", "AlphaPose keypoints", 100, 0, 99)
+
+
+def video(path: str) -> Video:
+    return Video(*place(path), "video", "video", 300, 10 * SECOND)
+
+
+def poses(path: str, first_s: float = 0, last_s: float = 10) -> Poses:
+    return Poses(*place(path), "tum", "TUM trajectory", span(first_s, last_s))
+
+
+def calibration(path: str, *cameras: str, pose: bool = False) -> Calibration:
+    return Calibration(*place(path), "anipose", "calibration", dict.fromkeys(cameras, Lens(True, pose)))
+
+
+def topic(
+    name: str, kind: TopicKind, type_: str = "", times: Span | None = None, source: str = ""
+) -> TopicFound:
+    types = {
+        "poses": "nav_msgs/msg/Odometry",
+        "pictures": "sensor_msgs/msg/Image",
+        "intrinsics": "sensor_msgs/msg/CameraInfo",
+        "angles": "geometry_msgs/msg/Vector3Stamped",
+        "transforms": "tf2_msgs/msg/TFMessage",
+    }
+    return TopicFound(name, type_ or types[kind], kind, 100, times or span(0, 10), "map", source)
+
+
+def recording(path: str, *topics: TopicFound, edges: tuple[Edge, ...] = ()) -> Recording:
+    file, where = place(path)
+    return Recording(file, where, "mcap", "MCAP log", (file,), topics, edges)
+
+
+def camera(draft: Draft, name: str) -> CameraDraft:
+    return next(found for found in draft.cameras if found.name == name)
+
+
+def taken(choice: Choice | None) -> str:
+    """What was chosen, in a word."""
+    if choice is None:
+        return ""
+    settings = choice.taken.settings
+    return str(settings.get("topic") or settings.get("child") or choice.taken.found.path.name)
+
+
+def others(choice: Choice | None) -> list[str]:
+    return [taken(Choice(other)) for other in choice.others] if choice else []
+
+
+# --- cameras -------------------------------------------------------------------------------------------
+
+
+def test_video_keypoints_poses_and_truth_meet_by_the_name_of_the_drone() -> None:
+    draft = match(
+        Findings(
+            videos=[video("drone2.mp4"), video("drone1.mp4")],
+            keypoints=[keypoints("kp/drone1_alphapose.json"), keypoints("kp/drone_02.json")],
+            poses=[poses("drone1_poses.tum"), poses("drone1_true.tum"), poses("drone2/odometry.tum")],
+            calibrations=[calibration("drone1.yaml", "narrow"), calibration("drone2.yaml", "wide")],
+        )
+    )
+    assert [c.name for c in draft.cameras] == ["drone1", "drone2"]
+    assert [taken(c.poses) for c in draft.cameras] == ["drone1_poses.tum", "odometry.tum"]
+    assert [taken(c.intrinsics) for c in draft.cameras] == ["drone1.yaml", "drone2.yaml"]
+    assert [c.keypoints[0].found.path.name for c in draft.cameras] == [
+        "drone1_alphapose.json",
+        "drone_02.json",
+    ]
+    assert taken(draft.cameras[0].true_poses) == "drone1_true.tum"
+    assert draft.cameras[1].true_poses is None
+    assert not draft.unused
+
+
+def test_ten_drones_are_listed_in_the_order_of_their_numbers() -> None:
+    draft = match(Findings(videos=[video(f"drone{k}.mp4") for k in range(10, 0, -1)]))
+    assert [c.name for c in draft.cameras] == [f"drone{k}" for k in range(1, 11)]
+
+
+def test_of_two_sets_of_keypoints_the_one_for_most_cameras_is_taken() -> None:
+    draft = match(
+        Findings(keypoints=[keypoints("a/cam01.json"), keypoints("b/cam01.json"), keypoints("b/cam02.json")])
+    )
+    assert [[str(k.found.path.parent.name) for k in c.keypoints] for c in draft.cameras] == [
+        ["b", "a"],
+        ["b"],
+    ]
+
+
+def test_the_last_video_and_the_last_keypoints_are_a_pair_unless_they_are_counted() -> None:
+    draft = match(Findings(videos=[video("DJI_0001.mp4")], keypoints=[keypoints("walk.json")]))
+    assert [c.paired for c in draft.cameras] == [True]
+    counted = match(Findings(videos=[video("drone1.mp4")], keypoints=[keypoints("drone2.json")]))
+    assert [c.name for c in counted.cameras] == ["drone1", "drone2"]
+
+
+def test_files_of_one_name_in_numbered_folders_are_several_cameras() -> None:
+    draft = match(Findings(videos=[video("drone1/DJI_0001.mp4"), video("drone2/DJI_0001.mp4")]))
+    assert [c.name for c in draft.cameras] == ["drone1", "drone2"]
+
+
+def test_two_cameras_of_one_drone_share_its_poses() -> None:
+    log = recording(
+        "flight.mcap",
+        topic("/drone1/front/image_raw", "pictures"),
+        topic("/drone1/back/image_raw", "pictures"),
+        topic("/drone1/front/camera_info", "intrinsics"),
+        topic("/drone1/back/camera_info", "intrinsics"),
+        topic("/drone1/odometry", "poses"),
+    )
+    draft = match(Findings(recordings=[log]))
+    assert sorted(c.name for c in draft.cameras) == ["back", "front"]
+    assert {taken(c.poses) for c in draft.cameras} == {"/drone1/odometry"}
+    assert taken(camera(draft, "back").intrinsics) == "/drone1/back/camera_info"
+
+
+def test_without_pictures_whatever_has_poses_is_a_camera() -> None:
+    log = recording("flight.mcap", topic("/uav1/odometry", "poses"), topic("/uav2/odometry", "poses"))
+    draft = match(Findings(recordings=[log]))
+    assert [c.name for c in draft.cameras] == ["uav1", "uav2"]
+    assert not any(c.videos or c.keypoints for c in draft.cameras)
+
+
+def test_depth_is_no_picture() -> None:
+    log = recording(
+        "d1.mcap",
+        topic("/drone1/depth/image_raw", "pictures"),
+        topic("/drone1/color/image_raw", "pictures"),
+    )
+    draft = match(Findings(recordings=[log]))
+    assert [c.name for c in draft.cameras] == ["drone1"]
+    assert [v.settings["topic"] for v in draft.cameras[0].videos] == ["/drone1/color/image_raw"]
+
+
+# --- poses ---------------------------------------------------------------------------------------------
+
+
+def test_topics_without_a_prefix_are_called_after_their_log() -> None:
+    logs = [
+        recording(f"{name}.bag", topic("/odometry", "poses"), topic("/camera/image_raw", "pictures"))
+        for name in ("red", "blue")
+    ]
+    draft = match(Findings(recordings=logs))
+    assert {c.name: c.poses.taken.settings["log"] for c in draft.cameras if c.poses} == {
+        "red": "red",
+        "blue": "blue",
+    }
+
+
+def test_time_decides_between_two_flights_of_one_drone() -> None:
+    flown = recording("cameras.mcap", topic("/drone1/image_raw", "pictures", times=span(100, 160)))
+    draft = match(
+        Findings(recordings=[flown], poses=[poses("a/drone1.tum", 0, 60), poses("b/drone1.tum", 90, 170)])
+    )
+    assert draft.cameras[0].poses
+    assert draft.cameras[0].poses.taken.found.path.parent.name == "b"
+    assert len(draft.cameras[0].poses.others) == 1
+
+
+def test_time_shared_with_the_other_drones_decides_where_pictures_have_no_stamps() -> None:
+    draft = match(
+        Findings(
+            videos=[video("drone1.mp4"), video("drone2.mp4")],
+            poses=[
+                poses("a/drone1.tum", 0, 60),
+                poses("b/drone1.tum", 205, 250),
+                poses("drone2.tum", 200, 250),
+            ],
+        )
+    )
+    choice = camera(draft, "drone1").poses
+    assert choice
+    assert choice.taken.found.path.parent.name == "b"
+
+
+def test_a_second_more_of_a_lesser_kind_does_not_beat_odometry() -> None:
+    log = recording(
+        "flight.mcap",
+        topic("/drone1/image_raw", "pictures", times=span(0, 60)),
+        topic("/drone1/mocap/pose", "poses", "geometry_msgs/msg/PoseStamped", span(0, 60)),
+        topic("/drone1/odometry", "poses", times=span(1, 60)),
+        topic("/drone1/setpoint/pose", "poses", times=span(0, 60)),
+        topic("/drone1/ground_truth/odom", "poses", times=span(0, 60)),
+        topic("/person/odom", "poses", times=span(0, 60)),
+    )
+    draft = match(Findings(recordings=[log]))
+    assert taken(draft.cameras[0].poses) == "/drone1/odometry"
+    assert others(draft.cameras[0].poses) == ["/drone1/mocap/pose"]
+    assert [actor.settings["topic"] for actor in draft.actors] == ["/person/odom"]
+
+
+def test_poses_of_a_camera_come_before_those_of_a_body() -> None:
+    log = recording(
+        "flight.mcap",
+        topic("/drone1/image_raw", "pictures"),
+        topic("/drone1/odometry", "poses", source="drone1/base_link"),
+        topic("/tf", "transforms"),
+        edges=(
+            Edge("/tf", "map", "drone1/base_link", False),
+            Edge("/tf_static", "drone1/base_link", "drone1/camera_link", True),
+            Edge("/tf_static", "drone1/camera_link", "drone1/camera_optical_frame", True),
+            Edge("/tf_static", "map", "camera_optical_on_a_tripod", True),
+        ),
+    )
+    assert chains(log) == [("map", "drone1/camera_optical_frame"), ("map", "drone1/base_link")]
+    choice = match(Findings(recordings=[log])).cameras[0].poses
+    assert choice
+    assert choice.taken.settings == {"log": "flight", "parent": "map", "child": "drone1/camera_optical_frame"}
+    assert not choice.taken.of_body
+    assert others(choice) == ["/drone1/odometry", "drone1/base_link"]
+
+
+def test_a_loop_of_transforms_ends() -> None:
+    edges = (Edge("/tf", "a", "base_link", False), Edge("/tf", "base_link", "a", False))
+    assert chains(recording("a.mcap", edges=edges)) == []
+
+
+def test_nothing_named_like_it_is_not_guessed_among_several_cameras() -> None:
+    draft = match(Findings(videos=[video("drone1.mp4"), video("drone2.mp4")], poses=[poses("drone1.tum")]))
+    assert taken(camera(draft, "drone1").poses) == "drone1.tum"
+    assert camera(draft, "drone2").poses is None
+
+
+def test_a_lone_camera_takes_what_lies_beside_it_whatever_its_name() -> None:
+    draft = match(
+        Findings(
+            videos=[video("DJI_0001.mp4")],
+            poses=[poses("walk.tum")],
+            calibrations=[calibration("mavic.yaml", "x")],
+        )
+    )
+    assert taken(draft.cameras[0].poses) == "walk.tum"
+    assert taken(draft.cameras[0].intrinsics) == "mavic.yaml"
+    assert draft.cameras[0].poses
+    assert not draft.cameras[0].poses.named
+
+
+def test_static_poses_serve_where_no_log_has_any() -> None:
+    files = [keypoints("cam1.json"), keypoints("cam2.json")]
+    shared = calibration("calibration.toml", "cam1", "cam2", pose=True)
+    draft = match(
+        Findings(keypoints=files, calibrations=[shared], poses=[poses("cam1.tum"), poses("cam2_true.tum")])
+    )
+    assert taken(camera(draft, "cam1").poses) == "cam1.tum"
+    assert others(camera(draft, "cam1").poses) == ["calibration.toml"]
+    assert taken(camera(draft, "cam2").poses) == "calibration.toml"
+    assert taken(camera(draft, "cam2").true_poses) == "cam2_true.tum"
+
+
+def test_truth_is_used_as_poses_only_where_there_is_nothing_else() -> None:
+    draft = match(Findings(videos=[video("drone1.mp4")], poses=[poses("drone1_gt.tum")]))
+    assert taken(draft.cameras[0].poses) == "drone1_gt.tum"
+    assert draft.cameras[0].true_poses is None
+
+
+# --- calibrations, gimbals, frame times ------------------------------------------------------------------
+
+
+def test_one_calibration_without_a_name_serves_all_and_says_so() -> None:
+    draft = match(
+        Findings(videos=[video("a.mp4"), video("b.mp4")], calibrations=[calibration("gopro.yaml", "camera")])
+    )
+    choices = [c.intrinsics for c in draft.cameras]
+    assert [taken(choice) for choice in choices] == ["gopro.yaml", "gopro.yaml"]
+    assert not any(choice.named for choice in choices if choice)
+
+
+def test_the_calibration_of_another_drone_is_not_taken() -> None:
+    draft = match(
+        Findings(
+            videos=[video("drone1.mp4"), video("drone2.mp4"), video("drone3.mp4")],
+            calibrations=[calibration("drone1.yaml", "camera"), calibration("drone2.yaml", "camera")],
+        )
+    )
+    assert [taken(c.intrinsics) for c in draft.cameras] == ["drone1.yaml", "drone2.yaml", ""]
+
+
+def test_camera_info_beside_the_pictures_is_taken() -> None:
+    log = recording(
+        "flight.mcap",
+        topic("/drone1/rgb/image_raw", "pictures"),
+        topic("/drone1/ir/camera_info", "intrinsics"),
+        topic("/drone1/rgb/camera_info", "intrinsics"),
+    )
+    draft = match(Findings(recordings=[log]))
+    assert taken(draft.cameras[0].intrinsics) == "/drone1/rgb/camera_info"
+
+
+def test_angles_are_a_gimbal_only_by_name_and_for_poses_of_a_body() -> None:
+    log = recording(
+        "flight.mcap",
+        topic("/drone1/image_raw", "pictures"),
+        topic("/drone1/odometry", "poses", source="base_link"),
+        topic("/drone1/imu/mag", "angles"),
+        topic("/drone1/gimbal_angles", "angles"),
+    )
+    assert taken(match(Findings(recordings=[log])).cameras[0].gimbal) == "/drone1/gimbal_angles"
+    of_camera = match(Findings(recordings=[log], poses=[poses("drone1.tum")]))
+    assert of_camera.cameras[0].gimbal is None
+
+
+def test_frame_times_go_to_the_video_of_their_name() -> None:
+    stamps = [
+        FrameTimes(*place(f"DJI_000{k}.SRT"), "frame_times", "frame times", "srt", 300, span(0, 10))
+        for k in (1, 2)
+    ]
+    draft = match(Findings(videos=[video("DJI_0001.mp4"), video("DJI_0002.mp4")], frame_times=stamps))
+    assert [taken(c.frame_times) for c in draft.cameras] == ["DJI_0001.SRT", "DJI_0002.SRT"]
+
+
+def test_joints_are_true_only_by_name() -> None:
+    joints = [Joints(*place(name), "trc", "TRC", span(0, 10)) for name in ("result.trc", "truth.trc")]
+    draft = match(Findings(videos=[video("a.mp4")], joints=joints))
+    assert [found.path.name for found in draft.true_joints] == ["truth.trc"]
+    assert [found.path.name for found in draft.unused] == ["result.trc"]
+
+
+# --- split logs ----------------------------------------------------------------------------------------
+
+
+def test_parts_of_a_log_are_one_recording_and_logs_of_two_drones_are_not() -> None:
+    parts = [
+        recording(f"d1_{k}.mcap", topic("/odometry", "poses", times=span(10 * k, 10 * k + 9.9)))
+        for k in range(12)
+    ]
+    [whole] = joined(parts[::-1])
+    assert [path.name for path in whole.parts] == [f"d1_{k}.mcap" for k in range(12)]
+    assert whole.topics[0].span == span(0, 119.9)
+    assert whole.topics[0].count == 1200
+    at_once = [replace(part, topics=(topic("/odometry", "poses"),)) for part in parts[:2]]
+    assert len(joined(at_once)) == 2
+    assert len(joined([parts[0], parts[2]])) == 2
+
+
+def test_only_logs_that_are_named_stand_in_the_manifest() -> None:
+    logs = [
+        recording("d1.mcap", topic("/drone1/image", "pictures"), topic("/drone1/odom", "poses")),
+        recording("other.mcap"),
+    ]
+    draft = match(Findings(recordings=logs))
+    assert list(draft.logs) == ["d1"]
+    assert [found.path.name for found in draft.unused] == ["other.mcap"]
