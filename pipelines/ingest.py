@@ -7,19 +7,19 @@ chunk of its own: an interrupted ingest continues with the cameras that it had n
 
 from __future__ import annotations
 
+import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.geometry.cameras import Intrinsics, fit_to_size
-from pipelines.geometry.poses import enu_from_ned, gaps, interpolate_poses
+from pipelines.formats.flight_sources import CameraFrames, FlightSources, losses
+from pipelines.geometry.poses import gaps, interpolate_poses
 from pipelines.session.description import (
+    ActorEntry,
     CameraEntry,
     ClockEntry,
     Description,
@@ -27,33 +27,20 @@ from pipelines.session.description import (
     Interpolation,
     IntrinsicsEntry,
     KeypointsEntry,
+    MapEntry,
     PosesEntry,
     TruthEntry,
 )
 from pipelines.session.errors import DataError, NotYetReadError
-from pipelines.session.manifest import (
-    Axes,
-    Camera,
-    Flight,
-    IntrinsicsSource,
-    KeypointSource,
-    Truth,
-    read_flight,
-)
+from pipelines.session.manifest import Camera, Flight, PoseSource, read_flight
+from pipelines.session.maps import store_map
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import CalibratedCamera, Detections, JointMotion, Trajectory
-from pipelines.session.registries import (
-    FORMATS,
-    CalibrationFormat,
-    JointFormat,
-    KeypointFormat,
-    TrajectoryFormat,
-    noise_models,
-    recognise,
-)
+from pipelines.session.records import Detections, Int64, Trajectory
+from pipelines.session.registries import noise_models
 from pipelines.session.stages import Stage, StageRecord, locked
 from pipelines.session.storage import read_json, sha256_of, write_json
 from pipelines.session.tables import (
+    ACTOR,
     CAMERA_POSES,
     FRAMES,
     KEYPOINTS,
@@ -62,15 +49,12 @@ from pipelines.session.tables import (
     TRUTH,
     write_table,
 )
-from pipelines.session.tabular import frames_table, keypoints_table, motion_table, pose_table
+from pipelines.session.tabular import actor_table, frames_table, keypoints_table, motion_table, pose_table
 
-if TYPE_CHECKING:
-    import pandas as pd
+INGEST = Stage("ingest", revision=2)
 
-INGEST = Stage("ingest", revision=1)
-
-_MOST_FRAMES = 20_000_000  # a week at 30 Hz: more is a frame number misread from a date
-_LARGEST_SHARE_OUTSIDE = 0.05  # of keypoints beyond the picture; detectors overshoot the border a little
+_MUCH_SHORTER = 0.9  # a video that covers less than this share of its pose log is worth a word
+_SHORTER_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -114,18 +98,15 @@ def ingest(
     target = session or flight_path.with_suffix(".session")
     _refuse_other_flight(target, flight, overwrite)
     interpolation = Interpolation(max_gap_s=max_pose_gap_s, max_extrapolation_s=max_extrapolation_s)
-    sources = _hash_sources(flight, flight_path.parent)
-    settings = {
-        "flight": flight.model_dump(mode="json"),
-        "pose_interpolation": interpolation.model_dump(),
-    }
+    sources = _hash_sources(flight, flight_path.parent, progress)
+    settings = {"flight": flight.model_dump(mode="json"), "pose_interpolation": interpolation.model_dump()}
 
     with locked(target, create=True, overwrite=overwrite) as writable:
         run = writable.begin(INGEST, settings=settings, inputs=sources, force=force)
         if run.finished:
             return Ingested(target, run.record, _stored_description(target), skipped=True)
 
-        reader = _Reader(flight, flight_path, interpolation)
+        reader = _Reader(flight, flight_path, target, interpolation)
         progress.start("Reading cameras", len(flight.cameras))
         entries: dict[str, CameraEntry] = {}
         warnings: list[str] = []
@@ -138,6 +119,9 @@ def ingest(
             progress.advance()
         _check_overlap(flight_path, entries)
         truth = reader.store_truth(run.folder, entries)
+        actor = reader.store_actor(run.folder, entries)
+        map_ = reader.store_map(run.folder)
+        warnings += reader.take_notes()
 
         description = Description(
             schema_version=1,
@@ -145,6 +129,8 @@ def ingest(
             clock_reference=flight.reference_camera,
             pose_interpolation=interpolation,
             cameras=entries,
+            actor=actor,
+            map=map_,
             truth=truth,
             sources=sources,
             warnings=warnings,
@@ -160,33 +146,16 @@ def _stored_description(folder: Path) -> Description:
 
 def _refuse_unread_parts(flight: Flight, path: Path) -> None:
     """Refuse, in one line, what is valid in a manifest but has no reader in this version."""
-    unread = [
-        part
-        for part, stated in (("actor", flight.actor), ("actors", flight.actors), ("map", flight.map))
-        if stated
-    ]
-    unread += ["plan"] if flight.plan else []
+    unread = ["plan"] if flight.plan else []
+    unread += ["actors"] if flight.actors else []
+    unread += ["map.log"] if flight.map and flight.map.log else []
     for name, camera in flight.cameras.items():
-        place = f"cameras.{name}"
-        if camera.video:
-            unread.append(f"{place}.video")
-        if camera.gimbal:
-            unread.append(f"{place}.gimbal")
-        if camera.pose.of == "body" or camera.mount:
-            unread.append(f"{place}.mount")
-        unread += [f"{place}.pose.{key}" for key in ("log", "dji", "ulog") if getattr(camera.pose, key)]
-        unread += [f"{place}.intrinsics.log"] if camera.intrinsics.log else []
-        if camera.frame_times:
-            unread += [
-                f"{place}.frame_times.{key}"
-                for key in ("csv", "log", "srt")
-                if getattr(camera.frame_times, key)
-            ]
+        unread += [f"cameras.{name}.pose.{key}" for key in ("dji", "ulog") if getattr(camera.pose, key)]
     if unread:
         raise NotYetReadError(
             path,
             f"{', '.join(unread)}: this version has no reader for {'it' if len(unread) == 1 else 'them'} yet",
-            "leave it out, or give the same data as TUM, CSV, a calibration file or keypoint files",
+            "leave it out, or give the same data in a format of `mocap info --help`",
         )
 
 
@@ -206,18 +175,42 @@ def _refuse_other_flight(target: Path, flight: Flight, overwrite: bool) -> None:
         )
 
 
-def _hash_sources(flight: Flight, base: Path) -> dict[str, str]:
+def _hash_sources(flight: Flight, base: Path, progress: Progress) -> dict[str, str]:
     """The sha256 of every file that is read, by the path that the manifest states."""
     stated: list[str] = []
+
+    def take(*paths: str | None) -> None:
+        stated.extend(path for path in paths if path)
+
+    def take_log(log: str | None) -> None:
+        if log:
+            take(*(flight.logs[log].path if log in flight.logs else [log]))
+
     for camera in flight.cameras.values():
-        pose = camera.pose
-        stated += [path for path in (pose.tum, pose.csv, pose.static and pose.static.path) if path]
-        stated += [camera.intrinsics.path] if camera.intrinsics.path else []
-        stated += [camera.keypoints.path] if camera.keypoints else []
+        pose, times, video = camera.pose, camera.frame_times, camera.video
+        take(pose.tum, pose.csv, pose.static.path if pose.static else None, camera.intrinsics.path)
+        take(camera.keypoints.path if camera.keypoints else None)
+        for log in (pose.log, camera.intrinsics.log, camera.gimbal.log if camera.gimbal else None):
+            take_log(log)
+        if times:
+            take(times.csv, times.srt)
+            take_log(times.log)
+        if video:
+            take(video.path)
+            take_log(video.log)
+    if flight.actor:
+        take_log(flight.actor.log)
+    if flight.map:
+        take(flight.map.path)
     if flight.truth:
-        stated += [flight.truth.joints.path] if flight.truth.joints else []
-        stated += flight.truth.poses.values()
-    return {path: sha256_of(base / path) for path in dict.fromkeys(stated)}
+        take(flight.truth.joints.path if flight.truth.joints else None, *flight.truth.poses.values())
+    unique = list(dict.fromkeys(stated))
+    progress.start("Hashing sources", len(unique))
+    hashes = {}
+    for path in unique:
+        hashes[path] = sha256_of(base / path)
+        progress.advance()
+    return hashes
 
 
 def _counts(entries: Mapping[str, CameraEntry]) -> dict[str, object]:
@@ -239,79 +232,89 @@ def _check_overlap(flight_path: Path, entries: Mapping[str, CameraEntry]) -> Non
                 flight_path,
                 f"cameras.{name}: its frames ({_span(first, last)}) overlap in time with no other camera's"
                 f" ({_span(min(o.first_t_ns for o in others), max(o.last_t_ns for o in others))})",
-                "check frame_times.start_ns and clock.offset_s",
+                "check frame_times.start and clock.offset_s",
             )
 
 
 class _Reader:
-    """Reads the parts of one flight; what it doubts is collected camera by camera."""
+    """Stores the parts of one flight; what is doubted is collected as notes."""
 
-    def __init__(self, flight: Flight, flight_path: Path, interpolation: Interpolation) -> None:
+    def __init__(
+        self, flight: Flight, flight_path: Path, session: Path, interpolation: Interpolation
+    ) -> None:
         self._flight = flight
         self._flight_path = flight_path
-        self._base = flight_path.parent
+        self._session = session
         self._interpolation = interpolation
-        self._calibrations: dict[str, dict[str, CalibratedCamera]] = {}
+        self._max_gap_ns = round(interpolation.max_gap_s * 1e9)
+        self._notes: list[str] = []
+        self._sources = FlightSources(
+            flight, flight_path, max_gap_ns=self._max_gap_ns, note=self._notes.append
+        )
+
+    def take_notes(self) -> list[str]:
+        """What was noted since the last time this was asked."""
+        taken = list(dict.fromkeys(self._notes))
+        self._notes.clear()
+        return taken
 
     def store_camera(self, name: str, folder: Path) -> None:
         """Write the tables of one camera and what is to be said of them."""
-        camera = self._flight.cameras[name]
-        source = camera.keypoints
-        if source is None:
-            raise NotYetReadError(self._flight_path, f"cameras.{name} has no keypoints", "give their file")
-        warnings: list[str] = []
-        detections, detector_format = self._read_keypoints(source)
-        intrinsics = self._read_intrinsics(name, camera, detections, warnings)
-        frames_t_ns = self._frame_times(name, camera, source, detections)
-        trajectory = self._read_trajectory(name, camera, frames_t_ns)
-        without_pose = self._frames_without_pose(name, trajectory, camera, frames_t_ns, warnings)
+        camera, sources = self._flight.cameras[name], self._sources
+        video = sources.video(camera)
+        detections, detector_format = None, ""
+        if camera.keypoints:
+            detections, detector_format = sources.keypoints(camera.keypoints)
+        intrinsics = sources.intrinsics(name, camera, video, detections)
+        frames = sources.frames(name, camera, video, detections)
+        trajectory = sources.trajectory(name, camera, int(frames.t_ns[0]))
         if camera.pose_noise:
             noise_models(f"{self._flight_path}: cameras.{name}.pose_noise", camera.pose_noise)
-        warnings += _loss_warnings(name, "poses", trajectory.dropped)
-        warnings += _loss_warnings(name, "keypoints", detections.dropped)
+        if detections is not None:
+            detections = _within(detections, frames)
+            if not len(detections.frame):
+                raise DataError(
+                    self._flight_path,
+                    f"cameras.{name}: no frame of its keypoints is one of its pictures",
+                    "check first_frame and frame_times",
+                )
 
         tables = folder / "tables"
         tables.mkdir()
-        write_table(tables / "frames.parquet", frames_table(frames_t_ns), FRAMES)
+        write_table(tables / "frames.parquet", frames_table(frames.frame, frames.t_ns, frames.pts_ns), FRAMES)
         write_table(
             tables / "poses.parquet",
             pose_table(trajectory),
             POSES if trajectory.covariance is None else POSES_WITH_COVARIANCE,
         )
-        write_table(tables / "keypoints.parquet", keypoints_table(detections, frames_t_ns), KEYPOINTS)
-        clock = camera.clock
+        if detections is not None:
+            keypoints = keypoints_table(detections, frames.frame, frames.t_ns)
+            write_table(tables / "keypoints.parquet", keypoints, KEYPOINTS)
         entry = CameraEntry(
             intrinsics=IntrinsicsEntry.of(intrinsics),
             frames=FramesEntry(
-                count=len(frames_t_ns),
-                first_t_ns=int(frames_t_ns[0]),
-                last_t_ns=int(frames_t_ns[-1]),
-                rate_hz=_rate(frames_t_ns),
+                count=len(frames.t_ns),
+                first_t_ns=int(frames.t_ns[0]),
+                last_t_ns=int(frames.t_ns[-1]),
+                rate_hz=_rate(frames.t_ns),
+                dropped=video.dropped if video else {},
             ),
-            poses=PosesEntry(
-                source=_pose_path(camera),
-                static=camera.pose.static is not None,
-                count=len(trajectory.t_ns),
-                rate_hz=_rate(trajectory.t_ns),
-                gaps_ns=[] if camera.pose.static else gaps(trajectory.t_ns, self._max_gap_ns),
-                frames_without_pose=without_pose,
-                dropped=trajectory.dropped,
-            ),
-            keypoints=KeypointsEntry(
-                source=source.path,
-                format=detector_format,
-                joints=list(detections.joints),
-                detections=len(detections.frame),
-                people_at_once=int(np.unique(detections.frame, return_counts=True)[1].max()),
-                frames_without_person=len(frames_t_ns) - len(np.unique(detections.frame)),
-                dropped=detections.dropped,
-            ),
+            poses=self._poses_entry(name, camera, trajectory, frames.t_ns),
+            keypoints=_keypoints_entry(camera, detections, detector_format, len(frames.t_ns)),
             clock=ClockEntry(
-                offset_s=(clock.offset_ns if clock else 0) / 1e9, sigma_s=clock.sigma_s if clock else 0.0
+                offset_s=camera.clock.offset_ns / 1e9 if camera.clock else 0.0,
+                sigma_s=camera.clock.sigma_s if camera.clock else 0.0,
             ),
             pose_noise=camera.pose_noise,
-            media=None,
+            media=self._media(camera),
         )
+        warnings = self.take_notes()
+        for what, dropped in (
+            ("frames", entry.frames.dropped),
+            ("poses", entry.poses.dropped),
+            ("keypoints", entry.keypoints.dropped if entry.keypoints else {}),
+        ):
+            warnings += [f"{name}: {what} dropped: {losses(dropped)}"] if dropped else []
         write_json(folder / "entry.json", {"entry": entry.model_dump(mode="json"), "warnings": warnings})
 
     def store_truth(self, folder: Path, entries: Mapping[str, CameraEntry]) -> TruthEntry | None:
@@ -319,19 +322,18 @@ class _Reader:
         truth = self._flight.truth
         if truth is None:
             return None
-        motion = self._read_truth_joints(truth)
-        if motion is not None:
-            first = min(entry.frames.first_t_ns for entry in entries.values())
-            last = max(entry.frames.last_t_ns for entry in entries.values())
-            if motion.t_ns[0] > last or motion.t_ns[-1] < first:
-                raise DataError(
-                    self._base / truth.joints.path if truth.joints else self._flight_path,
-                    f"spans {_span(motion.t_ns[0], motion.t_ns[-1])}, the pictures {_span(first, last)}",
-                    "check its time base: stamps are world times",
-                )
+        motion = self._sources.true_joints(truth.joints) if truth.joints else None
+        if motion is not None and truth.joints is not None:
+            self._refuse_no_overlap(truth.joints.path, motion.t_ns, entries)
             write_table(folder / "truth.parquet", motion_table(motion), TRUTH)
         if truth.poses:
-            write_table(folder / "truth_poses.parquet", self._truth_poses_table(truth), CAMERA_POSES)
+            import pandas as pd
+
+            tables = [
+                pose_table(self._sources.true_poses(stated)).assign(camera=name)
+                for name, stated in truth.poses.items()
+            ]
+            write_table(folder / "truth_poses.parquet", pd.concat(tables, ignore_index=True), CAMERA_POSES)
         return TruthEntry(
             joints=list(motion.joints) if motion else [],
             people=motion.position.shape[1] if motion else 0,
@@ -340,248 +342,144 @@ class _Reader:
             cameras=list(truth.poses),
         )
 
-    @property
-    def _max_gap_ns(self) -> int:
-        return round(self._interpolation.max_gap_s * 1e9)
+    def store_actor(self, folder: Path, entries: Mapping[str, CameraEntry]) -> ActorEntry | None:
+        """Write where the actor was, as logged."""
+        actor = self._flight.actor
+        if actor is None:
+            return None
+        trajectory = self._sources.actor(actor.log, actor.topic)
+        self._refuse_no_overlap(actor.log, trajectory.t_ns, entries)
+        write_table(folder / "actor.parquet", actor_table(trajectory), ACTOR)
+        return ActorEntry(
+            source=actor.log, point=actor.point, count=len(trajectory.t_ns), dropped=trajectory.dropped
+        )
 
-    @property
-    def _max_extrapolation_ns(self) -> int:
-        return round(self._interpolation.max_extrapolation_s * 1e9)
+    def store_map(self, folder: Path) -> MapEntry | None:
+        """Write what stands around."""
+        stated = self._flight.map
+        if stated is None or stated.path is None:
+            return None
+        occupancy = self._sources.map(stated.path, stated.resolution_m)
+        if self._flight.world.frame == "ned":
+            self._notes.append(f"{stated.path}: the map is taken to be in ENU axes although the world is NED")
+        store_map(folder, [occupancy])
+        known = occupancy.probability[~np.isnan(occupancy.probability)]
+        return MapEntry(
+            source=stated.path,
+            unknown=stated.unknown,
+            resolution_m=occupancy.resolution_m,
+            shape=list(occupancy.probability.shape),
+            occupied=int((known >= 0.5).sum()),
+            free=int((known < 0.5).sum()),
+            dropped=occupancy.dropped,
+        )
 
-    def _read_keypoints(self, source: KeypointSource) -> tuple[Detections, str]:
-        path = self._base / source.path
-        if source.format:
-            reader = FORMATS.get(source.format)
-            if not isinstance(reader, KeypointFormat):
-                raise DataError(path, f"{source.format} is no keypoint format", "leave `format:` out")
-        else:
-            reader = recognise(path, KeypointFormat, "keypoint file")
-        detections = reader.read_keypoints(path, skeleton=source.skeleton, first_frame=source.first_frame)
-        if not len(detections.frame):
-            raise DataError(path, "holds no keypoints", "run the detector again, or leave the camera out")
-        if source.image_size:
-            detections = replace(detections, image_size=(source.image_size[0], source.image_size[1]))
-        return detections, reader.name
-
-    def _read_intrinsics(
-        self, name: str, camera: Camera, detections: Detections, warnings: list[str]
-    ) -> Intrinsics:
-        source = camera.intrinsics
-        place = f"{self._flight_path}: cameras.{name}.intrinsics"
-        if source.path:
-            calibrated = self._calibrated(name, source.path, source.camera)
-            if calibrated.intrinsics is None:
-                raise DataError(
-                    self._base / source.path, "holds poses but no intrinsics", "name another file"
-                )
-            intrinsics = calibrated.intrinsics
-        else:
-            intrinsics = _inline_intrinsics(source, place)
-        if detections.image_size:
-            try:
-                intrinsics, note = fit_to_size(intrinsics, *detections.image_size)
-            except ValueError as error:
-                raise DataError(
-                    place, str(error), "give the calibration that belongs to these pictures"
-                ) from None
-            if note:
-                warnings.append(f"{name}: {note}")
-        _refuse_keypoints_outside(place, intrinsics, detections)
-        return intrinsics
-
-    def _calibrated(self, name: str, path: str, camera: str | None) -> CalibratedCamera:
-        """The camera of a calibration file that is asked for, bears this name, or is the only one."""
-        if path not in self._calibrations:
-            file = self._base / path
-            reader = recognise(file, CalibrationFormat, "calibration")
-            self._calibrations[path] = reader.read_calibration(file)
-        cameras = self._calibrations[path]
-        if camera is None and name not in cameras and len(cameras) == 1:
-            return next(iter(cameras.values()))
-        if (camera or name) not in cameras:
-            listed = ", ".join(sorted(cameras)[:20])
-            raise DataError(
-                self._base / path,
-                f"holds no camera {camera or name!r} (there are {listed})",
-                "say which with {path: ..., camera: ...}",
-            )
-        return cameras[camera or name]
-
-    def _frame_times(
-        self, name: str, camera: Camera, source: KeypointSource, detections: Detections
-    ) -> np.ndarray:
-        times = camera.frame_times
-        if times is None or times.fps is None:
-            raise DataError(
-                self._flight_path,
-                f"cameras.{name}.frame_times: without a video it needs fps",
-                "write frame_times: {start: SECONDS, fps: 30}",
-            )
-        count = int(detections.frames_listed[-1]) + 1
-        if count > _MOST_FRAMES:
-            raise DataError(
-                self._base / source.path,
-                f"numbers its frames up to {count - 1}",
-                "say with first_frame which number the first frame bears",
-            )
-        offset_ns = camera.clock.offset_ns if camera.clock else 0
-        return times.start_ns + offset_ns + _ticks_ns(count, times.fps)
-
-    def _read_trajectory(self, name: str, camera: Camera, frames_t_ns: np.ndarray) -> Trajectory:
-        path = self._base / _pose_path(camera)
-        axes: Axes = camera.pose.axes or self._flight.world.frame
-        if camera.pose.static:
-            calibrated = self._calibrated(name, camera.pose.static.path, camera.pose.static.camera)
-            if calibrated.position is None or calibrated.quaternion_xyzw is None:
-                raise DataError(path, "holds intrinsics but no camera pose", "name a file with extrinsics")
-            still = Trajectory(
-                t_ns=frames_t_ns[:1],
-                position=calibrated.position[None],
-                quaternion_xyzw=calibrated.quaternion_xyzw[None],
-            )
-            return _in_enu(still, axes)
-        kind = "tum" if camera.pose.tum else "csv"
-        reader = FORMATS.get(kind)
-        if not isinstance(reader, TrajectoryFormat):
-            raise DataError(path, f"the format {kind} reads no trajectories")
-        trajectory = reader.read_trajectory(path)
-        if not len(trajectory.t_ns):
-            raise DataError(path, f"holds no usable pose ({_losses(trajectory.dropped)})", "mend the log")
-        return _in_enu(trajectory, axes)
+    def _poses_entry(
+        self, name: str, camera: Camera, trajectory: Trajectory, frames_t_ns: Int64
+    ) -> PosesEntry:
+        static = camera.pose.static is not None
+        poses_t_ns = trajectory.t_ns
+        if not static:
+            span, covered = int(np.ptp(poses_t_ns)) / 1e9, int(np.ptp(frames_t_ns)) / 1e9
+            if covered < _MUCH_SHORTER * span and span - covered > _SHORTER_S:
+                self._notes.append(f"{name}: its pictures cover {covered:.1f} s of {span:.1f} s of poses")
+        return PosesEntry(
+            source=_pose_source(camera.pose),
+            static=static,
+            count=len(poses_t_ns),
+            rate_hz=_rate(poses_t_ns),
+            gaps_ns=[] if static else gaps(poses_t_ns, self._max_gap_ns),
+            frames_without_pose=0
+            if static
+            else self._frames_without_pose(name, camera, trajectory, frames_t_ns),
+            dropped=trajectory.dropped,
+        )
 
     def _frames_without_pose(
-        self,
-        name: str,
-        trajectory: Trajectory,
-        camera: Camera,
-        frames_t_ns: np.ndarray,
-        warnings: list[str],
+        self, name: str, camera: Camera, trajectory: Trajectory, frames_t_ns: Int64
     ) -> int:
-        if camera.pose.static:
-            return 0
         position, _ = interpolate_poses(
             trajectory.t_ns,
             trajectory.position,
             trajectory.quaternion_xyzw,
             frames_t_ns,
             max_gap_ns=self._max_gap_ns,
-            max_extrapolation_ns=self._max_extrapolation_ns,
+            max_extrapolation_ns=round(self._interpolation.max_extrapolation_s * 1e9),
         )
         without = int(np.isnan(position[:, 0]).sum())
         if without == len(frames_t_ns):
             raise DataError(
-                self._base / _pose_path(camera),
+                self._flight_path.parent / _pose_source(camera.pose),
                 f"has a pose for none of the {without} frames of camera {name}: frames span"
                 f" {_span(frames_t_ns[0], frames_t_ns[-1])}, poses {_span(*trajectory.t_ns[[0, -1]])}"
                 f" at {_rate(trajectory.t_ns) or 0:.3g} Hz",
                 "check clocks and units, or raise --max-pose-gap",
             )
         if without:
-            warnings.append(
+            self._notes.append(
                 f"{name}: {without} of {len(frames_t_ns)} frames have no pose (no logged pose within"
                 f" {self._interpolation.max_gap_s:g} s gaps and {self._interpolation.max_extrapolation_s:g} s"
                 " at the ends)"
             )
         return without
 
-    def _read_truth_joints(self, truth: Truth) -> JointMotion | None:
-        source = truth.joints
-        if source is None:
+    def _refuse_no_overlap(self, stated: str, t_ns: Int64, entries: Mapping[str, CameraEntry]) -> None:
+        first = min(entry.frames.first_t_ns for entry in entries.values())
+        last = max(entry.frames.last_t_ns for entry in entries.values())
+        if t_ns[0] > last or t_ns[-1] < first:
+            raise DataError(
+                self._flight_path.parent / stated,
+                f"spans {_span(t_ns[0], t_ns[-1])}, the pictures {_span(first, last)}",
+                "check its time base: stamps are world times",
+            )
+
+    def _media(self, camera: Camera) -> str | None:
+        """Where the pictures lie, as seen from the session: sessions are moved together with their flight."""
+        if camera.video is None or camera.video.path is None:
             return None
-        path = self._base / source.path
-        axes = source.axes or ("ned" if self._flight.world.frame == "ned" else None)
-        reader: object = (
-            FORMATS.get(source.format) if source.format else recognise(path, JointFormat, "truth")
-        )
-        if not isinstance(reader, JointFormat):
-            raise DataError(path, f"{source.format} holds no joints", "leave `format:` out")
-        motion = reader.read_joints(path, unit=source.unit, axes="z-up" if axes == "ned" else axes)
-        if axes == "ned":
-            motion = replace(motion, position=motion.position[..., [1, 0, 2]] * [1, 1, -1])
-        return motion
-
-    def _truth_poses_table(self, truth: Truth) -> pd.DataFrame:
-        import pandas as pd
-
-        tables = []
-        for name, stated in truth.poses.items():
-            path = self._base / stated
-            trajectory = recognise(path, TrajectoryFormat, "camera trajectory").read_trajectory(path)
-            table = pose_table(_in_enu(trajectory, self._flight.world.frame))
-            tables.append(table.assign(camera=name))
-        return pd.concat(tables, ignore_index=True)
+        path = self._flight_path.parent / camera.video.path
+        return Path(os.path.relpath(path, self._session)).as_posix()
 
 
-def detections_path(camera: Camera) -> str:
-    """The path of a camera's keypoints as the manifest states it."""
-    return camera.keypoints.path if camera.keypoints else ""
+def _keypoints_entry(
+    camera: Camera, detections: Detections | None, detector_format: str, frames: int
+) -> KeypointsEntry | None:
+    if camera.keypoints is None or detections is None:
+        return None
+    return KeypointsEntry(
+        source=camera.keypoints.path,
+        format=detector_format,
+        joints=list(detections.joints),
+        detections=len(detections.frame),
+        people_at_once=int(np.unique(detections.frame, return_counts=True)[1].max()),
+        frames_without_person=frames - len(np.unique(detections.frame)),
+        dropped=detections.dropped,
+    )
 
 
-def _pose_path(camera: Camera) -> str:
-    pose = camera.pose
-    return pose.tum or pose.csv or (pose.static.path if pose.static else "")
+def _within(detections: Detections, frames: CameraFrames) -> Detections:
+    """The detections of frames that there are; the others are counted."""
+    known = np.isin(detections.frame, frames.frame)
+    if known.all():
+        return detections
+    lost = {"detections in frames without a time": int((~known).sum())}
+    return replace(
+        detections,
+        frame=detections.frame[known],
+        person=detections.person[known],
+        xy=detections.xy[known],
+        confidence=detections.confidence[known],
+        dropped=detections.dropped | lost,
+    )
 
 
-def _inline_intrinsics(source: IntrinsicsSource, place: str) -> Intrinsics:
-    try:
-        return Intrinsics(
-            width=source.width or 0,
-            height=source.height or 0,
-            fx=source.fx or 0.0,
-            fy=source.fy or 0.0,
-            cx=source.cx or 0.0,
-            cy=source.cy or 0.0,
-            model=source.model if source.distortion else "none",
-            distortion=tuple(source.distortion),
-            readout_s=source.readout_s,
-        )
-    except ValueError as error:
-        raise DataError(place, str(error), "mend the numbers") from None
+def _pose_source(pose: PoseSource) -> str:
+    return pose.tum or pose.csv or (pose.static.path if pose.static else pose.log) or ""
 
 
-def _refuse_keypoints_outside(place: str, intrinsics: Intrinsics, detections: Detections) -> None:
-    """Refuse a calibration whose picture is too small for the keypoints: it is of another size."""
-    xy = detections.xy[~np.isnan(detections.xy[..., 0])]
-    outside = ((xy < -0.5) | (xy > [intrinsics.width - 0.5, intrinsics.height - 0.5])).any(axis=-1)
-    if len(xy) and outside.mean() > _LARGEST_SHARE_OUTSIDE:
-        reach = np.percentile(xy, 99, axis=0)
-        raise DataError(
-            place,
-            f"is for {intrinsics.width}x{intrinsics.height} pictures, but {outside.mean():.0%} of the"
-            f" keypoints lie outside (they reach to x = {reach[0]:.0f}, y = {reach[1]:.0f})",
-            "give the calibration of these pictures, or their size with keypoints: {image_size: [W, H]}",
-        )
-
-
-def _in_enu(trajectory: Trajectory, axes: Axes) -> Trajectory:
-    if axes == "enu":
-        return trajectory
-    position, quaternion = enu_from_ned(trajectory.position, trajectory.quaternion_xyzw)
-    covariance = trajectory.covariance
-    if covariance is not None:
-        swap = np.eye(6)
-        swap[:3, :3] = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]  # the rotation part stays in the camera
-        covariance = swap @ covariance @ swap.T
-    return replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)
-
-
-def _ticks_ns(count: int, fps: Fraction) -> np.ndarray:
-    """Exact times of `count` frames from 0, each rounded to a ns; Python's integers cannot overflow here."""
-    period = Fraction(1_000_000_000) / fps
-    return np.array([round(k * period) for k in range(count)], dtype=np.int64)
-
-
-def _rate(t_ns: np.ndarray) -> float | None:
+def _rate(t_ns: Int64) -> float | None:
     return 1e9 * (len(t_ns) - 1) / float(t_ns[-1] - t_ns[0]) if len(t_ns) > 1 else None
 
 
 def _span(first_ns: int, last_ns: int) -> str:
     return f"{first_ns / 1e9:.3f} to {last_ns / 1e9:.3f} s"
-
-
-def _losses(dropped: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} {cause}" for cause, count in dropped.items()) or "it is empty"
-
-
-def _loss_warnings(name: str, what: str, dropped: Mapping[str, int]) -> Sequence[str]:
-    return [f"{name}: {what} dropped: {_losses(dropped)}"] if dropped else []

@@ -36,7 +36,7 @@ from pipelines.session.records import Float, Int64, Trajectory
 from pipelines.session.registries import noise_models, parsed_noise_models
 from pipelines.session.stages import Stage, StageRecord, locked
 from pipelines.session.storage import jsonable, read_json, write_json
-from pipelines.session.tables import FRAMES, KEYPOINTS, POSES, SKELETON, TRUTH, read_table, write_table
+from pipelines.session.tables import ACTOR, FRAMES, KEYPOINTS, POSES, SKELETON, TRUTH, read_table, write_table
 from pipelines.session.tabular import detections_from, motion_from, trajectory_from
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 RECONSTRUCT = Stage("reconstruct", revision=1)
 
 _TRUTH_GAP_NS = 250_000_000
+_ACTOR_GAP_NS = 2_000_000_000
 _UNKNOWN_SIGMA = (0.3, np.radians(1.0))
 """Camera pose noise (m, rad) taken for telling people apart where nobody states it: METHODS' medium level."""
 
@@ -112,7 +113,7 @@ def reconstruct(
         progress.start("Reconstructing", 4)
         cameras = _load_cameras(folder, description, settings)
         progress.advance()
-        observations, association = _observe(cameras, description, settings)
+        observations, association = _observe(folder, cameras, description, settings)
         progress.advance()
         views = _views(cameras, observations, settings, workers)
         solve = _solver(cameras, observations, settings, workers)
@@ -169,15 +170,19 @@ def _load_camera(
 ) -> Camera:
     tables = folder / "cameras" / name
     trajectory = trajectory_from(read_table(tables / "poses.parquet", POSES))
+    frames = read_table(tables / "frames.parquet", FRAMES)
     keypoints = read_table(tables / "keypoints.parquet", KEYPOINTS)
+    confident = keypoints[keypoints["confidence"] >= settings.min_confidence]
+    detections = detections_from(confident, joints)
     return Camera(
         name=name,
         intrinsics=entry.intrinsics.intrinsics(),
-        frame_t_ns=read_table(tables / "frames.parquet", FRAMES)["t_ns"].to_numpy(np.int64),
+        frame_t_ns=frames["t_ns"].to_numpy(np.int64),
         trajectory=trajectory,
         static=entry.poses.static,
         sigma=_stated_sigma(name, entry, trajectory, settings),
-        detections=detections_from(keypoints[keypoints["confidence"] >= settings.min_confidence], joints),
+        # From here on frames count the rows of the table: pictures without a time are not in it.
+        detections=replace(detections, frame=np.searchsorted(frames["frame"].to_numpy(), detections.frame)),
     )
 
 
@@ -213,11 +218,20 @@ def _load_truth(folder: Path, description: Description, observations: Observatio
     return interpolate_points(truth.t_ns, truth.position, observations.t_ns, max_gap_ns=_TRUTH_GAP_NS)
 
 
+def _load_actor(folder: Path, description: Description, t_ns: Int64) -> Float | None:
+    """The logged actor [T, 3] at given times, NaN where the log says nothing."""
+    if description.actor is None:
+        return None
+    table = read_table(folder / "actor.parquet", ACTOR)
+    position = table[["x", "y", "z"]].to_numpy(np.float64)
+    return interpolate_points(table["t_ns"].to_numpy(np.int64), position, t_ns, max_gap_ns=_ACTOR_GAP_NS)
+
+
 # --- the work ------------------------------------------------------------------------------------------
 
 
 def _observe(
-    cameras: list[Camera], description: Description, settings: Settings
+    folder: Path, cameras: list[Camera], description: Description, settings: Settings
 ) -> tuple[Observations, Association]:
     max_gap_ns = round(description.pose_interpolation.max_gap_s * 1e9)
     max_extrapolation_ns = round(description.pose_interpolation.max_extrapolation_s * 1e9)
@@ -229,6 +243,7 @@ def _observe(
         found.position,
         found.rotation,
         _ray_sigma(cameras, found.t_ns, found.position, settings),
+        actor=_load_actor(folder, description, found.t_ns),
         people=settings.people,
     )
     observations = observe(

@@ -39,6 +39,8 @@ _MAGIC = b"SQLite format 3\0"
 _INFORMATION = "rosbag2_bagfile_information"
 _METADATA_LIMIT = 16 << 20  # bytes of a metadata.yaml
 _LARGEST_ROWID = 1 << 48
+_SMALLEST_ROW = 6  # bytes a row takes in a file at the least: its length, its number, a header of four
+_MOST_ATTEMPTS = 10_000  # to go on behind damage
 _SUFFIXES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 
 
@@ -169,11 +171,15 @@ class _Sqlite3Part(LogPart):
             "FROM messages WHERE rowid > ? ORDER BY rowid"
         )
         numbers = array("q")
+        # Pages of a damaged file can lead in circles and show rows without end.
+        most = 4 * (self.file_size // _SMALLEST_ROW)
+        attempts = 0
         last, step, whole = -1, 1, False
-        while not whole and last < _LARGEST_ROWID:
+        while not whole and last < _LARGEST_ROWID and attempts < _MOST_ATTEMPTS:
+            attempts += 1
             try:
                 for row in self.database.execute(query, (last,)):
-                    if row[0] <= last:  # pages that lead in a circle
+                    if row[0] <= last or len(numbers) >= most:
                         raise sqlite3.DatabaseError
                     numbers.extend(row)
                     last, step = row[0], 1

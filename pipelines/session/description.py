@@ -51,6 +51,7 @@ class FramesEntry(Entry):
     first_t_ns: int
     last_t_ns: int
     rate_hz: float | None  # None for a single frame
+    dropped: dict[str, int] = {}  # frames that the video has lost
 
 
 class PosesEntry(Entry):
@@ -96,6 +97,27 @@ class CameraEntry(Entry):
     media: str | None
 
 
+class ActorEntry(Entry):
+    """Where the actor was, as logged."""
+
+    source: str
+    point: str  # of the body: hip, head, feet, centre
+    count: int
+    dropped: dict[str, int]
+
+
+class MapEntry(Entry):
+    """What stands around; unknown voxels count neither as occupied nor as free."""
+
+    source: str
+    unknown: str  # what the planner takes unknown voxels for
+    resolution_m: float
+    shape: list[int]
+    occupied: int
+    free: int
+    dropped: dict[str, int]
+
+
 class TruthEntry(Entry):
     """What is known to be true."""
 
@@ -121,6 +143,8 @@ class Description(Entry):
     clock_reference: str
     pose_interpolation: Interpolation
     cameras: dict[str, CameraEntry]
+    actor: ActorEntry | None = None
+    map: MapEntry | None = None
     truth: TruthEntry | None
     sources: dict[str, str]  # path as the manifest states it -> sha256
     warnings: list[str]

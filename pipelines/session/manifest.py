@@ -105,7 +105,7 @@ class World(Part):
 
 
 class LogClock(Part):
-    """How a recorder's clock relates to the world's: world time = log time * (1 + drift) + offset."""
+    """How a recorder's clock relates to the world's: the offset at the first message, and the drift since."""
 
     offset_s: float = 0.0
     drift_ppm: float = 0.0
@@ -209,6 +209,7 @@ class Gimbal(Part):
     relative_to: Literal["world", "body"]
     order: Literal["ypr", "rpy"] = "ypr"
     units: Literal["deg", "rad"] = "deg"
+    axes: Axes | None = None
 
 
 class IntrinsicsSource(Part):

@@ -36,6 +36,15 @@ KEYPOINTS = pa.schema(
         ("confidence", pa.float64()),
     ]
 )
+ACTOR = pa.schema(
+    [
+        ("t_ns", pa.int64()),
+        ("person", pa.int64()),
+        ("x", pa.float64()),
+        ("y", pa.float64()),
+        ("z", pa.float64()),
+    ]
+)
 TRUTH = pa.schema(
     [
         ("t_ns", pa.int64()),

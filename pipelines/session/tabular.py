@@ -22,11 +22,20 @@ _POSITION = ["x", "y", "z"]
 _QUATERNION = ["qx", "qy", "qz", "qw"]
 
 
-def frames_table(t_ns: Int64) -> pd.DataFrame:
-    """Frames 0, 1, ... and their world times, as rows of `tables.FRAMES`."""
+def frames_table(frame: Int64, t_ns: Int64, pts_ns: Int64) -> pd.DataFrame:
+    """Frames with their world times and their place in the video, as rows of `tables.FRAMES`."""
     import pandas as pd
 
-    return pd.DataFrame({"frame": np.arange(len(t_ns)), "t_ns": t_ns, "pts_ns": t_ns - t_ns[0]})
+    return pd.DataFrame({"frame": frame, "t_ns": t_ns, "pts_ns": pts_ns})
+
+
+def actor_table(trajectory: Trajectory) -> pd.DataFrame:
+    """Where the actor was, as rows of `tables.ACTOR`; person 0."""
+    import pandas as pd
+
+    table = pd.DataFrame({"t_ns": trajectory.t_ns, "person": 0})
+    table[_POSITION] = trajectory.position
+    return table
 
 
 def pose_table(trajectory: Trajectory) -> pd.DataFrame:
@@ -57,8 +66,14 @@ def trajectory_from(table: pd.DataFrame) -> Trajectory:
     )
 
 
-def keypoints_table(detections: Detections, frames_t_ns: Int64) -> pd.DataFrame:
-    """The joints that were found, as rows of `tables.KEYPOINTS`; `frames_t_ns[k]` is the time of frame k."""
+def keypoints_table(detections: Detections, known_frame: Int64, t_ns: Int64) -> pd.DataFrame:
+    """The joints that were found, as rows of `tables.KEYPOINTS`.
+
+    Args:
+        detections: in known frames only.
+        known_frame: [F] sorted.
+        t_ns: [F] their times.
+    """
     import pandas as pd
 
     row, joint = np.nonzero(~np.isnan(detections.xy[..., 0]))
@@ -66,7 +81,7 @@ def keypoints_table(detections: Detections, frames_t_ns: Int64) -> pd.DataFrame:
     return pd.DataFrame(
         {
             "frame": frame,
-            "t_ns": frames_t_ns[frame],
+            "t_ns": t_ns[np.searchsorted(known_frame, frame)],
             "person": detections.person[row],
             "joint": np.array(detections.joints, dtype=object)[joint],
             "x": detections.xy[row, joint, 0],

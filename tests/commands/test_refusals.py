@@ -29,9 +29,9 @@ def test_unknown_key_names_the_nearest(flight: SyntheticFlight) -> None:
 @pytest.mark.parametrize(
     ("change", "part"),
     [
-        ({"map": "site.bt"}, "map"),
+        ({"map": {"log": "d1", "topic": "/octomap"}}, "map.log"),
         ({"plan": {"log": "d1"}}, "plan"),
-        ({"actor": {"log": "d1", "topic": "/actor"}}, "actor"),
+        ({"actors": {"anna": {"log": "d1", "topic": "/actor"}}}, "actors"),
     ],
 )
 def test_parts_whose_readers_come_later_are_refused(
@@ -41,6 +41,15 @@ def test_parts_whose_readers_come_later_are_refused(
     flight.save()
     line = refused("ingest", flight.manifest)
     assert f"{part}: this version has no reader for it yet" in line
+
+
+@pytest.mark.parametrize("change", [{"map": "site.bt"}, {"truth": "true.csv"}])
+def test_file_that_is_not_there(flight: SyntheticFlight, change: dict[str, object]) -> None:
+    flight.settings.update(change)
+    flight.save()
+    line = refused("ingest", flight.manifest)
+    assert "No such file" in line
+    assert "check the path" in line
 
 
 def test_nan_poses_are_counted_and_the_rest_is_used(flight: SyntheticFlight, tmp_path: Path) -> None:

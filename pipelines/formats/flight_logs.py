@@ -1,0 +1,275 @@
+"""What a manifest takes from logs: which recording, which topic, and what it holds there.
+
+A topic that is left out is the only candidate of its kind, and what was chosen is said. Every reading
+is one pass over the messages of one topic: logs of any size stream.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pipelines.formats.log_messages import Kind, all_samples, kind_of
+from pipelines.formats.log_trajectories import (
+    Gathered,
+    StampCheck,
+    attitudes_of,
+    chained,
+    trajectory_of,
+    transforms_of,
+)
+from pipelines.geometry.poses import compose, matrix_from_quaternion, quaternion_from_rotation_vector
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import Flight
+from pipelines.session.manifest import Log as LogSource
+from pipelines.session.records import Int64, IntrinsicsSample, PictureSample, Trajectory
+from pipelines.session.registries import Log, LogFormat, recognise
+
+_MAY_DISAGREE_S = 0.5  # header and receive stamps: transport and decoding take less
+_MAY_JUMP_S = 1.0  # from one message to the next, beyond what time itself passed
+
+_NOUNS: dict[Kind, str] = {
+    "poses": "poses",
+    "transforms": "transforms",
+    "angles": "gimbal angles",
+    "intrinsics": "camera info",
+    "pictures": "pictures",
+}
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The pictures of a topic: when each was taken, strictly increasing."""
+
+    t_ns: Int64
+    dropped: dict[str, int] = field(default_factory=dict)
+
+
+class FlightLogs:
+    """The logs of one flight.
+
+    Args:
+        flight: the manifest.
+        base: the folder that its paths are relative to.
+        note: told what was chosen and what is doubtful, one line each.
+    """
+
+    def __init__(self, flight: Flight, base: Path, note: Callable[[str], None]) -> None:
+        self._flight = flight
+        self._base = base
+        self._note = note
+
+    def settings(self, log: str) -> LogSource:
+        """What the manifest says of a log: one of its names, or a path."""
+        return self._flight.logs.get(log) or LogSource(path=[log])
+
+    def paths(self, log: str) -> list[Path]:
+        """The files of a log."""
+        return [self._base / path for path in self.settings(log).path]
+
+    def trajectory(
+        self, log: str, topic: str | None, parent: str | None, child: str | None, *, max_gap_ns: int
+    ) -> Trajectory:
+        """Poses in the log's own world and axes, at world times.
+
+        Raises:
+            DataError: no such topic or frame, several candidates, or nothing usable.
+        """
+        with self._open(log) as (recording, source):
+            if parent is not None and child is not None:
+                gathered = self._chained(log, recording, source, topic, parent, child, max_gap_ns)
+            else:
+                name = self._choose(recording, source, "poses", topic)
+                messages = recording.messages([name])
+                gathered = trajectory_of(
+                    all_samples(messages, source),
+                    f"{source} {name}",
+                    stamps=self.settings(log).stamps,
+                    may_disagree_s=_MAY_DISAGREE_S,
+                    may_jump_s=_MAY_JUMP_S,
+                )
+            lost = dict(recording.dropped)
+        return self._at_world_times(log, source, gathered, lost)
+
+    def attitudes(
+        self,
+        log: str,
+        topic: str,
+        *,
+        order: Literal["ypr", "rpy"],
+        units: Literal["deg", "rad"],
+    ) -> Trajectory:
+        """A gimbal's attitude in the log's axes, at world times; its positions mean nothing."""
+        with self._open(log) as (recording, source):
+            name = self._choose(recording, source, "angles", topic)
+            gathered = attitudes_of(
+                all_samples(recording.messages([name]), source),
+                f"{source} {name}",
+                stamps=self.settings(log).stamps,
+                order=order,
+                units=units,
+                may_disagree_s=_MAY_DISAGREE_S,
+                may_jump_s=_MAY_JUMP_S,
+            )
+            lost = dict(recording.dropped)
+        return self._at_world_times(log, source, gathered, lost)
+
+    def intrinsics(self, log: str, topic: str | None) -> IntrinsicsSample:
+        """The first camera info of a topic.
+
+        Raises:
+            DataError: no such topic, or it is empty or changes during the flight.
+        """
+        with self._open(log) as (recording, source):
+            name = self._choose(recording, source, "intrinsics", topic)
+            first: IntrinsicsSample | None = None
+            for sample in all_samples(recording.messages([name]), source):
+                if not isinstance(sample, IntrinsicsSample):
+                    raise DataError(source, f"{name} holds no camera info", "name another topic")
+                if first is not None and sample.intrinsics != first.intrinsics:
+                    raise DataError(
+                        source,
+                        f"{name} changes during the flight (zoom?)",
+                        "give one calibration in a file or inline",
+                    )
+                first = first or sample
+        if first is None:
+            raise DataError(source, f"{name} is empty", "name another topic, or give the intrinsics")
+        return first
+
+    def frames(self, log: str, topic: str | None) -> Frames:
+        """When the pictures of a topic were taken, at world times.
+
+        Raises:
+            DataError: no such topic, or no picture in it.
+        """
+        settings = self.settings(log)
+        stamps: list[int] = []
+        with self._open(log) as (recording, source):
+            name = self._choose(recording, source, "pictures", topic)
+            for sample in all_samples(recording.messages([name]), source):
+                if not isinstance(sample, PictureSample):
+                    raise DataError(source, f"{name} holds no pictures", "name another topic")
+                by_header = settings.stamps == "header" and sample.stamp_ns
+                stamps.append(sample.stamp_ns if by_header else sample.receive_ns)
+            lost = Counter(recording.dropped)
+        t_ns = np.array(stamps, dtype=np.int64)
+        if not len(t_ns):
+            raise DataError(source, f"{name} holds no picture", "name another topic")
+        rising = t_ns > np.concatenate([[t_ns[0] - 1], np.maximum.accumulate(t_ns)[:-1]])
+        if not rising.all():
+            lost["picture without a later stamp"] += int((~rising).sum())
+        return Frames(self._world_times(log, t_ns[rising]), dict(lost))
+
+    @contextmanager
+    def _open(self, log: str) -> Iterator[tuple[Log, str]]:
+        paths = self.paths(log)
+        recording_format = recognise(paths[0], LogFormat, "log")
+        with recording_format.open_log(paths) as recording:
+            yield recording, str(paths[0])
+
+    def _choose(self, recording: Log, source: str, kind: Kind, topic: str | None) -> str:
+        """The topic that is named, or the only one of its kind."""
+        there = {candidate.name: candidate for candidate in recording.topics if kind_of(candidate) == kind}
+        listed = ", ".join(sorted(there)) or "none"
+        if topic is not None:
+            every = {candidate.name: candidate for candidate in recording.topics}
+            if topic in there:
+                return topic
+            if topic in every:
+                problem = f"topic {topic} holds {every[topic].type}, no {_NOUNS[kind]}"
+            else:
+                problem = f"has no topic {topic}"
+            raise DataError(source, problem, f"topics with {_NOUNS[kind]}: {listed}")
+        if len(there) != 1:
+            problem = f"has {len(there)} topics with {_NOUNS[kind]} ({listed})"
+            raise DataError(source, problem, "say which with `topic:`" if there else "name another log")
+        (only,) = there
+        self._note(f"{source}: took {_NOUNS[kind]} from {only}, the only candidate")
+        return only
+
+    def _chained(
+        self,
+        log: str,
+        recording: Log,
+        source: str,
+        topic: str | None,
+        parent: str,
+        child: str,
+        max_gap_ns: int,
+    ) -> Gathered:
+        names = [candidate.name for candidate in recording.topics if kind_of(candidate) == "transforms"]
+        if topic is not None:
+            names = [self._choose(recording, source, "transforms", topic)]
+        static = [name for name in names if name.endswith("static")]
+        moving = [name for name in names if name not in static]
+        transforms = transforms_of(
+            all_samples(recording.messages(moving), source),
+            source,
+            static=all_samples(recording.messages(static), source),
+        )
+        return chained(
+            transforms,
+            source,
+            parent=parent,
+            child=child,
+            stamps=self.settings(log).stamps,
+            max_gap_ns=max_gap_ns,
+            may_disagree_s=_MAY_DISAGREE_S,
+            may_jump_s=_MAY_JUMP_S,
+        )
+
+    def _at_world_times(self, log: str, source: str, gathered: Gathered, lost: dict[str, int]) -> Trajectory:
+        self._doubt(source, self.settings(log).stamps, gathered.stamps)
+        trajectory = gathered.trajectory
+        return replace(
+            trajectory,
+            t_ns=self._world_times(log, trajectory.t_ns),
+            dropped=dict(Counter(trajectory.dropped) + Counter(lost)),
+        )
+
+    def _world_times(self, log: str, t_ns: Int64) -> Int64:
+        clock = self.settings(log).clock
+        since_start = t_ns - t_ns[0]
+        drift_ns = np.round(since_start * (clock.drift_ppm * 1e-6)).astype(np.int64)
+        world_ns: Int64 = t_ns + drift_ns + round(clock.offset_s * 1e9)
+        return world_ns
+
+    def _doubt(self, source: str, stamps: str, check: StampCheck) -> None:
+        """Say how the stamps of a log disagree with each other."""
+        used = f"{stamps} stamps are used"
+        if check.without_header:
+            self._note(
+                f"{source}: {check.without_header} of {check.count} messages have no header stamp,"
+                " their time of receipt is taken"
+            )
+        if check.disagreeing:
+            self._note(
+                f"{source}: header and receive stamps disagree by up to {check.largest_disagreement_s:.3g} s"
+                f" in {check.disagreeing} of {check.count} messages; {used}"
+            )
+        for jump in check.jumps[:5]:
+            self._note(
+                f"{source}: the clock jumps by {jump.jump_s:.3g} s at {jump.header_ns / 1e9:.3f} s; {used}"
+            )
+
+
+def in_world(trajectory: Trajectory, log: LogSource) -> Trajectory:
+    """A trajectory in the ENU axes of its log, moved to where the log's origin lies in the world."""
+    place = log.world_from_log
+    turn = quaternion_from_rotation_vector(np.array([0.0, 0.0, np.radians(place.yaw_deg)]))
+    position, quaternion = compose(
+        (np.array(place.translation), turn), (trajectory.position, trajectory.quaternion_xyzw)
+    )
+    covariance = trajectory.covariance
+    if covariance is not None:
+        rotated = np.eye(6)
+        rotated[:3, :3] = matrix_from_quaternion(turn)  # the rotation part stays in the body
+        covariance = rotated @ covariance @ rotated.T
+    return replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)

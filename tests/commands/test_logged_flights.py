@@ -1,0 +1,167 @@
+"""Flights whose poses, intrinsics and pictures are in logs: every container, and what damage does."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipelines.geometry.poses import conjugate, multiply
+from tests.commands.runner import content, mocap, refused, succeeds
+from tests.synthetic.logged_flights import write_logged_flight
+from tests.synthetic.logs import CONTAINERS, Container, cut
+
+
+def ingested(folder: Path) -> tuple[Path, dict[str, Any]]:
+    succeeds("ingest", folder / "flight.yaml")
+    session = folder / "flight.session"
+    return session, json.loads((session / "session.json").read_text(encoding="utf-8"))
+
+
+def tables(session: Path) -> dict[str, str]:
+    """What the session holds of the flight; session.json names the logs, which differ."""
+    return {name: digest for name, digest in content(session).items() if name.endswith(".parquet")}
+
+
+def test_every_container_gives_the_same_session(tmp_path: Path) -> None:
+    sessions, described = [], []
+    for container in CONTAINERS:
+        write_logged_flight(tmp_path / container, container)
+        session, description = ingested(tmp_path / container)
+        sessions.append(tables(session))
+        del description["sources"], description["warnings"]
+        for camera in description["cameras"].values():
+            del camera["poses"]["source"]
+        described.append(description)
+    assert len(sessions) >= 4
+    assert sessions[0]
+    assert all(session == sessions[0] for session in sessions)
+    assert all(description == described[0] for description in described)
+
+
+@pytest.mark.parametrize("container", ["ros1", "ros2-mcap"])
+def test_poses_of_the_body_become_those_of_the_camera(tmp_path: Path, container: Container) -> None:
+    flight = write_logged_flight(tmp_path, container)
+    session, description = ingested(tmp_path)
+    for k, name in enumerate(flight.cameras):
+        poses = pd.read_parquet(session / "cameras" / name / "poses.parquet")
+        assert list(poses["t_ns"]) == list(flight.t_ns)
+        # Doubles all the way: a few roundings of numbers of 10 m.
+        assert np.abs(poses[["x", "y", "z"]].to_numpy() - flight.camera_position[k]).max() < 1e-9
+        logged = poses[["qx", "qy", "qz", "qw"]].to_numpy()
+        apart = multiply(conjugate(flight.camera_quaternion[k]), logged)[:, :3]
+        assert np.abs(apart).max() < 1e-9
+        # The lever arm of 0.11 m turns 0.01 rad of the body into 1.1 mm of the camera: next to nothing.
+        assert np.sqrt(poses["c22"].to_numpy()) == pytest.approx(0.3, abs=0.001)
+        intrinsics = description["cameras"][name]["intrinsics"]
+        assert (intrinsics["width"], intrinsics["fx"]) == (1280, 762.0)
+    result = json.loads(succeeds("reconstruct", session, "--json"))
+    assert result["mpjpe_mm"] < 0.5
+
+
+def test_a_topic_that_is_left_out_is_chosen_and_said(tmp_path: Path) -> None:
+    flight = write_logged_flight(tmp_path, "ros2-sqlite3")
+    for name in flight.cameras:
+        del flight.settings["cameras"][name]["pose"]["topic"]
+    flight.save()
+    done = mocap("ingest", flight.manifest)
+    assert done.returncode == 0
+    assert "took poses from /drone1/odometry, the only candidate" in done.stderr
+
+
+def test_missing_topic_lists_the_candidates(tmp_path: Path) -> None:
+    flight = write_logged_flight(tmp_path, "ros2-mcap")
+    flight.settings["cameras"]["drone1"]["pose"]["topic"] = "/drone1/odom"
+    flight.save()
+    line = refused("ingest", flight.manifest)
+    assert "has no topic /drone1/odom" in line
+    assert "/drone1/odometry" in line
+    flight.settings["cameras"]["drone1"]["pose"]["topic"] = "/drone1/camera_info"
+    flight.save()
+    assert "CameraInfo" in refused("ingest", flight.manifest)
+
+
+@pytest.mark.parametrize("container", ["ros1", "mcap-cdr"])
+def test_truncated_log_is_salvaged_and_the_loss_is_said(tmp_path: Path, container: Container) -> None:
+    flight = write_logged_flight(tmp_path, container, seconds=3.0)
+    (log,) = [path for path in (tmp_path / "logs").iterdir() if path.name.startswith("drone2")]
+    cut(log, 0.4)
+    done = mocap("ingest", flight.manifest)
+    assert done.returncode == 0, done.stderr
+    lost = [line for line in done.stderr.splitlines() if "drone2" in line and "dropped" in line]
+    assert lost, done.stderr
+    stored = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
+    poses = stored["cameras"]["drone2"]["poses"]
+    assert 0 < poses["count"] < len(flight.t_ns)
+    assert poses["dropped"]
+    assert stored["cameras"]["drone1"]["poses"]["dropped"] == {}
+
+
+def test_log_of_nothing_but_its_head_is_refused(tmp_path: Path) -> None:
+    flight = write_logged_flight(tmp_path, "mcap-cdr")
+    (log,) = [path for path in (tmp_path / "logs").iterdir() if path.name.startswith("drone2")]
+    log.write_bytes(log.read_bytes()[:40])
+    assert "drone2" in refused("ingest", flight.manifest)
+
+
+def test_bag_folder_without_metadata(tmp_path: Path) -> None:
+    flight = write_logged_flight(tmp_path, "ros2-sqlite3")
+    with_metadata, _ = ingested(tmp_path)
+    before = tables(with_metadata)
+    for metadata in (tmp_path / "logs").rglob("metadata.yaml"):
+        metadata.unlink()
+    succeeds("ingest", flight.manifest)
+    assert tables(with_metadata) == before
+
+
+def test_clock_jump_is_said(tmp_path: Path) -> None:
+    flight = write_logged_flight(tmp_path, "mcap-cdr")
+    settings = flight.settings["cameras"]["drone1"]["pose"]
+    # The recorder's clock was set back by an hour before drone2 took off: its header stamps disagree.
+    flight.settings["logs"] = {
+        "d1": {"path": settings["log"], "clock": {"offset_s": 3600}},
+    }
+    settings["log"] = "d1"
+    flight.save()
+    line = refused("ingest", flight.manifest)
+    assert "drone1" in line
+    assert "check clocks" in line
+
+
+def test_video_shorter_than_its_log_is_said(tmp_path: Path) -> None:
+    flight = write_logged_flight(tmp_path, "mcap-cdr", seconds=4.0)
+    camera = flight.settings["cameras"]["drone1"]
+    keypoints = tmp_path / camera["keypoints"]["path"]
+    people = json.loads(keypoints.read_text(encoding="utf-8"))
+    keypoints.write_text(json.dumps(people[:30]), encoding="utf-8")
+    del camera["video"]
+    camera["frame_times"] = {"start": int(flight.t_ns[0]) // 10**9, "fps": 30}
+    flight.save()
+    done = mocap("ingest", flight.manifest)
+    assert done.returncode == 0
+    assert "drone1: its pictures cover 1.0 s of 4.0 s of poses" in done.stderr
+
+
+def test_keypoints_beyond_the_pictures_are_counted(tmp_path: Path) -> None:
+    flight = write_logged_flight(tmp_path, "mcap-cdr")
+    camera = flight.settings["cameras"]["drone1"]
+    keypoints = tmp_path / camera["keypoints"]["path"]
+    people = json.loads(keypoints.read_text(encoding="utf-8"))
+    beyond = [{**person, "image_id": f"{100 + k:06d}.jpg"} for k, person in enumerate(people[:3])]
+    keypoints.write_text(json.dumps(people + beyond), encoding="utf-8")
+    done = mocap("ingest", flight.manifest)
+    assert done.returncode == 0, done.stderr
+    assert "drone1: keypoints dropped: 3 detections in frames without a time" in done.stderr
+
+
+def test_moved_flight_is_the_same_flight(tmp_path: Path) -> None:
+    write_logged_flight(tmp_path / "here", "ros2-mcap")
+    session, _ = ingested(tmp_path / "here")
+    shutil.copytree(tmp_path / "here", tmp_path / "there")
+    assert "unchanged" in succeeds("ingest", tmp_path / "there" / "flight.yaml")
+    assert content(tmp_path / "there" / "flight.session") == content(session)

@@ -1,0 +1,100 @@
+"""The flight of two drones as their recorders bring it home: odometry, camera info and pictures in a log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.mounting import body_from_camera
+from pipelines.geometry.poses import compose, invert
+from tests.synthetic.flights import LENS, START_NS, SyntheticFlight, write_flight
+from tests.synthetic.logs import Container, Entry, write_log
+
+LEVER_ARM = (0.10, 0.0, -0.05)
+LATE_NS = 4_000_000  # a message is received this long after its header stamp
+
+
+def write_logged_flight(
+    folder: Path, container: Container, *, cameras: int = 2, seconds: float = 0.5
+) -> SyntheticFlight:
+    """A clean flight whose poses, intrinsics and frame times are in one log for each drone.
+
+    The odometry is that of a body which carries its camera 30 degrees down on a lever arm. Pictures are
+    plain and 16 pixels wide: only their stamps matter.
+    """
+    flight = write_flight(folder, cameras=cameras, seconds=seconds, clean=True, keypoint_format="alphapose")
+    for k, name in enumerate(flight.cameras):
+        entries = sorted(
+            [*_odometry(flight, k, name), *_camera_info(flight, name), *_pictures(flight, name)],
+            key=lambda entry: (entry.stamp_ns, entry.topic),
+        )
+        log = write_log(folder / "logs", name, container, entries)
+        camera = flight.settings["cameras"][name]
+        where = {"log": str(log.relative_to(folder))}
+        del camera["frame_times"]
+        camera["video"] = {**where, "topic": f"/{name}/image/compressed"}
+        camera["pose"] = {**where, "topic": f"/{name}/odometry", "of": "body"}
+        camera["mount"] = {"looks": "forward", "down_deg": 30, "translation": list(LEVER_ARM)}
+        camera["intrinsics"] = where
+    flight.save()
+    return flight
+
+
+def header(stamp_ns: int, frame: str) -> dict[str, Any]:
+    """A header as every stamped message has it."""
+    return {"stamp": stamp_ns, "frame_id": frame}
+
+
+def _odometry(flight: SyntheticFlight, k: int, name: str) -> list[Entry]:
+    camera_from_body = invert(np.array(LEVER_ARM), body_from_camera("forward", 30.0))
+    position, quaternion = compose((flight.camera_position[k], flight.camera_quaternion[k]), camera_from_body)
+    entries = []
+    for stamp_ns, at, turned in zip(flight.t_ns, position, quaternion, strict=True):
+        pose = {
+            "position": dict(zip("xyz", at.tolist(), strict=True)),
+            "orientation": dict(zip("xyzw", turned.tolist(), strict=True)),
+        }
+        fields = {
+            "header": header(int(stamp_ns), "map"),
+            "child_frame_id": f"{name}/base_link",
+            "pose": {"pose": pose, "covariance": _covariance()},
+        }
+        received = int(stamp_ns) + LATE_NS
+        entries.append(Entry(f"/{name}/odometry", "nav_msgs/msg/Odometry", received, fields))
+    return entries
+
+
+def _covariance() -> NDArray[np.float64]:
+    return np.diag([0.04, 0.04, 0.09, 1e-4, 1e-4, 1e-4]).ravel()
+
+
+def _camera_info(flight: SyntheticFlight, name: str) -> list[Entry]:
+    fields = {
+        "header": header(START_NS, name),
+        "width": LENS.width,
+        "height": LENS.height,
+        "distortion_model": "plumb_bob",
+        "d": np.array([*LENS.distortion, 0.0]),
+        "k": np.array([LENS.fx, 0, LENS.cx, 0, LENS.fy, LENS.cy, 0, 0, 1.0]),
+    }
+    return [
+        Entry(f"/{name}/camera_info", "sensor_msgs/msg/CameraInfo", int(stamp_ns) + LATE_NS, fields)
+        for stamp_ns in flight.t_ns[:3]
+    ]
+
+
+def _pictures(flight: SyntheticFlight, name: str) -> list[Entry]:
+    _, jpeg = cv2.imencode(".jpg", np.full((9, 16, 3), 90, np.uint8))
+    return [
+        Entry(
+            f"/{name}/image/compressed",
+            "sensor_msgs/msg/CompressedImage",
+            int(stamp_ns) + LATE_NS,
+            {"header": header(int(stamp_ns), name), "format": "jpeg", "data": jpeg.ravel()},
+        )
+        for stamp_ns in flight.t_ns
+    ]
