@@ -40,6 +40,7 @@ def init_command(
     missing: read the manifest before you ingest it.
     """
     from pipelines.draft import draft
+    from pipelines.session.storage import jsonable
 
     with watching(level(quiet, verbose)) as progress:
         result = draft(paths, output, overwrite=overwrite, progress=progress)
@@ -50,15 +51,14 @@ def init_command(
             for remark in remarks:
                 click.echo(f"{word}: {one_line(remark)}", err=True)
     if as_json:
-        print_json(
-            {
-                "flight": str(result.path),
-                "cameras": result.cameras,
-                "missing": result.missing,
-                "assumed": result.assumed,
-                "left_out": {str(left.path): left.reason for left in result.left_out},
-            }
-        )
+        summary = {
+            "flight": str(result.path),
+            "cameras": result.cameras,
+            "missing": result.missing,
+            "assumed": result.assumed,
+            "left_out": {str(left.path): left.reason for left in result.left_out},
+        }
+        print_json(jsonable(summary))
     else:
         click.echo(f"cameras: {', '.join(result.cameras) or 'none'}")
         click.echo(f"written: {_from_here(result.path)}")

@@ -242,11 +242,13 @@ class _Search:
     def _is_whole(self, folder: Path, children: Sequence[Path], format_: Format) -> bool:
         """Whether a folder that a format recognises is one thing, and not a place where such things lie.
 
-        Files of keypoints, one for each camera, are recognised as a folder too, and so are the files of a
-        bag beside the videos of its flight.
+        Files of keypoints, one for each camera, are recognised as a folder too, and so are a log that lies
+        alone in a folder and the files of a bag beside the videos of its flight.
         """
         if isinstance(format_, LogFormat):
-            return all(_kind(f) is LogFormat for child in children for f in self._recognising(child))
+            inside = [_kind(f) for child in children for f in self._recognising(child)]
+            alone = len(inside) == 1 and not (folder / "metadata.yaml").exists()
+            return not alone and all(kind is LogFormat for kind in inside)
         if not isinstance(format_, KeypointFormat):
             return True
         files = [child for child in children if child.suffix.lower() == ".json"]

@@ -169,6 +169,9 @@ class CameraText:
         if not choice.named:
             remarks.append("assumed: they are its own")
             self._assume("pose: that these poses are its own")
+        if taken.is_true:
+            remarks.append("assumed: these poses, called the truth, for there are no others")
+            self._assume("pose: what is called the truth, for there is nothing else")
         filmed = self._camera.filmed
         if filmed and taken.span and filmed.overlap_ns(taken.span) < 0:
             remarks.append(f"missing: it was filmed at other times, {spanned(filmed)}")

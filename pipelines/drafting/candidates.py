@@ -53,6 +53,7 @@ class Candidate:
     span: Span | None = None
     topic: TopicFound | None = None
     of_body: bool = False  # poses of the body; else of the camera
+    is_true: bool = False  # called the truth
     ned_hint: str = ""  # a name that sounds like north-east-down
 
     def affinity(self, label: Label) -> int:
@@ -94,12 +95,14 @@ def moving_poses(findings: Findings, logs: Mapping[str, Recording]) -> list[Cand
 
 def true_poses(findings: Findings) -> list[Candidate]:
     """Trajectories that are called the truth."""
-    return [c for c in (_trajectory(found) for found in findings.poses if _is_true(found)) if c]
+    files = (_trajectory(found) for found in findings.poses if _is_true(found))
+    return [replace(candidate, is_true=True) for candidate in files if candidate]
 
 
 def true_topics(logs: Mapping[str, Recording]) -> list[Candidate]:
     """Topics of poses that are called the truth."""
-    return [c for c in _topics(logs, "poses", _of_pose_topic) if c.topic and is_truth(c.topic)]
+    topics = _topics(logs, "poses", _of_pose_topic)
+    return [replace(c, is_true=True) for c in topics if c.topic and is_truth(c.topic)]
 
 
 def actors(logs: Mapping[str, Recording]) -> list[Candidate]:

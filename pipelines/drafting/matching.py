@@ -97,7 +97,7 @@ def match(findings: Findings) -> Draft:
     for camera in cameras:
         choose = _Chooser(camera, cameras, anchors)
         camera.poses = _beside(choose(moving), choose(still)) or choose(truth) or choose(of.true_topics(logs))
-        if camera.poses and camera.poses.taken not in truth:
+        if camera.poses and not camera.poses.taken.is_true:
             camera.true_poses = choose(truth)
         camera.intrinsics = choose(lenses, shared=True)
         camera.frame_times = choose(stamps) if "log" not in _video(camera) else None

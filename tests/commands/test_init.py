@@ -1,0 +1,371 @@
+"""`mocap init`: what it drafts is what the flight was, or says what is missing."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ruamel.yaml import YAML
+
+from pipelines.draft import Drafted, draft
+from pipelines.ingest import ingest
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import read_flight
+from tests.commands.runner import content, mocap, refused, succeeds
+from tests.real_data import real_data
+from tests.synthetic.flights import LENS, START_NS, SyntheticFlight, write_flight
+from tests.synthetic.logged_flights import LEVER_ARM, header, write_logged_flight
+from tests.synthetic.logs import Container, Entry, cut, write_mcap
+from tests.synthetic.videos import even_ticks, write_video
+
+
+def drafted(folder: Path) -> tuple[Drafted, dict[str, Any]]:
+    """The manifest of a folder, and what it says as plain YAML."""
+    result = draft([folder])
+    return result, YAML(typ="safe", pure=True).load(result.text)
+
+
+def edit(manifest: Path, edits: dict[str, str]) -> None:
+    """Replace what the manifest says, wherever it stands, as a user would."""
+    text = manifest.read_text(encoding="utf-8")
+    for old, new in edits.items():
+        assert old in text
+        text = text.replace(old, new)
+    manifest.write_text(text, encoding="utf-8")
+
+
+def tables(session: Path) -> dict[str, str]:
+    return {name: digest for name, digest in content(session).items() if name.endswith(".parquet")}
+
+
+def write_lenses(flight: SyntheticFlight) -> None:
+    """The intrinsics that the flight's manifest holds inline, as a calibration of all cameras."""
+    matrix = [[LENS.fx, 0.0, LENS.cx], [0.0, LENS.fy, LENS.cy], [0.0, 0.0, 1.0]]
+    lines = [
+        f'[cam_{k}]\nname = "{name}"\nsize = [{LENS.width}, {LENS.height}]\nmatrix = {matrix}\n'
+        f"distortions = {list(LENS.distortion)}\n"
+        for k, name in enumerate(flight.cameras)
+    ]
+    (flight.manifest.parent / "lenses.toml").write_text("\n".join(lines), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("keypoints", "poses", "static"),
+    [
+        ("alphapose", "tum", False),
+        ("openpose", "csv", False),
+        ("coco", "tum", False),
+        ("openpose", "tum", True),
+        ("coco", "tum", True),
+    ],
+)
+def test_drafted_flights_are_ingested_as_they_were_written(
+    tmp_path: Path, keypoints: str, poses: str, static: bool
+) -> None:
+    flight = write_flight(
+        tmp_path, cameras=3, fps=25, keypoint_format=keypoints, pose_format=poses, static=static
+    )
+    ingest(flight.manifest, tmp_path / "written.session")
+    flight.manifest.unlink()
+    if not static:
+        write_lenses(flight)
+
+    result, stated = drafted(tmp_path)
+    assert not result.missing
+    assert result.cameras == flight.cameras
+    assert any("fps 30" in remark for remark in result.assumed)
+    assert {camera["frame_times"]["start"] for camera in stated["cameras"].values()} == {START_NS // 10**9}
+    edit(result.path, {"fps: 30": "fps: 25"})
+    ingest(result.path)
+    assert tables(tmp_path / "flight.session") == tables(tmp_path / "written.session")
+
+
+@pytest.mark.parametrize("container", ["ros1", "ros2-sqlite3", "ros2-mcap", "mcap-cdr"])
+def test_drafted_logs_are_ingested_as_they_were_flown(tmp_path: Path, container: Container) -> None:
+    flight = write_logged_flight(tmp_path, container)
+    ingest(flight.manifest, tmp_path / "written.session")
+    flight.manifest.unlink()
+    for name in flight.cameras:
+        (
+            tmp_path / f"{name}.tum"
+        ).unlink()  # the camera's own poses: better than the body's, if they are there
+
+    result, stated = drafted(tmp_path)
+    assert not result.missing
+    assert sorted(stated["logs"]) == flight.cameras
+    for name, camera in stated["cameras"].items():
+        assert camera["video"] == {"log": name, "topic": f"/{name}/image/compressed"}
+        assert camera["pose"] == {"log": name, "topic": f"/{name}/odometry", "of": "body"}
+        assert camera["intrinsics"] == {"log": name, "topic": f"/{name}/camera_info"}
+    mount = "{looks: forward, down_deg: %g, translation: %s}"
+    edit(result.path, {mount % (0, [0, 0, 0]): mount % (30, list(LEVER_ARM))})
+    ingest(result.path)
+    assert tables(tmp_path / "flight.session") == tables(tmp_path / "written.session")
+
+
+def test_as_a_command(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, static=True)
+    flight.manifest.unlink()
+    (tmp_path / "notes.txt").write_text("windy", encoding="utf-8")
+    (tmp_path / ".hidden.json").write_text("[]", encoding="utf-8")
+    (tmp_path / "old.session").mkdir()
+    (tmp_path / "old.session" / "session.json").write_text("{}", encoding="utf-8")
+    (tmp_path / "frames").mkdir()
+    for k in range(30):
+        (tmp_path / "frames" / f"{k}.png").write_bytes(b"\x89PNG")
+
+    done = mocap("init", tmp_path)
+    assert done.returncode == 0
+    assert done.stdout.splitlines()[0] == "cameras: drone1, drone2"
+    told = done.stderr.splitlines()
+    assert f"{tmp_path}/notes.txt: not recognised, left out" in told
+    assert f"{tmp_path}/frames/*.png: 30 files not recognised, left out" in told
+    assert sum("left out" in line for line in told) == 2
+    assert [line for line in told if line.startswith("assumed: ")]
+    succeeds("ingest", tmp_path / "flight.yaml")
+
+    assert "--overwrite" in refused("init", tmp_path)
+    result = json.loads(succeeds("init", tmp_path, "--overwrite", "--json", "-q"))
+    assert result["cameras"] == ["drone1", "drone2"]
+    assert result["missing"] == []
+    assert mocap("init").returncode == 2
+    assert "PATHS" in succeeds("init", "--help")
+
+
+def test_nothing_recognised_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("windy", encoding="utf-8")
+    assert "notes.txt: not recognised" in refused("init", tmp_path / "notes.txt")
+    (tmp_path / "empty").mkdir()
+    assert "holds nothing that can be used" in refused("init", tmp_path / "empty")
+    assert not (tmp_path / "flight.yaml").exists()
+
+
+def test_what_is_missing_stands_where_it_belongs(tmp_path: Path) -> None:
+    write_flight(tmp_path).manifest.unlink()
+    for name in ("drone2.tum", "drone2_true.tum"):
+        (tmp_path / name).unlink()
+    result, stated = drafted(tmp_path)
+    assert sorted(result.missing) == [
+        "drone1, drone2: intrinsics: nothing of that name has them",
+        "drone2: pose: nothing of that name has poses",
+    ]
+    assert "pose" not in stated["cameras"]["drone2"]
+    lines = result.text.splitlines()
+    at = lines.index("  drone2:")
+    assert any("# pose: {tum: drone2.tum}  # missing" in line for line in lines[at:])
+    with pytest.raises(DataError, match=r"cameras\.drone1\.intrinsics: is missing"):
+        read_flight(result.path)
+
+
+def test_the_truth_stands_in_for_poses_only_with_a_word(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path)
+    flight.manifest.unlink()
+    write_lenses(flight)
+    (tmp_path / "drone2.tum").unlink()
+    result, stated = drafted(tmp_path)
+    assert stated["cameras"]["drone2"]["pose"] == {"tum": "drone2_true.tum"}
+    assert stated["truth"]["poses"] == {"drone1": "drone1_true.tum"}
+    assert "drone2: pose: what is called the truth, for there is nothing else" in result.assumed
+
+
+def test_files_that_cannot_be_read_are_told_and_left_out(tmp_path: Path) -> None:
+    write_flight(tmp_path, static=True).manifest.unlink()
+    (tmp_path / "drone2.json").write_text('[{"image_id": "0.jpg", "keypoints"', encoding="utf-8")
+    (tmp_path / "drone3.json").write_text(
+        '[{"image_id": "0.jpg", "keypoints": [1], "idx": 1}]', encoding="utf-8"
+    )
+    result, _ = drafted(tmp_path)
+    assert result.cameras == ["drone1"]
+    reasons = {left.path.name: left.reason for left in result.left_out}
+    assert "1 values are not x, y, confidence" in reasons["drone3.json"]
+    assert reasons["drone2.json"] == "not recognised, left out"
+
+
+HOSTILE = [
+    "true",
+    "a: b #c",
+    "x\n  pose: {static: y}\n",
+    "bell\x07 esc\x1b[31m",
+    "'single' \"double\" \\",
+    "{a}, [b]",
+    "line\u2028separator",
+    "- dash",
+]
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_names_hostile_to_yaml_stay_names(tmp_path: Path, name: str) -> None:
+    source = tmp_path / "source"
+    flight = write_flight(source, cameras=1)
+    flight.manifest.unlink()
+    folder = tmp_path / "hostile"
+    folder.mkdir()
+    for suffix in (".json", ".tum"):
+        (source / f"drone1{suffix}").rename(folder / f"{name}{suffix}")
+    # The same name twice: the second is told in a comment.
+    (folder / "again").mkdir()
+    shutil.copy(folder / f"{name}.tum", folder / "again")
+    write_lenses(flight)
+    (source / "lenses.toml").rename(folder / f"{name}.toml")
+
+    result, stated = drafted(folder)
+    assert len(result.cameras) == 1
+    assert not result.missing
+    assert set(stated) == {"schema", "name", "world", "cameras"}
+    [camera] = stated["cameras"].values()
+    assert camera["keypoints"] == f"{name}.json"
+    assert camera["pose"]["tum"] in {f"{name}.tum", f"again/{name}.tum"}
+    assert camera["intrinsics"] == f"{name}.toml"
+    assert all(line.isprintable() for line in result.text.split("\n"))
+    ingest(result.path)
+
+
+def test_a_name_that_is_no_text_is_left_out(tmp_path: Path) -> None:
+    write_flight(tmp_path, static=True).manifest.unlink()
+    try:
+        shutil.copy(tmp_path / "drone1.json", tmp_path / os.fsdecode(b"\xff.json"))
+    except OSError:
+        pytest.skip("this file system takes only text for names")
+    result, _ = drafted(tmp_path)
+    assert ["its name is no text" in left.reason for left in result.left_out] == [True]
+
+
+# --- where things lie ----------------------------------------------------------------------------------
+
+
+def test_paths_are_relative_to_the_manifest_wherever_it_lies(tmp_path: Path) -> None:
+    write_flight(tmp_path / "flight", static=True).manifest.unlink()
+    (tmp_path / "manifests").mkdir()
+    files = [tmp_path / "flight" / name for name in ("drone1.json", "drone2.json", "calibration.toml")]
+    elsewhere = draft(files, tmp_path / "manifests" / "a.yaml")
+    assert "keypoints: ../flight/drone1.json" in elsewhere.text
+    ingest(elsewhere.path)
+    assert draft(files).path == tmp_path / "flight" / "flight.yaml"
+
+    (tmp_path / "link").symlink_to(tmp_path / "manifests", target_is_directory=True)
+    linked = draft(files, tmp_path / "link" / "b.yaml")
+    assert not linked.missing
+    ingest(linked.path)
+
+
+def test_a_folder_that_is_one_thing_has_its_manifest_beside_it(tmp_path: Path) -> None:
+    write_flight(tmp_path, cameras=1, keypoint_format="openpose").manifest.unlink()
+    result = draft([tmp_path / "drone1"])
+    assert result.path == tmp_path / "flight.yaml"
+    assert "keypoints: drone1  # OpenPose keypoints" in result.text
+
+
+def test_keypoint_files_of_several_cameras_in_a_folder_are_not_frames_of_one(tmp_path: Path) -> None:
+    people = [{"keypoints": [[5.0, 5.0]] * 17, "keypoint_scores": [0.9] * 17}]
+    frames = [{"frame_id": k, "instances": people} for k in range(3)]
+    for name in ("drone1.json", "drone2.json"):
+        (tmp_path / name).write_text(json.dumps(frames), encoding="utf-8")
+    result, stated = drafted(tmp_path)
+    assert result.cameras == ["drone1", "drone2"]
+    assert stated["cameras"]["drone2"]["keypoints"] == "drone2.json"
+
+
+def test_parts_of_a_log_beside_a_video_are_one_log_and_not_the_folder(tmp_path: Path) -> None:
+    stamps = [START_NS + k * 10**8 for k in range(20)]
+    odometry = [
+        Entry("/odometry", "nav_msgs/msg/Odometry", t, {"header": header(t, "odom_ned")}) for t in stamps
+    ]
+    write_mcap(tmp_path / "drone1_0.mcap", odometry[:10])
+    write_mcap(tmp_path / "drone1_1.mcap", odometry[10:])
+    write_video(tmp_path / "drone1.mp4", even_ticks(30))
+    result, stated = drafted(tmp_path)
+    assert stated["logs"] == {"drone1": {"path": ["drone1_0.mcap", "drone1_1.mcap"], "stamps": "header"}}
+    camera = stated["cameras"]["drone1"]
+    assert camera["video"] == "drone1.mp4"
+    # The container counts from 0, the log since the epoch.
+    assert camera["frame_times"] == {"start": START_NS // 10**9}
+    assert "odom_ned sounds like north-east-down: then add axes: ned" in result.text
+    assert any("ned" in remark for remark in result.assumed)
+
+
+def test_the_whereabouts_of_a_gimbal_are_for_the_user_to_say(tmp_path: Path) -> None:
+    def at(topic: str, type_: str, **fields: Any) -> Entry:
+        return Entry(topic, type_, START_NS, {"header": header(START_NS, "map"), **fields})
+
+    write_mcap(
+        tmp_path / "drone1.mcap",
+        [
+            at("/drone1/image", "sensor_msgs/msg/CompressedImage", format="jpeg"),
+            at("/drone1/odometry", "nav_msgs/msg/Odometry", child_frame_id="base_link"),
+            at("/drone1/gimbal", "geometry_msgs/msg/Vector3Stamped"),
+            at("/drone1/imu/mag", "geometry_msgs/msg/Vector3Stamped"),
+            at("/actor/pose", "geometry_msgs/msg/PoseStamped"),
+        ],
+    )
+    result, stated = drafted(tmp_path)
+    assert stated["cameras"]["drone1"]["gimbal"] == {"log": "drone1", "topic": "/drone1/gimbal"}
+    assert "mount" not in stated["cameras"]["drone1"]
+    assert stated["actor"] == {"log": "drone1", "topic": "/actor/pose", "point": "hip"}
+    assert [m for m in result.missing if "relative_to" in m]
+    edit(result.path, {"# relative_to": "relative_to", "# intrinsics": "intrinsics"})
+    assert read_flight(result.path).cameras["drone1"].gimbal is not None
+
+
+def test_transforms_of_a_camera_are_named_by_their_frames(tmp_path: Path) -> None:
+    def link(parent: str, child: str) -> dict[str, Any]:
+        return {"header": header(START_NS, parent), "child_frame_id": child}
+
+    transforms = {
+        "/tf": link("map", "drone1/base_link"),
+        "/tf_static": link("drone1/base_link", "drone1/optical"),
+    }
+    entries = [
+        Entry(topic, "tf2_msgs/msg/TFMessage", START_NS, {"transforms": [transform]})
+        for topic, transform in transforms.items()
+    ]
+    picture = Entry(
+        "/drone1/image", "sensor_msgs/msg/CompressedImage", START_NS, {"header": header(START_NS, "")}
+    )
+    write_mcap(tmp_path / "flight.mcap", [*entries, picture])
+    result, stated = drafted(tmp_path)
+    assert result.path == tmp_path / "flight.yaml"  # one log in a folder is no bag
+    assert stated["cameras"]["drone1"]["pose"] == {
+        "log": "flight",
+        "parent": "map",
+        "child": "drone1/optical",
+        "of": "camera",
+    }
+
+
+def test_a_cut_log_is_drafted_by_what_is_left_of_it(tmp_path: Path) -> None:
+    flight = write_logged_flight(tmp_path, "mcap-cdr")
+    flight.manifest.unlink()
+    for name in flight.cameras:
+        (tmp_path / f"{name}.tum").unlink()
+        cut(tmp_path / "logs" / f"{name}.mcap", 0.7)
+    result, stated = drafted(tmp_path)
+    assert not result.missing
+    assert stated["cameras"]["drone2"]["pose"]["topic"] == "/drone2/odometry"
+
+
+# --- real recordings -----------------------------------------------------------------------------------
+
+
+def test_a_real_recording_of_four_cameras_needs_nothing_more(tmp_path: Path) -> None:
+    recording = real_data("pose2sim_single")
+    result = draft([recording], tmp_path / "flight.yaml")
+    assert result.cameras == ["cam01", "cam02", "cam03", "cam04"]
+    assert not result.missing
+    assert not result.assumed  # the videos have stamps
+    assert {left.path.name for left in result.left_out} == {"Config.toml", "LICENSE", "Calib.qca.txt"}
+    done = ingest(result.path)
+    assert [camera.frames.count for camera in done.description.cameras.values()] == [100] * 4
+
+
+def test_real_keypoints_without_videos_are_drafted_with_a_rate_to_check(tmp_path: Path) -> None:
+    recording = real_data("pose2sim_single")
+    result = draft([recording / "pose-associated", recording / "calibration"], tmp_path / "flight.yaml")
+    assert not result.missing
+    assert result.assumed == ["cam01, cam02, cam03, cam04: frame_times: fps 30, the first frame at 0 s"]
+    edit(result.path, {"fps: 30": "fps: 60"})
+    done = ingest(result.path)
+    assert [c.frames.rate_hz for c in done.description.cameras.values()] == [pytest.approx(60)] * 4
