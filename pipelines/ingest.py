@@ -7,7 +7,6 @@ chunk of its own: an interrupted ingest continues with the cameras that it had n
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -51,7 +50,7 @@ from pipelines.session.tables import (
 )
 from pipelines.session.tabular import actor_table, frames_table, keypoints_table, motion_table, pose_table
 
-INGEST = Stage("ingest", revision=2)
+INGEST = Stage("ingest", revision=1)
 
 _MUCH_SHORTER = 0.9  # a video that covers less than this share of its pose log is worth a word
 _SHORTER_S = 1.0
@@ -306,7 +305,7 @@ class _Reader:
                 sigma_s=camera.clock.sigma_s if camera.clock else 0.0,
             ),
             pose_noise=camera.pose_noise,
-            media=self._media(camera),
+            media=sources.media(camera, frames, self._session),
         )
         warnings = self.take_notes()
         for what, dropped in (
@@ -432,13 +431,6 @@ class _Reader:
                 f"spans {_span(t_ns[0], t_ns[-1])}, the pictures {_span(first, last)}",
                 "check its time base: stamps are world times",
             )
-
-    def _media(self, camera: Camera) -> str | None:
-        """Where the pictures lie, as seen from the session: sessions are moved together with their flight."""
-        if camera.video is None or camera.video.path is None:
-            return None
-        path = self._flight_path.parent / camera.video.path
-        return Path(os.path.relpath(path, self._session)).as_posix()
 
 
 def _keypoints_entry(

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
+from pipelines.formats.pictures import Picture, Pictures, open_pictures
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.page import render_page
 from pipelines.session.description import read_description
@@ -13,7 +16,7 @@ from pipelines.session.stages import Stage, StageRecord, WritableSession, locked
 from pipelines.session.storage import read_json
 from pipelines.session.tables import FRAMES, KEYPOINTS, POSES, SKELETON, TRUTH, read_table
 
-REPORT = Stage("report", revision=2)
+REPORT = Stage("report", revision=1)
 
 
 @dataclass(frozen=True)
@@ -39,13 +42,16 @@ def report(folder: Path, *, force: bool = False) -> Reported:
     with locked(folder) as session:
         records = _finished_stages(session)
         inputs = {name: digest for record in records.values() for name, digest in record.outputs.items()}
-        run = session.begin(REPORT, settings={"name": folder.stem}, inputs=inputs, force=force)
+        settings = {"name": folder.stem, "pictures": _pictures_there(folder)}
+        run = session.begin(REPORT, settings=settings, inputs=inputs, force=force)
         page = folder / "report" / "index.html"
         if run.finished:
             return Reported(page, run.record, skipped=True)
-        html = render_page(_load(folder, records), read_frame=None)
+        with ExitStack() as stack:
+            pictures, warnings = _open_pictures(folder, stack)
+            html = render_page(_load(folder, records), read_frame=partial(_read_frame, pictures))
         (run.folder / "index.html").write_text(html, encoding="utf-8")
-        record = run.publish(counts={}, warnings=[])
+        record = run.publish(counts={}, warnings=warnings)
     return Reported(page, record, skipped=False)
 
 
@@ -54,6 +60,30 @@ def _finished_stages(session: WritableSession) -> dict[str, StageRecord]:
     if records["ingest"] is None:
         raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
     return {name: record for name, record in records.items() if record is not None}
+
+
+def _pictures_there(folder: Path) -> list[str]:
+    """The cameras whose pictures are still where they were."""
+    cameras = read_description(folder).cameras
+    media = {name: entry.media for name, entry in cameras.items() if entry.media}
+    return [name for name, entry in media.items() if all((folder / path).exists() for path in entry.paths)]
+
+
+def _open_pictures(folder: Path, stack: ExitStack) -> tuple[dict[str, Pictures], list[str]]:
+    """The pictures of every camera that still has them; missing ones cost overlays only, and are said."""
+    opened, warnings = {}, []
+    for name, entry in read_description(folder).cameras.items():
+        if entry.media is None:
+            continue
+        try:
+            opened[name] = stack.enter_context(open_pictures(entry.media, folder))
+        except DataError as error:
+            warnings.append(f"{name}: no overlays on its pictures: {error}")
+    return opened, warnings
+
+
+def _read_frame(pictures: dict[str, Pictures], camera: str, frame: int) -> Picture | None:
+    return pictures[camera].read(frame) if camera in pictures else None
 
 
 def _load(folder: Path, records: dict[str, StageRecord]) -> SessionContent:

@@ -6,6 +6,7 @@ is one pass over the messages of one topic: logs of any size stream.
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ from pipelines.formats.log_trajectories import (
     trajectory_of,
     transforms_of,
 )
+from pipelines.formats.pictures import later_pictures, stamp_of
 from pipelines.geometry.poses import compose, matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight
@@ -47,6 +49,7 @@ _NOUNS: dict[Kind, str] = {
 class Frames:
     """The pictures of a topic: when each was taken, strictly increasing."""
 
+    topic: str
     t_ns: Int64
     dropped: dict[str, int] = field(default_factory=dict)
 
@@ -149,23 +152,29 @@ class FlightLogs:
         Raises:
             DataError: no such topic, or no picture in it.
         """
-        settings = self.settings(log)
-        stamps: list[int] = []
+        stamps = self.settings(log).stamps
         with self._open(log) as (recording, source):
             name = self._choose(recording, source, "pictures", topic)
-            for sample in all_samples(recording.messages([name]), source):
-                if not isinstance(sample, PictureSample):
-                    raise DataError(source, f"{name} holds no pictures", "name another topic")
-                by_header = settings.stamps == "header" and sample.stamp_ns
-                stamps.append(sample.stamp_ns if by_header else sample.receive_ns)
+            seen = 0
+            t_ns = array("q")
+
+            def pictures() -> Iterator[PictureSample]:
+                nonlocal seen
+                for sample in all_samples(recording.messages([name]), source):
+                    if not isinstance(sample, PictureSample):
+                        raise DataError(source, f"{name} holds no pictures", "name another topic")
+                    seen += 1
+                    yield sample
+
+            for picture in later_pictures(pictures(), stamps):
+                t_ns.append(stamp_of(picture, stamps))
             lost = Counter(recording.dropped)
-        t_ns = np.array(stamps, dtype=np.int64)
-        if not len(t_ns):
+        if not t_ns:
             raise DataError(source, f"{name} holds no picture", "name another topic")
-        rising = t_ns > np.concatenate([[t_ns[0] - 1], np.maximum.accumulate(t_ns)[:-1]])
-        if not rising.all():
-            lost["picture without a later stamp"] += int((~rising).sum())
-        return Frames(self._world_times(log, t_ns[rising]), dict(lost))
+        if seen > len(t_ns):
+            lost["picture without a later stamp"] += seen - len(t_ns)
+        times = np.frombuffer(t_ns, dtype=np.int64)
+        return Frames(name, self._world_times(log, times), dict(lost))
 
     @contextmanager
     def _open(self, log: str) -> Iterator[tuple[Log, str]]:

@@ -6,6 +6,7 @@ or said as a note.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -25,6 +26,7 @@ from pipelines.geometry.mounting import (
 )
 from pipelines.geometry.pose_covariance import mounted_covariance
 from pipelines.geometry.poses import enu_from_ned, interpolate_poses
+from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import (
     Axes,
@@ -67,6 +69,7 @@ class CameraFrames:
     frame: Int64  # [F] numbers, as keypoints count them
     t_ns: Int64  # [F]
     pts_ns: Int64  # [F] since the first picture of the video
+    topic: str | None = None  # the pictures themselves lie in this topic of a log
 
 
 class FlightSources:
@@ -155,6 +158,18 @@ class FlightSources:
             "write frame_times: {start: SECONDS, fps: 30}",
         )
 
+    def media(self, camera: Camera, frames: CameraFrames, session: Path) -> MediaEntry | None:
+        """Where the pictures lie, as seen from the session: it is moved together with its flight."""
+        video = camera.video
+        if video is None:
+            return None
+        paths = self._logs.paths(video.log) if video.log else [self._base / (video.path or "")]
+        return MediaEntry(
+            paths=[Path(os.path.relpath(path, session)).as_posix() for path in paths],
+            topic=frames.topic,
+            stamps=self._logs.settings(video.log).stamps if video.log else "header",
+        )
+
     def _listed_frames(self, camera: Camera, detections: Detections | None) -> int:
         if detections is None or camera.keypoints is None:
             raise DataError(
@@ -197,8 +212,9 @@ class FlightSources:
                 f" the first {count} are used"
             )
         t_ns = found.t_ns[:count]
-        pts_ns = t_ns - t_ns[0] if video is None else video.pts_ns[:count]
-        return CameraFrames(np.arange(count), t_ns, pts_ns)
+        if video is None:
+            return CameraFrames(np.arange(count), t_ns, t_ns - t_ns[0], topic=found.topic)
+        return CameraFrames(np.arange(count), t_ns, video.pts_ns[:count])
 
     # --- calibration -----------------------------------------------------------------------------------
 

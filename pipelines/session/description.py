@@ -85,6 +85,14 @@ class ClockEntry(Entry):
     sigma_s: float
 
 
+class MediaEntry(Entry):
+    """Where the pictures of a camera lie; without them only overlays are lost."""
+
+    paths: list[str]  # relative to the session's folder: a video file, or the files of a log
+    topic: str | None = None  # of the log
+    stamps: str = "header"  # by which the log's pictures are ordered
+
+
 class CameraEntry(Entry):
     """One camera."""
 
@@ -94,7 +102,7 @@ class CameraEntry(Entry):
     keypoints: KeypointsEntry | None
     clock: ClockEntry
     pose_noise: dict[str, dict[str, float | str]] | None
-    media: str | None
+    media: MediaEntry | None
 
 
 class ActorEntry(Entry):

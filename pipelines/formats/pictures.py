@@ -1,0 +1,128 @@
+"""The pictures of a camera by frame number, wherever they lie: in a video file or in a topic of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.formats.log_messages import all_samples
+from pipelines.formats.video import VideoReader
+from pipelines.session.description import MediaEntry
+from pipelines.session.records import PictureSample
+from pipelines.session.registries import Log, LogFormat, recognise
+
+Picture = NDArray[np.uint8]
+
+_CHANNELS = {"mono8": 1, "8uc1": 1, "rgb8": 3, "bgr8": 3, "8uc3": 3, "rgba8": 4, "bgra8": 4}
+
+
+class Pictures(Protocol):
+    """Pictures at hand; a context manager."""
+
+    def read(self, number: int) -> Picture | None:
+        """One picture, BGR; None where it cannot be decoded."""
+
+    def __enter__(self) -> Self:
+        """The pictures themselves."""
+
+    def __exit__(self, *exception: object) -> None:
+        """Close the files."""
+
+
+def open_pictures(media: MediaEntry, session: Path) -> Pictures:
+    """Open the pictures that a session was made from.
+
+    Args:
+        media: where they lay, relative to the session.
+        session: its folder.
+
+    Raises:
+        DataError: they are not there any more, or cannot be read.
+    """
+    paths = [session / path for path in media.paths]
+    return VideoReader(paths[0]) if media.topic is None else LoggedPictures(paths, media.topic, media.stamps)
+
+
+class LoggedPictures:
+    """Pictures of a topic, numbered as ingest numbers them; reading forward is cheap, backward starts anew.
+
+    Args:
+        paths: the files of the recording.
+        topic: the topic.
+        stamps: which stamps order the pictures: header or receive.
+    """
+
+    def __init__(self, paths: list[Path], topic: str, stamps: str) -> None:
+        self._source = paths[0]
+        self._topic = topic
+        self._stamps = stamps
+        self._stack = ExitStack()
+        log_format = recognise(paths[0], LogFormat, "log")
+        self._log: Log = self._stack.enter_context(log_format.open_log(paths))
+        self._next = 0
+        self._samples = self._begin()
+
+    def __enter__(self) -> Self:
+        """The pictures themselves."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Close the files."""
+        self._stack.close()
+
+    def read(self, number: int) -> Picture | None:
+        """One picture, BGR; None where it cannot be decoded or the log ends before it."""
+        if number < self._next:
+            self._next, self._samples = 0, self._begin()
+        for sample in self._samples:
+            self._next += 1
+            if self._next > number:
+                return decode(sample)
+        return None
+
+    def _begin(self) -> Iterator[PictureSample]:
+        samples = all_samples(self._log.messages([self._topic]), self._source)
+        pictures = (sample for sample in samples if isinstance(sample, PictureSample))
+        return later_pictures(pictures, self._stamps)
+
+
+def later_pictures(pictures: Iterator[PictureSample], stamps: str) -> Iterator[PictureSample]:
+    """The pictures whose stamp is above all before: frame k of a topic is the k-th of these."""
+    newest: int | None = None
+    for picture in pictures:
+        stamp_ns = stamp_of(picture, stamps)
+        if newest is None or stamp_ns > newest:
+            newest = stamp_ns
+            yield picture
+
+
+def stamp_of(picture: PictureSample, stamps: str) -> int:
+    """The stamp that counts: that of the header where it has one and it is wanted."""
+    return picture.stamp_ns if stamps == "header" and picture.stamp_ns else picture.receive_ns
+
+
+def decode(sample: PictureSample) -> Picture | None:
+    """A picture of a log as BGR; None where its bytes are damaged or its encoding is not known."""
+    import cv2
+
+    if sample.width is None or sample.height is None:
+        decoded = (
+            cv2.imdecode(np.asarray(sample.data, np.uint8), cv2.IMREAD_COLOR) if len(sample.data) else None
+        )
+        return None if decoded is None else np.asarray(decoded, np.uint8)
+    encoding = sample.encoding.lower()
+    channels = _CHANNELS.get(encoding)
+    step = sample.step or sample.width * (channels or 0)
+    if channels is None or step < sample.width * channels or len(sample.data) < step * sample.height:
+        return None
+    rows = sample.data[: step * sample.height].reshape(sample.height, step)
+    pixels = rows[:, : sample.width * channels].reshape(sample.height, sample.width, channels)
+    if channels == 1:
+        return np.repeat(pixels, 3, axis=2)
+    colours = pixels[..., :3]
+    return np.ascontiguousarray(colours[..., ::-1] if encoding.startswith("rgb") else colours)
