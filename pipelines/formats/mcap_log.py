@@ -18,7 +18,7 @@ from mcap.exceptions import McapError
 
 from pipelines.formats.chunked_logs import CHUNK_LIMIT, Chunk, ChunkedPart, Content
 from pipelines.formats.message_decoders import Schema, ros2_name
-from pipelines.formats.recordings import Channel, Recording, describe_recording, open_file, open_parts
+from pipelines.formats.recordings import Channel, OpenLog, describe_log, open_file, open_parts
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64
 
@@ -57,15 +57,15 @@ class McapLog:
     def describe(self, path: Path) -> dict[str, object]:
         """Messages, times, storage, topics, and what was lost."""
         with self.open_log([path]) as log:
-            return describe_recording(log)
+            return describe_log(log)
 
-    def open_log(self, paths: Sequence[Path]) -> Recording:
+    def open_log(self, paths: Sequence[Path]) -> OpenLog:
         """Open one file, or the parts of a split one.
 
         Raises:
             DataError: no file can be read as MCAP, or holds anything.
         """
-        return Recording(*open_parts(paths, open_mcap))
+        return OpenLog(*open_parts(paths, open_mcap))
 
 
 def open_mcap(path: Path) -> McapPart:

@@ -107,7 +107,7 @@ class LogPart(ABC):
         return rows[np.argsort(self.table.stamp_ns[rows], kind="stable")].astype(np.int64)
 
 
-class Recording:
+class OpenLog:
     """An open log of one or more parts."""
 
     def __init__(self, parts: Sequence[LogPart], lost: Counter[str]) -> None:
@@ -115,7 +115,7 @@ class Recording:
         self._lost = lost
         self._topics = {key: self._summary(*key) for key in sorted(self._keys())}
 
-    def __enter__(self) -> Recording:
+    def __enter__(self) -> OpenLog:
         """The log itself."""
         return self
 
@@ -253,7 +253,7 @@ def require_content(part: LogPart) -> None:
         )
 
 
-def describe_recording(log: Recording) -> dict[str, object]:
+def describe_log(log: OpenLog) -> dict[str, object]:
     """Files, messages, times and storage of a log, each topic, and what was lost by cause."""
     topics = log.topics
     first = min((t.first_ns for t in topics if t.first_ns is not None), default=None)
@@ -270,7 +270,7 @@ def describe_recording(log: Recording) -> dict[str, object]:
     return facts | {f"dropped: {cause}": count for cause, count in log.dropped.items()}
 
 
-def _describe_topic(log: Recording, topic: Topic) -> dict[str, object]:
+def _describe_topic(log: OpenLog, topic: Topic) -> dict[str, object]:
     facts: dict[str, object] = {
         "type": topic.type,
         "encoding": topic.encoding,

@@ -15,7 +15,7 @@ import numpy as np
 
 from pipelines.formats.chunked_logs import Chunk, ChunkedPart, Content
 from pipelines.formats.message_decoders import Schema, ros2_name
-from pipelines.formats.recordings import Channel, Recording, describe_recording, open_file, open_parts
+from pipelines.formats.recordings import Channel, OpenLog, describe_log, open_file, open_parts
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64
 
@@ -49,15 +49,15 @@ class Ros1Bag:
     def describe(self, path: Path) -> dict[str, object]:
         """Messages, times, storage, topics, and what was lost."""
         with self.open_log([path]) as log:
-            return describe_recording(log)
+            return describe_log(log)
 
-    def open_log(self, paths: Sequence[Path]) -> Recording:
+    def open_log(self, paths: Sequence[Path]) -> OpenLog:
         """Open one bag, or several as one recording.
 
         Raises:
             DataError: no file can be read as a bag, or holds anything.
         """
-        return Recording(*open_parts(paths, _open_part))
+        return OpenLog(*open_parts(paths, _open_part))
 
 
 class _Bag(ChunkedPart):

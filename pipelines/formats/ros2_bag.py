@@ -6,6 +6,7 @@ read to its end, so sqlite is asked here.
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import sqlite3
@@ -26,8 +27,8 @@ from pipelines.formats.recordings import (
     Channel,
     LogPart,
     MessageTable,
-    Recording,
-    describe_recording,
+    OpenLog,
+    describe_log,
     open_file,
     open_parts,
     require_content,
@@ -67,13 +68,13 @@ class Ros2Bag:
     def describe(self, path: Path) -> dict[str, object]:
         """Messages, times, storage, topics, what was lost, and where metadata.yaml says something else."""
         with self.open_log([path]) as log:
-            facts = describe_recording(log)
+            facts = describe_log(log)
         stated = _contents(path).stated
         if stated and facts["messages"] and stated.times != {key: facts[key] for key in stated.times}:
             facts["metadata.yaml states"] = stated.times
         return facts
 
-    def open_log(self, paths: Sequence[Path]) -> Recording:
+    def open_log(self, paths: Sequence[Path]) -> OpenLog:
         """Open a bag's folder, or its files.
 
         Raises:
@@ -86,7 +87,7 @@ class Ros2Bag:
         found = sum(len(part.table.stamp_ns) for part in parts)
         if len(stated) == len(contents) and found < sum(stated):
             lost["messages that metadata.yaml counts and the files lack"] = sum(stated) - found
-        return Recording(parts, lost)
+        return OpenLog(parts, lost)
 
 
 @dataclass(frozen=True)
@@ -132,16 +133,42 @@ class _Sqlite3Part(LogPart):
         self.database.close()
 
     def read(self, rows: Int64) -> Iterator[tuple[int, bytes]]:
-        """The bytes of messages, one query each."""
-        for k, place in enumerate(self.table.place[rows].tolist()):
-            try:
-                row = self.database.execute("SELECT data FROM messages WHERE rowid = ?", (place,)).fetchone()
-            except sqlite3.Error:
-                row = None
-            if row is None or not isinstance(row[0], bytes):
+        """The bytes of messages: by one query where they lie in the order of receipt, else one by one."""
+        places = self.table.place[rows].tolist()
+        done = 0
+        if places and np.all(np.diff(places) > 0):
+            for k, data in self._in_one_query(rows, places):
+                yield k, data
+                done = k + 1
+        for k in range(done, len(places)):
+            message = self._message(places[k])
+            if message is None:
                 self.lose(int(rows[k]), DAMAGED)
-                continue
-            yield k, row[0]
+            else:
+                yield k, message
+
+    def _in_one_query(self, rows: Int64, places: Sequence[int]) -> Iterator[tuple[int, bytes]]:
+        """The messages up to the first that is damaged."""
+        query = (
+            "SELECT rowid, data FROM messages WHERE rowid BETWEEN ? AND ? "
+            "AND topic_id IN (SELECT value FROM json_each(?)) ORDER BY rowid"
+        )
+        topics = json.dumps(np.unique(self.table.channel[rows]).tolist())
+        try:
+            found = self.database.execute(query, (places[0], places[-1], topics))
+            for k, (place, (found_place, data)) in enumerate(zip(places, found, strict=False)):
+                if found_place != place or not isinstance(data, bytes):
+                    return
+                yield k, data
+        except sqlite3.Error:
+            return
+
+    def _message(self, place: int) -> bytes | None:
+        try:
+            row = self.database.execute("SELECT data FROM messages WHERE rowid = ?", (place,)).fetchone()
+        except sqlite3.Error:
+            return None
+        return row[0] if row and isinstance(row[0], bytes) else None
 
     def _read_topics(self) -> None:
         definitions = self._definitions()
