@@ -1,0 +1,121 @@
+"""Flights with pictures: container stamps, overlays on frames, and what happens when they are gone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from tests.commands.runner import mocap, refused, succeeds
+from tests.synthetic.flights import START_NS, SyntheticFlight, write_flight
+from tests.synthetic.logged_flights import write_logged_flight
+from tests.synthetic.videos import SIZE, TICK_S, even_ticks, uneven_ticks, write_video
+
+HALF_SECOND = 15
+
+
+def with_videos(folder: Path) -> SyntheticFlight:
+    """A clean flight whose frames are stamped by its videos; the lens is scaled to their size."""
+    flight = write_flight(folder, seconds=0.5, clean=True)
+    for name in flight.cameras:
+        write_video(folder / f"{name}.mp4", even_ticks(HALF_SECOND))
+        camera = flight.settings["cameras"][name]
+        camera["video"] = f"{name}.mp4"
+        camera["frame_times"] = {"start": START_NS // 10**9}
+        # The pictures are small: their keypoints lie where a camera of that size would see them.
+        width, height = SIZE
+        scale = np.array([width / 1280, height / 720])
+        keypoints = folder / camera["keypoints"]["path"]
+        people = json.loads(keypoints.read_text(encoding="utf-8"))
+        for person in people:
+            joints = np.array(person["keypoints"]).reshape(-1, 3)
+            joints[:, :2] *= scale
+            person["keypoints"] = joints.ravel().tolist()
+        keypoints.write_text(json.dumps(people), encoding="utf-8")
+        lens = camera["intrinsics"]
+        lens.update(width=width, height=height)
+        for key, factor in (("fx", 0), ("cx", 0), ("fy", 1), ("cy", 1)):
+            lens[key] = float(lens[key] * scale[factor])
+    flight.save()
+    return flight
+
+
+def session_json(folder: Path) -> dict[str, Any]:
+    stored: dict[str, Any] = json.loads(
+        (folder / "flight.session" / "session.json").read_text(encoding="utf-8")
+    )
+    return stored
+
+
+def test_frames_are_stamped_by_the_container(tmp_path: Path) -> None:
+    flight = with_videos(tmp_path)
+    ticks = uneven_ticks(HALF_SECOND)
+    write_video(tmp_path / "drone2.mp4", ticks)
+    succeeds("ingest", flight.manifest)
+    frames = pd.read_parquet(tmp_path / "flight.session" / "cameras" / "drone2" / "frames.parquet")
+    expected = [START_NS + round(tick * TICK_S * 10**9) for tick in ticks]
+    assert np.abs(frames["t_ns"].to_numpy() - expected).max() <= 1
+    assert frames["frame"].tolist() == list(range(HALF_SECOND))
+
+
+def test_frame_times_of_a_csv(tmp_path: Path) -> None:
+    flight = with_videos(tmp_path)
+    rows = [f"{k},{START_NS + 40_000_000 * k}" for k in range(HALF_SECOND) if k != 3]
+    (tmp_path / "times.csv").write_text("\n".join(["frame,t_ns", *rows]) + "\n", encoding="utf-8")
+    flight.settings["cameras"]["drone1"]["frame_times"] = {"csv": "times.csv"}
+    flight.save()
+    done = mocap("ingest", flight.manifest)
+    assert done.returncode == 0, done.stderr
+    assert "drone1: 1 of 15 frames of the video have no time" in done.stderr
+    frames = pd.read_parquet(tmp_path / "flight.session" / "cameras" / "drone1" / "frames.parquet")
+    assert frames["frame"].tolist() == [0, 1, 2, *range(4, HALF_SECOND)]
+    assert frames["t_ns"].iloc[3] == START_NS + 160_000_000
+    succeeds("reconstruct", tmp_path / "flight.session")
+
+
+def test_overlays_lie_on_frames_until_the_video_is_gone(tmp_path: Path) -> None:
+    flight = with_videos(tmp_path)
+    session = tmp_path / "flight.session"
+    succeeds("ingest", flight.manifest)
+    assert json.loads(succeeds("reconstruct", session, "--json"))["mpjpe_mm"] < 2
+    succeeds("report", session)
+    page = session / "report" / "index.html"
+    pictures = page.read_text(encoding="utf-8").count("data:image/jpeg")
+    assert pictures > 0
+    (tmp_path / "drone1.mp4").unlink()
+    succeeds("report", session)
+    fewer = page.read_text(encoding="utf-8").count("data:image/jpeg")
+    assert 0 < fewer < pictures
+    stage = json.loads((session / "report" / "stage.json").read_text(encoding="utf-8"))
+    assert any("drone1" in warning for warning in stage["warnings"])
+
+
+def test_overlays_on_pictures_of_a_log(tmp_path: Path) -> None:
+    write_logged_flight(tmp_path, "ros2-mcap")
+    session = tmp_path / "flight.session"
+    succeeds("ingest", tmp_path / "flight.yaml")
+    succeeds("reconstruct", session)
+    succeeds("report", session)
+    assert "data:image/jpeg" in (session / "report" / "index.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("content", [b"", b"no video at all", b"\0\0\0\x18ftypisom" + bytes(40)])
+def test_video_that_is_none(tmp_path: Path, content: bytes) -> None:
+    flight = with_videos(tmp_path)
+    (tmp_path / "drone1.mp4").write_bytes(content)
+    assert "drone1.mp4" in refused("ingest", flight.manifest)
+
+
+def test_video_without_keypoints_is_ingested_and_reconstruct_says_what_is_missing(tmp_path: Path) -> None:
+    flight = with_videos(tmp_path)
+    for name in flight.cameras:
+        del flight.settings["cameras"][name]["keypoints"]
+    flight.save()
+    succeeds("ingest", flight.manifest)
+    assert session_json(tmp_path)["cameras"]["drone1"]["keypoints"] is None
+    assert "keypoints" in refused("reconstruct", tmp_path / "flight.session")
+    succeeds("report", tmp_path / "flight.session")

@@ -1,0 +1,175 @@
+"""Real logs, maps and calibrations, ingested as commands: what is in the session is what facts.json says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from ruamel.yaml import YAML
+
+from tests.commands.runner import mocap, refused, succeeds
+from tests.real_data import real_data
+
+FRAMES = 20
+
+
+def facts(name: str) -> dict[str, Any]:
+    every: dict[str, Any] = json.loads(real_data("facts.json").read_text(encoding="utf-8"))
+    told: dict[str, Any] = every[name]
+    return told
+
+
+def write_flight(folder: Path, pose: dict[str, Any], start_s: float, **parts: Any) -> Path:
+    """One camera whose poses come from a real log; its keypoints are two joints that are always there."""
+    people = [
+        {
+            "image_id": k,
+            "category_id": 1,
+            "keypoints": [*(v for j in range(17) for v in (100 + j, 200 + k, 0.9))],
+            "score": 1.0,
+        }
+        for k in range(FRAMES)
+    ]
+    (folder / "keypoints.json").write_text(json.dumps(people), encoding="utf-8")
+    camera = {
+        "pose": pose,
+        "mount": {"looks": "forward"},
+        "intrinsics": {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240},
+        "frame_times": {"start": start_s, "fps": 10},
+        "keypoints": "keypoints.json",
+    }
+    if pose.get("of") != "body":
+        del camera["mount"]
+    path = folder / "flight.yaml"
+    with path.open("w", encoding="utf-8") as file:
+        YAML(typ="safe", pure=True).dump({"schema": 1, "cameras": {"husky": camera}, **parts}, file)
+    return path
+
+
+def session_of(path: Path) -> dict[str, Any]:
+    stored: dict[str, Any] = json.loads(
+        (path.with_suffix(".session") / "session.json").read_text(encoding="utf-8")
+    )
+    return stored
+
+
+def test_odometry_of_a_real_robot(tmp_path: Path) -> None:
+    name = "logs/ros1/husky_gps_imu_odom.bag"
+    told = facts(name)["topics"]["/husky_velocity_controller/odom"]
+    first_s, last_s = told["header_stamp_range"]
+    path = write_flight(tmp_path, {"log": str(real_data(name)), "of": "body"}, start_s=first_s + 10)
+    done = mocap("ingest", path)
+    assert done.returncode == 0, done.stderr
+    assert "took poses from /husky_velocity_controller/odom, the only candidate" in done.stderr
+    poses = pd.read_parquet(tmp_path / "flight.session" / "cameras" / "husky" / "poses.parquet")
+    assert len(poses) == told["count"]
+    assert session_of(path)["cameras"]["husky"]["poses"]["dropped"] == {}
+    # Stated with six decimals, stamps as doubles of seconds since the epoch.
+    position = poses[["x", "y", "z"]].to_numpy()
+    assert position.min(axis=0) == pytest.approx(told["position_bbox"]["min"], abs=1e-6)
+    assert position.max(axis=0) == pytest.approx(told["position_bbox"]["max"], abs=1e-6)
+    assert poses["t_ns"].iloc[[0, -1]].to_numpy() / 1e9 == pytest.approx([first_s, last_s], abs=1e-6)
+    assert np.linalg.norm(np.diff(position, axis=0), axis=1).sum() == pytest.approx(
+        told["path_length"], abs=1e-3
+    )
+
+
+def test_stamps_that_disagree_by_months_are_doubted(tmp_path: Path) -> None:
+    name = "logs/ros1/embag_pointcloud2_lidar.bag"
+    # Header stamps count from the simulation's start, 60.2 s; receive stamps are of 2020.
+    path = write_flight(tmp_path, {"log": str(real_data(name)), "of": "body"}, start_s=60)
+    done = mocap("ingest", path)
+    assert done.returncode == 0, done.stderr
+    assert "header and receive stamps disagree by up to" in done.stderr
+    assert "header stamps are used" in done.stderr
+
+
+def test_a_chain_of_transforms(tmp_path: Path) -> None:
+    name = "logs/ros1/foxglove_example.bag"
+    told = facts(name)
+    pose = {"log": str(real_data(name)), "parent": "world", "child": "turtle1", "of": "body"}
+    path = write_flight(tmp_path, pose, start_s=told["start_ns"] / 1e9 + 5)
+    succeeds("ingest", path)
+    poses = pd.read_parquet(tmp_path / "flight.session" / "cameras" / "husky" / "poses.parquet")
+    # Two turtles, one transform each, in every other message of /tf.
+    assert len(poses) == told["topics"]["/tf"]["count"] / 2
+
+
+def test_rotations_that_are_none_are_refused(tmp_path: Path) -> None:
+    name = "logs/ros2/plotjuggler_rosbag2_test"
+    path = write_flight(
+        tmp_path, {"log": str(real_data(name)), "topic": "/pose"}, start_s=facts(name)["start_ns"] / 1e9
+    )
+    line = refused("ingest", path)  # their norm is 13
+    assert "1565" in line
+
+
+def test_calibration_and_pictures_of_a_real_json_log(tmp_path: Path) -> None:
+    name = "logs/mcap/json_camera_calibration_images.mcap"
+    log = str(real_data(name))
+    told = facts(name)["topics"]["/image/compressed"]
+    (tmp_path / "still.toml").write_text(
+        '[camera]\nname = "camera"\nsize = [640, 480]\nmatrix = [[800, 0, 320], [0, 800, 240], [0, 0, 1]]\n'
+        "distortions = [0, 0, 0, 0]\nrotation = [0, 0, 0]\ntranslation = [0, 0, 0]\n",
+        encoding="utf-8",
+    )
+    path = tmp_path / "flight.yaml"
+    path.write_text(
+        f"schema: 1\nlogs:\n  json: {{path: {log}, stamps: receive}}\n"
+        "cameras:\n  camera:\n    video: {log: json}\n    pose: {static: still.toml}\n"
+        f"    intrinsics: {{log: {log}, topic: /camera_calibration}}\n",
+        encoding="utf-8",
+    )
+    succeeds("ingest", path)
+    camera = session_of(path)["cameras"]["camera"]
+    assert camera["frames"]["count"] == told["count"]
+    assert camera["frames"]["first_t_ns"] == facts(name)["start_ns"]
+    assert camera["intrinsics"]["distortion"][:2] == [-0.2, 0.1]
+    text = path.read_text(encoding="utf-8")
+    # Its header stamps stand still: one picture can be told from the others by them.
+    path.write_text(text.replace("stamps: receive", "stamps: header"), encoding="utf-8")
+    done = mocap("ingest", path)
+    assert "9 picture without a later stamp" in done.stderr
+    path.write_text(text.replace("/camera_calibration", "/camera_calibration/custom"), encoding="utf-8")
+    assert "CylinderCameraModel" in refused("ingest", path)
+
+
+@pytest.mark.parametrize("name", ["maps/octomap_geb079.bt", "maps/octomap_ecmrv4_withfree.ot"])
+def test_real_octomaps(tmp_path: Path, name: str) -> None:
+    told = facts(name)
+    log = "logs/ros1/husky_gps_imu_odom.bag"
+    first_s = facts(log)["topics"]["/husky_velocity_controller/odom"]["header_stamp_range"][0]
+    path = write_flight(
+        tmp_path, {"log": str(real_data(log)), "of": "body"}, start_s=first_s + 1, map=str(real_data(name))
+    )
+    succeeds("ingest", path)
+    stored = session_of(path)["map"]
+    assert stored["resolution_m"] == told["resolution"]
+    assert stored["occupied"] == told["occupied_voxels_at_finest"]
+    assert stored["free"] == told["free_voxels_at_finest"]
+    assert (tmp_path / "flight.session" / "map" / "0.npz").exists()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "logs/ros1/husky_gps_imu_odom.bag",
+        "logs/ros1/foxglove_example-bz2.bag",
+        "logs/ros2/rosbag2_wbag_sqlite3",
+        "logs/ros2/rosbag2_wbag_mcap",
+        "logs/mcap/edge_publish_vs_log_time.mcap",
+    ],
+)
+def test_info_of_real_logs(name: str) -> None:
+    told = facts(name)
+    (reading,) = json.loads(succeeds("info", real_data(name), "--json"))["readings"]
+    assert reading["messages"] == told["messages"]
+    # The ordinary reader believes metadata.yaml; where that is wrong, both are said.
+    assert reading.get("metadata.yaml states", reading)["first_ns"] == told["start_ns"]
+    assert {topic: seen["messages"] for topic, seen in reading["topics"].items()} == {
+        topic: seen["count"] for topic, seen in told["topics"].items()
+    }
