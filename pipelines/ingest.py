@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.flight_sources import CameraFrames, FlightSources, losses
+from pipelines.formats.flight_sources import CameraFrames, FlightSources, losses, source_files
 from pipelines.geometry.poses import gaps, interpolate_poses
 from pipelines.session.description import (
     ActorEntry,
@@ -54,6 +56,7 @@ INGEST = Stage("ingest", revision=1)
 
 _MUCH_SHORTER = 0.9  # a video that covers less than this share of its pose log is worth a word
 _SHORTER_S = 1.0
+_HASHERS = 4
 
 
 @dataclass(frozen=True)
@@ -206,10 +209,17 @@ def _hash_sources(flight: Flight, base: Path, progress: Progress) -> dict[str, s
     unique = list(dict.fromkeys(stated))
     progress.start("Hashing sources", len(unique))
     hashes = {}
-    for path in unique:
-        hashes[path] = sha256_of(base / path)
-        progress.advance()
+    with ThreadPoolExecutor(_HASHERS) as pool:  # hashing releases the interpreter: long logs side by side
+        for path, digest in zip(unique, pool.map(lambda path: _hash_of(base / path), unique), strict=True):
+            hashes[path] = digest
+            progress.advance()
     return hashes
+
+
+def _hash_of(path: Path) -> str:
+    """The sha256 of a source; of a floor plan's YAML, together with the picture that it names."""
+    digests = [sha256_of(file) for file in source_files(path)]
+    return digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
 
 
 def _counts(entries: Mapping[str, CameraEntry]) -> dict[str, object]:

@@ -16,6 +16,7 @@ import numpy as np
 
 from pipelines.formats.flight_logs import FlightLogs, in_world
 from pipelines.formats.frame_times import read_frame_times, times_of_frames
+from pipelines.formats.ros_map import FORMAT as ROS_MAP
 from pipelines.geometry.cameras import Intrinsics, fit_to_size
 from pipelines.geometry.mounting import (
     attitude_in_enu,
@@ -419,6 +420,13 @@ class FlightSources:
         path = self._base / stated
         trajectory = recognise(path, TrajectoryFormat, "camera trajectory").read_trajectory(path)
         return _in_enu(trajectory, self._flight.world.frame)
+
+
+def source_files(path: Path) -> list[Path]:
+    """A stated source and the files that it leads to: a floor plan is a YAML and a picture."""
+    if path.suffix.lower() in {".yaml", ".yml"} and ROS_MAP.recognises(path):
+        return [path, *ROS_MAP.pictures(path)]
+    return [path]
 
 
 def losses(dropped: dict[str, int]) -> str:

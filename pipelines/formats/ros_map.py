@@ -72,6 +72,10 @@ class RosMap:
         keys = ("image", "resolution", "origin", "occupied_thresh")
         return all(re.search(rf"(?m)^{key}\s*:", head) for key in keys)
 
+    def pictures(self, path: Path) -> list[Path]:
+        """The files that the YAML leads to: they decide the map as much as it does."""
+        return [_read_plan(path).image]
+
     def describe(self, path: Path) -> dict[str, object]:
         """The YAML's values, pixels by state, and the extruded map."""
         plan = _read_plan(path)

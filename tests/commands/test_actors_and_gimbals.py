@@ -1,0 +1,117 @@
+"""The actor's log, a gimbal's angles, and a floor plan with its picture, through the commands."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+
+from pipelines.geometry.mounting import body_from_camera
+from pipelines.geometry.poses import conjugate, multiply, quaternion_from_rotation_vector, rotate
+from tests.commands.runner import mocap, succeeds
+from tests.synthetic.flights import SyntheticFlight, write_flight
+from tests.synthetic.logged_flights import header
+from tests.synthetic.logs import Entry, write_log
+
+
+def write_actor(flight: SyntheticFlight, folder: Path) -> None:
+    """The actor's hip, as a tracker on board would log it."""
+    hip = flight.position[:, [flight.joints.index(f"{side}_hip") for side in ("left", "right")]].mean(axis=1)
+    entries = [
+        Entry(
+            "/actor",
+            "geometry_msgs/msg/PoseStamped",
+            int(stamp_ns),
+            {
+                "header": header(int(stamp_ns), "map"),
+                "pose": {"position": dict(zip("xyz", at.tolist(), strict=True)), "orientation": {"w": 1.0}},
+            },
+        )
+        for stamp_ns, at in zip(flight.t_ns, hip, strict=True)
+    ]
+    write_log(folder, "actor", "ros2-mcap", entries)
+    flight.settings["actor"] = {"log": "actor", "topic": "/actor"}
+    flight.save()
+
+
+def test_the_logged_actor_decides_who_it_is(tmp_path: Path) -> None:
+    # Both people are seen by all cameras in every frame: nothing but the log tells the actor.
+    flight = write_flight(tmp_path, cameras=3, bystander=True, clean=True)
+    write_actor(flight, tmp_path)
+    succeeds("ingest", flight.manifest)
+    actor = pd.read_parquet(tmp_path / "flight.session" / "actor.parquet")
+    assert list(actor["t_ns"]) == list(flight.t_ns)
+    result = json.loads(succeeds("reconstruct", tmp_path / "flight.session", "--json"))
+    assert result["mpjpe_mm"] < 0.5
+
+
+def test_gimbal_angles_in_the_world_replace_the_rotation_of_the_body(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=2, clean=True)
+    lever_arm = np.array([0.0, 0.0, -0.2])
+    for k, name in enumerate(flight.cameras):
+        # A level body that heads anywhere; what looks at the actor is the gimbal alone.
+        heading = quaternion_from_rotation_vector(np.array([0.0, 0.0, 0.3 + k]))
+        world_from_gimbal = multiply(flight.camera_quaternion[k], conjugate(body_from_camera("forward")))
+        position = flight.camera_position[k] - rotate(heading, lever_arm)
+        entries: list[Entry] = []
+        for stamp_ns, at, turned in zip(flight.t_ns, position, world_from_gimbal, strict=True):
+            stamped = header(int(stamp_ns), "map")
+            pose = _pose(at, heading)
+            attitude = dict(zip("xyzw", turned.tolist(), strict=True))
+            entries += [
+                Entry(
+                    "/pose", "geometry_msgs/msg/PoseStamped", int(stamp_ns), {"header": stamped, "pose": pose}
+                ),
+                Entry(
+                    "/gimbal",
+                    "geometry_msgs/msg/QuaternionStamped",
+                    int(stamp_ns),
+                    {"header": stamped, "quaternion": attitude},
+                ),
+            ]
+        write_log(tmp_path, f"{name}_log", "mcap-cdr", entries)
+        camera = flight.settings["cameras"][name]
+        camera["pose"] = {"log": f"{name}_log.mcap", "topic": "/pose", "of": "body"}
+        camera["mount"] = {"looks": "forward", "translation": lever_arm.tolist()}
+        camera["gimbal"] = {"log": f"{name}_log.mcap", "topic": "/gimbal", "relative_to": "world"}
+    flight.save()
+    succeeds("ingest", flight.manifest)
+    for k, name in enumerate(flight.cameras):
+        poses = pd.read_parquet(tmp_path / "flight.session" / "cameras" / name / "poses.parquet")
+        logged = poses[["qx", "qy", "qz", "qw"]].to_numpy()
+        assert np.abs(poses[["x", "y", "z"]].to_numpy() - flight.camera_position[k]).max() < 1e-9
+        assert np.abs(multiply(conjugate(flight.camera_quaternion[k]), logged)[:, :3]).max() < 1e-9
+
+
+def _pose(at: Any, quaternion: Any) -> dict[str, Any]:
+    return {
+        "position": dict(zip("xyz", at.tolist(), strict=True)),
+        "orientation": dict(zip("xyzw", quaternion.tolist(), strict=True)),
+    }
+
+
+def test_a_floor_plan_is_read_again_when_its_picture_changes(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, clean=True)
+    picture = np.full((4, 5), 254, np.uint8)
+    cv2.imwrite(str(tmp_path / "site.png"), picture)
+    (tmp_path / "site.yaml").write_text(
+        "image: site.png\nresolution: 0.5\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\n"
+        "free_thresh: 0.25\n",
+        encoding="utf-8",
+    )
+    flight.settings["map"] = "site.yaml"
+    flight.save()
+    succeeds("ingest", flight.manifest)
+    stored = tmp_path / "flight.session" / "session.json"
+    assert json.loads(stored.read_text(encoding="utf-8"))["map"]["occupied"] == 0
+    assert "unchanged" in succeeds("ingest", flight.manifest)
+    picture[2, 3] = 0
+    cv2.imwrite(str(tmp_path / "site.png"), picture)
+    done = mocap("ingest", flight.manifest)
+    assert "written" in done.stdout
+    described = json.loads(stored.read_text(encoding="utf-8"))["map"]
+    assert described["occupied"] == described["shape"][2]
