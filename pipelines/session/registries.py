@@ -7,16 +7,21 @@ in this package or in a package of the user's own. An entry point names an objec
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.geometry.noise import NoiseModel, build, parse
 from pipelines.session.errors import DataError
 from pipelines.session.records import (
     CalibratedCamera,
     Detections,
+    Float,
     JointMotion,
     Message,
     Occupancy,
@@ -128,6 +133,62 @@ class MapFormat(Format, Protocol):
         """Read it as voxels, in the axes of the file; `resolution_m` where the user states their size."""
 
 
+@dataclass(frozen=True)
+class Region:
+    """A square of a picture in which one person is looked for; it may reach beyond the picture."""
+
+    centre: tuple[float, float]  # px
+    side: float  # px
+    angle_rad: float = (
+        0.0  # clockwise in the picture: how far the person's up is turned from the picture's up
+    )
+
+
+@dataclass(frozen=True)
+class Person:
+    """One person that a detector found in a region."""
+
+    xy: Float  # [J, 2] px in the whole picture, NaN where a joint was not found
+    confidence: Float  # [J] 0..1
+    presence: float  # 0..1, whether there is a person at all
+    region: Region  # where the same person is to be looked for in the next frame
+
+
+class KeypointNetworks(Protocol):
+    """The loaded networks of a detector; a context manager is not needed: they hold no files open."""
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """What the J joints are called."""
+
+    def find_people(self, picture: NDArray[np.uint8]) -> list[tuple[Region, float]]:
+        """People in a picture [H, W, 3] BGR looked at as a whole, and how sure it is; best first."""
+
+    def locate(self, picture: NDArray[np.uint8], regions: Sequence[Region]) -> list[Person]:
+        """The joints of the person in each region, whether or not there is one (see `presence`)."""
+
+
+class Detector(Protocol):
+    """A keypoint detector."""
+
+    @property
+    def name(self) -> str:
+        """What the user writes after `--detector`."""
+
+    @property
+    def title(self) -> str:
+        """What `mocap models` calls it."""
+
+    def models(self) -> dict[str, Path | None]:
+        """The files it needs: name to where they are, None for those that are missing."""
+
+    def fetch(self) -> None:
+        """Get the missing files. DataError says what to do where that fails."""
+
+    def load(self, *, threads: int) -> KeypointNetworks:
+        """Load the networks. DataError where a file is missing or is not the one that was expected."""
+
+
 class Export(Protocol):
     """A way out of a session."""
 
@@ -176,6 +237,7 @@ class Registry(Generic[T]):
 
 FORMATS: Registry[Format] = Registry("mocap.formats", "format")
 EXPORTS: Registry[Export] = Registry("mocap.exports", "export format")
+DETECTORS: Registry[Detector] = Registry("mocap.detectors", "detector")
 NOISE_MODELS: Registry[type[NoiseModel]] = Registry("mocap.noise_models", "pose noise model")
 
 F = TypeVar("F")
