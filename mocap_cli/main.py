@@ -12,6 +12,7 @@ from mocap_cli.export import export_command
 from mocap_cli.info import info_command
 from mocap_cli.ingest import ingest_command
 from mocap_cli.init import init_command
+from mocap_cli.models import models_command
 from mocap_cli.reconstruct import reconstruct_command
 from mocap_cli.report import report_command
 from mocap_cli.terminal import one_line
@@ -57,6 +58,7 @@ for command in (
     report_command,
     export_command,
     info_command,
+    models_command,
 ):
     mocap.add_command(command)
 

@@ -182,8 +182,8 @@ class Detector(Protocol):
     def models(self) -> dict[str, Path | None]:
         """The files it needs: name to where they are, None for those that are missing."""
 
-    def fetch(self) -> None:
-        """Get the missing files. DataError says what to do where that fails."""
+    def fetch(self, source: Path | None = None) -> None:
+        """Get the missing files, from `source` where they are here already. DataError says what to do."""
 
     def load(self, *, threads: int) -> KeypointNetworks:
         """Load the networks. DataError where a file is missing or is not the one that was expected."""

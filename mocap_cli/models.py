@@ -1,0 +1,62 @@
+"""`mocap models`: which keypoint detectors are there, and how to get their files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from mocap_cli.options import any_path, json_option
+from mocap_cli.terminal import print_json, print_table
+
+
+@click.group("models", invoke_without_command=True)
+@json_option
+@click.pass_context
+def models_command(context: click.Context, as_json: bool) -> None:
+    """List the keypoint detectors and whether their files are here; `fetch` gets those that are missing."""
+    if context.invoked_subcommand is not None:
+        return
+    from pipelines.session.registries import DETECTORS
+
+    detectors = DETECTORS.all()
+    if as_json:
+        print_json({"detectors": [_listed(d.name, d.title, d.models()) for d in detectors]})
+        return
+    print_table(
+        ("detector", "file", "where"),
+        [(d.name, file, path or "missing") for d in detectors for file, path in d.models().items()],
+    )
+    for detector in detectors:
+        if None in detector.models().values():
+            click.echo(f"Get what is missing with `mocap models fetch {detector.name}`.")
+
+
+@models_command.command("fetch")
+@click.argument("name", metavar="DETECTOR")
+@click.option(
+    "--from",
+    "source",
+    type=any_path,
+    help="Take the files from here instead of the network: the wheel that ships them, or a folder.",
+)
+@json_option
+def fetch_command(name: str, source: Path | None, as_json: bool) -> None:
+    """Get the model files of a detector into the user's cache."""
+    from pipelines.session.registries import DETECTORS
+
+    detector = DETECTORS.get(name)
+    detector.fetch(source)
+    if as_json:
+        print_json(_listed(detector.name, detector.title, detector.models()))
+        return
+    for path in detector.models().values():
+        click.echo(f"ready: {path}")
+
+
+def _listed(name: str, title: str, files: dict[str, Path | None]) -> dict[str, object]:
+    return {
+        "name": name,
+        "title": title,
+        "files": {file: None if path is None else str(path) for file, path in files.items()},
+    }

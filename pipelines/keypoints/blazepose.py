@@ -1,0 +1,297 @@
+"""Detector `blazepose`: the two networks of MediaPipe's pose solution (BlazePose GHUM full), run by LiteRT.
+
+What stands around the networks follows MediaPipe 0.10.21 (Bazarevsky et al., BlazePose: On-device Real-time
+Body Pose Tracking, 2020; the calculators are named where they are followed), except for two things:
+
+- Positions are ours: the centre of the top left pixel is (0, 0). MediaPipe takes the edges of its crops
+  for the centres of pixels when it samples, and for edges when it reports. On 2639 joints of mirrored crops
+  the networks themselves count from the edges to within 0.05 of a crop's pixel, which settles it.
+- A joint's confidence is the peak of its heatmap, not its visibility, which does not tell bad joints.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.keypoints.blazepose_models import BLAZEPOSE_MODELS, WheelModels
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float
+from pipelines.session.registries import Person, Region
+from pipelines.session.skeletons import get_skeleton
+
+if TYPE_CHECKING:
+    from ai_edge_litert.interpreter import Interpreter
+
+Picture = NDArray[np.uint8]
+
+_PICTURE_SIDE = 224  # of the person detector's input
+_CROP_SIDE = 256  # of the landmark network's input
+_CELL = 4  # crop pixels for each cell of a heatmap
+_CELLS = _CROP_SIDE // _CELL
+_LANDMARKS = 39  # 33 joints, the two that place the next region, and 4 that MediaPipe does not use either
+_CENTRE, _TOP = 33, 34
+_SURE = 0.5  # a person, or a heatmap's peak, of at least this counts
+_SAME_PERSON = 0.3  # intersection over union
+_MARGIN = 1.25  # a region's side over the diameter of the circle around the person
+
+
+class BlazePose:
+    """The two networks. Not to be shared by threads: each takes its own."""
+
+    def __init__(self, person_model: Path, landmark_model: Path, *, threads: int) -> None:
+        self._people = _Network(person_model, threads)
+        self._landmarks = _Network(landmark_model, threads)
+        self._anchors = _anchors()
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The 33 joints of skeleton `blazepose33`."""
+        return get_skeleton("blazepose33").joints
+
+    def find_people(self, picture: Picture) -> list[tuple[Region, float]]:
+        """People in a picture [H, W, 3] BGR, best first; tall ones, since the network sees 224 x 224 pixels.
+
+        PoseDetectionCpu: the picture is fitted into 224 x 224, black around; boxes relative to anchors
+        (TensorsToDetectionsCalculator) that overlap are merged (NonMaxSuppressionCalculator, WEIGHTED).
+        """
+        height, width = picture.shape[:2]
+        scale = max(height, width) / _PICTURE_SIDE
+        corner = (np.array([width, height]) - _PICTURE_SIDE * scale) / 2
+        placed = np.column_stack([np.eye(2) * scale, corner])
+        fitted = _sampled(picture, placed, _PICTURE_SIDE, beyond="black")
+        raw = self._people(fitted * np.float32(2 / 255) - np.float32(1))
+        score = _sigmoid(raw["Identity_1"][0, :, 0])
+        sure = score >= _SURE
+        numbers = raw["Identity"][0, sure].astype(np.float64) / _PICTURE_SIDE
+        points = numbers.reshape(-1, 6, 2)
+        points[:, [0, 2, 3, 4, 5]] += self._anchors[sure, None]
+        return [
+            # The half crop pixel puts the crop where MediaPipe samples it.
+            (_shifted(_region(*(merged * _PICTURE_SIDE * scale + corner)), -0.5), float(best))
+            for merged, best in _merged(points, score[sure])
+        ]
+
+    def locate(self, picture: Picture, regions: Sequence[Region]) -> list[Person]:
+        """The joints of the person in each region of a picture [H, W, 3] BGR.
+
+        Every joint has a position. Its confidence is the peak of its heatmap within 4 cells around it, or
+        the network's own word that the joint lies inside the crop where that is less; 0 outside of the crop.
+        """
+        return [self._locate(picture, region) for region in regions]
+
+    def _locate(self, picture: Picture, region: Region) -> Person:
+        picture_from_crop = _picture_from_crop(region)
+        crop = _sampled(picture, picture_from_crop, _CROP_SIDE, beyond="edge")
+        raw = self._landmarks(crop * np.float32(1 / 255))
+        landmarks = raw["Identity"].reshape(_LANDMARKS, 5).astype(np.float64)
+        in_crop, peak = _refined(landmarks[:, :2], raw["Identity_3"][0].astype(np.float64))
+        xy = (in_crop - 0.5) @ picture_from_crop[:, :2].T + picture_from_crop[:, 2]
+        inside = _sigmoid(landmarks[:, 4])
+        count = len(self.joints)
+        return Person(
+            xy=xy[:count],
+            confidence=np.minimum(peak, inside)[:count],
+            presence=float(raw["Identity_1"].item()),
+            region=_region(xy[_CENTRE], xy[_TOP]),
+        )
+
+
+class BlazePoseDetector:
+    """What `mocap models` and the stages see of it; `models` tells where its files come from."""
+
+    name = "blazepose"
+    title = "BlazePose GHUM full (MediaPipe 0.10.21, Apache-2.0): 33 joints, on the CPU"
+
+    def __init__(self, models: WheelModels) -> None:
+        self._models = models
+
+    def models(self) -> dict[str, Path | None]:
+        """The two networks' files: name to path, None where missing."""
+        return self._models.present()
+
+    def fetch(self, source: Path | None = None) -> None:
+        """Get the missing files; see `WheelModels.fetch`."""
+        self._models.fetch(source)
+
+    def load(self, *, threads: int) -> BlazePose:
+        """Load the networks; the results do not depend on `threads`.
+
+        Raises:
+            DataError: a file is missing or is not the one that was expected.
+        """
+        person_model, landmark_model = self._models.verified().values()
+        return BlazePose(person_model, landmark_model, threads=threads)
+
+
+DETECTOR = BlazePoseDetector(BLAZEPOSE_MODELS)
+
+
+class _Network:
+    """One LiteRT model with one input: picture in, named tensors out."""
+
+    def __init__(self, path: Path, threads: int) -> None:
+        from ai_edge_litert.interpreter import Interpreter
+
+        with _quiet_stderr():
+            try:
+                self._interpreter: Interpreter = Interpreter(str(path), num_threads=threads)
+            except ValueError as error:
+                raise DataError(path, f"is no readable model ({error})") from None
+            self._interpreter.allocate_tensors()
+        self._input = self._interpreter.get_input_details()[0]["index"]
+        self._outputs = {tensor["name"]: tensor["index"] for tensor in self._interpreter.get_output_details()}
+
+    def __call__(self, picture: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
+        self._interpreter.set_tensor(self._input, picture[None])
+        self._interpreter.invoke()
+        return {name: self._interpreter.get_tensor(index) for name, index in self._outputs.items()}
+
+
+_stderr_lock = threading.Lock()
+
+
+@contextmanager
+def _quiet_stderr() -> Iterator[None]:
+    """Nothing of the process reaches stderr: LiteRT greets there from C++, with no switch to stop it."""
+    with _stderr_lock:
+        sys.stderr.flush()
+        kept = os.dup(2)
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        try:
+            os.dup2(nowhere, 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(nowhere)
+            os.close(kept)
+
+
+def _anchors() -> Float:
+    """The centres [2254, 2] that the person detector's numbers are relative to, as shares of its input.
+
+    SsdAnchorsCalculator: strides 8, 16 and three times 32, two anchors for each.
+    """
+    grids = []
+    for cells, each in ((28, 2), (14, 2), (7, 6)):
+        centre = (np.arange(cells) + 0.5) / cells
+        x, y = np.meshgrid(centre, centre)
+        grids.append(np.repeat(np.column_stack([x.ravel(), y.ravel()]), each, axis=0))
+    return np.concatenate(grids)
+
+
+def _merged(points: Float, score: Float) -> Iterator[tuple[Float, np.float64]]:
+    """One answer for all that overlap the best one, then for the rest, and so on.
+
+    Args:
+        points: [N, 6, 2] the centre and size of a box, then four points.
+        score: [N] 0..1.
+
+    Yields:
+        The first two of the four points [2, 2] (middle of the hips, top of the circle around the person),
+        averaged with the scores as weights, and the best score.
+    """
+    low, high = points[:, 0] - points[:, 1] / 2, points[:, 0] + points[:, 1] / 2
+    area = np.prod(high - low, axis=1)
+    left = np.argsort(-score, kind="stable")
+    while len(left):
+        best = left[0]
+        common = np.prod(
+            np.clip(np.minimum(high[best], high[left]) - np.maximum(low[best], low[left]), 0, None), 1
+        )
+        same = common > _SAME_PERSON * (area[best] + area[left] - common)
+        same[0] = True
+        group = left[same]
+        yield np.average(points[group, 2:4], axis=0, weights=score[group]), score[best]
+        left = left[~same]
+
+
+def _region(centre: Float, top: Float) -> Region:
+    """The square around a person, from the middle of the hips and a point above on the circle around all.
+
+    AlignmentPointsRectsCalculator and RectTransformationCalculator: upright means centre below top.
+    """
+    right, down = top - centre
+    return Region(
+        centre=(float(centre[0]), float(centre[1])),
+        side=float(2 * np.hypot(right, down) * _MARGIN),
+        angle_rad=float(np.arctan2(right, -down)),
+    )
+
+
+def _shifted(region: Region, crop_px: float) -> Region:
+    """The region moved by so many pixels of its crop, to its right and down."""
+    x, y = _axes(region) @ np.full(2, crop_px) + region.centre
+    return Region((float(x), float(y)), region.side, region.angle_rad)
+
+
+def _axes(region: Region) -> Float:
+    """[2, 2]: the columns are one crop pixel to the right and one down, in the picture's pixels."""
+    cosine, sine = np.cos(region.angle_rad), np.sin(region.angle_rad)
+    return np.array([[cosine, -sine], [sine, cosine]]) * region.side / _CROP_SIDE
+
+
+def _picture_from_crop(region: Region) -> Float:
+    """[2, 3]: from the crop's pixels to the picture's, both counted from the centre of the top left one."""
+    axes = _axes(region)
+    return np.column_stack([axes, np.array(region.centre) - axes @ np.full(2, (_CROP_SIDE - 1) / 2)])
+
+
+def _sampled(picture: Picture, picture_from_crop: Float, side: int, *, beyond: str) -> NDArray[np.float32]:
+    """The RGB values 0..255 [side, side, 3] of a BGR picture where a crop's pixels lie, bilinear.
+
+    OpenCV 4 rounds positions to 1/32 px when it warps, as does the one inside MediaPipe; OpenCV 5 does
+    not, which moves landmarks by 0.6 px (median) where the crop is coarser than the picture. Fixed-point
+    maps are rounded the same way in both.
+    """
+    import cv2
+
+    column = np.arange(side)
+    x, y = (
+        (row[0] * column + (row[1] * column + row[2])[:, None]).astype(np.float32)
+        for row in picture_from_crop
+    )
+    whole, part = cv2.convertMaps(x, y, cv2.CV_16SC2)
+    border = cv2.BORDER_REPLICATE if beyond == "edge" else cv2.BORDER_CONSTANT
+    sampled = cv2.remap(picture, whole, part, cv2.INTER_LINEAR, borderMode=border)
+    rgb: NDArray[np.float32] = sampled[:, :, ::-1].astype(np.float32)
+    return rgb
+
+
+def _refined(in_crop: Float, heatmap: Float) -> tuple[Float, Float]:
+    """Positions moved to the middle of the heatmap around them, and the heatmap's peak there.
+
+    RefineLandmarksFromHeatmapCalculator, 9 x 9 cells, for peaks of at least 0.5; others stay.
+
+    Args:
+        in_crop: [L, 2] crop pixels.
+        heatmap: [64, 64, L] logits, row first.
+
+    Returns:
+        The positions [L, 2] and the peaks [L] 0..1, 0 where a position lies outside of the crop.
+    """
+    cell = np.trunc(in_crop / _CELL).astype(np.int64)[:, :, None] + np.arange(-4, 5)  # [L, xy, 9]
+    exists = (cell >= 0) & (cell < _CELLS)
+    x, y = np.moveaxis(np.clip(cell, 0, _CELLS - 1), 1, 0)
+    joint = np.arange(len(in_crop))[:, None, None]
+    here = _sigmoid(heatmap[y[:, :, None], x[:, None, :], joint])  # [L, row, column]
+    centred = exists[:, 0, 4] & exists[:, 1, 4]
+    here = np.where(exists[:, 1, :, None] & exists[:, 0, None, :] & centred[:, None, None], here, 0.0)
+    peak = here.max(axis=(1, 2))
+    total = np.maximum(here.sum(axis=(1, 2)), np.finfo(float).tiny)
+    middle = np.stack([np.einsum("lrc,lc->l", here, x), np.einsum("lrc,lr->l", here, y)], 1) / total[:, None]
+    return np.where((peak >= _SURE)[:, None], middle * _CELL, in_crop), peak
+
+
+def _sigmoid(logit: NDArray[np.floating[Any]]) -> Float:
+    # Beyond 60 nothing changes but the overflow warning.
+    sigmoid: Float = 1 / (1 + np.exp(-np.clip(logit.astype(np.float64), -60, 60)))
+    return sigmoid
