@@ -1,0 +1,70 @@
+"""Where the log says that the actor is in a picture, and how far that can be off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.geometry.poses import invert, transform
+
+Float = NDArray[np.float64]
+
+_SIGMAS = 3.0
+_STEP = 1e-4  # of the range: small against a body, large against rounding
+
+
+@dataclass(frozen=True)
+class Hint:
+    """The actor's place in the picture as the log has it."""
+
+    centre: tuple[float, float]  # px
+    height_px: float  # of the actor standing across the line of sight
+    margin_px: float  # three sigma: how far from `centre` the actor may be
+
+
+def project_actor(
+    position_world: Float,
+    world_from_camera: tuple[Float, Float],
+    intrinsics: Intrinsics,
+    *,
+    sigma_m: float,
+    sigma_rad: float,
+    height_m: float = 1.75,
+) -> Hint | None:
+    """The actor's logged position in a camera's picture.
+
+    The height is that of a body across the line of sight, whatever the tilt: the length in which the
+    sizes of regions are measured. Lengths are turned into pixels where the actor appears, so distortion
+    and the stretch away from the axis are in them.
+
+    Args:
+        position_world: [3] m, the point of the actor that the log follows (hip or near it).
+        world_from_camera: position [3] m and quaternion [4] xyzw of the camera at that time.
+        intrinsics: the camera.
+        sigma_m: one sigma per axis of the actor's position relative to the camera's, both errors together.
+        sigma_rad: one sigma per axis of the camera's rotation.
+        height_m: of the actor.
+
+    Returns:
+        The hint; None where a number is missing (NaN), the actor is behind the camera or beyond the
+        model's valid radius, or outside the picture by more than the margin.
+    """
+    actor = transform(invert(*world_from_camera), position_world)
+    # project() expects depth to be comparable, and NaN fails every comparison.
+    if not actor[2] > 0:
+        return None
+    distance = float(np.linalg.norm(actor))
+    across = np.linalg.svd(actor[None, :])[2][1:]  # two unit vectors at right angles to the line of sight
+    points = np.vstack([actor, actor + _STEP * distance * across])
+    pixels = project(points, intrinsics)
+    if not np.isfinite(pixels).all():
+        return None
+    px_per_rad = float(np.sqrt(abs(np.linalg.det(pixels[1:] - pixels[0])))) / _STEP
+    margin = _SIGMAS * px_per_rad * float(np.hypot(sigma_m / distance, sigma_rad))
+    x, y = float(pixels[0, 0]), float(pixels[0, 1])
+    if not (-margin <= x <= intrinsics.width - 1 + margin and -margin <= y <= intrinsics.height - 1 + margin):
+        return None
+    return Hint((x, y), px_per_rad * height_m / distance, margin)

@@ -1,0 +1,102 @@
+"""Squares of large pictures: what they cover, and that everybody in them is found once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipelines.keypoints.tiles import Tile, find_in, square_about, squares_about, tiles
+from tests.keypoints.bars import Bar, BarNetworks, draw
+
+
+def _holds(tile: Tile, x: float, y: float, size: float) -> bool:
+    """Whether a square of that size about a place is whole in the tile, to the pixel's rounding."""
+    across = tile.left - 1 <= x - size / 2 and x + size / 2 <= tile.left + tile.width + 1
+    return across and tile.top - 1 <= y - size / 2 and y + size / 2 <= tile.top + tile.height + 1
+
+
+@given(
+    width=st.integers(640, 4096),
+    height=st.integers(640, 4096),
+    share=st.sampled_from([1.0, 0.5, 0.25]),
+    place=st.tuples(st.floats(0, 1), st.floats(0, 1)),
+)
+def test_a_body_of_a_third_of_a_tile_is_whole_in_one(
+    width: int, height: int, share: float, place: tuple[float, float]
+) -> None:
+    side = round(min(width, height) * share)
+    body = side / 3
+    x = body / 2 + place[0] * (width - body)
+    y = body / 2 + place[1] * (height - body)
+
+    assert any(_holds(tile, x, y, body) for tile in tiles(width, height) if tile.width == tile.height == side)
+
+
+@given(width=st.integers(1, 8000), height=st.integers(1, 8000))
+def test_tiles_lie_in_the_picture_and_start_with_the_whole(width: int, height: int) -> None:
+    cover = tiles(width, height) if max(width, height) < 20 * min(width, height) else tiles(width, width)
+    size = (cover[0].width, cover[0].height)
+
+    assert (cover[0].left, cover[0].top) == (0, 0)
+    assert len(set(cover)) == len(cover)
+    for tile in cover:
+        assert 0 <= tile.left <= size[0] - tile.width
+        assert 0 <= tile.top <= size[1] - tile.height
+
+
+@pytest.mark.parametrize("size", [(1280, 720), (1920, 1080), (3840, 2160)])
+def test_the_number_of_tiles_does_not_grow_with_the_picture(size: tuple[int, int]) -> None:
+    # By hand at 16:9, steps of 2/3 of a side: 1 + 3 + 5 x 3 + 11 x 6.
+    assert len(tiles(*size)) == 1 + 3 + 15 + 66
+
+
+def test_small_pictures_are_not_cut_into_crumbs() -> None:
+    assert tiles(100, 80) == [Tile(0, 0, 100, 80)]
+
+
+@given(centre=st.tuples(st.floats(-500, 2500), st.floats(-500, 1500)), side=st.floats(1, 5000))
+def test_a_square_is_moved_into_the_picture(centre: tuple[float, float], side: float) -> None:
+    square = square_about(centre, side, 1920, 1080)
+
+    assert 0 <= square.left <= 1920 - square.width
+    assert 0 <= square.top <= 1080 - square.height
+    assert (square.width, square.height) == (min(round(side), 1920), min(round(side), 1080))
+
+
+@given(
+    margin=st.floats(0, 300),
+    offset=st.tuples(st.floats(-1, 1), st.floats(-1, 1)),
+)
+def test_squares_hold_a_body_anywhere_within_the_margin(margin: float, offset: tuple[float, float]) -> None:
+    # 100 px bodies: 3 x 3 squares are enough for a margin of three heights.
+    squares = squares_about((960, 540), 100, margin, 1920, 1080)
+
+    assert len(squares) <= 9
+    assert any(_holds(s, 960 + margin * offset[0], 540 + margin * offset[1], 100) for s in squares)
+
+
+def test_people_are_found_once_and_in_the_pixels_of_the_whole_picture() -> None:
+    people = [Bar(700, 500, 121), Bar(760, 505, 121), Bar(1500, 300, 201)]
+    picture = draw(1920, 1080, *people)
+
+    found = find_in(BarNetworks(), picture, tiles(1920, 1080))
+
+    # Those cut off by a tile's border may remain as further candidates: none elsewhere than on a body.
+    for person in people:
+        assert np.min([np.hypot(r.centre[0] - person.x, r.centre[1] - person.y) for r, _ in found]) <= 0.5
+    places = np.array([region.centre for region, _ in found])
+    apart = np.linalg.norm(places[:, None] - places, axis=2)[np.triu_indices(len(places), 1)]
+    # 0.2 of a region's side of 1.25 heights: cut bodies of 121 px have smaller regions.
+    assert apart.min() >= 0.2 * 1.25 * 121 * 0.25
+
+
+@settings(max_examples=20)
+@given(x=st.integers(40, 920), y=st.integers(40, 500))
+def test_small_people_are_found_by_tiles_and_not_in_the_whole(x: int, y: int) -> None:
+    picture = draw(960, 540, Bar(x, y, 71))
+
+    assert not find_in(BarNetworks(), picture, tiles(960, 540)[:1])
+    best, _ = find_in(BarNetworks(), picture, tiles(960, 540))[0]
+    assert best.centre == pytest.approx((x, y), abs=0.5)
