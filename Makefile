@@ -36,6 +36,8 @@ lint: setup
 
 bench: setup
 	$(BIN)/python -m benchmarks.triangulation
+	$(BIN)/python -m benchmarks.loss
+	$(BIN)/python -m benchmarks.ingest_log
 
 # Write the sample flight again: the same bytes as in the repository.
 sample: setup

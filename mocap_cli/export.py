@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from mocap_cli.options import folder, json_option, overwrite_option, session_argument
+from mocap_cli.options import any_path, json_option, overwrite_option, session_argument
 from mocap_cli.terminal import print_json
 
 
@@ -19,7 +19,7 @@ from mocap_cli.terminal import print_json
     metavar="FORMAT[,FORMAT...]",
     help="trc (OpenSim, metres, Y up), csv (everything, long), tum (camera trajectories).",
 )
-@click.option("-o", "--output", type=folder, help="Folder [default: the session's name with .export].")
+@click.option("-o", "--output", type=any_path, help="Folder [default: the session's name with .export].")
 @overwrite_option
 @json_option
 def export_command(session: Path, formats: str, output: Path | None, overwrite: bool, as_json: bool) -> None:

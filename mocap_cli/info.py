@@ -7,17 +7,17 @@ from pathlib import Path
 
 import click
 
-from mocap_cli.options import existing_path, json_option
+from mocap_cli.options import any_path, json_option
 from mocap_cli.terminal import one_line, print_json
 
 _LONGEST_LIST = 12
 
 
 @click.command("info")
-@click.argument("path", type=existing_path)
+@click.argument("path", type=any_path)
 @json_option
 def info_command(path: Path, as_json: bool) -> None:
-    """Say what a session, manifest, trajectory, calibration or keypoint file holds."""
+    """Say what a log, video, map, calibration, keypoint file, trajectory, manifest or session holds."""
     from pipelines.session.storage import jsonable
     from pipelines.survey import survey
 

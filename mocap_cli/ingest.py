@@ -8,28 +8,28 @@ from typing import TYPE_CHECKING
 import click
 
 from mocap_cli.options import (
-    existing_file,
-    folder,
+    FiniteRange,
+    any_path,
     force_option,
     json_option,
     level,
     overwrite_option,
     verbosity_options,
 )
-from mocap_cli.terminal import one_line, print_json, print_table, watching
+from mocap_cli.terminal import one_line, print_json, print_table, say_warnings, watching
 
 if TYPE_CHECKING:
     from pipelines.ingest import Ingested
 
 
 @click.command("ingest")
-@click.argument("flight", type=existing_file, metavar="FLIGHT.yaml")
+@click.argument("flight", type=any_path, metavar="FLIGHT.yaml")
 @click.option(
-    "-o", "--output", type=folder, help="Session folder [default: the manifest's name with .session]."
+    "-o", "--output", type=any_path, help="Session folder [default: the manifest's name with .session]."
 )
 @click.option(
     "--max-pose-gap",
-    type=click.FloatRange(0, min_open=True),
+    type=FiniteRange(0, 1e6, min_open=True),
     default=0.5,
     show_default=True,
     metavar="SECONDS",
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--max-extrapolation",
-    type=click.FloatRange(0),
+    type=FiniteRange(0, 1e6),
     default=0.1,
     show_default=True,
     metavar="SECONDS",
@@ -71,10 +71,13 @@ def ingest_command(
             force=force,
             progress=progress,
         )
+    say_warnings(result.description.warnings, quiet)
     if as_json:
         print_json(result.description.model_dump(mode="json", by_alias=True))
-    else:
+        return
+    if not quiet:
         _print(result)
+    click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder}")
 
 
 def _print(result: Ingested) -> None:
@@ -102,6 +105,3 @@ def _print(result: Ingested) -> None:
             for name, camera in description.cameras.items()
         ],
     )
-    for warning in description.warnings:
-        click.echo(f"warning: {one_line(warning)}", err=True)
-    click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mocap_cli.options import existing_path, json_option, level, overwrite_option, verbosity_options
+from mocap_cli.options import any_path, json_option, level, overwrite_option, verbosity_options
 from mocap_cli.terminal import one_line, print_json, watching
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ _MANY = 5  # files of one kind in one folder that are told one by one
 
 
 @click.command("init")
-@click.argument("paths", type=existing_path, nargs=-1, required=True, metavar="PATHS...")
+@click.argument("paths", type=any_path, nargs=-1, required=True, metavar="PATHS...")
 @click.option(
     "-o",
     "--output",

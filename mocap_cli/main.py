@@ -69,5 +69,13 @@ def run() -> None:
         mocap()
     except BrokenPipeError:
         # The reader of our output (head, a pager) went away: no reason for a traceback at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
+        _leave_stdout()
+    except OSError as error:
+        click.echo(f"mocap: cannot write its output ({error.strerror}); nothing else is lost", err=True)
+        _leave_stdout()
+
+
+def _leave_stdout() -> None:
+    """End without trying to write what is still to be written."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -10,13 +11,10 @@ import click
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
-existing_file = click.Path(exists=True, dir_okay=False, path_type=Path)
-existing_path = click.Path(exists=True, path_type=Path)
-folder = click.Path(file_okay=False, path_type=Path)
+any_path = click.Path(path_type=Path)
+"""Whether a path is there and of the right kind is told by whoever reads it, in the words of the house."""
 
-session_argument = click.argument(
-    "session", type=click.Path(exists=True, file_okay=False, path_type=Path), metavar="SESSION"
-)
+session_argument = click.argument("session", type=any_path, metavar="SESSION")
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Write where something else lies. Never done without this."
 )
@@ -28,9 +26,20 @@ json_option = click.option(
 )
 
 
+class FiniteRange(click.FloatRange):
+    """A range of numbers without NaN and infinity, which click lets through."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number, or a usage error."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is no finite number.", param, ctx)
+        return number
+
+
 def verbosity_options(command: Command) -> Command:
     """Add -q and -v; the command takes `quiet: bool` and `verbose: int`."""
-    quiet = click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors and the result.")
+    quiet = click.option("-q", "--quiet", is_flag=True, help="Say only where the result is, and errors.")
     verbose = click.option("-v", "--verbose", count=True, help="Say more.")
     return quiet(verbose(command))
 

@@ -8,8 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mocap_cli.options import force_option, json_option, level, session_argument, verbosity_options
-from mocap_cli.terminal import one_line, print_json, print_table, watching
+from mocap_cli.options import (
+    FiniteRange,
+    force_option,
+    json_option,
+    level,
+    session_argument,
+    verbosity_options,
+)
+from mocap_cli.terminal import print_json, print_table, say_warnings, watching
 
 if TYPE_CHECKING:
     from pipelines.geometry.triangulation import Method
@@ -28,21 +35,21 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--rate",
-    type=click.FloatRange(0, 10_000, min_open=True),
+    type=FiniteRange(0, 10_000, min_open=True),
     metavar="HZ",
     help="Rate of the skeleton [default: the frames of the camera with the most].",
 )
 @click.option("--persons", type=click.IntRange(1, 20), default=1, show_default=True, help="How many people.")
 @click.option(
     "--min-confidence",
-    type=click.FloatRange(0, 1),
+    type=FiniteRange(0, 1),
     default=0.3,
     show_default=True,
     help="Keypoints below this are not used.",
 )
 @click.option(
     "--pixel-noise",
-    type=click.FloatRange(0, min_open=True),
+    type=FiniteRange(0.01, 10_000),
     default=3.0,
     show_default=True,
     metavar="PX",
@@ -53,6 +60,20 @@ if TYPE_CHECKING:
     metavar="MODEL",
     help="What is known of the camera poses' errors, instead of what flight.yaml says; for example"
     ' "white:position_m=0.3,rotation_deg=1 + drift:position_m_per_sqrt_s=0.05".',
+)
+@click.option(
+    "--detector",
+    default="blazepose",
+    show_default=True,
+    help="Runs on the pictures of cameras that came without keypoints (see `mocap models`).",
+)
+@click.option(
+    "--every",
+    type=click.IntRange(1, 1000),
+    default=1,
+    show_default=True,
+    metavar="N",
+    help="Let the detector look at every N-th picture only.",
 )
 @click.option(
     "--workers",
@@ -72,13 +93,15 @@ def reconstruct_command(
     min_confidence: float,
     pixel_noise: float,
     pose_noise: str | None,
+    detector: str,
+    every: int,
     workers: int,
     force: bool,
     as_json: bool,
     quiet: bool,
     verbose: int,
 ) -> None:
-    """Triangulate the actor's joints and measure the errors."""
+    """Find the actor's joints in the pictures, triangulate them, and measure the errors."""
     from pipelines.reconstruct import Settings, reconstruct
 
     settings = Settings(
@@ -88,13 +111,18 @@ def reconstruct_command(
         min_confidence=min_confidence,
         pixel_sigma=pixel_noise,
         pose_noise=pose_noise,
+        detector=detector,
+        every=every,
     )
     with watching(level(quiet, verbose)) as progress:
         result = reconstruct(session, settings, workers=workers, force=force, progress=progress)
+    say_warnings(result.record.warnings, quiet)
     if as_json:
         print_json(result.metrics)
-    else:
+        return
+    if not quiet:
         _print(result)
+    click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'reconstruct'}")
 
 
 def _print(result: Reconstructed) -> None:
@@ -112,6 +140,3 @@ def _print(result: Reconstructed) -> None:
             row += [joint.get("mpjpe_mm"), joint.get("root_mpjpe_mm"), joint.get("pa_mpjpe_mm")]
         rows.append(row)
     print_table(header, rows)
-    for warning in result.record.warnings:
-        click.echo(f"warning: {one_line(warning)}", err=True)
-    click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'reconstruct'}")

@@ -77,6 +77,13 @@ def watching(verbosity: int) -> Iterator[Progress]:
         yield _BarsOnStderr(verbosity, bars)
 
 
+def say_warnings(warnings: Sequence[str], quiet: bool) -> None:
+    """What is doubtful, on stderr."""
+    if not quiet:
+        for warning in warnings:
+            click.echo(f"warning: {one_line(warning)}", err=True)
+
+
 def print_json(result: Mapping[str, object]) -> None:
     """The machine-readable result."""
     click.echo(json.dumps(result, indent=2, ensure_ascii=False, allow_nan=False))

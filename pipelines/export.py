@@ -11,7 +11,7 @@ from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
 from pipelines.session.records import Recording
 from pipelines.session.registries import EXPORTS
-from pipelines.session.stages import open_session
+from pipelines.session.stages import open_session, session_name
 from pipelines.session.storage import as_data_error, sha256_of
 from pipelines.session.tables import POSES, SKELETON, read_table
 from pipelines.session.tabular import motion_from, trajectory_from
@@ -34,15 +34,16 @@ def export(
     Args:
         folder: the session.
         formats: registered names.
-        output: where to; by default the session's folder with `.export` instead of `.session`.
+        output: where to; by default beside the session, `.export` in the place of `.session`.
         overwrite: replace files that are there and differ.
 
     Raises:
         DataError: no such format, nothing to export, or a file would be overwritten.
     """
-    exports = [EXPORTS.get(name) for name in dict.fromkeys(formats)]
+    exports = [EXPORTS.get(name) for name in dict.fromkeys(name.lower() for name in formats)]
     recording = load_recording(folder)
-    target = output or folder.with_suffix(".export")
+    target = output or folder.resolve().with_name(f"{session_name(folder)}.export")
+    is_new = not target.exists()
     try:
         target.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=target, prefix=".writing-") as temporary:
@@ -54,6 +55,9 @@ def export(
             return _move(made, target, overwrite)
     except OSError as error:
         raise as_data_error(error, target) from error
+    finally:
+        if is_new and target.is_dir() and not any(target.iterdir()):
+            target.rmdir()
 
 
 def load_recording(folder: Path) -> Recording:

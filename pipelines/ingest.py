@@ -7,8 +7,9 @@ chunk of its own: an interrupted ingest continues with the cameras that it had n
 
 from __future__ import annotations
 
+import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -57,6 +58,7 @@ INGEST = Stage("ingest", revision=1)
 _MUCH_SHORTER = 0.9  # a video that covers less than this share of its pose log is worth a word
 _SHORTER_S = 1.0
 _HASHERS = 4
+_FASTEST_MPS = 100.0  # no camera that films a person flies faster
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,12 @@ def ingest(
     _refuse_other_flight(target, flight, overwrite)
     interpolation = Interpolation(max_gap_s=max_pose_gap_s, max_extrapolation_s=max_extrapolation_s)
     sources = _hash_sources(flight, flight_path.parent, progress)
-    settings = {"flight": flight.model_dump(mode="json"), "pose_interpolation": interpolation.model_dump()}
+    settings = {
+        "flight": flight.model_dump(mode="json"),
+        "cameras": list(flight.cameras),  # their order decides between equals
+        "pose_interpolation": interpolation.model_dump(),
+        "flight_from_session": Path(os.path.relpath(flight_path.parent, target)).as_posix(),  # for media
+    }
 
     with locked(target, create=True, overwrite=overwrite) as writable:
         run = writable.begin(INGEST, settings=settings, inputs=sources, force=force)
@@ -232,17 +239,27 @@ def _counts(entries: Mapping[str, CameraEntry]) -> dict[str, object]:
 
 
 def _check_overlap(flight_path: Path, entries: Mapping[str, CameraEntry]) -> None:
-    """Refuse a camera whose frames share no moment with those of any other."""
-    for name, entry in entries.items():
-        others = [other.frames for key, other in entries.items() if key != name]
-        first, last = entry.frames.first_t_ns, entry.frames.last_t_ns
-        if others and not any(first <= o.last_t_ns and o.first_t_ns <= last for o in others):
+    """Refuse cameras whose frames share no moment with the others', not even by way of a third camera."""
+    ordered = sorted(entries, key=lambda name: entries[name].frames.first_t_ns)
+    reached_ns = entries[ordered[0]].frames.last_t_ns
+    for place, name in enumerate(ordered):
+        frames = entries[name].frames
+        if frames.first_t_ns > reached_ns:
+            # The smaller side is the odd one out.
+            late = 2 * place >= len(ordered)
+            odd, rest = (ordered[place:], ordered[:place]) if late else (ordered[:place], ordered[place:])
             raise DataError(
                 flight_path,
-                f"cameras.{name}: its frames ({_span(first, last)}) overlap in time with no other camera's"
-                f" ({_span(min(o.first_t_ns for o in others), max(o.last_t_ns for o in others))})",
+                f"cameras.{', '.join(odd)}: frames ({_span_of(odd, entries)}) overlap in time with no other"
+                f" camera's ({_span_of(rest, entries)})",
                 "check frame_times.start and clock.offset_s",
             )
+        reached_ns = max(reached_ns, frames.last_t_ns)
+
+
+def _span_of(names: Sequence[str], entries: Mapping[str, CameraEntry]) -> str:
+    frames = [entries[name].frames for name in names]
+    return _span(min(f.first_t_ns for f in frames), max(f.last_t_ns for f in frames))
 
 
 class _Reader:
@@ -306,7 +323,7 @@ class _Reader:
                 first_t_ns=int(frames.t_ns[0]),
                 last_t_ns=int(frames.t_ns[-1]),
                 rate_hz=_rate(frames.t_ns),
-                dropped=video.dropped if video else {},
+                dropped=frames.dropped,
             ),
             poses=self._poses_entry(name, camera, trajectory, frames.t_ns),
             keypoints=_keypoints_entry(camera, detections, detector_format, len(frames.t_ns)),
@@ -388,7 +405,10 @@ class _Reader:
     ) -> PosesEntry:
         static = camera.pose.static is not None
         poses_t_ns = trajectory.t_ns
+        without_pose = 0
         if not static:
+            without_pose = self._frames_without_pose(name, camera, trajectory, frames_t_ns)
+            self._doubt_speed(name, trajectory)
             span, covered = int(np.ptp(poses_t_ns)) / 1e9, int(np.ptp(frames_t_ns)) / 1e9
             if covered < _MUCH_SHORTER * span and span - covered > _SHORTER_S:
                 self._notes.append(f"{name}: its pictures cover {covered:.1f} s of {span:.1f} s of poses")
@@ -398,11 +418,20 @@ class _Reader:
             count=len(poses_t_ns),
             rate_hz=_rate(poses_t_ns),
             gaps_ns=[] if static else gaps(poses_t_ns, self._max_gap_ns),
-            frames_without_pose=0
-            if static
-            else self._frames_without_pose(name, camera, trajectory, frames_t_ns),
+            frames_without_pose=without_pose,
             dropped=trajectory.dropped,
         )
+
+    def _doubt_speed(self, name: str, trajectory: Trajectory) -> None:
+        step_s = np.diff(trajectory.t_ns) / 1e9
+        speed = np.linalg.norm(np.diff(trajectory.position, axis=0), axis=1) / step_s
+        too_fast = speed > _FASTEST_MPS
+        if too_fast.any():
+            first_s = int(trajectory.t_ns[np.argmax(too_fast)] - trajectory.t_ns[0]) / 1e9
+            self._notes.append(
+                f"{name}: its poses jump {int(too_fast.sum())} times, by up to {speed.max():.3g} m/s"
+                f" (first after {first_s:.2f} s)"
+            )
 
     def _frames_without_pose(
         self, name: str, camera: Camera, trajectory: Trajectory, frames_t_ns: Int64

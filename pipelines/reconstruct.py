@@ -7,7 +7,7 @@ status that says why.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.geometry.noise import sum_sigma
-from pipelines.geometry.poses import interpolate_points, rates
+from pipelines.detect import detect
 from pipelines.geometry.triangulation import (
     STATUS,
     Method,
@@ -26,26 +25,23 @@ from pipelines.geometry.triangulation import (
     triangulate,
 )
 from pipelines.keypoints.association import Association, associate
+from pipelines.reconstruction.loading import load_actor, load_cameras, load_truth
 from pipelines.reconstruction.observations import Camera, Observations, candidates, observe, time_base
 from pipelines.reconstruction.quality import assess
 from pipelines.reconstruction.reweighting import triangulate_heavy_tailed
-from pipelines.session.description import CameraEntry, Description, read_description
+from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Float, Int64, Trajectory
-from pipelines.session.registries import noise_models, parsed_noise_models
+from pipelines.session.records import Float, Int64
 from pipelines.session.stages import Stage, StageRecord, locked
 from pipelines.session.storage import jsonable, read_json, write_json
-from pipelines.session.tables import ACTOR, FRAMES, KEYPOINTS, POSES, SKELETON, TRUTH, read_table, write_table
-from pipelines.session.tabular import detections_from, motion_from, trajectory_from
+from pipelines.session.tables import SKELETON, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
 
 RECONSTRUCT = Stage("reconstruct", revision=1)
 
-_TRUTH_GAP_NS = 250_000_000
-_ACTOR_GAP_NS = 2_000_000_000
 _UNKNOWN_SIGMA = (0.3, np.radians(1.0))
 """Camera pose noise (m, rad) taken for telling people apart where nobody states it: METHODS' medium level."""
 
@@ -60,6 +56,8 @@ class Settings:
     min_confidence: float = 0.3
     pixel_sigma: float = 3.0
     pose_noise: str | None = None
+    detector: str = "blazepose"  # for cameras with pictures and without keypoints
+    every: int = 1  # of their pictures
 
 
 @dataclass(frozen=True)
@@ -100,18 +98,28 @@ def reconstruct(
         ingested = session.record("ingest")
         if ingested is None:
             raise DataError(folder, "was never ingested completely", "run `mocap ingest` again")
-        run = session.begin(
-            RECONSTRUCT, settings=asdict(settings), inputs=dict(ingested.outputs), force=force
+        detected = detect(
+            session,
+            detector=settings.detector,
+            every=settings.every,
+            workers=workers,
+            progress=progress,
         )
+        inputs = dict(ingested.outputs) | (detected.outputs if detected else {})
+        run = session.begin(RECONSTRUCT, settings=asdict(settings), inputs=inputs, force=force)
         if run.finished:
             metrics = read_json(folder / "reconstruct" / "metrics.json")
             return Reconstructed(folder, run.record, metrics, skipped=True)
-        for name, (before, now) in run.replaces.items():
-            progress.note(f"replaces the reconstruction made with {name} = {before} (now {now})")
 
         description = read_description(folder)
         progress.start("Reconstructing", 4)
-        cameras = _load_cameras(folder, description, settings)
+        cameras, warnings = load_cameras(
+            folder,
+            description,
+            detected,
+            min_confidence=settings.min_confidence,
+            pose_noise=settings.pose_noise,
+        )
         progress.advance()
         observations, association = _observe(folder, cameras, description, settings)
         progress.advance()
@@ -127,7 +135,7 @@ def reconstruct(
                 result,
                 cameras=[camera.name for camera in cameras],
                 method=settings.method,
-                truth=_load_truth(folder, description, observations),
+                truth=load_truth(folder, description, observations.joints, observations.t_ns),
                 solve=solve,
             )
         )
@@ -135,96 +143,12 @@ def reconstruct(
         write_json(run.folder / "metrics.json", metrics)
         record = run.publish(
             counts={**metrics["status_counts"], "association": _association_counts(association)},
-            warnings=association.reasons,
+            warnings=[*warnings, *association.reasons, *_unused(cameras, result)],
         )
         progress.advance()
+        for name, (before, now) in run.replaces.items():
+            progress.note(f"replaced the reconstruction made with {name} = {before} (now {now})")
     return Reconstructed(folder, record, metrics, skipped=False)
-
-
-# --- loading -------------------------------------------------------------------------------------------
-
-
-def _load_cameras(folder: Path, description: Description, settings: Settings) -> list[Camera]:
-    with_keypoints = {name: entry for name, entry in description.cameras.items() if entry.keypoints}
-    if len(with_keypoints) < 2:
-        raise DataError(
-            folder, f"has keypoints of {len(with_keypoints)} camera", "a skeleton needs two cameras at least"
-        )
-    joints = _common_joints(folder, with_keypoints)
-    return [_load_camera(folder, name, entry, joints, settings) for name, entry in with_keypoints.items()]
-
-
-def _common_joints(folder: Path, entries: Mapping[str, CameraEntry]) -> tuple[str, ...]:
-    """The joints that two cameras at least can see, in the order of the camera that knows the most."""
-    known = [entry.keypoints.joints for entry in entries.values() if entry.keypoints]
-    shared = [name for name in max(known, key=len) if sum(name in joints for joints in known) > 1]
-    if not shared:
-        raise DataError(
-            folder, "has no joint that two cameras' detectors both know", "use one skeleton for all"
-        )
-    return tuple(shared)
-
-
-def _load_camera(
-    folder: Path, name: str, entry: CameraEntry, joints: tuple[str, ...], settings: Settings
-) -> Camera:
-    tables = folder / "cameras" / name
-    trajectory = trajectory_from(read_table(tables / "poses.parquet", POSES))
-    frames = read_table(tables / "frames.parquet", FRAMES)
-    keypoints = read_table(tables / "keypoints.parquet", KEYPOINTS)
-    confident = keypoints[keypoints["confidence"] >= settings.min_confidence]
-    detections = detections_from(confident, joints)
-    return Camera(
-        name=name,
-        intrinsics=entry.intrinsics.intrinsics(),
-        frame_t_ns=frames["t_ns"].to_numpy(np.int64),
-        trajectory=trajectory,
-        static=entry.poses.static,
-        sigma=_stated_sigma(name, entry, trajectory, settings),
-        # From here on frames count the rows of the table: pictures without a time are not in it.
-        detections=replace(detections, frame=np.searchsorted(frames["frame"].to_numpy(), detections.frame)),
-    )
-
-
-def _stated_sigma(name: str, entry: CameraEntry, trajectory: Trajectory, settings: Settings) -> Float | None:
-    """The pose noise [N, 2] as somebody states it: the command line, flight.yaml, or the log itself."""
-    if settings.pose_noise:
-        models = parsed_noise_models("--pose-noise", settings.pose_noise)
-    elif entry.pose_noise:
-        models = noise_models(f"pose_noise of {name}", entry.pose_noise)
-    else:
-        return _logged_sigma(trajectory)
-    elapsed_s = (trajectory.t_ns - trajectory.t_ns[0]) / 1e9
-    return sum_sigma(
-        models, elapsed_s, *rates(trajectory.t_ns, trajectory.position, trajectory.quaternion_xyzw)
-    )
-
-
-def _logged_sigma(trajectory: Trajectory) -> Float | None:
-    """Mean standard deviation per axis of the logged covariance; all zero means that it is unknown."""
-    covariance = trajectory.covariance
-    if covariance is None or not np.any(covariance):
-        return None
-    variances = np.diagonal(covariance, axis1=1, axis2=2)
-    sigma: Float = np.sqrt(np.stack([variances[:, :3].mean(axis=1), variances[:, 3:].mean(axis=1)], axis=1))
-    return sigma
-
-
-def _load_truth(folder: Path, description: Description, observations: Observations) -> Float | None:
-    """The true joints [T, P, J, 3] at the skeleton's times; NaN for joints that only the skeleton has."""
-    if description.truth is None or not description.truth.joints:
-        return None
-    truth = motion_from(read_table(folder / "truth.parquet", TRUTH), observations.joints)
-    return interpolate_points(truth.t_ns, truth.position, observations.t_ns, max_gap_ns=_TRUTH_GAP_NS)
-
-
-def _load_actor(folder: Path, description: Description, t_ns: Int64) -> Float | None:
-    """The logged actor [T, 3] at given times, NaN where the log says nothing."""
-    if description.actor is None:
-        return None
-    table = read_table(folder / "actor.parquet", ACTOR)
-    position = table[["x", "y", "z"]].to_numpy(np.float64)
-    return interpolate_points(table["t_ns"].to_numpy(np.int64), position, t_ns, max_gap_ns=_ACTOR_GAP_NS)
 
 
 # --- the work ------------------------------------------------------------------------------------------
@@ -243,7 +167,7 @@ def _observe(
         found.position,
         found.rotation,
         _ray_sigma(cameras, found.t_ns, found.position, settings),
-        actor=_load_actor(folder, description, found.t_ns),
+        actor=load_actor(folder, description, found.t_ns),
         people=settings.people,
     )
     observations = observe(
@@ -263,12 +187,16 @@ def _ray_sigma(cameras: list[Camera], t_ns: Int64, position: Float, settings: Se
     The distance to the actor is not known yet: the distance to the middle of the cameras, which
     surround it, stands for it.
     """
-    middle = np.nanmean(position, axis=(0, 1))
+    posed = ~np.isnan(position[..., 0])
+    if not posed.any():
+        raise DataError("the cameras", "have no pose at any picture", "check clocks and pose logs")
+    middle = position[posed].mean(axis=0)
     columns = []
     for c, camera in enumerate(cameras):
         stated = camera.sigma_at(t_ns)
         sigma = np.tile(_UNKNOWN_SIGMA, (len(t_ns), 1)) if stated is None else stated
-        distance = np.nanmedian(np.linalg.norm(position[:, c] - middle, axis=-1))
+        away = position[posed[:, c], c] - middle
+        distance = float(np.median(np.linalg.norm(away, axis=-1))) if len(away) else 1.0
         pixel = settings.pixel_sigma / camera.focal_px
         columns.append(np.sqrt(pixel**2 + sigma[:, 1] ** 2 + (sigma[:, 0] / max(distance, 1.0)) ** 2))
     return np.stack(columns, axis=1)
@@ -347,6 +275,16 @@ def _row_mean(values: Float) -> Float:
     count = (~np.isnan(values)).sum(axis=1)
     mean: Float = np.where(count > 0, np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)
     return mean
+
+
+def _unused(cameras: list[Camera], result: Triangulation) -> list[str]:
+    """The cameras that contributed nothing: in the wrong place, at the wrong time, or of somebody else."""
+    used = np.atleast_1d(result.inlier.any(axis=0))
+    return [
+        f"{camera.name}: none of its views was used"
+        for camera, any_used in zip(cameras, used, strict=True)
+        if not any_used
+    ]
 
 
 def _association_counts(association: Association) -> dict[str, list[int]]:

@@ -12,7 +12,7 @@ from pipelines.reporting.content import SessionContent
 from pipelines.reporting.page import render_page
 from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
-from pipelines.session.stages import Stage, StageRecord, WritableSession, locked
+from pipelines.session.stages import Stage, StageRecord, WritableSession, locked, session_name
 from pipelines.session.storage import read_json
 from pipelines.session.tables import FRAMES, KEYPOINTS, POSES, SKELETON, TRUTH, read_table
 
@@ -42,7 +42,7 @@ def report(folder: Path, *, force: bool = False) -> Reported:
     with locked(folder) as session:
         records = _finished_stages(session)
         inputs = {name: digest for record in records.values() for name, digest in record.outputs.items()}
-        settings = {"name": folder.stem, "pictures": _pictures_there(folder)}
+        settings = {"name": session_name(folder), "pictures": _pictures_there(folder)}
         run = session.begin(REPORT, settings=settings, inputs=inputs, force=force)
         page = folder / "report" / "index.html"
         if run.finished:
@@ -92,7 +92,7 @@ def _load(folder: Path, records: dict[str, StageRecord]) -> SessionContent:
     has_truth = description.truth is not None and bool(description.truth.joints)
     with_keypoints = [name for name, entry in description.cameras.items() if entry.keypoints]
     return SessionContent(
-        name=folder.stem,
+        name=session_name(folder),
         session=description.model_dump(mode="json", by_alias=True),
         skeleton=read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON) if reconstructed else None,
         metrics=read_json(folder / "reconstruct" / "metrics.json") if reconstructed else None,

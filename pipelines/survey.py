@@ -9,7 +9,7 @@ from typing import Any
 from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
-from pipelines.session.registries import FORMATS
+from pipelines.session.registries import FORMATS, why_not
 from pipelines.session.stages import open_session
 
 
@@ -41,7 +41,9 @@ def survey(path: Path) -> list[Survey]:
         return readings
     if path.suffix in {".yaml", ".yml"}:
         return [Survey(path, "flight manifest", _of_manifest(path))]
-    raise DataError(path, "is of no known kind", f"known formats: {', '.join(FORMATS.names())}")
+    raise DataError(
+        path, f"is of no known kind{why_not(path)}", f"known formats: {', '.join(FORMATS.names())}"
+    )
 
 
 def _of_session(path: Path) -> dict[str, Any]:

@@ -98,7 +98,8 @@ class FlightLogs:
                     may_jump_s=_MAY_JUMP_S,
                 )
             lost = dict(recording.dropped)
-        return self._at_world_times(log, source, gathered, lost)
+            started_ns = _start_ns(recording)
+        return self._at_world_times(log, source, gathered, lost, started_ns)
 
     def attitudes(
         self,
@@ -121,7 +122,8 @@ class FlightLogs:
                 may_jump_s=_MAY_JUMP_S,
             )
             lost = dict(recording.dropped)
-        return self._at_world_times(log, source, gathered, lost)
+            started_ns = _start_ns(recording)
+        return self._at_world_times(log, source, gathered, lost, started_ns)
 
     def intrinsics(self, log: str, topic: str | None) -> IntrinsicsSample:
         """The first camera info of a topic.
@@ -169,12 +171,13 @@ class FlightLogs:
             for picture in later_pictures(pictures(), stamps):
                 t_ns.append(stamp_of(picture, stamps))
             lost = Counter(recording.dropped)
+            started_ns = _start_ns(recording)
         if not t_ns:
             raise DataError(source, f"{name} holds no picture", "name another topic")
         if seen > len(t_ns):
             lost["picture without a later stamp"] += seen - len(t_ns)
         times = np.frombuffer(t_ns, dtype=np.int64)
-        return Frames(name, self._world_times(log, times), dict(lost))
+        return Frames(name, self._world_times(log, times, started_ns), dict(lost))
 
     @contextmanager
     def _open(self, log: str) -> Iterator[tuple[Log, str]]:
@@ -234,18 +237,20 @@ class FlightLogs:
             may_jump_s=_MAY_JUMP_S,
         )
 
-    def _at_world_times(self, log: str, source: str, gathered: Gathered, lost: dict[str, int]) -> Trajectory:
+    def _at_world_times(
+        self, log: str, source: str, gathered: Gathered, lost: dict[str, int], started_ns: int
+    ) -> Trajectory:
         self._doubt(source, self.settings(log).stamps, gathered.stamps)
         trajectory = gathered.trajectory
         return replace(
             trajectory,
-            t_ns=self._world_times(log, trajectory.t_ns),
+            t_ns=self._world_times(log, trajectory.t_ns, started_ns),
             dropped=dict(Counter(trajectory.dropped) + Counter(lost)),
         )
 
-    def _world_times(self, log: str, t_ns: Int64) -> Int64:
+    def _world_times(self, log: str, t_ns: Int64, started_ns: int) -> Int64:
         clock = self.settings(log).clock
-        since_start = t_ns - t_ns[0]
+        since_start = t_ns - started_ns
         drift_ns = np.round(since_start * (clock.drift_ppm * 1e-6)).astype(np.int64)
         world_ns: Int64 = t_ns + drift_ns + round(clock.offset_s * 1e9)
         return world_ns
@@ -267,6 +272,11 @@ class FlightLogs:
             self._note(
                 f"{source}: the clock jumps by {jump.jump_s:.3g} s at {jump.header_ns / 1e9:.3f} s; {used}"
             )
+
+
+def _start_ns(recording: Log) -> int:
+    """When the first message of a recording was received: what its clock's drift counts from."""
+    return min((topic.first_ns for topic in recording.topics if topic.first_ns is not None), default=0)
 
 
 def in_world(trajectory: Trajectory, log: LogSource) -> Trajectory:

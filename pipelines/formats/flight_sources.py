@@ -7,14 +7,15 @@ or said as a note.
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.flight_logs import FlightLogs, in_world
+from pipelines.formats.flight_logs import FlightLogs, Frames, in_world
 from pipelines.formats.frame_times import read_frame_times, times_of_frames
 from pipelines.formats.ros_map import FORMAT as ROS_MAP
 from pipelines.geometry.cameras import Intrinsics, fit_to_size
@@ -33,6 +34,7 @@ from pipelines.session.manifest import (
     Axes,
     Camera,
     Flight,
+    FrameTimes,
     IntrinsicsSource,
     KeypointSource,
     Mount,
@@ -71,6 +73,7 @@ class CameraFrames:
     t_ns: Int64  # [F]
     pts_ns: Int64  # [F] since the first picture of the video
     topic: str | None = None  # the pictures themselves lie in this topic of a log
+    dropped: dict[str, int] = field(default_factory=dict)  # pictures that are not among them, by cause
 
 
 class FlightSources:
@@ -137,36 +140,45 @@ class FlightSources:
     def _unclocked_frames(
         self, name: str, camera: Camera, video: VideoIndex | None, detections: Detections | None
     ) -> CameraFrames:
-        times = camera.frame_times
-        if times is not None and times.fps is not None:
-            count = video.count if video else self._listed_frames(camera, detections)
+        times = camera.frame_times or FrameTimes()
+        logged = None
+        if camera.video is not None and camera.video.log is not None:
+            logged = self._logs.frames(camera.video.log, camera.video.topic)
+        pictures = _pictures(video, logged)
+        if times.fps is not None:
+            count = len(pictures.t_ns) if pictures else self._listed_frames(camera, detections)
             since_start = _ticks_ns(count, times.fps)
-            return CameraFrames(np.arange(count), times.start_ns + since_start, since_start)
-        if times is not None and (times.csv or times.srt):
-            return self._frames_of_file(name, self._base / (times.csv or times.srt or ""), video)
-        log = times.log if times is not None else None
-        topic = times.topic if times is not None else None
-        if log is None and camera.video is not None:
-            log, topic = camera.video.log, camera.video.topic
-        if log is not None:
-            return self._frames_of_log(name, log, topic, video)
-        if video is not None:
-            start_ns = times.start_ns if times else 0
-            return CameraFrames(np.arange(video.count), start_ns + video.pts_ns, video.pts_ns)
-        raise DataError(
-            self._manifest,
-            f"cameras.{name}: nothing says when its frames were taken",
-            "write frame_times: {start: SECONDS, fps: 30}",
-        )
+            topic, lost = (pictures.topic, pictures.dropped) if pictures else (None, {})
+            return CameraFrames(np.arange(count), times.start_ns + since_start, since_start, topic, lost)
+        if times.csv or times.srt:
+            return self._frames_of_file(self._base / (times.csv or times.srt or ""), pictures)
+        if times.log is not None:
+            return self._frames_of_log(times.log, times.topic, pictures)
+        if pictures is None:
+            raise DataError(
+                self._manifest,
+                f"cameras.{name}: nothing says when its frames were taken",
+                "write frame_times: {start: SECONDS, fps: 30}",
+            )
+        if logged is None:
+            return replace(pictures, t_ns=times.start_ns + pictures.pts_ns)
+        if times.start_ns:
+            raise DataError(
+                self._manifest,
+                f"cameras.{name}.frame_times: start has no use, the log stamps its pictures",
+                "leave it out, or correct the log's clock with logs: {...: {clock: ...}}",
+            )
+        return pictures
 
     def media(self, camera: Camera, frames: CameraFrames, session: Path) -> MediaEntry | None:
         """Where the pictures lie, as seen from the session: it is moved together with its flight."""
         video = camera.video
         if video is None:
             return None
-        paths = self._logs.paths(video.log) if video.log else [self._base / (video.path or "")]
+        stated = self._logs.settings(video.log).path if video.log else [video.path or ""]
         return MediaEntry(
-            paths=[Path(os.path.relpath(path, session)).as_posix() for path in paths],
+            paths=[Path(os.path.relpath(self._base / path, session)).as_posix() for path in stated],
+            sources=stated,
             topic=frames.topic,
             stamps=self._logs.settings(video.log).stamps if video.log else "header",
         )
@@ -185,37 +197,43 @@ class FlightSources:
             )
         return count
 
-    def _frames_of_file(self, name: str, path: Path, video: VideoIndex | None) -> CameraFrames:
+    def _frames_of_file(self, path: Path, pictures: CameraFrames | None) -> CameraFrames:
         stamps = read_frame_times(path)
-        for cause, count in stamps.dropped.items():
-            self._note(f"{name}: frame times dropped: {count} {cause}")
-        if video is None:
-            return CameraFrames(stamps.frame, stamps.t_ns, stamps.t_ns - stamps.t_ns[0])
-        t_ns, known = times_of_frames(stamps, video.pts_ns)
+        if pictures is None:
+            since_start = stamps.t_ns - stamps.t_ns[0]
+            return CameraFrames(stamps.frame, stamps.t_ns, since_start, dropped=stamps.dropped)
+        t_ns, known = times_of_frames(stamps, pictures.pts_ns)
         if not known.any():
-            raise DataError(
-                path, "has a time for none of the video's frames", "check that they belong together"
-            )
-        if not known.all():
-            self._note(f"{name}: {int((~known).sum())} of {video.count} frames of the video have no time")
-        return CameraFrames(np.flatnonzero(known), t_ns[known], video.pts_ns[known])
+            raise DataError(path, "has a time for none of the pictures", "check that they belong together")
+        lost = Counter(pictures.dropped) + Counter(stamps.dropped)
+        lost["without a time"] += int((~known).sum())
+        return replace(
+            pictures,
+            frame=pictures.frame[known],
+            t_ns=t_ns[known],
+            pts_ns=pictures.pts_ns[known],
+            dropped=dict(+lost),
+        )
 
-    def _frames_of_log(
-        self, name: str, log: str, topic: str | None, video: VideoIndex | None
-    ) -> CameraFrames:
-        found = self._logs.frames(log, topic)
-        for cause, count in found.dropped.items():
-            self._note(f"{name}: pictures in the log lost: {count} {cause}")
-        count = len(found.t_ns) if video is None else min(video.count, len(found.t_ns))
-        if video is not None and video.count != len(found.t_ns):
-            self._note(
-                f"{name}: the video has {video.count} frames, the log has stamps of {len(found.t_ns)};"
-                f" the first {count} are used"
+    def _frames_of_log(self, log: str, topic: str | None, pictures: CameraFrames | None) -> CameraFrames:
+        """Frame times that a topic of pictures states, for the frames of a video in the same order."""
+        stamped = self._logs.frames(log, topic)
+        if pictures is None:
+            since_start = stamped.t_ns - stamped.t_ns[0]
+            return CameraFrames(
+                np.arange(len(since_start)), stamped.t_ns, since_start, dropped=stamped.dropped
             )
-        t_ns = found.t_ns[:count]
-        if video is None:
-            return CameraFrames(np.arange(count), t_ns, t_ns - t_ns[0], topic=found.topic)
-        return CameraFrames(np.arange(count), t_ns, video.pts_ns[:count])
+        count = min(len(pictures.t_ns), len(stamped.t_ns))
+        lost = Counter(pictures.dropped) + Counter(stamped.dropped)
+        lost["without a stamp in the log"] += len(pictures.t_ns) - count
+        lost["stamp in the log without a picture"] += len(stamped.t_ns) - count
+        return replace(
+            pictures,
+            frame=pictures.frame[:count],
+            t_ns=stamped.t_ns[:count],
+            pts_ns=pictures.pts_ns[:count],
+            dropped=dict(+lost),
+        )
 
     # --- calibration -----------------------------------------------------------------------------------
 
@@ -409,9 +427,15 @@ class FlightSources:
         reader = named or recognise(path, JointFormat, "file of true joints")
         if not isinstance(reader, JointFormat):
             raise DataError(path, f"{source.format} holds no joints", "leave `format:` out")
-        axes = source.axes or ("ned" if self._flight.world.frame == "ned" else None)
-        motion = reader.read_joints(path, unit=source.unit, axes="z-up" if axes == "ned" else axes)
-        if axes == "ned":
+        if source.axes is None and self._flight.world.frame == "ned":
+            raise DataError(
+                path,
+                "has joints of unknown axes in a NED world",
+                "say truth: {joints: {axes: ned}} or z-up, y-up",
+            )
+        is_ned = source.axes == "ned"
+        motion = reader.read_joints(path, unit=source.unit, axes="z-up" if is_ned else source.axes)
+        if is_ned:
             motion = replace(motion, position=motion.position[..., [1, 0, 2]] * [1, 1, -1])
         return motion
 
@@ -420,6 +444,17 @@ class FlightSources:
         path = self._base / stated
         trajectory = recognise(path, TrajectoryFormat, "camera trajectory").read_trajectory(path)
         return _in_enu(trajectory, self._flight.world.frame)
+
+
+def _pictures(video: VideoIndex | None, logged: Frames | None) -> CameraFrames | None:
+    """The pictures of a video or a topic, by their own stamps; None where there are none."""
+    if video is not None:
+        return CameraFrames(np.arange(video.count), video.pts_ns, video.pts_ns, dropped=video.dropped)
+    if logged is not None:
+        since_start = logged.t_ns - logged.t_ns[0]
+        count = np.arange(len(since_start))
+        return CameraFrames(count, logged.t_ns, since_start, logged.topic, logged.dropped)
+    return None
 
 
 def source_files(path: Path) -> list[Path]:

@@ -18,6 +18,8 @@ from pipelines.session.registries import Log, LogFormat, recognise
 
 Picture = NDArray[np.uint8]
 
+_MAY_LEAP_NS = 1_000_000_000  # transport and decoding take less
+
 _CHANNELS = {"mono8": 1, "8uc1": 1, "rgb8": 3, "bgr8": 3, "8uc3": 3, "rgba8": 4, "bgra8": 4}
 
 
@@ -93,12 +95,28 @@ class LoggedPictures:
 
 def later_pictures(pictures: Iterator[PictureSample], stamps: str) -> Iterator[PictureSample]:
     """The pictures whose stamp is above all before: frame k of a topic is the k-th of these."""
-    newest: int | None = None
+    newest: PictureSample | None = None
+    leapt: PictureSample | None = None
     for picture in pictures:
-        stamp_ns = stamp_of(picture, stamps)
-        if newest is None or stamp_ns > newest:
-            newest = stamp_ns
-            yield picture
+        if newest is not None:
+            if stamp_of(picture, stamps) <= stamp_of(newest, stamps):
+                continue
+            # One damaged stamp far ahead must not cost all the pictures behind it; a clock that was set
+            # forward shows in the next picture too.
+            if _leap_ns(newest, picture) > _MAY_LEAP_NS and (
+                leapt is None or abs(_leap_ns(leapt, picture)) > _MAY_LEAP_NS
+            ):
+                leapt = picture
+                continue
+        newest, leapt = picture, None
+        yield picture
+
+
+def _leap_ns(before: PictureSample, after: PictureSample) -> int:
+    """How much more the header's clock went on between two pictures than that of receipt."""
+    if not before.stamp_ns or not after.stamp_ns:
+        return 0
+    return (after.stamp_ns - before.stamp_ns) - (after.receive_ns - before.receive_ns)
 
 
 def stamp_of(picture: PictureSample, stamps: str) -> int:

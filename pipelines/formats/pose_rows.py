@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,9 @@ import numpy as np
 from pipelines.formats.stamps import Bool
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Int64, Trajectory
+
+FARTHEST_M = 1e9
+"""Beyond the Moon: no pose of a flight, and squares of what lies much further overflow."""
 
 NORM_TOLERANCE = 0.1
 """Quaternions this far from unit length are rounding or few decimals; further off they are no rotations."""
@@ -29,9 +33,9 @@ def clean_poses(
     - "not finite": a stamp or a number that is missing, NaN or infinite. A covariance that is blank
       as a whole is unknown (all zero) and keeps its row;
     - "zero quaternion", "quaternion not unit" (off by more than NORM_TOLERANCE; closer ones are normalised);
-    - "duplicate stamp", "backward stamp": of the rows left, one is kept when its stamp is above the
-      largest before it, so what was logged first stays. A stamp far in the future hides what follows
-      it until time catches up; the count shows it.
+    - "absurd position": further from the origin than FARTHEST_M;
+    - "duplicate stamp", "stamp out of order": of the rows left, the longest chain of rising stamps is
+      kept, so that one wrong stamp costs one row; of equal stamps the first stays.
 
     Args:
         source: the file, for messages.
@@ -55,6 +59,8 @@ def clean_poses(
         "zero quaternion": norm < 1e-9,
         "quaternion not unit": np.abs(norm - 1) > NORM_TOLERANCE,
     }
+    with np.errstate(invalid="ignore"):
+        causes["absurd position"] = np.abs(position).max(axis=1, initial=0.0) > FARTHEST_M
     if covariance is not None:
         causes["not finite"] |= ~np.isfinite(covariance).all(axis=(1, 2))
 
@@ -64,12 +70,12 @@ def clean_poses(
         _drop(keep, bad, cause, dropped)
     late = np.flatnonzero(keep)
     if len(late) > 1:
-        before = np.maximum.accumulate(t_ns[late])[:-1]
-        for cause, bad in (
-            ("duplicate stamp", t_ns[late][1:] == before),
-            ("backward stamp", t_ns[late][1:] < before),
-        ):
-            _drop(keep, np.isin(np.arange(len(keep)), late[1:][bad]), cause, dropped)
+        stamps = t_ns[late]
+        duplicate = np.zeros(len(stamps), dtype=np.bool_)
+        duplicate[1:] = stamps[1:] == stamps[:-1]
+        rising = longest_rising(stamps)
+        for cause, bad in (("duplicate stamp", duplicate), ("stamp out of order", ~rising)):
+            _drop(keep, np.isin(np.arange(len(keep)), late[bad]), cause, dropped)
     if not keep.any():
         counts = ", ".join(f"{count} {cause}" for cause, count in dropped.items()) or "it has no rows"
         raise DataError(source, f"holds no usable pose ({counts})", "check how it was written")
@@ -80,6 +86,31 @@ def clean_poses(
         covariance=None if covariance is None else covariance[keep],
         dropped=dropped,
     )
+
+
+def longest_rising(stamps: Int64) -> Bool:
+    """The longest strictly rising chain of stamps: one stamp far ahead must not cost all rows behind it.
+
+    Fredman 1975 (patience sorting); of equally long chains that whose stamps are smallest at the end.
+    """
+    if (np.diff(stamps) > 0).all():
+        return np.ones(len(stamps), dtype=np.bool_)
+    tails: list[int] = []  # smallest last stamp of a chain of each length
+    places: list[int] = []  # where it stands
+    before = np.full(len(stamps), -1, dtype=np.int64)
+    for place, stamp in enumerate(stamps.tolist()):
+        length = bisect_left(tails, stamp)
+        if length < len(tails) and tails[length] == stamp:
+            continue  # of equal stamps the first stays
+        before[place] = places[length - 1] if length else -1
+        tails[length : length + 1] = [stamp]
+        places[length : length + 1] = [place]
+    chain = np.zeros(len(stamps), dtype=np.bool_)
+    place = places[-1]
+    while place >= 0:
+        chain[place] = True
+        place = int(before[place])
+    return chain
 
 
 def _drop(keep: Bool, bad: Bool, cause: str, dropped: dict[str, int]) -> None:

@@ -195,7 +195,7 @@ class TrcExport:
             write_joints(path, motion, person)
             paths.append(path)
         if not paths:
-            raise DataError(recording.name, "holds no joints to export", "reconstruct it first")
+            raise DataError(recording.name, "holds no joints to export", "run `mocap reconstruct` first")
         return sorted(paths)
 
 

@@ -44,10 +44,13 @@ class VideoContainer:
 
     def recognises(self, path: Path) -> bool:
         """Whether it begins as one of these containers does; or is empty, but was to become one."""
-        if not path.is_file():
+        try:
+            if not path.is_file():
+                return False
+            empty = path.suffix.lower() in self.suffixes and path.stat().st_size == 0
+            return empty or _container_format(path) is not None
+        except OSError:
             return False
-        empty = path.suffix.lower() in self.suffixes and path.stat().st_size == 0
-        return empty or _container_format(path) is not None
 
     def describe(self, path: Path) -> dict[str, object]:
         """Frames, times, rate, gaps, picture, codec, and what the file lost."""

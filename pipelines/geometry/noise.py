@@ -29,6 +29,8 @@ from pipelines.geometry.poses import (
     rotation_vector_from_quaternion,
 )
 
+_LARGEST = 1e6  # of any parameter: squares of larger ones overflow long before they mean anything
+
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Frame = Literal["world", "body"]
@@ -309,8 +311,8 @@ def _check_parameter(name: str, value: object) -> None:
             raise ValueError(f"frame is {value!r} instead of world or body")
     elif not isinstance(value, (int, float)) or isinstance(value, bool):
         raise ValueError(f"{name} is {value!r} instead of a number")
-    elif not (math.isfinite(value) and value >= 0):
-        raise ValueError(f"{name} is {value}; it must be finite and not negative")
+    elif not 0 <= value <= _LARGEST:
+        raise ValueError(f"{name} is {value}; it must lie between 0 and {_LARGEST:g}")
 
 
 def _parse_one(part: str) -> tuple[str, dict[str, object]]:

@@ -16,7 +16,8 @@ from pipelines.geometry.cameras import Intrinsics, undistort
 from pipelines.geometry.poses import interpolate_points, interpolate_poses, matrix_from_quaternion
 from pipelines.session.records import Detections, Float, Int64, Trajectory
 
-_FRAME_GAP = 1.5  # frame periods: keypoints further apart are not neighbours
+_FRAME_GAP_NS = 500_000_000  # consecutive frames further apart than this, and than usual, are not bridged
+_USUAL = 1.5  # times the median frame period
 
 
 @dataclass(frozen=True)
@@ -24,12 +25,14 @@ class Camera:
     """One camera of a session.
 
     `sigma` is the standard deviation per axis of position (m) and rotation (rad) at each pose of the
-    trajectory, as a prior or the log's covariance states it; None when nobody does.
+    trajectory, as a prior or the log's covariance states it; None when nobody does. Detections count
+    frames by their row in `frame_t_ns`; where `follows` is False, pictures are missing before that row.
     """
 
     name: str
     intrinsics: Intrinsics
     frame_t_ns: Int64  # [F]
+    follows: NDArray[np.bool_]  # [F] whether the frame is the next picture after the row before
     trajectory: Trajectory
     static: bool
     sigma: Float | None  # [N, 2]
@@ -169,11 +172,9 @@ def observe(
     """
     views, weights, poses, sigmas = [], [], [], []
     for c, camera in enumerate(cameras):
-        xy, confidence = _of_people(camera, found.frame[:, c], choice[:, c])
-        period = int(np.median(np.diff(camera.frame_t_ns))) if len(camera.frame_t_ns) > 1 else 0
-        gap_ns = int(_FRAME_GAP * period)
-        views.append(interpolate_points(camera.frame_t_ns, xy, t_ns, max_gap_ns=gap_ns))
-        weights.append(interpolate_points(camera.frame_t_ns, confidence, t_ns, max_gap_ns=gap_ns))
+        xy, confidence = _of_people(camera, found, c, choice[:, c])
+        views.append(_at(camera, xy, t_ns))
+        weights.append(_at(camera, confidence, t_ns))
         poses.append(camera.poses_at(t_ns, max_gap_ns=max_gap_ns, max_extrapolation_ns=max_extrapolation_ns))
         sigmas.append(camera.sigma_at(t_ns))
     position, rotation = (np.stack(part, axis=1) for part in zip(*poses, strict=True))
@@ -185,9 +186,23 @@ def observe(
         confidence=np.nan_to_num(np.stack(weights, axis=3)),
         position=position,
         rotation=rotation,
-        pose_sigma=np.stack([np.zeros((len(t_ns), 2)) if s is None else s for s in sigmas], axis=1)
-        if stated
-        else None,
+        pose_sigma=_all_sigmas(cameras, sigmas) if stated else None,
+    )
+
+
+def _all_sigmas(cameras: list[Camera], sigmas: list[Float | None]) -> Float:
+    """The pose noise [T, C, 2]: as stated; for moving cameras of which nobody states it, the others' median.
+
+    A still camera of which nothing is stated was calibrated, and counts as exact.
+    """
+    stated = [sigma for sigma in sigmas if sigma is not None]
+    usual = np.median(stated, axis=0)
+    return np.stack(
+        [
+            sigma if sigma is not None else (np.zeros_like(usual) if camera.static else usual)
+            for camera, sigma in zip(cameras, sigmas, strict=True)
+        ],
+        axis=1,
     )
 
 
@@ -211,17 +226,36 @@ def _nearest_frame(frame_t_ns: Int64, t_ns: Int64) -> Int64:
     return np.where(np.abs(frame_t_ns[nearest] - t_ns) <= period, nearest, -1)
 
 
-def _of_people(camera: Camera, frame: Int64, choice: Int64) -> tuple[Float, Float]:
+def _of_people(camera: Camera, found: Candidates, c: int, choice: Int64) -> tuple[Float, Float]:
     """Rays [F, P, J, 2] and confidence [F, P, J] of each person in the camera's own frames.
 
-    A frame may stand at several times of the timeline (clocks are never quite equal): the last decides.
+    A frame of a slow camera stands at several times of the timeline: the time nearest to it decides.
     """
     shape = (len(camera.frame_t_ns), choice.shape[1], camera.rays.shape[2])
     xy = np.full((*shape, 2), np.nan)
     confidence = np.full(shape, np.nan)
+    frame = found.frame[:, c]
+    apart_ns = np.abs(found.t_ns - camera.frame_t_ns[frame])
+    nearest_last = np.argsort(-apart_ns, kind="stable")
     for person in range(choice.shape[1]):
-        (rows,) = np.nonzero((frame >= 0) & (choice[:, person] >= 0))
+        rows = nearest_last[(frame[nearest_last] >= 0) & (choice[nearest_last, person] >= 0)]
         xy[frame[rows], person] = camera.rays[frame[rows], choice[rows, person]]
         confidence[frame[rows], person] = camera.confidence[frame[rows], choice[rows, person]]
     confidence[np.isnan(xy[..., 0])] = np.nan
     return xy, confidence
+
+
+def _at(camera: Camera, values: Float, t_ns: Int64) -> Float:
+    """Values [F, ...] of a camera's frames at other times [T, ...]; NaN where pictures are missing."""
+    stamps = camera.frame_t_ns
+    period = int(np.median(np.diff(stamps))) if len(stamps) > 1 else 0
+    # A missing picture is a row of NaN between its neighbours.
+    breaks = np.flatnonzero(~camera.follows[1:]) + 1
+    between = (stamps[breaks - 1] + stamps[breaks]) // 2
+    apart = (between > stamps[breaks - 1]) & (between < stamps[breaks])
+    return interpolate_points(
+        np.insert(stamps, breaks[apart], between[apart]),
+        np.insert(values, breaks[apart], np.nan, axis=0),
+        t_ns,
+        max_gap_ns=max(_FRAME_GAP_NS, int(_USUAL * period)),
+    )

@@ -7,19 +7,23 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.metrics import measure, measure_shape
+from pipelines.geometry.metrics import JointErrors, measure, measure_shape
 from pipelines.geometry.triangulation import STATUS, Method, Triangulation, Views
 from pipelines.reconstruction.observations import Observations
+from pipelines.reconstruction.reweighting import reprojection_px
 from pipelines.session.records import Float
 from pipelines.session.skeletons import bones_of
 
-_ERRORS = ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm", "e_recon_m2", "pck150", "pck150_auc")
+_UNMEASURED = dict.fromkeys(
+    [*(field.name for field in fields(JointErrors)), "root_frames_left_out", "pa_frames_left_out"]
+)
+"""What stands in the place of errors where there is no truth."""
 
 
 def assess(
@@ -50,16 +54,16 @@ def assess(
     per_joint = {
         name: _figures(status[:, :, j], residual[:, :, j]) for j, name in enumerate(observations.joints)
     }
-    errors: dict[str, Any] = dict.fromkeys(_ERRORS)
+    errors: dict[str, Any] = {**_UNMEASURED, "per_joint": {}}
     if truth is not None:
         errors |= measure(position, _own_truth(position, truth), observations.joints, observations.t_ns)
-        for name, figures in errors.pop("per_joint").items():
-            per_joint[name] |= figures
+    for name, figures in errors.pop("per_joint").items():
+        per_joint[name] |= _of_truth(figures)
     overall = _figures(status, residual)
     return {
         "method": method,
         **overall,
-        **errors,
+        **_of_truth(errors),
         "reprojection_px_per_camera": {name: _spread(residual[..., c]) for c, name in enumerate(cameras)},
         "leave_one_camera_out_px": _leave_one_out(views, cameras, solve),
         "shape": measure_shape(
@@ -79,6 +83,12 @@ def _figures(status: NDArray[np.int8], residual: Float) -> dict[str, Any]:
         | {name: counts[name] for name in STATUS if name != "ok" and counts[name]},
         "reprojection_px": _spread(residual),
     }
+
+
+def _of_truth(errors: dict[str, Any]) -> dict[str, Any]:
+    """The errors, their share named as what it is: of the joint-frames that have truth."""
+    share = {"reconstructed_share_of_truth": errors["reconstructed_share"]}
+    return share | {name: value for name, value in errors.items() if name != "reconstructed_share"}
 
 
 def _spread(residual: Float) -> dict[str, float | None]:
@@ -116,17 +126,5 @@ def _leave_one_out(
         weight = views.weight.copy()
         weight[:, c] = 0
         points = solve(replace(views, weight=weight)).points
-        figures[name] = _spread(_residual(views, points, c))
+        figures[name] = _spread(reprojection_px(views, points)[:, c])
     return figures
-
-
-def _residual(views: Views, points: Float, camera: int) -> Float:
-    """Reprojection distance [N] in px of points in one camera; NaN behind it and where it saw nothing."""
-    rotation = views.rotation[views.pose_index, camera]
-    x, y, z = np.einsum("nij,ni->jn", rotation, points - views.position[views.pose_index, camera])
-    front = z > 0
-    depth = np.where(front, z, 1.0)
-    seen = views.xy[:, camera]
-    distance = views.focal[camera] * np.hypot(x / depth - seen[:, 0], y / depth - seen[:, 1])
-    used = front & (views.weight[:, camera] > 0)
-    return np.where(used, distance, np.nan)

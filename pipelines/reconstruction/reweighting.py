@@ -13,25 +13,51 @@ from dataclasses import replace
 import numpy as np
 
 from pipelines.geometry.triangulation import Triangulation, Views, triangulate
+from pipelines.session.records import Float
 
 _ROUNDS = 12  # the median joint moves by less than 0.1 mm after that, on a real recording
 
 
 def triangulate_heavy_tailed(views: Views, *, threads: int) -> Triangulation:
-    """`robust` triangulation under Cauchy's loss: iteratively reweighted least squares.
+    """`robust` triangulation, its inliers weighed by Cauchy's loss: iteratively reweighted least squares.
 
     A view of whitened residual r counts 1 / (1 + r^2) as much (Holland and Welsch 1977, table 1, with
-    the scale that `views.pixel_sigma` states instead of their tuning constant).
+    the scale that `views.pixel_sigma` states instead of their tuning constant). Which views are inliers
+    is what `robust` says; the covariance is that of the weights in the last round.
 
     Args:
         views: what was seen; `pixel_sigma` as `estimate_noise` found it.
         threads: see `triangulate`.
     """
-    result = triangulate(views, method="robust", threads=threads)
+    first = triangulate(views, method="robust", threads=threads)
+    inliers = np.where(first.inlier, views.weight, 0.0)
+    result = first
     for _ in range(_ROUNDS):
-        whitened = views.weight * result.residual_px / views.pixel_sigma
+        whitened = inliers * result.residual_px / views.pixel_sigma
         # Without a residual (not reconstructed, behind the camera) there is nothing to weight by.
         loss = np.where(np.isfinite(whitened), np.nan_to_num(whitened) ** 2, 0.0)
-        weighted = replace(views, weight=views.weight / np.sqrt(1.0 + loss))
+        weighted = replace(views, weight=inliers / np.sqrt(1.0 + loss))
         result = triangulate(weighted, method="robust", threads=threads)
+    lost = first.points[:, :1] * result.points[:, :1]  # NaN where either has no point
+    return replace(
+        result,
+        inlier=first.inlier & result.inlier,
+        residual_px=np.where(np.isnan(lost), first.residual_px, reprojection_px(views, result.points)),
+        status=np.where(np.isnan(first.points[:, 0]), first.status, result.status),
+    )
+
+
+def reprojection_px(views: Views, points: Float) -> Float:
+    """Reprojection distance [N, C] in px of every view; NaN where nothing was seen, inf behind a camera.
+
+    Args:
+        views: what was seen.
+        points: [N, 3] m; NaN gives NaN.
+    """
+    rotation, position = views.rotation[views.pose_index], views.position[views.pose_index]
+    x, y, z = np.einsum("ncij,nci->jnc", rotation, points[:, None] - position)
+    depth = np.where(z > 0, z, 1.0)
+    distance = views.focal * np.hypot(x / depth - views.xy[..., 0], y / depth - views.xy[..., 1])
+    seen = (views.weight > 0) & np.isfinite(distance)
+    result: Float = np.where(seen, np.where(z > 0, distance, np.inf), np.nan)
     return result

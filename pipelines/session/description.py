@@ -14,6 +14,8 @@ from pipelines.geometry.cameras import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.storage import read_json
 
+SCHEMA = 1
+
 
 class Entry(BaseModel):
     """A mapping of session.json; keys that a later version added are kept out of the way."""
@@ -89,6 +91,7 @@ class MediaEntry(Entry):
     """Where the pictures of a camera lie; without them only overlays are lost."""
 
     paths: list[str]  # relative to the session's folder: a video file, or the files of a log
+    sources: list[str]  # the same files as `Description.sources` names them
     topic: str | None = None  # of the log
     stamps: str = "header"  # by which the log's pictures are ordered
 
@@ -165,8 +168,13 @@ def read_description(session: Path) -> Description:
         DataError: the file is damaged or does not hold what this version needs.
     """
     path = session / "session.json"
+    document = read_json(path, "ingest the flight again with --force")
+    if isinstance(document.get("schema"), int) and document["schema"] > SCHEMA:
+        raise DataError(
+            path, f"has schema {document['schema']}, this version reads up to {SCHEMA}", "update mocap"
+        )
     try:
-        return Description.model_validate(read_json(path))
+        return Description.model_validate(document)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])

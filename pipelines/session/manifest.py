@@ -32,6 +32,8 @@ SCHEMA = 1
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _LARGEST_MANIFEST = 1_000_000  # bytes; a real one has a few thousand
 
+_LATEST_NS = 2**62  # differences of two such times fit int64
+
 Axes = Literal["enu", "ned"]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Quaternion = Annotated[list[float], Field(min_length=4, max_length=4)]
@@ -49,16 +51,19 @@ def _fps(value: object) -> Fraction:
         fps = Fraction(str(value).replace(" ", ""))
     except (ValueError, ZeroDivisionError):
         raise ValueError("is no frame rate; write 30, 29.97 or 30000/1001") from None
-    if not 0 < fps <= 100_000:
-        raise ValueError("is no frame rate; it must lie above 0 and at most at 100000")
+    if not Fraction(1, 1000) <= fps <= 100_000:
+        raise ValueError("is no frame rate; it must lie between 0.001 and 100000")
     return fps
 
 
 def _nanoseconds(value: object) -> int:
     try:
-        return int((Decimal(str(value)) * 1_000_000_000).to_integral_value())
+        nanoseconds = int((Decimal(str(value)) * 1_000_000_000).to_integral_value())
     except ArithmeticError:
         raise ValueError("is no time in seconds") from None
+    if abs(nanoseconds) > _LATEST_NS:
+        raise ValueError("is no time in seconds: it lies beyond the year 2116 (are these ms or ns?)")
+    return nanoseconds
 
 
 Fps = Annotated[Fraction, BeforeValidator(_fps)]
@@ -183,6 +188,15 @@ class PoseSource(Part):
     of: Literal["camera", "body"] | None = None
     axes: Axes | None = None
 
+    @model_validator(mode="after")
+    def _only_of_logs(self) -> PoseSource:
+        stated = [name for name in ("topic", "parent", "child") if getattr(self, name) is not None]
+        if stated and self.log is None:
+            raise ValueError(f"{', '.join(stated)}: only a pose from a log has that")
+        if (self.parent is None) != (self.child is None):
+            raise ValueError("needs both parent and child, or neither")
+        return self
+
 
 class RigidTransform(Part):
     """Translation in metres and a unit quaternion."""
@@ -268,8 +282,13 @@ class Camera(Part):
     def _has_pictures(self) -> Camera:
         if self.video is None and self.keypoints is None:
             raise ValueError("needs a video or keypoints")
-        if self.pose.of == "body" and self.mount is None and self.gimbal is None:
+        carried = self.mount is not None or self.gimbal is not None
+        if self.pose.of == "body" and not carried:
             raise ValueError("pose is of the body: say how the camera sits on it with `mount` or `gimbal`")
+        if carried and self.pose.of != "body" and not (self.pose.log and self.pose.of is None):
+            raise ValueError("a mount or gimbal needs the pose of the body: add `of: body` to `pose`")
+        if self.pose.static and self.pose.of == "body":
+            raise ValueError("a still camera's pose is its own: leave `of: body` and the mount out")
         return self
 
 
@@ -300,7 +319,7 @@ class TruthJoints(Part):
     path: str
     format: str | None = None
     unit: Literal["m", "cm", "mm"] | None = None
-    axes: Literal["z-up", "y-up"] | None = None
+    axes: Literal["z-up", "y-up", "ned"] | None = None
 
 
 class Truth(Part):

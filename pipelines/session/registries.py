@@ -6,6 +6,7 @@ in this package or in a package of the user's own. An entry point names an objec
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -265,12 +266,28 @@ def recognise(path: Path, protocol: type[F], noun: str, formats: Sequence[Format
         return matches[0]
     known = ", ".join(sorted(f.name for f in candidates))
     if not matches:
-        raise DataError(path, f"not recognised as a {noun}", f"known formats: {known}")
+        raise DataError(path, f"not recognised as a {noun}{why_not(path)}", f"known formats: {known}")
     raise DataError(
         path,
         f"could be {' or '.join(sorted(f.name for f in matches))}",
         "say which with `format:`",
     )
+
+
+def why_not(path: Path) -> str:
+    """What may have kept a file from being recognised, to be put behind that; empty where nothing is seen."""
+    if not path.is_file():
+        return ""
+    try:
+        if path.stat().st_size == 0:
+            return ": it is empty"
+        if path.suffix.lower() == ".json":
+            json.loads(path.read_bytes())
+    except OSError as error:
+        return f": it cannot be read ({error.strerror})"
+    except (ValueError, RecursionError) as error:
+        return f": it is no valid JSON ({str(error)[:100]}), perhaps cut off"
+    return ""
 
 
 def noise_models(place: str, parts: Mapping[str, Mapping[str, object]]) -> list[NoiseModel]:

@@ -271,6 +271,11 @@ class Run:
         write_json(path, {"schema": SCHEMA, "runs": [*runs.get("runs", []), entry]})
 
 
+def session_name(folder: Path) -> str:
+    """What a session is called: its folder's name, whatever way it was written, without `.session`."""
+    return folder.resolve().name.removesuffix(".session")
+
+
 def open_session(folder: Path) -> Session:
     """Open a session to read it; what a killed writer left half published is finished first.
 

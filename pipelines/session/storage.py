@@ -17,7 +17,7 @@ import numpy as np
 from pipelines.session.errors import DataError
 
 _REMEDIES = {
-    errno.ENOENT: "check the path; paths are relative to the file that names them",
+    errno.ENOENT: "check the path; those in a flight.yaml are relative to it",
     errno.ENOSPC: "free some space and run the command again",
     errno.EDQUOT: "free some space and run the command again",
     errno.EACCES: "check its permissions, or choose another place with --output",

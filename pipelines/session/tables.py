@@ -79,7 +79,9 @@ def write_table(path: Path, frame: pd.DataFrame, schema: pa.Schema) -> None:
     import pyarrow.parquet as pq
 
     columns = [pa.array(frame[field.name].to_numpy(), type=field.type, from_pandas=False) for field in schema]
-    pq.write_table(pa.Table.from_arrays(columns, schema=schema), path, compression="zstd", version="2.6")
+    # An open file, because pyarrow takes no path that is not UTF-8.
+    with path.open("wb") as file:
+        pq.write_table(pa.Table.from_arrays(columns, schema=schema), file, compression="zstd", version="2.6")
 
 
 def read_table(path: Path, schema: pa.Schema) -> pd.DataFrame:
@@ -91,7 +93,8 @@ def read_table(path: Path, schema: pa.Schema) -> pd.DataFrame:
     import pyarrow.parquet as pq
 
     try:
-        table = pq.read_table(path)
+        with path.open("rb") as file:
+            table = pq.read_table(file)
     except (OSError, pa.ArrowException) as error:
         raise DataError(
             path, "cannot be read as Parquet", "run the stage that wrote it again with --force"

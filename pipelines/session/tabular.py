@@ -7,6 +7,7 @@ as NaN.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -111,6 +112,24 @@ def detections_from(table: pd.DataFrame, joints: tuple[str, ...]) -> Detections:
     )
 
 
+def most_confident(detections: Detections, most: int) -> tuple[Detections, int]:
+    """At most so many people of each frame, by confidence, and how many are left out."""
+    frame = detections.frame
+    order = np.lexsort((detections.person, -detections.confidence.sum(axis=1), frame))
+    rank = np.arange(len(frame)) - np.searchsorted(frame[order], frame[order], side="left")
+    kept = np.sort(order[rank < most])
+    if len(kept) == len(frame):
+        return detections, 0
+    chosen = replace(
+        detections,
+        frame=frame[kept],
+        person=detections.person[kept],
+        xy=detections.xy[kept],
+        confidence=detections.confidence[kept],
+    )
+    return chosen, len(frame) - len(kept)
+
+
 def motion_table(motion: JointMotion) -> pd.DataFrame:
     """The joints that are there, as rows of `tables.TRUTH`."""
     import pandas as pd
@@ -130,8 +149,9 @@ def motion_table(motion: JointMotion) -> pd.DataFrame:
 def motion_from(table: pd.DataFrame, joints: tuple[str, ...]) -> JointMotion:
     """The motion of these joints in a table of `tables.TRUTH` or `tables.SKELETON`; the rest is left out."""
     joint = _index_of(table["joint"], joints)
-    table, joint = table[joint >= 0], joint[joint >= 0]
+    # Times at which none of these joints is there are times all the same.
     t_ns, row = np.unique(table["t_ns"].to_numpy(np.int64), return_inverse=True)
+    table, row, joint = table[joint >= 0], row[joint >= 0], joint[joint >= 0]
     person = table["person"].to_numpy(np.int64)
     shape = (len(t_ns), int(person.max(initial=0)) + 1, len(joints))
     position = np.full((*shape, 3), np.nan)

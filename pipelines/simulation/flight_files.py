@@ -32,7 +32,8 @@ def write_tum(path: Path, t_ns: Int64, position: Float, quaternion_xyzw: Float) 
     lines = ["# t x y z qx qy qz qw"]
     for stamp, xyz, xyzw in zip(t_ns.tolist(), position.tolist(), quaternion_xyzw.tolist(), strict=True):
         numbers = [*(f"{v:.6f}" for v in xyz), *(f"{v:.9f}" for v in xyzw)]
-        lines.append(" ".join([f"{stamp // 10**9}.{stamp % 10**9:09d}", *numbers]))
+        seconds, rest = divmod(abs(stamp), 10**9)
+        lines.append(" ".join([f"{'-' if stamp < 0 else ''}{seconds}.{rest:09d}", *numbers]))
     _write_lines(path, lines)
 
 

@@ -36,7 +36,7 @@ def test_every_container_gives_the_same_session(tmp_path: Path) -> None:
         sessions.append(tables(session))
         del description["sources"], description["warnings"]
         for camera in description["cameras"].values():
-            del camera["poses"]["source"]
+            del camera["poses"]["source"], camera["media"]
         described.append(description)
     assert len(sessions) >= 4
     assert sessions[0]
@@ -119,10 +119,22 @@ def test_bag_folder_without_metadata(tmp_path: Path) -> None:
     assert tables(with_metadata) == before
 
 
-def test_clock_jump_is_said(tmp_path: Path) -> None:
+def test_clock_that_jumps_in_flight_is_said_and_the_rest_is_used(tmp_path: Path) -> None:
+    flight = write_logged_flight(tmp_path, "mcap-cdr", seconds=2.0, jump_s=-30.0)
+    done = mocap("ingest", flight.manifest)
+    assert done.returncode == 0, done.stderr
+    assert "the clock jumps by -30 s" in done.stderr
+    assert "header stamps are used" in done.stderr
+    stored = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
+    # What was stamped before the jump's landing cannot be put into an order: it is counted.
+    lost = stored["cameras"]["drone1"]["poses"]["dropped"]
+    assert sum(lost.values()) + stored["cameras"]["drone1"]["poses"]["count"] == len(flight.t_ns)
+    assert lost
+
+
+def test_clock_of_another_day_is_refused(tmp_path: Path) -> None:
     flight = write_logged_flight(tmp_path, "mcap-cdr")
     settings = flight.settings["cameras"]["drone1"]["pose"]
-    # The recorder's clock was set back by an hour before drone2 took off: its header stamps disagree.
     flight.settings["logs"] = {
         "d1": {"path": settings["log"], "clock": {"offset_s": 3600}},
     }

@@ -75,7 +75,7 @@ def test_a_clock_jump_is_told_with_its_place_and_size(jump_s: float) -> None:
     assert found.stamps.disagreeing == 8
     assert found.stamps.largest_disagreement_s == pytest.approx(jump_s - 0.002)
     if jump_s < 0:  # nothing after the jump comes later than what came before it
-        assert found.trajectory.dropped == {"backward stamp": 8}
+        assert found.trajectory.dropped == {"stamp out of order": 8}
     else:
         assert found.trajectory.dropped == {}
 

@@ -65,23 +65,31 @@ def test_rows_are_dropped_by_cause(tmp_path: Path) -> None:
             "4 0 0 0 0 0 0 1e200",
             "5 0 0 0 0 0 0 1.09",
             f"5.000 0 0 7 {IDENTITY}",
+            f"5.5 0 0 0 {IDENTITY}",
             f"4.5 0 0 0 {IDENTITY}",
             f"6 0 0 0 {IDENTITY}",
             "7 0 0",
         ),
     )
     poses = READER.read_trajectory(path)
-    assert poses.t_ns.tolist() == [10**9, 5 * 10**9, 6 * 10**9]
+    assert poses.t_ns.tolist() == [10**9, 5 * 10**9, 55 * 10**8, 6 * 10**9]
     assert poses.dropped == {
         "truncated last line": 1,
         "not finite": 4,
         "zero quaternion": 1,
         "quaternion not unit": 1,
         "duplicate stamp": 1,
-        "backward stamp": 1,
+        "stamp out of order": 1,
     }
     np.testing.assert_array_equal(np.linalg.norm(poses.quaternion_xyzw, axis=1), 1)
     assert poses.position[1, 2] == 0, "of two rows with one stamp the first is kept"
+
+
+def test_one_stamp_far_ahead_costs_one_row(tmp_path: Path) -> None:
+    stamps = [*range(1, 50), 1_000_000, *range(50, 100)]
+    poses = READER.read_trajectory(write(tmp_path, rows(*(f"{t} 0 0 0 {IDENTITY}" for t in stamps))))
+    assert poses.t_ns.tolist() == [t * 10**9 for t in range(1, 100)]
+    assert poses.dropped == {"stamp out of order": 1}
 
 
 @pytest.mark.parametrize(

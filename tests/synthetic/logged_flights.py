@@ -19,9 +19,11 @@ LATE_NS = 4_000_000  # a message is received this long after its header stamp
 
 
 def write_logged_flight(
-    folder: Path, container: Container, *, cameras: int = 2, seconds: float = 0.5
+    folder: Path, container: Container, *, cameras: int = 2, seconds: float = 0.5, jump_s: float = 0.0
 ) -> SyntheticFlight:
     """A clean flight whose poses, intrinsics and frame times are in one log for each drone.
+
+    The clock that stamps the odometry of drone1 jumps by `jump_s` after three quarters of the flight.
 
     The odometry is that of a body which carries its camera 30 degrees down on a lever arm. Pictures are
     plain and 16 pixels wide: only their stamps matter.
@@ -29,7 +31,11 @@ def write_logged_flight(
     flight = write_flight(folder, cameras=cameras, seconds=seconds, clean=True, keypoint_format="alphapose")
     for k, name in enumerate(flight.cameras):
         entries = sorted(
-            [*_odometry(flight, k, name), *_camera_info(flight, name), *_pictures(flight, name)],
+            [
+                *_odometry(flight, k, name, jump_s if k == 0 else 0.0),
+                *_camera_info(flight, name),
+                *_pictures(flight, name),
+            ],
             key=lambda entry: (entry.stamp_ns, entry.topic),
         )
         log = write_log(folder / "logs", name, container, entries)
@@ -49,17 +55,19 @@ def header(stamp_ns: int, frame: str) -> dict[str, Any]:
     return {"stamp": stamp_ns, "frame_id": frame}
 
 
-def _odometry(flight: SyntheticFlight, k: int, name: str) -> list[Entry]:
+def _odometry(flight: SyntheticFlight, k: int, name: str, jump_s: float) -> list[Entry]:
     camera_from_body = invert(np.array(LEVER_ARM), body_from_camera("forward", 30.0))
     position, quaternion = compose((flight.camera_position[k], flight.camera_quaternion[k]), camera_from_body)
     entries = []
-    for stamp_ns, at, turned in zip(flight.t_ns, position, quaternion, strict=True):
+    jump_at = 3 * len(flight.t_ns) // 4
+    for row, (stamp_ns, at, turned) in enumerate(zip(flight.t_ns, position, quaternion, strict=True)):
+        stated_ns = int(stamp_ns) + (round(jump_s * 1e9) if row >= jump_at else 0)
         pose = {
             "position": dict(zip("xyz", at.tolist(), strict=True)),
             "orientation": dict(zip("xyzw", turned.tolist(), strict=True)),
         }
         fields = {
-            "header": header(int(stamp_ns), "map"),
+            "header": header(stated_ns, "map"),
             "child_frame_id": f"{name}/base_link",
             "pose": {"pose": pose, "covariance": _covariance()},
         }

@@ -1,0 +1,273 @@
+"""Stage `detect`: run a keypoint detector over the pictures of every camera that came without keypoints.
+
+Pictures are taken in blocks of fixed length, each followed from its own start, so that blocks can be worked
+on side by side and an interrupted run continues with those that are missing; the result does not depend on
+either.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines.formats.pictures import open_pictures
+from pipelines.geometry.poses import interpolate_points, interpolate_poses, matrix_from_quaternion
+from pipelines.keypoints.hints import Hint, project_actor
+from pipelines.keypoints.tracking import PeopleTracker
+from pipelines.session.description import CameraEntry, Description, MediaEntry, read_description
+from pipelines.session.errors import DataError
+from pipelines.session.progress import Progress, Silent
+from pipelines.session.records import Detections, Float, Int64
+from pipelines.session.registries import DETECTORS, KeypointNetworks
+from pipelines.session.stages import Stage, StageRecord, WritableSession
+from pipelines.session.storage import read_json, sha256_of, write_json
+from pipelines.session.tables import ACTOR, FRAMES, KEYPOINTS, POSES, read_table, write_table
+from pipelines.session.tabular import keypoints_table, trajectory_from
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+DETECT = Stage("detect", revision=1)
+
+_BLOCK = 300  # pictures; ten seconds are worth little when lost, and a search at each start costs little
+_ACTOR_GAP_NS = 2_000_000_000
+_ACTOR_SIGMA_M = 1.0
+_POSE_SIGMA_RAD = np.radians(1.0)  # margin of the projected actor, METHODS' medium level of pose noise
+
+
+@dataclass(frozen=True)
+class Block:
+    """Rows of a camera's frames that are worked on in one go."""
+
+    camera: str
+    first: int
+    stop: int
+
+    @property
+    def name(self) -> str:
+        """A name that sorts in time."""
+        return f"{self.camera}-{self.first:09d}"
+
+
+def cameras_to_detect(description: Description) -> dict[str, MediaEntry]:
+    """The cameras with pictures and without keypoints."""
+    return {
+        name: entry.media
+        for name, entry in description.cameras.items()
+        if entry.media is not None and entry.keypoints is None
+    }
+
+
+def detect(
+    session: WritableSession,
+    *,
+    detector: str = "blazepose",
+    every: int = 1,
+    workers: int = 1,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> StageRecord | None:
+    """Find keypoints where none were imported.
+
+    Args:
+        session: locked by the caller.
+        detector: a registered name.
+        every: look at every k-th picture only.
+        workers: blocks worked on at once; the result does not depend on them.
+        force: do it again although nothing changed.
+        progress: who watches.
+
+    Returns:
+        The record of the stage; None where every camera has keypoints already.
+
+    Raises:
+        DataError: the detector's files are missing, pictures are gone, or nobody was found in any.
+    """
+    progress = progress or Silent()
+    description = read_description(session.folder)
+    media = cameras_to_detect(description)
+    if not media:
+        return None
+    chosen = DETECTORS.get(detector)
+    models = {name: path for name, path in chosen.models().items() if path is not None}
+    settings = {"detector": detector, "every": every, "cameras": sorted(media)}
+    inputs = {f"model {name}": sha256_of(path) for name, path in models.items()}
+    inputs |= _inputs(session, description, media)
+    run = session.begin(DETECT, settings=settings, inputs=inputs, force=force)
+    if run.finished:
+        return run.record
+
+    work = _Work(session.folder, description, every)
+    blocks = [block for name in media for block in work.blocks(name)]
+    progress.start("Detecting keypoints", sum(work.pictures(block) for block in blocks))
+    with ThreadPoolExecutor(workers) as pool:
+        produce = partial(_produce, work, chosen.name, progress)
+        folders = list(pool.map(lambda block: run.chunk(block.name, partial(produce, block)), blocks))
+    counts = _assemble(run.folder, media, blocks, folders)
+    if not any(camera["detections"] for camera in counts.values()):
+        raise DataError(
+            session.folder, "nobody was found in any picture", "look at the pictures, or give keypoints"
+        )
+    joints = list(read_json(folders[0] / "counts.json")["joints"])
+    return run.publish(counts={"joints": joints, "cameras": counts})
+
+
+def _inputs(
+    session: WritableSession, description: Description, media: Mapping[str, MediaEntry]
+) -> dict[str, str]:
+    """The hashes of what decides the keypoints: pictures, frame times, and what the hints are made of."""
+    ingested = session.record("ingest")
+    if ingested is None:
+        raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
+    tables = {f"cameras/{name}/{table}.parquet" for name in media for table in ("frames", "poses")}
+    inputs = {name: digest for name, digest in ingested.outputs.items() if name in tables | {"actor.parquet"}}
+    for entry in media.values():
+        inputs |= {source: description.sources[source] for source in entry.sources}
+    return inputs
+
+
+class _Work:
+    """What the blocks of a session need to know."""
+
+    def __init__(self, folder: Path, description: Description, every: int) -> None:
+        self.folder = folder
+        self.every = every
+        self._description = description
+        self._frames = {
+            name: read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
+            for name in cameras_to_detect(description)
+        }
+
+    def blocks(self, camera: str) -> list[Block]:
+        """The blocks of a camera."""
+        count = len(self._frames[camera])
+        return [Block(camera, first, min(first + _BLOCK, count)) for first in range(0, count, _BLOCK)]
+
+    def pictures(self, block: Block) -> int:
+        """How many pictures of a block are looked at."""
+        return len(self.rows(block))
+
+    def rows(self, block: Block) -> range:
+        """The rows of the frame table that are looked at: every k-th from the first of all on."""
+        first = -(-block.first // self.every) * self.every
+        return range(first, block.stop, self.every)
+
+    def frames(self, block: Block) -> tuple[Int64, Int64]:
+        """Numbers and times of the frames that are looked at."""
+        rows = self._frames[block.camera].iloc[list(self.rows(block))]
+        return rows["frame"].to_numpy(np.int64), rows["t_ns"].to_numpy(np.int64)
+
+    def entry(self, block: Block) -> CameraEntry:
+        """The camera as it was ingested."""
+        return self._description.cameras[block.camera]
+
+    def hints(self, block: Block, t_ns: Int64) -> list[Hint | None]:
+        """Where the logged actor should be in each picture; None without a log or a pose."""
+        if self._description.actor is None:
+            return [None] * len(t_ns)
+        table = read_table(self.folder / "actor.parquet", ACTOR)
+        actor = interpolate_points(
+            table["t_ns"].to_numpy(np.int64),
+            table[["x", "y", "z"]].to_numpy(np.float64),
+            t_ns,
+            max_gap_ns=_ACTOR_GAP_NS,
+        )
+        position, rotation = self._poses(block, t_ns)
+        intrinsics = self.entry(block).intrinsics.intrinsics()
+        return [
+            project_actor(
+                at,
+                (centre, turned),
+                intrinsics,
+                sigma_m=_ACTOR_SIGMA_M,
+                sigma_rad=float(_POSE_SIGMA_RAD),
+            )
+            if np.isfinite(at).all() and np.isfinite(centre).all()
+            else None
+            for at, centre, turned in zip(actor, position, rotation, strict=True)
+        ]
+
+    def _poses(self, block: Block, t_ns: Int64) -> tuple[Float, Float]:
+        table = read_table(self.folder / "cameras" / block.camera / "poses.parquet", POSES)
+        trajectory = trajectory_from(table)
+        if self.entry(block).poses.static:
+            position = np.repeat(trajectory.position, len(t_ns), axis=0)
+            quaternion = np.repeat(trajectory.quaternion_xyzw, len(t_ns), axis=0)
+        else:
+            bounds = self._description.pose_interpolation
+            position, quaternion = interpolate_poses(
+                trajectory.t_ns,
+                trajectory.position,
+                trajectory.quaternion_xyzw,
+                t_ns,
+                max_gap_ns=round(bounds.max_gap_s * 1e9),
+                max_extrapolation_ns=round(bounds.max_extrapolation_s * 1e9),
+            )
+        return position, matrix_from_quaternion(quaternion)
+
+
+def _produce(work: _Work, detector: str, progress: Progress, block: Block, folder: Path) -> None:
+    """Write what the detector finds in the pictures of one block."""
+    networks = DETECTORS.get(detector).load(threads=1)
+    media = work.entry(block).media
+    if media is None:
+        raise ValueError(f"{block.camera} has no pictures")
+    frame, t_ns = work.frames(block)
+    tracker = PeopleTracker(networks)
+    found: list[tuple[int, int, Float, Float]] = []
+    undecoded = 0
+    with open_pictures(media, work.folder) as pictures:
+        for number, hint in zip(frame.tolist(), work.hints(block, t_ns), strict=True):
+            picture = pictures.read(number)
+            progress.advance()
+            if picture is None:
+                undecoded += 1
+                continue
+            found += [
+                (number, seen.track, seen.person.xy, seen.person.confidence)
+                for seen in tracker.step(picture, hint=hint)
+            ]
+    write_table(folder / "keypoints.parquet", _table(found, networks, frame, t_ns), KEYPOINTS)
+    counts = {**tracker.counts, "detections": len(found), "undecoded": undecoded}
+    write_json(folder / "counts.json", {"joints": list(networks.joints), "counts": counts})
+
+
+def _table(
+    found: list[tuple[int, int, Float, Float]], networks: KeypointNetworks, frame: Int64, t_ns: Int64
+) -> pd.DataFrame:
+    joints = networks.joints
+    detections = Detections(
+        joints=joints,
+        frame=np.array([row[0] for row in found], dtype=np.int64),
+        person=np.array([row[1] for row in found], dtype=np.int64),
+        xy=np.array([row[2] for row in found], dtype=np.float64).reshape(-1, len(joints), 2),
+        confidence=np.array([row[3] for row in found], dtype=np.float64).reshape(-1, len(joints)),
+        frames_listed=frame,
+    )
+    return keypoints_table(detections, frame, t_ns)
+
+
+def _assemble(
+    folder: Path, media: Mapping[str, MediaEntry], blocks: list[Block], folders: list[Path]
+) -> dict[str, dict[str, int]]:
+    """The tables of all cameras from those of their blocks, and what was counted on the way."""
+    import pandas as pd
+
+    counts: dict[str, dict[str, int]] = {}
+    for name in media:
+        own = [made for block, made in zip(blocks, folders, strict=True) if block.camera == name]
+        tables = [read_table(made / "keypoints.parquet", KEYPOINTS) for made in own]
+        (folder / name).mkdir()
+        write_table(folder / name / "keypoints.parquet", pd.concat(tables, ignore_index=True), KEYPOINTS)
+        total: Counter[str] = Counter()
+        for made in own:
+            total.update(read_json(made / "counts.json")["counts"])
+        counts[name] = dict(sorted(total.items()))
+    return counts

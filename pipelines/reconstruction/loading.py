@@ -1,0 +1,183 @@
+"""What a reconstruction needs of a session: its cameras, the logged actor, the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.geometry.noise import sum_sigma
+from pipelines.geometry.poses import interpolate_points, rates
+from pipelines.reconstruction.observations import Camera
+from pipelines.session.description import CameraEntry, Description
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float, Int64, Trajectory
+from pipelines.session.registries import noise_models, parsed_noise_models
+from pipelines.session.stages import StageRecord
+from pipelines.session.tables import ACTOR, FRAMES, KEYPOINTS, POSES, TRUTH, read_table
+from pipelines.session.tabular import detections_from, most_confident, motion_from, trajectory_from
+
+_TRUTH_GAP = 1.5  # median steps: truth is never bridged across a missing sample
+_ACTOR_GAP_NS = 2_000_000_000
+_MOST_PEOPLE = 12  # in one picture; more are mistakes of a detector, and memory goes with their number
+_SANE_VARIANCE = (100.0, np.pi**2)  # m^2, rad^2: what ROS means by 1e6 is "unknown"
+
+
+@dataclass(frozen=True)
+class _Keypoints:
+    """Where the keypoints of a camera lie: those that came with it, or those that were detected."""
+
+    table: Path
+    joints: tuple[str, ...]
+    every: int = 1  # the detector looked at every k-th picture only
+
+
+def _keypoints(folder: Path, description: Description, detected: StageRecord | None) -> dict[str, _Keypoints]:
+    """The keypoints of every camera that has any."""
+    sources = {}
+    for name, entry in description.cameras.items():
+        if entry.keypoints is not None:
+            table = folder / "cameras" / name / "keypoints.parquet"
+            sources[name] = _Keypoints(table, tuple(entry.keypoints.joints))
+        elif detected is not None and name in detected.counts["cameras"]:
+            table = folder / "detect" / name / "keypoints.parquet"
+            joints, every = tuple(detected.counts["joints"]), int(detected.settings["every"])
+            sources[name] = _Keypoints(table, joints, every)
+    return sources
+
+
+def load_cameras(
+    folder: Path,
+    description: Description,
+    detected: StageRecord | None,
+    *,
+    min_confidence: float,
+    pose_noise: str | None,
+) -> tuple[list[Camera], list[str]]:
+    """Every camera with keypoints, and what is to be said of them.
+
+    Args:
+        folder: the session.
+        description: its session.json.
+        detected: the record of the detector's stage, if it ran.
+        min_confidence: keypoints below are not used.
+        pose_noise: what is known of the poses' errors, in place of what the flight says.
+
+    Raises:
+        DataError: fewer than two cameras have keypoints, or they share no joint.
+    """
+    sources = _keypoints(folder, description, detected)
+    if len(sources) < 2:
+        raise DataError(
+            folder, f"has keypoints of {len(sources)} camera(s)", "a skeleton needs two cameras at least"
+        )
+    joints = _common_joints(folder, sources)
+    warnings: list[str] = []
+    cameras = []
+    for name, source in sources.items():
+        entry = description.cameras[name]
+        camera = _load_camera(folder, name, entry, source, joints, min_confidence, warnings)
+        sigma = _stated_sigma(name, entry, camera.trajectory, pose_noise)
+        cameras.append(replace(camera, sigma=sigma))
+    return cameras, warnings
+
+
+def _common_joints(folder: Path, sources: Mapping[str, _Keypoints]) -> tuple[str, ...]:
+    """The joints that two cameras at least can see, in the order of the camera that knows the most."""
+    known = [source.joints for source in sources.values()]
+    shared = [name for name in max(known, key=len) if sum(name in joints for joints in known) > 1]
+    if not shared:
+        raise DataError(
+            folder, "has no joint that two cameras' detectors both know", "use one skeleton for all"
+        )
+    return tuple(shared)
+
+
+def _load_camera(
+    folder: Path,
+    name: str,
+    entry: CameraEntry,
+    source: _Keypoints,
+    joints: tuple[str, ...],
+    min_confidence: float,
+    warnings: list[str],
+) -> Camera:
+    tables = folder / "cameras" / name
+    trajectory = trajectory_from(read_table(tables / "poses.parquet", POSES))
+    frames = read_table(tables / "frames.parquet", FRAMES).iloc[:: source.every]
+    keypoints = read_table(source.table, KEYPOINTS)
+    confident = keypoints[keypoints["confidence"] >= min_confidence]
+    detections = detections_from(confident, joints)
+    detections, crowd = most_confident(detections, _MOST_PEOPLE)
+    if crowd:
+        warnings.append(f"{name}: {crowd} detections left out, more than {_MOST_PEOPLE} in a picture")
+    frame = frames["frame"].to_numpy(np.int64)
+    return Camera(
+        name=name,
+        intrinsics=entry.intrinsics.intrinsics(),
+        frame_t_ns=frames["t_ns"].to_numpy(np.int64),
+        follows=np.diff(frame, prepend=frame[0] - source.every) == source.every,
+        trajectory=trajectory,
+        static=entry.poses.static,
+        sigma=None,
+        # From here on frames count the rows of the table: pictures without a time are not in it.
+        detections=replace(detections, frame=np.searchsorted(frame, detections.frame)),
+    )
+
+
+def _stated_sigma(
+    name: str, entry: CameraEntry, trajectory: Trajectory, pose_noise: str | None
+) -> Float | None:
+    """The pose noise [N, 2] as somebody states it: the command line, flight.yaml, or the log itself."""
+    if pose_noise:
+        models = parsed_noise_models("--pose-noise", pose_noise)
+    elif entry.pose_noise:
+        models = noise_models(f"pose_noise of {name}", entry.pose_noise)
+    else:
+        return _logged_sigma(trajectory)
+    elapsed_s = (trajectory.t_ns - trajectory.t_ns[0]) / 1e9
+    return sum_sigma(
+        models, elapsed_s, *rates(trajectory.t_ns, trajectory.position, trajectory.quaternion_xyzw)
+    )
+
+
+def _logged_sigma(trajectory: Trajectory) -> Float | None:
+    """Standard deviation [N, 2] of the logged covariances: the mean over the axes that say something.
+
+    Zero, negative, NaN and absurdly large variances are what logs write for "unknown". A pose none of whose
+    axes is known has the median of the others; None where there is no other.
+    """
+    if trajectory.covariance is None:
+        return None
+    variances = np.diagonal(trajectory.covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
+    known = (variances > 0) & (variances < np.array(_SANE_VARIANCE)[:, None])
+    count = known.sum(axis=2)
+    mean = np.where(known, variances, 0.0).sum(axis=2) / np.maximum(count, 1)
+    if not (count > 0).any(axis=0).all():
+        return None
+    for block in range(2):
+        unknown = count[:, block] == 0
+        mean[unknown, block] = np.median(mean[~unknown, block])
+    sigma: Float = np.sqrt(mean)
+    return sigma
+
+
+def load_truth(folder: Path, description: Description, joints: tuple[str, ...], t_ns: Int64) -> Float | None:
+    """The true joints [T, P, J, 3] at the skeleton's times; NaN for joints that only the skeleton has."""
+    if description.truth is None or not description.truth.joints:
+        return None
+    truth = motion_from(read_table(folder / "truth.parquet", TRUTH), joints)
+    step_ns = int(np.median(np.diff(truth.t_ns))) if len(truth.t_ns) > 1 else 0
+    gap_ns = int(_TRUTH_GAP * step_ns)
+    return interpolate_points(truth.t_ns, truth.position, t_ns, max_gap_ns=gap_ns)
+
+
+def load_actor(folder: Path, description: Description, t_ns: Int64) -> Float | None:
+    """The logged actor [T, 3] at given times, NaN where the log says nothing."""
+    if description.actor is None:
+        return None
+    table = read_table(folder / "actor.parquet", ACTOR)
+    position = table[["x", "y", "z"]].to_numpy(np.float64)
+    return interpolate_points(table["t_ns"].to_numpy(np.int64), position, t_ns, max_gap_ns=_ACTOR_GAP_NS)

@@ -1,0 +1,73 @@
+"""The real detector on real pictures, from video files to a skeleton, as commands."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipelines.formats.trc import FORMAT as TRC
+from pipelines.session.registries import DETECTORS
+from pipelines.session.tabular import motion_from
+from tests.commands.runner import content, mocap, refused, succeeds
+from tests.real_data import real_data
+
+EVERY = 10
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Path:
+    """Four videos, their calibration, and no keypoints."""
+    if None in DETECTORS.get("blazepose").models().values():
+        fetched = mocap("models", "fetch", "blazepose", timeout=300)
+        if fetched.returncode:
+            pytest.skip(f"the detector's networks cannot be fetched here: {fetched.stderr.strip()}")
+    recording = real_data("pose2sim_single")
+    shutil.copytree(recording / "videos", tmp_path / "videos")
+    calibration = recording / "calibration" / "Calib_qualisys.toml"
+    lines = ["schema: 1", "name: Detected", "cameras:"]
+    for name in ("cam01", "cam02", "cam03", "cam04"):
+        where = f"pose: {{static: {calibration}}}, intrinsics: {calibration}"
+        lines.append(f"  {name}: {{video: videos/{name}.mp4, {where}}}")
+    path = tmp_path / "flight.yaml"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    succeeds("ingest", path)
+    return path
+
+
+@pytest.mark.slow
+def test_detector_and_triangulation_agree_with_the_peers_skeleton(flight: Path) -> None:
+    session = flight.with_suffix(".session")
+    result: dict[str, Any] = json.loads(succeeds("reconstruct", session, "--every", str(EVERY), "--json"))
+    assert result["reconstructed_share"] > 0.95
+    peer = TRC.read_joints(real_data("pose2sim_single/pose-3d/single_0-99.trc"), unit=None, axes=None)
+    ours = motion_from(pd.read_parquet(session / "reconstruct" / "skeleton.parquet"), peer.joints)
+    apart_mm = 1e3 * np.linalg.norm(ours.position - peer.position[::EVERY], axis=-1)
+    # Two detectors do not mean the same places by hips and shoulders: some centimetres, never a limb.
+    assert np.nanmedian(apart_mm) < 60
+    assert np.isfinite(apart_mm[..., peer.joints.index("left_knee")]).mean() > 0.9
+
+    # Not the detector's again: its keypoints are kept while pictures and settings are the same.
+    (flight.parent / "videos" / "cam01.mp4").unlink()
+    succeeds("reconstruct", session, "--every", str(EVERY), "--method", "dlt")
+    assert "cam01.mp4" in refused("reconstruct", session, "--every", str(2 * EVERY))
+
+
+@pytest.mark.slow
+def test_keypoints_do_not_depend_on_workers(flight: Path) -> None:
+    session = flight.with_suffix(".session")
+    results = []
+    for workers in ("1", "2"):
+        shutil.rmtree(session / "detect", ignore_errors=True)
+        succeeds("reconstruct", session, "--every", "25", "--workers", workers, "--force")
+        results.append(content(session))
+    assert results[0] == results[1]
+
+
+def test_unknown_detector_lists_those_there_are(flight: Path) -> None:
+    assert "blazepose" in refused("reconstruct", flight.with_suffix(".session"), "--detector", "magic")
