@@ -157,6 +157,18 @@ def write_flight(
     return flight
 
 
+def film_at(flight: SyntheticFlight, name: str, t_ns: Int64) -> None:
+    """Have one camera of a clean flight take its pictures at other times; its frame times become a CSV."""
+    k = flight.cameras.index(name)
+    position, quaternion = _camera_poses(_seconds(t_ns), len(flight.cameras), static=False)
+    pixels = see(_actor(_seconds(t_ns)), position[k], quaternion[k], LENS)
+    folder = flight.manifest.parent
+    write_alphapose(folder / f"{name}.json", [Sighting(1, pixels, np.ones(pixels.shape[:2]))])
+    rows = [f"{frame},{stamp_ns}" for frame, stamp_ns in enumerate(t_ns.tolist())]
+    (folder / f"{name}_times.csv").write_text("\n".join(["frame,t_ns", *rows]) + "\n", encoding="utf-8")
+    flight.settings["cameras"][name]["frame_times"] = {"csv": f"{name}_times.csv"}
+
+
 def _stamps(count: int, rate_hz: int, start_ns: int) -> Int64:
     return start_ns + (np.arange(count, dtype=np.int64) * 10**9 + rate_hz // 2) // rate_hz
 

@@ -1,0 +1,140 @@
+"""Cameras that take their pictures at different times, at different rates, or irregularly."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from tests.commands.runner import mocap, succeeds
+from tests.synthetic.flights import START_NS, SyntheticFlight, film_at, write_flight
+
+# Between two pictures a joint is taken to move in a straight line in the picture. A foot in mid swing is
+# accelerated by at most some 60 m/s^2, so that a period T costs up to a T^2 / 8: 8 mm at 30 Hz at the
+# worst moment, and a tenth of that in the mean over all joints and times.
+INTERPOLATED_MM = 1.5
+
+
+def measured(flight: SyntheticFlight, *options: str) -> dict[str, Any]:
+    succeeds("ingest", flight.manifest)
+    session = flight.manifest.with_suffix(".session")
+    result: dict[str, Any] = json.loads(succeeds("reconstruct", session, "--json", *options))
+    return result
+
+
+def test_shutters_that_are_not_synchronised(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=3, clean=True)
+    film_at(flight, "drone2", flight.t_ns + 11_000_000)
+    film_at(flight, "drone3", flight.t_ns - 7_000_000)
+    flight.save()
+    result = measured(flight)
+    assert result["mpjpe_mm"] < INTERPOLATED_MM
+    assert result["reconstructed_share"] == 1.0
+
+
+def test_clock_offset_that_is_stated_is_applied(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=2, clean=True)
+    # The video's clock shows 0.2 s too little: world time = video time + 0.2 s.
+    film_at(flight, "drone2", flight.t_ns)
+    times = flight.manifest.parent / "drone2_times.csv"
+    table = pd.read_csv(times)
+    table["t_ns"] -= 200_000_000
+    table.to_csv(times, index=False)
+    flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": 0.2}
+    flight.save()
+    assert measured(flight)["mpjpe_mm"] < 0.5
+    flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": -0.2}
+    flight.save()
+    # The other sign is 0.4 s off: the walk goes on by half a metre meanwhile, and the drone with it.
+    done = mocap("ingest", flight.manifest)
+    assert done.returncode == 0
+    wrong = mocap("reconstruct", flight.manifest.with_suffix(".session"), "--json", "-q")
+    assert wrong.returncode == 1 or json.loads(wrong.stdout)["mpjpe_mm"] > 10
+
+
+def test_rates_that_differ(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=3, clean=True, fps=30)
+    film_at(flight, "drone3", flight.t_ns[::2])
+    flight.save()
+    result = measured(flight)
+    # At 15 Hz the error of interpolation is four times that at 30 Hz, in one of three cameras.
+    assert result["mpjpe_mm"] < 4 * INTERPOLATED_MM
+    assert result["reconstructed_share"] == 1.0
+    skeleton = pd.read_parquet(tmp_path / "flight.session" / "reconstruct" / "skeleton.parquet")
+    assert list(skeleton["t_ns"].unique()) == list(flight.t_ns), "the camera with the most frames"
+
+
+def test_irregular_pictures_lose_nothing(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=2, clean=True)
+    pattern = np.cumsum([0, *([33_000_000, 33_000_000, 100_000_000] * 6)])[:17]
+    film_at(flight, "drone2", flight.t_ns[0] + pattern)
+    flight.save()
+    result = measured(flight)
+    last_ns = int(flight.t_ns[0] + pattern[-1])
+    covered = int((flight.t_ns <= last_ns).sum())
+    assert result["status_counts"]["ok"] == covered * len(flight.joints)
+
+
+def test_missing_picture_is_not_bridged(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=2, clean=True)
+    times = pd.DataFrame({"frame": np.arange(len(flight.t_ns)), "t_ns": flight.t_ns}).drop(index=10)
+    times.to_csv(tmp_path / "times.csv", index=False)
+    flight.settings["cameras"]["drone2"]["frame_times"] = {"csv": "times.csv"}
+    flight.save()
+    measured(flight)
+    skeleton = pd.read_parquet(tmp_path / "flight.session" / "reconstruct" / "skeleton.parquet")
+    at_gap = skeleton[skeleton["t_ns"] == flight.t_ns[10]]
+    assert set(at_gap["status"]) == {"few_views"}
+    assert set(skeleton[skeleton["t_ns"] != flight.t_ns[10]]["status"]) == {"ok"}
+
+
+def test_a_stated_rate(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=2, clean=True)
+    result = measured(flight, "--rate", "10")
+    skeleton = pd.read_parquet(tmp_path / "flight.session" / "reconstruct" / "skeleton.parquet")
+    times = skeleton["t_ns"].unique()
+    assert list(times) == [START_NS + 100_000_000 * k for k in range(len(times))]
+    assert len(times) == 10
+    assert result["mpjpe_mm"] < 0.5, "every third picture is taken just then"
+
+
+def test_truth_is_not_bridged_over_missing_samples(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=2, clean=True)
+    truth = pd.read_csv(tmp_path / "truth.csv")
+    gone = truth["t_ns"].isin(flight.t_ns[10:16])
+    truth[~gone].to_csv(tmp_path / "truth.csv", index=False)
+    result = measured(flight)
+    assert result["mpjpe_mm"] < 0.05
+    assert result["joint_frames"] == (len(flight.t_ns) - 6) * len(flight.joints)
+
+
+def test_still_and_moving_cameras_together(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=3, clean=True)
+    del flight.settings["cameras"]["drone3"]
+    still = write_flight(tmp_path / "still", cameras=3, clean=True, static=True)
+    camera = still.settings["cameras"]["drone3"]
+    camera["keypoints"]["path"] = f"still/{camera['keypoints']['path']}"
+    camera["pose"] = {"static": "still/calibration.toml"}
+    camera["intrinsics"] = "still/calibration.toml"
+    flight.settings["cameras"]["drone3"] = camera
+    flight.settings["truth"] = {"joints": "truth.csv"}
+    flight.save()
+    assert measured(flight)["mpjpe_mm"] < 0.5
+
+
+def test_outliers_of_still_cameras_are_not_inliers(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=4, clean=True, static=True)
+    path = tmp_path / "drone1.json"
+    people = json.loads(path.read_text(encoding="utf-8"))
+    for person in people[::2]:
+        person["keypoints"][0] += 150  # the nose of every other picture
+    path.write_text(json.dumps(people), encoding="utf-8")
+    measured(flight)
+    skeleton = pd.read_parquet(tmp_path / "flight.session" / "reconstruct" / "skeleton.parquet")
+    nose = skeleton[skeleton["joint"] == "nose"].reset_index(drop=True)
+    assert set(nose["views"][::2]) == {3}
+    assert set(nose["views"][1::2]) == {4}
+    assert nose["reprojection_px"].max() < 1
