@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.detect import detect
 from pipelines.geometry.triangulation import (
@@ -121,12 +122,12 @@ def reconstruct(
             pose_noise=settings.pose_noise,
         )
         progress.advance()
-        observations, association = _observe(folder, cameras, description, settings)
+        observations, association, seen = _observe(folder, cameras, description, settings)
         progress.advance()
         views = _views(cameras, observations, settings, workers)
         solve = _solver(cameras, observations, settings, workers)
-        result = solve(views)
-        _refuse_nothing(folder, result, association)
+        result = _refused_people(solve(views), observations, seen)
+        _refuse_nothing(folder, views, result, association)
         progress.advance()
         metrics = jsonable(
             assess(
@@ -156,7 +157,8 @@ def reconstruct(
 
 def _observe(
     folder: Path, cameras: list[Camera], description: Description, settings: Settings
-) -> tuple[Observations, Association]:
+) -> tuple[Observations, Association, NDArray[np.bool_]]:
+    """What the cameras saw of each person, how people were told apart, and when [T] anybody was seen."""
     max_gap_ns = round(description.pose_interpolation.max_gap_s * 1e9)
     max_extrapolation_ns = round(description.pose_interpolation.max_extrapolation_s * 1e9)
     found = candidates(cameras, max_gap_ns=max_gap_ns, max_extrapolation_ns=max_extrapolation_ns)
@@ -178,7 +180,9 @@ def _observe(
         max_gap_ns=max_gap_ns,
         max_extrapolation_ns=max_extrapolation_ns,
     )
-    return observations, association
+    nearest = np.clip(np.searchsorted(found.t_ns, observations.t_ns), 0, len(found.t_ns) - 1)
+    seen = np.asarray((found.confidence > 0).any(axis=(1, 2, 3)), dtype=np.bool_)[nearest]
+    return observations, association, seen
 
 
 def _ray_sigma(cameras: list[Camera], t_ns: Int64, position: Float, settings: Settings) -> Float:
@@ -234,7 +238,27 @@ def _solver(
     return partial(triangulate, method=settings.method, threads=workers)
 
 
-def _refuse_nothing(folder: Path, result: Triangulation, association: Association) -> None:
+def _refused_people(
+    result: Triangulation, observations: Observations, seen: NDArray[np.bool_]
+) -> Triangulation:
+    """Joints of a person for whom no view was taken, although somebody was seen, are rejected."""
+    shape = observations.confidence.shape[:3]
+    status = result.status.reshape(shape)
+    nobody = (status == STATUS.index("not_detected")).all(axis=2)
+    refused = nobody & seen[:, None]
+    marked = np.where(refused[:, :, None], STATUS.index("rejected"), status).astype(np.int8)
+    return replace(result, status=marked.ravel())
+
+
+def _said_noise(views: Views) -> str:
+    """The noise that the gates were told of."""
+    position_m, rotation_rad = np.median(views.pose_sigma, axis=(0, 1))
+    pixels = float(np.median(views.pixel_sigma))
+    rotation_deg = np.degrees(rotation_rad)
+    return f"noise taken for poses {position_m:.3g} m and {rotation_deg:.3g} deg, pixels {pixels:.3g}"
+
+
+def _refuse_nothing(folder: Path, views: Views, result: Triangulation, association: Association) -> None:
     """Where not a single joint came out, say which gate stopped them."""
     if (result.status == STATUS.index("ok")).any():
         return
@@ -243,8 +267,9 @@ def _refuse_nothing(folder: Path, result: Triangulation, association: Associatio
     reasons = "; ".join(association.reasons)
     raise DataError(
         folder,
-        f"no joint could be reconstructed ({gates})" + (f"; {reasons}" if reasons else ""),
-        "check calibration, clocks and poses, or state the pose noise with --pose-noise",
+        f"no joint could be reconstructed ({gates}; {_said_noise(views)})"
+        + (f"; {reasons}" if reasons else ""),
+        "check calibration, clocks and poses, or state another pose noise with --pose-noise",
     )
 
 
