@@ -56,7 +56,7 @@ def report(folder: Path, *, force: bool = False) -> Reported:
 
 
 def _finished_stages(session: WritableSession) -> dict[str, StageRecord]:
-    records = {name: session.record(name) for name in ("ingest", "reconstruct")}
+    records = {name: session.record(name) for name in ("ingest", "detect", "reconstruct")}
     if records["ingest"] is None:
         raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
     return {name: record for name, record in records.items() if record is not None}
@@ -90,7 +90,12 @@ def _load(folder: Path, records: dict[str, StageRecord]) -> SessionContent:
     description = read_description(folder)
     reconstructed = "reconstruct" in records
     has_truth = description.truth is not None and bool(description.truth.joints)
-    with_keypoints = [name for name, entry in description.cameras.items() if entry.keypoints]
+    keypoints = {
+        name: folder / "cameras" / name for name, entry in description.cameras.items() if entry.keypoints
+    }
+    if "detect" in records:
+        detected = records["detect"].counts["cameras"]
+        keypoints |= {name: folder / "detect" / name for name in detected if name not in keypoints}
     return SessionContent(
         name=session_name(folder),
         session=description.model_dump(mode="json", by_alias=True),
@@ -106,8 +111,7 @@ def _load(folder: Path, records: dict[str, StageRecord]) -> SessionContent:
             for name in description.cameras
         },
         keypoints={
-            name: read_table(folder / "cameras" / name / "keypoints.parquet", KEYPOINTS)
-            for name in with_keypoints
+            name: read_table(place / "keypoints.parquet", KEYPOINTS) for name, place in keypoints.items()
         },
         stages={name: asdict(record) for name, record in records.items()},
     )

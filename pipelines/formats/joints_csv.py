@@ -16,7 +16,7 @@ from pipelines.formats.stamps import cell_name, parse_stamps, stamp_column
 from pipelines.formats.summaries import describe_motion
 from pipelines.formats.text_tables import parse_table, read_head, read_text
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64, JointMotion, Recording
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Int64, JointMotion, Recording
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -155,7 +155,7 @@ def _dense(
 
 
 def write_joints(path: Path, motion: JointMotion) -> None:
-    """Write `t_ns,person,joint,x,y,z` and, where they are known, status and reprojection_px; NaN is blank."""
+    """Write `t_ns,person,joint,x,y,z` and what else is known of each (covariance in m^2); NaN is blank."""
     import pandas as pd
 
     times, people, joints = motion.position.shape[:3]
@@ -166,6 +166,10 @@ def write_joints(path: Path, motion: JointMotion) -> None:
         "joint": np.array(motion.joints, dtype=object)[joint.ravel()],
         **dict(zip("xyz", motion.position.reshape(times * people * joints, 3).T, strict=True)),
     }
+    if motion.covariance is not None:
+        columns |= dict(zip(POINT_COVARIANCE_COLUMNS, motion.covariance.reshape(-1, 6).T, strict=True))
+    if motion.views is not None:
+        columns["views"] = motion.views.ravel()
     if motion.status is not None:
         columns["status"] = motion.status.ravel()
     if motion.reprojection_px is not None:

@@ -87,6 +87,7 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
         name=content.name,
         title=summary.description.flight or content.name,
         summary=summary,
+        detected=set(content.keypoints),
         description=summary.description,
         started=wording.moment(summary.origin_ns),
         method=text(summary.metrics, "method"),

@@ -432,6 +432,10 @@ def _describe(problem: Any) -> str:  # pydantic_core.ErrorDetails, whose ctx has
         return f"{place}: unknown key, {hint}"
     if problem["type"] == "missing":
         return f"{place}: is missing"
+    if problem["type"] in {"model_type", "model_attributes_type", "dict_type"}:
+        return f"{place}: must be a mapping (key: value), not {str(problem['input'])[:60]!r}"
+    if place == "cameras" and problem["type"] == "too_short":
+        return "cameras: needs at least one camera"
     message = problem["msg"].removeprefix("Value error, ")
     return f"{place}: {message}" if place else message
 

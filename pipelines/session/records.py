@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics
 
+POINT_COVARIANCE_COLUMNS = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
+"""Upper triangle of a joint's covariance, m^2, as tables name it."""
+
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
@@ -72,6 +75,8 @@ class JointMotion:
     position: Float  # [T, P, J, 3] m, world
     status: NDArray[np.str_] | None = None  # [T, P, J] words of tables.STATUS, where they are known
     reprojection_px: Float | None = None  # [T, P, J]
+    views: Int64 | None = None  # [T, P, J] cameras that measured the joint
+    covariance: Float | None = None  # [T, P, J, 6] m^2: xx, xy, xz, yy, yz, zz
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import pyarrow as pa
 
 from pipelines.session.errors import DataError
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -66,7 +67,7 @@ SKELETON = pa.schema(
         ("x", pa.float64()),
         ("y", pa.float64()),
         ("z", pa.float64()),
-        *[(name, pa.float64()) for name in ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")],
+        *[(name, pa.float64()) for name in POINT_COVARIANCE_COLUMNS],
         ("views", pa.int64()),
         ("reprojection_px", pa.float64()),
         ("status", pa.string()),

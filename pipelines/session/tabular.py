@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.session.records import Detections, Int64, JointMotion, Trajectory
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Detections, Int64, JointMotion, Trajectory
 from pipelines.session.tables import COVARIANCE_COLUMNS
 
 if TYPE_CHECKING:
@@ -156,13 +156,17 @@ def motion_from(table: pd.DataFrame, joints: tuple[str, ...]) -> JointMotion:
     shape = (len(t_ns), int(person.max(initial=0)) + 1, len(joints))
     position = np.full((*shape, 3), np.nan)
     position[row, person, joint] = table[_POSITION].to_numpy(np.float64)
-    status = reprojection = None
+    status = reprojection = views = covariance = None
     if "status" in table:
         status = np.full(shape, "not_detected", dtype="U16")
         status[row, person, joint] = table["status"].to_numpy(str)
         reprojection = np.full(shape, np.nan)
         reprojection[row, person, joint] = table["reprojection_px"].to_numpy(np.float64)
-    return JointMotion(t_ns, joints, position, status, reprojection)
+        views = np.zeros(shape, np.int64)
+        views[row, person, joint] = table["views"].to_numpy(np.int64)
+        covariance = np.full((*shape, 6), np.nan)
+        covariance[row, person, joint] = table[list(POINT_COVARIANCE_COLUMNS)].to_numpy(np.float64)
+    return JointMotion(t_ns, joints, position, status, reprojection, views, covariance)
 
 
 def _index_of(names: pd.Series[str], wanted: Sequence[str]) -> NDArray[np.intp]:
