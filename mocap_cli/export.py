@@ -10,7 +10,7 @@ from mocap_cli.options import any_path, json_option, overwrite_option, session_a
 from mocap_cli.terminal import print_json
 
 
-@click.command("export")
+@click.command("export", short_help="Write TRC, CSV or TUM.")
 @session_argument
 @click.option(
     "--to",

@@ -13,7 +13,7 @@ from mocap_cli.terminal import one_line, print_json
 _LONGEST_LIST = 12
 
 
-@click.command("info")
+@click.command("info", short_help="Say what a file or session holds.")
 @click.argument("path", type=any_path)
 @json_option
 def info_command(path: Path, as_json: bool) -> None:

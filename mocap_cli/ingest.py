@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pipelines.ingest import Ingested
 
 
-@click.command("ingest")
+@click.command("ingest", short_help="Read a flight into a session.")
 @click.argument("flight", type=any_path, metavar="FLIGHT.yaml")
 @click.option(
     "-o", "--output", type=any_path, help="Session folder [default: the manifest's name with .session]."

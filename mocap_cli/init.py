@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _MANY = 5  # files of one kind in one folder that are told one by one
 
 
-@click.command("init")
+@click.command("init", short_help="Draft a flight.yaml from what was brought home.")
 @click.argument("paths", type=any_path, nargs=-1, required=True, metavar="PATHS...")
 @click.option(
     "-o",

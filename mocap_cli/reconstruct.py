@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pipelines.reconstruct import Reconstructed
 
 
-@click.command("reconstruct")
+@click.command("reconstruct", short_help="Detect, triangulate, measure the errors.")
 @session_argument
 @click.option(
     "--method",

@@ -10,7 +10,7 @@ from mocap_cli.options import any_path, force_option, json_option, level, verbos
 from mocap_cli.terminal import print_json, say_warnings, watching
 
 
-@click.command("report")
+@click.command("report", short_help="Write a page about each session.")
 @click.argument("sessions", nargs=-1, required=True, type=any_path, metavar="SESSION...")
 @force_option
 @json_option

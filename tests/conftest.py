@@ -1,0 +1,15 @@
+"""How hypothesis works here: no deadlines, and the same examples every time unless asked to explore.
+
+HYPOTHESIS_PROFILE=explore make test
+"""
+
+from __future__ import annotations
+
+import os
+
+from hypothesis import settings
+
+# A shared machine is sometimes slow: time is watched by the tests that are about time.
+settings.register_profile("repeatable", deadline=None, derandomize=True)
+settings.register_profile("explore", deadline=None, print_blob=True)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
