@@ -10,7 +10,7 @@ from mocap_cli.options import any_path, json_option
 from mocap_cli.terminal import print_json, print_table
 
 
-@click.group("models", invoke_without_command=True)
+@click.group("models", invoke_without_command=True, short_help="List and fetch keypoint detectors.")
 @json_option
 @click.pass_context
 def models_command(context: click.Context, as_json: bool) -> None:

@@ -44,6 +44,7 @@ from pipelines.session.registries import (
     MapFormat,
     TrajectoryFormat,
     VideoFormat,
+    why_not,
 )
 from pipelines.session.storage import as_data_error
 
@@ -219,7 +220,7 @@ class _Search:
         elif formats := self._recognising(path):
             yield path, formats
         else:
-            self.left_out.append(LeftOut(path, "not recognised, left out"))
+            self.left_out.append(LeftOut(path, _why_left_out(path)))
 
     def _under_folder(self, folder: Path) -> Iterator[Thing]:
         """The folder itself where it is one thing, and what lies in it but is no part of that."""
@@ -387,3 +388,15 @@ def _pose_samples(log: Log, topic: str, messages: int, source: Path) -> Iterator
             yield from (sample for sample in samples(message, source) if isinstance(sample, PoseSample))
         except DataError:
             continue
+
+
+def _why_left_out(path: Path) -> str:
+    """What to say of a file that no format knows."""
+    if path.suffix.lower() in {".yaml", ".yml"}:
+        try:
+            read_flight(path)
+        except DataError:
+            pass
+        else:
+            return "is a flight manifest already (run `mocap ingest` on it), left out"
+    return f"not recognised{why_not(path)}, left out"

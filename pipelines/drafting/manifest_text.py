@@ -49,7 +49,7 @@ def write_manifest(draft: Draft, name: str, relative: Callable[[Path], str]) -> 
         _HEAD,
         entry("schema", SCHEMA),
         entry("name", name),
-        entry("world", {"frame": "enu"}, "the axes of the poses: x east, y north, z up; or ned"),
+        entry("world", {"frame": "enu"}, "assumed: the poses have z up (x east, y north); or ned"),
         *_logs(draft, relative, remarks),
         *_cameras(draft, relative, remarks),
         *_actor(draft, relative, remarks),
