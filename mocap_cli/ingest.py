@@ -77,7 +77,16 @@ def ingest_command(
         return
     if not quiet:
         _print(result)
+        _print_stamps(result)
     click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder}")
+
+
+def _print_stamps(result: Ingested) -> None:
+    """Which of a log's two times was taken, because recorders differ in which is right."""
+    for stamps in ("header", "receive"):
+        names = [name for name, c in result.description.cameras.items() if c.poses.stamps == stamps]
+        if names:
+            click.echo(f"poses are timed by the {stamps} stamps of their logs: {', '.join(names)}")
 
 
 def _print(result: Ingested) -> None:

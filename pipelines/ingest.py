@@ -420,6 +420,7 @@ class _Reader:
             gaps_ns=[] if static else gaps(poses_t_ns, self._max_gap_ns),
             frames_without_pose=without_pose,
             dropped=trajectory.dropped,
+            stamps=self._sources.stamps(camera.pose.log) if camera.pose.log else None,
         )
 
     def _doubt_speed(self, name: str, trajectory: Trajectory) -> None:

@@ -97,6 +97,10 @@ class FlightSources:
         self._logs = FlightLogs(flight, self._base, note)
         self._calibrations: dict[str, dict[str, CalibratedCamera]] = {}
 
+    def stamps(self, log: str) -> str:
+        """Which stamps of a log's messages count: header or receive."""
+        return self._logs.settings(log).stamps
+
     # --- keypoints and pictures ------------------------------------------------------------------------
 
     def keypoints(self, source: KeypointSource) -> tuple[Detections, str]:

@@ -66,6 +66,7 @@ class PosesEntry(Entry):
     gaps_ns: list[tuple[int, int]]  # stretches of the log longer than the largest gap that is bridged
     frames_without_pose: int
     dropped: dict[str, int]
+    stamps: str | None = None  # of a log's messages: header or receive
 
 
 class KeypointsEntry(Entry):

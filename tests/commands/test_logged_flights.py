@@ -72,6 +72,7 @@ def test_a_topic_that_is_left_out_is_chosen_and_said(tmp_path: Path) -> None:
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0
     assert "took poses from /drone1/odometry, the only candidate" in done.stderr
+    assert "poses are timed by the header stamps of their logs: drone1, drone2" in done.stdout
 
 
 def test_missing_topic_lists_the_candidates(tmp_path: Path) -> None:
