@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -109,7 +110,11 @@ def detect(
     progress.start("Detecting keypoints", sum(work.pictures(block) for block in blocks))
     with ThreadPoolExecutor(workers) as pool:
         produce = partial(_produce, work, chosen.name, progress)
-        folders = list(pool.map(lambda block: run.chunk(block.name, partial(produce, block)), blocks))
+        try:
+            folders = list(pool.map(lambda block: run.chunk(block.name, partial(produce, block)), blocks))
+        except BaseException:
+            work.stopped.set()  # or Ctrl-C would wait for the blocks under way
+            raise
     counts = _assemble(run.folder, media, blocks, folders)
     if not any(camera["detections"] for camera in counts.values()):
         raise DataError(
@@ -139,6 +144,7 @@ class _Work:
     def __init__(self, folder: Path, description: Description, every: int) -> None:
         self.folder = folder
         self.every = every
+        self.stopped = Event()
         self._description = description
         self._frames = {
             name: read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
@@ -225,6 +231,8 @@ def _produce(work: _Work, detector: str, progress: Progress, block: Block, folde
     undecoded = 0
     with open_pictures(media, work.folder) as pictures:
         for number, hint in zip(frame.tolist(), work.hints(block, t_ns), strict=True):
+            if work.stopped.is_set():
+                raise InterruptedError("another block failed, or the user stopped it")
             picture = pictures.read(number)
             progress.advance()
             if picture is None:

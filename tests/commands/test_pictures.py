@@ -74,8 +74,6 @@ def test_frame_times_of_a_csv(tmp_path: Path) -> None:
     frames = pd.read_parquet(tmp_path / "flight.session" / "cameras" / "drone1" / "frames.parquet")
     assert frames["frame"].tolist() == [0, 1, 2, *range(4, HALF_SECOND)]
     assert frames["t_ns"].iloc[3] == START_NS + 160_000_000
-    # The clock of drone1 runs slow: nobody is where both cameras see him, but nothing breaks.
-    assert mocap("reconstruct", tmp_path / "flight.session").returncode in {0, 1}
 
 
 def test_overlays_lie_on_frames_until_the_video_is_gone(tmp_path: Path) -> None:

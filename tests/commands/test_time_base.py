@@ -45,14 +45,15 @@ def test_clock_offset_that_is_stated_is_applied(tmp_path: Path) -> None:
     table.to_csv(times, index=False)
     flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": 0.2}
     flight.save()
-    assert measured(flight)["mpjpe_mm"] < 0.5
+    right_mm = measured(flight)["mpjpe_mm"]
+    assert right_mm < 0.5
     flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": -0.2}
     flight.save()
     # The other sign is 0.4 s off: the walk goes on by half a metre meanwhile, and the drone with it.
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0
     wrong = mocap("reconstruct", flight.manifest.with_suffix(".session"), "--json", "-q")
-    assert wrong.returncode == 1 or json.loads(wrong.stdout)["mpjpe_mm"] > 10
+    assert wrong.returncode == 1 or json.loads(wrong.stdout)["mpjpe_mm"] > 100 * right_mm
 
 
 def test_rates_that_differ(tmp_path: Path) -> None:
