@@ -10,27 +10,17 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
+from typing import Annotated, Literal
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-    model_validator,
-)
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from pipelines.session.errors import DataError
+from pipelines.session.yaml_models import Part, read_yaml_model
 
 SCHEMA = 1
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_LARGEST_MANIFEST = 1_000_000  # bytes; a real one has a few thousand
 
 _LATEST_NS = 2**62  # differences of two such times fit int64
 
@@ -69,29 +59,6 @@ def _nanoseconds(value: object) -> int:
 Fps = Annotated[Fraction, BeforeValidator(_fps)]
 SecondsAsNs = Annotated[int, BeforeValidator(_nanoseconds)]
 """Seconds in the file (number or text), exact nanoseconds in the program."""
-
-
-class Part(BaseModel):
-    """A mapping of the manifest: unknown keys are refused, numbers are finite."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    shorthand: ClassVar[str | None] = None
-    """The key that a bare text (or list) stands for: `map: site.bt` means `map: {path: site.bt}`."""
-    one_of: ClassVar[tuple[str, ...]] = ()
-    """The keys that exclude each other; exactly one of them must be there."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _expand_shorthand(cls, value: object) -> object:
-        return {cls.shorthand: value} if cls.shorthand and isinstance(value, str | list) else value
-
-    @model_validator(mode="after")
-    def _exactly_one(self) -> Part:
-        stated = [name for name in self.one_of if getattr(self, name) is not None]
-        if self.one_of and len(stated) != 1:
-            raise ValueError(f"needs exactly one of {', '.join(self.one_of)}" + f" (has {len(stated)})")
-        return self
 
 
 class Origin(Part):
@@ -383,76 +350,7 @@ def read_flight(path: Path) -> Flight:
         DataError: the file is missing, no YAML, or does not keep to the schema; the message holds
             every problem that was found.
     """
-    raw = _read_yaml(path)
-    if not isinstance(raw, Mapping):
-        raise DataError(path, "is no flight manifest", "it must be a mapping with `schema: 1` and `cameras:`")
-    if isinstance(raw.get("schema"), int) and raw["schema"] > SCHEMA:
-        raise DataError(
-            path, f"has schema {raw['schema']}, newer than {SCHEMA}", "use a newer version of mocap"
-        )
-    try:
-        flight = Flight.model_validate(raw)
-    except ValidationError as error:
-        problems = [_describe(problem) for problem in error.errors()]
-        raise DataError(path, "; ".join(dict.fromkeys(problems))) from None
+    flight = read_yaml_model(
+        path, Flight, "flight manifest", newest=SCHEMA, shape="a mapping with `schema: 1` and `cameras:`"
+    )
     return flight if flight.name else flight.model_copy(update={"name": path.stem})
-
-
-def _read_yaml(path: Path) -> object:
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import MarkedYAMLError, YAMLError
-
-    try:
-        if path.stat().st_size > _LARGEST_MANIFEST:
-            raise DataError(path, f"is larger than {_LARGEST_MANIFEST} bytes", "this is no flight manifest")
-        text = path.read_text(encoding="utf-8-sig")
-        value: object = YAML(typ="safe", pure=True).load(text)
-    except OSError as error:
-        raise DataError(
-            path, f"cannot be read ({error.strerror})", "give the path of a flight.yaml"
-        ) from None
-    except UnicodeDecodeError:
-        raise DataError(path, "is no UTF-8 text", "give the path of a flight.yaml") from None
-    except MarkedYAMLError as error:
-        line = f" in line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        problem = " ".join(str(error.problem or error.context).split())
-        raise DataError(path, f"is no valid YAML{line} ({problem})", "mend that line") from None
-    except (YAMLError, ValueError, RecursionError) as error:
-        problem = " ".join(str(error).split())[:200]
-        raise DataError(path, f"is no valid YAML ({problem})", "mend it") from None
-    return value
-
-
-def _describe(problem: Any) -> str:  # pydantic_core.ErrorDetails, whose ctx has no fixed shape
-    place = ".".join(str(part) for part in problem["loc"])
-    if problem["type"] == "extra_forbidden":
-        known = _keys_at(problem["loc"][:-1])
-        near = difflib.get_close_matches(str(problem["loc"][-1]), known, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
-        return f"{place}: unknown key, {hint}"
-    if problem["type"] == "missing":
-        return f"{place}: is missing"
-    if problem["type"] in {"model_type", "model_attributes_type", "dict_type"}:
-        return f"{place}: must be a mapping (key: value), not {str(problem['input'])[:60]!r}"
-    if place == "cameras" and problem["type"] == "too_short":
-        return "cameras: needs at least one camera"
-    message = problem["msg"].removeprefix("Value error, ")
-    return f"{place}: {message}" if place else message
-
-
-def _keys_at(place: tuple[str | int, ...]) -> list[str]:
-    """The keys that the schema knows at a place, found by walking the types of the fields."""
-    kind: Any = Flight
-    for part in place:
-        if isinstance(kind, type) and issubclass(kind, Part):
-            fields = {field.alias or name: field for name, field in kind.model_fields.items()}
-            kind = _without_none(fields[str(part)].annotation)
-        else:
-            kind = _without_none(get_args(kind)[-1])
-    return [field.alias or name for name, field in kind.model_fields.items()]
-
-
-def _without_none(annotation: Any) -> Any:
-    if get_origin(annotation) is None or type(None) not in get_args(annotation):
-        return annotation
-    return next(a for a in get_args(annotation) if a is not type(None))

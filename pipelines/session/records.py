@@ -80,6 +80,22 @@ class JointMotion:
 
 
 @dataclass(frozen=True)
+class SkeletalMotion:
+    """A chain of bones and how its joints turn: what BVH files hold. Parents stand before children.
+
+    A bone's world rotation is its parent's times its own; in the rest pose all are the identity.
+    """
+
+    t_s: Float  # [T] seconds since the first frame
+    bones: tuple[str, ...]  # as the file calls them
+    parent: tuple[int, ...]  # -1 for the root
+    offset: Float  # [B, 3] m, from the parent's joint in the rest pose, z up
+    end: dict[int, Float]  # bone to where its end site lies, [3] m
+    root: Float  # [T, 3] m, where the root's joint is
+    rotation: Float  # [T, B, 4] unit quaternions xyzw, parent_from_bone
+
+
+@dataclass(frozen=True)
 class Recording:
     """Everything an export may need: the skeleton and the cameras' poses that it was made with."""
 

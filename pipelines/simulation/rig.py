@@ -1,0 +1,140 @@
+"""The bones of a simulated person: what motions are made of and what a body's mesh hangs on.
+
+Every bone is turned from a neutral pose: standing upright, arms hanging, legs straight, feet pointing
+ahead, soles flat on the ground. Body axes are x forward, y left, z up, so that a person whose bones are
+all turned by the identity looks east.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.poses import rotate
+
+Float = NDArray[np.float64]
+
+_TRUNK = {
+    "pelvis": None,
+    "spine": "pelvis",
+    "back": "spine",
+    "chest": "back",
+    "neck": "chest",
+    "head": "neck",
+}
+_LIMBS = {
+    "clavicle": "chest",
+    "upper_arm": "clavicle",
+    "forearm": "upper_arm",
+    "hand": "forearm",
+    "thigh": "pelvis",
+    "shank": "thigh",
+    "foot": "shank",
+    "toes": "foot",
+}
+SIDES = ("left", "right")
+
+PARENT: dict[str, str | None] = _TRUNK | {
+    f"{side}_{bone}": parent if parent in _TRUNK else f"{side}_{parent}"
+    for side in SIDES
+    for bone, parent in _LIMBS.items()
+}
+"""Every bone and the one it hangs on, parents first."""
+
+BONES = tuple(PARENT)
+BONE = {name: index for index, name in enumerate(BONES)}
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The lengths of one person's bones, in the neutral pose.
+
+    `offset` is where each bone's joint (its upper end) lies from its parent's joint; the pelvis's lies
+    from the point of the ground between the feet. `sole` is where heel, ball and tip of each sole lie
+    from the joint of that foot, left then right; the tip belongs to the toes, the others to the foot.
+    """
+
+    offset: Float  # [B, 3] m
+    sole: Float  # [2, 3, 3] m
+
+    @property
+    def height_of_pelvis(self) -> float:
+        """How high the pelvis's joint is above the ground in the neutral pose, m."""
+        return float(self.offset[0, 2])
+
+
+@dataclass(frozen=True)
+class BodyMotion:
+    """How one person moves.
+
+    `rotation` is world_from_bone relative to the neutral pose: a bone's point that lies `v` from the
+    bone's joint in the neutral pose lies `rotate(rotation, v)` from it now. Knees, elbows and other joints
+    bend by the difference between a bone's rotation and its parent's.
+    """
+
+    t_s: Float  # [T] seconds since the flight's start, strictly increasing
+    root: Float  # [T, 3] m, the pelvis's joint in the world
+    rotation: Float  # [T, B, 4] unit quaternions xyzw
+
+
+def joint_centres(rig: Rig, motion: BodyMotion) -> Float:
+    """Where the joint of every bone is: [T, B, 3] m, world, in the order of `BONES`."""
+    centres = np.empty((len(motion.t_s), len(BONES), 3))
+    for bone, (name, parent) in enumerate(PARENT.items()):
+        if parent is None:
+            centres[:, BONE[name]] = motion.root
+        else:
+            above = BONE[parent]
+            centres[:, bone] = centres[:, above] + rotate(motion.rotation[:, above], rig.offset[bone])
+    return centres
+
+
+def sole_points(rig: Rig, motion: BodyMotion) -> Float:
+    """Where heel, ball and tip of the soles are: [T, 2, 3, 3] m, world, left foot first."""
+    centres = joint_centres(rig, motion)
+    points = np.empty((len(motion.t_s), 2, 3, 3))
+    for index, side in enumerate(SIDES):
+        foot, toes = BONE[f"{side}_foot"], BONE[f"{side}_toes"]
+        turned = motion.rotation[:, foot, None]
+        points[:, index, :2] = centres[:, foot, None] + rotate(turned, rig.sole[index, :2])
+        tip = rig.sole[index, 2] - rig.offset[toes]
+        points[:, index, 2] = centres[:, toes] + rotate(motion.rotation[:, toes], tip)
+    return points
+
+
+def average_rig(height_m: float = 1.75) -> Rig:
+    """A person of average proportions.
+
+    Segment lengths are fractions of the height after Drillis & Contini (in Winter, "Biomechanics and
+    Motor Control of Human Movement", 4th ed. 2009, chapter 4), the trunk in three equal parts.
+    """
+    h = height_m
+    offset = np.zeros((len(BONES), 3))
+    offset[BONE["pelvis"]] = (0.0, 0.0, 0.53 * h)
+    trunk = 0.288 * h / 3
+    for name, up in (
+        ("spine", trunk),
+        ("back", trunk),
+        ("chest", trunk),
+        ("neck", 0.03 * h),
+        ("head", 0.052 * h),
+    ):
+        offset[BONE[name]] = (0.0, 0.0, up)
+    for sign, side in zip((1.0, -1.0), SIDES, strict=True):
+        hanging = {
+            "clavicle": (0.0, sign * 0.02 * h, 0.0),
+            "upper_arm": (0.0, sign * 0.1095 * h, 0.0),
+            "forearm": (0.0, 0.0, -0.186 * h),
+            "hand": (0.0, 0.0, -0.146 * h),
+            "thigh": (0.0, sign * 0.0525 * h, 0.0),
+            "shank": (0.0, 0.0, -0.245 * h),
+            "foot": (0.0, 0.0, -0.246 * h),
+            "toes": (0.09 * h, 0.0, -0.026 * h),
+        }
+        for bone, place in hanging.items():
+            offset[BONE[f"{side}_{bone}"]] = place
+    ankle = 0.039 * h
+    sole = np.array([[-0.033 * h, 0.0, -ankle], [0.085 * h, 0.0, -ankle], [0.119 * h, 0.0, -ankle]])
+    return Rig(offset, np.stack([sole, sole]))

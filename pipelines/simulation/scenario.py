@@ -1,0 +1,290 @@
+"""`SCENARIO.yaml`: who moves how, in which world, and which drones film it.
+
+Everything is stated in metres, seconds and degrees, in a world with x east, y north, z up whose ground
+is at z = 0 where nothing rises.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from pipelines.session.manifest import SecondsAsNs
+from pipelines.session.yaml_models import Part, read_yaml_model
+
+SCHEMA = 1
+_MOST_VOXELS = 20_000_000
+
+Place = Annotated[list[Annotated[float, Field(ge=-10_000, le=10_000)]], Field(min_length=2, max_length=2)]
+"""East and north, m."""
+Seconds = Annotated[float, Field(gt=0, le=3600)]
+Metres = Annotated[float, Field(gt=0, le=1000)]
+
+
+# --- the actor -----------------------------------------------------------------------------------------
+
+
+class Body(Part):
+    """What the actor looks like."""
+
+    sex: Literal["female", "male"] = "male"
+    height_m: float = Field(1.75, ge=1.2, le=2.2)
+    build: Literal["slim", "average", "heavy"] = "average"
+    outfit: Literal["casual", "sport", "dark", "bright"] = "casual"
+
+
+class Travel(Part):
+    """On foot from here to there: a straight line, an arc of `turn_deg` (left is positive), or to a place."""
+
+    one_of = ("distance_m", "to")
+    distance_m: Metres | None = None
+    to: Place | None = None
+    turn_deg: float = Field(0.0, ge=-36_000, le=36_000)
+    speed_mps: float | None = Field(None, ge=0.3, le=6.0)
+
+    @model_validator(mode="after")
+    def _arc_has_room(self) -> Travel:
+        if self.to is not None and self.turn_deg:
+            raise ValueError("turn_deg goes with distance_m; a way `to` a place is straight")
+        if self.distance_m and self.turn_deg and self.distance_m / abs(math.radians(self.turn_deg)) < 0.5:
+            raise ValueError("the arc is tighter than 0.5 m: a person turns on the spot with `turn`")
+        return self
+
+
+class Stand(Part):
+    """Stay, breathing and swaying a little."""
+
+    seconds: Seconds
+
+
+class Turn(Part):
+    """On the spot, in small steps; left is positive."""
+
+    deg: float = Field(ge=-720, le=720)
+
+
+class Crouch(Part):
+    """Down, stay, up again."""
+
+    seconds: Seconds = 2.0
+    depth: float = Field(0.8, gt=0, le=1)  # 1 is as deep as people sit on their heels
+
+
+class Reach(Part):
+    """Up and ahead with a hand, and back."""
+
+    side: Literal["left", "right", "both"] = "right"
+    height_m: float = Field(1.9, ge=0.3, le=2.6)
+    seconds: Seconds = 2.0
+
+
+class Kick(Part):
+    """The seed's soccer: a run-up, the kick, the follow-through, and back to a stand."""
+
+    foot: Literal["left", "right"] = "right"
+    run_up_m: float = Field(3.0, ge=1.0, le=10)
+
+
+class Step(Part):
+    """One thing the actor does."""
+
+    one_of = ("walk", "jog", "stand", "turn", "crouch", "reach", "kick")
+    walk: Travel | None = None
+    jog: Travel | None = None
+    stand: Stand | None = None
+    turn: Turn | None = None
+    crouch: Crouch | None = None
+    reach: Reach | None = None
+    kick: Kick | None = None
+
+
+class Motion(Part):
+    """What the actor does one after another, or a BVH file. Whoever is done stands still, or begins again."""
+
+    shorthand = "steps"
+    one_of = ("steps", "bvh")
+    steps: Annotated[list[Step], Field(min_length=1, max_length=1000)] | None = None
+    bvh: str | None = None
+    unit: Literal["m", "cm", "mm", "inch"] = "cm"  # of the BVH file
+    axes: Literal["y-up", "z-up"] = "y-up"
+    repeat: bool = False
+
+
+class Actor(Part):
+    """Who is filmed."""
+
+    body: Body = Body()
+    start: Place = [0.0, 0.0]
+    heading_deg: float = 0.0  # counterclockwise from east
+    motion: Motion
+    estimate_sigma_m: float = Field(0.2, ge=0, le=10)  # of the actor's logged position, per axis
+    estimate_rate_hz: float = Field(10.0, gt=0, le=100)
+
+
+# --- the world -----------------------------------------------------------------------------------------
+
+
+class Ground(Part):
+    """The ground that is there to see and to map: a square about the middle."""
+
+    centre: Place = [0.0, 0.0]
+    size_m: float = Field(60.0, gt=1, le=1000)
+
+
+class Mound(Part):
+    """A hill of Gaussian shape: the seed's mound."""
+
+    centre: Place
+    sigma_m: Annotated[list[Metres], Field(min_length=2, max_length=2)]  # along x and y before yaw
+    height_m: float = Field(gt=0, le=100)
+    yaw_deg: float = 0.0
+
+
+class Tree(Part):
+    """A trunk and a crown."""
+
+    position: Place
+    height_m: float = Field(6.0, gt=0.5, le=60)
+    crown_radius_m: float = Field(1.6, gt=0, le=20)
+
+
+class Wood(Part):
+    """Trees strewn at random, none nearer to the actor's way than `clear_m`."""
+
+    count: int = Field(ge=1, le=2000)
+    centre: Place = [0.0, 0.0]
+    radius_m: Metres = 25.0
+    clear_m: float = Field(4.0, ge=0)
+    height_m: float = Field(6.0, gt=0.5, le=60)
+
+
+class Wall(Part):
+    """An upright slab along a line on the ground."""
+
+    start: Place
+    end: Place
+    height_m: Metres = 2.5
+    thickness_m: Metres = 0.3
+
+
+class Mapping(Part):
+    """The occupancy map that the drones had: voxels over the ground, up to a height."""
+
+    resolution_m: float = Field(0.25, gt=0.01, le=10)
+    height_m: Metres = 12.0
+
+
+class World(Part):
+    """What stands around."""
+
+    ground: Ground = Ground()
+    mounds: Annotated[list[Mound], Field(max_length=100)] = []
+    trees: Annotated[list[Tree], Field(max_length=2000)] = []
+    wood: Wood | None = None
+    walls: Annotated[list[Wall], Field(max_length=200)] = []
+    map: Mapping = Mapping()
+    sun: Annotated[list[float], Field(min_length=3, max_length=3)] = [0.45, -0.35, 0.82]  # towards it
+
+    @model_validator(mode="after")
+    def _map_fits(self) -> World:
+        side = self.ground.size_m / self.map.resolution_m
+        voxels = side * side * self.map.height_m / self.map.resolution_m
+        if voxels > _MOST_VOXELS:
+            raise ValueError(
+                f"map: {voxels:.3g} voxels are more than {_MOST_VOXELS:,}: take a coarser resolution_m, "
+                "a smaller ground or a lower height_m"
+            )
+        if self.sun[2] <= 0.1:
+            raise ValueError("sun: it must stand above the horizon: z above 0.1")
+        return self
+
+
+# --- the drones ----------------------------------------------------------------------------------------
+
+
+class Formation(Part):
+    """Where the drones fly about the actor: slots at yaw + i 360/n (90 for two)."""
+
+    planner: str = "ring"  # or a planner arm: adaptive, fixed, ...
+    radius_m: float = Field(10.0, ge=2, le=200)
+    tilt_deg: float = Field(15.0, ge=-10, le=85)
+    yaw_deg: float = 0.0
+    yaw_rate_deg_per_s: float = Field(0.0, ge=-90, le=90)  # of the ring
+    variation: float = Field(0.0, ge=0, le=3)  # how far each strays from its slot
+
+
+class Limits(Part):
+    """What a drone can do."""
+
+    speed_mps: float = Field(8.0, gt=0, le=50)
+    acceleration_mps2: float = Field(4.0, gt=0, le=50)
+
+
+class Lens(Part):
+    """The camera on every drone."""
+
+    width: int = Field(1280, ge=64, le=7680)
+    height: int = Field(720, ge=64, le=4320)
+    hfov_deg: float = Field(80.0, ge=5, le=150)
+    rate_hz: float = Field(30.0, ge=1, le=240)
+    dropped_share: float = Field(0.0, ge=0, lt=0.5)  # frames that the recorder lost
+
+
+class Drones(Part):
+    """The team."""
+
+    count: int = Field(2, ge=1, le=16)
+    formation: Formation = Formation()
+    limits: Limits = Limits()
+    camera: Lens = Lens()
+    odometry_hz: float = Field(50.0, ge=1, le=1000)
+    pose_noise: dict[str, dict[str, float | str]] = {}  # as in flight.yaml
+    state_pose_noise: bool = True  # write it into flight.yaml as the prior
+    clock_offsets_s: list[float] = []  # of each drone's pictures against its log, by drone; 0 where absent
+
+
+class DetectorErrors(Part):
+    """What `--no-video` makes of true keypoints, beside what grows with tilt and hides behind things."""
+
+    scale: float = Field(1.0, ge=0, le=100)  # of the measured pixel error; 0 gives exact keypoints
+    missed_share: float = Field(0.02, ge=0, lt=1)
+    outlier_share: float = Field(0.01, ge=0, lt=1)
+    swap_share: float = Field(0.005, ge=0, lt=1)  # of frames, left for right in one limb pair
+
+
+class Scenario(Part):
+    """A flight to be simulated."""
+
+    schema_version: Literal[1] = Field(alias="schema")
+    name: str = Field("", max_length=1000)
+    seed: int = Field(1, ge=0, lt=2**32)
+    duration_s: Seconds
+    start_ns: SecondsAsNs = Field(1_700_000_000_000_000_000, alias="start")
+    actor: Actor
+    world: World = World()
+    drones: Drones = Drones()
+    keypoints: DetectorErrors = DetectorErrors()
+
+    @model_validator(mode="after")
+    def _an_offset_for_each(self) -> Scenario:
+        if len(self.drones.clock_offsets_s) > self.drones.count:
+            raise ValueError("drones.clock_offsets_s: there are more offsets than drones")
+        if any(abs(offset) > 10 for offset in self.drones.clock_offsets_s):
+            raise ValueError("drones.clock_offsets_s: an offset is beyond 10 s")
+        return self
+
+
+def read_scenario(path: Path) -> Scenario:
+    """Read and validate a scenario.
+
+    Raises:
+        DataError: the file is missing, no YAML, or does not keep to the schema; the message holds
+            every problem that was found.
+    """
+    scenario = read_yaml_model(
+        path, Scenario, "scenario", newest=SCHEMA, shape="a mapping with `schema: 1` and `actor:`"
+    )
+    return scenario if scenario.name else scenario.model_copy(update={"name": path.stem})
