@@ -27,8 +27,9 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 
+from pipelines.formats.ros_messages import build
 from pipelines.session.registries import LogFormat, recognise
-from tests.synthetic.logs import ROS1, ROS2, build
+from tests.synthetic.logs import ROS1, ROS2
 
 POSE, PICTURE = "/drone1/odometry", "/drone1/camera/image/compressed"
 TICKS_HZ = 300  # odometry every third tick, a picture every tenth

@@ -16,18 +16,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
-from rosbags.interfaces import Nodetype
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
-from rosbags.typesys.store import Typestore
 from ruamel.yaml import YAML
 
+from pipelines.formats.ros_messages import build
 from tests.formats.foxglove_protobuf import protobuf
 
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
@@ -199,34 +197,6 @@ def cut(path: Path, share: float) -> Path:
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
     return path
-
-
-def build(store: Typestore, type_: str, fields: Mapping[str, Any]) -> Any:
-    """A message of a ROS type; what `fields` leaves out is zero or empty, or ROS 1's seq."""
-    if type_ in {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}:
-        raise TypeError("stamps are plain numbers")
-    _, described = store.fielddefs[type_]
-    # ROS 2 wrote CameraInfo's D, K, R and P small.
-    values = [_value(store, kind, fields.get(name, fields.get(name.lower()))) for name, kind in described]
-    return store.types[type_](*values)
-
-
-def _value(store: Typestore, kind: Any, given: Any) -> Any:
-    if kind[0] == Nodetype.NAME:
-        if kind[1] in {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}:
-            return store.types[kind[1]](*divmod(given or 0, 10**9))
-        return build(store, kind[1], given or {})
-    if kind[0] == Nodetype.BASE:
-        return given if given is not None else ("" if kind[1][0] == "string" else 0)
-    (inner, name), length = kind[1]
-    if inner == Nodetype.NAME:
-        return [build(store, name, item) for item in given or [{}] * length]
-    if name[0] == "string":
-        return list(given or [""] * length)
-    dtype = {"bool": "bool", "byte": "uint8", "char": "uint8", "octet": "uint8"}.get(name[0], name[0])
-    if isinstance(given, bytes):
-        return np.frombuffer(given, dtype)
-    return np.zeros(length, dtype) if given is None else np.asarray(given, dtype).ravel()
 
 
 def _topics(entries: Sequence[Entry]) -> dict[str, str]:
