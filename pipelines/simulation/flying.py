@@ -1,0 +1,348 @@
+"""How drones fly: point masses that track moving slots, bodies that lean, gimbals that aim.
+
+A drone is a mass that a cascade of two loops steers, as autopilots do: the distance to its slot asks for a
+velocity, the error in velocity for an acceleration, and the attitude needs time to give it. Nothing blows
+and nothing saturates but speed and acceleration. The attitude follows from the motion: a multirotor leans
+so that its thrust makes the acceleration; its nose turns to the actor. The camera hangs in a gimbal.
+
+Everything is integrated in equal steps of at most `STEP_S` between the moments that are asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.compilation import cached, helper
+from pipelines.geometry.mounting import attitude_from_angles, body_from_camera
+from pipelines.geometry.poses import multiply, quaternion_from_matrix, rotate
+from pipelines.simulation.drone_paths import orbit
+from pipelines.simulation.scenario import Formation, Limits
+
+Float = NDArray[np.float64]
+
+STEP_S = 0.005
+"""The integration's longest step."""
+
+LEVER_ARM = (0.10, 0.0, -0.05)
+"""Where the camera sits in the body (forward, left, up), m."""
+
+POSITION_GAIN_PER_S, VELOCITY_GAIN_PER_S = 1.5, 4.0
+ATTITUDE_LAG_S = 0.15  # until an acceleration that is asked for is there: the body must lean first
+_BRAKING_SHARE = 0.5  # of the acceleration limit, for coming to a stop; the rest is for corrections
+
+HEADING_LAG_S, HEADING_RATE_RADPS = 0.3, math.radians(90.0)
+GIMBAL_LAG_S, GIMBAL_RATE_RADPS = 0.05, math.radians(120.0)
+
+_GRAVITY_MPS2 = 9.81
+_DRAG_PER_S = 0.15  # of the rotors and the frame, linear in speed: 7 degrees of lean at 8 m/s
+_LEAST_LIFT = 0.2  # of gravity: rotors do not push down
+
+
+@dataclass(frozen=True)
+class DronePaths:
+    """Where every drone is, and how it and its camera are turned."""
+
+    t_s: Float  # [T] seconds since the flight's start, strictly increasing
+    position: Float  # [N, T, 3] m, the body's origin in the world
+    velocity: Float  # [N, T, 3] m/s
+    body_xyzw: Float  # [N, T, 4] world_from_body (x forward, y left, z up)
+    camera_xyzw: Float  # [N, T, 4] world_from_camera (x right, y down, z forward)
+
+    @property
+    def camera_position(self) -> Float:
+        """[N, T, 3] m: the lever arm turns with the body."""
+        return self.position + rotate(self.body_xyzw, np.array(LEVER_ARM))
+
+
+class Known(NamedTuple):
+    """What a planner knows when it is asked: nothing later than `t_s`, and of the actor only estimates."""
+
+    t_s: float
+    actor_t_s: Float  # [M] stamps of the estimates so far
+    actor: Float  # [M, 3] m, where the actor's hip was estimated to be
+    position: Float  # [N, 3] m, the drones
+    velocity: Float  # [N, 3] m/s
+
+
+Planner = Callable[[Known], tuple[Float, Float]]
+"""Asked at a stated rate: where every drone's slot is now [N, 3] m, and how it moves [N, 3] m/s.
+
+Until it is asked again the slots move on in straight lines. A planner that plans trajectories samples its
+latest one here and replans as often as it likes; it keeps its own state.
+"""
+
+
+def moments(first_s: float, last_s: float) -> Float:
+    """Moments [T] to fly at: 100 a second, from `first_s` to `last_s` or just beyond."""
+    return first_s + np.arange(math.ceil((last_s - first_s) * 100 - 1e-6) + 1) / 100
+
+
+def ring_slots(formation: Formation, count: int, actor: Float, t_s: Float) -> Float:
+    """Slots [N, T, 3] m on a ring about the actor, whatever stands in the way.
+
+    Args:
+        formation: the ring; its `planner` does not matter here.
+        count: how many drones.
+        actor: [T, 3] m, a smooth point of the actor.
+        t_s: [T] seconds.
+    """
+    position, _ = orbit(
+        t_s,
+        actor,
+        cameras=count,
+        range_m=formation.radius_m,
+        tilt_deg=formation.tilt_deg,
+        yaw_deg=formation.yaw_deg,
+        yaw_rate_deg_per_s=formation.yaw_rate_deg_per_s,
+        variation=formation.variation,
+    )
+    return position
+
+
+def fly(slots: Float, aim: Float, t_s: Float, limits: Limits) -> DronePaths:
+    """Fly after slots that are known beforehand.
+
+    The drones start in their slots and move with them as fast as they may. Behind a slot that
+    accelerates by `a` a drone lags by about a / (POSITION_GAIN_PER_S VELOCITY_GAIN_PER_S): the slot's
+    velocity is fed forward, its acceleration is not. The camera lags by the rate at which its aim turns
+    times GIMBAL_LAG_S.
+
+    Args:
+        slots: [N, T, 3] m, of the bodies' origins.
+        aim: [T, 3] m, what the cameras look at.
+        t_s: [T] seconds, strictly increasing (`moments`).
+        limits: of speed and acceleration; neither is ever exceeded.
+
+    Raises:
+        ValueError: times that do not increase strictly, or numbers that are not finite.
+    """
+    _check(t_s, slots, aim)
+    velocity = np.gradient(slots, t_s, axis=1) if len(t_s) > 1 else np.zeros_like(slots)
+    flight = _Flight.starting(slots[:, :1], velocity[:, :1], t_s, limits)
+    flight.advance(0, slots, velocity)
+    return flight.paths(aim)
+
+
+def fly_with(
+    planner: Planner,
+    start: Float,
+    aim: Float,
+    t_s: Float,
+    limits: Limits,
+    *,
+    actor_t_s: Float,
+    actor: Float,
+    rate_hz: float,
+) -> DronePaths:
+    """Fly after slots that a planner gives on the way.
+
+    Args:
+        planner: asked at the first of the moments `t_s` and then at the first one at or after every
+            further 1 / `rate_hz`.
+        start: [N, 3] m, where the drones hover at first.
+        aim: [T, 3] m, what the cameras look at.
+        t_s: [T] seconds, strictly increasing (`moments`).
+        limits: of speed and acceleration; neither is ever exceeded.
+        actor_t_s: [M] seconds, increasing: when the actor's position was estimated.
+        actor: [M, 3] m, the estimates.
+        rate_hz: how often the planner is asked.
+
+    Raises:
+        ValueError: times that do not increase strictly, numbers that are not finite, or slots of
+            another shape.
+    """
+    _check(t_s, start, aim)
+    flight = _Flight.starting(start[:, None], np.zeros_like(start[:, None]), t_s, limits)
+    ticks = np.floor((t_s - t_s[:1]) * rate_hz + 1e-9)
+    calls = np.flatnonzero(np.diff(ticks, prepend=-1.0)).tolist()
+    for first, following in pairwise([*calls, len(t_s) - 1]):
+        now = t_s[first]
+        so_far = int(np.searchsorted(actor_t_s, now, side="right"))
+        position, velocity = flight.position[:, first].copy(), flight.velocity[:, first].copy()
+        slot, slot_velocity = planner(
+            Known(float(now), actor_t_s[:so_far], actor[:so_far], position, velocity)
+        )
+        if slot.shape != start.shape or not np.isfinite([slot, slot_velocity]).all():
+            raise ValueError(f"the planner's slots at {now:g} s are not {start.shape} finite numbers")
+        since = (t_s[first : following + 1] - now)[:, None]
+        moving = slot[:, None] + slot_velocity[:, None] * since
+        flight.advance(first, moving, np.broadcast_to(slot_velocity[:, None], moving.shape).copy())
+    return flight.paths(aim)
+
+
+class _Flight(NamedTuple):
+    """A flight in the making; rows are filled as it advances."""
+
+    t_s: Float  # [T]
+    limits: Limits
+    position: Float  # [N, T, 3]
+    velocity: Float
+    acceleration: Float
+
+    @classmethod
+    def starting(cls, position: Float, velocity: Float, t_s: Float, limits: Limits) -> _Flight:
+        """All drones at [N, 1, 3] with velocities [N, 1, 3], as far as the limits go; nothing flown yet."""
+        speed = np.linalg.norm(velocity, axis=-1, keepdims=True)
+        allowed = velocity * (limits.speed_mps / np.maximum(speed, limits.speed_mps))
+        rows = (1, len(t_s), 1)
+        positions = np.tile(position, rows)
+        return cls(t_s, limits, positions, np.tile(allowed, rows), np.zeros_like(positions))
+
+    def advance(self, first: int, slot: Float, slot_velocity: Float) -> None:
+        """Track slots [N, S, 3] from the moment `first` for as long as they reach."""
+        rows = slice(first, first + slot.shape[1])
+        _track(
+            self.t_s[rows],
+            np.ascontiguousarray(slot),
+            slot_velocity,
+            self.position[:, rows],
+            self.velocity[:, rows],
+            self.acceleration[:, rows],
+            self.limits.speed_mps,
+            self.limits.acceleration_mps2,
+        )
+
+    def paths(self, aim: Float) -> DronePaths:
+        """The bodies' attitudes, which follow from the motion, and the cameras'."""
+        away = aim - self.position
+        heading = _followed(
+            np.arctan2(away[..., 1], away[..., 0]), self.t_s, HEADING_LAG_S, HEADING_RATE_RADPS
+        )
+        body_xyzw = _leaning(self.acceleration, self.velocity, heading)
+        sight = away - rotate(body_xyzw, np.array(LEVER_ARM))
+        pan = np.arctan2(sight[..., 1], sight[..., 0])
+        down = np.arctan2(-sight[..., 2], np.hypot(sight[..., 0], sight[..., 1]))
+        yaw, pitch = (_followed(angle, self.t_s, GIMBAL_LAG_S, GIMBAL_RATE_RADPS) for angle in (pan, down))
+        gimbal = attitude_from_angles(
+            np.stack([yaw, pitch, np.zeros_like(yaw)], axis=-1), order="ypr", units="rad"
+        )
+        camera_xyzw = multiply(gimbal, body_from_camera("forward"))
+        return DronePaths(self.t_s, self.position, self.velocity, body_xyzw, camera_xyzw)
+
+
+def _check(t_s: Float, *places: Float) -> None:
+    if (np.diff(t_s) <= 0).any():
+        raise ValueError("times must increase strictly")
+    if not all(np.isfinite(values).all() for values in (t_s, *places)):
+        raise ValueError("times, slots and aim must be finite")
+
+
+def _leaning(acceleration: Float, velocity: Float, heading: Float) -> Float:
+    """world_from_body [..., 4] of multirotors: up along the thrust, the nose above the heading.
+
+    Mellinger & Kumar 2011, "Minimum snap trajectory generation and control for quadrotors", Sec. III,
+    with drag against the velocity.
+    """
+    thrust = acceleration + _DRAG_PER_S * velocity
+    lift = np.maximum(thrust[..., 2] + _GRAVITY_MPS2, _LEAST_LIFT * _GRAVITY_MPS2)
+    up = _unit(np.concatenate([thrust[..., :2], lift[..., None]], axis=-1))
+    level_left = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], axis=-1)
+    forward = _unit(np.cross(level_left, up))
+    return quaternion_from_matrix(np.stack([forward, np.cross(up, forward), up], axis=-1))
+
+
+def _followed(angle: Float, t_s: Float, lag_s: float, fastest_radps: float) -> Float:
+    """Angles [N, T] of something that turns after `angle`, and points there at first."""
+    target = np.unwrap(angle, axis=1) if angle.size else angle
+    followed = target.copy()
+    _follow(t_s, target, lag_s, fastest_radps, followed)
+    return followed
+
+
+def _unit(vectors: Float) -> Float:
+    unit: Float = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return unit
+
+
+# --- the integration -----------------------------------------------------------------------------------
+
+
+@helper
+def _steps(span_s: float) -> int:
+    """Into how many equal steps an interval is divided; the margin is for rounding alone."""
+    return max(1, math.ceil(span_s / STEP_S - 1e-6))
+
+
+@helper
+def _shorten(vector: Float, longest: float) -> None:
+    """Keep the direction of [3], and the length within `longest`."""
+    length = math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    if length > longest:
+        vector *= longest / length
+
+
+@helper
+def _approach(distance_m: float, braking_mps2: float) -> float:
+    """How fast to fly towards a slot: in proportion while near, and so as to be able to stop from afar.
+
+    The "square root controller" of ArduPilot: both parts and their slopes agree where they meet.
+    """
+    near = braking_mps2 / POSITION_GAIN_PER_S**2
+    if distance_m <= near:
+        return POSITION_GAIN_PER_S * distance_m
+    return math.sqrt(2 * braking_mps2 * (distance_m - near / 2))
+
+
+@cached
+def _track(
+    t_s: Float,
+    slot: Float,
+    slot_velocity: Float,
+    position: Float,
+    velocity: Float,
+    acceleration: Float,
+    speed_limit: float,
+    acceleration_limit: float,
+) -> None:
+    """Fly from the first row of the last three arrays [N, T, 3], and write the others.
+
+    The acceleration is a mean of accelerations within the limit, so it keeps to the limit. A velocity
+    that would leave the ball of allowed ones is put back on it; as a ball is convex, that never lengthens
+    the step from a velocity inside, so what the drone really accelerated keeps to the limit as well.
+    """
+    kept = _BRAKING_SHARE * acceleration_limit
+    for n in range(position.shape[0]):
+        at, moving, pushed = position[n, 0].copy(), velocity[n, 0].copy(), acceleration[n, 0].copy()
+        for k in range(len(t_s) - 1):
+            steps = _steps(t_s[k + 1] - t_s[k])
+            step_s = (t_s[k + 1] - t_s[k]) / steps
+            response = 1 - math.exp(-step_s / ATTITUDE_LAG_S)
+            for m in range(steps):
+                share = m / steps
+                missing = slot[n, k] + share * (slot[n, k + 1] - slot[n, k]) - at
+                distance = math.sqrt(missing[0] ** 2 + missing[1] ** 2 + missing[2] ** 2)
+                wanted = slot_velocity[n, k] + share * (slot_velocity[n, k + 1] - slot_velocity[n, k])
+                if distance > 0:
+                    wanted += missing * (_approach(distance, kept) / distance)
+                _shorten(wanted, speed_limit)
+                push = VELOCITY_GAIN_PER_S * (wanted - moving)
+                _shorten(push, acceleration_limit)
+                pushed += response * (push - pushed)
+                faster = moving + pushed * step_s
+                _shorten(faster, speed_limit)
+                at += (moving + faster) * (step_s / 2)
+                pushed = (faster - moving) / step_s
+                moving = faster
+            position[n, k + 1], velocity[n, k + 1], acceleration[n, k + 1] = at, moving, pushed
+
+
+@cached
+def _follow(t_s: Float, target: Float, lag_s: float, fastest_radps: float, angle: Float) -> None:
+    """Turn after angles [N, T], from the first row of `angle`, whose other rows are written."""
+    for n in range(target.shape[0]):
+        now = angle[n, 0] if len(t_s) else 0.0
+        for k in range(len(t_s) - 1):
+            steps = _steps(t_s[k + 1] - t_s[k])
+            step_s = (t_s[k + 1] - t_s[k]) / steps
+            for m in range(steps):
+                wanted = target[n, k] + m / steps * (target[n, k + 1] - target[n, k])
+                rate = (wanted - now) / lag_s
+                now += min(max(rate, -fastest_radps), fastest_radps) * step_s
+            angle[n, k + 1] = now
