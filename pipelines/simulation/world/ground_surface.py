@@ -1,0 +1,83 @@
+"""The ground to look at: coarse where it is level, fine on mounds, out to the horizon."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.simulation import scenario
+from pipelines.simulation.surfaces import Surface
+from pipelines.simulation.world.terrain import Terrain
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+_FAR_M = 2000.0  # beyond, the horizon is less than two pixels away for a drone at 5 m
+_CELLS = 16  # along the ground's square, at least
+_GROWTH = 0.5  # cells outside are at most half as wide as their distance from it
+_FLATNESS_M = 0.01  # how far triangles may be from the ground
+_FINEST = 15  # halvings of the whole
+_PATCHES = 0.16  # how much darker meadows get in patches
+
+
+def ground_surface(ground: scenario.Ground, terrain: Terrain, seed: int) -> Surface:
+    """Triangles over the corners of a quadtree, whose cells are halved until the ground in them is flat.
+
+    A linear triangle within a circle of radius r errs by at most curvature r^2 / 2 (r = side / sqrt 2).
+    """
+    from scipy.spatial import Delaunay
+
+    cell_m = ground.size_m / _CELLS
+    whole_m = cell_m * 2 ** math.ceil(math.log2(2 * max(_FAR_M, 3 * ground.size_m) / cell_m))
+    corners, finest_m = _corners(ground, terrain, whole_m)
+    local = corners * finest_m - whole_m / 2
+    faces = Delaunay(local).simplices.astype(np.int32)  # counterclockwise in the plane
+    xy = local + np.array(ground.centre)
+    a, b, c = xy[faces[:, 0]], xy[faces[:, 1]], xy[faces[:, 2]]
+    turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    faces[turn < 0] = faces[turn < 0][:, ::-1]
+    vertices = np.concatenate([xy, terrain.height(xy)[:, None]], axis=1)
+    return Surface(vertices, faces, _patches(xy, seed), smooth=True, ground=True)
+
+
+def _corners(ground: scenario.Ground, terrain: Terrain, whole_m: float) -> tuple[Int64, float]:
+    """Corners [V, 2] of the cells, in units of the finest cell's side, and that side in metres."""
+    finest_m = whole_m / 2**_FINEST
+    cells, side = np.zeros((1, 2), dtype=np.int64), 2**_FINEST
+    found = []
+    while len(cells):
+        centre = (cells + side / 2) * finest_m - whole_m / 2
+        split = _too_wide(centre, side * finest_m, ground, terrain) & (side > 1)
+        steps = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
+        found.append((cells[~split][:, None] + steps * side).reshape(-1, 2))
+        side //= 2
+        cells = (cells[split][:, None] + steps * side).reshape(-1, 2)
+    return np.unique(np.concatenate(found), axis=0), finest_m
+
+
+def _too_wide(centre: Float, side_m: float, ground: scenario.Ground, terrain: Terrain) -> NDArray[np.bool_]:
+    """Which cells [N] about centres [N, 2], seen from the ground's middle, are to be halved."""
+    outside = np.abs(centre).max(axis=1) - side_m / 2 - ground.size_m / 2
+    allowed = np.maximum(1.001 * ground.size_m / _CELLS, _GROWTH * outside)
+    # Triangles join corners of neighbouring cells, too: look a cell further.
+    curvature = terrain.curvature_within(centre + np.array(ground.centre), side_m * 1.5)
+    wide: NDArray[np.bool_] = (side_m > allowed) | (curvature * side_m**2 / 4 > _FLATNESS_M)
+    return wide
+
+
+def _patches(xy: Float, seed: int) -> NDArray[np.float32]:
+    """Slow changes of tone [V, 3], so that a texture that repeats is not seen to."""
+    rng = np.random.default_rng([seed, _LOOKS])
+    tone = np.zeros(len(xy))
+    for wavelength_m in (9.0, 15.0, 24.0, 41.0, 70.0):
+        bearing, phase = rng.uniform(0, 2 * np.pi, 2)
+        away = xy[:, 0] * np.cos(bearing) + xy[:, 1] * np.sin(bearing)
+        tone += np.sin(2 * np.pi * away / wavelength_m + phase) / 5
+    darker = _PATCHES * (0.5 - 0.5 * tone)[:, None]
+    colour: NDArray[np.float32] = (1 - darker * np.array([0.7, 1.0, 1.1])).astype(np.float32)
+    return colour
+
+
+_LOOKS = 2
