@@ -16,6 +16,7 @@ from typing import Literal
 
 import numpy as np
 
+from pipelines.formats.fixed_layouts import PoseArrays, read_poses
 from pipelines.formats.log_messages import Kind, all_samples, kind_of
 from pipelines.formats.log_trajectories import (
     Gathered,
@@ -23,9 +24,11 @@ from pipelines.formats.log_trajectories import (
     attitudes_of,
     chained,
     trajectory_of,
+    trajectory_of_arrays,
     transforms_of,
 )
 from pipelines.formats.pictures import later_pictures, stamp_of
+from pipelines.formats.recordings import OpenLog
 from pipelines.geometry.poses import compose, matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight
@@ -89,14 +92,7 @@ class FlightLogs:
                 gathered = self._chained(log, recording, source, topic, parent, child, max_gap_ns)
             else:
                 name = self._choose(recording, source, "poses", topic)
-                messages = recording.messages([name])
-                gathered = trajectory_of(
-                    all_samples(messages, source),
-                    f"{source} {name}",
-                    stamps=self.settings(log).stamps,
-                    may_disagree_s=_MAY_DISAGREE_S,
-                    may_jump_s=_MAY_JUMP_S,
-                )
+                gathered = self._poses(log, recording, source, name)
             lost = dict(recording.dropped)
             started_ns = _start_ns(recording)
         return self._at_world_times(log, source, gathered, lost, started_ns)
@@ -206,6 +202,19 @@ class FlightLogs:
         self._note(f"{source}: took {_NOUNS[kind]} from {only}, the only candidate")
         return only
 
+    def _poses(self, log: str, recording: Log, source: str, topic: str) -> Gathered:
+        """The poses of a topic: all at once where its messages are alike, else one by one."""
+        place, stamps = f"{source} {topic}", self.settings(log).stamps
+        arrays = poses_at_once(recording, topic)
+        if arrays is not None:
+            return trajectory_of_arrays(
+                arrays, place, stamps=stamps, may_disagree_s=_MAY_DISAGREE_S, may_jump_s=_MAY_JUMP_S
+            )
+        samples = all_samples(recording.messages([topic]), source)
+        return trajectory_of(
+            samples, place, stamps=stamps, may_disagree_s=_MAY_DISAGREE_S, may_jump_s=_MAY_JUMP_S
+        )
+
     def _chained(
         self,
         log: str,
@@ -277,6 +286,17 @@ class FlightLogs:
 def _start_ns(recording: Log) -> int:
     """When the first message of a recording was received: what its clock's drift counts from."""
     return min((topic.first_ns for topic in recording.topics if topic.first_ns is not None), default=0)
+
+
+def poses_at_once(recording: Log, topic: str) -> PoseArrays | None:
+    """All poses of a topic, if one file format of ours holds it and its messages are alike."""
+    if not isinstance(recording, OpenLog):
+        return None
+    of_that_name = [known for known in recording.topics if known.name == topic]
+    schemas = {schema for known in of_that_name for schema in recording.schemas(known)}
+    if len(of_that_name) != 1 or len(schemas) != 1:
+        return None
+    return read_poses(schemas.pop(), recording.payloads(of_that_name[0]))
 
 
 def in_world(trajectory: Trajectory, log: LogSource) -> Trajectory:

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from pipelines.formats.fixed_layouts import PoseArrays
 from pipelines.formats.pose_rows import clean_poses
 from pipelines.geometry.mounting import attitude_from_angles
 from pipelines.geometry.pose_covariance import pose_covariance_in_body
@@ -87,6 +88,14 @@ class SampleRows:
         self.add(pose, pose.position + pose.quaternion_xyzw)
         if pose.covariance is not None:
             self._covariances.frombytes(pose.covariance.tobytes())
+
+    def add_arrays(self, poses: PoseArrays) -> None:
+        """Many poses at once."""
+        self._header_ns.frombytes(poses.header_ns.tobytes())
+        self._receive_ns.frombytes(poses.receive_ns.tobytes())
+        self._values.frombytes(poses.pose.tobytes())
+        if poses.covariance is not None:
+            self._covariances.frombytes(poses.covariance.tobytes())
 
     def values(self, width: int) -> Float:
         """[N, width]."""
@@ -178,6 +187,21 @@ def trajectory_of(
         rows.add_pose(sample)
     trajectory = rows.trajectory(source, stamps)
     return Gathered(trajectory, rows.check(may_disagree_s, may_jump_s), frames or ("", ""))
+
+
+def trajectory_of_arrays(
+    poses: PoseArrays,
+    source: Source,
+    *,
+    stamps: Stamps,
+    may_disagree_s: float = 0.5,
+    may_jump_s: float = 1.0,
+) -> Gathered:
+    """The same of poses that were read at once; arguments as those of `trajectory_of`."""
+    rows = SampleRows()
+    rows.add_arrays(poses)
+    trajectory = rows.trajectory(source, stamps)
+    return Gathered(trajectory, rows.check(may_disagree_s, may_jump_s), poses.frames)
 
 
 def attitudes_of(

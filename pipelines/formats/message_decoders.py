@@ -64,6 +64,28 @@ def decoder(schema: Schema) -> Decoder:
     raise ValueError(f"messages in encoding {schema.encoding or 'none'!r} are not read")
 
 
+@lru_cache(maxsize=256)
+def is_standard(schema: Schema) -> bool:
+    """Whether a type of ROS is defined in this log as ROS itself defines it, with all that it is made of."""
+    from rosbags.typesys import Stores, get_typestore
+
+    ours = get_typestore(Stores.ROS1_NOETIC if schema.encoding == "ros1" else Stores.LATEST)
+    try:
+        theirs = _typestore(schema)
+        return _same_type(theirs, ours, schema.type)
+    except (ValueError, KeyError):
+        return False
+
+
+def _same_type(theirs: Typestore, ours: Typestore, type_: str) -> bool:
+    from rosbags.interfaces import Nodetype
+
+    fields, expected = theirs.fielddefs[type_][1], ours.fielddefs[type_][1]
+    return fields == expected and all(
+        _same_type(theirs, ours, str(kind[1])) for _, kind in fields if kind[0] == Nodetype.NAME
+    )
+
+
 def _ros_decoder(schema: Schema) -> Decoder:
     from rosbags.serde import SerdeError
 

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import IO
 
@@ -140,6 +140,25 @@ class OpenLog:
         streams = [self._of_part(part, frozenset(topics)) for part in self.parts]
         return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("receive_ns"))
 
+    def payloads(self, topic: Topic) -> Iterator[tuple[int, memoryview | bytes]]:
+        """Stamp of receipt and bytes of each message of a topic, in the order of receipt.
+
+        A view is valid until the next message is asked for.
+        """
+        streams = []
+        for part in self.parts:
+            rows = part.rows_of(_channels_of(part, topic.name, topic.type, topic.encoding))
+            streams.append(_payloads_of(part, rows))
+        return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=itemgetter(0))
+
+    def schemas(self, topic: Topic) -> set[Schema]:
+        """How the messages of a topic are written; parts may differ."""
+        return {
+            part.channels[channel].schema
+            for part in self.parts
+            for channel in _channels_of(part, topic.name, topic.type, topic.encoding)
+        }
+
     def stamps(self, topic: Topic) -> Int64:
         """When the messages of a topic were received, sorted."""
         stamps = [
@@ -198,6 +217,13 @@ class OpenLog:
         stamps = self.stamps(Topic(name, type_, encoding, 0, None, None))
         first, last = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (None, None)
         return Topic(name, type_, encoding, len(stamps), first, last)
+
+
+def _payloads_of(part: LogPart, rows: Int64) -> Iterator[tuple[int, memoryview | bytes]]:
+    stamps = part.table.stamp_ns[rows].tolist()
+    for start in range(0, len(rows), _BATCH):
+        for k, data in part.read(rows[start : start + _BATCH]):
+            yield stamps[start + k], data
 
 
 def open_file(path: Path) -> tuple[IO[bytes], int]:
