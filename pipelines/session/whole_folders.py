@@ -1,0 +1,146 @@
+"""A folder of results that appears in one piece, made of parts that outlive an interrupt.
+
+    with whole_folder(target, key, overwrite=overwrite) as making:
+        video = making.part("drone1-0", encode)
+        ...
+        (making.folder / "flight.yaml").write_text(...)
+        making.publish()
+
+Everything is made in a hidden folder beside the target and renamed to it at the end. Parts lie there by
+key: other settings do not find them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from pipelines.session.errors import BusyError, DataError
+from pipelines.session.storage import as_data_error, read_json, remove_tree, sync_folder, sync_tree
+
+
+class Making:
+    """A folder in the making.
+
+    Attributes:
+        folder: what is written here appears as the target when published.
+    """
+
+    def __init__(self, work: Path, target: Path, key: str) -> None:
+        self.folder = work / "whole"
+        self._work = work
+        self._target = target
+        self._parts = work / key
+
+    def part(self, name: str, produce: Callable[[Path], None]) -> Path:
+        """The folder of a finished part, made by `produce` unless an interrupted run finished it."""
+        finished = self._parts / name
+        if not finished.is_dir():
+            temporary = self._parts / f"{name}.new"
+            remove_tree(temporary)
+            temporary.mkdir(parents=True)
+            produce(temporary)
+            sync_tree(temporary)
+            temporary.rename(finished)
+        return finished
+
+    def publish(self) -> None:
+        """Put the folder in the target's place, and what lay there away."""
+        sync_tree(self.folder)
+        old = self._work / "old"
+        remove_tree(old)
+        if self._target.exists():
+            self._target.rename(old)
+        self.folder.rename(self._target)
+        sync_folder(self._target.parent)
+
+
+@contextmanager
+def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Iterator[Making]:
+    """Make a folder; parts stay when the work is interrupted, and go when it ends or cannot succeed.
+
+    Args:
+        target: the folder.
+        key: equal for equal results.
+        mark: a file that every such folder has; a target without it is somebody else's.
+        overwrite: replace what is somebody else's, too.
+
+    Raises:
+        DataError: the target is something else, or cannot be written.
+        BusyError: another process makes the same folder.
+    """
+    target = target.absolute()
+    _check(target, mark, overwrite)
+    work = target.parent / f".{target.name}.making"
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+        with _held(work / "lock", target):
+            _put_back(work, target)
+            for stale in [path for path in work.iterdir() if path.is_dir() and path.name != key]:
+                remove_tree(stale)
+            making = Making(work, target, key)
+            making.folder.mkdir()
+            try:
+                yield making
+            except DataError:
+                remove_tree(work / key)  # the user will change something
+                raise
+            else:
+                remove_tree(work / key)
+            finally:
+                with suppress(OSError):
+                    _put_back(work, target)
+                    remove_tree(work / "whole")
+    except OSError as error:
+        raise as_data_error(error, target) from error
+    finally:
+        _tidy(work)
+
+
+def is_made(target: Path, key: str, *, mark: str) -> bool:
+    """Whether the target is there already with this key, which its mark states."""
+    with suppress(DataError):
+        return read_json(target / mark).get("key") == key
+    return False
+
+
+def _check(target: Path, mark: str, overwrite: bool) -> None:
+    if overwrite or not target.exists() or (target / mark).is_file():
+        return
+    if not target.is_dir():
+        raise DataError(target, "is a file, not a folder", "choose another place with --output")
+    if entries := sorted(path.name for path in target.iterdir()):
+        raise DataError(
+            target,
+            f"holds something else ({len(entries)} entries, the first {entries[0]})",
+            "choose another place with --output, or replace it with --overwrite",
+        )
+
+
+@contextmanager
+def _held(path: Path, target: Path) -> Iterator[None]:
+    try:
+        lock = FileLock(path).acquire(timeout=0)
+    except Timeout:
+        raise BusyError(f"{target} is being made by another process; wait for it to finish") from None
+    with lock:
+        yield
+
+
+def _put_back(work: Path, target: Path) -> None:
+    """What a kill between two renames left without a successor goes back; else it goes."""
+    old = work / "old"
+    if old.exists() and not target.exists():
+        old.rename(target)
+    remove_tree(old)
+
+
+def _tidy(work: Path) -> None:
+    """Remove the place of work where nothing is left in it but the lock."""
+    with suppress(OSError):
+        if {path.name for path in work.iterdir()} <= {"lock"}:
+            (work / "lock").unlink(missing_ok=True)
+            work.rmdir()
