@@ -1,0 +1,327 @@
+"""Drones that fly: within their limits, where control theory says, leaning and looking as they should."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.geometry.poses import matrix_from_quaternion
+from pipelines.simulation.drone_paths import orbit
+from pipelines.simulation.flying import (
+    ATTITUDE_LAG_S,
+    GIMBAL_LAG_S,
+    GIMBAL_RATE_RADPS,
+    HEADING_LAG_S,
+    LEVER_ARM,
+    POSITION_GAIN_PER_S,
+    STEP_S,
+    VELOCITY_GAIN_PER_S,
+    DronePaths,
+    Known,
+    fly,
+    fly_with,
+    moments,
+    ring_slots,
+)
+from pipelines.simulation.scenario import Formation, Limits
+
+Float = NDArray[np.float64]
+
+T_S = moments(0.0, 20.0)
+MIDDLE = np.tile([0.0, 0.0, 1.0], (len(T_S), 1))
+RING = Formation(radius_m=10.0, tilt_deg=15.0, yaw_rate_deg_per_s=20.0)
+TURN_RADPS, RADIUS_M = math.radians(20.0), 10.0 * math.cos(math.radians(15.0))
+SETTLED = T_S > 10.0  # the slowest mode of the loops decays within a second
+
+
+def circling() -> DronePaths:
+    """Three drones on a ring around a standing actor."""
+    return fly(ring_slots(RING, 3, MIDDLE, T_S), MIDDLE, T_S, Limits())
+
+
+def norm(vectors: Float) -> Float:
+    length: Float = np.linalg.norm(vectors, axis=-1)
+    return length
+
+
+def angle_deg(one: Float, other: Float) -> Float:
+    sine, cosine = norm(np.cross(one, other)), np.sum(one * other, axis=-1)
+    angle: Float = np.degrees(np.arctan2(sine, cosine))
+    return angle
+
+
+# --- slots and moments ---------------------------------------------------------------------------------
+
+
+def test_moments_cover_their_span() -> None:
+    assert moments(-1.0, 0.02)[[0, 99, -1]] == pytest.approx([-1.0, -0.01, 0.02])
+    assert len(moments(-1.0, 0.02)) == 103
+    assert moments(0.0, 0.001) == pytest.approx([0.0, 0.01])
+    assert moments(3.0, 3.0) == pytest.approx([3.0])
+
+
+def test_slots_are_those_of_the_orbit() -> None:
+    formation = Formation(radius_m=7.0, tilt_deg=30.0, yaw_deg=20.0, yaw_rate_deg_per_s=5.0, variation=0.5)
+    expected, _ = orbit(
+        T_S,
+        MIDDLE,
+        cameras=4,
+        range_m=7.0,
+        tilt_deg=30.0,
+        yaw_deg=20.0,
+        yaw_rate_deg_per_s=5.0,
+        variation=0.5,
+    )
+    assert (ring_slots(formation, 4, MIDDLE, T_S) == expected).all()
+
+
+# --- tracking ------------------------------------------------------------------------------------------
+
+
+def test_behind_a_circling_slot_a_drone_lags_as_its_loops_say() -> None:
+    """Of the slot's path s and the error e: lag e''' + e'' + kv e' + kv kp e = lag s''' + s''.
+
+    The integration holds each push for a step, which delays the velocity loop by at most one: kv STEP_S
+    = 2 % of it.
+    """
+    turning = 1j * TURN_RADPS
+    inertia = ATTITUDE_LAG_S * turning**3 + turning**2
+    loops = VELOCITY_GAIN_PER_S * (turning + POSITION_GAIN_PER_S)
+    expected_m = RADIUS_M * abs(inertia / (inertia + loops))
+    lag_m = norm(circling().position - ring_slots(RING, 3, MIDDLE, T_S))[:, SETTLED]
+    assert lag_m == pytest.approx(expected_m, rel=VELOCITY_GAIN_PER_S * STEP_S)
+    # The rule of thumb of the docstring: the slot's acceleration over both gains.
+    rule_m = RADIUS_M * TURN_RADPS**2 / (POSITION_GAIN_PER_S * VELOCITY_GAIN_PER_S)
+    assert expected_m == pytest.approx(rule_m, rel=0.1)
+
+
+def test_behind_a_slot_that_moves_evenly_there_is_no_error() -> None:
+    slots = (np.array([3.0, -4.0, 0.5]) * T_S[:, None])[None]
+    paths = fly(slots, MIDDLE, T_S, Limits())
+    assert paths.position == pytest.approx(slots, abs=1e-9)
+    assert norm(paths.velocity) == pytest.approx(math.sqrt(25.25))
+
+
+def test_where_a_slot_stands_a_drone_hovers_level() -> None:
+    slots = np.tile([[[4.0, 3.0, 6.0]]], (1, len(T_S), 1))
+    paths = fly(slots, MIDDLE, T_S, Limits())
+    assert paths.position == pytest.approx(slots, abs=1e-12)
+    assert paths.velocity == pytest.approx(0.0, abs=1e-12)
+    up = matrix_from_quaternion(paths.body_xyzw)[..., 2]
+    assert up == pytest.approx(np.broadcast_to([0.0, 0.0, 1.0], up.shape), abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_limits_are_never_exceeded(seed: int) -> None:
+    """Slots that jump by tens of metres and race between jumps; both limits hold to rounding."""
+    rng = np.random.default_rng(seed)
+    limits = Limits(speed_mps=rng.uniform(1, 15), acceleration_mps2=rng.uniform(1, 12))
+    jumps = np.repeat(rng.uniform(-40, 40, (3, 10, 3)), len(T_S) // 10 + 1, axis=1)[:, : len(T_S)]
+    slots: Float = jumps + rng.uniform(-20, 20, (3, 1, 3)) * T_S[:, None]
+    paths = fly(slots, MIDDLE, T_S, limits)
+    speed = norm(paths.velocity)
+    acceleration = norm(np.diff(paths.velocity, axis=1)) / np.diff(T_S)
+    assert speed.max() <= limits.speed_mps * (1 + 1e-12)
+    assert acceleration.max() <= limits.acceleration_mps2 * (1 + 1e-9)
+    # It does use what it has, at least the half that brakes.
+    assert speed.max() > 0.99 * limits.speed_mps
+    assert acceleration.max() > 0.5 * limits.acceleration_mps2
+    moved = np.diff(paths.position, axis=1)
+    assert norm(moved).max() <= limits.speed_mps * np.diff(T_S).max() * (1 + 1e-9)
+
+
+def test_a_far_slot_is_reached_without_shooting_past() -> None:
+    """Half the acceleration limit brakes; what the attitude's lag adds is at most v lag (here 8 * 0.15)."""
+    slots = np.zeros((1, len(T_S), 3))
+    slots[:, 1:] = [60.0, 0.0, 0.0]
+    x = fly(slots, MIDDLE, T_S, Limits()).position[0, :, 0]
+    assert x.max() < 60.0 + 8.0 * ATTITUDE_LAG_S / 10
+    assert x[-1] == pytest.approx(60.0, abs=0.01)
+    # 60 m at 8 m/s, 4 m/s^2 to speed up, 2 m/s^2 to brake: 7.5 + 1 + 2 s, and a second to settle.
+    assert T_S[np.argmax(x > 59.5)] < 11.5
+
+
+def test_moments_may_be_coarse_and_uneven() -> None:
+    """Between moments at most 0.1 s apart slots go straight, off by a dt^2 / 8 = 1.5 mm, and so do their
+    velocities, off by a turn dt^2 / 8 = 0.5 mm/s; the integration itself is as fine as ever.
+    """
+    kept = np.random.default_rng(0).random(len(T_S)) < 0.1
+    kept[::10] = True
+    t_s = T_S[kept]
+    coarse = fly(ring_slots(RING, 3, MIDDLE[kept], t_s), MIDDLE[kept], t_s, Limits())
+    difference = coarse.position[:, SETTLED[kept]] - circling().position[:, SETTLED & kept]
+    assert norm(difference).max() < 0.002
+
+
+# --- a planner on the way ------------------------------------------------------------------------------
+
+
+def swaying(t_s: Float | float) -> tuple[Float, Float]:
+    """A slot that swings by 2 m along east with 0.2 rad/s, at rest at first: place and velocity [..., 3]."""
+    t = np.asarray(t_s)[..., None]
+    east = np.array([1.0, 0.0, 0.0])
+    return [5.0, 5.0, 5.0] + 2 * (1 - np.cos(0.2 * t)) * east, 0.4 * np.sin(0.2 * t) * east
+
+
+def test_a_planner_that_knows_the_slots_flies_as_if_they_were_given() -> None:
+    """Between calls a slot's velocity is held: wrong by a / rate, which the loops make a / rate / kp of."""
+    rate_hz, acceleration = 25.0, 2 * 0.2**2
+    given = fly(swaying(T_S)[0][None], MIDDLE, T_S, Limits())
+    planned = fly_with(
+        lambda known: (swaying(known.t_s)[0][None], swaying(known.t_s)[1][None]),
+        given.position[:, 0],
+        MIDDLE,
+        T_S,
+        Limits(),
+        actor_t_s=np.empty(0),
+        actor=np.empty((0, 3)),
+        rate_hz=rate_hz,
+    )
+    difference = norm(planned.position - given.position)
+    assert 0 < difference.max() < acceleration / rate_hz / POSITION_GAIN_PER_S
+
+
+def test_a_planner_knows_the_past_alone() -> None:
+    actor_t_s = np.arange(0.05, 2.0, 0.1)
+    actor = np.random.default_rng(2).normal(size=(len(actor_t_s), 3))
+    heard: list[Known] = []
+
+    def listen(known: Known) -> tuple[Float, Float]:
+        heard.append(known)
+        return known.position + np.array([1.0, 0.0, 0.0]), np.zeros_like(known.position)
+
+    t_s = moments(0.0, 2.0)
+    start = np.array([[5.0, 0.0, 3.0], [0.0, 5.0, 3.0]])
+    paths = fly_with(
+        listen, start, MIDDLE[: len(t_s)], t_s, Limits(), actor_t_s=actor_t_s, actor=actor, rate_hz=20
+    )
+    assert [known.t_s for known in heard] == pytest.approx(np.arange(41) / 20)
+    for known in heard:
+        assert len(known.actor) == (actor_t_s <= known.t_s).sum()
+        assert (known.actor == actor[: len(known.actor)]).all()
+        row = round(known.t_s * 100)
+        assert (known.position == paths.position[:, row]).all()
+        assert (known.velocity == paths.velocity[:, row]).all()
+    # The slot always lies 1 m ahead: kp m/s, less what the accelerating takes.
+    assert paths.velocity[:, -1, 0] == pytest.approx([POSITION_GAIN_PER_S] * 2, rel=0.1)
+
+
+@pytest.mark.parametrize("slots", [np.zeros((2, 3)), np.full((1, 3), np.nan)])
+def test_a_planner_must_give_a_slot_for_each(slots: Float) -> None:
+    with pytest.raises(ValueError, match="the planner's slots at 0 s are not"):
+        fly_with(
+            lambda _: (slots, np.zeros_like(slots)),
+            np.zeros((1, 3)),
+            MIDDLE,
+            T_S,
+            Limits(),
+            actor_t_s=np.empty(0),
+            actor=np.empty((0, 3)),
+            rate_hz=10,
+        )
+
+
+# --- attitudes -----------------------------------------------------------------------------------------
+
+
+def test_bodies_lean_along_their_thrust() -> None:
+    """Thrust is acceleration, drag and gravity. Between moments the acceleration differs by at most
+    the limit / lag * 10 ms = 0.27 m/s^2 from that of the velocities' differences: 0.27 / 9.81 rad = 1.6 deg.
+    """
+    paths = circling()
+    mean = np.diff(paths.velocity, axis=1) / np.diff(T_S)[:, None]
+    thrust = mean + 0.15 * paths.velocity[:, 1:] + [0.0, 0.0, 9.81]
+    up = matrix_from_quaternion(paths.body_xyzw)[:, 1:, :, 2]
+    assert angle_deg(up, thrust).max() < 1.6
+    inward, forward = RADIUS_M * TURN_RADPS**2, 0.15 * RADIUS_M * TURN_RADPS
+    expected_deg = math.degrees(math.atan(math.hypot(inward, forward) / 9.81))
+    lean_deg = angle_deg(up, np.array([0.0, 0.0, 1.0]))[:, SETTLED[1:]]
+    assert lean_deg == pytest.approx(expected_deg, rel=0.02)
+
+
+def test_the_nose_turns_to_the_actor() -> None:
+    """A heading that turns at a rate lags by rate times lag."""
+    paths = circling()
+    nose = matrix_from_quaternion(paths.body_xyzw)[..., 0]
+    away = MIDDLE - paths.position
+    off = np.arctan2(nose[..., 1], nose[..., 0]) - np.arctan2(away[..., 1], away[..., 0])
+    lag = np.angle(np.exp(1j * off))[:, SETTLED]
+    assert lag == pytest.approx(-TURN_RADPS * HEADING_LAG_S, rel=0.03)
+
+
+def test_even_a_drone_that_dives_stays_upright() -> None:
+    slots = np.zeros((1, len(T_S), 3))
+    slots[:, :10, 2] = 100.0
+    paths = fly(slots, MIDDLE, T_S, Limits(speed_mps=50, acceleration_mps2=50))
+    assert paths.velocity[0, :, 2].min() < -10
+    assert matrix_from_quaternion(paths.body_xyzw)[..., 2, 2].min() > 0
+    assert norm(paths.body_xyzw) == pytest.approx(1.0)
+
+
+def test_cameras_look_at_their_aim_and_stand_upright() -> None:
+    """Seen from the camera the aim turns with the ring; the gimbal lags by that rate times its lag."""
+    paths = circling()
+    right, down, forward = np.moveaxis(matrix_from_quaternion(paths.camera_xyzw), -1, 0)
+    sight = MIDDLE - paths.camera_position
+    off_deg = angle_deg(forward, sight)
+    # A turn about the vertical moves the axis by cos(tilt) of it.
+    expected_deg = 20.0 * GIMBAL_LAG_S * math.cos(math.radians(15.0))
+    assert off_deg[:, 0] == pytest.approx(0.0, abs=1e-9)
+    assert off_deg[:, SETTLED] == pytest.approx(expected_deg, rel=0.05)
+    assert right[..., 2] == pytest.approx(0.0, abs=1e-12)
+    assert (down[..., 2] < -0.9).all()
+
+
+def test_the_camera_sits_at_the_lever_arms_end() -> None:
+    paths = circling()
+    arm = paths.camera_position - paths.position
+    axes = matrix_from_quaternion(paths.body_xyzw)
+    assert (axes.swapaxes(-1, -2) @ arm[..., None])[..., 0] == pytest.approx(
+        np.broadcast_to(LEVER_ARM, arm.shape), abs=1e-12
+    )
+
+
+def test_a_gimbal_turns_no_faster_than_it_can() -> None:
+    slots = np.tile([[[10.0, 0.0, 5.0]]], (1, len(T_S), 1))
+    aim = np.where(T_S[:, None] < 5, [0.0, 0.0, 1.0], [20.0, 3.0, 1.0])  # jumps behind the drone
+    forward = matrix_from_quaternion(fly(slots, aim, T_S, Limits()).camera_xyzw)[0, :, :, 2]
+    rate = np.radians(angle_deg(forward[1:], forward[:-1])) / np.diff(T_S)
+    # Pan and tilt are limited each; the axis turns by cos(tilt) of the pan.
+    assert 0.9 * GIMBAL_RATE_RADPS < rate.max() < math.sqrt(2) * GIMBAL_RATE_RADPS
+    assert angle_deg(forward[-1], aim[-1] - [10.0, 0.0, 5.0]) < 0.6  # the lever arm's parallax: 0.1 / 11
+
+
+# --- edges ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("drones", [0, 2])
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_short_flights_and_empty_teams(drones: int, count: int) -> None:
+    slots = np.ones((drones, count, 3)) * [5.0, 0.0, 5.0]
+    given = fly(slots, MIDDLE[:count], T_S[:count], Limits())
+    planned = fly_with(
+        lambda known: (known.position, known.velocity),
+        np.ones((drones, 3)),
+        MIDDLE[:count],
+        T_S[:count],
+        Limits(),
+        actor_t_s=np.empty(0),
+        actor=np.empty((0, 3)),
+        rate_hz=10,
+    )
+    for paths in (given, planned):
+        assert paths.position.shape == paths.camera_position.shape == (drones, count, 3)
+        assert paths.body_xyzw.shape == paths.camera_xyzw.shape == (drones, count, 4)
+        assert np.isfinite(paths.camera_xyzw).all()
+
+
+def test_nonsense_is_refused() -> None:
+    slots = np.ones((1, 3, 3))
+    with pytest.raises(ValueError, match="increase strictly"):
+        fly(slots, slots[0], np.array([0.0, 0.0, 1.0]), Limits())
+    slots[0, 1, 2] = np.nan
+    with pytest.raises(ValueError, match="finite"):
+        fly(slots, np.zeros((3, 3)), np.arange(3.0), Limits())

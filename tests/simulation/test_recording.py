@@ -1,0 +1,262 @@
+"""Simulated recorders: their stamps, their exact poses, and errors as large as they say."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.geometry.mounting import body_from_camera, compose_gimbal
+from pipelines.geometry.noise import Bias, GaussMarkov, Latency, NoiseModel, White
+from pipelines.geometry.pose_covariance import mounted_covariance
+from pipelines.geometry.poses import conjugate, multiply, rotation_vector_from_quaternion
+from pipelines.simulation.flying import LEVER_ARM, DronePaths, fly, moments, ring_slots
+from pipelines.simulation.recording import (
+    ACTOR_CORRELATION_S,
+    DronePoses,
+    estimate,
+    estimate_actor,
+    frame_times,
+    log_times,
+    poses_at,
+    sample_log,
+)
+from pipelines.simulation.scenario import Formation, Lens, Limits
+
+Float = NDArray[np.float64]
+
+
+def flight(rate_hz: int = 100) -> DronePaths:
+    """Two drones that circle a walking actor for ten seconds."""
+    t_s = moments(-1.0, 10.0)[:: 100 // rate_hz]
+    actor = np.stack([1.2 * t_s, 0 * t_s, 1.0 + 0 * t_s], axis=1)
+    formation = Formation(yaw_rate_deg_per_s=15.0, variation=1.0)
+    return fly(ring_slots(formation, 2, actor, t_s), actor, t_s, Limits())
+
+
+PATHS = flight()
+
+
+def generator(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+# --- stamps --------------------------------------------------------------------------------------------
+
+
+def test_a_log_has_stamps_of_its_own() -> None:
+    t_ns = log_times(50.0, (-0.5, 9.5), generator())
+    assert t_ns.dtype == np.int64
+    assert abs(len(t_ns) - 500) <= 1
+    assert -0.5e9 <= t_ns[0] < -0.5e9 + 1.4 * 20e6
+    assert 9.5e9 - 1.4 * 20e6 < t_ns[-1] <= 9.5e9
+    # A step is the period with the difference of two jitters of 2 % of it; 499 give 3 % of their sigma.
+    steps_ms = np.diff(t_ns) / 1e6
+    assert steps_ms.mean() == pytest.approx(20.0, abs=0.02)
+    assert steps_ms.std() == pytest.approx(0.4 * math.sqrt(2), rel=0.12)
+    assert (t_ns == log_times(50.0, (-0.5, 9.5), generator())).all()
+    assert t_ns[0] != log_times(50.0, (-0.5, 9.5), generator(1))[0]
+
+
+def test_an_empty_span_has_no_stamps() -> None:
+    assert log_times(50.0, (3.0, 3.0), generator()).shape == (0,)
+    assert log_times(50.0, (3.0, 2.0), generator()).shape == (0,)
+    assert frame_times(Lens(), 0.0, generator()).shape == (0,)
+
+
+def test_frames_are_even_but_for_those_that_were_lost() -> None:
+    """10,000 frames: the standard error of a share of 0.2 is 0.4 %."""
+    lens = Lens(rate_hz=30, dropped_share=0.2)
+    t_ns = frame_times(lens, 10_000 / 30, generator())
+    whole = frame_times(lens.model_copy(update={"dropped_share": 0.0}), 10_000 / 30, generator())
+    assert len(whole) == 10_000
+    assert np.abs(np.diff(whole) - 1e9 / 30).max() <= 1
+    assert 0 <= whole[0] < 1e9 / 30
+    assert whole[-1] < 10_000 / 30 * 1e9
+    assert np.isin(t_ns, whole).all()
+    assert 1 - len(t_ns) / len(whole) == pytest.approx(0.2, abs=0.016)
+
+
+def test_the_first_and_last_frame_are_never_lost() -> None:
+    lens = Lens(rate_hz=10, dropped_share=0.49)
+    for seed in range(20):
+        kept = frame_times(lens, 1.0, generator(seed))
+        whole = frame_times(lens.model_copy(update={"dropped_share": 0.0}), 1.0, generator(seed))
+        assert (kept[0], kept[-1]) == (whole[0], whole[-1])
+        assert len(whole) == 10
+
+
+# --- true poses ----------------------------------------------------------------------------------------
+
+
+def test_at_the_paths_own_moments_poses_are_those_of_the_path() -> None:
+    poses = poses_at(PATHS, 1, np.rint(PATHS.t_s * 1e9).astype(np.int64))
+    assert poses.position == pytest.approx(PATHS.position[1], abs=1e-9)
+    assert poses.camera_position == pytest.approx(PATHS.camera_position[1], abs=1e-9)
+    for one, other in (
+        (poses.quaternion_xyzw, PATHS.body_xyzw[1]),
+        (poses.camera_quaternion_xyzw, PATHS.camera_xyzw[1]),
+    ):
+        assert np.abs(np.sum(one * other, axis=1)) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_between_moments_poses_go_on_smoothly() -> None:
+    """From every fifth moment (0.05 s), the others come out: a cubic errs by jerk h^3 / 100, attitudes
+    by their angular acceleration h^2 / 8. While circling both are below 4 m/s^3 and 1 rad/s^2.
+    """
+    every = slice(200, None, 5)
+    coarse = DronePaths(
+        PATHS.t_s[every],
+        PATHS.position[:, every],
+        PATHS.velocity[:, every],
+        PATHS.body_xyzw[:, every],
+        PATHS.camera_xyzw[:, every],
+    )
+    asked_ns = np.rint(PATHS.t_s[200:-5] * 1e9).astype(np.int64)
+    poses, truth = poses_at(coarse, 0, asked_ns), poses_at(PATHS, 0, asked_ns)
+    assert np.abs(poses.position - truth.position).max() < 4 * 0.05**3 / 100
+    for one, other in (
+        (poses.quaternion_xyzw, truth.quaternion_xyzw),
+        (poses.camera_quaternion_xyzw, truth.camera_quaternion_xyzw),
+    ):
+        turned = rotation_vector_from_quaternion(multiply(conjugate(one), other))
+        assert np.linalg.norm(turned, axis=1).max() < 1 * 0.05**2 / 8
+
+
+def test_before_and_after_the_flight_there_are_no_poses() -> None:
+    for moment in (-1_010_000_000, 10_010_000_000):
+        with pytest.raises(ValueError, match="before or after the flight"):
+            poses_at(PATHS, 0, np.array([0, moment]))
+    assert poses_at(PATHS, 0, np.empty(0, dtype=np.int64)).camera_position.shape == (0, 3)
+
+
+# --- estimated poses -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("models", [[], [White(position_m=0.3, rotation_deg=1.0)]])
+def test_body_and_gimbal_make_the_camera(models: list[NoiseModel]) -> None:
+    """As ingest composes them: the camera of the log, which is the true one without noise."""
+    truth = sample_log(PATHS, 0, 50.0, (0.0, 9.0), generator())
+    log = estimate(truth, models, generator(1))
+    body, arm = (log.body.position, log.body.quaternion_xyzw), np.array(LEVER_ARM)
+    forward = body_from_camera("forward")
+    on_body = multiply(conjugate(body[1]), log.gimbal_xyzw)
+    for position, quaternion in (
+        compose_gimbal(body, arm, log.gimbal_xyzw, forward, relative_to="world"),
+        compose_gimbal(body, arm, on_body, forward, relative_to="body"),
+    ):
+        assert position == pytest.approx(log.camera.position, abs=1e-9)
+        cosine = np.abs(np.sum(quaternion * log.camera.quaternion_xyzw, axis=1))
+        assert cosine == pytest.approx(1.0, abs=1e-12)
+        if not models:
+            assert position == pytest.approx(truth.camera_position, abs=1e-9)
+            assert log.body.position == pytest.approx(truth.position, abs=1e-9)
+            turned = multiply(conjugate(truth.camera_quaternion_xyzw), quaternion)
+            assert rotation_vector_from_quaternion(turned) == pytest.approx(0.0, abs=1e-9)
+
+
+def many_poses() -> DronePoses:
+    t_ns = np.arange(20_000) * 500_000
+    return poses_at(PATHS, 0, t_ns)
+
+
+def test_logged_cameras_err_as_their_models_say() -> None:
+    """20,000 rows, three axes: a sigma is known to 1 / sqrt(2 * 60,000) = 0.3 %."""
+    truth = many_poses()
+    log = estimate(truth, [White(position_m=0.2, rotation_deg=1.5)], generator(2))
+    offset = log.camera.position - truth.camera_position
+    turned = multiply(conjugate(truth.camera_quaternion_xyzw), log.camera.quaternion_xyzw)
+    assert offset.std() == pytest.approx(0.2, rel=0.012)
+    assert rotation_vector_from_quaternion(turned).std() == pytest.approx(math.radians(1.5), rel=0.012)
+    assert log.camera.covariance is not None
+    expected = np.diag([0.04] * 3 + [math.radians(1.5) ** 2] * 3)
+    assert np.abs(log.camera.covariance - expected).max() < 1e-15
+
+
+def test_covariances_of_the_body_are_those_of_its_errors() -> None:
+    """The normalised squared error of six numbers: its mean over 20,000 rows is 6 +- sqrt(12 / 20,000).
+
+    To first order; with rotations of 1.5 degrees the second is 0.03 % of it.
+    """
+    truth = many_poses()
+    # As large in the lever arm as in the place itself, so that their correlation matters.
+    log = estimate(truth, [White(position_m=0.003, rotation_deg=1.5)], generator(3))
+    turned = multiply(conjugate(truth.quaternion_xyzw), log.body.quaternion_xyzw)
+    error = np.concatenate(
+        [log.body.position - truth.position, rotation_vector_from_quaternion(turned)], axis=1
+    )
+    assert log.body.covariance is not None
+    squared = np.einsum("ti,tij,tj->t", error, np.linalg.inv(log.body.covariance), error)
+    assert squared.mean() == pytest.approx(6.0, abs=4 * math.sqrt(12 / 20_000) + 0.02)
+    # What ingest makes of it is the camera's again.
+    carried = mounted_covariance(
+        log.body.covariance, log.body.quaternion_xyzw, np.array(LEVER_ARM), log.camera.quaternion_xyzw
+    )
+    assert log.camera.covariance is not None
+    assert np.abs(carried - log.camera.covariance).max() < 1e-15
+
+
+def test_stated_sigmas_are_the_sum_of_all_models() -> None:
+    """A latency's grows with the speed, a bias holds throughout; variances add up."""
+    truth = sample_log(PATHS, 1, 50.0, (0.0, 9.0), generator())
+    log = estimate(truth, [Bias(position_m=0.3), Latency(latency_ms=50.0)], generator(4))
+    step_s = (truth.t_ns[2:] - truth.t_ns[:-2]) / 1e9
+    speed = np.linalg.norm(truth.camera_position[2:] - truth.camera_position[:-2], axis=1) / step_s
+    assert log.camera.covariance is not None
+    # Speeds from two steps or from each differ by the curve within: a percent.
+    assert log.camera.covariance[1:-1, 2, 2] == pytest.approx(0.3**2 + (0.05 * speed) ** 2, rel=0.01)
+
+
+def test_a_log_that_does_not_err_states_no_covariance() -> None:
+    log = estimate(sample_log(PATHS, 0, 50.0, (0.0, 1.0), generator()), [White()], generator())
+    assert log.body.covariance is None
+    assert log.camera.covariance is None
+
+
+def test_an_empty_log_stays_empty() -> None:
+    log = estimate(sample_log(PATHS, 0, 50.0, (1.0, 1.0), generator()), [White(position_m=1.0)], generator())
+    assert log.body.position.shape == log.camera.position.shape == (0, 3)
+    assert log.gimbal_xyzw.shape == (0, 4)
+
+
+def test_the_same_seed_gives_the_same_log() -> None:
+    models = [GaussMarkov(position_m=0.1, rotation_deg=0.5, correlation_s=5.0), White(position_m=0.01)]
+    logs = [
+        estimate(sample_log(flight(), 0, 50.0, (0.0, 9.0), generator(5)), models, generator(6)) for _ in "ab"
+    ]
+    assert logs[0].body.t_ns.tobytes() == logs[1].body.t_ns.tobytes()
+    assert logs[0].body.position.tobytes() == logs[1].body.position.tobytes()
+    assert logs[0].gimbal_xyzw.tobytes() == logs[1].gimbal_xyzw.tobytes()
+
+
+# --- the actor -----------------------------------------------------------------------------------------
+
+
+def test_the_actors_estimate_errs_as_stated() -> None:
+    """10,000 s at 10 Hz: errors correlated over 0.5 s count as 10,000 independent ones per axis
+    (2 * 0.5 s apart, for the mean), so their sigma is known to 1 / sqrt(2 * 30,000) = 0.4 %.
+    """
+    t_s = np.linspace(0.0, 10_000.0, 11)
+    hip = np.stack([t_s, -t_s, 1.0 + 0 * t_s], axis=1)
+    t_ns, position = estimate_actor(
+        t_s, hip, sigma_m=0.2, rate_hz=10.0, span_s=(0.0, 10_000.0), rng=generator()
+    )
+    truth = np.stack([t_ns / 1e9, -t_ns / 1e9, np.ones(len(t_ns))], axis=1)
+    error = position - truth
+    assert error.std() == pytest.approx(0.2, rel=0.016)
+    correlation = (error[1:] * error[:-1]).mean() / error.var()
+    assert correlation == pytest.approx(math.exp(-0.1 / ACTOR_CORRELATION_S), abs=0.01)
+
+
+def test_the_actor_is_estimated_only_where_known() -> None:
+    t_s = np.arange(0.0, 5.0, 0.1)
+    hip = np.zeros((len(t_s), 3))
+    t_ns, position = estimate_actor(t_s, hip, sigma_m=0.0, rate_hz=10.0, span_s=(0.0, 4.0), rng=generator())
+    assert (position == 0).all()
+    assert len(t_ns) in {39, 40}
+    with pytest.raises(ValueError, match="not known throughout"):
+        estimate_actor(t_s, hip, sigma_m=0.0, rate_hz=10.0, span_s=(0.0, 6.0), rng=generator())
+    empty = estimate_actor(t_s, hip, sigma_m=0.2, rate_hz=10.0, span_s=(0.0, 0.0), rng=generator())
+    assert empty[1].shape == (0, 3)
