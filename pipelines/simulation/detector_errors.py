@@ -1,0 +1,254 @@
+"""What a keypoint detector would make of true pixels, where no video is rendered.
+
+How large its errors are was measured by tilt (`data/detector_errors.csv` says how); how they hang together
+in time, behind obstacles and between left and right is modelled here, by the constants below.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.session.errors import DataError
+from pipelines.session.skeletons import mirrored
+from pipelines.simulation.scenario import DetectorErrors
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+MEASURED = Path(__file__).parent / "data" / "detector_errors.csv"
+COLUMNS = ("tilt_deg", "joint", "median_error_share", "missed_share", "confidence")
+ANY_JOINT = "*"
+
+REFERENCE_TILT_DEG = 15.0
+"""Where a scenario's shares of missed joints and outliers hold; elsewhere they grow as the measured one."""
+_LEAST_MISSED = 0.01  # fewer than this a few hundred pictures do not tell apart
+
+KEPT_PER_FRAME = 0.7
+"""Autocorrelation of a joint's error from one frame to the next: 0.1 s at 30 frames a second."""
+
+HIDDEN_MISSED_SHARE, HIDDEN_ERROR, HIDDEN_CONFIDENCE = 0.7, 4.0, 0.4
+"""Of hidden joints: how many are missed; the others' errors and confidences, times those of visible ones."""
+
+OUTLIER_SHARES = (0.2, 1.0)
+"""How far an outlier lies from the truth, in heights of the person."""
+
+SWAP_FRAMES = (2, 6)
+"""For how many frames left and right stay swapped."""
+
+# Ordinary errors lower or raise the confidence by up to half of this, outliers by half and some more.
+_CONFIDENCE_RANGE, _CONFIDENCE_NOISE, _OUTLIER_DOUBT = 0.2, 0.04, 0.4
+
+# Half the errors are shorter than this many sigmas of a coordinate (Rayleigh distribution).
+_MEDIAN_PER_SIGMA = np.sqrt(2 * np.log(2))
+
+_LIMBS = (
+    ("elbow", "wrist", "pinky", "index", "thumb"),
+    ("knee", "ankle", "heel", "big_toe", "small_toe"),
+)
+
+
+# --- the table -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ErrorTable:
+    """Measured errors by joint (`ANY_JOINT` for all others) and tilt."""
+
+    rows: Mapping[str, Float]  # [K, 4]: tilt in degrees, rising; median error share; missed share; confidence
+
+    def at(self, tilt_deg: Float, joints: tuple[str, ...]) -> tuple[Float, Float, Float]:
+        """Median error share, missed share and confidence, each [T, J].
+
+        Straight between the measured tilts; beyond them as at the nearest.
+
+        Raises:
+            ValueError: a joint has no rows, and there are none for all others.
+        """
+        missing = [name for name in joints if name not in self.rows and ANY_JOINT not in self.rows]
+        if missing:
+            raise ValueError(f"no errors were measured for {', '.join(missing)}")
+        tables = [self.rows.get(name, self.rows.get(ANY_JOINT, np.empty((0, 4)))) for name in joints]
+        values = np.empty((3, len(tilt_deg), len(joints)))
+        for j, table in enumerate(tables):
+            for k in range(3):
+                values[k, :, j] = np.interp(tilt_deg, table[:, 0], table[:, k + 1])
+        return values[0], values[1], values[2]
+
+
+@lru_cache(maxsize=4)
+def read_errors(path: Path = MEASURED) -> ErrorTable:
+    """The measured errors: a CSV with `COLUMNS`; lines that begin with # say where they are from.
+
+    Raises:
+        DataError: no such file, other columns, something that is no number or out of range, a tilt twice.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(path, f"cannot be read: {error}", "make it again") from error
+    rows = list(csv.reader(line for line in lines if line.strip() and not line.startswith("#")))
+    if not rows or tuple(rows[0]) != COLUMNS:
+        raise DataError(path, "is no table of detector errors", f"its header must be {','.join(COLUMNS)}")
+    by_joint: dict[str, list[list[float]]] = {}
+    for row in rows[1:]:
+        by_joint.setdefault(row[1] if len(row) > 1 else "", []).append(_numbers(path, row))
+    tables = {joint: np.array(sorted(values)) for joint, values in by_joint.items()}
+    if not tables or any((np.diff(table[:, 0]) <= 0).any() for table in tables.values()):
+        raise DataError(path, "has no rows, or a tilt twice for one joint", "give every tilt once")
+    return ErrorTable(tables)
+
+
+def _numbers(path: Path, row: list[str]) -> list[float]:
+    """Tilt, error, missed share and confidence of one row."""
+    try:
+        tilt, _, error, missed, confidence = row
+        values = [float(text) for text in (tilt, error, missed, confidence)]
+    except ValueError:
+        values = [np.nan]
+    in_range = np.isfinite(values).all() and min(values[1:]) >= 0 and max(values[2:]) <= 1
+    if not in_range:
+        raise DataError(path, f"has a row {','.join(row)}", "give a tilt, a joint and three shares")
+    return values
+
+
+# --- the detector --------------------------------------------------------------------------------------
+
+
+def view_of(camera: Float, target: Float, *, height_m: float, focal_px: float) -> tuple[Float, Float]:
+    """How steeply a camera looks down at a person [T] in degrees, and the person's apparent height [T] px.
+
+    Args:
+        camera: [T, 3] m.
+        target: [T, 3] m, the person's middle, not where the camera is.
+        height_m: the person's, standing.
+        focal_px: the camera's focal length.
+
+    Returns:
+        The elevation of the camera above the target, and f H/d: the height as seen from the side,
+        whatever the tilt, which measured errors are shares of.
+    """
+    away = camera - target
+    distance = np.linalg.norm(away, axis=-1)
+    return np.degrees(np.arcsin(away[..., 2] / distance)), focal_px * height_m / distance
+
+
+def detect_keypoints(
+    pixels: Float,
+    visible: Bool,
+    tilt_deg: Float,
+    apparent_height_px: Float,
+    errors: DetectorErrors,
+    rng: np.random.Generator,
+    *,
+    joints: tuple[str, ...],
+    table: ErrorTable | None = None,
+) -> tuple[Float, Float]:
+    """Keypoints of one person in one camera, frame by frame.
+
+    Errors have the measured median length and no preferred direction; from frame to frame they follow a
+    first-order autoregression (`KEPT_PER_FRAME`). Misses and outliers come one by one, more of them the
+    steeper the camera looks. Hidden joints are mostly missed (`HIDDEN_MISSED_SHARE`, whatever the scenario
+    says), else badly found. Swapped limbs (elbow to hand, knee to foot) stay so for `SWAP_FRAMES`. The mean
+    confidence of visible joints is the measured one; a joint's own falls with the rank of its error among
+    errors of its kind, and outliers lose up to `_OUTLIER_DOUBT` more, so that some of them look good.
+
+    With `errors.scale` 0 there are neither outliers nor swaps: what is found is exact.
+
+    Args:
+        pixels: [T, J, 2] exact pixels; NaN for what is not in the picture, which is never found.
+        visible: [T, J] whether nothing hides the joint.
+        tilt_deg: [T] elevation of the camera above the person.
+        apparent_height_px: [T] (`view_of`).
+        errors: the scenario's; its shares hold for visible joints.
+        rng: draws as many numbers for what is seen as for what is not.
+        joints: the joints' names.
+        table: measured errors; by default those that come with the program.
+
+    Returns:
+        [T, J, 2] px, NaN for what was missed, and confidences [T, J] above 0 and at most 1; 0 for those.
+
+    Raises:
+        ValueError: a joint without measured errors.
+    """
+    table = read_errors() if table is None else table
+    median_share, measured_missed, mean_confidence = table.at(tilt_deg, joints)
+    _, usual, _ = table.at(np.array([REFERENCE_TILT_DEG]), joints)
+    growth = measured_missed / max(float(usual.mean()) if usual.size else 0.0, _LEAST_MISSED)
+
+    shape = pixels.shape[:2]
+    unit_error = _correlated(shape, rng)
+    angle, far = rng.uniform(0, 2 * np.pi, shape), rng.uniform(*OUTLIER_SHARES, shape)
+    missed = rng.random(shape) < np.where(visible, errors.missed_share * growth, HIDDEN_MISSED_SHARE)
+    outlier = rng.random(shape) < errors.outlier_share * growth
+    doubt, noise = rng.random(shape), rng.standard_normal(shape)
+    swapped = _swapped(shape[0], joints, errors.swap_share, rng)
+    if errors.scale == 0:
+        outlier, swapped = np.zeros_like(outlier), np.zeros_like(swapped)
+
+    sigma_px = errors.scale * apparent_height_px[:, None] * median_share / _MEDIAN_PER_SIGMA
+    ordinary = unit_error * (sigma_px * np.where(visible, 1.0, HIDDEN_ERROR))[..., None]
+    gross = (far * apparent_height_px[:, None])[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    found = pixels + np.where(outlier[..., None], gross, ordinary)
+
+    # The Rayleigh distribution function: uniform, so that the mean confidence is not changed by it.
+    rank = np.where(outlier, 1.0, -np.expm1(-np.sum(unit_error**2, axis=-1) / 2))
+    confidence = mean_confidence + _CONFIDENCE_RANGE * (0.5 - rank) - _OUTLIER_DOUBT * doubt * outlier
+    confidence = confidence * np.where(visible, 1.0, HIDDEN_CONFIDENCE) + _CONFIDENCE_NOISE * noise
+    confidence = np.clip(confidence, 0.01, 1.0)
+
+    found[missed] = np.nan
+    confidence[np.isnan(found).any(axis=-1)] = 0.0
+    return _exchanged(found, swapped, joints), _exchanged(confidence, swapped, joints)
+
+
+def _correlated(shape: tuple[int, ...], rng: np.random.Generator) -> Float:
+    """Unit normal errors [T, J, 2]; each joint's go on as those of the frame before."""
+    error = rng.standard_normal((*shape, 2))
+    fresh = np.sqrt(1 - KEPT_PER_FRAME**2)
+    for k in range(1, len(error)):
+        error[k] = KEPT_PER_FRAME * error[k - 1] + fresh * error[k]
+    return error
+
+
+def _swapped(frames: int, joints: tuple[str, ...], share: float, rng: np.random.Generator) -> Bool:
+    """Which joints [T, J] have their mirror's place: one limb of a pair at a time, for a few frames.
+
+    Runs of mean length L begin with the probability p per frame outside of them; the mean gap is then
+    (1 - p) / p, and the share of swapped frames s = L / (L + (1 - p) / p).
+    """
+    limbs = [_limb(joints, parts) for parts in _LIMBS]
+    shortest, longest = SWAP_FRAMES
+    length = (shortest + longest) / 2
+    begins = rng.random(frames) < share / (share + length * (1 - share))
+    lasts, which = rng.integers(shortest, longest + 1, frames), rng.integers(len(limbs), size=frames)
+    swapped = np.zeros((frames, len(joints)), dtype=np.bool_)
+    free_from = 0
+    for frame in np.flatnonzero(begins).tolist():
+        if frame >= free_from:
+            free_from = frame + int(lasts[frame])
+            swapped[frame:free_from] = limbs[which[frame]]
+    return swapped
+
+
+def _limb(joints: tuple[str, ...], parts: tuple[str, ...]) -> Bool:
+    """Which joints [J] belong to a pair of limbs, both sides of each there."""
+    names = {f"{side}_{part}" for side in ("left", "right") for part in parts}
+    return np.array([name in names and mirrored(name) in joints for name in joints], dtype=np.bool_)
+
+
+def _exchanged(values: Float, swapped: Bool, joints: tuple[str, ...]) -> Float:
+    """[T, J, ...] with every swapped joint's value taken from its mirror."""
+    mirror = [
+        joints.index(mirrored(name)) if mirrored(name) in joints else j for j, name in enumerate(joints)
+    ]
+    exchanged: Float = np.where(
+        swapped.reshape(*swapped.shape, *(1,) * (values.ndim - 2)), values[:, mirror], values
+    )
+    return exchanged
