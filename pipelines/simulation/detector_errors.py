@@ -42,8 +42,10 @@ OUTLIER_SHARES = (0.2, 1.0)
 SWAP_FRAMES = (2, 6)
 """For how many frames left and right stay swapped."""
 
-# Ordinary errors lower or raise the confidence by up to half of this, outliers by half and some more.
-_CONFIDENCE_RANGE, _CONFIDENCE_NOISE, _OUTLIER_DOUBT = 0.2, 0.04, 0.4
+# Ordinary errors raise or lower the confidence by up to half the range, outliers lower it by half of it
+# and some more. Chosen so that it tells errors above 5 % of the height as well as the measured detector's
+# does: the area under the ROC curve is 0.84 to 0.90 over tilts of 60 to 15 degrees, measured was 0.88.
+_CONFIDENCE_RANGE, _CONFIDENCE_NOISE, _OUTLIER_DOUBT = 0.14, 0.05, 0.3
 
 # Half the errors are shorter than this many sigmas of a coordinate (Rayleigh distribution).
 _MEDIAN_PER_SIGMA = np.sqrt(2 * np.log(2))
