@@ -17,11 +17,18 @@ def models_command(context: click.Context, as_json: bool) -> None:
     """List the keypoint detectors and whether their files are here; `fetch` gets those that are missing."""
     if context.invoked_subcommand is not None:
         return
-    from pipelines.session.registries import DETECTORS
+    from pipelines.session.registries import DETECTORS, DetectorFamily
 
-    detectors = DETECTORS.all()
+    registered = DETECTORS.all()
+    families = [d for d in registered if isinstance(d, DetectorFamily)]
+    detectors = [d for d in registered if not isinstance(d, DetectorFamily)]
     if as_json:
-        print_json({"detectors": [_listed(d.name, d.title, d.models()) for d in detectors]})
+        print_json(
+            {
+                "detectors": [_listed(d.name, d.title, d.models()) for d in detectors],
+                "families": [{"name": f.name, "title": f.title, "usage": f.usage} for f in families],
+            }
+        )
         return
     print_table(
         ("detector", "file", "where"),
@@ -30,6 +37,8 @@ def models_command(context: click.Context, as_json: bool) -> None:
     for detector in detectors:
         if None in detector.models().values():
             click.echo(f"Get what is missing with `mocap models fetch {detector.name}`.")
+    for family in families:
+        click.echo(f"\n{family.title}: --detector {family.usage.replace(chr(10), chr(10) + '  ')}")
 
 
 @models_command.command("fetch")
@@ -43,9 +52,9 @@ def models_command(context: click.Context, as_json: bool) -> None:
 @json_option
 def fetch_command(name: str, source: Path | None, as_json: bool) -> None:
     """Get the model files of a detector into the user's cache."""
-    from pipelines.session.registries import DETECTORS
+    from pipelines.session.registries import find_detector
 
-    detector = DETECTORS.get(name)
+    detector = find_detector(name)
     detector.fetch(source)
     if as_json:
         print_json(_listed(detector.name, detector.title, detector.models()))

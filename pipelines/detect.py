@@ -26,7 +26,7 @@ from pipelines.session.description import CameraEntry, Description, MediaEntry, 
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Detections, Float, Int64
-from pipelines.session.registries import DETECTORS, KeypointNetworks
+from pipelines.session.registries import Detector, KeypointNetworks, find_detector
 from pipelines.session.stages import Stage, StageRecord, WritableSession
 from pipelines.session.storage import read_json, sha256_of, write_json
 from pipelines.session.tables import ACTOR, FRAMES, KEYPOINTS, POSES, read_table, write_table
@@ -71,6 +71,8 @@ def detect(
     *,
     detector: str = "blazepose",
     every: int = 1,
+    start_s: float | None = None,
+    end_s: float | None = None,
     workers: int = 1,
     force: bool = False,
     progress: Progress | None = None,
@@ -79,8 +81,11 @@ def detect(
 
     Args:
         session: locked by the caller.
-        detector: a registered name.
+        detector: a registered name, or that of a family, a colon and its argument.
         every: look at every k-th picture only.
+        start_s: look at pictures from then on only, in seconds since the first frame of the flight's cameras,
+            those with keypoints among them; from the first by default.
+        end_s: and at those before then; to the last by default.
         workers: blocks worked on at once; the result does not depend on them.
         force: do it again although nothing changed.
         progress: who watches.
@@ -96,20 +101,33 @@ def detect(
     media = cameras_to_detect(description)
     if not media:
         return None
-    chosen = DETECTORS.get(detector)
+    chosen = find_detector(detector)
     models = {name: path for name, path in chosen.models().items() if path is not None}
-    settings = {"detector": detector, "every": every, "cameras": sorted(media)}
+    settings = {
+        "detector": chosen.name,
+        "every": every,
+        "cameras": sorted(media),
+        "start_s": start_s,
+        "end_s": end_s,
+    }
     inputs = {f"model {name}": sha256_of(path) for name, path in models.items()}
     inputs |= _inputs(session, description, media)
     run = session.begin(DETECT, settings=settings, inputs=inputs, force=force)
     if run.finished:
         return run.record
 
-    work = _Work(session.folder, description, every)
+    work = _Work(session.folder, description, every, (start_s, end_s))
     blocks = [block for name in media for block in work.blocks(name)]
-    progress.start("Detecting keypoints", sum(work.pictures(block) for block in blocks))
+    pictures = sum(work.pictures(block) for block in blocks)
+    if not pictures:
+        raise DataError(
+            session.folder,
+            f"no picture lies {_span_words(start_s, end_s)}",
+            "look at `mocap info`, or leave it out",
+        )
+    progress.start("Detecting keypoints", pictures)
     with ThreadPoolExecutor(workers) as pool:
-        produce = partial(_produce, work, chosen.name, progress)
+        produce = partial(_produce, work, chosen, progress)
         try:
             folders = list(pool.map(lambda block: run.chunk(block.name, partial(produce, block)), blocks))
         except BaseException:
@@ -121,7 +139,9 @@ def detect(
             session.folder, "nobody was found in any picture", "look at the pictures, or give keypoints"
         )
     joints = list(read_json(folders[0] / "counts.json")["joints"])
-    return run.publish(counts={"joints": joints, "cameras": counts})
+    rows = {name: list(work.span(name)) for name in media}
+    progress.note(f"keypoints detected by {chosen.title}")
+    return run.publish(counts={"detector": chosen.title, "joints": joints, "cameras": counts, "rows": rows})
 
 
 def _inputs(
@@ -141,7 +161,13 @@ def _inputs(
 class _Work:
     """What the blocks of a session need to know."""
 
-    def __init__(self, folder: Path, description: Description, every: int) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        description: Description,
+        every: int,
+        span_s: tuple[float | None, float | None],
+    ) -> None:
         self.folder = folder
         self.every = every
         self.stopped = Event()
@@ -150,11 +176,25 @@ class _Work:
             name: read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
             for name in cameras_to_detect(description)
         }
+        first_ns = min(
+            int(read_table(folder / "cameras" / name / "frames.parquet", FRAMES)["t_ns"].iloc[0])
+            for name in description.cameras
+        )
+        self._spans = {
+            name: _rows_between(frames["t_ns"].to_numpy(np.int64) - first_ns, *span_s)
+            for name, frames in self._frames.items()
+        }
 
     def blocks(self, camera: str) -> list[Block]:
-        """The blocks of a camera."""
-        count = len(self._frames[camera])
-        return [Block(camera, first, min(first + _BLOCK, count)) for first in range(0, count, _BLOCK)]
+        """The blocks of a camera; a single one of nothing where no picture is in the span."""
+        start, stop = self._spans[camera]
+        firsts = range(start, stop, _BLOCK) or [start]
+        return [Block(camera, first, min(first + _BLOCK, stop)) for first in firsts]
+
+    def span(self, camera: str) -> tuple[int, int]:
+        """First row of a camera's frame table that is looked at, and the one behind the last."""
+        start, stop = self._spans[camera]
+        return -(-start // self.every) * self.every, stop
 
     def pictures(self, block: Block) -> int:
         """How many pictures of a block are looked at."""
@@ -219,9 +259,22 @@ class _Work:
         return position, matrix_from_quaternion(quaternion)
 
 
-def _produce(work: _Work, detector: str, progress: Progress, block: Block, folder: Path) -> None:
+def _span_words(start_s: float | None, end_s: float | None) -> str:
+    start = "" if start_s is None else f" from {start_s:g} s on"
+    end = "" if end_s is None else f" before {end_s:g} s"
+    return f"in the flight{start}{end}"
+
+
+def _rows_between(since_ns: Int64, start_s: float | None, end_s: float | None) -> tuple[int, int]:
+    """First row of sorted times [F] at or after `start_s`, and first one at or after `end_s`."""
+    first = 0 if start_s is None else int(np.searchsorted(since_ns, round(start_s * 1e9), side="left"))
+    stop = len(since_ns) if end_s is None else int(np.searchsorted(since_ns, round(end_s * 1e9), side="left"))
+    return first, max(first, stop)
+
+
+def _produce(work: _Work, detector: Detector, progress: Progress, block: Block, folder: Path) -> None:
     """Write what the detector finds in the pictures of one block."""
-    networks = DETECTORS.get(detector).load(threads=1)
+    networks = detector.load(threads=1)
     media = work.entry(block).media
     if media is None:
         raise ValueError(f"{block.camera} has no pictures")

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.keypoints.blazepose_models import BLAZEPOSE_MODELS, WheelModels
+from pipelines.keypoints.crops import Picture, sampled
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float
 from pipelines.session.registries import Person, Region
@@ -30,8 +31,6 @@ from pipelines.session.skeletons import get_skeleton
 
 if TYPE_CHECKING:
     from ai_edge_litert.interpreter import Interpreter
-
-Picture = NDArray[np.uint8]
 
 _PICTURE_SIDE = 224  # of the person detector's input
 _CROP_SIDE = 256  # of the landmark network's input
@@ -44,18 +43,12 @@ _SAME_PERSON = 0.3  # intersection over union
 _MARGIN = 1.25  # a region's side over the diameter of the circle around the person
 
 
-class BlazePose:
-    """The two networks. Not to be shared by threads: each takes its own."""
+class PersonFinder:
+    """The person detector alone. Not to be shared by threads: each takes its own."""
 
-    def __init__(self, person_model: Path, landmark_model: Path, *, threads: int) -> None:
+    def __init__(self, person_model: Path, *, threads: int) -> None:
         self._people = _Network(person_model, threads)
-        self._landmarks = _Network(landmark_model, threads)
         self._anchors = _anchors()
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """The 33 joints of skeleton `blazepose33`."""
-        return get_skeleton("blazepose33").joints
 
     def find_people(self, picture: Picture) -> list[tuple[Region, float]]:
         """People in a picture [H, W, 3] BGR, best first; tall ones, since the network sees 224 x 224 pixels.
@@ -67,7 +60,7 @@ class BlazePose:
         scale = max(height, width) / _PICTURE_SIDE
         corner = (np.array([width, height]) - _PICTURE_SIDE * scale) / 2
         placed = np.column_stack([np.eye(2) * scale, corner])
-        fitted = _sampled(picture, placed, _PICTURE_SIDE, beyond="black")
+        fitted = sampled(picture, placed, (_PICTURE_SIDE, _PICTURE_SIDE), beyond="black")
         raw = self._people(fitted * np.float32(2 / 255) - np.float32(1))
         score = _sigmoid(raw["Identity_1"][0, :, 0])
         sure = score >= _SURE
@@ -80,6 +73,19 @@ class BlazePose:
             for merged, best in _merged(points, score[sure])
         ]
 
+
+class BlazePose(PersonFinder):
+    """The two networks. Not to be shared by threads: each takes its own."""
+
+    def __init__(self, person_model: Path, landmark_model: Path, *, threads: int) -> None:
+        super().__init__(person_model, threads=threads)
+        self._landmarks = _Network(landmark_model, threads)
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The 33 joints of skeleton `blazepose33`."""
+        return get_skeleton("blazepose33").joints
+
     def locate(self, picture: Picture, regions: Sequence[Region]) -> list[Person]:
         """The joints of the person in each region of a picture [H, W, 3] BGR.
 
@@ -90,7 +96,7 @@ class BlazePose:
 
     def _locate(self, picture: Picture, region: Region) -> Person:
         picture_from_crop = _picture_from_crop(region)
-        crop = _sampled(picture, picture_from_crop, _CROP_SIDE, beyond="edge")
+        crop = sampled(picture, picture_from_crop, (_CROP_SIDE, _CROP_SIDE), beyond="edge")
         raw = self._landmarks(crop * np.float32(1 / 255))
         landmarks = raw["Identity"].reshape(_LANDMARKS, 5).astype(np.float64)
         in_crop, peak = _refined(landmarks[:, :2], raw["Identity_3"][0].astype(np.float64))
@@ -130,6 +136,11 @@ class BlazePoseDetector:
         """
         person_model, landmark_model = self._models.verified().values()
         return BlazePose(person_model, landmark_model, threads=threads)
+
+    def load_person_finder(self, *, threads: int) -> PersonFinder:
+        """The person detector alone, for other networks; errors as those of `load`."""
+        person_model, _ = self._models.verified().values()
+        return PersonFinder(person_model, threads=threads)
 
 
 DETECTOR = BlazePoseDetector(BLAZEPOSE_MODELS)
@@ -243,27 +254,6 @@ def _picture_from_crop(region: Region) -> Float:
     """[2, 3]: from the crop's pixels to the picture's, both counted from the centre of the top left one."""
     axes = _axes(region)
     return np.column_stack([axes, np.array(region.centre) - axes @ np.full(2, (_CROP_SIDE - 1) / 2)])
-
-
-def _sampled(picture: Picture, picture_from_crop: Float, side: int, *, beyond: str) -> NDArray[np.float32]:
-    """The RGB values 0..255 [side, side, 3] of a BGR picture where a crop's pixels lie, bilinear.
-
-    OpenCV 4 rounds positions to 1/32 px when it warps, as does the one inside MediaPipe; OpenCV 5 does
-    not, which moves landmarks by 0.6 px (median) where the crop is coarser than the picture. Fixed-point
-    maps are rounded the same way in both.
-    """
-    import cv2
-
-    column = np.arange(side)
-    x, y = (
-        (row[0] * column + (row[1] * column + row[2])[:, None]).astype(np.float32)
-        for row in picture_from_crop
-    )
-    whole, part = cv2.convertMaps(x, y, cv2.CV_16SC2)
-    border = cv2.BORDER_REPLICATE if beyond == "edge" else cv2.BORDER_CONSTANT
-    sampled = cv2.remap(picture, whole, part, cv2.INTER_LINEAR, borderMode=border)
-    rgb: NDArray[np.float32] = sampled[:, :, ::-1].astype(np.float32)
-    return rgb
 
 
 def _refined(in_crop: Float, heatmap: Float) -> tuple[Float, Float]:

@@ -174,7 +174,7 @@ class Detector(Protocol):
 
     @property
     def name(self) -> str:
-        """What the user writes after `--detector`."""
+        """What the user writes after `--detector`, without paths: with the models, it decides the results."""
 
     @property
     def title(self) -> str:
@@ -188,6 +188,26 @@ class Detector(Protocol):
 
     def load(self, *, threads: int) -> KeypointNetworks:
         """Load the networks. DataError where a file is missing or is not the one that was expected."""
+
+
+@runtime_checkable
+class DetectorFamily(Protocol):
+    """Detectors that are told what to run, behind a colon: `--detector NAME:ARGUMENT`."""
+
+    @property
+    def name(self) -> str:
+        """What the user writes before the colon."""
+
+    @property
+    def title(self) -> str:
+        """What `mocap models` calls it."""
+
+    @property
+    def usage(self) -> str:
+        """What the user writes after `--detector`, and what it means; one line each."""
+
+    def configured(self, argument: str) -> Detector:
+        """The detector of that argument. DataError says what is wrong with it."""
 
 
 class Export(Protocol):
@@ -238,10 +258,27 @@ class Registry(Generic[T]):
 
 FORMATS: Registry[Format] = Registry("mocap.formats", "format")
 EXPORTS: Registry[Export] = Registry("mocap.exports", "export format")
-DETECTORS: Registry[Detector] = Registry("mocap.detectors", "detector")
+DETECTORS: Registry[Detector | DetectorFamily] = Registry("mocap.detectors", "detector")
 NOISE_MODELS: Registry[type[NoiseModel]] = Registry("mocap.noise_models", "pose noise model")
 
 F = TypeVar("F")
+
+
+def find_detector(text: str) -> Detector:
+    """The detector that a user asks for: a registered name, or that of a family, a colon and its argument.
+
+    Raises:
+        DataError: no such name, an argument where none is taken, none where one is needed, or a bad one.
+    """
+    name, colon, argument = text.partition(":")
+    found = DETECTORS.get(name)
+    if isinstance(found, DetectorFamily):
+        if not argument:
+            raise DataError(text, "does not say which model", f"write {found.usage.splitlines()[0]}")
+        return found.configured(argument)
+    if colon:
+        raise DataError(text, f"{name} takes nothing behind its name", f"write {name}")
+    return found
 
 
 def recognise(path: Path, protocol: type[F], noun: str, formats: Sequence[Format] | None = None) -> F:

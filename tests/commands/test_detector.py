@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from pipelines.formats.trc import FORMAT as TRC
-from pipelines.session.registries import DETECTORS
+from pipelines.session.registries import find_detector
 from pipelines.session.tabular import motion_from
 from tests.commands.runner import content, mocap, refused, succeeds
 from tests.real_data import real_data
@@ -23,7 +23,7 @@ EVERY = 10
 @pytest.fixture
 def flight(tmp_path: Path) -> Path:
     """Four videos, their calibration, and no keypoints."""
-    if None in DETECTORS.get("blazepose").models().values():
+    if None in find_detector("blazepose").models().values():
         fetched = mocap("models", "fetch", "blazepose", timeout=300)
         if fetched.returncode:
             pytest.skip(f"the detector's networks cannot be fetched here: {fetched.stderr.strip()}")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipelines.keypoints import blazepose
 from pipelines.keypoints.blazepose import DETECTOR, BlazePose
+from pipelines.keypoints.crops import sampled
 from pipelines.session.errors import DataError
 from pipelines.session.registries import Person, Region
 from tests.real_data import real_data
@@ -214,7 +215,7 @@ def test_a_crop_takes_the_colours_where_its_pixels_lie() -> None:
     x, y = np.meshgrid(np.arange(256), np.arange(256))
     picture = np.stack([np.zeros_like(x), y, x], axis=2).astype(np.uint8)
     region = Region((120.0, 130.0), 100.0, 0.4)
-    rgb = blazepose._sampled(picture, blazepose._picture_from_crop(region), CROP, beyond="edge")
+    rgb = sampled(picture, blazepose._picture_from_crop(region), (CROP, CROP), beyond="edge")
     axes = crop_pixel(100.0, 0.4)
     for row, column in ((0, 0), (255, 255), (17, 200), (128, 127)):
         position = axes @ (column - 127.5, row - 127.5) + region.centre
@@ -225,8 +226,8 @@ def test_a_crop_takes_the_colours_where_its_pixels_lie() -> None:
 def test_beyond_the_picture_is_its_edge_or_black() -> None:
     picture = np.full((40, 40, 3), 200, np.uint8)
     outside = blazepose._picture_from_crop(Region((-500.0, 20.0), 100.0))
-    assert (blazepose._sampled(picture, outside, CROP, beyond="edge") == 200).all()
-    assert (blazepose._sampled(picture, outside, CROP, beyond="black") == 0).all()
+    assert (sampled(picture, outside, (CROP, CROP), beyond="edge") == 200).all()
+    assert (sampled(picture, outside, (CROP, CROP), beyond="black") == 0).all()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,168 @@
+"""From the outputs of top-down pose networks to joints in their input: SimCC and heatmaps.
+
+Positions are pixels of the network's input, the centre of the top left one at (0, 0).
+
+- SimCC (Li et al., "SimCC: a Simple Coordinate Classification Perspective", 2022; RTMPose): one score for
+  each bin of x and of y, `split` bins to a pixel; bin b lies at b / split, as MMPose encodes and decodes.
+  Networks are trained on Gaussians of several bins, so that their scores are about the logarithm of one, a
+  parabola: that through the best bin and two on either side, by least squares, has the joint at its top.
+  A soft argmax over all bins would be drawn to the middle by what other people and noise leave in them.
+- Heatmaps (HRNet, ViTPose, AlphaPose's FastPose): cell k of w lies at k (W - 1) / (w - 1) where they were
+  trained unbiased (`udp`: Huang et al., "The Devil Is in the Details", 2020; ViTPose), and at k W / w where
+  not (`msra`: HRNet and FastPose as published). Between the cells, the logarithm of the smoothed map is
+  developed to the second order about the best cell (DARK: Zhang et al., "Distribution-Aware Coordinate
+  Representation", 2020): exact for a Gaussian.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.keypoints.onnx_network import written_shapes
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float
+
+HeatmapCells = Literal["udp", "msra"]
+
+_SMOOTHING_CELLS = 11  # DARK's kernel for 64 x 48 cells, of sigma 2 as the Gaussians it was trained on
+_REACH = 2  # bins on either side of the best one
+_FLOOR = 1e-10
+
+
+@dataclass(frozen=True)
+class PoseDecoder:
+    """How the outputs of one network are read.
+
+    Attributes:
+        outputs: names of the x and y scores, or of the heatmaps.
+        count: how many joints there are.
+        per_px: [2] bins or cells for each pixel of the input, in x and y.
+    """
+
+    outputs: tuple[str, ...]
+    count: int
+    per_px: tuple[float, float]
+
+    @property
+    def kind(self) -> str:
+        """SimCC or heatmaps."""
+        return "SimCC" if len(self.outputs) == 2 else "heatmaps"
+
+    def decode(self, outputs: dict[str, NDArray[Any]]) -> tuple[Float, Float]:
+        """Joints [N, K, 2] in pixels of the input, NaN where nothing is above 0, and scores [N, K] 0..1."""
+        maps = [outputs[name].astype(np.float64) for name in self.outputs]
+        place, score = simcc_peaks(*maps) if len(maps) == 2 else heatmap_peaks(maps[0])
+        xy = place / np.array(self.per_px)
+        return np.where((score > 0)[..., None], xy, np.nan), np.clip(score, 0.0, 1.0)
+
+
+def decoder_for(
+    path: Path, shapes: Mapping[str, tuple[int, ...]], size: tuple[int, int], cells: HeatmapCells
+) -> PoseDecoder:
+    """How to read a network's outputs, from their shapes.
+
+    Args:
+        path: of the model, for the message.
+        shapes: of the outputs for one picture, by name.
+        size: width and height of the network's input.
+        cells: where the cells of heatmaps lie.
+
+    Raises:
+        DataError: they are of no kind that is known.
+    """
+    width, height = size
+    lines = {name: shape for name, shape in shapes.items() if len(shape) == 3}
+    if len(lines) == 2 and len({shape[1] for shape in lines.values()}) == 1:
+        for x, y in (tuple(lines), tuple(lines)[::-1]):
+            split = lines[x][2] / width
+            if split >= 1 and split == lines[y][2] / height:
+                return PoseDecoder((x, y), lines[x][1], (split, split))
+    maps = {name: shape for name, shape in shapes.items() if len(shape) == 4}
+    if len(maps) == 1:
+        ((name, (_, count, rows, columns)),) = maps.items()
+        if 1 < rows <= height and 1 < columns <= width and columns * height == rows * width:
+            if cells == "udp":
+                return PoseDecoder((name,), count, ((columns - 1) / (width - 1), (rows - 1) / (height - 1)))
+            return PoseDecoder((name,), count, (columns / width, rows / height))
+    raise DataError(
+        path,
+        f"its outputs are not understood: {written_shapes(shapes)} for an input of {width}x{height}",
+        f"expected SimCC, [N,K,{width}s] and [N,K,{height}s], or heatmaps, [N,K,{height}/s,{width}/s]",
+    )
+
+
+def simcc_peaks(x: Float, y: Float) -> tuple[Float, Float]:
+    """The joints' places [N, K, 2] in bins and their scores [N, K]: the smaller of the two best ones."""
+    places, scores = zip(*(_line_peaks(line) for line in (x, y)), strict=True)
+    return np.stack(places, axis=-1), np.minimum(*scores)
+
+
+def _line_peaks(scores: Float) -> tuple[Float, Float]:
+    """The tops [N, K] of parabolas about the best bins of [N, K, B], within a bin of them.
+
+    Least squares of a + b d + c d^2 to d = -2..2: b = sum(d s) / 10, c = sum((d^2 - 2) s) / 14. The best
+    bin is left where it is at either end of the line.
+    """
+    last = scores.shape[-1] - 1
+    best = scores.argmax(axis=-1)
+    offset = np.arange(-_REACH, _REACH + 1)
+    around = np.take_along_axis(scores, np.clip(best[..., None] + offset, 0, last), axis=-1)
+    slope = np.einsum("nkd,d->nk", around, offset) / 10
+    bend = np.einsum("nkd,d->nk", around, offset**2 - 2) / 14
+    inside = (best >= _REACH) & (best <= last - _REACH) & (bend < 0)
+    shift = np.where(inside, -slope / np.where(inside, 2 * bend, 1.0), 0.0)
+    return best + np.clip(shift, -1.0, 1.0), around[..., _REACH]
+
+
+def heatmap_peaks(maps: Float) -> tuple[Float, Float]:
+    """The joints' places [N, K, 2] in cells and the maps' [N, K, h, w] largest values [N, K].
+
+    One Newton step from the best cell, at most one cell in each direction; none at the border, where the
+    derivatives are not known, or where the map bends upwards.
+    """
+    people, joints, rows, columns = maps.shape
+    flat = maps.reshape(people * joints, rows, columns)
+    index = flat.reshape(len(flat), -1).argmax(axis=1)
+    row, column = np.divmod(index, columns)
+    score = flat[np.arange(len(flat)), row, column]
+    place = np.column_stack([column, row]).astype(np.float64)
+    inside = (row > 0) & (row < rows - 1) & (column > 0) & (column < columns - 1) & (score > 0)
+    for i in np.flatnonzero(inside):
+        place[i] += _newton_step(_log_around(flat[i], row[i], column[i]))
+    return place.reshape(people, joints, 2), score.reshape(people, joints)
+
+
+def _log_around(heatmap: Float, row: int, column: int) -> Float:
+    """The logarithm [3, 3] of the smoothed map around a cell; smoothing sees the whole map's values there.
+
+    Beyond the border the map counts as 0, as in DARK.
+    """
+    reach = _SMOOTHING_CELLS // 2
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / 2.0) ** 2)
+    kernel /= kernel.sum()
+    padded = np.pad(np.maximum(heatmap, 0.0), reach + 1)
+    part = padded[row : row + _SMOOTHING_CELLS + 2, column : column + _SMOOTHING_CELLS + 2]
+    windows = np.lib.stride_tricks.sliding_window_view(part, (_SMOOTHING_CELLS, _SMOOTHING_CELLS))
+    smoothed = np.einsum("rcij,i,j->rc", windows, kernel, kernel)
+    around: Float = np.log(np.maximum(smoothed, _FLOOR))
+    return around
+
+
+def _newton_step(around: Float) -> Float:
+    """From the middle of [3, 3] values to the top of the paraboloid through them, [x, y]."""
+    dx, dy = (around[1, 2] - around[1, 0]) / 2, (around[2, 1] - around[0, 1]) / 2
+    dxx = around[1, 2] - 2 * around[1, 1] + around[1, 0]
+    dyy = around[2, 1] - 2 * around[1, 1] + around[0, 1]
+    dxy = (around[2, 2] - around[2, 0] - around[0, 2] + around[0, 0]) / 4
+    determinant = dxx * dyy - dxy**2
+    if dxx >= 0 or determinant <= 0:
+        return np.zeros(2)
+    step = np.array([dxy * dy - dyy * dx, dxy * dx - dxx * dy]) / determinant
+    bounded: Float = np.clip(step, -1.0, 1.0)
+    return bounded
