@@ -1,0 +1,182 @@
+"""From a plan to the bones: pelvis, trunk, legs and arms at every moment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.poses import multiply, rotate
+from pipelines.simulation.motion import gait
+from pipelines.simulation.motion.feet import foot_over_time
+from pipelines.simulation.motion.keys import Keys
+from pipelines.simulation.motion.legs import leg_rotations, pelvis_height, two_bones
+from pipelines.simulation.motion.plan import Plan
+from pipelines.simulation.motion.turns import about, partly
+from pipelines.simulation.rig import BONE, BONES, SIDES, BodyMotion, Rig
+
+Float = NDArray[np.float64]
+Heights = Callable[[Float], Float]
+
+_STANDING_SOFTNESS_M, _STEPPING_SOFTNESS_M = 0.006, 0.026
+_HEADROOM_M = 0.015  # what is wanted of the pelvis of somebody upright is more than the legs allow
+
+
+@dataclass(frozen=True)
+class Style:
+    """What is different from one person to the next."""
+
+    sway_m: float
+    sway_phase: tuple[float, float, float]  # rad
+    arm_share: float
+    breath_hz: float
+
+
+def bodies(
+    rig: Rig, plan: Plan, style: Style, t_s: Float, start: Float, heading: float, ground: Heights
+) -> BodyMotion:
+    """Pose all bones.
+
+    Args:
+        rig: whose bones.
+        plan: what is done.
+        style: how.
+        t_s: [T]
+        start: [2] m, where the plan began.
+        heading: rad, and looking where.
+        ground: heights of places [N, 2].
+    """
+    keys = plan.keys
+    place, yaw = plan.body_at(t_s, start, heading)
+    run = keys.at("running", t_s)
+    speed = np.maximum(keys.at("speed", t_s), 0.0)
+    stride = keys.at("stride", t_s)
+    swing = gait.swing(stride, speed, run, style.arm_share)
+
+    pelvis_yaw = yaw + swing.pelvis_yaw + _deg(keys, "pelvis_yaw_deg", t_s)
+    tilt = _deg(keys, "tilt_deg", t_s) + 0.4 * swing.lean
+    pelvis = multiply(
+        multiply(about(2, pelvis_yaw), about(1, tilt)),
+        about(0, swing.pelvis_list + 0.3 * _deg(keys, "side_deg", t_s)),
+    )
+    ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    sway = swing.sway_m + _idle(style, t_s, 0.31, 0) * style.sway_m + keys.at("aside", t_s)
+    along = _idle(style, t_s, 0.23, 1) * style.sway_m - keys.at("back", t_s)
+    floor = ground(place)
+    place = place + sway[:, None] * left + along[:, None] * ahead
+
+    feet = [foot_over_time(rig, side, t_s, plan.feet[side], keys, ground) for side in (0, 1)]
+    wanted = floor + _wanted_height(rig, plan, speed, run, stride) - keys.at("drop", t_s)
+    moving = np.clip(speed / 0.8, 0.0, 1.0)
+    softness = _STANDING_SOFTNESS_M + moving * (_STEPPING_SOFTNESS_M - _STANDING_SOFTNESS_M)
+    height = pelvis_height(rig, place, pelvis, feet, wanted, softness)
+    root = np.concatenate([place, height[:, None]], axis=1)
+    bones = {"pelvis": pelvis} | leg_rotations(rig, root, pelvis, feet)
+    for foot, side in zip(feet, SIDES, strict=True):
+        bones |= {f"{side}_foot": foot.rotation, f"{side}_toes": foot.toes}
+    bones |= _trunk(plan, style, swing, t_s, yaw, pelvis)
+    _arms(rig, plan, swing, t_s, root, bones, floor)
+    rotation = np.stack([bones[name] for name in BONES], axis=1)
+    return BodyMotion(t_s, root, rotation)
+
+
+def _deg(keys: Keys, name: str, t_s: Float) -> Float:
+    return np.asarray(np.radians(keys.at(name, t_s)), dtype=np.float64)
+
+
+def _idle(style: Style, t_s: Float, rate_hz: float, which: int) -> Float:
+    """Slow, never quite repeating, at most 1."""
+    phase = style.sway_phase[which]
+    return 0.6 * np.sin(2 * np.pi * rate_hz * t_s + phase) + 0.4 * np.sin(
+        2 * np.pi * rate_hz * 0.43 * t_s + 2 * phase
+    )
+
+
+def _wanted_height(rig: Rig, plan: Plan, speed: Float, run: Float, stride: Float) -> Float:
+    """Of the pelvis above the ground: out of reach for walkers, a bounce for runners."""
+    upright = rig.height_of_pelvis + _HEADROOM_M
+    step_s = 1 / np.array([gait.cadence(v, 1.0, plan.leg_m) for v in speed])
+    flight = np.array([gait.swing_steps(v, 1.0) for v in speed]) - 1
+    runner = 0.97 * rig.height_of_pelvis + gait.bounce_m(stride, step_s, flight)
+    return (1 - run) * upright + run * runner
+
+
+def _trunk(
+    plan: Plan, style: Style, swing: gait.Swing, t_s: Float, yaw: Float, pelvis: Float
+) -> dict[str, Float]:
+    keys = plan.keys
+    breath = np.radians(0.6) * np.sin(2 * np.pi * style.breath_hz * t_s + style.sway_phase[2])
+    chest_yaw = yaw + swing.chest_yaw + _deg(keys, "chest_yaw_deg", t_s)
+    lean = swing.lean + _deg(keys, "lean_deg", t_s) + breath
+    side = _deg(keys, "side_deg", t_s)
+    chest = multiply(multiply(about(2, chest_yaw), about(1, lean)), about(0, side))
+    look = _deg(keys, "look_deg", t_s)
+    head = multiply(about(2, yaw + 0.3 * (chest_yaw - yaw)), about(1, 0.45 * lean + look))
+    third = np.full(len(t_s), 1 / 3)
+    return {
+        "spine": partly(pelvis, chest, third),
+        "back": partly(pelvis, chest, 2 * third),
+        "chest": chest,
+        "neck": partly(chest, head, 1.5 * third),
+        "head": head,
+    }
+
+
+def _arms(
+    rig: Rig,
+    plan: Plan,
+    swing: gait.Swing,
+    t_s: Float,
+    root: Float,
+    bones: dict[str, Float],
+    floor: Float,
+) -> None:
+    """Clavicles, arms and hands: hanging, swinging, or reaching for a height."""
+    keys = plan.keys
+    chest = bones["chest"]
+    shoulders = root
+    for below, bone in (("pelvis", "spine"), ("spine", "back"), ("back", "chest")):
+        shoulders = shoulders + rotate(bones[below], rig.offset[BONE[bone]])
+    for index, (sign, side) in enumerate(zip((1.0, -1.0), SIDES, strict=True)):
+        flexed = swing.shoulder[:, index] + _deg(keys, f"{side}_shoulder_deg", t_s)
+        raised = swing.abduction[:, index] + _deg(keys, f"{side}_abduct_deg", t_s)
+        elbow = swing.elbow[:, index] + _deg(keys, f"{side}_elbow_deg", t_s)
+        reaching = keys.at(f"{side}_reach", t_s)
+        height = keys.at(f"{side}_reach_m", t_s)
+        upper_arm, forearm = (rig.offset[BONE[f"{side}_{bone}"]] for bone in ("forearm", "hand"))
+        joint = rig.offset[BONE[f"{side}_clavicle"]]
+        out = rig.offset[BONE[f"{side}_upper_arm"]]
+
+        level = shoulders[:, 2] + rotate(chest, joint + out)[:, 2] - floor
+        lift = np.radians(22.0) * reaching * np.clip((height - level) / 0.4 + 0.2, 0.0, 1.0)
+        clavicle = multiply(chest, about(0, sign * lift))
+        shoulder = shoulders + rotate(chest, joint) + rotate(clavicle, out)
+
+        arm = multiply(multiply(chest, about(0, sign * raised)), about(1, -flexed))
+        # Hanging arms are turned in, so that bent elbows bring the hands ahead of the body.
+        arm = multiply(arm, about(2, np.full(len(t_s), -sign * np.radians(18.0))))
+        lower = multiply(arm, about(1, -elbow))
+        if reaching.any():
+            up = height + floor - shoulder[:, 2]
+            far = 0.97 * np.sqrt(np.sum(upper_arm**2)) + 0.97 * np.sqrt(np.sum(forearm**2))
+            up = np.clip(up, -far, far)
+            ahead = np.minimum(np.sqrt(np.maximum(far**2 - up**2, 0.0)), 0.75 * far)
+            towards = rotate(about(2, _yaw(chest)), np.stack([ahead, 0 * ahead, up], axis=1))
+            hinge = rotate(chest, np.array([0.0, -1.0, sign * 0.6]))
+            there = two_bones(upper_arm, forearm, towards, hinge)
+            arm, lower = (partly(a, b, reaching) for a, b in zip((arm, lower), there, strict=True))
+        bones |= {
+            f"{side}_clavicle": clavicle,
+            f"{side}_upper_arm": arm,
+            f"{side}_forearm": lower,
+            f"{side}_hand": multiply(lower, about(1, np.full(len(t_s), np.radians(-8.0)))),
+        }
+
+
+def _yaw(rotation: Float) -> Float:
+    """[T] rad, where x points over the ground."""
+    ahead = rotate(rotation, np.array([1.0, 0.0, 0.0]))
+    return np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))

@@ -1,0 +1,224 @@
+"""The plan of a motion: which way the body goes, when which foot steps where, and the keys of every curve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.simulation.motion import gait
+from pipelines.simulation.motion.keys import Keys
+from pipelines.simulation.motion.ways import Pace, Part, Way, pace
+
+Float = NDArray[np.float64]
+Curve = Callable[[Float], Float]
+
+LEFT, RIGHT = 0, 1
+_STANDING_HALF_M, _WALKING_HALF_M, _RUNNING_HALF_M = 0.085, 0.048, 0.025  # between the feet, per 1.75 m
+_TOE_OUT = np.radians(6.0)
+_TURN_RATE, _TURN_CADENCE = np.radians(65.0), 1.9
+_LAST_STEPS_CADENCE = 1.5
+_STILL_M, _STILL_RAD = 0.01, np.radians(2.0)
+
+
+@dataclass(frozen=True)
+class Footstep:
+    """A foot leaves the ground and comes down elsewhere."""
+
+    lift_s: float
+    strike_s: float
+    place: Float  # [2] m, below the ankle when the sole is flat
+    yaw: float  # rad
+    run: float  # 0 walks, 1 runs
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A time during which the body goes somewhere or turns: where it is, is a function of time."""
+
+    start_s: float
+    end_s: float
+    way: Way | None
+    along_m: Curve | None  # an antiderivative of the speed, of seconds since the start; None on the spot
+    place: Float  # [2] m, where there is no way
+    turn: tuple[float, float]  # rad, heading from and to, where there is no way
+
+    def at(self, t_s: Float) -> tuple[Float, Float]:
+        """[N, 2] m and heading [N] in rad; held before the start and after the end."""
+        since = np.clip(t_s - self.start_s, 0.0, self.end_s - self.start_s)
+        if self.way is not None and self.along_m is not None:
+            return self.way.place(self.along_m(since))
+        share = since / (self.end_s - self.start_s)
+        smooth = share * share * share * (10 - 15 * share + 6 * share * share)
+        heading = self.turn[0] + smooth * (self.turn[1] - self.turn[0])
+        return np.broadcast_to(self.place, (len(t_s), 2)), heading
+
+
+@dataclass
+class Plan:
+    """What has been planned up to `t_s`; the body stands there at `place`, looking along `heading`."""
+
+    place: Float  # [2] m
+    heading: float  # rad
+    leg_m: float
+    step_width: float = 1.0  # by the usual
+    t_s: float = 0.0
+    stride: float = 0.0  # rad, of the last strike
+    keys: Keys = field(default_factory=Keys)
+    stretches: list[Stretch] = field(default_factory=list)
+    feet: tuple[list[Footstep], list[Footstep]] = field(default_factory=lambda: ([], []))
+
+    def __post_init__(self) -> None:
+        """Put both feet beside each other under the body."""
+        for foot in (LEFT, RIGHT):
+            place, yaw = self._beside(foot, self.place, self.heading, 0.0, 0.0)
+            self.feet[foot].append(Footstep(-2.0, -1.0, place, yaw, 0.0))
+        self.keys.add("stride", (-1.0, 0.0))
+
+    def body_at(self, t_s: Float, start: Float, heading: float) -> tuple[Float, Float]:
+        """Where the body is, [T, 2] m, and its heading [T] in rad, from where it began."""
+        place = np.broadcast_to(start, (len(t_s), 2)).copy()
+        towards = np.full(len(t_s), heading)
+        for stretch in self.stretches:
+            later = t_s >= stretch.start_s
+            place[later], towards[later] = stretch.at(t_s[later])
+        return place, towards
+
+    # --- what a body does with its feet ----------------------------------------------------------------
+
+    def stay(self, seconds: float) -> None:
+        """Leave the feet where they are."""
+        self.t_s += seconds
+
+    def turn(self, angle: float) -> None:
+        """On the spot by an angle in rad, to the left if positive."""
+        if abs(angle) < _STILL_RAD / 20:
+            return
+        lasting = abs(angle) / _TURN_RATE * 1.4 + 0.3
+        turn = (self.heading, self.heading + angle)
+        stretch = Stretch(self.t_s, self.t_s + lasting, None, None, self.place, turn)
+        self._step_through(
+            stretch, [(0.0, 0.0, 0.0)], first=LEFT if angle > 0 else RIGHT, least=_TURN_CADENCE
+        )
+
+    def travel(self, parts: Sequence[Part]) -> None:
+        """From a stand to a stand."""
+        knots = pace(parts).knots
+        stretch = self._along(parts, Pace(knots))
+        self._step_through(stretch, knots, first=RIGHT)
+
+    def run_up(self, parts: Sequence[Part], speeds: Pace, plant_s: float, foot: int) -> Stretch:
+        """Run so that `foot` strikes `plant_s` after the start, and take no step after that one.
+
+        The caller plans the rest of the steps and sets the time.
+        """
+        stretch = self._along(parts, speeds)
+        knots = [knot for knot in speeds.knots if knot[0] <= plant_s + 1e-9]
+        phase = self._phase(knots, 0.0)
+        count = max(2, round(float(phase(np.array(plant_s)))))
+        first = foot if count % 2 else 1 - foot
+        self._walk_steps(stretch, knots, first, count, stretch_phase=count / float(phase(np.array(plant_s))))
+        return stretch
+
+    def step(self, foot: int, lift_s: float, strike_s: float, at: tuple[Float, float], run: float) -> None:
+        """Put a foot beside where the body is to be: its place [2] in m and its heading in rad."""
+        self._put(foot, lift_s, strike_s, self._beside(foot, *at, 0.0, 0.0), run)
+
+    # --- how -------------------------------------------------------------------------------------------
+
+    def _along(self, parts: Sequence[Part], speeds: Pace) -> Stretch:
+        from scipy.interpolate import CubicHermiteSpline
+
+        times, values, run = np.array(speeds.knots).T
+        along = CubicHermiteSpline(times, values, np.zeros_like(values)).antiderivative()
+        way = Way(self.place, parts)
+        for name, curve in (("speed", values), ("run", run)):
+            self.keys.add(name, *zip(self.t_s + times, curve, strict=True))
+        running = [gait.running(v) * r for v, r in zip(values, run, strict=True)]
+        self.keys.add("running", *zip(self.t_s + times, running, strict=True))
+        return Stretch(self.t_s, self.t_s + times[-1], way, along, self.place, (0.0, 0.0))
+
+    def _phase(self, knots: Sequence[tuple[float, float, float]], least: float) -> Curve:
+        """Steps since the start, as a function of seconds since then."""
+        from scipy.interpolate import CubicHermiteSpline
+
+        cadence = [max(gait.cadence(v, r * gait.running(v), self.leg_m), least) for _, v, r in knots]
+        times = [knot[0] for knot in knots]
+        # Standing still at either end, the steps go on at a pace of their own.
+        times, cadence = [times[0] - 5.0, *times, times[-1] + 5.0], [cadence[0], *cadence, cadence[-1]]
+        phase = CubicHermiteSpline(times, cadence, np.zeros(len(times))).antiderivative()
+        began = float(phase(0.0))
+        return lambda t_s: phase(t_s) - began
+
+    def _step_through(
+        self,
+        stretch: Stretch,
+        knots: Sequence[tuple[float, float, float]],
+        *,
+        first: int,
+        least: float = _LAST_STEPS_CADENCE,
+    ) -> None:
+        """Step until both feet stand under the body at the end of the stretch."""
+        self._walk_steps(stretch, knots, first, None, least=least)
+
+    def _walk_steps(
+        self,
+        stretch: Stretch,
+        knots: Sequence[tuple[float, float, float]],
+        first: int,
+        count: int | None,
+        *,
+        least: float = 0.0,
+        stretch_phase: float = 1.0,
+    ) -> None:
+        phase = self._phase(knots, least)
+        lasting = stretch.end_s - stretch.start_s
+        fine = np.linspace(-3.0, lasting + 5.0, int((lasting + 8.0) / 0.005))
+        phases = phase(fine) * stretch_phase
+
+        def when(at_phase: float) -> float:
+            return stretch.start_s + float(np.interp(at_phase, phases, fine))
+
+        times, speeds, runs = np.array(knots).T
+        landed, number = 0, 0
+        while (landed < 2) if count is None else (number < count):
+            number += 1
+            strike_s = when(number)
+            since = strike_s - stretch.start_s
+            speed = float(np.interp(since, times, speeds))
+            run = float(np.interp(since, times, runs)) * gait.running(speed)
+            in_air = gait.swing_steps(speed, run)
+            lift_s = max(when(number - in_air), stretch.start_s)
+            # The stance lasts 2 - in_air steps.
+            above_s = when(number + gait.above_foot(run) * (2 - in_air))
+            (place,), (heading,) = stretch.at(np.array([above_s]))
+            foot = first if number % 2 else 1 - first
+            self._put(foot, lift_s, strike_s, self._beside(foot, place, heading, speed, run), run)
+            self.t_s = strike_s
+            landed = landed + 1 if above_s >= stretch.end_s else 0
+        self.stretches.append(stretch)
+        (self.place,), (self.heading,) = (values.copy() for values in stretch.at(np.array([stretch.end_s])))
+
+    def _beside(
+        self, foot: int, place: Float, heading: float, speed: float, run: float
+    ) -> tuple[Float, float]:
+        walks = min(speed / 0.9, 1.0)
+        half = (1 - walks) * _STANDING_HALF_M + walks * ((1 - run) * _WALKING_HALF_M + run * _RUNNING_HALF_M)
+        half *= self.step_width * self.leg_m / 0.86 * (1 if foot == LEFT else -1)
+        across = half * np.array([-np.sin(heading), np.cos(heading)])
+        return place + across, heading + _TOE_OUT * (1 if foot == LEFT else -1) * (1 - 0.6 * run)
+
+    def _put(self, foot: int, lift_s: float, strike_s: float, at: tuple[Float, float], run: float) -> None:
+        before = self.feet[foot][-1]
+        place, yaw = at
+        moved = float(np.hypot(*(place - before.place)))
+        side = 0.0 if foot == LEFT else np.pi
+        # The next stride angle, beyond the last strike's, that belongs to this foot.
+        steps = np.ceil((self.stride - side) / (2 * np.pi) + 0.25)
+        self.stride = side + 2 * np.pi * float(steps)
+        self.keys.add("stride", (strike_s, self.stride))
+        if moved < _STILL_M and abs(yaw - before.yaw) < _STILL_RAD:
+            return
+        self.feet[foot].append(Footstep(max(lift_s, before.strike_s + 0.05), strike_s, place, yaw, run))

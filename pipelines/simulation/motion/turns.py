@@ -1,0 +1,42 @@
+"""Rotations that bodies are made of: about one axis, from three axes, part of the way."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.poses import (
+    conjugate,
+    multiply,
+    quaternion_from_matrix,
+    quaternion_from_rotation_vector,
+    rotation_vector_from_quaternion,
+)
+
+Float = NDArray[np.float64]
+
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def about(axis: int, angle: Float) -> Float:
+    """[T, 4] rotations about x, y or z (0, 1, 2) by [T] rad; y turns forward (x) down, z to the left."""
+    turned = np.zeros((len(angle), 4))
+    turned[:, axis] = np.sin(angle / 2)
+    turned[:, 3] = np.cos(angle / 2)
+    return turned
+
+
+def partly(start: Float, end: Float, share: Float) -> Float:
+    """[T, 4] rotations that are `share` [T] of the shortest way from one to another."""
+    vector = rotation_vector_from_quaternion(multiply(conjugate(start), end))
+    return multiply(start, quaternion_from_rotation_vector(share[:, None] * vector))
+
+
+def from_axes(forward: Float, left: Float, up: Float) -> Float:
+    """[T, 4] rotations that take x, y, z to these orthonormal [T, 3] axes."""
+    return quaternion_from_matrix(np.stack([forward, left, up], axis=-1))
+
+
+def unit(vectors: Float) -> Float:
+    """[T, 3] of length 1."""
+    return np.asarray(vectors / np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True)), dtype=np.float64)
