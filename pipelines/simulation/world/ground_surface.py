@@ -17,8 +17,8 @@ Int64 = NDArray[np.int64]
 _FAR_M = 2000.0  # beyond, the horizon is less than two pixels away for a drone at 5 m
 _CELLS = 16  # along the ground's square, at least
 _GROWTH = 0.5  # cells outside are at most half as wide as their distance from it
-_FLATNESS_M = 0.01  # how far triangles may be from the ground
-_FINEST = 15  # halvings of the whole
+_FLATNESS_M = 0.02  # how far triangles may be from the ground
+_FINEST = 17  # halvings of the whole: cells of 3 to 6 cm, however steep a mound
 _PATCHES = 0.16  # how much darker meadows get in patches
 
 

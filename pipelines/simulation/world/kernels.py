@@ -123,7 +123,8 @@ def hidden(
         # From the target: drones look down, so the way to them soon climbs faster than any mound.
         start = (target[n, 0], target[n, 1], target[n, 2])
         way = (eye[n, 0] - start[0], eye[n, 1] - start[1], eye[n, 2] - start[2])
-        out[n] = (
+        known = math.isfinite(way[0] + way[1] + way[2])
+        out[n] = known and (
             _meets_tree(trunks, crowns, start, way)
             or _meets_slab(slabs, start, way)
             or _meets_ground(mounds, slope, curvature, start, way)

@@ -15,8 +15,10 @@ Faces = NDArray[np.int32]
 
 _SIDES = 10  # of a trunk
 _RINGS = 5
-_CLUSTERS = 11  # of leaves in a crown
-_RAGGED = 0.05  # how far leaves stand out of their cluster, of the crown's radius (sigma)
+_CLUSTERS = 16  # of leaves in a crown
+_HEART = 0.8  # radius of what is filled with leaves anyway: no line of sight slips through
+_OUTLINE = 12
+_RAGGED = 0.04  # how far leaves stand out of their cluster, of the crown's radius (sigma)
 _MANY_TREES = 40  # more are drawn with fewer triangles each
 _BARK = (0.16, 0.115, 0.08)
 _GREENS = ((0.10, 0.19, 0.045), (0.13, 0.22, 0.05), (0.075, 0.155, 0.05), (0.165, 0.22, 0.06))
@@ -73,19 +75,20 @@ def _drawn_trunk(trunk: Float, rng: np.random.Generator) -> Surface:
 def _drawn_crown(crown: Float, sphere: tuple[Float, Faces], rng: np.random.Generator) -> Surface:
     """Clusters of leaves around the middle: the outermost of some balls in every direction.
 
-    The whole is scaled to the volume of the ellipsoid: the mean of radius^3 over directions is 1.
+    An outline shows the outermost leaves. A high mean of the radius over all directions is therefore scaled
+    to 1, so that outlines are as large as the ellipsoid's.
     """
     direction, faces = sphere
-    middle = _spread(_CLUSTERS, rng) * rng.uniform(0.5, 0.62, _CLUSTERS)[:, None]
-    size = rng.uniform(0.4, 0.52, _CLUSTERS)
+    middle = _spread(_CLUSTERS, rng) * rng.uniform(0.58, 0.66, _CLUSTERS)[:, None]
+    size = rng.uniform(0.38, 0.46, _CLUSTERS)
     toward = np.einsum("vk,ck->vc", direction, middle)
     inside = size**2 - (middle**2).sum(axis=1) + toward**2
     reach = np.where(inside > 0, toward + np.sqrt(np.maximum(inside, 0)), 0)
     nearest = reach.argmax(axis=1)
-    radius = np.maximum(reach.max(axis=1), 0.72)  # a heart, so that no line of sight slips through
-    depth = np.clip((radius - 0.72) / 0.3, 0, 1)
-    radius = np.clip(radius + rng.normal(0, _RAGGED, len(radius)), 0.6, 1.3)
-    radius /= np.cbrt((radius**3).mean())
+    radius = np.maximum(reach.max(axis=1), _HEART)
+    depth = np.clip((radius - _HEART) / (1.05 - _HEART), 0, 1)
+    radius = np.clip(radius + rng.normal(0, _RAGGED, len(radius)), 0.7, 1.2)
+    radius /= (radius**_OUTLINE).mean() ** (1 / _OUTLINE)
     green = np.array(_GREENS)[rng.integers(len(_GREENS))] * rng.uniform(0.85, 1.15)
     tone = rng.uniform(0.75, 1.25, _CLUSTERS)[nearest] * (0.5 + 0.5 * depth)  # dark between the clusters
     tone *= rng.uniform(0.75, 1.25, len(radius))

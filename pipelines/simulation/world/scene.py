@@ -42,9 +42,9 @@ class World:
     def surfaces(self) -> list[Surface]:
         """What is to be seen: the ground out to the horizon, then trunks, crowns and walls if there are any.
 
-        The ground is within 1 cm of `height` near mounds, trunks within 2.5 % of their radius. Crowns are
-        ragged, with leaves up to a quarter beyond or short of the ellipsoid that `solid` and `hidden` know,
-        but have its volume.
+        The ground is within 2 cm of `height`, trunks within 4 % of their radius, walls exact. Crowns are
+        ragged, with leaves up to a fifth beyond or three tenths short of the ellipsoid that `solid` and
+        `hidden` know; seen from anywhere, about nine tenths of both outlines' union is common to both.
         """
         return [
             ground_surface(self.ground, self.terrain, self.seed),

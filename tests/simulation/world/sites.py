@@ -1,0 +1,37 @@
+"""Worlds with a bit of everything, for tests."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.simulation import scenario
+from pipelines.simulation.world import World, build_world
+
+Float = NDArray[np.float64]
+
+NOBODY: Float = np.zeros((0, 2))
+
+MOUNDS = [
+    {"centre": [4.0, 3.0], "sigma_m": [3.0, 1.5], "height_m": 2.0, "yaw_deg": 30.0},
+    {"centre": [-5.0, 1.0], "sigma_m": [2.0, 2.0], "height_m": 0.8},
+]
+TREES = [
+    {"position": [0.0, 5.0], "height_m": 5.0, "crown_radius_m": 1.2},
+    {"position": [4.5, 2.0], "height_m": 3.0, "crown_radius_m": 0.9},
+]
+WALLS = [
+    {"start": [-6.0, -3.0], "end": [-1.0, -5.0], "height_m": 2.0},
+    {"start": [3.0, -2.0], "end": [3.0, 4.0], "height_m": 1.0, "thickness_m": 0.5},
+]
+
+
+def site(**parts: object) -> World:
+    """Whatever parts of a scenario's world are named, on a ground of 20 m."""
+    spec = scenario.World.model_validate({"ground": {"size_m": 20.0}, **parts})
+    return build_world(spec, 3, keep_clear=NOBODY)
+
+
+def everything() -> World:
+    """Two mounds that overlap, two trees, two walls."""
+    return site(mounds=MOUNDS, trees=TREES, walls=WALLS)

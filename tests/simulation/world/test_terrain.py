@@ -1,0 +1,85 @@
+"""The ground against its closed form, and its bounds against dense sampling."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.simulation import scenario
+from pipelines.simulation.world.terrain import Terrain
+from tests.simulation.world.sites import MOUNDS, everything, site
+
+Float = NDArray[np.float64]
+
+
+def closed_form(xy: Float) -> Float:
+    """h exp(-d' S^-1 d / 2) with S = R diag(sigma^2) R', mound by mound."""
+    total = np.zeros(xy.shape[:-1])
+    for mound in map(scenario.Mound.model_validate, MOUNDS):
+        yaw = np.radians(mound.yaw_deg)
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        spread = np.linalg.inv(turn @ np.diag(np.square(mound.sigma_m)) @ turn.T)
+        away = xy - np.array(mound.centre)
+        total += mound.height_m * np.exp(-np.einsum("...i,ij,...j->...", away, spread, away) / 2)
+    return total
+
+
+def scattered(count: int) -> Float:
+    return np.random.default_rng(5).uniform(-12, 12, (count, 2))
+
+
+def test_heights_are_those_of_the_formula() -> None:
+    world, xy = everything(), scattered(400).reshape(20, 20, 2)
+    assert world.height(xy).shape == (20, 20)
+    np.testing.assert_allclose(
+        world.height(xy), closed_form(xy), rtol=0, atol=1e-13
+    )  # sums of two numbers < 3
+    assert world.height(np.array([1e6, -1e6])) == 0.0, "defined everywhere"
+    assert np.array_equal(site().height(xy), np.zeros((20, 20)))
+
+
+def test_normals_are_those_of_finite_differences() -> None:
+    world, xy, step = everything(), scattered(300), 1e-5
+    slopes = [(closed_form(xy + shift) - closed_form(xy - shift)) / (2 * step) for shift in step * np.eye(2)]
+    expected = np.stack([-slopes[0], -slopes[1], np.ones(len(xy))], axis=1)
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    # Central differences err by step^2 / 6 times third derivatives (below 2) and 1e-16 / step: 1e-11 each.
+    np.testing.assert_allclose(world.normal(xy), expected, rtol=0, atol=1e-10)
+
+
+def second_derivatives(terrain: Terrain, xy: Float) -> Float:
+    """The largest in any direction, [N], by differences of slopes: the spectral norm of the Hessian."""
+    step = 1e-4
+    normals = [terrain.normal(xy + sign * shift) for shift in step * np.eye(2) for sign in (1, -1)]
+    slopes = [-normal[..., :2] / normal[..., 2:] for normal in normals]
+    hessian = np.stack([(slopes[0] - slopes[1]), (slopes[2] - slopes[3])], axis=-1) / (2 * step)
+    norms: Float = np.linalg.norm(hessian, ord=2, axis=(-2, -1))
+    return norms
+
+
+def test_no_place_is_steeper_or_more_curved_than_stated() -> None:
+    terrain = everything().terrain
+    axis = np.linspace(-12, 12, 241)
+    xy = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    normal = terrain.normal(xy)
+    steepest = (np.hypot(normal[:, 0], normal[:, 1]) / normal[:, 2]).max()
+    # The bounds add up what the mounds reach at different places, so they are not met, but of their size.
+    assert 0.6 * terrain.slope < steepest <= terrain.slope
+    curved = second_derivatives(terrain, xy)
+    assert 0.6 * terrain.curvature < curved.max() <= terrain.curvature
+    rng = np.random.default_rng(2)
+    for radius in (0.3, 2.0):
+        centre = rng.uniform(-10, 10, (40, 2))
+        bound = terrain.curvature_within(centre, radius)
+        within = np.linalg.norm(xy - centre[:, None], axis=-1) <= radius
+        assert all(curved[near].max() <= limit + 1e-6 for near, limit in zip(within, bound, strict=True))
+
+
+def test_one_mound_meets_its_bounds() -> None:
+    """Steepest at one sigma along its short axis, most curved on top."""
+    terrain = site(mounds=[{"centre": [1.0, 2.0], "sigma_m": [3.0, 1.5], "height_m": 2.0}]).terrain
+    flank, top = np.array([1.0, 3.5]), np.array([[1.0, 2.0]])
+    normal = terrain.normal(flank)
+    assert abs(np.hypot(normal[0], normal[1]) / normal[2] - terrain.slope) < 1e-12
+    # Differences err by step^2 / 6 times fourth derivatives (3 h / sigma^4 = 1.2): 2e-9.
+    assert abs(second_derivatives(terrain, top)[0] - terrain.curvature) < 1e-7
