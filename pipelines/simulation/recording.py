@@ -76,10 +76,11 @@ def log_times(rate_hz: float, span_s: tuple[float, float], rng: np.random.Genera
 def frame_times(lens: Lens, duration_s: float, rng: np.random.Generator) -> Int64:
     """Stamps [F] of the frames that one camera kept, ns since the flight's start.
 
-    The shutter is even and starts anywhere within the first frame's time. Frames are lost one by one
-    with the lens's share; the first and the last are kept.
+    The shutter is even and starts anywhere within the first frame's time, or at the flight's start where
+    shutters are synchronised. Frames are lost one by one with the lens's share; the first and the last
+    are kept.
     """
-    phase = rng.random()
+    phase = rng.random() * (lens.shutters == "free")
     count = max(0, int(np.ceil(duration_s * lens.rate_hz - phase)))
     shutter_s = np.arange(count, dtype=np.float64) / lens.rate_hz + phase / lens.rate_hz
     t_ns = _nanoseconds(shutter_s)

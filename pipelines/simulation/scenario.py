@@ -231,6 +231,7 @@ class Lens(Part):
     hfov_deg: float = Field(80.0, ge=5, le=150)
     rate_hz: float = Field(30.0, ge=1, le=240)
     dropped_share: float = Field(0.0, ge=0, lt=0.5)  # frames that the recorder lost
+    shutters: Literal["free", "synchronised"] = "free"
 
 
 class Drones(Part):

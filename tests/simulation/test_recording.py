@@ -46,6 +46,13 @@ def generator(seed: int = 0) -> np.random.Generator:
 # --- stamps --------------------------------------------------------------------------------------------
 
 
+def test_synchronised_shutters_take_their_pictures_together() -> None:
+    lens = Lens(shutters="synchronised")
+    t_ns = frame_times(lens, 1.0, generator(3))
+    assert t_ns.tolist() == [round(k * 1e9 / 30) for k in range(30)]
+    assert frame_times(Lens(), 1.0, generator(3))[0] > 0
+
+
 def test_a_log_has_stamps_of_its_own() -> None:
     t_ns = log_times(50.0, (-0.5, 9.5), generator())
     assert t_ns.dtype == np.int64
