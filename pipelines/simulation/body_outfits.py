@@ -1,0 +1,274 @@
+"""Dressing a body: which skin shows, and clothes, shoes and hair as layers that lie over each other.
+
+Garments are cut from a suit of tights that lies on the skin (MakeHuman's), each with vertices of its own
+and its own distance from the skin, so that a shirt hangs over trousers and trousers over shoes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.simulation.body_asset import PARTS
+from pipelines.simulation.body_patches import Patch, cut, normals, pick, together, triangles
+from pipelines.simulation.rig import BONE, SIDES
+
+Float = NDArray[np.float64]
+Colour = tuple[float, float, float]
+
+# Places along a limb: 0 at its root, 1 at the knee or elbow, 2 at the ankle or wrist.
+_SOCK_TOP, _SHOE_TOP = 1.78, 1.88
+_TUCKED = 0.12  # how far skin goes on under a hem, in those places: about 4 cm
+
+# Metres for a body of 1.75 m; scaled with it.
+_USUAL_HEIGHT_M = 1.75
+_SOLE_M = 0.016  # below the bare foot
+_SOLE_EDGE_M = 0.008  # above it
+_WRINKLE_M = 0.004
+_WRINKLE_PER_M = 28.0  # standard deviation of the wave numbers, rad: folds of about 20 cm
+
+
+@dataclass(frozen=True)
+class Outfit:
+    """Colours are linear RGB reflectances; `sleeve` and `leg` say where they end, in places along a limb."""
+
+    sleeve: float
+    leg: float
+    shirt: Colour
+    trousers: Colour
+    shoes: Colour
+    soles: Colour
+    skin: Colour
+    hair: Colour
+
+
+OUTFITS = {
+    "casual": Outfit(
+        sleeve=0.6,
+        leg=1.93,
+        shirt=(0.42, 0.06, 0.05),
+        trousers=(0.05, 0.08, 0.2),
+        shoes=(0.2, 0.19, 0.18),
+        soles=(0.7, 0.7, 0.66),
+        skin=(0.5, 0.31, 0.22),
+        hair=(0.035, 0.02, 0.012),
+    ),
+    "sport": Outfit(
+        sleeve=0.45,
+        leg=0.72,
+        shirt=(0.06, 0.3, 0.62),
+        trousers=(0.05, 0.05, 0.06),
+        shoes=(0.65, 0.08, 0.06),
+        soles=(0.75, 0.75, 0.75),
+        skin=(0.33, 0.18, 0.115),
+        hair=(0.012, 0.009, 0.008),
+    ),
+    "dark": Outfit(
+        sleeve=1.93,
+        leg=1.93,
+        shirt=(0.025, 0.027, 0.03),
+        trousers=(0.035, 0.035, 0.042),
+        shoes=(0.02, 0.02, 0.02),
+        soles=(0.03, 0.03, 0.03),
+        skin=(0.5, 0.31, 0.22),
+        hair=(0.02, 0.014, 0.01),
+    ),
+    "bright": Outfit(
+        sleeve=1.93,
+        leg=1.93,
+        shirt=(0.8, 0.36, 0.03),
+        trousers=(0.55, 0.5, 0.41),
+        shoes=(0.6, 0.6, 0.6),
+        soles=(0.3, 0.2, 0.12),
+        skin=(0.55, 0.36, 0.27),
+        hair=(0.16, 0.09, 0.035),
+    ),
+}
+_LIPS, _BROW, _WHITE, _IRIS = (0.36, 0.13, 0.11), (0.04, 0.025, 0.015), (0.7, 0.7, 0.68), (0.05, 0.04, 0.03)
+_SOCKS = (0.65, 0.65, 0.65)
+
+
+@dataclass(frozen=True)
+class Undressed:
+    """A body at rest as the asset has it, in metres."""
+
+    vertices: Float  # [V, 3]
+    quads: NDArray[np.intp]  # [Q, 4]
+    part: NDArray[np.uint8]  # [V]
+    weights: Float  # [V, 22]
+    joint: Float  # [22, 3]
+    height_m: float
+
+
+@dataclass(frozen=True)
+class Dressed:
+    """What is seen of a person, at rest."""
+
+    vertices: Float  # [N, 3] m
+    weights: Float  # [N, 22]
+    faces: NDArray[np.int32]  # [F, 3]
+    colour: NDArray[np.float32]  # [N, 3]
+    sole: NDArray[np.bool_]  # [N] the level undersides of the shoes
+
+
+def dress(body: Undressed, outfit: Outfit, *, hair_m: float) -> Dressed:
+    """Put clothes, shoes and hair on a body; hair stands `hair_m` off the scalp on a body of 1.75 m."""
+    unit = body.height_m / _USUAL_HEIGHT_M
+    waist = body.joint[BONE["pelvis"], 2] + 0.02 * unit
+    skin, suit = _bare(body), _suit(body)
+
+    arm, leg, above = suit.values["arm"], suit.values["leg"], suit.values["place"][:, 2]
+    shirt = cut(suit, np.minimum(outfit.sleeve - arm, above - waist + 0.08 * unit))
+    shirt = cut(shirt, shirt.values["below_collar"])
+    trousers = cut(suit, np.minimum(outfit.leg - leg, waist - above - 0.03 * unit))
+    shoes = cut(suit, leg - _SOCK_TOP)
+
+    worn = _put_on(shirt, outfit.shirt, (0.018 + _WRINKLE_M * shirt.values["wrinkle"]) * unit)
+    loose = np.clip((trousers.values["leg"] - 0.1) / 1.6, 0.0, 1.0)
+    fold_m = _WRINKLE_M * trousers.values["wrinkle"] * np.clip(2 * loose, 0.2, 1.0)
+    worn_below = _put_on(trousers, outfit.trousers, (0.006 + 0.014 * loose + fold_m) * unit)
+    layers = [*_skin_and_hair(skin, outfit, hair_m * unit), worn, worn_below, *_shoes(shoes, outfit, unit)]
+    whole = together(layers, ("place", "weights", "colour", "sole"))
+    return Dressed(
+        whole.values["place"],
+        whole.values["weights"],
+        whole.faces.astype(np.int32),
+        np.clip(whole.values["colour"], 0.0, 1.0).astype(np.float32),
+        whole.values["sole"] > 0,
+    )
+
+
+# --- the patches that all is cut from ------------------------------------------------------------------
+
+
+def _bare(body: Undressed) -> Patch:
+    """Skin and eyes."""
+    quads = body.quads[body.part[body.quads].min(axis=1) != PARTS.index("cloth")]
+    return _with_values(body, triangles(quads))
+
+
+def _suit(body: Undressed) -> Patch:
+    """The tights that clothes are cut from."""
+    quads = body.quads[body.part[body.quads].min(axis=1) == PARTS.index("cloth")]
+    return _with_values(body, triangles(quads))
+
+
+def _with_values(body: Undressed, faces: NDArray[np.intp]) -> Patch:
+    unit = body.height_m / _USUAL_HEIGHT_M
+    x, _, z = (body.vertices - body.joint[BONE["neck"]]).T / unit
+    eyes = body.vertices[body.part == PARTS.index("white")].mean(axis=0)
+    ahead, _, above = (body.vertices - eyes).T / unit
+    values = {
+        "place": body.vertices,
+        "normal": normals(body.vertices, faces),
+        "weights": body.weights,
+        "part": body.part.astype(np.float64),
+        "arm": _along_limb(body, ("upper_arm", "forearm", "hand")),
+        "leg": _along_limb(body, ("thigh", "shank", "foot")),
+        "below_collar": 0.012 - 0.35 * np.maximum(x - 0.02, 0.0) - z,
+        "hairy": _on_scalp(ahead, above),
+        "wrinkle": _wrinkles(body.vertices / unit),
+        "rough": np.random.default_rng(1).normal(0.0, 1.0, len(body.vertices)),
+        "sole": np.zeros(len(body.vertices)),
+    }
+    return pick(Patch(values, faces), np.ones(len(faces), dtype=np.bool_))
+
+
+def _along_limb(body: Undressed, bones: tuple[str, str, str]) -> Float:
+    """[V] the place along an arm or leg, by the side a vertex is on; negative or zero off the limb."""
+    place = np.zeros(len(body.vertices))
+    for sign, side in zip((1.0, -1.0), SIDES, strict=True):
+        root, bend, end = (body.joint[BONE[f"{side}_{name}"]] for name in bones)
+        upper = _share(body.vertices, root, bend)
+        lower = _share(body.vertices, bend, end)
+        on_side = body.vertices[:, 1] * sign > 0
+        place = np.where(on_side, np.minimum(upper, 1.0) + np.maximum(lower, 0.0), place)
+    names = (*bones, "toes") if bones[2] == "foot" else bones
+    held = body.weights[:, [BONE[f"{side}_{name}"] for side in SIDES for name in names]].sum(axis=1)
+    return np.where(held > 0.5, place, np.minimum(place, 0.0))
+
+
+def _share(points: Float, start: Float, end: Float) -> Float:
+    way = end - start
+    share: Float = np.einsum("vi,i->v", points - start, way) / np.sum(way * way)
+    return share
+
+
+def _on_scalp(ahead: Float, above: Float) -> Float:
+    """[V] how far hair grows beyond its line, m; places relative to the middle of the eyes.
+
+    The line goes over the forehead, down before the ears, round behind them and along the nape.
+    """
+    crown = above - 0.06 + 0.25 * np.maximum(-ahead - 0.02, 0.0)
+    sides = np.minimum(-ahead - 0.045, above - 0.012)
+    back = np.minimum(-ahead - 0.112, above + 0.06)
+    return np.maximum(np.maximum(crown, sides), back)
+
+
+def _wrinkles(vertices: Float) -> Float:
+    """[V] folds of cloth, -1.5..1.5: a sum of plane waves, the same for everyone."""
+    draw = np.random.default_rng(0)
+    wave, phase = draw.normal(0.0, _WRINKLE_PER_M, (12, 3)), draw.uniform(0.0, 2 * np.pi, 12)
+    folds = np.sin(np.einsum("vi,ki->vk", vertices, wave) + phase).sum(axis=1) / np.sqrt(12)
+    clipped: Float = np.clip(folds, -1.5, 1.5)
+    return clipped
+
+
+# --- layers --------------------------------------------------------------------------------------------
+
+
+def _put_on(patch: Patch, colour: Colour, off_m: Float) -> Patch:
+    """A layer of one colour, [V] m outward from the body."""
+    place = patch.values["place"] + off_m[:, None] * patch.values["normal"]
+    shade = 1 + 0.1 * patch.values["wrinkle"] + 0.04 * patch.values["rough"]
+    return patch.replaced(place=place, colour=np.array(colour) * shade[:, None])
+
+
+def _skin_and_hair(skin: Patch, outfit: Outfit, hair_m: float) -> tuple[Patch, Patch]:
+    """Skin where an outfit bares it, and a little under every hem; hair on the scalp."""
+    arm, leg = skin.values["arm"], skin.values["leg"]
+    bare = (arm > outfit.sleeve - _TUCKED) | ((leg > outfit.leg - _TUCKED) & (leg < _SOCK_TOP + _TUCKED))
+    bare |= (skin.values["below_collar"] < 0.04) & (arm <= 0)
+    shown = pick(skin, np.any(bare[skin.faces], axis=1))
+
+    # Hair grows from the skin of the head alone: not from eyes, nor from whatever else is as high.
+    head = shown.values["weights"][:, BONE["head"]] + shown.values["weights"][:, BONE["neck"]] > 0.9
+    is_skin = shown.values["part"] == PARTS.index("skin")
+    grows = np.where(head & is_skin, shown.values["hairy"], -1.0)
+    hair = cut(shown, grows)
+    off_m = hair_m * np.clip(hair.values["hairy"] / 0.02, 0.2, 1.0)
+    bald = cut(shown, 0.004 - grows)
+    tone = _skin_colours(outfit)[np.rint(bald.values["part"]).astype(np.intp)]
+    bald = bald.replaced(colour=tone * (1 + 0.03 * bald.values["rough"])[:, None])
+    return bald, _put_on(hair, outfit.hair, off_m)
+
+
+def _skin_colours(outfit: Outfit) -> Float:
+    """[P, 3] by `PARTS`; lips are as much darker as the skin."""
+    darker = np.array(outfit.skin) / np.array(OUTFITS["casual"].skin)
+    by_part = dict.fromkeys(PARTS, np.array(outfit.skin))
+    by_part |= {"lips": darker * _LIPS, "brow": np.array(_BROW)}
+    by_part |= {"white": np.array(_WHITE), "iris": np.array(_IRIS)}
+    return np.stack([by_part[part] for part in PARTS])
+
+
+def _shoes(patch: Patch, outfit: Outfit, unit: float) -> list[Patch]:
+    """Shoes with level soles below the bare feet, and the socks above them."""
+    place, normal, leg = (patch.values[name] for name in ("place", "normal", "leg"))
+    off_m = np.where(leg > _SHOE_TOP, 0.007, 0.006) * unit
+    sole = (place[:, 2] < 0.014 * unit) | ((normal[:, 2] < -0.45) & (place[:, 2] < 0.03 * unit))
+    place = place + off_m[:, None] * normal
+    place[sole, 2] = -_SOLE_M * unit
+    place[:, 2] = np.maximum(place[:, 2], -_SOLE_M * unit)
+    whole = patch.replaced(place=place, sole=sole.astype(np.float64))
+
+    edge_m = _SOLE_EDGE_M * unit
+    below = cut(whole, edge_m - place[:, 2])
+    above = cut(whole, place[:, 2] - edge_m)
+    shoe, sock = (cut(above, side * (above.values["leg"] - _SHOE_TOP)) for side in (1.0, -1.0))
+    return [
+        _put_on(part, colour, np.zeros(len(part.values["leg"])))
+        for part, colour in ((below, outfit.soles), (shoe, outfit.shoes), (sock, _SOCKS))
+    ]
