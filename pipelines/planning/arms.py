@@ -1,0 +1,192 @@
+"""The arms that are compared: ways to decide which slots the cameras take.
+
+All share forecast, local planner and tracking. An arm is one object with a name that starts a
+`FormationPlanner` for a flight; a package adds one by an entry point in `mocap.planner_arms`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.costs import cost_map, costs_of_slots, error_map
+from pipelines.planning.distance_field import DistanceField
+from pipelines.planning.formation import (
+    YAW,
+    FormationPath,
+    formation_slots,
+    slot_offsets,
+    wrapped,
+    yaw_set,
+)
+from pipelines.planning.information import log_determinant, ray_information
+from pipelines.planning.search import best_sequence, lattice
+
+Float = NDArray[np.float64]
+
+_TOO_NEAR = 100.0  # cost of a slot within the separation of another drone's: more than anything it gains
+
+
+class FormationPlanner(Protocol):
+    """Decides for one flight which slots the cameras take."""
+
+    def plan(self, t_s: float, commanded: Float, actor: Float, field: DistanceField) -> FormationPath:
+        """Decide anew.
+
+        Args:
+            t_s: now.
+            commanded: [n, 3] the slots that are commanded now (yaw rad, tilt rad, range m).
+            actor: [T, 3] forecast at the knots t_s + knot_s, t_s + 2 knot_s, ...
+            field: what stands around.
+        """
+
+
+class Arm(Protocol):
+    """A way to plan formations."""
+
+    @property
+    def name(self) -> str:
+        """What the user writes after `--arms`."""
+
+    @property
+    def title(self) -> str:
+        """What reports call it."""
+
+    def start(self, config: PlannerConfig, *, drones: int, yaw_rad: float) -> FormationPlanner:
+        """A planner for a flight whose first camera starts at that yaw."""
+
+
+@dataclass(frozen=True)
+class _FixedArm:
+    name: str = "fixed"
+    title: str = "fixed yaw"
+
+    def start(self, config: PlannerConfig, *, drones: int, yaw_rad: float) -> FormationPlanner:
+        return _Fixed(config, drones, yaw_rad)
+
+
+@dataclass(frozen=True)
+class _SearchingArm:
+    name: str
+    title: str
+    predicts_error: bool = False
+
+    def start(self, config: PlannerConfig, *, drones: int, yaw_rad: float) -> FormationPlanner:
+        return _Formation(config, drones, yaw_rad, predicts_error=self.predicts_error)
+
+
+@dataclass(frozen=True)
+class _GreedyArm:
+    name: str = "greedy"
+    title: str = "each drone on its own, most information first"
+
+    def start(self, config: PlannerConfig, *, drones: int, yaw_rad: float) -> FormationPlanner:
+        return _Greedy(config, drones, yaw_rad)
+
+
+FIXED: Arm = _FixedArm()
+ADAPTIVE: Arm = _SearchingArm("adaptive", "adaptive formation")
+COVARIANCE: Arm = _SearchingArm("covariance", "adaptive formation, predicted error", predicts_error=True)
+GREEDY: Arm = _GreedyArm()
+
+
+class _Fixed:
+    """The yaw of the start for ever; only the local planner gives way."""
+
+    def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
+        self._slots = formation_slots(
+            np.array([yaw_rad]), drones, tilt_rad=config.tilt_rad, range_m=config.radius_m
+        )
+        self._rates = np.array(config.slot_rates)
+
+    def plan(self, t_s: float, commanded: Float, actor: Float, field: DistanceField) -> FormationPath:  # noqa: ARG002
+        return FormationPath(np.array([t_s]), self._slots, self._rates)
+
+
+class _Formation:
+    """The whole formation as one state: yaw (Ho et al.), or yaw, tilt and range to predict errors."""
+
+    def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float, *, predicts_error: bool) -> None:
+        tilts = np.radians(config.tilts_deg) if predicts_error else np.array([config.tilt_rad])
+        ranges = np.array(config.ranges_m) if predicts_error else np.array([config.radius_m])
+        states = _all_states(yaw_set(config.yaws, yaw_rad), tilts, ranges)
+        self._lattice = lattice(
+            states, rates=np.array(config.slot_rates), knot_s=config.knot_s, w_turn=config.w_turn
+        )
+        first = formation_slots(np.zeros(len(states)), drones, tilt_rad=0.0, range_m=0.0)
+        self._slots = states[:, None] + first  # [S, n, 3]
+        self._offsets = slot_offsets(self._slots)
+        self._config, self._predicts_error = config, predicts_error
+
+    def plan(self, t_s: float, commanded: Float, actor: Float, field: DistanceField) -> FormationPath:
+        costs = costs_of_slots(field, actor, self._offsets, self._config)
+        cost = cost_map(costs, self._config)
+        if self._predicts_error:
+            cost += self._config.w_error * error_map(costs, self._offsets, self._config)
+        sequence, _ = best_sequence(cost, self._lattice, commanded[0])
+        return _path(t_s, commanded, self._slots[sequence], self._config)
+
+
+class _Greedy:
+    """One drone after the other on a lattice of its own, each for what it adds to those before.
+
+    Bucker et al. 2020 (arXiv 2011.05437), solved sequentially, with the marginal log-det of the ray model's
+    information in place of their diversity of views.
+    """
+
+    def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
+        start = formation_slots(np.array(yaw_rad), drones, tilt_rad=config.tilt_rad, range_m=config.radius_m)
+        tilts, ranges = np.radians(config.tilts_deg), np.array(config.ranges_m)
+        self._lattices = [
+            lattice(
+                _all_states(yaw_set(config.yaws, slot[YAW]), tilts, ranges),
+                rates=np.array(config.slot_rates),
+                knot_s=config.knot_s,
+                w_turn=config.w_turn,
+            )
+            for slot in start
+        ]
+        self._offsets = [slot_offsets(each.states) for each in self._lattices]
+        self._information = [ray_information(offsets, config) for offsets in self._offsets]
+        self._config = config
+
+    def plan(self, t_s: float, commanded: Float, actor: Float, field: DistanceField) -> FormationPath:
+        config = self._config
+        known = np.zeros((len(actor), 1, 3, 3)) + np.eye(3) / config.prior_sigma_m**2
+        taken: list[Float] = []
+        slots = np.empty((len(actor), len(self._lattices), 3))
+        for i, (grid, offsets, information) in enumerate(
+            zip(self._lattices, self._offsets, self._information, strict=True)
+        ):
+            costs = costs_of_slots(field, actor, offsets[:, None], config)
+            free = (costs.occluded == 0.0)[..., None]  # [T, S, 1, 1] once more below
+            gained = free[..., None].reshape(*free.shape[:2], 1, 1) * information
+            gain = log_determinant(known + gained) - log_determinant(known)
+            cost = cost_map(costs, config) - config.w_error * gain
+            for other in taken:
+                apart = np.linalg.norm(offsets - other[:, None], axis=-1)
+                cost += np.where(apart < config.soft_separation_m, _TOO_NEAR, 0.0)
+            sequence, _ = best_sequence(cost, grid, commanded[i])
+            at = np.arange(len(actor))
+            known = known + gained[at, sequence][:, None]
+            taken.append(offsets[sequence])
+            slots[:, i] = grid.states[sequence]
+        return _path(t_s, commanded, slots, config)
+
+
+def _all_states(yaws: Float, tilts: Float, ranges: Float) -> Float:
+    """[S, 3] every combination."""
+    return np.stack(np.meshgrid(yaws, tilts, ranges, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _path(t_s: float, commanded: Float, slots: Float, config: PlannerConfig) -> FormationPath:
+    """From the commanded slots [n, 3] through slots [T, n, 3], each turn the shorter way round."""
+    through = np.concatenate([commanded[None], slots])
+    turns = wrapped(np.diff(through[..., YAW], axis=0))
+    through[1:, :, YAW] = commanded[:, YAW] + np.cumsum(turns, axis=0)
+    knots = t_s + config.knot_s * np.arange(len(through), dtype=np.float64)
+    return FormationPath(knots, through, np.array(config.slot_rates))

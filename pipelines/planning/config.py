@@ -1,0 +1,190 @@
+"""What a planner can be told: weights, distances, rates. docs/planner.md says what they do."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from pipelines.planning.kernels import Weights
+from pipelines.session.errors import DataError
+
+MOST_DRONES = 16
+_SIGNED = ("tilt_deg",)
+_MAY_BE_ZERO = (
+    *("w_obs", "w_occ", "w_turn", "w_error", "l_obs", "l_occ", "l_sep", "a_velocity", "a_acceleration"),
+    *("speed_floor_mps", "sight_start_m", "k_integral", "actor_noise_m"),
+    *("position_sigma_m", "rotation_sigma_deg"),
+)
+_MOST = {"yaws": 360, "horizon_knots": 60, "waypoints": 200, "iterations": 10_000}
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """Settings of every arm; the defaults are those that docs/planner.md measures.
+
+    Raises:
+        ValueError: a value that cannot be meant; the message names it.
+    """
+
+    # The formation.
+    radius_m: float = 10.0
+    tilt_deg: float = 15.0
+    yaws: int = 8  # D: over a full turn, the first at the yaw of the start
+    knot_s: float = 2.0
+    horizon_knots: int = 5  # T
+    yaw_rate_deg_per_s: float = 22.5
+    tilt_rate_deg_per_s: float = 5.0  # tilt and range are searched by `covariance` and `greedy` alone
+    range_rate_mps: float = 1.0
+    tilts_deg: tuple[float, ...] = (5.0, 15.0, 25.0, 35.0)
+    ranges_m: tuple[float, ...] = (8.0, 10.0, 12.0)
+
+    # What its search weighs.
+    w_obs: float = 1.0
+    w_occ: float = 1.0
+    w_turn: float = 0.05  # per 45 deg of yaw, or 2 s of tilting or approaching
+    w_error: float = 1.0  # per metre of predicted error, or per nat of information
+
+    # What the local planner weighs.
+    l_obs: float = 50.0
+    l_occ: float = 2.0
+    l_form: float = 1.0
+    l_sep: float = 50.0
+    a_velocity: float = 1.0
+    a_acceleration: float = 1.0
+    a_jerk: float = 1.0
+    eps_obs_m: float = 3.0
+    eps_occ_m: float = 0.5
+    sight_start_m: float = 1.5  # maps contain the actor
+    speed_floor_mps: float = 1.0  # 0 is the literal form, in which obstacles do not push who stands
+    separation_m: float = 3.0
+    soft_separation_m: float = 3.5
+    waypoints: int = 20
+    waypoint_s: float = 0.5
+    iterations: int = 40
+    tolerance: float = 1e-3
+    step_cap_m: float = 0.5
+
+    # Rates, and how plans are flown.
+    central_hz: float = 10.0
+    local_hz: float = 5.0
+    tracking_hz: float = 50.0
+    k_position: float = 6.0
+    k_velocity: float = 4.0
+    k_integral: float = 0.5
+    acceleration_mps2: float = 4.0
+    speed_mps: float = 8.0  # not enforced: what is faster is counted
+    jerk_mps3: float = 50.0  # likewise
+
+    # The actor's estimate.
+    actor_sigma_m: float = 0.2  # of the logged position, per axis
+    actor_q: float = 0.1  # m^2/s^3, how much the velocity wanders
+    actor_noise_m: float = 0.0  # added to the log by a replay, drawn from its seed
+
+    # The ray model of what a camera is worth.
+    pixel_sigma_rad: float = 0.003  # 3 px at f = 1000 px
+    position_sigma_m: float = 0.3
+    rotation_sigma_deg: float = 1.0
+    prior_sigma_m: float = 2.0  # what is known of a joint without any camera
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            for number in value if isinstance(value, tuple) else (value,):
+                least = -10.0 if field.name in _SIGNED else 0.0
+                if (
+                    not math.isfinite(number)
+                    or number < least
+                    or (number == 0 and field.name not in _MAY_BE_ZERO + _SIGNED)
+                ):
+                    raise ValueError(f"{field.name}: {number:g} is out of range")
+            if value == ():
+                raise ValueError(f"{field.name}: needs at least one value")
+        for name, most in _MOST.items():
+            if getattr(self, name) > most:
+                raise ValueError(f"{name}: {getattr(self, name)} is more than {most}")
+        if max(self.tilt_deg, *self.tilts_deg) > 85:
+            raise ValueError("tilt_deg and tilts_deg: at most 85, cameras do not look straight down")
+        if self.soft_separation_m < self.separation_m:
+            raise ValueError(
+                "soft_separation_m: less than separation_m, plans would be pushed apart too late"
+            )
+
+    @property
+    def tilt_rad(self) -> float:
+        """Desired elevation of the cameras above the actor."""
+        return math.radians(self.tilt_deg)
+
+    @property
+    def slot_rates(self) -> tuple[float, float, float]:
+        """How fast yaw (rad/s), tilt (rad/s) and range (m/s) of a slot change."""
+        yaw, tilt = math.radians(self.yaw_rate_deg_per_s), math.radians(self.tilt_rate_deg_per_s)
+        return yaw, tilt, self.range_rate_mps
+
+    def local_weights(self, resolution_m: float) -> Weights:
+        """What the local planner's kernels take, sight lines sampled every half voxel of that side."""
+        reach_m = max(self.radius_m - self.sight_start_m, resolution_m)
+        return Weights(
+            l_obs=self.l_obs,
+            l_occ=self.l_occ,
+            l_form=self.l_form,
+            l_sep=self.l_sep,
+            a_velocity=self.a_velocity,
+            a_acceleration=self.a_acceleration,
+            a_jerk=self.a_jerk,
+            eps_obs_m=self.eps_obs_m,
+            eps_occ_m=self.eps_occ_m,
+            soft_separation_m=self.soft_separation_m,
+            sight_start_m=self.sight_start_m,
+            speed_floor_mps=self.speed_floor_mps,
+            step_s=self.waypoint_s,
+            samples=max(math.ceil(2 * reach_m / resolution_m), 4),
+        )
+
+
+def planner_config(values: Mapping[str, object], source: Path | str = "planner settings") -> PlannerConfig:
+    """Settings from a mapping, as read from YAML; what it does not mention keeps its default.
+
+    Raises:
+        DataError: an unknown key, a value of another type, or one out of range; every problem of the
+            first two kinds in one message.
+    """
+    known = {field.name: field.default for field in fields(PlannerConfig)}
+    problems, taken = [], {}
+    for key, value in values.items():
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, n=1)
+            problems.append(f"unknown key {key!r}" + (f" (did you mean {near[0]!r}?)" if near else ""))
+            continue
+        try:
+            taken[key] = _like(known[key], value)
+        except TypeError as error:
+            problems.append(f"{key}: {error}")
+    if problems:
+        raise DataError(source, "; ".join(problems), f"there are {', '.join(known)}")
+    try:
+        return PlannerConfig(**taken)  # type: ignore[arg-type]  # checked one by one above
+    except ValueError as error:
+        raise DataError(source, str(error)) from None
+
+
+def _like(default: object, value: object) -> object:
+    """A value of the default's type; numbers are not read out of text, nor counts out of fractions."""
+    if isinstance(default, tuple):
+        if not isinstance(value, list | tuple):
+            raise TypeError("must be a list of numbers")
+        return tuple(float(_number(part)) for part in value)
+    number = _number(value)
+    if isinstance(default, int):
+        if number != int(number):
+            raise TypeError(f"{number:g} is no whole number")
+        return int(number)
+    return float(number)
+
+
+def _number(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise TypeError(f"{value!r} is no number")
+    return value

@@ -1,0 +1,53 @@
+"""The cost map C[t, s] of the formation search: obstacles at the slots and in the sight lines."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.distance_field import DistanceField
+from pipelines.planning.information import predicted_error, ray_information
+from pipelines.planning.kernels import slot_costs
+
+Float = NDArray[np.float64]
+
+
+class SlotCosts(NamedTuple):
+    """Of every slot of every state at every time, [T, S, n]."""
+
+    obstacle: Float  # O = clip(1 - M/eps_obs, 0, 1)
+    occluded: Float  # share of the sight line that is occupied
+
+
+def costs_of_slots(field: DistanceField, actor: Float, offsets: Float, config: PlannerConfig) -> SlotCosts:
+    """Look at every slot.
+
+    The integrand of the obstacle cost that Ho et al. print ignores its variable; here it is one minus the
+    signed distance over the local planner's `eps_obs_m`, so that both planners keep the same distance.
+
+    Args:
+        field: what stands around.
+        actor: [T, 3] forecast, metres, world.
+        offsets: [S, n, 3] metres, the slots of each state from the actor.
+        config: `eps_obs_m`, `sight_start_m`.
+    """
+    return SlotCosts(*slot_costs(field.grid, actor, offsets, config.eps_obs_m, config.sight_start_m))
+
+
+def cost_map(costs: SlotCosts, config: PlannerConfig) -> Float:
+    """C [T, S] = w_obs sum O + w_occ sum of occupied shares over the drones."""
+    weighted = config.w_obs * costs.obstacle
+    weighted += config.w_occ * costs.occluded
+    total: Float = weighted.sum(axis=2)
+    return total
+
+
+def error_map(costs: SlotCosts, offsets: Float, config: PlannerConfig) -> Float:
+    """[T, S] predicted error in metres of the views that are free, with a weak prior where too few are."""
+    information = ray_information(offsets, config)
+    free = (costs.occluded == 0.0).astype(np.float64)
+    total = np.einsum("tsn,snij->tsij", free, information) + np.eye(3) / config.prior_sigma_m**2
+    return predicted_error(total)

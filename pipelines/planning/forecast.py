@@ -1,0 +1,86 @@
+"""Where the actor is, and will be: a Kalman filter with a constant-velocity model."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+_FIRST_SPEED_MPS = 3.0  # standard deviation per axis before a second measurement: people run
+
+
+class ActorFilter:
+    """Position and velocity of the actor from the measurements so far, and nothing later.
+
+    x = [p, v] per axis, F = [[1, dt], [0, 1]], Q = q [[dt^3/3, dt^2/2], [dt^2/2, dt]] (white noise
+    acceleration), measurements of the position with standard deviation `sigma_m` per axis. All three axes
+    have the same model and noise, so that one 2x2 covariance serves them all.
+
+    Args:
+        q: m^2/s^3, how much the velocity wanders.
+        sigma_m: of the measured position, per axis.
+    """
+
+    def __init__(self, *, q: float, sigma_m: float) -> None:
+        self._q = q
+        self._variance = sigma_m**2
+        self._t_s: float | None = None
+        self._state = np.zeros((2, 3))
+        self._covariance = np.diag([self._variance, _FIRST_SPEED_MPS**2])
+
+    @property
+    def started(self) -> bool:
+        """Whether there was a measurement yet."""
+        return self._t_s is not None
+
+    def measure(self, t_s: float, position: Float) -> None:
+        """Take in one measured position [3], metres, world, not earlier than the last one.
+
+        Raises:
+            ValueError: the time goes backwards, or the position is not finite.
+        """
+        if not np.isfinite(position).all():
+            raise ValueError("a measured position must be finite: leave out what was not measured")
+        if self._t_s is None:
+            self._state[0] = position
+            self._t_s = t_s
+            return
+        state, P = self._predicted(t_s)
+        gain = P[:, 0] / (P[0, 0] + self._variance)
+        self._state = state + gain[:, None] * (position - state[0])
+        # Joseph's form: stays positive definite whatever the rounding.
+        keep = np.array([[1.0 - gain[0], 0.0], [-gain[1], 1.0]])
+        kept = np.einsum("ij,jk,lk->il", keep, P, keep)
+        self._covariance = kept + self._variance * gain[:, None] * gain
+        self._t_s = t_s
+
+    def at(self, t_s: float) -> tuple[Float, Float, Float]:
+        """State [2, 3] (position m, velocity m/s) and covariance [2, 2] per axis, at or after the last one.
+
+        Raises:
+            ValueError: nothing was measured yet, or the time is before the last measurement.
+        """
+        state, covariance = self._predicted(t_s)
+        return state[0], state[1], covariance
+
+    def forecast(self, t_s: Float) -> Float:
+        """Positions [T, 3] at times [T], of which none is before the last measurement."""
+        if self._t_s is None:
+            raise ValueError("nothing was measured yet")
+        ahead = t_s - self._t_s
+        if ahead.size and ahead.min() < 0:
+            raise ValueError("a forecast looks ahead of the last measurement")
+        where: Float = self._state[0] + ahead[:, None] * self._state[1]
+        return where
+
+    def _predicted(self, t_s: float) -> tuple[Float, Float]:
+        if self._t_s is None:
+            raise ValueError("nothing was measured yet")
+        dt = t_s - self._t_s
+        if dt < 0:
+            raise ValueError(f"time goes back by {-dt:g} s")
+        F = np.array([[1.0, dt], [0.0, 1.0]])
+        Q = self._q * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        state = np.stack([self._state[0] + dt * self._state[1], self._state[1]])
+        return state, np.einsum("ij,jk,lk->il", F, self._covariance, F) + Q

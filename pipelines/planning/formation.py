@@ -1,0 +1,113 @@
+"""Slots about the actor: yaw, tilt and range of every camera, and how a formation moves between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.compilation import cached
+from pipelines.geometry.poses import quaternion_from_matrix
+
+Float = NDArray[np.float64]
+
+YAW, TILT, RANGE = range(3)
+"""A slot is three numbers: yaw (rad, counterclockwise from east), tilt (rad above the actor), range (m)."""
+
+
+def spacing_rad(drones: int) -> float:
+    """Yaw between neighbours: equal parts of a turn, but 90 deg for two, which must not face each other."""
+    return np.pi / 2 if drones == 2 else 2 * np.pi / drones
+
+
+def formation_slots(yaw_rad: Float, drones: int, *, tilt_rad: float, range_m: float) -> Float:
+    """The slots [..., n, 3] of a formation whose first camera has these yaws [...]."""
+    slots = np.empty((*np.shape(yaw_rad), drones, 3))
+    slots[..., YAW] = np.asarray(yaw_rad)[..., None] + spacing_rad(drones) * np.arange(drones)
+    slots[..., TILT] = tilt_rad
+    slots[..., RANGE] = range_m
+    return slots
+
+
+def slot_offsets(slots: Float) -> Float:
+    """From the actor to slots [..., 3]: metres, world (Ho et al., Sec. IV-A)."""
+    yaw, tilt, distance = np.moveaxis(slots, -1, 0)
+    level = distance * np.cos(tilt)
+    return np.stack([level * np.cos(yaw), level * np.sin(yaw), distance * np.sin(tilt)], axis=-1)
+
+
+def slot_of(offset: Float) -> Float:
+    """The slot [..., 3] of an offset from the actor, yaw within -pi..pi."""
+    x, y, z = np.moveaxis(offset, -1, 0)
+    level = np.hypot(x, y)
+    return np.stack([np.arctan2(y, x), np.arctan2(z, level), np.hypot(level, z)], axis=-1)
+
+
+def wrapped(angle_rad: Float) -> Float:
+    """Angles within -pi..pi, half open."""
+    within: Float = (angle_rad + np.pi) % (2 * np.pi) - np.pi
+    return within
+
+
+def yaw_set(yaws: int, start_rad: float) -> Float:
+    """[D] equidistant yaws over -pi..pi, half open, one of them the yaw of the start.
+
+    Without a reason to turn, a formation so stays exactly where it began.
+    """
+    turns = np.arange(yaws, dtype=np.float64) / yaws
+    return np.sort(wrapped(start_rad + 2 * np.pi * turns))
+
+
+@dataclass(frozen=True)
+class FormationPath:
+    """What the formation is told: slots at knots, approached from the commanded ones at limited rates."""
+
+    knot_s: Float  # [K + 1] the first is the time at which it was planned
+    slots: Float  # [K + 1, n, 3] the first is what was commanded then; yaw is continuous
+    rates: Float  # [3] rad/s, rad/s, m/s
+
+    def at(self, t_s: Float) -> Float:
+        """Commanded slots [T, n, 3] at times [T]; before the first knot and after the last as there.
+
+        From knot to knot with the full rate and then waiting, not evenly: replanned many times before
+        the next knot, an even approach never arrives, and cells beyond the neighbour stay out of reach.
+        """
+        slots = np.empty((len(t_s), *self.slots.shape[1:]))
+        _commanded(self.knot_s, self.slots, self.rates, t_s, slots)
+        return slots
+
+
+@cached
+def _commanded(knot_s: Float, slots: Float, rates: Float, t_s: Float, found: Float) -> None:
+    last = knot_s.size - 1
+    for p in range(t_s.size):
+        k = 0
+        while k < last and knot_s[k + 1] <= t_s[p]:
+            k += 1
+        after_s = max(t_s[p] - knot_s[k], 0.0)
+        for i in range(slots.shape[1]):
+            for axis in range(3):
+                start = slots[k, i, axis]
+                way = slots[min(k + 1, last), i, axis] - start
+                most = rates[axis] * after_s
+                found[p, i, axis] = start + min(max(way, -most), most)
+
+
+def aim(camera: Float, target: Float) -> Float:
+    """Orientation of upright cameras that look at a point.
+
+    Args:
+        camera: [..., 3] metres, world.
+        target: [..., 3] metres, world; a camera straight above it has north up in its picture.
+
+    Returns:
+        [..., 4] unit quaternions xyzw, world_from_camera (x right, y down, z forward).
+    """
+    forward = target - camera
+    forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
+    right = np.stack([forward[..., 1], -forward[..., 0], np.zeros(forward.shape[:-1])], axis=-1)
+    level = np.linalg.norm(right, axis=-1, keepdims=True)
+    right = np.where(level > 1e-9, right / np.maximum(level, 1e-9), [1.0, 0.0, 0.0])
+    down = np.cross(forward, right)
+    return quaternion_from_matrix(np.stack([right, down, forward], axis=-1))

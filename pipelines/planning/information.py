@@ -1,0 +1,54 @@
+"""What cameras are worth before they have seen anything: the ray model of their information."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.planning.config import PlannerConfig
+
+Float = NDArray[np.float64]
+
+
+def ray_information(offset: Float, config: PlannerConfig) -> Float:
+    """Information of one camera on a point: I = (1 - d d')/s^2, nothing along the ray d.
+
+    s^2 = (rho sigma_px/f)^2 + (rho sigma_rot)^2 + sigma_pos^2, rho the distance.
+
+    Args:
+        offset: [..., 3] metres, from the point to the camera, not zero.
+        config: pixel, rotation and position noise.
+
+    Returns:
+        [..., 3, 3] 1/m^2.
+    """
+    square = np.sum(offset**2, axis=-1)[..., None, None]
+    turned = config.pixel_sigma_rad**2 + np.radians(config.rotation_sigma_deg) ** 2
+    across = np.eye(3) - offset[..., :, None] * offset[..., None, :] / square
+    information: Float = across / (square * turned + config.position_sigma_m**2)
+    return information
+
+
+def predicted_error(information: Float) -> Float:
+    """sqrt(tr S), S = I^-1: the expected error in metres of [..., 3, 3]; inf where something is unseen."""
+    minors, determinant = _minors(information)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        trace = np.sum(minors, axis=-1) / determinant
+    # Singular up to rounding: the determinant is far below the cube of what it is made of.
+    scale = np.trace(information, axis1=-2, axis2=-1) ** 3
+    return np.sqrt(np.where(determinant > 1e-12 * scale, trace, np.inf))
+
+
+def log_determinant(information: Float) -> Float:
+    """Logarithm of the determinant of positive definite [..., 3, 3]."""
+    logarithm: Float = np.log(_minors(information)[1])
+    return logarithm
+
+
+def _minors(matrix: Float) -> tuple[Float, Float]:
+    """The three principal 2x2 minors [..., 3] and the determinant of symmetric matrices."""
+    a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2]
+    d, e, f = matrix[..., 1, 1], matrix[..., 1, 2], matrix[..., 2, 2]
+    first = d * f - e * e
+    determinant = a * first - b * (b * f - c * e) + c * (b * e - c * d)
+    return np.stack([first, a * f - c * c, a * d - b * b], axis=-1), determinant

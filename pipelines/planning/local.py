@@ -1,0 +1,197 @@
+"""Each drone's own trajectory: covariant gradient descent about the slots (Bonatti et al. 2020; CHOMP).
+
+J = J_smooth + l_obs J_obs + l_occ J_occ + l_form J_form + l_sep J_sep over N waypoints, start fixed by
+position and velocity, end free (t_f = N step_s):
+
+    J_smooth  1/(2 t_f) sum_d a_d int |x^(d)|^2, d = 1..3, finite differences
+    J_form    1/(2 t_f) int |x - slot|^2
+    J_obs     int c(x; eps_obs) s dt, s = sqrt(|v|^2 + v0^2)
+    J_occ     int int c(p; eps_occ) |dp| s dt along the sight line, up to `sight_start_m` from the actor
+    J_sep     1/t_f int sum max(0, 3.5 m - distance)^2 / 2 over the other drones' latest plans
+
+c is CHOMP's hinge of the signed distance. With s = |v| (v0 = 0, as published) a drone that stands feels no
+obstacle at all. Gradients are exact derivatives of the discretised sums, so that a step that follows them
+lowers what is compared; in the limit they are the functional gradients of the papers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.distance_field import DistanceField
+from pipelines.planning.kernels import Weights, descend, evaluate, factorise
+from pipelines.planning.tracking import Plan
+
+Float = NDArray[np.float64]
+
+TERMS = ("smooth", "form", "obs", "occ", "sep")
+_ROUNDS = 20  # of pushing apart
+_MARGIN_M = 0.1  # projected waypoints keep this much more than the least distance
+
+
+class Separation(StrEnum):
+    """What it took to keep the distance to the other drones' plans."""
+
+    KEPT = "kept"
+    PROJECTED = "projected"  # waypoints were pushed apart
+    REJECTED = "rejected"  # that did not help: the plan before goes on
+    BROKEN = "broken"  # nor does that keep the distance; the better of both is flown
+
+
+@dataclass(frozen=True)
+class LocalPlan:
+    """What the local planner decided."""
+
+    plan: Plan
+    cost: float  # of the optimised path, before any projection
+    evaluations: int
+    separation: Separation
+
+
+class LocalPlanner:
+    """The optimiser of one configuration; factorises its metric once and keeps no other state."""
+
+    def __init__(self, config: PlannerConfig) -> None:
+        self._config = config
+        self._factor = factorise(config.waypoints, config.local_weights(1.0))
+        self._weights: dict[float, Weights] = {}
+
+    def plan(
+        self,
+        t_s: float,
+        position: Float,
+        velocity: Float,
+        *,
+        slots: Float,
+        actor: Float,
+        others: Sequence[Plan],
+        field: DistanceField,
+        previous: Plan | None,
+    ) -> LocalPlan:
+        """Plan from here.
+
+        Args:
+            t_s: now.
+            position: [3] metres, world.
+            velocity: [3] m/s.
+            slots: [N, 3] where the drone should be at each waypoint's time.
+            actor: [N, 3] where the actor will be then.
+            others: the latest plans of the other drones.
+            field: what stands around.
+            previous: this drone's plan before, to begin with; the slots where there is none.
+        """
+        config = self._config
+        times = t_s + config.waypoint_s * np.arange(1, config.waypoints + 1, dtype=np.float64)
+        waypoints = np.stack([p.at(np.append(t_s, times))[0] for p in others]) if others else _nobody(times)
+        guess = slots if previous is None else previous.at(times)[0]
+        path, cost, evaluations = descend(
+            _with_start(position, velocity, guess, config.waypoint_s),
+            np.ascontiguousarray(slots),
+            np.ascontiguousarray(actor),
+            np.ascontiguousarray(waypoints[:, 1:]),
+            field.grid,
+            self._weights_for(field),
+            self._factor,
+            config.iterations,
+            config.tolerance,
+            config.step_cap_m,
+        )
+        old = None if previous is None else np.concatenate([position[None], guess])
+        kept, separation = _keep_apart(path[2:], waypoints, old, field, config.separation_m)
+        return LocalPlan(Plan(t_s, kept, velocity.copy(), config.waypoint_s), cost, evaluations, separation)
+
+    def cost(
+        self,
+        position: Float,
+        velocity: Float,
+        waypoints: Float,
+        *,
+        slots: Float,
+        actor: Float,
+        others: Float,
+        field: DistanceField,
+    ) -> tuple[float, dict[str, float], Float]:
+        """The cost of waypoints [N, 3]: in total, its unweighted terms, and the gradient [N, 3].
+
+        `others` [M, N, 3] are the other drones' waypoints; the rest is as in `plan`.
+        """
+        terms, gradient = np.zeros(len(TERMS)), np.zeros_like(waypoints)
+        path = _with_start(position, velocity, waypoints, self._config.waypoint_s)
+        total = evaluate(path, slots, actor, others, field.grid, self._weights_for(field), terms, gradient)
+        return total, dict(zip(TERMS, terms.tolist(), strict=True)), gradient
+
+    def _weights_for(self, field: DistanceField) -> Weights:
+        side = field.grid.resolution_m
+        if side not in self._weights:
+            self._weights[side] = self._config.local_weights(side)
+        return self._weights[side]
+
+
+def closest_approach(path: Float, others: Float) -> float:
+    """The least distance in metres between points that fly straight from waypoint to waypoint.
+
+    Args:
+        path: [N + 1, 3].
+        others: [M, N + 1, 3] at the same times.
+
+    Returns:
+        inf where there is nobody else.
+    """
+    apart = path - others
+    start, way = apart[:, :-1], np.diff(apart, axis=1)
+    square = np.sum(way**2, axis=-1)
+    u = np.clip(-np.sum(start * way, axis=-1) / np.maximum(square, 1e-12), 0.0, 1.0)
+    distance = np.linalg.norm(start + u[..., None] * way, axis=-1)
+    return float(distance.min(initial=np.inf))
+
+
+def _with_start(position: Float, velocity: Float, waypoints: Float, step_s: float) -> Float:
+    """[N + 3, 3]: where the drone was and is at its velocity, and the waypoints."""
+    back = np.array([-2.0, -1.0, 0.0])[:, None] * step_s
+    return np.concatenate([position + back * velocity, waypoints])
+
+
+def _nobody(times: Float) -> Float:
+    return np.empty((0, len(times) + 1, 3))
+
+
+def _keep_apart(
+    path: Float, others: Float, old: Float | None, field: DistanceField, least_m: float
+) -> tuple[Float, Separation]:
+    """The path [N + 1, 3], if need be pushed away from the others' [M, N + 1, 3], or the one before."""
+    if closest_approach(path, others) >= least_m:
+        return path, Separation.KEPT
+    pushed = _pushed_apart(path, others, least_m + _MARGIN_M)
+    free = field.sample(pushed[1:])[0].min() > min(0.0, field.sample(path[1:])[0].min())
+    if free and closest_approach(pushed, others) >= least_m:
+        return pushed, Separation.PROJECTED
+    if old is not None and closest_approach(old, others) >= least_m:
+        return old, Separation.REJECTED
+    choices = [path] + ([pushed] if free else []) + ([] if old is None else [old])
+    return max(choices, key=lambda choice: closest_approach(choice, others)), Separation.BROKEN
+
+
+def _pushed_apart(path: Float, others: Float, least_m: float) -> Float:
+    """Waypoints moved straight away from others until none is nearer than that, the start excepted."""
+    pushed = path.copy()
+    for _ in range(_ROUNDS):
+        moved = False
+        for other in others:
+            apart = pushed[1:] - other[1:]
+            distance = np.linalg.norm(apart, axis=1)
+            near = distance < least_m - 1e-9
+            # Exactly in the same place: one of them goes up.
+            direction = np.where(
+                distance[:, None] > 1e-6, apart / np.maximum(distance, 1e-6)[:, None], [0, 0, 1]
+            )
+            pushed[1:][near] = (other[1:] + least_m * direction)[near]
+            moved = moved or bool(near.any())
+        if not moved:
+            break
+    return pushed

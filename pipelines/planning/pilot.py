@@ -1,0 +1,134 @@
+"""The planner as it flies: measurements in, references out, replanning when it is time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.planning.arms import Arm
+from pipelines.planning.config import MOST_DRONES, PlannerConfig
+from pipelines.planning.distance_field import DistanceField
+from pipelines.planning.forecast import ActorFilter
+from pipelines.planning.formation import FormationPath, formation_slots, slot_offsets
+from pipelines.planning.local import LocalPlanner, Separation
+from pipelines.planning.tracking import Plan
+
+Float = NDArray[np.float64]
+
+_NOW_S = 1e-6  # times are sums of periods: due this much early is due
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the drones are asked for at one time; [N, 3] metres, world, but for the slots."""
+
+    position: Float
+    velocity: Float
+    acceleration: Float
+    slots: Float  # [N, 3] yaw rad, tilt rad, range m
+    actor: Float  # [3] the estimate that cameras aim at
+
+
+@dataclass
+class PlanningTimes:
+    """Measured seconds of every planning call; they differ from run to run."""
+
+    central_s: list[float]
+    local_s: list[float]
+
+
+class Pilot:
+    """One arm in flight: call `measure` whenever the actor was measured and `step` at the tracking rate.
+
+    Central planning, local planning and tracking have the rates of the configuration, counted from the
+    first step. Drones plan one after the other, each with the latest plans of the others.
+
+    Args:
+        arm: which slots the cameras take.
+        config: weights and rates.
+        drones: how many, 1 to 16.
+        yaw_rad: of the first camera at the start, counterclockwise from east.
+
+    Raises:
+        ValueError: an impossible number of drones.
+    """
+
+    def __init__(self, arm: Arm, config: PlannerConfig, *, drones: int, yaw_rad: float) -> None:
+        if not 1 <= drones <= MOST_DRONES:
+            raise ValueError(f"{drones} drones: 1 to {MOST_DRONES} can be planned for")
+        self._config = config
+        self._formation_planner = arm.start(config, drones=drones, yaw_rad=yaw_rad)
+        self._local_planner = LocalPlanner(config)
+        self._filter = ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m)
+        slots = formation_slots(
+            np.array([yaw_rad]), drones, tilt_rad=config.tilt_rad, range_m=config.radius_m
+        )
+        self._formation = FormationPath(np.zeros(1), slots, np.array(config.slot_rates))
+        self._plans: list[Plan | None] = [None] * drones
+        self._next_central_s = self._next_local_s = -np.inf
+        self.times = PlanningTimes([], [])
+        self.separation: Counter[Separation] = Counter()
+
+    def measure(self, t_s: float, position: Float) -> None:
+        """The actor was at [3] metres, world (the middle of the hips), at a time that never goes back."""
+        self._filter.measure(t_s, position)
+
+    def slots_now(self, t_s: float) -> tuple[Float, Float]:
+        """Commanded slots [N, 3], and where they are by the actor's estimate, [N, 3] metres, world."""
+        slots = self._formation.at(np.array([t_s]))[0]
+        return slots, self._filter.forecast(np.array([t_s]))[0] + slot_offsets(slots)
+
+    def step(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> Command:
+        """Replan what is due, and say what to fly now.
+
+        Args:
+            t_s: now; at or after the latest measurement, of which there must be one.
+            position: [N, 3] metres, world, where the drones are.
+            velocity: [N, 3] m/s.
+            field: what is known of the surroundings now.
+        """
+        config = self._config
+        if t_s >= self._next_central_s - _NOW_S:
+            self._next_central_s = max(self._next_central_s, t_s) + 1.0 / config.central_hz
+            self._plan_formation(t_s, field)
+        if t_s >= self._next_local_s - _NOW_S:
+            self._next_local_s = max(self._next_local_s, t_s) + 1.0 / config.local_hz
+            self._plan_locally(t_s, position, velocity, field)
+        now = np.array([t_s])
+        asked = [plan.at(now) for plan in self._plans if plan is not None]
+        where, speed, change = (np.concatenate(part) for part in zip(*asked, strict=True))
+        return Command(where, speed, change, self._formation.at(now)[0], self._filter.forecast(now)[0])
+
+    def _plan_formation(self, t_s: float, field: DistanceField) -> None:
+        config = self._config
+        started = perf_counter()
+        knots = t_s + config.knot_s * np.arange(1, config.horizon_knots + 1, dtype=np.float64)
+        commanded = self._formation.at(np.array([t_s]))[0]
+        actor = self._filter.forecast(knots)
+        self._formation = self._formation_planner.plan(t_s, commanded, actor, field)
+        self.times.central_s.append(perf_counter() - started)
+
+    def _plan_locally(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
+        config = self._config
+        times = t_s + config.waypoint_s * np.arange(1, config.waypoints + 1, dtype=np.float64)
+        actor = self._filter.forecast(times)
+        slots = actor[:, None] + slot_offsets(self._formation.at(times))
+        for i in range(len(self._plans)):
+            started = perf_counter()
+            made = self._local_planner.plan(
+                t_s,
+                position[i],
+                velocity[i],
+                slots=slots[:, i],
+                actor=actor,
+                others=[plan for j, plan in enumerate(self._plans) if j != i and plan is not None],
+                field=field,
+                previous=self._plans[i],
+            )
+            self.times.local_s.append(perf_counter() - started)
+            self._plans[i] = made.plan
+            self.separation[made.separation] += 1

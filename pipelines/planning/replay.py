@@ -1,0 +1,142 @@
+"""Flying an arm again, offline: against the actor that was logged and the maps that were known then."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.planning.arms import Arm
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.distance_field import DistanceField, open_space
+from pipelines.planning.formation import YAW, aim, slot_of
+from pipelines.planning.local import Separation
+from pipelines.planning.pilot import Pilot, PlanningTimes
+from pipelines.planning.sight import visible
+from pipelines.planning.tracking import Tracker
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+Int64 = NDArray[np.int64]
+Mode = Literal["plan-only", "closed-loop"]
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """A replayed flight of N cameras at T times, one per tracking step."""
+
+    arm: str
+    t_ns: Int64  # [T] on the clock of the actor's log
+    position: Float  # [N, T, 3] metres, world
+    velocity: Float  # [N, T, 3] m/s
+    quaternion_xyzw: Float  # [N, T, 4] world_from_camera, aimed at the estimate
+    slots: Float  # [N, T, 3] commanded: yaw (rad, continuous), tilt (rad), range (m)
+    tilt_rad: Float  # [N, T] flown, above the logged actor
+    visible: Bool  # [N, T] nothing stands between camera and logged actor, by the last map
+    actor: Float  # [T, 3] the log, interpolated
+    estimate: Float  # [T, 3] what the planner believed
+    separation: dict[str, int]  # local plans by what kept them apart
+    times: PlanningTimes  # measured, different from run to run
+
+    @property
+    def t_s(self) -> Float:
+        """[T] seconds since the start."""
+        seconds: Float = (self.t_ns - self.t_ns[0]) / 1e9
+        return seconds
+
+    @property
+    def formation_yaw_rad(self) -> Float:
+        """[T] the yaw of the first camera's slot, continuous."""
+        return self.slots[0, :, YAW]
+
+
+def replay(
+    arm: Arm,
+    actor_t_ns: Int64,
+    actor: Float,
+    fields: Sequence[DistanceField],
+    *,
+    config: PlannerConfig,
+    drones: int,
+    yaw_rad: float = 0.0,
+    mode: Mode = "closed-loop",
+    seed: int = 0,
+) -> ReplayResult:
+    """Fly an arm against a log; equal arguments give equal results, but for the measured times.
+
+    The drones start in their slots, at rest. The actor is measured as logged, with `actor_noise_m` added
+    from the seed; nothing sees a later measurement or map than its own time.
+
+    Args:
+        arm: which slots the cameras take.
+        actor_t_ns: [A] stamps of the log, ascending, at least two.
+        actor: [A, 3] metres, world, the middle of the hips; rows with NaN were not measured.
+        fields: the maps by the time from which they hold; before the first one nothing is known.
+        config: weights and rates, the same for all arms of a comparison.
+        drones: how many cameras.
+        yaw_rad: of the first camera at the start, counterclockwise from east.
+        mode: `closed-loop` flies point masses with limited acceleration; `plan-only` puts the drones
+            exactly where their local plans want them.
+        seed: of the noise.
+
+    Raises:
+        ValueError: times that do not ascend, or fewer than two measurements.
+    """
+    t_ns, measured = _checked(actor_t_ns, actor)
+    log_s = (t_ns - t_ns[0]) / 1e9
+    noise = np.random.default_rng(seed).normal(size=measured.shape)
+    noisy = measured + config.actor_noise_m * noise
+    maps = sorted(fields, key=lambda field: field.from_ns)
+    period_ns = round(1e9 / config.tracking_hz)
+    replay_ns = t_ns[0] + period_ns * np.arange((t_ns[-1] - t_ns[0]) // period_ns + 1)
+    map_at = np.searchsorted([field.from_ns for field in maps], replay_ns, side="right")
+    known = [open_space(), *maps]
+    taken_in = np.searchsorted(t_ns, replay_ns, side="right")
+
+    pilot = Pilot(arm, config, drones=drones, yaw_rad=yaw_rad)
+    pilot.measure(0.0, noisy[0])
+    start = pilot.slots_now(0.0)[1]
+    tracker = Tracker(start, np.zeros_like(start), config)
+    shape = (drones, len(replay_ns), 3)
+    position, velocity, slots, estimate = (np.empty(s) for s in (shape, shape, shape, shape[1:]))
+    done = 1
+    for k, now_ns in enumerate(replay_ns):
+        t_s = float((now_ns - t_ns[0]) / 1e9)
+        for row in range(done, taken_in[k]):
+            pilot.measure(log_s[row], noisy[row])
+        done = max(done, int(taken_in[k]))
+        command = pilot.step(t_s, tracker.position, tracker.velocity, known[map_at[k]])
+        if mode == "plan-only":
+            tracker.position, tracker.velocity = command.position, command.velocity
+        position[:, k], velocity[:, k] = tracker.position, tracker.velocity
+        slots[:, k], estimate[k] = command.slots, command.actor
+        if mode == "closed-loop":
+            tracker.step(command.position, command.velocity, command.acceleration)
+
+    truth = np.stack([np.interp(replay_ns, t_ns, measured[:, axis]) for axis in range(3)], axis=-1)
+    return ReplayResult(
+        arm=arm.name,
+        t_ns=replay_ns,
+        position=position,
+        velocity=velocity,
+        quaternion_xyzw=aim(position, estimate),
+        slots=slots,
+        tilt_rad=slot_of(position - truth)[..., 1],
+        visible=visible(known[-1], position, truth, start_m=config.sight_start_m),
+        actor=truth,
+        estimate=estimate,
+        separation={kind.value: pilot.separation[kind] for kind in Separation},
+        times=pilot.times,
+    )
+
+
+def _checked(t_ns: Int64, actor: Float) -> tuple[Int64, Float]:
+    """The rows that were measured."""
+    rows = np.isfinite(actor).all(axis=1)
+    t_ns, actor = t_ns[rows], actor[rows]
+    if len(t_ns) < 2 or (np.diff(t_ns) <= 0).any():
+        raise ValueError("a replay needs two measurements of the actor or more, their stamps ascending")
+    return t_ns, actor

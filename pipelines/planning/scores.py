@@ -1,0 +1,151 @@
+"""What a flight was like: the same figures for every arm, replayed or flown (positions over time in)."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.distance_field import DistanceField
+from pipelines.planning.formation import RANGE, TILT, YAW, slot_of, wrapped
+from pipelines.planning.information import predicted_error, ray_information
+from pipelines.planning.sight import visible
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+Scores = dict[str, object]
+
+NEAR_OBSTACLE_M = 15.0
+_MOTION_HZ = 10.0  # speed, acceleration and jerk are means over this period: plans change at 5 Hz
+_LOOKS_PER_S = 5.0  # how often obstacles near the slots are looked for
+
+
+def score(
+    t_s: Float,
+    position: Float,
+    actor: Float,
+    field: DistanceField,
+    config: PlannerConfig,
+    *,
+    near: Bool | None = None,
+) -> Scores:
+    """Figures of one flight.
+
+    Args:
+        t_s: [T] seconds, ascending, at least four of them over half a second or more.
+        position: [N, T, 3] metres, world, the cameras; finite.
+        actor: [T, 3] metres, world; finite.
+        field: what stands around, as well as it is known in the end.
+        config: limits, `sight_start_m` and the ray model.
+        near: [T] when an obstacle is near (see `near_obstacle`); the same for all arms of a comparison.
+
+    Returns:
+        JSON-able: degrees and metres by name; None where there is nothing to count (no pair of drones,
+        never near an obstacle). `limit_violations` counts episodes per drone (per pair for separation).
+        `predicted_error_m` is sqrt(tr S) of the ray model over the times at which two free views or more
+        determine it, `undetermined_share` the share of the others.
+    """
+    slots = slot_of(position - actor)
+    tilt_deg = np.degrees(slots[..., TILT])
+    seen = visible(field, position, actor, start_m=config.sight_start_m)
+    clearance = field.sample(position)[0]
+    pairs = list(combinations(range(len(position)), 2))
+    apart = np.array([np.linalg.norm(position[i] - position[j], axis=-1) for i, j in pairs])
+    turned = np.array([wrapped(slots[j, :, YAW] - slots[i, :, YAW]) for i, j in pairs])
+    error = predicted_error(_information(position - actor, seen, config))
+    determined = np.isfinite(error)
+    motion = _motion(t_s, position)
+    limits = {"speed": config.speed_mps, "acceleration": config.acceleration_mps2, "jerk": config.jerk_mps3}
+    violations = {name: _episodes(motion[name] > limit) for name, limit in limits.items()}
+    violations["separation"] = _episodes(apart < config.separation_m) if pairs else 0
+    violations["collision"] = _episodes(clearance <= 0.0)
+    return {
+        "tilt_deg": {
+            "mean": float(tilt_deg.mean()),
+            "max": float(tilt_deg.max()),
+            "near_obstacle": None if near is None or not near.any() else float(tilt_deg[:, near].mean()),
+        },
+        "range_m": _spread(slots[..., RANGE]),
+        "yaw_separation_deg": _spread(np.degrees(np.abs(turned))) if pairs else None,
+        "occluded_share": float(1.0 - seen.mean()),
+        "min_clearance_m": float(clearance.min()),
+        "min_separation_m": float(apart.min()) if pairs else None,
+        "max_speed_mps": float(motion["speed"].max()),
+        "max_acceleration_mps2": float(motion["acceleration"].max()),
+        "max_jerk_mps3": float(motion["jerk"].max()),
+        "limit_violations": violations,
+        "predicted_error_m": {
+            "median": float(np.median(error[determined])) if determined.any() else None,
+            "p95": float(np.percentile(error[determined], 95)) if determined.any() else None,
+        },
+        "undetermined_share": float(1.0 - determined.mean()),
+    }
+
+
+def predicted_errors(position: Float, actor: Float, field: DistanceField, config: PlannerConfig) -> Float:
+    """[T] sqrt(tr S) in metres of the free views, inf where they do not determine a point."""
+    seen = visible(field, position, actor, start_m=config.sight_start_m)
+    return predicted_error(_information(position - actor, seen, config))
+
+
+def near_obstacle(t_s: Float, slot_position: Float, actor: Float, field: DistanceField) -> Bool:
+    """When something that stands higher than the actor's hips is within 15 m of a slot, level distance.
+
+    The ground is always near; what a drone at a low tilt has to give way to rises above the actor.
+
+    Args:
+        t_s: [T] seconds, ascending.
+        slot_position: [N, T, 3] metres, world.
+        actor: [T, 3] metres, world.
+        field: what stands around.
+
+    Returns:
+        [T]; looked at five times a second, and so until the next look.
+    """
+    grid = field.grid
+    occupied = grid.distance_m < 0.0
+    levels = np.arange(1, occupied.shape[2] + 1)
+    top_m = grid.origin[2] + grid.resolution_m * (occupied * levels).max(axis=2)
+    looks = np.unique(np.searchsorted(t_s, np.arange(t_s[0], t_s[-1] + 1e-9, 1.0 / _LOOKS_PER_S)))
+    found = np.zeros(len(looks), dtype=np.bool_)
+    centres = [grid.origin[a] + grid.resolution_m * (np.arange(top_m.shape[a]) + 0.5) for a in range(2)]
+    for k, look in enumerate(looks):
+        for x, y, _ in slot_position[:, look]:
+            part = tuple(
+                slice(*np.searchsorted(c, [v - NEAR_OBSTACLE_M, v + NEAR_OBSTACLE_M]))
+                for c, v in zip(centres, (x, y), strict=True)
+            )
+            east, north = centres[0][part[0]], centres[1][part[1]]
+            square = (east[:, None] - x) ** 2 + (north[None] - y) ** 2
+            found[k] |= ((top_m[part] > actor[look, 2]) & (square <= NEAR_OBSTACLE_M**2)).any()
+    latest = np.searchsorted(looks, np.arange(len(t_s)), side="right") - 1
+    return found[latest]
+
+
+def _information(offset: Float, seen: Bool, config: PlannerConfig) -> Float:
+    """[T, 3, 3] of all cameras that see the actor."""
+    total: Float = (ray_information(offset, config) * seen[..., None, None]).sum(axis=0)
+    return total
+
+
+def _motion(t_s: Float, position: Float) -> dict[str, Float]:
+    """Magnitudes [N, ...] of the derivatives, from positions at 10 Hz."""
+    even = np.arange(t_s[0], t_s[-1] + 1e-9, 1.0 / _MOTION_HZ)
+    value = np.array([[np.interp(even, t_s, axis) for axis in one.T] for one in position])
+    motion = {}
+    for name in ("speed", "acceleration", "jerk"):
+        value = np.diff(value, axis=-1) * _MOTION_HZ
+        motion[name] = np.linalg.norm(value, axis=1)
+    return motion
+
+
+def _spread(values: Float) -> dict[str, float]:
+    return {"mean": float(values.mean()), "min": float(values.min()), "max": float(values.max())}
+
+
+def _episodes(broken: Bool) -> int:
+    """How many times in all [N, T] rows something begins to hold."""
+    before = np.concatenate([np.zeros((len(broken), 1), dtype=np.bool_), broken[:, :-1]], axis=1)
+    return int((broken & ~before).sum())
