@@ -265,13 +265,16 @@ def _bones(path: Path, lines: list[str]) -> list[_Bone]:
                 count = int(rest[0]) if rest and rest[0].isdecimal() else -1
                 named = [channel.lower() for channel in rest[1 : 1 + count]]
                 _check_channels(path, number, count, named)
+                if bones[inner].channels:
+                    raise _bad_line(path, number, line)
                 bones[inner].channels, bones[inner].first_channel = named, channels
                 channels += count
                 words = rest[1 + count :]
             else:
                 raise _bad_line(path, number, line)
     if open_blocks or not bones:
-        raise DataError(path, f"its hierarchy lacks {max(len(open_blocks), 1)} closing braces", _EXPORT_AGAIN)
+        lack = f"lacks {len(open_blocks)} closing braces" if bones else "holds no bones"
+        raise DataError(path, f"its hierarchy {lack}", _EXPORT_AGAIN)
     return bones
 
 

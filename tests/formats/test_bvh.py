@@ -217,6 +217,8 @@ def test_position_channels_take_the_place_of_an_offset_unless_they_are_zero(tmp_
         ("", "is no BVH file"),
         ("HIERARCHY\nROOT a\n{\n", "ends before its line MOTION"),
         (TEXT.replace("}\n}\nMOTION", "}\nMOTION"), "lacks 1 closing braces"),
+        ("HIERARCHY\n" + FRAMES, "its hierarchy holds no bones"),
+        (TEXT.replace("CHANNELS 1 Y", "CHANNELS 1 Xrotation CHANNELS 1 Y"), "line 18: .* has no place there"),
         (TEXT.replace("JOINT Spine", "JOINT Hips"), "line 15: a second bone is called Hips"),
         (TEXT.replace("JOINT Spine", "BONE Spine"), "line 15: 'BONE Spine' has no place there"),
         (TEXT.replace("OFFSET 10 -5 0", "OFFSET 10 -5"), "line 8: 'OFFSET 10 -5' has no place"),
