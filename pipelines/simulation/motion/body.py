@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.poses import multiply, rotate
 from pipelines.simulation.motion import gait
-from pipelines.simulation.motion.feet import foot_over_time
+from pipelines.simulation.motion.feet import Foot, foot_over_time, sole_of
 from pipelines.simulation.motion.keys import Keys
 from pipelines.simulation.motion.legs import leg_rotations, pelvis_height, two_bones
 from pipelines.simulation.motion.plan import Plan
@@ -21,6 +21,7 @@ Float = NDArray[np.float64]
 Heights = Callable[[Float], Float]
 
 _STANDING_SOFTNESS_M, _STEPPING_SOFTNESS_M = 0.006, 0.026
+_SCRAPES_M = 0.02  # a kicking foot that comes as near to the ground is lifted
 _HEADROOM_M = 0.015  # what is wanted of the pelvis of somebody upright is more than the legs allow
 
 
@@ -74,6 +75,10 @@ def bodies(
     softness = _STANDING_SOFTNESS_M + moving * (_STEPPING_SOFTNESS_M - _STANDING_SOFTNESS_M)
     height = pelvis_height(rig, place, pelvis, feet, wanted, softness)
     root = np.concatenate([place, height[:, None]], axis=1)
+    feet = [
+        _kicking(rig, plan, side, foot, t_s, root, pelvis, ground)
+        for side, foot in zip(SIDES, feet, strict=True)
+    ]
     bones = {"pelvis": pelvis} | leg_rotations(rig, root, pelvis, feet)
     for foot, side in zip(feet, SIDES, strict=True):
         bones |= {f"{side}_foot": foot.rotation, f"{side}_toes": foot.toes}
@@ -81,6 +86,34 @@ def bodies(
     _arms(rig, plan, swing, t_s, root, bones, floor)
     rotation = np.stack([bones[name] for name in BONES], axis=1)
     return BodyMotion(t_s, root, rotation)
+
+
+def _kicking(
+    rig: Rig, plan: Plan, side: str, foot: Foot, t_s: Float, root: Float, pelvis: Float, ground: Heights
+) -> Foot:
+    """A foot, or, as far as it kicks, where the angles of hip, knee and ankle bring it."""
+    share = foot.kicks
+    if not share.any():
+        return foot
+    thigh = multiply(pelvis, about(1, -_deg(plan.keys, "kick_thigh_deg", t_s)))
+    shank = multiply(thigh, about(1, _deg(plan.keys, "kick_knee_deg", t_s)))
+    kicked = multiply(shank, about(1, -_deg(plan.keys, "kick_ankle_deg", t_s)))
+    ankle = root
+    for above, bone in ((pelvis, "thigh"), (thigh, "shank"), (shank, "foot")):
+        ankle = ankle + rotate(above, rig.offset[BONE[f"{side}_{bone}"]])
+    moved = replace(
+        foot,
+        ankle=foot.ankle + share[:, None] * (ankle - foot.ankle),
+        rotation=partly(foot.rotation, kicked, share),
+        toes=partly(foot.toes, kicked, share),
+    )
+    # What would scrape the ground is lifted by a bent knee.
+    lowest = np.full(len(t_s), np.inf)
+    for point in sole_of(rig, SIDES.index(side), moved):
+        lowest = np.minimum(lowest, point[:, 2] - ground(point[:, :2]))
+    spare = (lowest - _SCRAPES_M) / _SCRAPES_M
+    lifted = _SCRAPES_M * np.logaddexp(0.0, -2.0 * spare) / 2.0
+    return replace(moved, ankle=moved.ankle + (share * lifted)[:, None] * np.array([0.0, 0.0, 1.0]))
 
 
 def _deg(keys: Keys, name: str, t_s: Float) -> Float:

@@ -40,6 +40,7 @@ class Foot:
     rotation: Float  # [T, 4] world_from_foot
     toes: Float  # [T, 4]
     carries: Float  # [T] 1 while it is planted, 0 in the middle of a swing
+    kicks: Float  # [T] 1 while it swings as a kick, not as a step
     least_knee: Float  # [T] rad that its knee is flexed at least
 
 
@@ -53,7 +54,7 @@ def foot_over_time(
         side: 0 is left.
         t_s: [T]
         steps: in the order of time; the first only says where the foot stands at the beginning.
-        extra: curves `heel_deg` (both heels raised by) on top of the steps.
+        extra: curves beside the steps: `heel_deg` that both heels are raised by, `left_kick`, `right_kick`.
         ground: heights of places [N, 2].
     """
     keys = _keys_of_steps(steps, leg_m=rig.height_of_pelvis)
@@ -76,8 +77,17 @@ def foot_over_time(
         rotation=rotation,
         toes=multiply(rotation, about(1, -bend)),
         carries=curve["carries"],
+        kicks=extra.at(f"{SIDES[side]}_kick", t_s),
         least_knee=np.radians(keys.at("knee_deg", t_s)),
     )
+
+
+def sole_of(rig: Rig, side: int, foot: Foot) -> tuple[Float, Float]:
+    """Heel and tip of a foot, [T, 3] m, world."""
+    joint = rig.offset[BONE[f"{SIDES[side]}_toes"]]
+    heel, _, tip = rig.sole[side]
+    at_tip = rotate(foot.rotation, joint) + rotate(foot.toes, tip - joint)
+    return foot.ankle + rotate(foot.rotation, heel), foot.ankle + at_tip
 
 
 def _sole(rig: Rig, side: int) -> tuple[Float, Float, Float]:
@@ -109,7 +119,7 @@ def _keys_of_steps(steps: Sequence[Footstep], leg_m: float) -> Keys:
 def _extent(before: Footstep, after: Footstep, leg_m: float) -> float:
     """How long a swing is, by that of a full stride of walking, at most 1."""
     moved = float(np.hypot(*(after.place - before.place))) + 0.15 * abs(after.yaw - before.yaw)
-    return min(moved * 0.93 / (leg_m * _FULL_SWING_M), 1.0)
+    return float(np.sin(np.pi / 2 * min(moved * 0.93 / (leg_m * _FULL_SWING_M), 1.0)))
 
 
 def _stance(keys: Keys, strike_s: float, lift_s: float | None, rolled: Roll) -> None:

@@ -90,7 +90,9 @@ def pelvis_height(
         aside = np.sum((foot.ankle[:, :2] - place - hip[:, :2]) ** 2, axis=1)
         reach = first**2 + second**2 + 2 * first * second * np.cos(foot.least_knee)
         above = np.sqrt(np.maximum(reach - aside, 0.09 * reach))
-        bound = foot.ankle[:, 2] + above - hip[:, 2] + _HANGS_FREE_M * (1 - foot.carries)
+        bound = (
+            foot.ankle[:, 2] + above - hip[:, 2] + _HANGS_FREE_M * (1 - foot.carries) + 2 * foot.kicks * first
+        )
         height = _lower(height, bound, softness_m)
     return height
 

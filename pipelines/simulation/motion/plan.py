@@ -109,7 +109,7 @@ class Plan:
         stretch = self._along(parts, Pace(knots))
         self._step_through(stretch, knots, first=RIGHT)
 
-    def run_up(self, parts: Sequence[Part], speeds: Pace, plant_s: float, foot: int) -> Stretch:
+    def run_up(self, parts: Sequence[Part], speeds: Pace, plant_s: float, foot: int) -> None:
         """Run so that `foot` strikes `plant_s` after the start, and take no step after that one.
 
         The caller plans the rest of the steps and sets the time.
@@ -120,7 +120,6 @@ class Plan:
         count = max(2, round(float(phase(np.array(plant_s)))))
         first = foot if count % 2 else 1 - foot
         self._walk_steps(stretch, knots, first, count, stretch_phase=count / float(phase(np.array(plant_s))))
-        return stretch
 
     def step(self, foot: int, lift_s: float, strike_s: float, at: tuple[Float, float], run: float) -> None:
         """Put a foot beside where the body is to be: its place [2] in m and its heading in rad."""
@@ -193,7 +192,12 @@ class Plan:
             lift_s = max(when(number - in_air), stretch.start_s)
             # The stance lasts 2 - in_air steps.
             above_s = when(number + gait.above_foot(run) * (2 - in_air))
-            (place,), (heading,) = stretch.at(np.array([above_s]))
+            (now, place), (_, heading) = stretch.at(np.array([strike_s, above_s]))
+            # Who still gains speed does not yet reach as far ahead.
+            mean = float(np.hypot(*(place - now))) / (above_s - strike_s)
+            if mean > 1.1 * speed:
+                early_s = strike_s + (above_s - strike_s) * 1.1 * speed / mean
+                (place,), (heading,) = stretch.at(np.array([early_s]))
             foot = first if number % 2 else 1 - first
             self._put(foot, lift_s, strike_s, self._beside(foot, place, heading, speed, run), run)
             self.t_s = strike_s

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.simulation.motion import gait
-from pipelines.simulation.motion.actions import crouch, reach
+from pipelines.simulation.motion.actions import crouch, kick, reach
 from pipelines.simulation.motion.body import Style, bodies
 from pipelines.simulation.motion.plan import Plan
 from pipelines.simulation.motion.ways import Part
@@ -69,6 +69,9 @@ def _once(steps: Sequence[Step], rig: Rig, plan: Plan, end_s: float) -> None:
             plan.turn(float(np.radians(step.turn.deg)))
         elif step.crouch:
             crouch(plan, step.crouch.seconds, step.crouch.depth)
+        elif step.kick:
+            kick(plan, step.kick.foot, step.kick.run_up_m)
+            plan.stay(_PAUSE_S)
         elif step.reach:
             shoulder_m = float(
                 sum(
