@@ -106,9 +106,7 @@ def make_skin(rest: Float, weights: Float) -> Skin:
 
 
 @cached
-def blend(
-    rest: Float, bone: NDArray[np.int64], weight: Float, matrix: Float, translation: Float
-) -> Float:  # pragma: no cover - compiled
+def blend(rest: Float, bone: NDArray[np.int64], weight: Float, matrix: Float, translation: Float) -> Float:
     """Points [V, 3] moved by the weighted mean of their bones' transforms; see `Skin`."""
     moved = np.empty_like(rest)
     for v in range(rest.shape[0]):

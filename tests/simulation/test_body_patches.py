@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pipelines.simulation.body_patches import Patch, cut, normals, pick, together, triangles
+
+Float = NDArray[np.float64]
+
+
+def sheet(n: int = 6) -> Patch:
+    """The unit square at z = 0, of n x n squares, seen from above, with what is linear on it."""
+    x, y = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1), indexing="ij")
+    corner = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    quads = np.stack([corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]], axis=-1)
+    place = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    return Patch({"place": place, "slope": 3 * place[:, 0] - place[:, 1]}, triangles(quads.reshape(-1, 4)))
+
+
+def area_upward(patch: Patch) -> Float:
+    a, b, c = np.moveaxis(patch.values["place"][patch.faces], 1, 0)
+    return np.asarray(np.cross(b - a, c - a)[:, 2] / 2)
+
+
+@given(st.floats(0.01, 0.99), st.sampled_from([0, 1]))
+def test_a_cut_along_a_line_leaves_its_part(where: float, axis: int) -> None:
+    whole = sheet()
+    kept = cut(whole, where - whole.values["place"][:, axis])
+    area = area_upward(kept)
+    np.testing.assert_allclose(area.sum(), where, atol=1e-12)
+    assert area.min() > -1e-15  # nothing is turned over
+    place = kept.values["place"]
+    assert place[:, axis].max() <= where + 1e-12
+    np.testing.assert_allclose(kept.values["slope"], 3 * place[:, 0] - place[:, 1], atol=1e-12)
+
+
+@given(st.floats(-2.0, 2.0), st.floats(0.0, 6.28))
+def test_both_sides_of_a_cut_make_the_whole(offset: float, angle: float) -> None:
+    whole = sheet()
+    along = whole.values["place"][:, :2] @ [np.cos(angle), np.sin(angle)] + offset
+    sides = [cut(whole, side * along) for side in (1.0, -1.0)]
+    parts = together(sides, ("place",))
+    np.testing.assert_allclose(area_upward(parts).sum(), 1.0, atol=1e-12)
+
+
+def test_a_cut_makes_each_vertex_once_and_leaves_none_unused() -> None:
+    whole = sheet()
+    kept = cut(whole, 0.37 - whole.values["place"][:, 0])
+    place = kept.values["place"]
+    assert len(np.unique(place, axis=0)) == len(place)
+    np.testing.assert_array_equal(np.unique(kept.faces), np.arange(len(place)))
+
+
+def test_nothing_to_cut_is_the_same_and_nothing_to_keep_is_empty() -> None:
+    whole = sheet()
+    count = len(whole.values["place"])
+    np.testing.assert_array_equal(cut(whole, np.ones(count)).faces, whole.faces)
+    assert len(cut(whole, -np.ones(count)).faces) == 0
+    assert len(pick(whole, np.zeros(len(whole.faces), dtype=np.bool_)).values["place"]) == 0
+
+
+def test_normals_point_to_where_the_corners_run_counterclockwise() -> None:
+    whole = sheet()
+    up = np.tile([0.0, 0.0, 1.0], (len(whole.values["place"]), 1))
+    np.testing.assert_allclose(normals(whole.values["place"], whole.faces), up, atol=1e-12)
