@@ -33,7 +33,7 @@ _HAIR_M = {"female": 0.016, "male": 0.01}
 
 # Arms lean outward by the least of these that keeps hands and forearms off hips and trunk.
 _LEANS_RAD = np.radians(np.arange(0.0, 31.0, 1.0))
-_SLICE, _SOLE_STRIP = 0.017, 0.017  # fractions of the height
+_CLOTHES, _SLICE, _SOLE_STRIP = 0.008, 0.017, 0.017  # fractions of the height
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def make_body(look: Body) -> Person:
     body = _undressed(look)
     dressed = dress(body, OUTFITS[look.outfit], hair_m=_HAIR_M[look.sex])
     skin = make_skin(dressed.vertices, dressed.weights)
-    skinning = _cleared(body, dressed, skin)
+    skinning = _cleared(body)
     rig = _measured(skinning, skin, dressed, _SOLE_STRIP * look.height_m)
     mass, moment = _keypoint_parts(body)
     return Person(
@@ -125,11 +125,12 @@ def _height_standing(vertices: Float, joint: Float) -> float:
 # --- the neutral pose ----------------------------------------------------------------------------------
 
 
-def _cleared(body: Undressed, dressed: Dressed, skin: Skin) -> Skinning:
-    """The neutral pose, with the least lean of the arms that keeps them off the body."""
-    held = dressed.weights
-    arm = held[:, [BONE["left_forearm"], BONE["left_hand"]]].sum(axis=1) > 0.5
-    trunk = held[:, [BONE[name] for name in ("pelvis", "spine", "back", "left_thigh")]].sum(axis=1) > 0.5
+def _cleared(body: Undressed) -> Skinning:
+    """The neutral pose, with the least lean of the arms that keeps them off the body in any clothes."""
+    skin = make_skin(body.vertices, body.weights)
+    arm = body.weights[:, [BONE["left_forearm"], BONE["left_hand"]]].sum(axis=1) > 0.5
+    inner = [BONE[name] for name in ("pelvis", "spine", "back", "left_thigh")]
+    trunk = body.weights[:, inner].sum(axis=1) > 0.5
     for lean_rad in _LEANS_RAD:
         turns = neutral_turns(body.joint, float(lean_rad))
         skinning = Skinning(body.joint, turns, neutral_offsets(body.joint, turns))
@@ -140,14 +141,14 @@ def _cleared(body: Undressed, dressed: Dressed, skin: Skin) -> Skinning:
 
 
 def _apart(outer: Float, inner: Float) -> bool:
-    """Whether the first points lie left of the second in every level slice; fractions of the height."""
+    """Whether the first lie left of the second in every level slice, with room for clothes between."""
     bottom = min(outer[:, 2].min(), inner[:, 2].min())
     at_outer, at_inner = (((points[:, 2] - bottom) / _SLICE).astype(np.intp) for points in (outer, inner))
     slices = max(at_outer.max(), at_inner.max()) + 1
     least, most = np.full(slices, np.inf), np.full(slices, -np.inf)
     np.minimum.at(least, at_outer, outer[:, 1])
     np.maximum.at(most, at_inner, inner[:, 1])
-    return bool((least > most).all())
+    return bool((least > most + _CLOTHES).all())
 
 
 def _standing(skinning: Skinning, skin: Skin) -> Float:

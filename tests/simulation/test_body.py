@@ -195,6 +195,15 @@ def test_keypoints_lie_at_the_joints_and_the_same_on_both_sides(person: Person) 
     assert places["left_eye"][1] > 0
 
 
+def test_rig_and_keypoints_are_the_same_in_every_outfit() -> None:
+    people = [make_body(Body.model_validate({"outfit": outfit})) for outfit in OUTFITS]
+    motion = random_motion(people[0])
+    for person in people[1:]:
+        np.testing.assert_array_equal(person.rig.offset, people[0].rig.offset)
+        np.testing.assert_allclose(person.rig.sole, people[0].rig.sole, atol=1e-12)
+        np.testing.assert_array_equal(person.keypoints(motion), people[0].keypoints(motion))
+
+
 def test_keypoints_of_long_motions_are_those_of_their_parts() -> None:
     person = make_body(Body())
     motion = random_motion(person, frames=2500)
