@@ -59,15 +59,17 @@ def foot_over_time(
     """
     keys = _keys_of_steps(steps, leg_m=rig.height_of_pelvis)
     curve = {name: keys.at(name, t_s) for name in ("x", "y", "yaw", "clear", "soft", "bent", "carries")}
-    pitch = np.radians(keys.at("pitch_deg", t_s) - extra.at("heel_deg", t_s))
     joint, heel, tip = _sole(rig, side)
+    place = np.stack([curve["x"], curve["y"]], axis=1)
+    base, tilt, rise = _on_ground(place, curve["yaw"], heel[0], tip[0], ground)
+    pitch = np.radians(keys.at("pitch_deg", t_s) - extra.at("heel_deg", t_s))
+    # Uphill the heel behind rises as much more as the ground is steep.
+    pitch -= keys.at("leaves", t_s) * np.arctan(np.maximum(rise, 0.0))
 
     bend = curve["bent"] * _bent_toes(pitch)
     ankle_xz = _rolled(joint, heel, tip, pitch, bend, curve["soft"])
     ankle_xz[:, 1] += curve["clear"]
 
-    place = np.stack([curve["x"], curve["y"]], axis=1)
-    base, tilt = _on_ground(place, curve["yaw"], heel[0], tip[0], ground)
     frame = multiply(about(2, curve["yaw"]), tilt)
     flat = np.array([0.0, 0.0, -heel[1]])
     moved = np.stack([ankle_xz[:, 0], np.zeros(len(t_s)), ankle_xz[:, 1]], axis=1)
@@ -140,6 +142,7 @@ def _stance(keys: Keys, strike_s: float, lift_s: float | None, rolled: Roll) -> 
     keys.add("pitch_deg", (lift_s, rolled.lift_deg))
     for name, value in (("clear", 0.0), ("soft", _SOFTNESS_M[0]), ("bent", 1.0), ("carries", 1.0)):
         keys.add(name, (lift_s, value))
+    keys.add("leaves", (lift_s - 0.5 * lasting, 0.0), (lift_s - 0.18 * lasting, 0.9), (lift_s, 1.0))
 
 
 def _swing(keys: Keys, lift_s: float, strike_s: float, rolled: Roll) -> None:
@@ -149,6 +152,7 @@ def _swing(keys: Keys, lift_s: float, strike_s: float, rolled: Roll) -> None:
         ("clear", rolled.clearance_m),
         ("soft", ((0.25, _SOFTNESS_M[1]), (0.75, _SOFTNESS_M[1]))),
         ("bent", ((0.35, 0.0), (0.9, 0.0))),
+        ("leaves", ((0.5, 0.0),)),
         ("carries", ((0.2, 0.0), (0.6, 0.0), (0.9, 1.0))),
     ):
         keys.add(name, *((lift_s + share * (strike_s - lift_s), value) for share, value in curve))
@@ -181,8 +185,10 @@ def _rolled(joint: Float, heel: Float, tip: Float, pitch: Float, bend: Float, so
     return on_heel * (heel - heel_now) + (1 - on_heel) * (tip - tip_now)
 
 
-def _on_ground(place: Float, yaw: Float, heel_m: float, tip_m: float, ground: Heights) -> tuple[Float, Float]:
-    """Where a flat sole lies: [T, 3] m below the ankle, and how the ground tilts it, [T, 4]."""
+def _on_ground(
+    place: Float, yaw: Float, heel_m: float, tip_m: float, ground: Heights
+) -> tuple[Float, Float, Float]:
+    """Where a flat sole lies: [T, 3] m below the ankle, the ground's tilt, [T, 4], and its slope, [T]."""
     ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
     left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
     at_heel, at_tip = ground(place + heel_m * ahead), ground(place + tip_m * ahead)
@@ -193,4 +199,4 @@ def _on_ground(place: Float, yaw: Float, heel_m: float, tip_m: float, ground: He
     )
     base = np.concatenate([place, (at_heel - heel_m * rise)[:, None]], axis=1)
     tilt = multiply(about(1, -np.arctan(rise)), about(0, np.arctan(across * np.cos(np.arctan(rise)))))
-    return base, tilt
+    return base, tilt, rise

@@ -20,6 +20,7 @@ _STANDING_HALF_M, _WALKING_HALF_M, _RUNNING_HALF_M = 0.085, 0.048, 0.025  # betw
 _TOE_OUT = np.radians(6.0)
 _TURN_RATE, _TURN_CADENCE = np.radians(65.0), 1.9
 _LAST_STEPS_CADENCE = 1.5
+_SHORTER_UPHILL = 0.9  # cadence rises by this times the slope
 _STILL_M, _STILL_RAD = 0.01, np.radians(2.0)
 
 
@@ -63,6 +64,7 @@ class Plan:
     place: Float  # [2] m
     heading: float  # rad
     leg_m: float
+    ground: Callable[[Float], Float]  # height of places [N, 2]
     step_width: float = 1.0  # by the usual
     t_s: float = 0.0
     stride: float = 0.0  # rad, of the last strike
@@ -116,10 +118,9 @@ class Plan:
         """
         stretch = self._along(parts, speeds)
         knots = [knot for knot in speeds.knots if knot[0] <= plant_s + 1e-9]
-        phase = self._phase(knots, 0.0)
-        count = max(2, round(float(phase(np.array(plant_s)))))
+        count = max(2, round(float(self._phase(knots, 0.0)(np.array(plant_s)))))
         first = foot if count % 2 else 1 - foot
-        self._walk_steps(stretch, knots, first, count, stretch_phase=count / float(phase(np.array(plant_s))))
+        self._walk_steps(stretch, knots, first, count)
 
     def step(self, foot: int, lift_s: float, strike_s: float, at: tuple[Float, float], run: float) -> None:
         """Put a foot beside where the body is to be: its place [2] in m and its heading in rad."""
@@ -170,12 +171,19 @@ class Plan:
         count: int | None,
         *,
         least: float = 0.0,
-        stretch_phase: float = 1.0,
     ) -> None:
+        """Plan the steps of a stretch: `count` of them up to the last knot, or until both feet stand."""
         phase = self._phase(knots, least)
         lasting = stretch.end_s - stretch.start_s
         fine = np.linspace(-3.0, lasting + 5.0, int((lasting + 8.0) / 0.005))
-        phases = phase(fine) * stretch_phase
+        place, _ = stretch.at(stretch.start_s + fine)
+        # Steps are shorter where it is steep.
+        climbed = np.abs(np.diff(self.ground(place))) / np.maximum(np.hypot(*np.diff(place, axis=0).T), 1e-9)
+        taken = np.diff(phase(fine)) * (1 + _SHORTER_UPHILL * np.minimum(climbed, 1.0))
+        phases = np.concatenate([[0.0], np.cumsum(taken)])
+        phases -= np.interp(0.0, fine, phases)
+        if count is not None:
+            phases *= count / np.interp(knots[-1][0], fine, phases)
 
         def when(at_phase: float) -> float:
             return stretch.start_s + float(np.interp(at_phase, phases, fine))
