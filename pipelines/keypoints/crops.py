@@ -62,4 +62,4 @@ def in_picture(xy: Float, picture_from_crop: Float) -> Float:
 def side_of_box(width: float, height: float, size: tuple[int, int], padding: float) -> float:
     """The side of the region that holds a box with that padding, for a network of that input size."""
     longer = max(size)
-    return padding * max(width * longer / size[0], height * longer / size[1])
+    return float(padding * max(width * longer / size[0], height * longer / size[1]))

@@ -30,7 +30,7 @@ from pipelines.session.records import Float
 
 HeatmapCells = Literal["udp", "msra"]
 
-_SMOOTHING_CELLS = 11  # DARK's kernel for 64 x 48 cells, of sigma 2 as the Gaussians it was trained on
+_SMOOTHING_CELLS, _SMOOTHING_SIGMA = 11, 2.0  # DARK's kernel for 64 x 48 cells
 _REACH = 2  # bins on either side of the best one
 _FLOOR = 1e-10
 
@@ -133,36 +133,32 @@ def heatmap_peaks(maps: Float) -> tuple[Float, Float]:
     score = flat[np.arange(len(flat)), row, column]
     place = np.column_stack([column, row]).astype(np.float64)
     inside = (row > 0) & (row < rows - 1) & (column > 0) & (column < columns - 1) & (score > 0)
-    for i in np.flatnonzero(inside):
-        place[i] += _newton_step(_log_around(flat[i], row[i], column[i]))
+    place[inside] += _newton_steps(_log_around(flat[inside], row[inside], column[inside]))
     return place.reshape(people, joints, 2), score.reshape(people, joints)
 
 
-def _log_around(heatmap: Float, row: int, column: int) -> Float:
-    """The logarithm [3, 3] of the smoothed map around a cell; smoothing sees the whole map's values there.
-
-    Beyond the border the map counts as 0, as in DARK.
-    """
+def _log_around(maps: Float, row: NDArray[np.intp], column: NDArray[np.intp]) -> Float:
+    """The logarithm [M, 3, 3] of smoothed maps [M, h, w] around one cell each, 0 beyond the border."""
     reach = _SMOOTHING_CELLS // 2
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / 2.0) ** 2)
-    kernel /= kernel.sum()
-    padded = np.pad(np.maximum(heatmap, 0.0), reach + 1)
-    part = padded[row : row + _SMOOTHING_CELLS + 2, column : column + _SMOOTHING_CELLS + 2]
-    windows = np.lib.stride_tricks.sliding_window_view(part, (_SMOOTHING_CELLS, _SMOOTHING_CELLS))
-    smoothed = np.einsum("rcij,i,j->rc", windows, kernel, kernel)
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SMOOTHING_SIGMA) ** 2)
+    shifted = np.stack([np.pad(kernel / kernel.sum(), (shift, 2 - shift)) for shift in range(3)])
+    padded = np.pad(np.maximum(maps, 0.0), ((0, 0), (reach + 1, reach + 1), (reach + 1, reach + 1)))
+    offset = np.arange(_SMOOTHING_CELLS + 2)
+    which = np.arange(len(maps))[:, None, None]
+    part = padded[which, (row[:, None] + offset)[:, :, None], (column[:, None] + offset)[:, None, :]]
+    smoothed = np.einsum("mrj,cj->mrc", np.einsum("mij,ri->mrj", part, shifted), shifted)
     around: Float = np.log(np.maximum(smoothed, _FLOOR))
     return around
 
 
-def _newton_step(around: Float) -> Float:
-    """From the middle of [3, 3] values to the top of the paraboloid through them, [x, y]."""
-    dx, dy = (around[1, 2] - around[1, 0]) / 2, (around[2, 1] - around[0, 1]) / 2
-    dxx = around[1, 2] - 2 * around[1, 1] + around[1, 0]
-    dyy = around[2, 1] - 2 * around[1, 1] + around[0, 1]
-    dxy = (around[2, 2] - around[2, 0] - around[0, 2] + around[0, 0]) / 4
+def _newton_steps(around: Float) -> Float:
+    """From the middle of [M, 3, 3] values to the tops [M, 2] of paraboloids through them, x and y."""
+    dx, dy = (around[:, 1, 2] - around[:, 1, 0]) / 2, (around[:, 2, 1] - around[:, 0, 1]) / 2
+    dxx = around[:, 1, 2] - 2 * around[:, 1, 1] + around[:, 1, 0]
+    dyy = around[:, 2, 1] - 2 * around[:, 1, 1] + around[:, 0, 1]
+    dxy = (around[:, 2, 2] - around[:, 2, 0] - around[:, 0, 2] + around[:, 0, 0]) / 4
     determinant = dxx * dyy - dxy**2
-    if dxx >= 0 or determinant <= 0:
-        return np.zeros(2)
-    step = np.array([dxy * dy - dyy * dx, dxy * dx - dxx * dy]) / determinant
-    bounded: Float = np.clip(step, -1.0, 1.0)
-    return bounded
+    has_top = (dxx < 0) & (determinant > 0)
+    step = np.stack([dxy * dy - dyy * dx, dxy * dx - dxx * dy], axis=1)
+    step = step / np.where(has_top, determinant, 1.0)[:, None]
+    return np.where(has_top[:, None], np.clip(step, -1.0, 1.0), 0.0)

@@ -1,7 +1,7 @@
 """Small real ONNX models whose answers are known: they find bright spots, or say what they were told to.
 
-A pose model here has two kinds of joints: those of even number are where the upper half of its input is
-brightest, those of odd number where the lower half is.
+A pose model here divides its input into bands of equal height, two unless asked for others: joint j is
+where the band j modulo their number is brightest.
 """
 
 from __future__ import annotations
@@ -29,12 +29,13 @@ def heatmap_model(
     batch: int | str = "n",
     layout: str = "nchw",
     open_size: bool = False,
+    bands: int = 2,
     channel: tuple[float, float, float] = (1 / 3, 1 / 3, 1 / 3),
 ) -> Path:
     """Cell k is the brightness at pixel k (W - 1) / (w - 1) (`udp`) or at k `stride` (`msra`)."""
     width, height = size
     columns, rows = width // stride, height // stride
-    constants = _pose_constants(size, joints, channel)
+    constants = _pose_constants(size, joints, channel, bands)
     if cells == "udp":
         constants["sizes"] = np.array([joints, rows, columns], np.int64)
         last = helper.make_node(
@@ -98,11 +99,10 @@ def constant_model(
 
 
 def _pose_constants(
-    size: tuple[int, int], joints: int, channel: Sequence[float]
+    size: tuple[int, int], joints: int, channel: Sequence[float], bands: int = 2
 ) -> dict[str, NDArray[np.float32] | NDArray[np.int64]]:
-    upper = np.arange(size[1])[:, None] < size[1] / 2
-    odd = np.arange(joints)[:, None, None] % 2 == 1
-    mask = np.broadcast_to(odd ^ upper, (joints, size[1], size[0]))
+    band = np.arange(size[1]) * bands // size[1]
+    mask = np.repeat((np.arange(joints)[:, None] % bands == band)[:, :, None], size[0], axis=2)
     return {
         "weight": np.array(channel, np.float32).reshape(1, 3, 1, 1),
         "mask": mask[None].astype(np.float32),
@@ -154,9 +154,11 @@ def spots(
     width: int, height: int, places: Sequence[tuple[float, float]], sigma_px: float, colour: int | None = None
 ) -> NDArray[np.uint8]:
     """A black picture [H, W, 3] BGR with round Gaussian spots; of one BGR channel only where it is given."""
-    x, y = np.meshgrid(np.arange(width), np.arange(height))
-    bright = sum(np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * sigma_px**2)) for u, v in places)
-    grey = np.clip(np.round(255 * np.asarray(bright)), 0, 255).astype(np.uint8)
+    x, y = (
+        np.exp(-((np.arange(length) - np.array(at)[:, None]) ** 2) / (2 * sigma_px**2))
+        for length, at in zip((width, height), zip(*places, strict=True), strict=True)
+    )
+    grey = np.clip(np.round(255 * np.einsum("pr,pc->rc", y, x)), 0, 255).astype(np.uint8)
     picture = np.zeros((height, width, 3), np.uint8)
     picture[..., slice(None) if colour is None else colour] = grey[..., None] if colour is None else grey
     return picture

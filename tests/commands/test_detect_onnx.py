@@ -1,0 +1,111 @@
+"""The user's own model through the commands: spans, errors, and what a kill in the middle leaves behind."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipelines.session.registries import DETECTORS
+from tests.commands.runner import MOCAP, content, refused, succeeds
+from tests.keypoints.spotted_flights import CAMERAS, FPS, person_at, spot_detector, write_spotted_flight
+
+pytestmark = pytest.mark.skipif(
+    "onnx" not in DETECTORS.names(), reason="installed before `onnx` was registered: run `make setup`"
+)
+
+
+def test_keypoints_of_the_users_model_become_a_skeleton(tmp_path: Path) -> None:
+    frames = 30
+    session = write_spotted_flight(tmp_path, frames).with_suffix(".session")
+    succeeds("ingest", tmp_path / "flight.yaml")
+    detector = spot_detector(tmp_path)
+    succeeds("reconstruct", session, "--detector", detector)
+
+    table = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
+    assert (table["status"] == "ok").all()
+    found = table[["x", "y", "z"]].to_numpy().reshape(frames, 17, 3)
+    truth = person_at(np.arange(frames) / FPS)[:, np.arange(17) % 3]
+    # 0.1 input pixels (tests/keypoints/test_onnx_pose.py), of 0.6 picture pixels, and as much again for the
+    # video's quantisation; a pixel is 2 cm, and depth errs by 1 / sin(31 deg) = 1.9 times as much.
+    assert np.linalg.norm(found - truth, axis=-1).max() < 0.1 * 0.6 * 2 * 0.02 * 1.9 * np.sqrt(3)
+
+    stage = json.loads((session / "detect" / "stage.json").read_text(encoding="utf-8"))
+    assert str(tmp_path) not in json.dumps(stage)
+    # The models may move, and the detector does not run again.
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    for model in ("pose.onnx", "people.onnx"):
+        shutil.move(tmp_path / model, moved / model)
+    before = (session / "detect" / "stage.json").stat().st_ino
+    succeeds("reconstruct", session, "--detector", detector.replace(f"{tmp_path}/", f"{moved}/"))
+    assert (session / "detect" / "stage.json").stat().st_ino == before
+    assert "pose.onnx: does not exist" in refused("reconstruct", session, "--detector", detector)
+
+
+def test_what_cannot_be_run_is_refused_in_one_line(tmp_path: Path) -> None:
+    session = write_spotted_flight(tmp_path, 5).with_suffix(".session")
+    succeeds("ingest", tmp_path / "flight.yaml")
+    assert "write onnx:MODEL.onnx" in refused("reconstruct", session, "--detector", "onnx")
+    assert "takes nothing behind" in refused("reconstruct", session, "--detector", "blazepose:x")
+    text = tmp_path / "text.onnx"
+    text.write_text("no model")
+    assert "is no model" in refused("reconstruct", session, "--detector", f"onnx:{text}")
+
+
+def test_models_tells_how_to_use_your_own() -> None:
+    listed = succeeds("models")
+    assert "--detector onnx:MODEL.onnx" in listed
+    families = json.loads(succeeds("models", "--json"))["families"]
+    assert [family["name"] for family in families] == ["onnx"]
+
+
+@pytest.mark.slow
+def test_stopped_in_the_middle_it_goes_on_with_what_is_finished(tmp_path: Path) -> None:
+    frames = 700  # three blocks for each camera
+    manifest = write_spotted_flight(tmp_path, frames)
+    detector = spot_detector(tmp_path)
+    undisturbed, session = tmp_path / "undisturbed.session", tmp_path / "stopped.session"
+    for folder in (undisturbed, session):
+        succeeds("ingest", manifest, "-o", folder)
+    succeeds("reconstruct", undisturbed, "--detector", detector, "--workers", "1")
+
+    kept: dict[str, int] = {}
+    for blocks, how, status in (
+        (1, signal.SIGKILL, -signal.SIGKILL),
+        (2, signal.SIGINT, 130),
+        (4, signal.SIGKILL, -signal.SIGKILL),
+    ):
+        assert stopped_with(how, blocks, session, detector) == status
+        now = finished(session)
+        assert blocks <= len(now) < 3 * len(CAMERAS)
+        assert kept.items() <= now.items()  # the very same files: not made again
+        kept = now
+    succeeds("reconstruct", session, "--detector", detector, "--workers", "1")
+    assert content(session) == content(undisturbed)
+
+
+def stopped_with(how: signal.Signals, blocks: int, session: Path, detector: str) -> int:
+    """Send a signal to `mocap reconstruct` once so many blocks are finished; its exit status."""
+    arguments = [MOCAP, "reconstruct", str(session), "--detector", detector, "--workers", "1"]
+    process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while len(finished(session)) < blocks:
+        assert process.poll() is None, "it ended before it could be stopped"
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(how)
+    return process.wait(60)
+
+
+def finished(session: Path) -> dict[str, int]:
+    """The blocks that are finished, with the inode of their table."""
+    blocks = (session / ".partial").glob("detect-*/*/keypoints.parquet")
+    return {table.parent.name: table.stat().st_ino for table in blocks if table.parent.suffix != ".new"}

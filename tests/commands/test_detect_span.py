@@ -1,0 +1,48 @@
+"""Stage `detect` on a span of the flight, called as the stages above call it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from pipelines.detect import detect
+from pipelines.ingest import ingest
+from pipelines.session.errors import DataError
+from pipelines.session.registries import DETECTORS
+from pipelines.session.stages import StageRecord, locked
+from tests.keypoints.spotted_flights import CAMERAS, FPS, spot_detector, write_spotted_flight
+
+pytestmark = pytest.mark.skipif(
+    "onnx" not in DETECTORS.names(), reason="installed before `onnx` was registered: run `make setup`"
+)
+
+
+def test_only_the_pictures_of_the_span_are_looked_at(tmp_path: Path) -> None:
+    session = tmp_path / "flight.session"
+    ingest(write_spotted_flight(tmp_path, 40), session)
+    detector = spot_detector(tmp_path)
+
+    def run(start_s: float | None, end_s: float | None, every: int = 1) -> StageRecord:
+        with locked(session) as writable:
+            record = detect(writable, detector=detector, start_s=start_s, end_s=end_s, every=every)
+        assert record is not None
+        return record
+
+    def frames(camera: str) -> list[int]:
+        table = pd.read_parquet(session / "detect" / camera / "keypoints.parquet")
+        return sorted({int(frame) for frame in table["frame"]})
+
+    # Frame k is at k / 30 s: from the 10th on, and before the 20th.
+    record = run(10 / FPS, 20 / FPS)
+    assert all(frames(camera) == list(range(10, 20)) for camera in CAMERAS)
+    assert record.counts["rows"] == {name: [10, 20] for name in CAMERAS}
+    assert record.counts["cameras"]["left"]["frames"] == 10
+    # Every fourth of the flight, not of the span: the same pictures as without one.
+    record = run(10 / FPS, None, every=4)
+    assert frames("left") == [12, 16, 20, 24, 28, 32, 36]
+    assert record.counts["rows"]["left"] == [12, 40]
+    assert run(None, 20 / FPS).key != run(None, None).key
+    with pytest.raises(DataError, match="no picture lies in the flight from 9 s on"):
+        run(9.0, None)
