@@ -40,3 +40,13 @@ def from_axes(forward: Float, left: Float, up: Float) -> Float:
 def unit(vectors: Float) -> Float:
     """[T, 3] of length 1."""
     return np.asarray(vectors / np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True)), dtype=np.float64)
+
+
+def between(one: Float, other: Float) -> Float:
+    """[4] the shortest rotation from one direction [3] to another; about z where they are opposite."""
+    one, other = one / np.sqrt(np.sum(one**2)), other / np.sqrt(np.sum(other**2))
+    turned = np.array([*np.cross(one, other), 1.0 + float(np.sum(one * other))])
+    length = float(np.sqrt(np.sum(turned**2)))
+    if length < 1e-9:
+        return np.array([0.0, 0.0, 1.0, 0.0])
+    return turned / length

@@ -1,0 +1,264 @@
+"""Recorded motion of somebody else's skeleton, put on the actor's bones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.poses import conjugate, multiply, rotate
+from pipelines.session.errors import DataError
+from pipelines.session.records import SkeletalMotion
+from pipelines.simulation.motion.bone_names import match_bones
+from pipelines.simulation.motion.legs import two_bones
+from pipelines.simulation.motion.turns import about, between, partly
+from pipelines.simulation.rig import BONE, BONES, SIDES, BodyMotion, Rig, joint_centres, sole_points
+
+Float = NDArray[np.float64]
+
+_END_OF_LIMB = {"thigh": "shank", "shank": "foot", "upper_arm": "forearm", "forearm": "hand", "foot": "toes"}
+_FLAT_FOOT = np.radians(30.0)  # feet that point down by less than this in the rest pose are meant to stand
+_T_POSE_TURN = np.radians(20.0)  # in one frame: nobody turns a joint so fast
+_SEAM_S = 0.5  # the end of a repeated motion is bent to its beginning over this long
+_AT_REST_MPS = 0.3  # a foot that is slower stands
+
+
+def retarget(
+    source: SkeletalMotion,
+    rig: Rig,
+    t_s: Float,
+    *,
+    ground: Callable[[Float], Float],
+    start: Float,
+    heading_deg: float,
+    repeat: bool,
+) -> BodyMotion:
+    """Move our bones as those of a recording.
+
+    Bones are matched by name (`match_bones`), and turned as the source's are turned from its rest pose,
+    after the limbs of our neutral pose were laid along those of that rest pose: arms that hang along arms
+    of a T-pose. The rest pose is taken to stand upright. The way of the pelvis is scaled by the length of
+    the legs, begins at `start` and looks along `heading_deg`. Heights are those of the recording over its
+    floor, scaled, over the ground here; a foot that would come below it is lifted, its knee bending. A
+    single frame at the beginning from which the pose jumps, a T-pose put there for calibration, is left out.
+
+    Args:
+        source: what moves.
+        rig: whose bones are to move.
+        t_s: [T] seconds; beyond the end of the recording its last pose is held, or it begins again.
+        ground: heights of places [N, 2].
+        start: [2] m.
+        heading_deg: counterclockwise from east.
+        repeat: begin again where it ended; the last half second is bent to the first pose.
+
+    Raises:
+        DataError: the bones of a person were not found, or a leg of the source has no length.
+    """
+    match = match_bones(source)
+    source = _without_first_pose(source)
+    rest = _rest_joints(source)
+    scale = _leg_length(rig) / _source_leg_length(rest, match)
+    laid = _laid_on(rig, rest, match)
+    bones = [match[name] for name in BONES]
+
+    def moved(at_s: Float, *, again: bool) -> BodyMotion:
+        pose = _sampled(source, bones, laid, at_s, repeat=again)
+        about_up = about(2, np.full(len(at_s), np.radians(heading_deg) - pose.heading))
+        place = rotate(about_up, (pose.root - pose.first) * scale)
+        root = np.concatenate([place[:, :2] + start, pose.root[:, 2:] * scale], axis=1)
+        return BodyMotion(at_s, root, multiply(about_up[:, None], pose.rotation))
+
+    floor_m = _floor(rig, moved(source.t_s, again=False))
+    return _on_ground(rig, moved(t_s, again=repeat), floor_m, ground)
+
+
+# --- the source's rest pose ----------------------------------------------------------------------------
+
+
+def _without_first_pose(source: SkeletalMotion) -> SkeletalMotion:
+    if len(source.t_s) < 3:
+        return source
+    turned = [_angle(source.rotation[i], source.rotation[i + 1]).max() for i in (0, 1)]
+    if turned[0] < _T_POSE_TURN or turned[0] < 5 * turned[1]:
+        return source
+    return SkeletalMotion(
+        source.t_s[1:] - source.t_s[1],
+        source.bones,
+        source.parent,
+        source.offset,
+        source.end,
+        source.root[1:],
+        source.rotation[1:],
+    )
+
+
+def _angle(one: Float, other: Float) -> Float:
+    """[B] rad between rotations."""
+    relative = multiply(conjugate(one), other)
+    return np.asarray(
+        2 * np.arctan2(np.sqrt(np.sum(relative[..., :3] ** 2, axis=-1)), np.abs(relative[..., 3])),
+        dtype=np.float64,
+    )
+
+
+def _rest_joints(source: SkeletalMotion) -> Float:
+    """[B, 3] m, the joints in the rest pose."""
+    joints = np.zeros((len(source.bones), 3))
+    for bone, parent in enumerate(source.parent):
+        if parent >= 0:
+            joints[bone] = joints[parent] + source.offset[bone]
+    return joints
+
+
+def _leg_length(rig: Rig) -> float:
+    return sum(float(np.linalg.norm(rig.offset[BONE[f"left_{bone}"]])) for bone in ("shank", "foot"))
+
+
+def _source_leg_length(rest: Float, match: dict[str, int]) -> float:
+    legs = [
+        float(np.linalg.norm(rest[match[f"{side}_{lower}"]] - rest[match[f"{side}_{upper}"]]))
+        for side in SIDES
+        for upper, lower in (("thigh", "shank"), ("shank", "foot"))
+    ]
+    if min(legs) <= 0:
+        raise DataError("skeleton", "a thigh or a shank has no length", "give its bones their offsets")
+    return sum(legs) / 2
+
+
+def _laid_on(rig: Rig, rest: Float, match: dict[str, int]) -> Float:
+    """[B, 4] how our bones are turned when we stand as the source does in its rest pose."""
+    across = rest[match["left_thigh"]] - rest[match["right_thigh"]]
+    facing = about(2, np.array([np.arctan2(-across[0], across[1])]))[0]
+    laid = np.broadcast_to(facing, (len(BONES), 4)).copy()
+    for side in SIDES:
+        for bone, end in _END_OF_LIMB.items():
+            name, below = f"{side}_{bone}", f"{side}_{end}"
+            theirs = rest[match[below]] - rest[match[name]]
+            if float(np.linalg.norm(theirs)) <= 0:
+                continue  # the source ends here: the bone goes on as what it hangs on
+            ours = rotate(facing, rig.offset[BONE[below]])
+            if bone == "foot":
+                falls = [np.arctan2(-v[2], np.hypot(v[0], v[1])) for v in (ours, theirs)]
+                if abs(falls[1] - falls[0]) < _FLAT_FOOT:
+                    theirs = np.array(
+                        [theirs[0], theirs[1], ours[2] / np.hypot(*ours[:2]) * np.hypot(*theirs[:2])]
+                    )
+            laid[BONE[name]] = multiply(between(ours, theirs), facing)
+        for bone, above in (("hand", "forearm"), ("toes", "foot")):
+            laid[BONE[f"{side}_{bone}"]] = laid[BONE[f"{side}_{above}"]]
+    return laid
+
+
+# --- over time -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Pose:
+    root: Float  # [T, 3] m, of the source
+    rotation: Float  # [T, B, 4] of our bones
+    first: Float  # [3] m, where the root begins
+    heading: float  # rad, where the first pose looks
+
+
+def _sampled(source: SkeletalMotion, bones: list[int], laid: Float, t_s: Float, *, repeat: bool) -> _Pose:
+    """Poses at the asked times; every round of a repeated motion begins where the last one ended."""
+    world = np.empty_like(source.rotation)
+    for bone, parent in enumerate(source.parent):
+        own = source.rotation[:, bone]
+        world[:, bone] = own if parent < 0 else multiply(world[:, parent], own)
+    rotation = multiply(world[:, bones], laid)
+    heading = [_heading(rotation[i, BONE["pelvis"]]) for i in (0, -1)]
+    root, first = source.root, source.root[0]
+    lasts = float(source.t_s[-1])
+    since = np.clip(t_s, 0.0, lasts)
+    rounds = np.zeros(len(t_s), dtype=np.int64)
+    if repeat and lasts > 0:
+        seam = np.clip((source.t_s - (lasts - min(_SEAM_S, lasts / 2))) / min(_SEAM_S, lasts / 2), 0.0, 1.0)
+        share = seam * seam * (3 - 2 * seam)
+        again = multiply(about(2, np.array([heading[1] - heading[0]])), rotation[0])
+        rotation = np.stack(
+            [
+                partly(rotation[:, b], np.broadcast_to(again[b], rotation[:, b].shape), share)
+                for b in range(len(BONES))
+            ],
+            axis=1,
+        )
+        root = root.copy()
+        root[:, 2] += share * (root[0, 2] - root[-1, 2])
+        rounds = np.floor(np.maximum(t_s, 0.0) / lasts).astype(np.int64)
+        since = np.maximum(t_s, 0.0) - rounds * lasts
+    after = np.clip(np.searchsorted(source.t_s, since, side="right"), 1, max(len(source.t_s) - 1, 1))
+    after = np.minimum(after, len(source.t_s) - 1)
+    before = np.maximum(after - 1, 0)
+    step = np.where(after > before, source.t_s[after] - source.t_s[before], 1.0)
+    share = np.clip((since - source.t_s[before]) / step, 0.0, 1.0)
+    at = root[before] + share[:, None] * (root[after] - root[before])
+    turned = np.stack(
+        [partly(rotation[before, bone], rotation[after, bone], share) for bone in range(len(BONES))], axis=1
+    )
+    if rounds.any():
+        at, turned = _rounds(at, turned, rounds, root[-1] - first, first, heading[1] - heading[0])
+    return _Pose(at, turned, first, heading[0])
+
+
+def _rounds(
+    at: Float, turned: Float, rounds: NDArray[np.int64], moved: Float, first: Float, turn: float
+) -> tuple[Float, Float]:
+    """Poses of later rounds, each turned and moved on from the last."""
+    at, turned = at.copy(), turned.copy()
+    start = first.copy()
+    for number in range(int(rounds.max()) + 1):
+        now = rounds == number
+        by = about(2, np.array([number * turn]))[0]
+        at[now, :2] = (rotate(by, (at[now] - first) * [1.0, 1.0, 0.0]) + start)[:, :2]
+        turned[now] = multiply(by, turned[now])
+        start = start + rotate(by, moved * [1.0, 1.0, 0.0])
+    return at, turned
+
+
+def _heading(rotation: Float) -> float:
+    ahead = rotate(rotation, np.array([1.0, 0.0, 0.0]))
+    return float(np.arctan2(ahead[1], ahead[0]))
+
+
+# --- on the ground -------------------------------------------------------------------------------------
+
+
+def _floor(rig: Rig, motion: BodyMotion) -> float:
+    """How high the recording's own floor is, m: where its lower foot is while that is at rest."""
+    points = sole_points(rig, motion).reshape(len(motion.t_s), -1, 3)
+    which = points[..., 2].argmin(axis=1)
+    lowest = points[np.arange(len(points)), which]
+    if len(points) < 2:
+        return float(lowest[0, 2])
+    speed = np.sqrt(np.sum(np.gradient(points, motion.t_s, axis=0) ** 2, axis=2))
+    at_rest = speed[np.arange(len(points)), which] < _AT_REST_MPS
+    return float(np.median(lowest[at_rest, 2]) if at_rest.any() else lowest[:, 2].min())
+
+
+def _on_ground(rig: Rig, motion: BodyMotion, floor_m: float, ground: Callable[[Float], Float]) -> BodyMotion:
+    """Stand the motion on the ground: the pelvis follows it, each foot is brought over it by its leg."""
+    root = motion.root.copy()
+    root[:, 2] += ground(root[:, :2]) - floor_m
+    motion = BodyMotion(motion.t_s, root, motion.rotation)
+
+    below = sole_points(rig, motion)
+    centres = joint_centres(rig, motion)
+    rotation = motion.rotation.copy()
+    left = np.array([0.0, 1.0, 0.0])
+    for index, side in enumerate(SIDES):
+        thigh, shank, foot = (BONE[f"{side}_{bone}"] for bone in ("thigh", "shank", "foot"))
+        heights = np.stack([ground(below[:, index, point, :2]) for point in range(3)], axis=1)
+        # As high over the ground under the foot as it was over that under the pelvis, and not below it.
+        ankle = centres[:, foot].copy()
+        under = ground(ankle[:, :2])
+        ankle[:, 2] += under - ground(root[:, :2])
+        clear = (below[:, index, :, 2] + (under - ground(root[:, :2]))[:, None] - heights).min(axis=1)
+        ankle[:, 2] += np.maximum(-clear, 0.0)
+        hinge = rotate(rotation[:, thigh], left) + rotate(rotation[:, shank], left)
+        rotation[:, thigh], rotation[:, shank] = two_bones(
+            rig.offset[shank], rig.offset[foot], ankle - centres[:, thigh], hinge
+        )
+    return BodyMotion(motion.t_s, root, rotation)
