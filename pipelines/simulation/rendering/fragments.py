@@ -1,0 +1,193 @@
+"""From samples to fragments: the pieces of surface that make up a pixel, each to be shaded once."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.compilation import cached
+from pipelines.simulation.rendering.meshes import GROUND, SMOOTH, Mesh
+from pipelines.simulation.rendering.raster import NOTHING, Band
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+UInt8 = NDArray[np.uint8]
+
+
+class View(NamedTuple):
+    """The camera, and the land that goes on level where the ground's mesh ends."""
+
+    position: Float  # [3] m
+    world_from_camera: Float  # [3, 3]
+    pinhole: Float  # [4] fx, fy, cx, cy
+    land: Float  # [4] height in m (NaN without land) and mean RGB reflectance
+
+
+class Fragments(NamedTuple):
+    """Pieces of surface, in the order of their pixels; fields are filled up to a count."""
+
+    pixel: Int32  # [N] of the band, row by row
+    share: Float32  # [N] of the pixel's samples
+    on_ground: UInt8  # [N] 0, or 1 + the pixel's place in a pattern of 4 x 4 for the texture
+    point: Float32  # [N, 3] m, world
+    normal: Float32  # [N, 3] unit, towards the camera's side of the face
+    colour: Float32  # [N, 3] RGB reflectance
+    distance: Float32  # [N] m from the camera
+    slant: Float32  # [N] cosine between the normal and the direction to the camera
+
+
+def room_for(count: int) -> Fragments:
+    """Fragments to be filled."""
+    point, normal, colour = (np.empty((count, 3), np.float32) for _ in range(3))
+    pixel, on_ground = np.empty(count, np.int32), np.empty(count, np.uint8)
+    share, distance, slant = (np.empty(count, np.float32) for _ in range(3))
+    return Fragments(pixel, share, on_ground, point, normal, colour, distance, slant)
+
+
+def gather(band: Band, first_row: int, shifts_px: Float, view: View, mesh: Mesh, fragments: Fragments) -> int:
+    """Find what a band's pixels are made of.
+
+    Samples of one face in one pixel become one fragment at their common centre, which lies on the face
+    and inside it. Samples without a face see land below the horizon, and nothing above.
+
+    Args:
+        band: what the samples see; `len(shifts_px)` sample rows per pixel row.
+        first_row: the picture's row that is the band's first.
+        shifts_px: of the sample rows, as they were drawn.
+        view: the camera.
+        mesh: what the band's faces index.
+        fragments: room for as many as there are samples; filled.
+
+    Returns:
+        How many fragments there are.
+    """
+    return _gather(
+        band.nearness,
+        band.source,
+        first_row,
+        shifts_px,
+        view.position,
+        view.world_from_camera,
+        view.pinhole,
+        view.land,
+        mesh.vertices,
+        mesh.faces,
+        mesh.normals,
+        mesh.colour,
+        mesh.kind,
+        fragments.pixel,
+        fragments.share,
+        fragments.on_ground,
+        fragments.point,
+        fragments.normal,
+        fragments.colour,
+        fragments.distance,
+        fragments.slant,
+    )
+
+
+@cached
+def _gather(
+    nearness: Float32,
+    source: Int32,
+    first_row: int,
+    shifts_px: Float,
+    position: Float,
+    turn: Float,
+    pinhole: Float,
+    land: Float,
+    vertices: Float,
+    faces: Int32,
+    normals: Float32,
+    colours: Float32,
+    kind: UInt8,
+    pixel: Int32,
+    share: Float32,
+    on_ground: UInt8,
+    point: Float32,
+    normal: Float32,
+    colour: Float32,
+    distance: Float32,
+    slant: Float32,
+) -> int:
+    per_pixel, width = len(shifts_px), nearness.shape[1]
+    weight, per_fx, per_fy = 1.0 / per_pixel, 1.0 / pinhole[0], 1.0 / pinhole[1]
+    (ax, bx, cx), (ay, by, cy), (az, bz, cz) = turn
+    ox, oy, oz = position
+    count = 0
+    for row in range(nearness.shape[0] // per_pixel):
+        top = row * per_pixel
+        for x in range(width):
+            place = 1 + 4 * (row & 3) + (x & 3)
+            done = 0  # a bit for each sample
+            for first in range(per_pixel):
+                if done >> first & 1:
+                    continue
+                face = source[top + first, x]
+                samples, near, right, down = 0, 0.0, 0.0, 0.0
+                for k in range(first, per_pixel):
+                    if source[top + k, x] == face:
+                        done |= 1 << k
+                        samples += 1
+                        near += nearness[top + k, x]
+                        right += shifts_px[k]
+                        down += (k + 0.5) * weight - 0.5
+                mean = 1.0 / samples
+                right = (x + right * mean - pinhole[2]) * per_fx
+                down = (first_row + row + down * mean - pinhole[3]) * per_fy
+                dx = ax * right + bx * down + cx
+                dy = ay * right + by * down + cy
+                dz = az * right + bz * down + cz
+                stretch = np.sqrt(dx * dx + dy * dy + dz * dz)  # metres of ray per metre of depth
+                if face == NOTHING:
+                    depth = (land[0] - oz) / dz
+                    if not (0.0 < depth < 1e6):  # NaN where there is no land
+                        continue
+                    nx, ny, nz = 0.0, 0.0, 1.0
+                    red, green, blue = land[1], land[2], land[3]
+                    on_ground[count] = place
+                else:
+                    depth = samples / near
+                    a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+                    px, py, pz = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+                    ux, uy, uz = vertices[b, 0] - px, vertices[b, 1] - py, vertices[b, 2] - pz
+                    vx, vy, vz = vertices[c, 0] - px, vertices[c, 1] - py, vertices[c, 2] - pz
+                    wx = ox + depth * dx - px
+                    wy = oy + depth * dy - py
+                    wz = oz + depth * dz - pz
+                    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+                    square = nx * nx + ny * ny + nz * nz
+                    # Barycentric coordinates: areas opposite the corners, over that of the face.
+                    per_square = 1.0 / square
+                    s = nx * (wy * vz - wz * vy) + ny * (wz * vx - wx * vz) + nz * (wx * vy - wy * vx)
+                    t = nx * (uy * wz - uz * wy) + ny * (uz * wx - ux * wz) + nz * (ux * wy - uy * wx)
+                    s = min(max(s * per_square, 0.0), 1.0)
+                    t = min(max(t * per_square, 0.0), 1.0 - s)
+                    o = 1.0 - s - t
+                    red = o * colours[a, 0] + s * colours[b, 0] + t * colours[c, 0]
+                    green = o * colours[a, 1] + s * colours[b, 1] + t * colours[c, 1]
+                    blue = o * colours[a, 2] + s * colours[b, 2] + t * colours[c, 2]
+                    if kind[face] & SMOOTH != 0:
+                        nx = o * normals[a, 0] + s * normals[b, 0] + t * normals[c, 0]
+                        ny = o * normals[a, 1] + s * normals[b, 1] + t * normals[c, 1]
+                        nz = o * normals[a, 2] + s * normals[b, 2] + t * normals[c, 2]
+                        square = max(nx * nx + ny * ny + nz * nz, 1e-30)
+                    scale = 1.0 / np.sqrt(square)
+                    nx, ny, nz = nx * scale, ny * scale, nz * scale
+                    on_ground[count] = place if kind[face] & GROUND != 0 else 0
+                towards = -(nx * dx + ny * dy + nz * dz) / stretch
+                side = 1.0 if towards > 0.0 else -1.0  # of the face that is seen
+                pixel[count] = row * width + x
+                share[count] = samples * weight
+                point[count, 0] = ox + depth * dx
+                point[count, 1] = oy + depth * dy
+                point[count, 2] = oz + depth * dz
+                normal[count, 0], normal[count, 1], normal[count, 2] = side * nx, side * ny, side * nz
+                colour[count, 0], colour[count, 1], colour[count, 2] = red, green, blue
+                distance[count] = depth * stretch
+                slant[count] = side * towards
+                count += 1
+    return count

@@ -1,0 +1,182 @@
+"""Pictures of people in a world, as a pinhole camera in daylight takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.poses import matrix_from_quaternion
+from pipelines.simulation.rendering.fragments import View, gather, room_for
+from pipelines.simulation.rendering.ground import ground_texture, paint
+from pipelines.simulation.rendering.meshes import GROUND, Mesh, mesh_of, stacked
+from pipelines.simulation.rendering.raster import (
+    CENTRES_PX,
+    NOTHING,
+    SHIFTS_PX,
+    SUBROWS,
+    Band,
+    bands,
+    draw,
+    empty_band,
+    projected,
+)
+from pipelines.simulation.rendering.sensor import developed
+from pipelines.simulation.rendering.shading import shade
+from pipelines.simulation.rendering.shadows import ShadowMap, shadow_map, sun_axes, sunlight
+from pipelines.simulation.surfaces import Surface
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+UInt8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+_BAND_ROWS = 16  # pixel rows whose samples fit a processor's cache
+_STATIC_TEXEL_M, _STATIC_TEXELS = 0.02, 2048
+_PERSON_TEXEL_M, _PERSON_TEXELS = 0.008, 1024
+_LEVEL_M = 0.05  # ground that keeps this close to its mean height casts no shadow worth a map
+
+
+class Renderer:
+    """A world and a camera that takes pictures of it; several threads may share one.
+
+    Everything is opaque and matt. The sun casts shadows, the sky lights without them. Where the mesh of
+    the ground ends, land goes on level at the height of its lowest point, to the horizon.
+
+    Args:
+        static: what stands still.
+        intrinsics: the camera, without distortion.
+        sun: [3] direction towards it, of any length.
+        seed: of the ground's texture and of the sensor's noise.
+
+    Raises:
+        ValueError: a camera with distortion, or a sun that is not above the horizon.
+    """
+
+    def __init__(self, static: Sequence[Surface], intrinsics: Intrinsics, *, sun: Float, seed: int) -> None:
+        if intrinsics.model != "none" and any(intrinsics.distortion):
+            raise ValueError(f"only cameras without distortion are rendered, not {intrinsics.model}")
+        direction = np.asarray(sun, np.float64)
+        if direction.shape != (3,) or not np.isfinite(direction).all() or direction[2] <= 0:
+            raise ValueError(f"the sun must stand above the horizon, not at {direction.tolist()}")
+        self._intrinsics = intrinsics
+        self._seed = seed
+        self._texture = ground_texture(seed)
+        self._axes = sun_axes(direction)
+        self._static = mesh_of(static)
+        self._land = _land(self._static)
+        self._static_shadows = _static_maps(self._static, self._axes)
+
+    def picture(
+        self, position: Float, quaternion_xyzw: Float, people: Sequence[Surface], frame: int
+    ) -> UInt8:
+        """What the camera sees.
+
+        Args:
+            position: [3] m, of the camera in the world.
+            quaternion_xyzw: [4] world_from_camera.
+            people: whoever moves.
+            frame: number of the picture; with the seed and the position it fixes the noise.
+
+        Returns:
+            [H, W, 3] BGR; equal arguments give equal bytes.
+        """
+        width, height = self._intrinsics.width, self._intrinsics.height
+        position = np.asarray(position, np.float64)
+        rotation = matrix_from_quaternion(np.asarray(quaternion_xyzw, np.float64))
+        of_people = [mesh_of([person]) for person in people if len(person.faces)]
+        mesh = stacked([self._static, *of_people])
+        shadows = [*self._static_shadows, *(_person_map(each, self._axes) for each in of_people)]
+        pinhole = np.array(
+            [self._intrinsics.fx, self._intrinsics.fy, self._intrinsics.cx, self._intrinsics.cy]
+        )
+        view = View(position, rotation, pinhole, self._land)
+
+        triangles = projected(mesh.vertices, mesh.faces, position, rotation, self._intrinsics)
+        chosen, start = bands(triangles, height, _BAND_ROWS)
+        light = np.empty((height, width, 3), np.float32)
+        fragments = room_for(SUBROWS * _BAND_ROWS * width)
+        for k, first_row in enumerate(range(0, height, _BAND_ROWS)):
+            rows = light[first_row : first_row + _BAND_ROWS]
+            band = empty_band(SUBROWS * len(rows), width)
+            draw(triangles, chosen[start[k] : start[k + 1]], SHIFTS_PX, SUBROWS * first_row, band)
+            count = gather(band, first_row, SHIFTS_PX, view, mesh, fragments)
+            paint(self._texture, fragments, count, view)
+            sun = sunlight(shadows, self._axes, fragments, count)
+            shade(fragments, count, sun, first_row, view, rows)
+        return developed(light, _noise_key(self._seed, frame, position))
+
+    def silhouette(
+        self, position: Float, quaternion_xyzw: Float, person: Surface, others: Sequence[Surface] = ()
+    ) -> Bool:
+        """The pixels at whose centres the person is what the camera sees.
+
+        Args:
+            position: [3] m, of the camera in the world.
+            quaternion_xyzw: [4] world_from_camera.
+            person: whose silhouette.
+            others: who may stand in front, besides what stands still.
+
+        Returns:
+            [H, W].
+        """
+        meshes = [mesh_of([person]), self._static, *(mesh_of([other]) for other in others)]
+        seen = self._at_centres(position, quaternion_xyzw, stacked(meshes)).source
+        mine: Bool = (seen != NOTHING) & (seen < len(person.faces))
+        return mine
+
+    def depth(self, position: Float, quaternion_xyzw: Float, people: Sequence[Surface] = ()) -> Float32:
+        """How far what is seen at each pixel's centre lies, along the optical axis.
+
+        Args:
+            position: [3] m, of the camera in the world.
+            quaternion_xyzw: [4] world_from_camera.
+            people: whoever moves.
+
+        Returns:
+            [H, W] m; infinite where no surface is seen.
+        """
+        mesh = stacked([self._static, *(mesh_of([person]) for person in people)])
+        nearness = self._at_centres(position, quaternion_xyzw, mesh).nearness
+        depth = np.full_like(nearness, np.inf)
+        return np.divide(np.float32(1), nearness, out=depth, where=nearness > 0)
+
+    def _at_centres(self, position: Float, quaternion_xyzw: Float, mesh: Mesh) -> Band:
+        rotation = matrix_from_quaternion(np.asarray(quaternion_xyzw, np.float64))
+        position = np.asarray(position, np.float64)
+        triangles = projected(mesh.vertices, mesh.faces, position, rotation, self._intrinsics)
+        band = empty_band(self._intrinsics.height, self._intrinsics.width)
+        draw(triangles, np.arange(len(triangles.source), dtype=np.int32), CENTRES_PX, 0, band)
+        return band
+
+
+def _land(static: Mesh) -> Float:
+    """[4] height and mean reflectance of the land around the ground; NaN without ground."""
+    corners = np.unique(static.faces[static.kind & GROUND != 0])
+    if len(corners) == 0:
+        return np.full(4, np.nan)
+    return np.array([static.vertices[corners, 2].min(), *static.colour[corners].mean(axis=0)], np.float64)
+
+
+def _static_maps(static: Mesh, axes: Float) -> list[ShadowMap]:
+    """One map, over all that stands on the ground or rises from it; none if nothing does."""
+    ground = np.zeros(len(static.vertices), np.bool_)
+    ground[static.faces[static.kind & GROUND != 0]] = True
+    height = static.vertices[:, 2]
+    level = np.median(height[ground]) if ground.any() else np.nan
+    casting = static.vertices[~(ground & (np.abs(height - level) < _LEVEL_M))]
+    if len(casting) == 0:
+        return []
+    return [shadow_map(static, casting, axes, finest_m=_STATIC_TEXEL_M, most_texels=_STATIC_TEXELS)]
+
+
+def _person_map(person: Mesh, axes: Float) -> ShadowMap:
+    return shadow_map(person, person.vertices, axes, finest_m=_PERSON_TEXEL_M, most_texels=_PERSON_TEXELS)
+
+
+def _noise_key(seed: int, frame: int, position: Float) -> int:
+    """The position sets apart the pictures that several cameras take of one frame."""
+    where = np.ascontiguousarray(position).view(np.uint32).tolist()
+    return int(np.random.SeedSequence([seed, frame, *where]).generate_state(1, np.uint64)[0])
