@@ -2,13 +2,13 @@
 
 A few moments, spread over the flight; the one where the views disagree most is always among them. Each
 camera shows its own frame nearest to the moment, with the skeleton and the logged pose interpolated to
-the time of that frame.
+the time of that frame. `views_of` does the same for any stretch of a camera's frames.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -90,7 +90,7 @@ def collect_moments(
     motion = summary.motion
     if motion is None or not motion.measured.any():
         return ()
-    cameras = [_Camera.of(row, content, summary) for row in summary.cameras if row.name in content.keypoints]
+    cameras = [_camera(row, content, summary) for row in summary.cameras if row.name in content.keypoints]
     if not cameras:
         return ()
     chosen, worst = choose_moments(motion)
@@ -159,48 +159,19 @@ def match_people(reprojected: Float, found: Float) -> list[int | None]:
     return matches
 
 
-def _row_median(values: Float) -> Float:
-    """Median of the finite numbers in each row; NaN where there are none."""
-    medians = np.full(len(values), np.nan)
-    known = np.isfinite(values).any(axis=1)
-    medians[known] = np.nanmedian(values[known], axis=1)
-    return medians
-
-
 @dataclass(frozen=True)
-class _Camera:
-    """One camera's frames, poses and what was found in its pictures."""
+class FilmedCamera:
+    """One camera's F frames, poses and what was found in its pictures."""
 
     name: str
     intrinsics: Intrinsics
     frame: Int64  # [F]
     frame_t_ns: Int64  # [F]
-    joints: tuple[str, ...]
     keypoints: pd.DataFrame  # tables.KEYPOINTS
     track: Trajectory
-    static: bool
+    static: bool  # the first pose of the track holds all the time
     max_gap_ns: int
     max_extrapolation_ns: int
-
-    @classmethod
-    def of(cls, camera: CameraRow, content: SessionContent, summary: Summary) -> _Camera:
-        frames, keypoints = content.frames[camera.name], content.keypoints[camera.name]
-        settings = section(content.stages.get("reconstruct", {}), "settings")
-        # What the reconstruction did not use is no measure of it.
-        used = keypoints["confidence"] >= (number(settings, "min_confidence") or 0.0)
-        between = summary.description.pose_interpolation
-        return cls(
-            name=camera.name,
-            intrinsics=camera.entry.intrinsics.intrinsics(),
-            frame=frames["frame"].to_numpy(np.int64),
-            frame_t_ns=frames["t_ns"].to_numpy(np.int64),
-            joints=summary.motion.joints if summary.motion is not None else (),
-            keypoints=keypoints[used],
-            track=trajectory_from(content.poses[camera.name]),
-            static=camera.entry.poses.static,
-            max_gap_ns=round(between.max_gap_s * 1e9),
-            max_extrapolation_ns=round(between.max_extrapolation_s * 1e9),
-        )
 
     def nearest_frame(self, t_ns: int) -> int | None:
         """Row of the frame nearest to a time; None where none lies within a frame period."""
@@ -208,59 +179,121 @@ class _Camera:
         period = int(np.median(np.diff(self.frame_t_ns))) if len(self.frame_t_ns) > 1 else 0
         return nearest if abs(int(self.frame_t_ns[nearest]) - t_ns) <= period else None
 
-    def people_in(self, frame: int) -> Float:
-        """What was found in a frame, [D, J, 2] px; NaN where a joint was not."""
-        return detections_from(self.keypoints[self.keypoints["frame"] == frame], self.joints).xy
+    def people_in(self, frames: Int64, joints: tuple[str, ...]) -> list[Float]:
+        """What was found in each of these frames, [D, J, 2] px; NaN where a joint was not."""
+        people = detections_from(self.keypoints[self.keypoints["frame"].isin(frames)], joints)
+        first, behind = (np.searchsorted(people.frame, frames, side=side) for side in ("left", "right"))
+        return [people.xy[start:stop] for start, stop in zip(first, behind, strict=True)]
 
-    def pose_at(self, t_ns: int) -> tuple[Float, Float]:
-        """world_from_camera: position [3] and rotation [3, 3], NaN without a pose."""
-        position, quaternion = self.track.position[:1], self.track.quaternion_xyzw[:1]
+    def poses_at(self, t_ns: Int64) -> tuple[Float, Float]:
+        """world_from_camera at times [N]: position [N, 3] and rotation [N, 3, 3], NaN without a pose."""
+        position = np.repeat(self.track.position[:1], len(t_ns), axis=0)
+        quaternion = np.repeat(self.track.quaternion_xyzw[:1], len(t_ns), axis=0)
         if not self.static:
             position, quaternion = interpolate_poses(
                 self.track.t_ns,
                 self.track.position,
                 self.track.quaternion_xyzw,
-                np.array([t_ns]),
+                t_ns,
                 max_gap_ns=self.max_gap_ns,
                 max_extrapolation_ns=self.max_extrapolation_ns,
             )
-        return position[0], matrix_from_quaternion(quaternion[0])
+        return position, matrix_from_quaternion(quaternion)
 
 
-def _view(
-    camera: _Camera, at: int, motion: Motion, row: int, origin_ns: int, read_frame: ReadFrame | None
-) -> View:
-    frame, t_ns = int(camera.frame[at]), int(camera.frame_t_ns[at])
-    skeleton = _skeleton_at(motion, t_ns)
-    joints, points = with_derived(motion.joints, skeleton)
-    position, rotation = camera.pose_at(t_ns)
-    reprojected = project((points - position) @ rotation, camera.intrinsics)
-    people = camera.people_in(frame)
-    matches = match_people(reprojected[:, : len(motion.joints)], people)
-    nobody = np.full((len(motion.joints), 2), np.nan)
-    found = np.stack([nobody if match is None else people[match] for match in matches])
-    lost = np.isfinite(found[..., 0]) & np.isnan(skeleton[..., 0])
-    rejected = lost & (motion.status[row] == STATUS.index("rejected"))
-    return View(
-        camera=camera.name,
-        intrinsics=camera.intrinsics,
-        joints=joints,
-        frame=frame,
-        t_s=(t_ns - origin_ns) / 1e9,
-        found=found,
-        reprojected=reprojected,
-        rejected=rejected,
-        unmeasured=lost & ~rejected,
-        others=people[[d for d in range(len(people)) if d not in matches]],
-        has_pose=bool(np.isfinite(position).all()),
-        picture=read_frame(camera.name, frame) if read_frame is not None else None,
+def _camera(camera: CameraRow, content: SessionContent, summary: Summary) -> FilmedCamera:
+    frames, keypoints = content.frames[camera.name], content.keypoints[camera.name]
+    settings = section(content.stages.get("reconstruct", {}), "settings")
+    # What the reconstruction did not use is no measure of it.
+    used = keypoints["confidence"] >= (number(settings, "min_confidence") or 0.0)
+    between = summary.description.pose_interpolation
+    return FilmedCamera(
+        name=camera.name,
+        intrinsics=camera.entry.intrinsics.intrinsics(),
+        frame=frames["frame"].to_numpy(np.int64),
+        frame_t_ns=frames["t_ns"].to_numpy(np.int64),
+        keypoints=keypoints[used],
+        track=trajectory_from(content.poses[camera.name]),
+        static=camera.entry.poses.static,
+        max_gap_ns=round(between.max_gap_s * 1e9),
+        max_extrapolation_ns=round(between.max_extrapolation_s * 1e9),
     )
 
 
-def _skeleton_at(motion: Motion, t_ns: int) -> Float:
-    """Measured joints [P, J, 3] at a time, interpolated between neighbours; NaN beside a missing one."""
+def status_at(motion: Motion, t_ns: Int64) -> NDArray[np.int8]:
+    """What became of every joint at the skeleton's time nearest to each of [N] times, [N, P, J].
+
+    -1, as where the table has no row, where that time is further away than two neighbours may be apart.
+    """
+    after = np.clip(np.searchsorted(motion.t_ns, t_ns), 1, max(len(motion.t_ns) - 1, 1))
+    around = np.minimum(np.stack([after - 1, after]), len(motion.t_ns) - 1)
+    apart = np.abs(motion.t_ns[around] - t_ns)
+    nearest = np.where(apart[1] < apart[0], around[1], around[0])
+    near = apart.min(axis=0) <= _longest_step_ns(motion)
+    return np.where(near[:, None, None], motion.status[nearest], np.int8(-1))
+
+
+def views_of(
+    camera: FilmedCamera, at: Int64, motion: Motion, status: NDArray[np.int8], origin_ns: int
+) -> list[View]:
+    """The skeleton as it would be seen in frames of a camera, beside what was found there; no pictures.
+
+    Args:
+        camera: the camera.
+        at: [N] rows of its frames.
+        motion: the skeleton; interpolated to the frames' times, never across a gap or a missing joint.
+        status: [N, P, J] of the joints at these frames, index into tables.STATUS.
+        origin_ns: the zero of the views' times.
+    """
+    frame, t_ns = camera.frame[at], camera.frame_t_ns[at]
+    skeleton = interpolate_points(
+        motion.t_ns, motion.measured_position, t_ns, max_gap_ns=_longest_step_ns(motion)
+    )
+    joints, points = with_derived(motion.joints, skeleton)
+    position, rotation = camera.poses_at(t_ns)
+    reprojected = project((points - position[:, None, None]) @ rotation[:, None], camera.intrinsics)
+    views = []
+    for n, people in enumerate(camera.people_in(frame, motion.joints)):
+        matches = match_people(reprojected[n, :, : len(motion.joints)], people)
+        nobody = np.full((len(motion.joints), 2), np.nan)
+        found = np.stack([nobody if match is None else people[match] for match in matches])
+        lost = np.isfinite(found[..., 0]) & np.isnan(skeleton[n, ..., 0])
+        rejected = lost & (status[n] == STATUS.index("rejected"))
+        views.append(
+            View(
+                camera=camera.name,
+                intrinsics=camera.intrinsics,
+                joints=joints,
+                frame=int(frame[n]),
+                t_s=(int(t_ns[n]) - origin_ns) / 1e9,
+                found=found,
+                reprojected=reprojected[n],
+                rejected=rejected,
+                unmeasured=lost & ~rejected,
+                others=people[[d for d in range(len(people)) if d not in matches]],
+                has_pose=bool(np.isfinite(position[n]).all()),
+                picture=None,
+            )
+        )
+    return views
+
+
+def _view(
+    camera: FilmedCamera, at: int, motion: Motion, row: int, origin_ns: int, read_frame: ReadFrame | None
+) -> View:
+    (view,) = views_of(camera, np.array([at]), motion, motion.status[[row]], origin_ns)
+    return view if read_frame is None else replace(view, picture=read_frame(view.camera, view.frame))
+
+
+def _longest_step_ns(motion: Motion) -> int:
+    """Times of the skeleton further apart have nothing between them."""
     usual_ns = float(np.median(np.diff(motion.t_ns))) if len(motion.t_ns) > 1 else 0.0
-    at_time: Float = interpolate_points(
-        motion.t_ns, motion.measured_position, np.array([t_ns]), max_gap_ns=round(_LONGEST_STEP * usual_ns)
-    )[0]
-    return at_time
+    return round(_LONGEST_STEP * usual_ns)
+
+
+def _row_median(values: Float) -> Float:
+    """Median of the finite numbers in each row; NaN where there are none."""
+    medians = np.full(len(values), np.nan)
+    known = np.isfinite(values).any(axis=1)
+    medians[known] = np.nanmedian(values[known], axis=1)
+    return medians

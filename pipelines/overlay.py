@@ -1,0 +1,388 @@
+"""The skeleton over every picture of a camera, as a video: the eye's check of a reconstruction.
+
+Read the skeleton, the cameras' poses and the keypoints of a session; draw them into picture after picture,
+block by block; join the blocks to one video for each camera, with the stamps of its pictures. The videos
+are no stage: nothing is made of them, and what a session's other stages write does not depend on them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from threading import Event
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines.formats.pictures import Picture, open_pictures
+from pipelines.formats.video_writing import TICK_S, join_videos, write_h264
+from pipelines.reporting.frame_drawing import blank_frame, caption_of, draw_frame, padded_to_even
+from pipelines.reporting.motion import Motion, motion_from_skeleton
+from pipelines.reporting.overlays import FilmedCamera, status_at, views_of
+from pipelines.session.description import Description, MediaEntry, read_description
+from pipelines.session.errors import DataError
+from pipelines.session.progress import Progress, Silent
+from pipelines.session.records import Int64, Trajectory
+from pipelines.session.stages import StageRecord, locked
+from pipelines.session.storage import canonical_json, read_json, write_json
+from pipelines.session.tables import CAMERA_POSES, FRAMES, KEYPOINTS, POSES, SKELETON, read_table
+from pipelines.session.tabular import trajectory_from
+from pipelines.session.whole_folders import Making, is_made, whole_folder
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_REVISION = 1
+_MARK = "overlay.json"
+_BLOCK = 300  # pictures that are drawn and encoded together, and kept when the work is interrupted
+_TICK_NS = int(TICK_S * 10**9) + 1
+
+
+def write_overlays(
+    folder: Path,
+    *,
+    cameras: Sequence[str] | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    workers: int = 1,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Write overlay/<camera>.mp4 of a reconstructed session.
+
+    Pictures that cannot be decoded are grey and say so. Without `cameras`, those whose pictures are not
+    there any more are left out, which is said.
+
+    Args:
+        folder: the session.
+        cameras: which ones; all that have pictures by default.
+        start_s: pictures from then on only, in seconds since the first frame of the flight's cameras.
+        end_s: and those before then.
+        workers: blocks of pictures drawn at once; what they show does not depend on them.
+        overwrite: do it again although nothing changed, and replace what is no overlay.
+        progress: who watches.
+
+    Returns:
+        The videos, in the order of the session's cameras.
+
+    Raises:
+        DataError: the session holds no skeleton or no pictures, a camera that was named has none, or its
+            pictures are gone or damaged; or the place is taken.
+        BusyError: another process writes the session.
+    """
+    progress = progress or Silent()
+    target = folder / "overlay"
+    with locked(folder) as session:
+        record = session.record("reconstruct")
+        if record is None:
+            raise DataError(folder, "holds no skeleton to draw", "run `mocap reconstruct` first")
+        description = read_description(folder)
+        span_s = (start_s, end_s)
+        wanted = _with_pictures(folder, description, cameras)
+        if not overwrite and (videos := _made(target, _key(record, wanted, span_s))):
+            return videos
+        there = _still_there(folder, description, wanted, progress, all_of_them=cameras is not None)
+        key = _key(record, there, span_s)
+        if not overwrite and (videos := _made(target, key)):
+            return videos
+        _refuse_foreign(target, overwrite)
+        with whole_folder(target, key, mark=_MARK, overwrite=overwrite) as making:
+            films = _films(folder, description, record, there, span_s, progress)
+            counts = _draw(folder, films, _show(folder, description, record), making, workers, progress)
+            summary = {"schema": 1, "key": key, "method": record.settings["method"], "cameras": counts}
+            write_json(making.folder / _MARK, summary)
+            making.publish()
+    return [_video(target, film.camera.name) for film in films]
+
+
+def _video(folder: Path, camera: str) -> Path:
+    return folder / f"{camera}.mp4"
+
+
+def _key(record: StageRecord, cameras: Sequence[str], span_s: tuple[float | None, float | None]) -> str:
+    """Equal for equal videos: the reconstruction's key stands for all that a session was made of."""
+    ingredients = {
+        "revision": _REVISION,
+        "reconstruct": record.key,
+        "cameras": list(cameras),
+        "span_s": span_s,
+    }
+    return hashlib.sha256(canonical_json(ingredients).encode()).hexdigest()
+
+
+def _made(target: Path, key: str) -> list[Path]:
+    """The videos that are there with this key; none where one is missing."""
+    if not is_made(target, key, mark=_MARK):
+        return []
+    videos = [_video(target, name) for name in read_json(target / _MARK)["cameras"]]
+    return videos if all(path.is_file() for path in videos) else []
+
+
+def _refuse_foreign(target: Path, overwrite: bool) -> None:
+    if target.exists() and not (target / _MARK).is_file() and not overwrite:
+        raise DataError(target, "is in the way, and no overlay of mocap's", "move it away, or use --force")
+
+
+# --- which cameras, and which of their pictures --------------------------------------------------------
+
+
+def _with_pictures(folder: Path, description: Description, cameras: Sequence[str] | None) -> list[str]:
+    """The cameras to draw on, in the session's order."""
+    filmed = [name for name, entry in description.cameras.items() if entry.media is not None]
+    for name in cameras or ():
+        if name not in description.cameras:
+            raise DataError(name, "no such camera", f"there are {', '.join(description.cameras)}")
+        if name not in filmed:
+            raise DataError(
+                name, "has no pictures to draw on", "state its `video` in flight.yaml, or leave it out"
+            )
+    if not filmed:
+        raise DataError(
+            folder, "has no pictures to draw on", "state the cameras' `video` in flight.yaml, and ingest it"
+        )
+    return [name for name in filmed if cameras is None or name in cameras]
+
+
+def _still_there(
+    folder: Path, description: Description, cameras: Sequence[str], progress: Progress, *, all_of_them: bool
+) -> list[str]:
+    """Those whose pictures lie where they lay when they were ingested."""
+    there, gone = [], []
+    for name in cameras:
+        missing = [path for path in _media(description, name).paths if not (folder / path).exists()]
+        if missing:
+            gone.append((name, folder / missing[0]))
+        else:
+            there.append(name)
+    if gone and (all_of_them or not there):
+        raise DataError(
+            gone[0][1].resolve(),
+            f"the pictures of {gone[0][0]} are not there any more",
+            "put them back, or ingest them from where they are now",
+        )
+    for name, path in gone:
+        progress.note(f"{name}: no overlay, its pictures are not there any more ({path.resolve()})")
+    return there
+
+
+def _media(description: Description, camera: str) -> MediaEntry:
+    media = description.cameras[camera].media
+    if media is None:
+        raise ValueError(f"{camera} has no pictures")
+    return media
+
+
+@dataclass(frozen=True)
+class _Film:
+    """The N pictures of a camera that are drawn on."""
+
+    camera: FilmedCamera
+    media: MediaEntry
+    rows: range  # N of the camera's frames
+    pts_ns: Int64  # [N] since the first of them
+    size: tuple[int, int]  # width, height
+
+    @property
+    def blocks(self) -> list[range]:
+        """Which of the N are drawn together."""
+        count = len(self.rows)
+        return [range(first, min(first + _BLOCK, count)) for first in range(0, count, _BLOCK)]
+
+
+def _films(
+    folder: Path,
+    description: Description,
+    record: StageRecord,
+    cameras: Sequence[str],
+    span_s: tuple[float | None, float | None],
+    progress: Progress,
+) -> list[_Film]:
+    offsets_s = read_json(folder / "reconstruct" / "metrics.json").get("clock_offsets_s", {})
+    refined = _refined_poses(folder)
+    films = []
+    for name in cameras:
+        frames = read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
+        rows = _rows_between(frames["t_ns"].to_numpy(np.int64) - _origin_ns(description), *span_s)
+        if not rows:
+            progress.note(f"{name}: no overlay, none of its pictures lies in the span")
+            continue
+        camera = _camera(folder, description, record, name, frames, refined, offsets_s.get(name) or 0.0)
+        pts_ns = frames["pts_ns"].to_numpy(np.int64)[rows.start : rows.stop]
+        media = _media(description, name)
+        size = _picture_size(folder, media, camera, rows)
+        films.append(_Film(camera, media, rows, _apart(pts_ns - pts_ns[0]), size))
+    if not films:
+        raise DataError(folder, "has no picture in that span", "look at `mocap info`, or leave the span out")
+    return films
+
+
+def _origin_ns(description: Description) -> int:
+    return min(entry.frames.first_t_ns for entry in description.cameras.values())
+
+
+def _rows_between(since_ns: Int64, start_s: float | None, end_s: float | None) -> range:
+    """The rows of sorted times [F] at or after `start_s` and before `end_s`."""
+    first = 0 if start_s is None else int(np.searchsorted(since_ns, round(start_s * 1e9)))
+    stop = len(since_ns) if end_s is None else int(np.searchsorted(since_ns, round(end_s * 1e9)))
+    return range(first, stop)
+
+
+def _apart(pts_ns: Int64) -> Int64:
+    """The stamps, where two would share a tick of the video, later by as much as it takes."""
+    least = np.arange(len(pts_ns)) * _TICK_NS
+    spread: Int64 = np.maximum.accumulate(pts_ns - least) + least
+    return spread
+
+
+def _camera(
+    folder: Path,
+    description: Description,
+    record: StageRecord,
+    name: str,
+    frames: pd.DataFrame,
+    refined: dict[str, Trajectory],
+    offset_s: float,
+) -> FilmedCamera:
+    """A camera as the reconstruction took it, or as it was refined."""
+    entry, bounds = description.cameras[name], description.pose_interpolation
+    stage = "cameras" if entry.keypoints is not None else "detect"
+    keypoints = read_table(folder / stage / name / "keypoints.parquet", KEYPOINTS)
+    logged = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
+    return FilmedCamera(
+        name=name,
+        intrinsics=entry.intrinsics.intrinsics(),
+        frame=frames["frame"].to_numpy(np.int64),
+        frame_t_ns=frames["t_ns"].to_numpy(np.int64) + round(offset_s * 1e9),
+        keypoints=keypoints[keypoints["confidence"] >= record.settings["min_confidence"]],
+        track=refined.get(name, logged),
+        static=entry.poses.static,
+        max_gap_ns=round(bounds.max_gap_s * 1e9),
+        max_extrapolation_ns=round(bounds.max_extrapolation_s * 1e9),
+    )
+
+
+def _refined_poses(folder: Path) -> dict[str, Trajectory]:
+    """The poses of the cameras that the reconstruction refined."""
+    path = folder / "reconstruct" / "cameras.parquet"
+    if not path.exists():
+        return {}
+    table = read_table(path, CAMERA_POSES)
+    return {str(name): trajectory_from(own.sort_values("t_ns")) for name, own in table.groupby("camera")}
+
+
+def _picture_size(folder: Path, media: MediaEntry, camera: FilmedCamera, rows: range) -> tuple[int, int]:
+    """Width and height of the first picture that can be decoded, else those of the calibration."""
+    with open_pictures(media, folder) as pictures:
+        for frame in camera.frame[rows.start : rows.stop].tolist():
+            picture = pictures.read(frame)
+            if picture is not None:
+                return picture.shape[1], picture.shape[0]
+    return camera.intrinsics.width, camera.intrinsics.height
+
+
+# --- drawing -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Show:
+    """What is the same in all videos."""
+
+    motion: Motion
+    method: str
+    origin_ns: int
+
+
+def _show(folder: Path, description: Description, record: StageRecord) -> _Show:
+    skeleton = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON)
+    return _Show(motion_from_skeleton(skeleton), record.settings["method"], _origin_ns(description))
+
+
+def _draw(
+    folder: Path, films: Sequence[_Film], show: _Show, making: Making, workers: int, progress: Progress
+) -> dict[str, dict[str, int]]:
+    """Draw all blocks and join them to a video for each camera; how many pictures were what."""
+    stopped = Event()
+    progress.start("Drawing overlays", sum(len(film.rows) for film in films))
+
+    def draw(item: tuple[_Film, range]) -> Path:
+        film, block = item
+        produce = partial(_draw_block, folder, film, block, show, stopped, progress)
+        return making.part(f"{film.camera.name}-{block.start}", produce)
+
+    items = [(film, block) for film in films for block in film.blocks]
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            parts = list(pool.map(draw, items))
+        except BaseException:
+            stopped.set()  # or Ctrl-C would wait for the blocks under way
+            raise
+    counts = {}
+    for film in films:
+        name = film.camera.name
+        own = [part for (of, _), part in zip(items, parts, strict=True) if of is film]
+        join_videos(_video(making.folder, name), [part / "part.mp4" for part in own])
+        total: Counter[str] = Counter()
+        for part in own:
+            total.update(read_json(part / "counts.json"))
+        counts[name] = dict(total)
+        if total["undecoded"]:
+            progress.note(
+                f"{name}: {total['undecoded']} of {total['frames']} pictures cannot be decoded and are grey"
+            )
+    return counts
+
+
+def _draw_block(
+    folder: Path,
+    film: _Film,
+    block: range,
+    show: _Show,
+    stopped: Event,
+    progress: Progress,
+    part: Path,
+) -> None:
+    at = np.array(film.rows[block.start : block.stop])
+    status = status_at(show.motion, film.camera.frame_t_ns[at])
+    views = views_of(film.camera, at, show.motion, status, show.origin_ns)
+    width, height = film.size
+    counts = {
+        "frames": len(views),
+        "undecoded": 0,
+        "without_pose": sum(not view.has_pose for view in views),
+    }
+
+    def pictures() -> Iterator[Picture]:
+        with open_pictures(film.media, folder) as source:
+            for view, of_joints in zip(views, status, strict=True):
+                if stopped.is_set():
+                    raise InterruptedError("another block failed, or the user stopped it")
+                picture = source.read(view.frame)
+                if picture is None:
+                    counts["undecoded"] += 1
+                    picture = blank_frame(width, height, f"frame {view.frame} cannot be decoded")
+                picture = _of_size(picture, width, height)
+                yield padded_to_even(draw_frame(picture, view, caption_of(view, of_joints, show.method)))
+                progress.advance()
+
+    write_h264(
+        part / "part.mp4",
+        pictures(),
+        film.pts_ns[block.start : block.stop],
+        width=width + width % 2,
+        height=height + height % 2,
+    )
+    write_json(part / "counts.json", counts)
+
+
+def _of_size(picture: Picture, width: int, height: int) -> Picture:
+    """A log's pictures may change their size under way, a video's may not."""
+    import cv2
+
+    if picture.shape[:2] == (height, width):
+        return picture
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,0 +1,172 @@
+"""A view drawn into its picture, for videos: bones, joints, keypoints and a caption as pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.reporting.bones import side_of
+from pipelines.reporting.overlays import Picture, View
+from pipelines.session.records import Float
+from pipelines.session.skeletons import bones_of
+from pipelines.session.tables import STATUS
+
+Colour = tuple[int, int, int]
+
+# Blue, green, red; the page's colours on pictures.
+SIDES: dict[str, Colour] = {"left": (245, 183, 89), "right": (92, 157, 255), "": (229, 226, 223)}
+FOUND: Colour = (224, 142, 255)
+REJECTED: Colour = (69, 90, 255)
+UNMEASURED: Colour = (209, 205, 201)
+GREY = 96
+_DARK: Colour = (0, 0, 0)
+_PAPER: Colour = (255, 255, 255)
+
+_BONE = 1 / 700  # of the picture's diagonal: 2 px at 1280 x 720
+_TEXT = 1 / 2000  # of it, too: OpenCV's scale, 22 px high at 1
+_LEAST_TEXT = 0.3  # OpenCV's scale below which no letter can be read
+_SHIFT = 4  # OpenCV takes coordinates in sixteenths of a pixel
+_FURTHEST_PX = 1e6  # of a point just before the camera's plane; OpenCV counts in 32 bits
+
+
+def draw_frame(picture: Picture, view: View, caption: Sequence[str]) -> Picture:
+    """A copy of a picture with a view's skeleton and keypoints, and lines of text at its upper left.
+
+    Bones and joints are coloured by the side of the body; what is NaN is not drawn. Rings are keypoints that
+    were found, crosses those of joints that were rejected (red) or not reconstructed (grey), small dots
+    the keypoints of other people.
+
+    Args:
+        picture: [height, width, 3]; of another size than the view's camera it is the same view at another
+            scale.
+        view: what to draw; its own picture is not looked at.
+        caption: lines of ASCII; left out where the picture is too small to read them.
+    """
+    drawn = picture.copy()
+    height, width = drawn.shape[:2]
+    scale = np.array([width / view.intrinsics.width, height / view.intrinsics.height])
+    bone = max(1, round(_BONE * float(np.hypot(width, height))))
+    reprojected, found, others = (
+        (points + 0.5) * scale - 0.5 for points in (view.reprojected, view.found, view.others)
+    )
+    _dots(drawn, others.reshape(-1, 2), bone, UNMEASURED)
+    _bones(drawn, view.joints, reprojected, bone)
+    for k, joint in enumerate(view.joints):
+        _dots(drawn, reprojected[:, k], 1.5 * bone, SIDES[side_of(joint)])
+    _rings(drawn, found[~view.rejected & ~view.unmeasured], 2.5 * bone, max(1, bone // 2), FOUND)
+    _crosses(drawn, found[view.rejected], 2.5 * bone, bone, REJECTED)
+    _crosses(drawn, found[view.unmeasured], 2.5 * bone, bone, UNMEASURED)
+    _write(drawn, caption, top=True)
+    return drawn
+
+
+def blank_frame(width: int, height: int, words: str) -> Picture:
+    """A grey picture that says in its middle why it is none."""
+    blank = np.full((height, width, 3), GREY, dtype=np.uint8)
+    _write(blank, [words], top=False)
+    return blank
+
+
+def caption_of(view: View, status: NDArray[np.int8], method: str) -> tuple[str, str]:
+    """What stands over a frame: camera, frame and time; how many joints came out, and what became of others.
+
+    Args:
+        view: the frame.
+        status: [P, J] index into tables.STATUS, -1 where the skeleton says nothing.
+        method: of the reconstruction.
+    """
+    counts = np.bincount(status[status >= 0].ravel(), minlength=len(STATUS))
+    said = [f"{count} {word}" for word, count in zip(STATUS, counts, strict=True) if count]
+    if not said:
+        said = ["no skeleton at this time"]
+    if not view.has_pose:
+        said.append("no camera pose at this time")
+    return f"{view.camera}   frame {view.frame}   {view.t_s:.3f} s", f"{method}: {', '.join(said)}"
+
+
+def padded_to_even(picture: Picture) -> Picture:
+    """The picture with its last column and row once more where their number is odd, as 4:2:0 needs it."""
+    height, width = picture.shape[:2]
+    return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
+# --- marks ---------------------------------------------------------------------------------------------
+
+
+def _bones(picture: Picture, joints: tuple[str, ...], people: Float, bone: int) -> None:
+    """The bones of people [P, K, 2]: their dark casing first, so that it covers none of them."""
+    place = {name: k for k, name in enumerate(joints)}
+    bones = [
+        (body[place[a]], body[place[b]], SIDES[side_of(a, b)]) for body in people for a, b in bones_of(joints)
+    ]
+    for start, end, _ in bones:
+        _line(picture, start, end, bone + 2, _DARK)
+    for start, end, colour in bones:
+        _line(picture, start, end, bone, colour)
+
+
+def _line(picture: Picture, start: Float, end: Float, thickness: int, colour: Colour) -> None:
+    import cv2
+
+    if _drawable(np.stack([start, end])).all():
+        cv2.line(picture, _fixed(start), _fixed(end), colour, thickness, cv2.LINE_AA, _SHIFT)
+
+
+def _dots(picture: Picture, points: Float, radius: float, colour: Colour) -> None:
+    import cv2
+
+    for point in points[_drawable(points)]:
+        cv2.circle(picture, _fixed(point), round(radius * 2**_SHIFT), colour, cv2.FILLED, cv2.LINE_AA, _SHIFT)
+
+
+def _rings(picture: Picture, points: Float, radius: float, thickness: int, colour: Colour) -> None:
+    import cv2
+
+    for point in points[_drawable(points)]:
+        cv2.circle(picture, _fixed(point), round(radius * 2**_SHIFT), colour, thickness, cv2.LINE_AA, _SHIFT)
+
+
+def _crosses(picture: Picture, points: Float, arm: float, thickness: int, colour: Colour) -> None:
+    arms = arm / np.sqrt(2) * np.array([[[-1, -1], [1, 1]], [[-1, 1], [1, -1]]])
+    for point in points:
+        for start, end in point + arms:
+            _line(picture, start, end, thickness, colour)
+
+
+def _drawable(points: Float) -> NDArray[np.bool_]:
+    return np.asarray((np.abs(points) < _FURTHEST_PX).all(axis=-1), np.bool_)  # NaN is not
+
+
+def _fixed(point: Float) -> tuple[int, int]:
+    x, y = np.round(point * 2**_SHIFT).astype(int).tolist()
+    return x, y
+
+
+def _write(picture: Picture, lines: Sequence[str], *, top: bool) -> None:
+    """Lines of text, white on darkened ground: at the upper left, or in the middle."""
+    import cv2
+
+    height, width = picture.shape[:2]
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    wanted = max(float(np.hypot(width, height)) * _TEXT, _LEAST_TEXT)
+
+    def widest(scale: float) -> int:  # letters do not grow evenly
+        return max(int(cv2.getTextSize(line, font, scale, _pen(scale))[0][0]) for line in lines)
+
+    scale = min(wanted, wanted * 0.9 * width / widest(wanted))
+    step = round(36 * scale)
+    if scale < _LEAST_TEXT or step * (len(lines) + 1) > height:
+        return
+    ground = (widest(scale) + step, step * len(lines) + step // 2)
+    left, upper = (0, 0) if top else ((width - ground[0]) // 2, (height - ground[1]) // 2)
+    part = picture[max(upper, 0) : upper + ground[1], max(left, 0) : left + ground[0]]
+    part[:] = part // 3
+    for k, line in enumerate(lines):
+        at = (left + step // 2, upper + (k + 1) * step)
+        cv2.putText(picture, line, at, font, scale, _PAPER, _pen(scale), cv2.LINE_AA)
+
+
+def _pen(scale: float) -> int:
+    return max(1, round(1.5 * scale))
