@@ -15,6 +15,7 @@ from mocap_cli.init import init_command
 from mocap_cli.models import models_command
 from mocap_cli.reconstruct import reconstruct_command
 from mocap_cli.report import report_command
+from mocap_cli.simulate import simulate_command
 from mocap_cli.terminal import one_line
 from pipelines.session.errors import MocapError
 
@@ -57,6 +58,7 @@ for command in (
     reconstruct_command,
     report_command,
     export_command,
+    simulate_command,
     info_command,
     models_command,
 ):

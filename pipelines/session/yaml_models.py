@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, get_args, get_origin
+from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
@@ -114,13 +114,16 @@ def _keys_at(model: type[Part], place: tuple[str | int, ...]) -> list[str]:
     for part in place:
         if isinstance(kind, type) and issubclass(kind, Part):
             fields = {field.alias or name: field for name, field in kind.model_fields.items()}
-            kind = _without_none(fields[str(part)].annotation)
-        else:
-            kind = _without_none(get_args(kind)[-1])
+            kind = _plain(fields[str(part)].annotation)
+        else:  # a list or a dict
+            kind = _plain(get_args(kind)[-1])
     return [field.alias or name for name, field in kind.model_fields.items()]
 
 
-def _without_none(annotation: Any) -> Any:
-    if get_origin(annotation) is None or type(None) not in get_args(annotation):
-        return annotation
-    return next(a for a in get_args(annotation) if a is not type(None))
+def _plain(annotation: Any) -> Any:
+    """A type without what may be None, and without what is said of it."""
+    if get_origin(annotation) is Annotated:
+        return _plain(get_args(annotation)[0])
+    if type(None) in get_args(annotation):
+        return _plain(next(a for a in get_args(annotation) if a is not type(None)))
+    return annotation

@@ -226,8 +226,8 @@ class Limits(Part):
 class Lens(Part):
     """The camera on every drone."""
 
-    width: int = Field(1280, ge=64, le=7680)
-    height: int = Field(720, ge=64, le=4320)
+    width: int = Field(1280, ge=64, le=7680, multiple_of=2)  # as H.264 has it
+    height: int = Field(720, ge=64, le=4320, multiple_of=2)
     hfov_deg: float = Field(80.0, ge=5, le=150)
     rate_hz: float = Field(30.0, ge=1, le=240)
     dropped_share: float = Field(0.0, ge=0, lt=0.5)  # frames that the recorder lost

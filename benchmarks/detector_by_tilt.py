@@ -1,0 +1,192 @@
+"""How well the keypoint detector sees people from above: errors by tilt, on rendered flights.
+
+python -m benchmarks.detector_by_tilt [--folder FOLDER] [--write]
+
+For every tilt four people walk on level ground while a drone circles each once at 10 m, filming 1280x720
+with a field of view of 80 degrees. The flights go through `mocap simulate`, `ingest` and the detection of
+`reconstruct`, as a user's would. The pictures are rendered; the detector is real. `--write` makes the data
+that simulation takes its detector's errors from.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from pipelines.detect import detect
+from pipelines.ingest import ingest
+from pipelines.session.skeletons import get_skeleton
+from pipelines.session.stages import locked
+from pipelines.simulate import simulate
+from pipelines.simulation.detector_errors import ANY_JOINT, COLUMNS, MEASURED, view_of
+from pipelines.simulation.flight import fly_scenario
+from pipelines.simulation.observe import see
+from pipelines.simulation.scenario import read_scenario
+
+Float = NDArray[np.float64]
+
+TILTS_DEG = (0, 15, 30, 45, 60)
+LOOKS = (
+    "{sex: male, height_m: 1.78, build: average, outfit: casual}",
+    "{sex: female, height_m: 1.66, build: slim, outfit: sport}",
+    "{sex: male, height_m: 1.84, build: heavy, outfit: dark}",
+    "{sex: female, height_m: 1.72, build: average, outfit: bright}",
+)
+SECONDS, RATE_HZ = 8, 10
+JOINTS = get_skeleton("coco17").joints
+TORSO = (JOINTS.index("left_shoulder"), JOINTS.index("right_hip"))
+PCK = 0.2  # of the torso's length in the picture
+GROSS = 0.1  # of the person's height: beyond that a joint counts as missed
+SOMEBODY_ELSE = 0.5  # of the person's height: a detection further off is not of the actor
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """All joints of one flight, frame by frame."""
+
+    error_px: Float  # [F, J], NaN where not found
+    height_px: Float  # [F] f H / d
+    torso_px: Float  # [F]
+    confidence: Float  # [F, J]
+    tilt_deg: Float  # [F]
+
+
+def main() -> None:
+    """Simulate, detect, compare, print; write the data when asked to."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--folder", type=Path, help="keep the flights there")
+    parser.add_argument("--write", action="store_true", help=f"write {MEASURED.name}")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = options.folder or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        by_tilt = {tilt: [measure(folder, tilt, k) for k in range(len(LOOKS))] for tilt in TILTS_DEG}
+    print_table(by_tilt)
+    if options.write:
+        write_table(by_tilt)
+
+
+def scenario_text(tilt_deg: int, look: int) -> str:
+    """One person, one drone."""
+    return f"""\
+schema: 1
+name: Tilt {tilt_deg} look {look}
+seed: {100 * tilt_deg + look}
+duration_s: {SECONDS}
+actor:
+  body: {LOOKS[look]}
+  motion: {{steps: [walk: {{distance_m: 12.5, turn_deg: {90 - 60 * look}}}], repeat: true}}
+  estimate_sigma_m: 0.1
+drones:
+  count: 1
+  formation: {{tilt_deg: {tilt_deg}, yaw_deg: {25 * look}, yaw_rate_deg_per_s: {360 / SECONDS}}}
+  limits: {{speed_mps: 20, acceleration_mps2: 20}}
+  camera: {{rate_hz: {RATE_HZ}}}
+"""
+
+
+def measure(folder: Path, tilt_deg: int, look: int) -> Sightings:
+    """Simulate one flight, run the detector on its video, compare with the truth."""
+    path = folder / f"tilt{tilt_deg}-{look}.yaml"
+    path.write_text(scenario_text(tilt_deg, look), encoding="utf-8")
+    flight_folder = path.with_suffix("")
+    simulate(path, flight_folder, workers=2)
+    session = ingest(flight_folder / "flight.yaml").folder
+    with locked(session) as writable:
+        detect(writable, workers=2)
+    found = pd.read_parquet(session / "detect" / "drone1" / "keypoints.parquet")
+
+    scenario = read_scenario(path)
+    flight = fly_scenario(scenario, [])
+    drone = flight.drones[0]
+    truth, rows = drone.at_frames, flight.moments_of(drone)
+    pixels = see(flight.joints[rows], truth.camera_position, truth.camera_quaternion_xyzw, drone.intrinsics)
+    tilt, height_px = view_of(
+        truth.camera_position,
+        flight.motion.root[rows],
+        height_m=scenario.actor.body.height_m,
+        focal_px=drone.intrinsics.fx,
+    )
+    error, confidence = compare(found, pixels, height_px)
+    torso = np.sqrt(((pixels[:, TORSO[0]] - pixels[:, TORSO[1]]) ** 2).sum(axis=-1))
+    return Sightings(error, height_px, torso, confidence, tilt)
+
+
+def compare(found: pd.DataFrame, pixels: Float, height_px: Float) -> tuple[Float, Float]:
+    """Errors [F, J] in px and confidences of the detection nearest to the actor in each frame."""
+    error = np.full(pixels.shape[:2], np.nan)
+    confidence = np.full(pixels.shape[:2], np.nan)
+    for _, person in found.groupby(["frame", "person"], sort=True):
+        frame = int(person["frame"].iloc[0])
+        by_joint = person.set_index("joint").reindex(JOINTS)
+        distance = np.sqrt(((by_joint[["x", "y"]].to_numpy() - pixels[frame]) ** 2).sum(axis=-1))
+        middle = np.nanmedian(distance) if np.isfinite(distance).any() else np.inf
+        before = np.nanmedian(error[frame]) if np.isfinite(error[frame]).any() else np.inf
+        if middle < SOMEBODY_ELSE * height_px[frame] and middle < before:
+            error[frame], confidence[frame] = distance, by_joint["confidence"].to_numpy()
+    return error, confidence
+
+
+# --- tables --------------------------------------------------------------------------------------------
+
+
+def print_table(by_tilt: dict[int, list[Sightings]]) -> None:
+    """The table of docs/detector.md."""
+    print("| tilt deg | pictures | found | px mean | px median | %H median | PCK@0.2 torso | confidence |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    for flights in by_tilt.values():
+        error = np.concatenate([flight.error_px for flight in flights])
+        height = np.concatenate([flight.height_px for flight in flights])[:, None]
+        torso = np.concatenate([flight.torso_px for flight in flights])[:, None]
+        confidence = np.concatenate([flight.confidence for flight in flights])
+        tilt = np.concatenate([flight.tilt_deg for flight in flights])
+        seen = np.isfinite(error).any(axis=1)
+        right = np.nan_to_num(error, nan=np.inf) <= PCK * torso
+        print(
+            f"| {tilt.mean():.0f} | {len(error)} | {100 * seen.mean():.1f} % | {np.nanmean(error):.1f} | "
+            f"{np.nanmedian(error):.1f} | {100 * np.nanmedian(error / height):.2f} | "
+            f"{100 * right.mean():.1f} % | {np.nanmean(confidence):.2f} |"
+        )
+
+
+def write_table(by_tilt: dict[int, list[Sightings]]) -> None:
+    """The data of the simulator: every joint by itself, and all joints together."""
+    lines = [line for line in (__doc__ or "").splitlines() if line and not line.startswith("python")]
+    with MEASURED.open("w", encoding="utf-8", newline="") as file:
+        file.writelines(f"# {line}\n" for line in lines)
+        file.write("# Made by: python -m benchmarks.detector_by_tilt --write\n")
+        file.write(
+            "# median_error_share: of the person's height f H / d. missed_share: not found, or further\n"
+        )
+        file.write(f"#   off than {GROSS} of that height. confidence: mean of the joints found.\n")
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        writer.writerows(table_rows(by_tilt))
+
+
+def table_rows(by_tilt: dict[int, list[Sightings]]) -> Iterator[tuple[int, str, str, str, str]]:
+    """Rows of the data, joint by joint."""
+    for j, joint in [(slice(None), ANY_JOINT), *((slice(k, k + 1), name) for k, name in enumerate(JOINTS))]:
+        for tilt, flights in by_tilt.items():
+            share = np.concatenate([(f.error_px / f.height_px[:, None])[:, j].ravel() for f in flights])
+            confidence = np.concatenate([f.confidence[:, j].ravel() for f in flights])
+            good = share <= GROSS  # not where it is NaN
+            yield (
+                tilt,
+                joint,
+                f"{np.median(share[good]):.4f}",
+                f"{1 - good.mean():.4f}",
+                f"{np.mean(confidence[good]):.3f}",
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""`mocap simulate`: a flight with known truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from mocap_cli.options import any_path, force_option, json_option, level, overwrite_option, verbosity_options
+from mocap_cli.terminal import print_json, print_table, watching
+
+
+@click.command("simulate", short_help="Make a flight with known truth.")
+@click.argument("scenario", type=any_path, metavar="SCENARIO.yaml")
+@click.option("-o", "--output", type=any_path, required=True, help="Folder of the flight.")
+@click.option(
+    "--no-video",
+    is_flag=True,
+    help="Write keypoints with the errors of a detector in the place of videos: a thousand times faster.",
+)
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 256),
+    default=2,
+    show_default=True,
+    help="Pictures rendered at once; the flight does not depend on them.",
+)
+@overwrite_option
+@force_option
+@json_option
+@verbosity_options
+def simulate_command(
+    scenario: Path,
+    output: Path,
+    no_video: bool,
+    workers: int,
+    overwrite: bool,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+    verbose: int,
+) -> None:
+    """Make the files that a flight would bring home: logs, videos, calibration, map - and the truth."""
+    from pipelines.simulate import simulate
+
+    with watching(level(quiet, verbose)) as progress:
+        result = simulate(
+            scenario,
+            output,
+            video=not no_video,
+            workers=workers,
+            overwrite=overwrite,
+            force=force,
+            progress=progress,
+        )
+    if as_json:
+        print_json(result.summary)
+        return
+    if not quiet:
+        summary = result.summary
+        rows = [(name, count, summary["poses"][name]) for name, count in summary["frames"].items()]
+        click.echo(f"{summary['name']}: {summary['duration_s']:g} s, simulated, {summary['pictures']}")
+        print_table(("camera", "frames", "poses"), rows)
+    click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'flight.yaml'}")

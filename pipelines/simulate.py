@@ -1,0 +1,345 @@
+"""Stage `simulate`: a flight with known truth, in the files that a real one would bring home.
+
+Read the scenario; fly it; write logs, calibration, map and truth; film it, or put what a detector would
+have found in the place of videos; tie all of it together with a flight.yaml.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+
+from pipelines.formats.bvh import read_motion
+from pipelines.formats.camera_info_writing import write_camera_info
+from pipelines.formats.octomap_writing import write_octomap
+from pipelines.formats.ros2_recording import Ros2Recording
+from pipelines.formats.video_writing import Picture, join_videos, write_h264
+from pipelines.geometry.pose_covariance import pose_covariance_in_body
+from pipelines.geometry.poses import conjugate
+from pipelines.session.errors import DataError
+from pipelines.session.progress import Progress, Silent
+from pipelines.session.records import Int64, SkeletalMotion
+from pipelines.session.registries import noise_models
+from pipelines.session.storage import canonical_json, read_json, sha256_of, write_json
+from pipelines.session.whole_folders import is_made, whole_folder
+from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, fly_scenario, keypoints_of
+from pipelines.simulation.flight_files import Sighting, write_alphapose, write_joints, write_tum
+from pipelines.simulation.manifest_text import manifest_text
+from pipelines.simulation.rendering.renderer import Renderer
+from pipelines.simulation.scenario import Scenario, read_scenario
+
+_REVISION = 1
+_MARK = "simulation.json"
+_BLOCK = 60  # pictures that are rendered and encoded together, and kept when the work is interrupted
+_RECEIVED_NS = 2_000_000  # after a message's own stamp, by the recorder on board
+_CAMERA_INFO_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What a simulation left behind."""
+
+    folder: Path
+    summary: dict[str, Any]
+    skipped: bool  # it was there already
+
+
+def simulate(
+    scenario_path: Path,
+    folder: Path,
+    *,
+    video: bool = True,
+    workers: int = 1,
+    overwrite: bool = False,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Simulated:
+    """Simulate a flight.
+
+    Args:
+        scenario_path: the scenario.
+        folder: where to; an earlier simulation there is replaced.
+        video: render videos; else keypoints with the errors of a detector take their place.
+        workers: pictures rendered at once; logs, truth and pictures do not depend on them.
+        overwrite: replace a folder that is no simulation.
+        force: do it again although nothing changed.
+        progress: who watches.
+
+    Raises:
+        DataError: the scenario cannot be used, or the folder cannot be written.
+        BusyError: another process makes the same folder.
+    """
+    progress = progress or Silent()
+    scenario = read_scenario(scenario_path)
+    key = _key(scenario, scenario_path, video)
+    if not force and is_made(folder, key, mark=_MARK):
+        return Simulated(folder, read_json(folder / _MARK), skipped=True)
+    noise = noise_models(f"{scenario_path}: drones.pose_noise", scenario.drones.pose_noise)
+    bvh = _bvh(scenario, scenario_path)
+    _refuse_unknown_planner(scenario, scenario_path)
+
+    with whole_folder(folder, key, mark=_MARK, overwrite=overwrite) as making:
+        progress.start("Flying", 3 + scenario.drones.count)
+        flight = fly_scenario(scenario, noise, bvh=bvh)
+        progress.advance()
+        _write_truth(making.folder, flight)
+        progress.advance()
+        occupancy = flight.world.occupancy(scenario.world.map.resolution_m, scenario.world.map.height_m)
+        write_octomap(making.folder / "site.bt", occupancy)
+        progress.advance()
+        for drone in flight.drones:
+            _write_log(making.folder / f"{drone.name}.mcap", flight, drone)
+            write_camera_info(making.folder / f"{drone.name}_camera.yaml", drone.name, drone.intrinsics)
+            progress.advance()
+        if video:
+            _film(flight, making.folder, making.part, workers, progress)
+        else:
+            for drone in flight.drones:
+                _write_keypoints(making.folder, flight, drone)
+        shutil.copyfile(scenario_path, making.folder / "scenario.yaml")
+        text = manifest_text(flight, video=video)
+        (making.folder / "flight.yaml").write_text(text, encoding="utf-8", newline="\n")
+        summary = _summary(flight, key, video)
+        write_json(making.folder / _MARK, summary)
+        making.publish()
+    return Simulated(folder, summary, skipped=False)
+
+
+def _key(scenario: Scenario, path: Path, video: bool) -> str:
+    """Equal for equal flights."""
+    ingredients: dict[str, object] = {
+        "revision": _REVISION,
+        "scenario": scenario.model_dump(mode="json"),
+        "video": video,
+    }
+    if scenario.actor.motion.bvh is not None:
+        ingredients["bvh"] = sha256_of(path.parent / scenario.actor.motion.bvh)
+    return hashlib.sha256(canonical_json(ingredients).encode()).hexdigest()
+
+
+def _bvh(scenario: Scenario, path: Path) -> SkeletalMotion | None:
+    motion = scenario.actor.motion
+    if motion.bvh is None:
+        return None
+    return read_motion(path.parent / motion.bvh, unit=motion.unit, axes=motion.axes)
+
+
+def _refuse_unknown_planner(scenario: Scenario, path: Path) -> None:
+    planner = scenario.drones.formation.planner
+    if planner != "ring":
+        raise DataError(path, f"drones.formation.planner: no such planner {planner!r}", "there is ring")
+
+
+# --- logs and truth ------------------------------------------------------------------------------------
+
+
+def _write_truth(folder: Path, flight: SimulatedFlight) -> None:
+    """What was really the case, at the times of pictures and logs."""
+    start_ns = flight.scenario.start_ns
+    truth = folder / "truth"
+    truth.mkdir()
+    write_joints(truth / "joints.csv", flight.t_ns + start_ns, flight.person.joints, flight.joints)
+    for drone in flight.drones:
+        poses = drone.at_log
+        write_tum(
+            truth / f"{drone.name}.tum",
+            poses.t_ns + start_ns,
+            poses.camera_position,
+            poses.camera_quaternion_xyzw,
+        )
+    offsets = {drone.name: drone.clock_offset_s for drone in flight.drones}
+    write_json(truth / "clocks.json", {"clock_offsets_s": offsets})
+
+
+def _write_log(path: Path, flight: SimulatedFlight, drone: SimulatedDrone) -> None:
+    """What the recorder on one drone wrote, message by message in the order of receipt."""
+    messages = [*_odometry(flight, drone), *_gimbal(flight, drone), *_camera_infos(flight, drone)]
+    if drone is flight.drones[0]:
+        messages += _actor(flight)
+    with Ros2Recording(path) as log:
+        for stamp_ns, topic, type_, fields in sorted(messages, key=lambda message: message[:2]):
+            log.write(topic, type_, stamp_ns + _RECEIVED_NS, fields)
+
+
+_Message = tuple[int, str, str, dict[str, Any]]
+
+
+def _odometry(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_Message]:
+    body = drone.log.body
+    covariance = np.zeros((len(body.t_ns), 6, 6))
+    if body.covariance is not None:  # ROS turns about fixed axes
+        covariance = pose_covariance_in_body(body.covariance, conjugate(body.quaternion_xyzw))
+    for k, stamp_ns in enumerate((body.t_ns + flight.scenario.start_ns).tolist()):
+        pose = {"position": _xyz(body.position[k]), "orientation": _xyzw(body.quaternion_xyzw[k])}
+        fields = {
+            "header": {"stamp": stamp_ns, "frame_id": "world"},
+            "child_frame_id": f"{drone.name}/body",
+            "pose": {"pose": pose, "covariance": covariance[k]},
+        }
+        yield stamp_ns, f"/{drone.name}/odometry", "nav_msgs/msg/Odometry", fields
+
+
+def _gimbal(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_Message]:
+    stamps = (drone.log.body.t_ns + flight.scenario.start_ns).tolist()
+    for stamp_ns, attitude in zip(stamps, drone.log.gimbal_xyzw, strict=True):
+        header = {"stamp": stamp_ns, "frame_id": "world"}
+        fields = {"header": header, "quaternion": _xyzw(attitude)}
+        yield stamp_ns, f"/{drone.name}/gimbal", "geometry_msgs/msg/QuaternionStamped", fields
+
+
+def _camera_infos(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_Message]:
+    lens = drone.intrinsics
+    fields = {
+        "width": lens.width,
+        "height": lens.height,
+        "distortion_model": "plumb_bob",
+        "d": [0.0] * 5,
+        "k": [lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0],
+        "r": np.eye(3),
+        "p": [lens.fx, 0.0, lens.cx, 0.0, 0.0, lens.fy, lens.cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+    }
+    first, last = drone.log.body.t_ns[[0, -1]] + flight.scenario.start_ns
+    for stamp_ns in range(int(first), int(last), _CAMERA_INFO_NS):
+        header = {"stamp": stamp_ns, "frame_id": f"{drone.name}/camera"}
+        yield (
+            stamp_ns,
+            f"/{drone.name}/camera/camera_info",
+            "sensor_msgs/msg/CameraInfo",
+            {"header": header, **fields},
+        )
+
+
+def _actor(flight: SimulatedFlight) -> Iterator[_Message]:
+    sigma = flight.scenario.actor.estimate_sigma_m
+    covariance = np.diag([sigma**2] * 3 + [0.0] * 3)
+    for stamp_ns, place in zip(
+        (flight.actor_ns + flight.scenario.start_ns).tolist(), flight.actor, strict=True
+    ):
+        pose = {"position": _xyz(place), "orientation": {"w": 1.0}}
+        fields = {
+            "header": {"stamp": stamp_ns, "frame_id": "world"},
+            "pose": {"pose": pose, "covariance": covariance},
+        }
+        yield stamp_ns, "/actor", "geometry_msgs/msg/PoseWithCovarianceStamped", fields
+
+
+def _xyz(vector: np.ndarray[Any, Any]) -> dict[str, float]:
+    return dict(zip("xyz", vector.tolist(), strict=True))
+
+
+def _xyzw(quaternion: np.ndarray[Any, Any]) -> dict[str, float]:
+    return dict(zip("xyzw", quaternion.tolist(), strict=True))
+
+
+# --- pictures ------------------------------------------------------------------------------------------
+
+
+def _write_keypoints(folder: Path, flight: SimulatedFlight, drone: SimulatedDrone) -> None:
+    """What a detector would have found, as AlphaPose writes it, and when the pictures were taken."""
+    xy, confidence = keypoints_of(flight, drone)
+    write_alphapose(folder / f"{drone.name}_keypoints.json", [Sighting(1, xy, confidence)])
+    stamps = picture_stamps(flight, drone)
+    lines = ["frame,t_ns", *(f"{frame},{stamp}" for frame, stamp in enumerate(stamps.tolist()))]
+    (folder / f"{drone.name}_frames.csv").write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+
+
+def picture_stamps(flight: SimulatedFlight, drone: SimulatedDrone) -> Int64:
+    """Stamps [F] of a drone's pictures by its own camera's clock, ns since the epoch."""
+    offset_ns = round(drone.clock_offset_s * 1e9)
+    stamps: Int64 = drone.at_frames.t_ns + flight.scenario.start_ns - offset_ns
+    return stamps
+
+
+def _film(
+    flight: SimulatedFlight,
+    folder: Path,
+    part: Callable[[str, Callable[[Path], None]], Path],
+    workers: int,
+    progress: Progress,
+) -> None:
+    """Render and encode every drone's pictures, block by block, and join the blocks."""
+    surfaces, world = flight.world.surfaces(), flight.scenario.world
+    stopped = Event()
+    # All drones have the same lens, so they share what was prepared for it.
+    renderer = Renderer(
+        surfaces, flight.drones[0].intrinsics, sun=np.array(world.sun), seed=flight.scenario.seed
+    )
+    blocks = [
+        (drone, first) for drone in flight.drones for first in range(0, len(drone.at_frames.t_ns), _BLOCK)
+    ]
+    progress.start("Rendering", sum(len(drone.at_frames.t_ns) for drone in flight.drones))
+
+    def film(block: tuple[SimulatedDrone, int]) -> Path:
+        drone, first = block
+        made = part(
+            f"{drone.name}-{first}", partial(_film_block, flight, renderer, drone, first, stopped, progress)
+        )
+        return made / "part.mp4"
+
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            parts = list(pool.map(film, blocks))
+        except BaseException:
+            stopped.set()  # or Ctrl-C would wait for the blocks under way
+            raise
+    for drone in flight.drones:
+        own = [made for (of, _), made in zip(blocks, parts, strict=True) if of is drone]
+        join_videos(folder / f"{drone.name}.mp4", own)
+
+
+def _film_block(
+    flight: SimulatedFlight,
+    renderer: Renderer,
+    drone: SimulatedDrone,
+    first: int,
+    stopped: Event,
+    progress: Progress,
+    folder: Path,
+) -> None:
+    truth, motion = drone.at_frames, flight.motion
+    frames = range(first, min(first + _BLOCK, len(truth.t_ns)))
+    rows = flight.moments_of(drone)
+
+    def pictures() -> Iterator[Picture]:
+        for frame in frames:
+            if stopped.is_set():
+                raise InterruptedError("another block failed, or the user stopped it")
+            person = flight.person.surface(motion.root[rows[frame]], motion.rotation[rows[frame]])
+            yield renderer.picture(
+                truth.camera_position[frame], truth.camera_quaternion_xyzw[frame], [person], frame
+            )
+            progress.advance()
+
+    lens = drone.intrinsics
+    since_first = truth.t_ns - truth.t_ns[0]
+    write_h264(
+        folder / "part.mp4",
+        pictures(),
+        since_first[frames.start : frames.stop],
+        width=lens.width,
+        height=lens.height,
+    )
+
+
+def _summary(flight: SimulatedFlight, key: str, video: bool) -> dict[str, Any]:
+    scenario = flight.scenario
+    return {
+        "schema": 1,
+        "key": key,
+        "name": scenario.name,
+        "simulated": True,
+        "seed": scenario.seed,
+        "duration_s": scenario.duration_s,
+        "pictures": "rendered video" if video else "keypoints of a modelled detector",
+        "frames": {drone.name: len(drone.at_frames.t_ns) for drone in flight.drones},
+        "poses": {drone.name: len(drone.log.body.t_ns) for drone in flight.drones},
+    }

@@ -1,0 +1,240 @@
+"""Simulated flights through the commands: the truth closes, the files are what others read."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from tests.commands.runner import MOCAP, content, refused, succeeds
+
+EXACT = """
+schema: 1
+name: Exact
+duration_s: 4
+actor:
+  motion:
+    - walk: {distance_m: 3, turn_deg: 60}
+    - kick: {run_up_m: 1.5}
+drones:
+  count: 3
+  camera: {shutters: synchronised}
+keypoints: {scale: 0, missed_share: 0, outlier_share: 0, swap_share: 0}
+"""
+SMALL = """
+schema: 1
+name: Small
+duration_s: 2
+actor: {motion: [walk: {distance_m: 5}]}
+world:
+  ground: {size_m: 30}
+  mounds: [{centre: [6, 6], sigma_m: [2, 3], height_m: 2}]
+  trees: [{position: [-6, 3]}]
+  walls: [{start: [-8, -8], end: [8, -8]}]
+  map: {resolution_m: 0.5, height_m: 6}
+drones:
+  count: 2
+  camera: {width: 320, height: 180, rate_hz: 30, dropped_share: 0.1}
+  pose_noise: {white: {position_m: 0.1, rotation_deg: 0.5}, bias: {position_m: 0.2}}
+  clock_offsets_s: [0, 0.12]
+"""
+
+
+def scenario(folder: Path, text: str) -> Path:
+    path = folder / "scenario.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def simulated(folder: Path, text: str, *options: str) -> Path:
+    """The flight.yaml of a simulated flight."""
+    output = folder / "flight"
+    succeeds("simulate", scenario(folder, text), "-o", output, *options)
+    return output / "flight.yaml"
+
+
+def reconstructed(flight: Path, *options: str) -> dict[str, Any]:
+    succeeds("ingest", flight)
+    metrics: dict[str, Any] = json.loads(
+        succeeds("reconstruct", flight.with_suffix(".session"), "--json", *options)
+    )
+    return metrics
+
+
+def test_the_truth_closes(tmp_path: Path) -> None:
+    """Exact keypoints and poses: what is left is interpolating poses, linear between 50 Hz stamps."""
+    metrics = reconstructed(simulated(tmp_path, EXACT, "--no-video"))
+    assert metrics["mpjpe_mm"] < 0.5
+    # The field of view holds the person throughout and nothing stands in the way.
+    assert metrics["reconstructed_share"] > 0.99
+
+
+def test_poses_that_are_logged_with_noise_cost_what_the_noise_says(tmp_path: Path) -> None:
+    noise = "drones:\n  pose_noise: {white: {position_m: 0.3, rotation_deg: 1}}"
+    metrics = reconstructed(simulated(tmp_path, EXACT.replace("drones:", noise), "--no-video"))
+    # A ray errs by 0.3 m in position and 10 m x 1 degree in direction across it: 0.35 m per axis of two.
+    # Three rays that surround the person average that; the mean error lies between a third and the whole.
+    assert 0.12e3 < metrics["mpjpe_mm"] < 0.6e3
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path: Path) -> None:
+    flights = []
+    for name, text in {"a": SMALL, "b": SMALL, "c": SMALL.replace("name", "seed: 2\nname")}.items():
+        (tmp_path / name).mkdir()
+        flights.append(content(simulated(tmp_path / name, text, "--no-video").parent))
+    assert flights[0] == flights[1]
+    same = {name for name in flights[0] if flights[0][name] == flights[2][name]}
+    # What a seed cannot change: the lens, the map, the offsets, and how the files hang together.
+    lenses = {"drone1_camera.yaml", "drone2_camera.yaml"}
+    assert same == {*lenses, "flight.yaml", "site.bt", "truth/clocks.json"}
+
+
+def test_videos_have_the_frames_that_were_kept_and_workers_do_not_matter(tmp_path: Path) -> None:
+    flights = []
+    for workers in ("1", "2"):
+        (tmp_path / workers).mkdir()
+        flights.append(simulated(tmp_path / workers, SMALL, "--workers", workers))
+    logs = [
+        {name: digest for name, digest in content(flight.parent).items() if not name.endswith(".mp4")}
+        for flight in flights
+    ]
+    assert logs[0] == logs[1]
+
+    summary = json.loads((flights[0].parent / "simulation.json").read_text())
+    assert summary["frames"]["drone1"] < 60  # some were dropped
+    stated: dict[str, Any] = json.loads(succeeds("ingest", flights[0], "--json"))
+    camera = stated["cameras"]["drone2"]
+    assert camera["frames"]["count"] == summary["frames"]["drone2"]
+    assert (camera["intrinsics"]["width"], camera["intrinsics"]["height"]) == (320, 180)
+    assert stated["map"] is not None
+    assert stated["actor"] is not None
+
+
+def test_a_clock_offset_is_in_the_pictures_times_and_not_stated(tmp_path: Path) -> None:
+    flight = simulated(tmp_path, SMALL, "--no-video")
+    succeeds("ingest", flight)
+    session = flight.with_suffix(".session")
+    offsets = json.loads((flight.parent / "truth" / "clocks.json").read_text())["clock_offsets_s"]
+    assert offsets == {"drone1": 0.0, "drone2": 0.12}
+    truth = pd.read_csv(flight.parent / "truth" / "joints.csv")["t_ns"].unique()
+    for name, offset_s in offsets.items():
+        frames = pd.read_parquet(session / "cameras" / name / "frames.parquet")["t_ns"]
+        assert np.isin(frames + round(offset_s * 1e9), truth).all()
+    assert flight.read_text().count("sigma_s: 0.3") == 2
+
+
+def test_the_log_is_read_by_the_libraries_that_others_use(tmp_path: Path) -> None:
+    log = simulated(tmp_path, SMALL, "--no-video").parent / "drone1.mcap"
+    with log.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    topics = {channel.topic for channel in summary.channels.values()}
+    assert topics == {"/drone1/odometry", "/drone1/gimbal", "/drone1/camera/camera_info", "/actor"}
+    with AnyReader([log]) as reader:
+        stamps = [stamp for _, stamp, _ in reader.messages()]
+        odometry = [
+            reader.deserialize(data, connection.msgtype)
+            for connection, _, data in reader.messages()
+            if connection.topic == "/drone1/odometry"
+        ]
+    assert stamps == sorted(stamps)
+    # 50 Hz for two seconds and 0.2 s on either side, give or take the ends.
+    assert abs(len(odometry) - 120) <= 2
+    covariance = odometry[0].pose.covariance.reshape(6, 6)  # type: ignore[attr-defined]
+    # White 0.1 m and bias 0.2 m are the camera's; the lever arm adds what 0.5 deg does to 0.11 m.
+    assert np.sqrt(np.diag(covariance)[:3]) == pytest.approx(np.hypot(0.1, 0.2), rel=1e-3)
+
+
+def test_the_map_is_read_by_octomap_itself(tmp_path: Path) -> None:
+    pyoctomap = pytest.importorskip("pyoctomap")
+    site = simulated(tmp_path, SMALL, "--no-video").parent / "site.bt"
+    tree = pyoctomap.OcTree(0.1)
+    assert tree.readBinary(str(site))
+    assert tree.getResolution() == 0.5
+    for place, occupied in {(6.2, 6.2, 1.2): True, (6.2, 6.2, 4.2): False, (0.2, -8.0, 1.2): True}.items():
+        node = tree.search(np.array(place))
+        assert tree.isNodeOccupied(node) is occupied
+
+
+def test_a_flight_that_is_there_is_not_made_again(tmp_path: Path) -> None:
+    flight = simulated(tmp_path, SMALL, "--no-video")
+    written = flight.stat().st_mtime_ns
+    assert "unchanged" in succeeds("simulate", tmp_path / "scenario.yaml", "-o", flight.parent, "--no-video")
+    assert flight.stat().st_mtime_ns == written
+    succeeds("simulate", tmp_path / "scenario.yaml", "-o", flight.parent, "--no-video", "--force")
+    assert flight.stat().st_mtime_ns > written
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("")
+    line = refused("simulate", tmp_path / "scenario.yaml", "-o", tmp_path / "mine", "--no-video")
+    assert "thesis.tex" in line
+    assert "--overwrite" in line
+
+
+@pytest.mark.slow
+def test_an_interrupted_rendering_goes_on_where_it_was(tmp_path: Path) -> None:
+    path = scenario(tmp_path, SMALL.replace("duration_s: 2", "duration_s: 5"))
+    output, parts = tmp_path / "flight", tmp_path / ".flight.making"
+    command = [MOCAP, "simulate", str(path), "-o", str(output), "--workers", "1"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 90
+    while not list(parts.glob("*/drone1-0/part.mp4")) and time.monotonic() < deadline:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+    assert not output.exists()
+    (kept,) = parts.glob("*/drone1-0/part.mp4")
+    inode = kept.stat().st_ino
+
+    succeeds(*command[1:])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["flight", "scenario.yaml"]
+    assert inode  # the part was there; the whole was joined from it and it was removed with the rest
+    summary = json.loads(succeeds("ingest", output / "flight.yaml", "--json"))
+    stated = json.loads((output / "simulation.json").read_text())["frames"]
+    assert summary["cameras"]["drone1"]["frames"]["count"] == stated["drone1"]
+
+
+HOSTILE = {
+    "negative size": ("size_m: 30", "size_m: -30", "world.ground.size_m"),
+    "no drones": ("count: 2", "count: 0", "drones.count"),
+    "a billion voxels": ("resolution_m: 0.5", "resolution_m: 0.011", "voxels"),
+    "unknown motion": ("walk: {distance_m: 5}", "moonwalk: {distance_m: 5}", "walk"),
+    "unknown key": ("duration_s: 2", "duration_s: 2\nwind_mps: 5", "wind_mps"),
+    "no number": ("duration_s: 2", "duration_s: .nan", "duration_s"),
+    "no motion": ("[walk: {distance_m: 5}]", "[]", "motion"),
+    "two things at once": ("{distance_m: 5}", "{distance_m: 5, to: [1, 2]}", "exactly one"),
+    "unknown noise": ("white:", "pink:", "pink"),
+    "noise below zero": ("position_m: 0.1", "position_m: -0.1", "position_m"),
+    "unknown planner": ("count: 2", "count: 2\n  formation: {planner: magic}", "magic"),
+    "a wood too dense": ("walls:", "wood: {count: 2000, radius_m: 3}\n  walls:", "wood"),
+    "a sun below the horizon": ("walls:", "sun: [1, 0, -1]\n  walls:", "sun"),
+    "an odd picture": ("width: 320", "width: 321", "width"),
+    "more offsets than drones": ("[0, 0.12]", "[0, 0.12, 0.3]", "clock_offsets_s"),
+    "newer schema": ("schema: 1", "schema: 2", "schema"),
+    "a BVH that is not there": ("[walk: {distance_m: 5}]", "{bvh: dance.bvh}", "dance.bvh"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_scenarios_get_one_line(tmp_path: Path, case: str) -> None:
+    old, new, said = HOSTILE[case]
+    assert old in SMALL
+    path = scenario(tmp_path, SMALL.replace(old, new))
+    assert said in refused("simulate", path, "-o", tmp_path / "flight", "--no-video")
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["scenario.yaml"]
+
+
+def test_no_yaml_and_no_file(tmp_path: Path) -> None:
+    assert "nothing.yaml" in refused("simulate", tmp_path / "nothing.yaml", "-o", tmp_path / "flight")
+    assert "no valid YAML" in refused("simulate", scenario(tmp_path, "a: [1"), "-o", tmp_path / "flight")
