@@ -29,11 +29,6 @@ class ActorFilter:
         self._state = np.zeros((2, 3))
         self._covariance = np.diag([self._variance, _FIRST_SPEED_MPS**2])
 
-    @property
-    def started(self) -> bool:
-        """Whether there was a measurement yet."""
-        return self._t_s is not None
-
     def measure(self, t_s: float, position: Float) -> None:
         """Take in one measured position [3], metres, world, not earlier than the last one.
 

@@ -31,7 +31,7 @@ from pipelines.planning.tracking import Plan
 Float = NDArray[np.float64]
 
 TERMS = ("smooth", "form", "obs", "occ", "sep")
-_ROUNDS = 20  # of pushing apart
+_ROUNDS = 10  # of pushing apart, each a little farther than the one before
 _MARGIN_M = 0.1  # projected waypoints keep this much more than the least distance
 
 
@@ -178,20 +178,37 @@ def _keep_apart(
 
 
 def _pushed_apart(path: Float, others: Float, least_m: float) -> Float:
-    """Waypoints moved straight away from others until none is nearer than that, the start excepted."""
+    """Waypoints moved aside until no way between them comes nearer to the others, the start excepted.
+
+    All that are near to another drone go the same way, along the line that joins the two where they are
+    nearest. Each straight away from the other would send those before and behind a crossing to its two
+    ends, and the drone through the middle.
+    """
     pushed = path.copy()
-    for _ in range(_ROUNDS):
-        moved = False
-        for other in others:
-            apart = pushed[1:] - other[1:]
-            distance = np.linalg.norm(apart, axis=1)
-            near = distance < least_m - 1e-9
-            # Exactly in the same place: one of them goes up.
-            direction = np.where(
-                distance[:, None] > 1e-6, apart / np.maximum(distance, 1e-6)[:, None], [0, 0, 1]
-            )
-            pushed[1:][near] = (other[1:] + least_m * direction)[near]
-            moved = moved or bool(near.any())
-        if not moved:
+    for round_ in range(_ROUNDS):
+        if closest_approach(pushed, others) >= least_m:
             break
+        wanted_m = least_m * (1.0 + 0.05 * round_)
+        for other in others:
+            apart = pushed - other
+            aside = _way_aside(apart)
+            along = np.sum(apart * aside, axis=1)
+            short = wanted_m**2 - np.sum(apart**2, axis=1)
+            way = np.where(short > 0.0, np.sqrt(np.maximum(along**2 + short, 0.0)) - along, 0.0)
+            # The neighbours go along: the ways between them must keep the distance too.
+            way = np.maximum(way, np.maximum(np.append(way[1:], 0.0), np.append(0.0, way[:-1])))
+            pushed[1:] += way[1:, None] * aside
     return pushed
+
+
+def _way_aside(apart: Float) -> Float:
+    """Unit vector [3] from the other drone to this one where [N + 1, 3] comes nearest to zero."""
+    start, way = apart[:-1], np.diff(apart, axis=0)
+    u = np.clip(-np.sum(start * way, axis=1) / np.maximum(np.sum(way**2, axis=1), 1e-12), 0.0, 1.0)
+    nearest = start + u[:, None] * way
+    k = int(np.argmin(np.sum(nearest**2, axis=1)))
+    aside = nearest[k]
+    if np.sum(aside**2) < 1e-6:  # straight through each other: to the left of the way, or east
+        aside = np.array([-way[k, 1], way[k, 0], 0.0])
+    length = float(np.sqrt(np.sum(aside**2)))
+    return aside / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])

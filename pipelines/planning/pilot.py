@@ -99,9 +99,13 @@ class Pilot:
             self._next_local_s = max(self._next_local_s, t_s) + 1.0 / config.local_hz
             self._plan_locally(t_s, position, velocity, field)
         now = np.array([t_s])
-        asked = [plan.at(now) for plan in self._plans if plan is not None]
+        return Command(*self.reference(t_s), self._formation.at(now)[0], self._filter.forecast(now)[0])
+
+    def reference(self, t_s: float) -> tuple[Float, Float, Float]:
+        """Position, velocity and acceleration [N, 3] of the latest local plans, after the first step."""
+        asked = [plan.at(np.array([t_s])) for plan in self._plans if plan is not None]
         where, speed, change = (np.concatenate(part) for part in zip(*asked, strict=True))
-        return Command(where, speed, change, self._formation.at(now)[0], self._filter.forecast(now)[0])
+        return where, speed, change
 
     def _plan_formation(self, t_s: float, field: DistanceField) -> None:
         config = self._config

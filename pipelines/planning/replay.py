@@ -109,12 +109,12 @@ def replay(
             pilot.measure(log_s[row], noisy[row])
         done = max(done, int(taken_in[k]))
         command = pilot.step(t_s, tracker.position, tracker.velocity, known[map_at[k]])
-        if mode == "plan-only":
-            tracker.position, tracker.velocity = command.position, command.velocity
         position[:, k], velocity[:, k] = tracker.position, tracker.velocity
         slots[:, k], estimate[k] = command.slots, command.actor
         if mode == "closed-loop":
             tracker.step(command.position, command.velocity, command.acceleration)
+        else:
+            tracker.position, tracker.velocity, _ = pilot.reference(t_s + period_ns / 1e9)
 
     truth = np.stack([np.interp(replay_ns, t_ns, measured[:, axis]) for axis in range(3)], axis=-1)
     return ReplayResult(

@@ -1,0 +1,41 @@
+"""Settings from mappings: what is taken, and what is refused how."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipelines.planning.config import PlannerConfig, planner_config
+from pipelines.session.errors import DataError
+
+
+def test_what_is_not_mentioned_keeps_its_default() -> None:
+    config = planner_config({"radius_m": 8, "yaws": 16.0, "tilts_deg": [10, 20]})
+    assert config == PlannerConfig(radius_m=8.0, yaws=16, tilts_deg=(10.0, 20.0))
+    assert planner_config({}) == PlannerConfig()
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"radus_m": 8}, r"unknown key 'radus_m' \(did you mean 'radius_m'\?\)"),
+        ({"radius_m": "wide"}, "radius_m: 'wide' is no number"),
+        ({"l_obs": True}, "l_obs: True is no number"),
+        ({"l_obs": float("nan")}, "l_obs: nan is no number"),
+        ({"yaws": 7.5}, "yaws: 7.5 is no whole number"),
+        ({"yaws": 1000}, "yaws: 1000 is more than 360"),
+        ({"ranges_m": 8}, "ranges_m: must be a list"),
+        ({"ranges_m": []}, "ranges_m: needs at least one"),
+        ({"radius_m": 0}, "radius_m: 0 is out of range"),
+        ({"l_occ": -1}, "l_occ: -1 is out of range"),
+        ({"tilt_deg": 88}, "at most 85"),
+        ({"soft_separation_m": 2.0}, "soft_separation_m"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(values: dict[str, object], said: str) -> None:
+    with pytest.raises(DataError, match=said):
+        planner_config(values, "weights.yaml")
+
+
+def test_all_unknown_keys_are_in_one_message() -> None:
+    with pytest.raises(DataError, match=r"^weights.yaml: unknown key 'a'; unknown key 'b'"):
+        planner_config({"a": 1, "b": 2}, "weights.yaml")

@@ -1,0 +1,76 @@
+"""The cost map by hand, and what cameras are worth by the ray model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.costs import cost_map, costs_of_slots, error_map
+from pipelines.planning.distance_field import open_space
+from pipelines.planning.formation import formation_slots, slot_offsets
+from pipelines.planning.information import log_determinant, predicted_error, ray_information
+from pipelines.planning.sight import occupied_share
+from tests.planning.worlds import wall
+
+CONFIG = PlannerConfig(w_obs=2.0, w_occ=3.0)
+
+
+def test_obstacles_count_by_distance_and_sight_by_share() -> None:
+    """Slot for slot what the field and the sight line say, at two places beside the wall."""
+    field = wall()
+    actor = np.array([[5.0, 0.0, 1.0], [12.0, 1.0, 1.0]])
+    yaws = np.radians([0, 60, 90, 120, 200])
+    offsets = slot_offsets(formation_slots(yaws, 3, tilt_rad=0.26, range_m=10.0))
+    costs = costs_of_slots(field, actor, offsets, CONFIG)
+    cameras = actor[:, None, None] + offsets
+    distance, _ = field.sample(cameras)
+    assert costs.obstacle == pytest.approx(np.clip(1 - distance / CONFIG.eps_obs_m, 0, 1), abs=1e-12)
+    share = occupied_share(field, cameras, actor[:, None, None], start_m=CONFIG.sight_start_m)
+    assert np.array_equal(costs.occluded, share)
+    assert costs.occluded.max() > 0.1
+    assert ((costs.obstacle > 0) & (costs.obstacle < 1)).any()
+    total = cost_map(costs, CONFIG)
+    assert total == pytest.approx((2 * costs.obstacle + 3 * costs.occluded).sum(axis=2), abs=1e-12)
+
+
+def test_hidden_views_cost_information() -> None:
+    actor = np.array([[5.0, 0.0, 1.0]])
+    offsets = slot_offsets(formation_slots(np.radians([-90.0, 90.0]), 2, tilt_rad=0.1, range_m=14.0))
+    free = error_map(costs_of_slots(open_space(), actor, offsets, CONFIG), offsets, CONFIG)
+    behind = error_map(costs_of_slots(wall(), actor, offsets, CONFIG), offsets, CONFIG)
+    assert free[0, 0] == pytest.approx(free[0, 1])
+    assert behind[0, 0] == free[0, 0]  # both cameras on the near side
+    assert behind[0, 1] > 2 * free[0, 1]
+    assert behind[0, 1] < CONFIG.prior_sigma_m * np.sqrt(3)
+
+
+def test_error_of_two_cameras_as_in_closed_form() -> None:
+    """Tr S = s^2 (1/2 + 2/sin^2 gamma) for equal cameras whose rays cross at gamma."""
+    config = replace(CONFIG, rotation_sigma_deg=0.8)
+    offset = np.array([[10.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
+    for gamma in np.radians([30.0, 60.0, 90.0, 150.0]):
+        offset[1] = 10 * np.array([np.cos(gamma), np.sin(gamma), 0.0])
+        s2 = (10 * 0.003) ** 2 + (10 * np.radians(0.8)) ** 2 + config.position_sigma_m**2
+        error = predicted_error(ray_information(offset, config).sum(axis=0))
+        assert error**2 == pytest.approx(s2 * (0.5 + 2 / np.sin(gamma) ** 2), rel=1e-9)
+
+
+def test_one_camera_or_two_face_to_face_determine_nothing() -> None:
+    offset = np.array([[10.0, 1.0, 2.0], [-10.0, -1.0, -2.0]])
+    information = ray_information(offset, CONFIG)
+    assert np.isinf(predicted_error(information)).all()
+    assert np.isinf(predicted_error(information.sum(axis=0)))
+    assert np.isinf(predicted_error(np.zeros((3, 3))))
+
+
+@given(st.integers(0, 10_000))
+def test_closed_forms_equal_linear_algebra(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    information = ray_information(rng.uniform(2, 12, (3, 3)), CONFIG).sum(axis=0) + np.eye(3)
+    assert predicted_error(information) ** 2 == pytest.approx(np.trace(np.linalg.inv(information)))
+    assert log_determinant(information) == pytest.approx(np.linalg.slogdet(information)[1])

@@ -1,0 +1,88 @@
+"""Distances to known surfaces, and gradients that are the derivative of what is interpolated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipelines.planning.distance_field import distance_field, open_space
+from pipelines.session.records import Occupancy
+
+RES = 0.25
+
+
+def slab(*, unknown_above: bool = False) -> Occupancy:
+    """Occupied up to z = 1 in a box of 4 m; the rest free, or unknown."""
+    probability = np.full((16, 16, 16), np.nan if unknown_above else 0.0, dtype=np.float32)
+    probability[:, :, :4] = 0.5  # exactly the threshold
+    probability[:, :, 4:8] = 0.49
+    return Occupancy(probability, np.array([-2.0, -2.0, 0.0]), RES, from_ns=7)
+
+
+@given(
+    st.floats(-5, 5),
+    st.floats(-5, 5),
+    st.floats(RES / 2, 4 - RES / 2),
+)
+def test_a_flat_surface_is_exact(x: float, y: float, z: float) -> None:
+    """Plus and minus half a voxel put the surface at z = 1 on both sides, linear between all centres."""
+    distance, gradient = distance_field(slab()).sample(np.array([x, y, z]))
+    assert distance == pytest.approx(z - 1.0, abs=1e-5)  # float32
+    if abs((z / RES - 0.5) % 1) > 1e-6:
+        assert gradient == pytest.approx([0, 0, 1], abs=1e-5)
+
+
+def test_a_sphere_is_within_a_voxel() -> None:
+    """Every surface voxel's centre lies within half a diagonal of the sphere, as does every look-up."""
+    centres = -3 + RES * (np.arange(24) + 0.5)
+    x, y, z = np.meshgrid(centres, centres, centres, indexing="ij")
+    occupied = x**2 + y**2 + z**2 < 1.5**2
+    field = distance_field(Occupancy(occupied.astype(np.float32), np.full(3, -3.0), RES))
+    points = np.random.default_rng(1).uniform(-2.8, 2.8, (500, 3))
+    distance, _ = field.sample(points)
+    assert np.abs(distance - (np.linalg.norm(points, axis=1) - 1.5)).max() < RES * np.sqrt(3)
+
+
+def test_gradient_is_the_derivative_of_the_interpolated_value() -> None:
+    """On random fields, inside cells: central differences of a polynomial of degree 3 are off by h^2."""
+    rng = np.random.default_rng(2)
+    occupied = rng.random((12, 9, 10)) < 0.1
+    field = distance_field(Occupancy(occupied.astype(np.float32), np.zeros(3), RES))
+    points = (rng.integers(1, 7, (300, 3)) + rng.uniform(0.51, 1.49, (300, 3))) * RES
+    h = 1e-5
+    _, gradient = field.sample(points)
+    for axis, step in enumerate(h * np.eye(3)):
+        numeric = (field.sample(points + step)[0] - field.sample(points - step)[0]) / (2 * h)
+        assert np.abs(gradient[:, axis] - numeric).max() < 1e-8
+
+
+def test_outside_the_grid_as_at_its_border() -> None:
+    field = distance_field(slab())
+    inside, _ = field.sample(np.array([0.0, 0.0, 4 - RES / 2]))
+    above, gradient = field.sample(np.array([[0.0, 0.0, 30.0], [50.0, -50.0, 2.0]]))
+    assert above[0] == inside
+    assert gradient[0].tolist() == [0, 0, 0]
+    assert above[1] == pytest.approx(1.0, abs=1e-5)
+    assert gradient[1] == pytest.approx([0, 0, 1], abs=1e-5)
+
+
+def test_unknown_is_free_or_occupied_as_asked() -> None:
+    point = np.array([0.0, 0.0, 3.0])
+    assert distance_field(slab(unknown_above=True)).sample(point)[0] == pytest.approx(2.0, abs=1e-5)
+    blocked = distance_field(slab(unknown_above=True), unknown="occupied")
+    assert blocked.sample(point)[0] == pytest.approx(-1.0, abs=1e-5)
+    assert blocked.from_ns == 7
+
+
+def test_maps_without_anything_and_of_one_layer() -> None:
+    nothing = Occupancy(np.zeros((1, 5, 1), dtype=np.float32), np.zeros(3), RES)
+    assert distance_field(nothing).sample(np.zeros((2, 2, 3)))[0].min() > 100
+    assert open_space().sample(np.array([1e6, -1e6, 0.0]))[0] > 100
+    solid = Occupancy(np.ones((1, 1, 4), dtype=np.float32), np.zeros(3), RES)
+    assert distance_field(solid).sample(np.zeros(3))[0] < -100
+    layer = np.zeros((1, 8, 1), dtype=np.float32)
+    layer[0, 0, 0] = 1
+    distance, _ = distance_field(Occupancy(layer, np.zeros(3), RES)).sample(np.array([5.0, 1.0, -5.0]))
+    assert distance == pytest.approx(1.0 - RES, abs=1e-6)

@@ -1,0 +1,270 @@
+"""The local planner: exact gradients, its metric, obstacles it leaves and drones it keeps away from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.distance_field import DistanceField, distance_field, open_space
+from pipelines.planning.local import TERMS, LocalPlanner, Separation, closest_approach
+from pipelines.planning.tracking import Plan
+from pipelines.session.records import Occupancy
+from tests.planning.worlds import bare_ground, mound
+
+Float = NDArray[np.float64]
+CONFIG = PlannerConfig(eps_obs_m=1.5)
+NOBODY = np.empty((0, 20, 3))
+
+
+def boulders() -> DistanceField:
+    occupied = np.random.default_rng(4).random((30, 30, 16)) < 0.006
+    return distance_field(Occupancy(occupied.astype(np.float32), np.array([-7.5, -7.5, -2.0]), 0.5))
+
+
+@pytest.mark.parametrize("speed_floor", [0.0, 1.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_gradient_is_the_derivative_of_the_cost(seed: int, speed_floor: float) -> None:
+    """Central differences of every waypoint; points lie in, near, far from and outside of the boulders.
+
+    With h = 1e-6 m they are off by rounding, 1e-16 J/h, and by h^2: far below 1e-4 of the largest entry.
+    A random point lies within h of a cell's face, where the field has a kink, once in 1e5.
+    """
+    rng = np.random.default_rng(seed)
+    planner = LocalPlanner(replace(CONFIG, speed_floor_mps=speed_floor))
+    field = boulders()
+    position, velocity = rng.normal(size=(2, 3))
+    waypoints = position + np.cumsum(rng.normal(size=(20, 3)), axis=0)
+    actor = waypoints + rng.normal(size=(20, 3)) * [5, 5, 1]  # some nearer than sight lines begin
+    slots, others = waypoints + rng.normal(size=(20, 3)), waypoints + 2.5 * rng.normal(size=(2, 20, 3))
+
+    def cost(moved: Float) -> tuple[float, dict[str, float], Float]:
+        return planner.cost(position, velocity, moved, slots=slots, actor=actor, others=others, field=field)
+
+    _, terms, gradient = cost(waypoints)
+    assert min(terms.values()) > 0
+    distance, _ = field.sample(waypoints)
+    assert (distance > CONFIG.eps_obs_m).any()
+    assert ((distance > 0) & (distance < CONFIG.eps_obs_m)).any()
+    numeric = np.zeros_like(gradient)
+    h = 1e-6
+    for place in np.ndindex(gradient.shape):
+        step = np.zeros_like(waypoints)
+        step[place] = h
+        numeric[place] = (cost(waypoints + step)[0] - cost(waypoints - step)[0]) / (2 * h)
+    assert np.abs(numeric - gradient).max() < 1e-4 * np.abs(gradient).max()
+
+
+def test_the_gradient_inside_an_obstacle() -> None:
+    """Only obstacles weigh: each entry by itself, on the branch M < 0."""
+    config = PlannerConfig(l_obs=1.0, l_occ=0.0, l_sep=0.0, l_form=1e-12, a_jerk=1e-12)
+    config = replace(config, a_velocity=0.0, a_acceleration=0.0)
+    planner, field = LocalPlanner(config), mound(9.0)
+    waypoints = np.linspace([27.0, 7.0, 2.0], [33.3, 9.1, 3.1], 20)
+    assert field.sample(waypoints)[0].max() < 0
+    start, still = waypoints[0], np.zeros(3)
+
+    def cost(moved: Float) -> tuple[float, Float]:
+        total, _, gradient = planner.cost(
+            start, still, moved, slots=waypoints, actor=waypoints + 9, others=NOBODY, field=field
+        )
+        return total, gradient
+
+    _, gradient = cost(waypoints)
+    h = 1e-6
+    for place in np.ndindex(gradient.shape):
+        step = np.zeros_like(waypoints)
+        step[place] = h
+        numeric = (cost(waypoints + step)[0] - cost(waypoints - step)[0]) / (2 * h)
+        assert gradient[place] == pytest.approx(numeric, rel=1e-4, abs=1e-6)
+
+
+def test_fine_waypoints_have_the_functional_gradient_of_the_papers() -> None:
+    """s (I - vv'/s^2) grad c - c (I - vv'/s^2) a / s, in the interior, for a field that is linear in z.
+
+    Central differences at step h leave h^2/6 times the third derivative: below 1e-3 here.
+    """
+    occupied = np.zeros((4, 4, 40), dtype=np.float32)
+    occupied[:, :, :4] = 1
+    field = distance_field(Occupancy(occupied, np.array([-1.0, -1.0, -2.0]), 0.5))  # M = z
+    h, n = 0.02, 200
+    config = replace(CONFIG, waypoints=n, waypoint_s=h, l_obs=1.0, l_occ=0.0, l_sep=0.0, eps_obs_m=8.0)
+    config = replace(config, l_form=1e-12, a_velocity=0.0, a_acceleration=0.0, a_jerk=1e-15)
+    t = h * np.arange(n + 1)
+    path = np.stack([1.5 * t, np.sin(t), 3.0 + np.cos(0.8 * t)], axis=1)
+    _, _, gradient = LocalPlanner(config).cost(
+        path[0],
+        np.zeros(3),
+        path[1:],
+        slots=path[1:],
+        actor=path[1:],
+        others=np.empty((0, n, 3)),
+        field=field,
+    )
+    v = np.stack([1.5 + 0 * t, np.cos(t), -0.8 * np.sin(0.8 * t)], axis=1)
+    a = np.stack([0 * t, -np.sin(t), -0.64 * np.cos(0.8 * t)], axis=1)
+    s = np.sqrt((v**2).sum(axis=1) + 1.0)[:, None]
+    c = (path[:, 2:] - 8.0) ** 2 / 16.0
+    grad_c = (path[:, 2:] - 8.0) / 8.0 * [0, 0, 1]
+
+    def across(w: Float) -> Float:
+        left: Float = w - v * (v * w).sum(axis=1)[:, None] / s**2
+        return left
+
+    expected = s * across(grad_c) - c * across(a) / s
+    inner = slice(2, n - 3)
+    assert gradient[inner] / h == pytest.approx(expected[1:][inner], abs=2e-3)
+
+
+def test_the_metric_is_the_curvature_of_the_smooth_terms() -> None:
+    """Without obstacles the cost is quadratic, and the first step of eta = 1 its minimum."""
+    rng = np.random.default_rng(6)
+    planner = LocalPlanner(replace(CONFIG, step_cap_m=100.0, tolerance=1e-15))
+    slots = np.cumsum(rng.normal(size=(20, 3)), axis=0)
+    position, velocity = rng.normal(size=(2, 3))
+    made = planner.plan(
+        0.0, position, velocity, slots=slots, actor=slots + 9, others=[], field=open_space(), previous=None
+    )
+    assert made.evaluations <= 3
+    total, terms, gradient = planner.cost(
+        position,
+        velocity,
+        made.plan.path[1:],
+        slots=slots,
+        actor=slots + 9,
+        others=NOBODY,
+        field=open_space(),
+    )
+    assert np.abs(gradient).max() < 1e-9
+    assert total == pytest.approx(made.cost)
+    assert terms["obs"] == terms["occ"] == terms["sep"] == 0
+    assert tuple(terms) == TERMS
+
+
+def test_terms_of_a_steady_flight_in_closed_form() -> None:
+    """2 m/s straight on, 1.5 m beside the slots, 3 m from another drone, over flat ground at 2 m."""
+    planner = LocalPlanner(CONFIG)
+    t = 0.5 * np.arange(1, 21)
+    waypoints = np.stack([2 * t - 10, 0 * t, 0 * t + 2.0], axis=1)
+    total, terms, _ = planner.cost(
+        np.array([-10.0, 0, 2]),
+        np.array([2.0, 0, 0]),
+        waypoints,
+        slots=waypoints + np.array([0, 1.5, 0]),
+        actor=waypoints + np.array([0, 10.0, 0]),
+        others=(waypoints + np.array([0, 0, 3.0]))[None],
+        field=bare_ground(),
+    )
+    speed = np.sqrt(2.0**2 + CONFIG.speed_floor_mps**2)
+    # Ground's surface is at 0.5 m: M = 1.5 = eps_obs, where the hinge just ends.
+    expected = {"smooth": 2.0**2 / 2, "form": 1.5**2 / 2, "obs": 0.0, "occ": 0.0, "sep": 0.5**2 / 2}
+    assert terms == pytest.approx(expected, abs=1e-9)
+    lower = waypoints - [0, 0, 1.2]  # M = 0.3 for drone and sight line
+    _, terms, _ = planner.cost(
+        lower[0] - [1.0, 0, 0],
+        np.array([2.0, 0, 0]),
+        lower,
+        slots=lower,
+        actor=lower + np.array([0, 10.0, 0]),
+        others=NOBODY,
+        field=bare_ground(),
+    )
+    assert terms["obs"] == pytest.approx((0.3 - 1.5) ** 2 / 3 * speed * 10, rel=1e-5)
+    assert terms["occ"] == pytest.approx((0.3 - 0.5) ** 2 / 1 * 8.5 * speed * 10, rel=1e-5)
+    assert total == pytest.approx(2.0 + 1.125 + CONFIG.l_sep * 0.125)
+
+
+def test_descent_never_ends_higher_than_it_began() -> None:
+    planner, field = LocalPlanner(CONFIG), boulders()
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        slots = np.cumsum(rng.normal(size=(20, 3)), axis=0)
+        position, velocity = rng.normal(size=(2, 3))
+        before, _, _ = planner.cost(
+            position, velocity, slots, slots=slots, actor=slots + 8, others=NOBODY, field=field
+        )
+        made = planner.plan(
+            0.0, position, velocity, slots=slots, actor=slots + 8, others=[], field=field, previous=None
+        )
+        assert made.cost < before
+        after, _, _ = planner.cost(
+            position, velocity, made.plan.path[1:], slots=slots, actor=slots + 8, others=NOBODY, field=field
+        )
+        assert after == pytest.approx(made.cost)
+        assert made.separation is Separation.KEPT
+
+
+@pytest.mark.parametrize(("speed_floor", "gets_out"), [(1.0, True), (0.0, False)])
+def test_who_stands_inside_the_mound_gets_out_if_speed_has_a_floor(
+    speed_floor: float, gets_out: bool
+) -> None:
+    """The literal form multiplies all obstacles by a speed of zero, and then has nothing to push with."""
+    planner = LocalPlanner(PlannerConfig(speed_floor_mps=speed_floor))
+    field, inside = mound(), np.array([30.0, 8.6, 3.5])
+    assert field.sample(inside)[0] < -0.5
+    slots = np.tile(inside, (20, 1))
+    made = planner.plan(
+        0.0, inside, np.zeros(3), slots=slots, actor=slots - [0, 9, 2], others=[], field=field, previous=None
+    )
+    assert (field.sample(made.plan.path[-1])[0] > 0) == gets_out
+
+
+def straight(start: Float, end: Float, start_s: float = 0.0) -> Plan:
+    return Plan(start_s, np.linspace(start, end, 21), (end - start) / 10.0, 0.5)
+
+
+def test_closest_approach_sees_between_the_waypoints() -> None:
+    """Two pass each other at 90 degrees, both at the crossing at 0.75 s, between two waypoints."""
+    path = np.array([[-1.5, 0, 0], [-0.5, 0, 0], [0.5, 0, 0], [1.5, 0, 0]])
+    other = path[:, [1, 0, 2]] + [0, 0, 0.25]
+    assert closest_approach(path, other[None]) == pytest.approx(0.25)
+    assert np.linalg.norm(path - other, axis=1).min() > 0.7
+    assert closest_approach(path, np.empty((0, 4, 3))) == np.inf
+
+
+def test_plans_that_would_meet_are_kept_apart() -> None:
+    """Head on along the same line, so strongly wanted that the soft term alone gives way."""
+    config = PlannerConfig(l_form=20.0, l_sep=0.5)
+    planner = LocalPlanner(config)
+    a, b = np.array([-10.0, 0, 4]), np.array([10.0, 0.1, 4])
+    other = straight(b, a)
+    made = planner.plan(
+        0.0,
+        a,
+        np.array([2.0, 0, 0]),
+        slots=straight(a, b).path[1:],
+        actor=straight(a, b).path[1:] + np.array([0, 30, 0]),
+        others=[other],
+        field=open_space(),
+        previous=None,
+    )
+    assert made.separation is Separation.PROJECTED
+    assert closest_approach(made.plan.path, other.path[None]) >= config.separation_m
+
+
+def test_where_pushing_does_not_help_the_plan_before_goes_on() -> None:
+    """Another drone comes through from above; sideways there is rock."""
+    occupied = np.ones((60, 24, 60), dtype=np.float32)
+    occupied[:, 11:13] = 0  # a gap 1 m wide along y = 0
+    field = distance_field(Occupancy(occupied, np.array([-15.0, -6.0, -15.0]), 0.5))
+    config = PlannerConfig(l_form=20.0, l_sep=0.0, eps_obs_m=0.3)
+    here, still = np.zeros(3), np.zeros(3)
+    slots = np.linspace([0.5, 0, 0], [10, 0, 0], 20)
+    beside = np.linspace([5.0, 2.9, 0], [5.0, 2.9, 0], 21)  # waits in the rock, seen from the gap
+    waiting = Plan(-0.2, np.zeros((21, 3)), still, 0.5)
+    made = LocalPlanner(config).plan(
+        0.0,
+        here,
+        still,
+        slots=slots,
+        actor=slots + np.array([0, 0, 9]),
+        others=[Plan(0.0, beside, still, 0.5)],
+        field=field,
+        previous=waiting,
+    )
+    assert made.separation is Separation.REJECTED
+    assert closest_approach(made.plan.path, beside[None]) >= config.separation_m
+    assert field.sample(made.plan.path)[0].min() > 0

@@ -1,0 +1,210 @@
+"""Whole flights past known obstacles: the seed's comparison, limits, causality, repeatability."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.geometry.poses import matrix_from_quaternion
+from pipelines.planning.arms import ADAPTIVE, COVARIANCE, FIXED, GREEDY, Arm, FormationPlanner
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.distance_field import DistanceField
+from pipelines.planning.formation import FormationPath
+from pipelines.planning.pilot import Pilot
+from pipelines.planning.replay import ReplayResult, replay
+from pipelines.planning.scores import near_obstacle, score
+from tests.planning.worlds import bare_ground, mound, trees, walker, wall
+
+Float = NDArray[np.float64]
+CONFIG = PlannerConfig()
+
+
+def fly(
+    arm: Arm,
+    field: DistanceField,
+    *,
+    seconds: float = 38.0,
+    config: PlannerConfig = CONFIG,
+    drones: int = 2,
+    yaw_deg: float = 45.0,
+    closed: bool = True,
+) -> ReplayResult:
+    return replay(
+        arm,
+        *walker(seconds),
+        [field],
+        config=config,
+        drones=drones,
+        yaw_rad=np.radians(yaw_deg),
+        mode="closed-loop" if closed else "plan-only",
+    )
+
+
+def tilt_deg(result: ReplayResult) -> Float:
+    return np.degrees(result.tilt_rad)
+
+
+def positions_of(result: ReplayResult) -> tuple[Float, Float, Float]:
+    return result.t_s, result.position, result.actor
+
+
+def test_the_adaptive_formation_goes_round_the_mound_and_the_fixed_one_over_it() -> None:
+    """A prototype had 38/38 deg for fixed and 17/16 for adaptive; asked for: the order, by a margin."""
+    field = mound()
+    fixed, adaptive = fly(FIXED, field), fly(ADAPTIVE, field)
+    assert tilt_deg(fixed).max(axis=1).min() > 30
+    assert tilt_deg(adaptive).max() < 20
+    assert np.ptp(fixed.formation_yaw_rad) == 0
+    assert np.abs(np.degrees(adaptive.formation_yaw_rad[-1]) - 45) > 80
+    near = near_obstacle(fixed.t_s, fixed.position, fixed.actor, field)
+    assert 0 < near.mean() <= 1
+    means = [tilt_deg(result)[:, near].mean() for result in (fixed, adaptive)]
+    assert means[0] - means[1] > 5
+    for result in (fixed, adaptive):
+        assert field.sample(result.position)[0].min() > 1
+        assert np.linalg.norm(result.position[0] - result.position[1], axis=-1).min() > 3
+
+
+def test_a_higher_mound_lifts_the_fixed_formation_further() -> None:
+    config = replace(CONFIG, l_obs=200.0, l_occ=5.0)
+    highest = [
+        tilt_deg(fly(arm, mound(height), config=config)).max()
+        for arm, height in ((FIXED, 6.0), (FIXED, 9.0), (ADAPTIVE, 9.0))
+    ]
+    assert highest[1] > highest[0] > 30
+    assert highest[2] < 20
+
+
+@pytest.mark.parametrize("arm", [FIXED, ADAPTIVE], ids=lambda arm: arm.name)
+@pytest.mark.parametrize("yaw_deg", [45.0, 17.3])
+def test_over_bare_ground_nothing_turns_or_climbs(arm: Arm, yaw_deg: float) -> None:
+    result = fly(arm, bare_ground(), seconds=12.0, yaw_deg=yaw_deg)
+    assert np.abs(tilt_deg(result) - CONFIG.tilt_deg).max() < 3
+    assert np.degrees(result.formation_yaw_rad) == pytest.approx(np.full(len(result.t_ns), yaw_deg))
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.02])
+def test_a_slot_inside_the_mound_of_a_standing_actor_is_left(speed: float) -> None:
+    field = mound()
+    stamps, hips = walker(15.0, speed)
+    hips = hips + np.array([30.0, -1.0, 0.0])  # the slot: 9.7 m north, 2.6 m up
+    inside = hips[0] + [0.0, 9.66, 2.59]
+    assert field.sample(inside)[0] < -0.5
+    result = replay(FIXED, stamps, hips, [field], config=CONFIG, drones=1, yaw_rad=np.pi / 2)
+    assert field.sample(result.position[0, -1])[0] > 0
+
+
+@pytest.mark.parametrize("arm", [FIXED, ADAPTIVE, COVARIANCE, GREEDY], ids=lambda arm: arm.name)
+@pytest.mark.parametrize("world", [wall, trees], ids=["wall", "trees"])
+def test_no_collision_and_enough_distance_past_wall_and_trees(arm: Arm, world: object) -> None:
+    field = wall() if world is wall else trees()
+    result = fly(arm, field, seconds=25.0, drones=3, yaw_deg=-90.0)
+    figures = score(*positions_of(result), field, CONFIG)
+    violations = figures["limit_violations"]
+    assert isinstance(violations, dict)
+    assert violations["collision"] == 0
+    assert violations["separation"] == 0
+
+
+@dataclass(frozen=True)
+class SamePlaceForAll:
+    """An arm that wants every drone in the slot of the first one after 3 s."""
+
+    name: str = "same-place"
+    title: str = "all in one slot"
+
+    def start(self, *_: object, **__: object) -> FormationPlanner:
+        return _SamePlace()
+
+
+class _SamePlace:
+    def plan(self, t_s: float, commanded: Float, *_: object, **__: object) -> FormationPath:
+        goal = commanded if t_s < 3 else np.repeat(commanded[:1], len(commanded), axis=0)
+        rates = np.array(CONFIG.slot_rates)
+        return FormationPath(np.array([t_s, t_s + 2.0]), np.stack([commanded, goal]), rates)
+
+
+@pytest.mark.parametrize("drones", [2, 3, 5])
+def test_drones_that_want_the_same_slot_keep_three_metres(drones: int) -> None:
+    result = fly(SamePlaceForAll(), bare_ground(), seconds=20.0, drones=drones)
+    assert np.ptp(result.slots[:, -1, 0]) < 1e-6  # they do want it
+    apart = np.linalg.norm(result.position[:, None] - result.position[None], axis=-1)
+    assert apart[~np.eye(drones, dtype=bool)].min() >= CONFIG.separation_m
+
+
+@pytest.mark.parametrize("arm", [ADAPTIVE, COVARIANCE, GREEDY], ids=lambda arm: arm.name)
+def test_the_same_arguments_give_the_same_bytes(arm: Arm) -> None:
+    config = replace(CONFIG, actor_noise_m=0.2)
+
+    def flown(seed: int) -> ReplayResult:
+        return replay(arm, *walker(5.0), [wall()], config=config, drones=2, seed=seed)
+
+    first, again, other = flown(1), flown(1), flown(2)
+    for name in ("position", "velocity", "quaternion_xyzw", "slots", "visible", "estimate"):
+        assert getattr(first, name).tobytes() == getattr(again, name).tobytes()
+    assert not np.array_equal(first.estimate, other.estimate)
+
+
+def test_nothing_is_seen_before_its_time() -> None:
+    """Log and map change at 6 s; until then everything flies as if they did not."""
+    stamps, hips = walker(10.0)
+    later = hips.copy()
+    later[stamps >= 6_000_000_000, 1] += 5.0
+    appearing = [replace(mound(), from_ns=6_000_000_000)]
+    hips, later = hips + np.array([22.0, 0, 0]), later + np.array([22.0, 0, 0])
+    plain, changed = (
+        replay(ADAPTIVE, stamps, actor, fields, config=CONFIG, drones=2, yaw_rad=np.radians(45))
+        for actor, fields in ((hips, []), (later, appearing))
+    )
+    before = plain.t_s < 6.0 - 1e-9
+    assert np.array_equal(plain.position[:, before], changed.position[:, before])
+    assert not np.allclose(plain.position[:, -1], changed.position[:, -1], atol=0.5)
+    assert np.ptp(changed.formation_yaw_rad[before]) == 0
+    assert np.ptp(changed.formation_yaw_rad) > 0
+
+
+def test_cameras_aim_at_the_estimate_and_not_at_the_truth() -> None:
+    config = replace(CONFIG, actor_noise_m=1.0)
+    result = replay(FIXED, *walker(5.0), [], config=config, drones=2)
+    forward = matrix_from_quaternion(result.quaternion_xyzw)[..., 2]
+    for target, met in ((result.estimate, True), (result.actor, False)):
+        towards = target - result.position
+        towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+        off = np.degrees(np.arccos(np.clip((forward * towards).sum(axis=-1), -1, 1)))
+        assert (off.max() < 1e-3) == met
+
+
+def test_plan_only_is_where_the_plans_are() -> None:
+    """Both modes agree where flying is easy; the plans' velocity is the derivative of their position.
+
+    20 ms at the largest acceleration of these plans, below 3 m/s^2, change the velocity by less than 0.06.
+    """
+    open_loop, closed = (fly(FIXED, bare_ground(), seconds=10.0, closed=closed) for closed in (False, True))
+    assert np.abs(open_loop.position - closed.position).max() < 0.5
+    assert not np.array_equal(open_loop.position, closed.position)
+    steps = np.diff(open_loop.position, axis=1) * 50
+    assert np.abs(steps - open_loop.velocity[:, 1:]).max() < 0.1
+
+
+def test_rows_without_a_measurement_are_left_out() -> None:
+    stamps, hips = walker(5.0)
+    gappy = hips.copy()
+    gappy[7:12] = np.nan
+    result = replay(FIXED, stamps, gappy, [], config=CONFIG, drones=1)
+    assert result.actor == pytest.approx(hips[0] + np.outer(result.t_s, [1.2, 0, 0]))
+    for bad in (stamps[:1], stamps[::-1]):
+        with pytest.raises(ValueError, match="ascending"):
+            replay(FIXED, bad, hips[: len(bad)], [], config=CONFIG, drones=1)
+    with pytest.raises(ValueError, match="17 drones"):
+        Pilot(FIXED, CONFIG, drones=17, yaw_rad=0.0)
+
+
+def test_the_rates_of_planning() -> None:
+    """10 Hz and 5 Hz over 4 s, both ends included, the local planner for each of 3 drones."""
+    result = fly(FIXED, bare_ground(), seconds=4.1, drones=3)
+    assert len(result.times.central_s) == 41
+    assert len(result.times.local_s) == 3 * 21
+    assert sum(result.separation.values()) == 3 * 21

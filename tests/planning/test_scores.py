@@ -1,0 +1,102 @@
+"""Figures of flights that are known by construction."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.distance_field import open_space
+from pipelines.planning.formation import formation_slots, slot_offsets
+from pipelines.planning.scores import near_obstacle, predicted_errors, score
+from tests.planning.worlds import bare_ground, wall
+
+Float = NDArray[np.float64]
+CONFIG = PlannerConfig()
+T_S = np.arange(0, 20.001, 0.02)
+
+
+def ring(drones: int, tilt_deg: float, *, rate_rad_per_s: float = 0.0) -> tuple[Float, Float]:
+    actor = np.stack([0 * T_S + 5, 0 * T_S, 0 * T_S + 1], axis=1)
+    yaw = rate_rad_per_s * T_S
+    slots = formation_slots(yaw, drones, tilt_rad=np.radians(tilt_deg), range_m=10.0)
+    return actor + np.swapaxes(slot_offsets(slots), 0, 1), actor
+
+
+def test_a_still_formation_in_the_open() -> None:
+    position, actor = ring(2, 30.0)
+    figures = score(T_S, position, actor, open_space(), CONFIG)
+    assert figures["tilt_deg"] == pytest.approx({"mean": 30, "max": 30, "near_obstacle": None})
+    assert figures["range_m"] == pytest.approx({"mean": 10, "min": 10, "max": 10})
+    assert figures["yaw_separation_deg"] == pytest.approx({"mean": 90, "min": 90, "max": 90})
+    assert figures["occluded_share"] == 0
+    assert figures["undetermined_share"] == 0
+    assert figures["max_speed_mps"] == pytest.approx(0)
+    assert figures["limit_violations"] == dict.fromkeys(
+        ("speed", "acceleration", "jerk", "separation", "collision"), 0
+    )
+    assert figures["min_separation_m"] == pytest.approx(10 * np.cos(np.radians(30)) * np.sqrt(2))
+    # cos gamma = cos^2 30 cos 90 + sin^2 30 = 1/4
+    s2 = (10 * 0.003) ** 2 + (10 * np.radians(1.0)) ** 2 + 0.3**2
+    error = np.sqrt(s2 * (0.5 + 2 / (1 - 1 / 16)))
+    assert figures["predicted_error_m"] == pytest.approx({"median": error, "p95": error})
+    assert predicted_errors(position, actor, open_space(), CONFIG) == pytest.approx(np.full(len(T_S), error))
+
+
+def test_a_turning_formation_has_the_speed_of_a_circle() -> None:
+    """At 10 Hz: v = r w sinc(w h / 2), and one more such factor per derivative; 5 % covers them."""
+    w = 0.9
+    position, actor = ring(3, 0.0, rate_rad_per_s=w)
+    figures = score(T_S, position, actor, open_space(), CONFIG)
+    assert figures["max_speed_mps"] == pytest.approx(10 * w, rel=0.05)
+    assert figures["max_acceleration_mps2"] == pytest.approx(10 * w**2, rel=0.05)
+    assert figures["max_jerk_mps3"] == pytest.approx(10 * w**3, rel=0.05)
+    violations = figures["limit_violations"]
+    assert isinstance(violations, dict)
+    assert violations["speed"] == 3  # one episode for each drone, all the time
+    assert violations["acceleration"] == 3
+    assert violations["jerk"] == 0
+
+
+def test_what_the_wall_hides_and_who_flies_into_it() -> None:
+    """Two cameras at 90 deg, one of them behind the wall from 5 s to 10 s, through its middle."""
+    position, actor = ring(2, 0.0)
+    behind = (T_S >= 5) & (T_S < 10)
+    position[1, behind] = [5.0, 8.0, 1.0]
+    position[1, ~behind] = [5.0, -10.0, 1.0]
+    figures = score(T_S, position, actor, wall(), CONFIG, near=behind)
+    assert figures["occluded_share"] == pytest.approx(0.5 * behind.mean())
+    assert figures["undetermined_share"] == pytest.approx(behind.mean())
+    assert figures["min_clearance_m"] == pytest.approx(-1.0, abs=0.5)  # the wall covers y = 6.5 to 9.5
+    assert isinstance(figures["limit_violations"], dict)
+    assert figures["limit_violations"]["collision"] == 1
+    assert figures["tilt_deg"] == pytest.approx({"mean": 0, "max": 0, "near_obstacle": 0}, abs=1e-9)
+
+
+def test_one_drone_has_no_pairs_and_two_in_one_place_are_too_near() -> None:
+    position, actor = ring(1, 15.0)
+    alone = score(T_S, position, actor, open_space(), CONFIG)
+    assert alone["yaw_separation_deg"] is None
+    assert alone["min_separation_m"] is None
+    assert alone["predicted_error_m"] == {"median": None, "p95": None}
+    assert alone["undetermined_share"] == 1.0
+    together = np.concatenate([position, position + np.array([0.1, 0, 0])])
+    figures = score(T_S, together, actor, open_space(), CONFIG)
+    assert isinstance(figures["limit_violations"], dict)
+    assert figures["limit_violations"]["separation"] == 1
+
+
+def test_near_is_what_stands_above_the_actor_within_fifteen_metres() -> None:
+    """The wall's near face is y = 6.5; a slot that comes from the south is near from y = -8.5 on.
+
+    Looks are 0.2 s apart, 0.2 m at 1 m/s, and columns count by their centres, 0.25 m behind the face.
+    """
+    slot = np.stack([0 * T_S + 12, T_S - 20, 0 * T_S + 3], axis=1)[None]
+    actor = np.tile([12.0, -25.0, 1.0], (len(T_S), 1))
+    near = near_obstacle(T_S, slot, actor, wall())
+    first = slot[0, np.argmax(near), 1]
+    assert -8.26 <= first <= -8.25 + 0.2 + 0.01
+    assert near[np.argmax(near) :].all()
+    assert not near_obstacle(T_S, slot, actor, bare_ground()).any()
+    assert not near_obstacle(T_S, slot, actor + np.array([0, 0, 6.0]), wall()).any()

@@ -1,0 +1,109 @@
+"""Dynamic programming against every sequence there is."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pipelines.planning.formation import wrapped, yaw_set
+from pipelines.planning.search import Lattice, best_sequence, lattice
+
+Float = NDArray[np.float64]
+RATES = np.array([np.radians(22.5), np.radians(5.0), 1.0])
+
+
+def yaw_ring(yaws: int, *, w_turn: float = 0.05, knot_s: float = 2.0) -> Lattice:
+    states = np.column_stack([yaw_set(yaws, 0.0), np.full(yaws, 0.26), np.full(yaws, 10.0)])
+    return lattice(states, rates=RATES, knot_s=knot_s, w_turn=w_turn)
+
+
+def price(sequence: tuple[int, ...], cost: Float, states: Float, start: Float, w_turn: float) -> float:
+    """Straight from the definition: inf where a rate is exceeded, |turn| in units of 2 s at the full rate."""
+    total, at = 0.0, start
+    for t, s in enumerate(sequence):
+        way = states[s] - at
+        way[0] = wrapped(way[0])
+        if (np.abs(way) > RATES * 2.0 + 1e-9).any():
+            return np.inf
+        total += cost[t, s] + w_turn * float((np.abs(way) / (2.0 * RATES)).sum())
+        at = states[s]
+    return total
+
+
+@given(st.integers(0, 10_000), st.integers(3, 8), st.integers(1, 4), st.sampled_from([0.0, 0.05, 0.5]))
+def test_no_sequence_of_yaws_is_cheaper(seed: int, yaws: int, times: int, w_turn: float) -> None:
+    rng = np.random.default_rng(seed)
+    grid = yaw_ring(yaws, w_turn=w_turn)
+    cost = rng.random((times, yaws))
+    start = np.array([grid.states[rng.integers(yaws), 0] + rng.uniform(-0.3, 0.3), 0.26, 10.0])
+    if np.abs(wrapped(grid.states[:, 0] - start[0])).min() > 2 * RATES[0]:
+        return  # nothing is in reach: the nearest is taken, which the definition does not know
+    found, value = best_sequence(cost, grid, start)
+    every = [price(s, cost, grid.states, start, w_turn) for s in product(range(yaws), repeat=times)]
+    assert value == pytest.approx(min(every), abs=1e-12)
+    assert price(tuple(found), cost, grid.states, start, w_turn) == pytest.approx(value, abs=1e-12)
+
+
+@given(st.integers(0, 10_000))
+def test_no_sequence_of_yaw_tilt_and_range_is_cheaper(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    states = np.array(list(product(yaw_set(4, 0.1), [0.1, 0.25], [8.0, 10.0, 13.0])))
+    grid = lattice(states, rates=RATES * [2, 1, 1], knot_s=2.0, w_turn=0.05)
+    cost = rng.random((3, len(states)))
+    start = states[rng.integers(len(states))]
+    found, value = best_sequence(cost, grid, start)
+    rates = RATES * [2, 1, 1]
+
+    def walk(t: int, at: Float) -> float:
+        if t == len(cost):
+            return 0.0
+        best = np.inf
+        for s, state in enumerate(states):
+            way = state - at
+            way[0] = wrapped(way[0])
+            if (np.abs(way) <= 2.0 * rates + 1e-9).all():
+                move = 0.05 / 2.0 * float((np.abs(way) / rates).sum())
+                best = min(best, cost[t, s] + move + walk(t + 1, state))
+        return best
+
+    assert value == pytest.approx(walk(0, start), abs=1e-12)
+    assert len(found) == 3
+
+
+def test_going_round_over_the_seam() -> None:
+    """From 135 deg the way to -135 deg is one cell of 90 and not three."""
+    grid = yaw_ring(8)
+    cost = np.ones((5, 8))
+    behind = int(np.argmin(np.abs(wrapped(grid.states[:, 0] - np.radians(-135)))))
+    cost[:, behind] = 0.0
+    found, _ = best_sequence(cost, grid, np.array([np.radians(135), 0.26, 10.0]))
+    yaws = np.degrees(grid.states[found, 0])
+    assert np.abs(yaws[0]) == pytest.approx(180)
+    assert yaws[1:] == pytest.approx(-135)
+
+
+@pytest.mark.parametrize("w_turn", [0.0, 0.05])
+def test_ties_stay(w_turn: float) -> None:
+    grid = yaw_ring(8, w_turn=w_turn)
+    for s in range(8):
+        found, value = best_sequence(np.full((5, 8), 0.5), grid, grid.states[s])
+        assert (found == s).all()
+        assert value == pytest.approx(2.5)
+
+
+@pytest.mark.parametrize(("yaws", "knot_s", "cells"), [(8, 2.0, 1), (16, 2.0, 2), (72, 0.5, 2), (72, 2.0, 9)])
+def test_reach_is_a_rate_and_not_a_number_of_cells(yaws: int, knot_s: float, cells: int) -> None:
+    grid = yaw_ring(yaws, knot_s=knot_s)
+    assert ((grid.neighbours >= 0).sum(axis=1) == 2 * cells + 1).all()
+    assert (grid.neighbours[:, 0] == np.arange(yaws)).all()
+
+
+def test_a_start_out_of_reach_goes_to_the_nearest_state() -> None:
+    grid = yaw_ring(3)
+    found, _ = best_sequence(np.zeros((2, 3)), grid, np.array([np.radians(50), 0.26, 10.0]))
+    assert wrapped(grid.states[found, 0]) == pytest.approx(0.0, abs=1e-12)

@@ -1,0 +1,81 @@
+"""Sight lines against a plain and slow reference."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pipelines.planning.distance_field import DistanceField, distance_field
+from pipelines.planning.sight import occupied_share, visible
+from pipelines.session.records import Occupancy
+
+RES = 0.5
+
+
+def random_field(seed: int, share: float) -> tuple[DistanceField, NDArray[np.bool_]]:
+    occupied = np.random.default_rng(seed).random((12, 10, 8)) < share
+    return distance_field(Occupancy(occupied.astype(np.float32), np.zeros(3), RES)), occupied
+
+
+def crossed_boxes(occupied: NDArray[np.bool_], a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Longest piece of the segment inside one occupied box (slab test of every box)."""
+    low = np.argwhere(occupied) * RES
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, last = (low - a) / (b - a), (low + RES - a) / (b - a)
+    near = np.nanmax(np.minimum(first, last), axis=1).clip(0, 1)
+    far = np.nanmin(np.maximum(first, last), axis=1).clip(0, 1)
+    return float((far - near).max(initial=0.0) * np.linalg.norm(b - a))
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.0, 0.02, 0.3]))
+def test_traversal_finds_every_box_that_is_crossed(seed: int, share: float) -> None:
+    field, occupied = random_field(seed, share)
+    rng = np.random.default_rng(seed)
+    camera, actor = rng.uniform(-2, 7, (2, 20, 3))
+    seen = visible(field, camera, actor, start_m=0.0)
+    for k in range(20):
+        longest = crossed_boxes(occupied, camera[k], actor[k])
+        if longest > 1e-9 or longest == 0.0:  # not where a corner is grazed
+            assert seen[k] == (longest == 0.0)
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.005, 0.05]))
+def test_leaping_changes_no_sample(seed: int, share: float) -> None:
+    field, occupied = random_field(seed, share)
+    rng = np.random.default_rng(seed)
+    camera, actor = rng.uniform(-2, 7, (2, 3))
+    length, start_m = float(np.linalg.norm(camera - actor)), 0.7
+    found = occupied_share(field, camera, actor, start_m=start_m)
+    if length <= start_m:
+        assert found == 0
+        return
+    count = int(np.ceil((length - start_m) / (RES / 2)))
+    along = start_m + (np.arange(count) + 0.5) * (length - start_m) / count
+    index = np.floor((actor + along[:, None] * (camera - actor) / length) / RES).astype(int)
+    inside = ((index >= 0) & (index < occupied.shape)).all(axis=1)
+    assert found == occupied[tuple(index[inside].T)].sum() / count
+
+
+def test_the_end_at_the_actor_is_left_out() -> None:
+    occupied = np.zeros((40, 3, 3), dtype=np.float32)
+    occupied[0:2] = 1  # the actor's own voxels, x < 1
+    field = distance_field(Occupancy(occupied, np.zeros(3), RES))
+    actor, camera = np.array([0.75, 0.75, 0.75]), np.array([10.75, 0.75, 0.75])
+    assert not visible(field, camera, actor, start_m=0.0)
+    assert visible(field, camera, actor, start_m=1.5)
+    assert occupied_share(field, camera, actor, start_m=1.5) == 0
+    assert occupied_share(field, camera, actor, start_m=0.0) == pytest.approx(0.25 / 10, abs=0.25 / 10)
+    assert visible(field, actor + np.array([0, 0, 1.0]), actor, start_m=1.5)
+
+
+def test_a_share_is_what_lies_in_the_way() -> None:
+    """5 m of 20 m; each end of the block is met to half a sample of 0.25 m."""
+    occupied = np.zeros((40, 3, 3), dtype=np.float32)
+    occupied[10:20] = 1
+    field = distance_field(Occupancy(occupied, np.zeros(3), RES))
+    share = occupied_share(field, np.array([[20.0, 0.7, 0.7]]), np.array([0.0, 0.7, 0.7]), start_m=0.0)
+    assert share.shape == (1,)
+    assert share[0] == pytest.approx(5 / 20, abs=0.25 / 20)
