@@ -47,7 +47,9 @@ def room_for(count: int) -> Fragments:
     return Fragments(pixel, share, on_ground, point, normal, colour, distance, slant)
 
 
-def gather(band: Band, first_row: int, shifts_px: Float, view: View, mesh: Mesh, fragments: Fragments) -> int:
+def gather(
+    band: Band, first_row: int, shifts_px: Float, view: View, mesh: Mesh, fragments: Fragments, sky: Float32
+) -> int:
     """Find what a band's pixels are made of.
 
     Samples of one face in one pixel become one fragment at their common centre, which lies on the face
@@ -60,6 +62,7 @@ def gather(band: Band, first_row: int, shifts_px: Float, view: View, mesh: Mesh,
         view: the camera.
         mesh: what the band's faces index.
         fragments: room for as many as there are samples; filled.
+        sky: [R * W] share of each pixel's samples that see nothing; filled.
 
     Returns:
         How many fragments there are.
@@ -86,6 +89,7 @@ def gather(band: Band, first_row: int, shifts_px: Float, view: View, mesh: Mesh,
         fragments.colour,
         fragments.distance,
         fragments.slant,
+        sky,
     )
 
 
@@ -112,15 +116,17 @@ def _gather(
     colour: Float32,
     distance: Float32,
     slant: Float32,
+    sky: Float32,
 ) -> int:
     per_pixel, width = len(shifts_px), nearness.shape[1]
     weight, per_fx, per_fy = 1.0 / per_pixel, 1.0 / pinhole[0], 1.0 / pinhole[1]
     (ax, bx, cx), (ay, by, cy), (az, bz, cz) = turn
     ox, oy, oz = position
-    count = 0
+    count, known = 0, NOTHING
     for row in range(nearness.shape[0] // per_pixel):
         top = row * per_pixel
         for x in range(width):
+            sky[row * width + x] = 0.0
             place = 1 + 4 * (row & 3) + (x & 3)
             done = 0  # a bit for each sample
             for first in range(per_pixel):
@@ -145,39 +151,45 @@ def _gather(
                 if face == NOTHING:
                     depth = (land[0] - oz) / dz
                     if not (0.0 < depth < 1e6):  # NaN where there is no land
+                        sky[row * width + x] = samples * weight
                         continue
                     nx, ny, nz = 0.0, 0.0, 1.0
                     red, green, blue = land[1], land[2], land[3]
                     on_ground[count] = place
                 else:
                     depth = samples / near
-                    a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-                    px, py, pz = vertices[a, 0], vertices[a, 1], vertices[a, 2]
-                    ux, uy, uz = vertices[b, 0] - px, vertices[b, 1] - py, vertices[b, 2] - pz
-                    vx, vy, vz = vertices[c, 0] - px, vertices[c, 1] - py, vertices[c, 2] - pz
-                    wx = ox + depth * dx - px
-                    wy = oy + depth * dy - py
-                    wz = oz + depth * dz - pz
-                    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-                    square = nx * nx + ny * ny + nz * nz
-                    # Barycentric coordinates: areas opposite the corners, over that of the face.
-                    per_square = 1.0 / square
-                    s = nx * (wy * vz - wz * vy) + ny * (wz * vx - wx * vz) + nz * (wx * vy - wy * vx)
-                    t = nx * (uy * wz - uz * wy) + ny * (uz * wx - ux * wz) + nz * (ux * wy - uy * wx)
-                    s = min(max(s * per_square, 0.0), 1.0)
-                    t = min(max(t * per_square, 0.0), 1.0 - s)
+                    if face != known:  # neighbours in a row mostly see the same face
+                        known = face
+                        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+                        smooth, ground = kind[face] & SMOOTH != 0, kind[face] & GROUND != 0
+                        px, py, pz = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+                        ux, uy, uz = vertices[b, 0] - px, vertices[b, 1] - py, vertices[b, 2] - pz
+                        vx, vy, vz = vertices[c, 0] - px, vertices[c, 1] - py, vertices[c, 2] - pz
+                        gx, gy, gz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+                        inverse = 1.0 / (gx * gx + gy * gy + gz * gz)
+                        # Barycentric coordinates are linear: areas opposite the corners, over the whole.
+                        sx, sy, sz = vy * gz - vz * gy, vz * gx - vx * gz, vx * gy - vy * gx
+                        tx, ty, tz = gy * uz - gz * uy, gz * ux - gx * uz, gx * uy - gy * ux
+                        length = np.sqrt(inverse)
+                        fx, fy, fz = gx * length, gy * length, gz * length
+                    wx, wy, wz = ox + depth * dx - px, oy + depth * dy - py, oz + depth * dz - pz
+                    s = (sx * wx + sy * wy + sz * wz) * inverse
+                    t = (tx * wx + ty * wy + tz * wz) * inverse
+                    s = min(max(s, 0.0), 1.0)
+                    t = min(max(t, 0.0), 1.0 - s)
                     o = 1.0 - s - t
                     red = o * colours[a, 0] + s * colours[b, 0] + t * colours[c, 0]
                     green = o * colours[a, 1] + s * colours[b, 1] + t * colours[c, 1]
                     blue = o * colours[a, 2] + s * colours[b, 2] + t * colours[c, 2]
-                    if kind[face] & SMOOTH != 0:
+                    if smooth:
                         nx = o * normals[a, 0] + s * normals[b, 0] + t * normals[c, 0]
                         ny = o * normals[a, 1] + s * normals[b, 1] + t * normals[c, 1]
                         nz = o * normals[a, 2] + s * normals[b, 2] + t * normals[c, 2]
-                        square = max(nx * nx + ny * ny + nz * nz, 1e-30)
-                    scale = 1.0 / np.sqrt(square)
-                    nx, ny, nz = nx * scale, ny * scale, nz * scale
-                    on_ground[count] = place if kind[face] & GROUND != 0 else 0
+                        scale = 1.0 / np.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-30))
+                        nx, ny, nz = nx * scale, ny * scale, nz * scale
+                    else:
+                        nx, ny, nz = fx, fy, fz
+                    on_ground[count] = place if ground else 0
                 towards = -(nx * dx + ny * dy + nz * dz) / stretch
                 side = 1.0 if towards > 0.0 else -1.0  # of the face that is seen
                 pixel[count] = row * width + x

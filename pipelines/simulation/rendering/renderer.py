@@ -98,14 +98,15 @@ class Renderer:
         chosen, start = bands(triangles, height, _BAND_ROWS)
         light = np.empty((height, width, 3), np.float32)
         fragments = room_for(SUBROWS * _BAND_ROWS * width)
+        sky = np.empty(_BAND_ROWS * width, np.float32)
         for k, first_row in enumerate(range(0, height, _BAND_ROWS)):
             rows = light[first_row : first_row + _BAND_ROWS]
             band = empty_band(SUBROWS * len(rows), width)
             draw(triangles, chosen[start[k] : start[k + 1]], SHIFTS_PX, SUBROWS * first_row, band)
-            count = gather(band, first_row, SHIFTS_PX, view, mesh, fragments)
+            count = gather(band, first_row, SHIFTS_PX, view, mesh, fragments, sky)
             paint(self._texture, fragments, count, view)
             sun = sunlight(shadows, self._axes, fragments, count)
-            shade(fragments, count, sun, first_row, view, rows)
+            shade(fragments, count, sun, sky, first_row, view, rows)
         return developed(light, _noise_key(self._seed, frame, position))
 
     def silhouette(

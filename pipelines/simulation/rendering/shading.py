@@ -23,18 +23,21 @@ ZENITH_RGB = np.array([0.14, 0.25, 0.47])
 HAZE_M = 700.0  # where haze has half its effect
 
 
-def shade(fragments: Fragments, count: int, sun: Float32, first_row: int, view: View, light: Float32) -> None:
-    """Write the light of the pixels of a band: the mean of their fragments, and sky in what is left.
+def shade(
+    fragments: Fragments, count: int, sun: Float32, sky: Float32, first_row: int, view: View, light: Float32
+) -> None:
+    """Write the light of the pixels of a band: the mean of what their samples see.
 
     Args:
         fragments: of the band.
         count: of the fragments.
         sun: [N] cosine of the sun's incidence times the share of it that reaches a fragment.
+        sky: [R * W] share of each pixel's samples that see sky.
         first_row: the row of the picture that is the band's first.
         view: the camera.
         light: [R, W, 3] the rows of the picture; written.
     """
-    _sky(first_row, view.world_from_camera, view.pinhole, light)
+    _fill_sky(sky, first_row, view.world_from_camera, view.pinhole, light)
     _add(
         fragments.pixel[:count],
         fragments.share,
@@ -47,17 +50,22 @@ def shade(fragments: Fragments, count: int, sun: Float32, first_row: int, view: 
 
 
 @cached
-def _sky(first_row: int, turn: Float, pinhole: Float, light: Float32) -> None:
-    """Paler towards the horizon, and below it as at it."""
+def _fill_sky(share: Float32, first_row: int, turn: Float, pinhole: Float, light: Float32) -> None:
+    """Paler towards the horizon, and below it as at it; black where none is seen."""
+    width = light.shape[1]
     for row in range(light.shape[0]):
         down = (first_row + row - pinhole[3]) / pinhole[1]
-        for x in range(light.shape[1]):
+        for x in range(width):
+            seen = share[row * width + x]
+            if seen == 0.0:
+                light[row, x, 0] = light[row, x, 1] = light[row, x, 2] = 0.0
+                continue
             right = (x - pinhole[2]) / pinhole[0]
             dz = turn[2, 0] * right + turn[2, 1] * down + turn[2, 2]
             sine = max(dz / np.sqrt(right * right + down * down + 1.0), 0.0)
             low = (1.0 - sine) * (1.0 - sine) * (1.0 - sine)
             for c in range(3):
-                light[row, x, c] = ZENITH_RGB[c] + low * (HORIZON_RGB[c] - ZENITH_RGB[c])
+                light[row, x, c] = seen * (ZENITH_RGB[c] + low * (HORIZON_RGB[c] - ZENITH_RGB[c]))
 
 
 @cached
@@ -70,18 +78,10 @@ def _add(
     sun: Float32,
     light: Float32,
 ) -> None:
-    """Fragments come in front of the sky: the first of a pixel takes away the sky's share of all."""
     for i in range(len(pixel)):
-        p = pixel[i]
-        if i == 0 or pixel[i - 1] != p:
-            covered, k = 0.0, i
-            while k < len(pixel) and pixel[k] == p:
-                covered += share[k]
-                k += 1
-            for c in range(3):
-                light[p, c] *= 1.0 - covered
+        p = np.uint64(pixel[i])
         up = 0.5 + 0.5 * normal[i, 2]
-        # A share that needs no exponential: half at HAZE_M, all at the horizon.
+        # A share of haze that needs no exponential: half at HAZE_M, all at the horizon.
         haze = distance[i] / (distance[i] + HAZE_M)
         for c in range(3):
             arriving = sun[i] * SUN_RGB[c] + up * SKY_RGB[c] + (1.0 - up) * BOUNCE_RGB[c]

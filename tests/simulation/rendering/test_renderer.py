@@ -1,0 +1,354 @@
+"""Rendered pictures against the geometry of what they show."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pipelines.geometry.cameras import Intrinsics, project, undistort
+from pipelines.geometry.poses import invert, quaternion_from_matrix, rotate, transform
+from pipelines.simulation.rendering import Renderer
+from pipelines.simulation.rendering.ground import FULL_SCALE, TILE_TEXELS, ground_texture
+from pipelines.simulation.rendering.sensor import EXPOSURE, NOISE
+from pipelines.simulation.rendering.shading import HAZE_M, HORIZON_RGB
+from pipelines.simulation.surfaces import Surface
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+Pose = tuple[Float, Float]
+
+SUN = np.array([0.4, -0.3, 0.8])
+CAMERA = Intrinsics(160, 120, 150.0, 140.0, 82.3, 57.6)
+SEED = 3
+FLOAT32 = 2.0**-23
+
+
+def looking(position: tuple[float, float, float], at: tuple[float, float, float]) -> Pose:
+    """A camera that looks at a point with its x axis level (along world x when it looks straight down)."""
+    forward = np.array(at, float) - position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right = np.array([1.0, 0.0, 0.0]) if np.linalg.norm(right) < 1e-9 else right / np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward], axis=1)
+    return np.array(position, float), quaternion_from_matrix(rotation)
+
+
+def rays(pose: Pose, intrinsics: Intrinsics = CAMERA) -> Float:
+    """[H, W, 3] directions in the world through the pixels' centres, of depth 1."""
+    x, y = np.meshgrid(np.arange(intrinsics.width), np.arange(intrinsics.height))
+    normalised = undistort(np.stack([x, y], axis=-1).astype(float), intrinsics)
+    return rotate(pose[1], np.concatenate([normalised, np.ones((*x.shape, 1))], axis=-1))
+
+
+def surface(vertices: Float, faces: NDArray[np.int32], grey: float = 0.5, *, smooth: bool = False) -> Surface:
+    return Surface(vertices, faces, np.full((len(vertices), 3), grey, np.float32), smooth)
+
+
+def rectangle(centre: Float, along: Float, across: Float, grey: float = 0.5) -> Surface:
+    """Of two triangles; `along` and `across` are half its sides."""
+    corners = np.stack(
+        [centre - along - across, centre + along - across, centre + along + across, centre - along + across]
+    )
+    return surface(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), grey)
+
+
+def level(half_m: float, height_m: float = 0.0, grey: float = 0.5) -> Surface:
+    return rectangle(
+        np.array([0.0, 0.0, height_m]), np.array([half_m, 0.0, 0.0]), np.array([0.0, half_m, 0.0]), grey
+    )
+
+
+def box(low: Float, high: Float) -> Surface:
+    """Twelve triangles."""
+    corner = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]
+    return surface(np.where(corner == 1, high, low), np.array(faces, np.int32))
+
+
+def sphere(centre: Float, radius: float, sectors: int = 48, rings: int = 24) -> Surface:
+    """Corners on the sphere, counted once."""
+    polar = np.linspace(0, np.pi, rings + 1)[1:-1, None]
+    turn = np.arange(sectors) * 2 * np.pi / sectors
+    z, rho = np.broadcast_to(np.cos(polar), (rings - 1, sectors)), np.sin(polar)
+    ring = np.stack([rho * np.cos(turn), rho * np.sin(turn), z], axis=-1).reshape(-1, 3)
+    vertices = np.concatenate([ring, [[0, 0, 1.0], [0, 0, -1.0]]])
+    top, bottom = len(ring), len(ring) + 1
+    faces = []
+    for j in range(sectors):
+        following = (j + 1) % sectors
+        faces += [(top, j, following), (bottom, top - sectors + following, top - sectors + j)]
+        for i in range(rings - 2):
+            a, b = i * sectors + j, i * sectors + following
+            faces += [(a, a + sectors, b), (b, a + sectors, b + sectors)]
+    return surface(centre + radius * vertices, np.array(faces, np.int32), smooth=True)
+
+
+def renderer(*static: Surface, intrinsics: Intrinsics = CAMERA) -> Renderer:
+    return Renderer(static, intrinsics, sun=SUN, seed=SEED)
+
+
+coordinates = st.floats(-3.0, 3.0)
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1))
+def test_a_silhouette_is_the_pixels_whose_centres_project_into_a_triangle(seed: int) -> None:
+    """Every pixel, but for centres that lie within rounding of an edge."""
+    rng = np.random.default_rng(seed)
+    mesh = surface(rng.uniform(-1.2, 1.2, (12, 3)), rng.permutation(12).reshape(4, 3).astype(np.int32))
+    pose = looking((rng.uniform(2, 4), rng.uniform(-4, -2), rng.uniform(-2, 4)), (0.0, 0.0, 0.0))
+    corners = project(transform(invert(*pose), mesh.vertices), CAMERA)[mesh.faces]
+    x, y = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    inside, doubtful = np.zeros(x.shape, bool), np.zeros(x.shape, bool)
+    for corner in corners:
+        edges = np.roll(corner, -1, axis=0) - corner
+        sides = np.stack(
+            [
+                (e[0] * (y - p[1]) - e[1] * (x - p[0])) / np.hypot(*e)
+                for p, e in zip(corner, edges, strict=True)
+            ]
+        )
+        inside |= (sides > 0).all(axis=0) | (sides < 0).all(axis=0)
+        doubtful |= (np.abs(sides) < 1e-6).any(axis=0)
+    silhouette = renderer().silhouette(*pose, mesh)
+    assert (silhouette == inside)[~doubtful].all()
+    assert doubtful.mean() < 0.01
+
+
+@settings(max_examples=20)
+@given(coordinates, coordinates, st.floats(3.0, 12.0), st.floats(0.3, 1.5))
+def test_a_sphere_fills_its_cone(x: float, y: float, away: float, radius: float) -> None:
+    """Rays within the tangent cone hit a ball; the mesh lies between it and the ball inside its faces."""
+    centre = np.array([x, away, y])
+    mesh = sphere(centre, radius)
+    pose = looking((0.0, -2.0, 0.5), (0.0, 5.0, 0.0))
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    normal = np.cross(b - a, c - a)
+    inner = np.min(np.abs(np.sum(normal * (a - centre), axis=1)) / np.linalg.norm(normal, axis=1))
+
+    def within_cone(r: float) -> Bool:
+        direction, to_centre = rays(pose), centre - pose[0]
+        along = direction @ to_centre
+        square = np.sum(direction**2, axis=-1) * (to_centre @ to_centre - r * r)
+        return np.asarray((along > 0) & (along**2 > square))
+
+    silhouette = renderer().silhouette(*pose, mesh)
+    assert not (silhouette & ~within_cone(radius * (1 + 1e-9))).any()
+    assert not (~silhouette & within_cone(inner * (1 - 1e-9))).any()
+
+
+@settings(max_examples=20)
+@given(st.floats(0.5, 30.0), st.floats(-60.0, 60.0))
+def test_depth_of_a_plane(height: float, tilt_deg: float) -> None:
+    """Ground that also lies under and behind the camera, so that its triangles cross the near plane."""
+    pose = looking((0.3, -0.2, height), (0.3, 20.0, height - 20 * np.tan(np.radians(tilt_deg))))
+    depth = renderer(level(5000.0)).depth(*pose)
+    with np.errstate(divide="ignore"):
+        expected = -height / rays(pose)[..., 2]
+    hit = (expected > 0) & (expected < 4000)
+    # Nearness is kept and stepped along a row in single precision: its error is a few units of the
+    # largest nearness in the row, which is that of the row's nearest pixel.
+    nearest = np.where(hit, 1 / expected, 0).max(axis=1, keepdims=True)
+    tolerance = 4 * FLOAT32 * nearest * expected
+    assert (np.abs(depth / expected - 1) < np.maximum(tolerance, 4 * FLOAT32))[hit].all()
+    assert np.isinf(depth[expected < 0]).all()
+    assert hit.any() or tilt_deg < 0
+
+
+def test_nothing_behind_the_camera_is_seen() -> None:
+    pose = looking((0.0, 0.0, 1.0), (0.0, 1.0, 1.0))
+    behind = sphere(np.array([0.0, -3.0, 1.0]), 1.0)
+    around = sphere(np.array([0.0, 0.0, 1.0]), 2.0)
+    one = renderer()
+    assert not one.silhouette(*pose, behind).any()
+    assert np.isinf(one.depth(*pose, [behind])).all()
+    assert np.array_equal(one.picture(*pose, [behind], 0), one.picture(*pose, [], 0))
+    assert one.silhouette(*pose, around).all()
+
+
+def test_the_nearer_one_hides_the_farther() -> None:
+    pose = looking((0.0, -6.0, 1.0), (0.0, 0.0, 1.0))
+    person = sphere(np.array([0.0, 0.0, 1.0]), 0.8)
+    alone = renderer().silhouette(*pose, person)
+    wall = rectangle(np.array([0.0, -2.0, 1.0]), np.array([3.0, 0.0, 0.0]), np.array([0.0, 0.0, 3.0]))
+    beyond = Surface(wall.vertices + np.array([0.0, 4.0, 0.0]), wall.faces, wall.colour)
+    half = Surface(wall.vertices + np.array([3.0, 0.0, 0.0]), wall.faces, wall.colour)
+    assert alone.any()
+    assert not renderer(wall).silhouette(*pose, person).any()
+    assert np.array_equal(renderer(beyond).silhouette(*pose, person), alone)
+    assert not renderer().silhouette(*pose, person, [wall]).any()
+    # The half wall begins at x = 0, which projects to cx.
+    left = np.arange(CAMERA.width) < CAMERA.cx
+    assert np.array_equal(renderer(half).silhouette(*pose, person), alone & left)
+    rest = renderer().silhouette(*pose, half, [person])
+    assert not (rest & renderer(half).silhouette(*pose, person)).any()
+
+
+def linear(picture: NDArray[np.uint8]) -> Float:
+    """Light from bytes, below the tone curve's shoulder: the inverse of sRGB."""
+    value = picture.astype(float) / 255
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4) / EXPOSURE
+
+
+def test_a_small_square_appears_where_it_is_projected() -> None:
+    """The centroid of its light is the projection of its centre, which half a pixel of shift would show.
+
+    The four samples of a pixel have x and y a quarter apart, so an edge is off by up to 1/8 px and the
+    centroid, the mean of two edges, too; the deviation over positions is 1/4 / sqrt(12) / sqrt(2) = 0.05.
+    Noise of 1.8 steps on 9 x 9 pixels adds 0.02. The mean of 25 has a deviation of 0.011.
+    """
+    pose = looking((0.0, -5.0, 1.0), (0.0, 0.0, 1.0))
+    dark = rectangle(np.array([0.0, 0.1, 1.0]), np.array([9.0, 0, 0]), np.array([0, 0, 9.0]), 0.0)
+    half = 5.0 / 150 * 1.7
+    errors = []
+    for k in range(25):
+        shift = 5.0 / 150 * np.array([(k % 5) / 5, 0.0, (k // 5) / 5])
+        # Lit from the front: the sun stands at negative y.
+        square = rectangle(
+            np.array([0.4, 0.0, 1.3]) + shift, np.array([half, 0, 0]), np.array([0, 0, half]), 0.5
+        )
+        expected = project(transform(invert(*pose), square.vertices.mean(axis=0)[None]), CAMERA)[0]
+        light = linear(renderer(dark).picture(*pose, [square], k))[..., 1]
+        x0, y0 = np.rint(expected).astype(int) - 4
+        window = light[y0 : y0 + 9, x0 : x0 + 9] - np.median(light)
+        column, row = np.meshgrid(np.arange(9), np.arange(9))
+        centroid = np.array(
+            [x0 + (window * column).sum() / window.sum(), y0 + (window * row).sum() / window.sum()]
+        )
+        errors.append(centroid - expected)
+    assert np.abs(errors).max() < 0.125 + 4 * 0.02
+    assert np.abs(np.mean(errors, axis=0)).max() < 4 * 0.011
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_the_shadow_of_a_box_falls_where_its_corners_throw_it(moves: bool) -> None:
+    """Every pixel of the ground whose line to the sun hits the box is dark, the others are light.
+
+    Left out are pixels nearer to the shadow's border than a map can tell: a look-up reaches two texels
+    of 2 cm, which the sun's elevation of 58 degrees stretches by 1.2, and leaves the surface by two
+    texels: 0.09 m in all, and a pixel of 0.08 m with the lens's softness on either side.
+    """
+    low, high = np.array([-0.5, -0.4, 0.0]), np.array([0.5, 0.6, 1.5])
+    cube = box(low, high)
+    pose = looking((0.0, 0.0, 12.0), (0.0, 0.0, 0.0))
+    plane = level(30.0)
+    one = renderer(plane) if moves else renderer(plane, cube)
+    picture = one.picture(*pose, [cube] if moves else [], 0)
+    light = linear(picture)[..., 1]
+    points = pose[0] + rays(pose) * (pose[0][2] / -rays(pose)[..., 2:])
+
+    def shaded(ground: Float) -> Bool:
+        with np.errstate(divide="ignore"):
+            ends = np.stack([(low - ground) / SUN, (high - ground) / SUN])
+        return np.asarray(ends.min(axis=0).max(axis=-1) < ends.max(axis=0).min(axis=-1))
+
+    reach = 0.09 + 2 * 0.08
+    around = [reach * np.array([np.cos(a), np.sin(a), 0.0]) for a in np.arange(16) * np.pi / 8]
+    votes = np.mean([shaded(points + step) for step in around], axis=0)
+    beside = ~one.silhouette(*pose, cube)
+    beside[1:-1, 1:-1] &= ~np.any(
+        [np.roll(~beside, (i, j), (0, 1))[1:-1, 1:-1] for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0
+    )
+    dark, bright = beside & (votes == 1), beside & (votes == 0)
+    assert dark.sum() > 50
+    between = (np.median(light[dark]) + np.median(light[bright])) / 2
+    assert np.median(light[bright]) > 2.5 * np.median(light[dark])
+    assert (light[dark] < between).all()
+    assert (light[bright] > between).all()
+
+
+def test_lit_surfaces_do_not_shade_themselves() -> None:
+    """A sphere's light is the sun's cosine on all of its sunny side: no stripes of its own shadow.
+
+    Seen from the direction of the sun, from 4 m, its limb is where the cosine is 0.25: 0.4 keeps off it.
+    """
+    ball = sphere(np.array([0.0, 0.0, 3.0]), 1.0, 96, 48)
+    towards = SUN / np.linalg.norm(SUN)
+    camera = Intrinsics(200, 200, 300.0, 300.0, 99.5, 99.5)
+    eye = np.array([0.0, 0.0, 3.0]) + 4 * towards
+    pose = looking((eye[0], eye[1], eye[2]), (0.0, 0.0, 3.0))
+    one = Renderer([], camera, sun=SUN, seed=0)
+    depth = one.depth(*pose, [ball])
+    light = linear(one.picture(*pose, [ball], 0))[..., 1]
+    normal = (pose[0] + rays(pose, camera) * np.where(np.isfinite(depth), depth, 0)[..., None]) - [0, 0, 3.0]
+    cosine = normal @ towards
+    seen = np.isfinite(depth) & (cosine > 0.4)
+    up = 0.5 + 0.5 * normal[..., 2]
+    expected = 0.5 * (0.79 * cosine + up * 0.25 + (1 - up) * 0.09)
+    away = np.linalg.norm(eye - [0, 0, 3.0])
+    haze = away / (away + HAZE_M)
+    expected = (1 - haze) * expected + haze * HORIZON_RGB[1]
+    # Noise of 1.8 steps: below 1.8 * 5 / 255 * 2.4 / 1.055 of the light above 40 % of full scale.
+    ratio = light[seen] / expected[seen]
+    assert abs(np.median(ratio) - 1) < 0.01
+    assert np.abs(ratio - 1).max() < 5 * NOISE / 255 * 2.4 / 0.4 + 0.02
+
+
+def test_equal_arguments_give_equal_bytes_in_any_thread() -> None:
+    mound = sphere(np.array([2.0, 3.0, -3.0]), 3.6)
+    ground = Surface(level(30.0).vertices, level(30.0).faces, level(30.0).colour, ground=True)
+    people = [sphere(np.array([0.0, 0.3 * k, 1.0]), 0.5) for k in range(4)]
+    pose = looking((4.0, -6.0, 3.0), (0.0, 0.0, 1.0))
+    one, other = renderer(ground, mound), renderer(ground, mound)
+    alone = [one.picture(*pose, [person], k) for k, person in enumerate(people)]
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(lambda k: other.picture(*pose, [people[k]], k), range(4)))
+    assert all(np.array_equal(a, b) for a, b in zip(alone, together, strict=True))
+
+
+def test_frames_differ_by_noise_alone() -> None:
+    """The difference of two frames has the deviation of two independent noises, and rounding's."""
+    pose = looking((4.0, -6.0, 3.0), (0.0, 0.0, 1.0))
+    one = renderer(level(30.0))
+    first, second = (one.picture(*pose, [], frame).astype(float) for frame in (0, 1))
+    middle = (first > 20) & (first < 235)
+    expected = np.sqrt(2 * (NOISE**2 + 1 / 12))
+    count = middle.sum()
+    assert abs((first - second)[middle].std() / expected - 1) < 5 / np.sqrt(2 * count)
+    assert abs((first - second)[middle].mean()) < 5 * expected / np.sqrt(count)
+
+
+def test_the_ground_texture_is_seamless_and_does_not_change_the_mean() -> None:
+    texture = ground_texture(SEED)
+    sides = [TILE_TEXELS >> level for level in range(len(texture.first))]
+    for side, first in zip(sides, texture.first, strict=True):
+        packed = texture.texels[first : first + side * side].reshape(side, side)
+        values = np.stack([packed >> shift & 0xFF for shift in (0, 8, 16)], axis=-1) * (FULL_SCALE / 255)
+        # Rounding to FULL_SCALE / 255, and what is brighter than FULL_SCALE is cut off.
+        assert np.abs(values.mean(axis=(0, 1)) - 1).max() < 0.5 * FULL_SCALE / 255 + 0.01
+        if side > 100:
+            inner = np.abs(np.diff(values, axis=0)).mean(axis=(1, 2))
+            seam = np.abs(values[0] - values[-1]).mean()
+            assert seam < inner.mean() + 5 * inner.std()
+
+
+def test_far_ground_does_not_shimmer() -> None:
+    """Where a pixel covers metres of grass, moving by a fraction of that changes nothing but the noise.
+
+    The site's slow changes have features of several metres; over 0.05 m they move by less than 2 %.
+    """
+    plane = level(400.0, grey=0.15)
+    ground = Surface(plane.vertices, plane.faces, plane.colour, ground=True)
+    one = renderer(ground)
+    still, moved = (linear(one.picture(*looking((x, 0.0, 80.0), (x, 60.0, 0.0)), [], 0)) for x in (0.0, 0.05))
+    # Noise by itself: a frame of equal noise differs by the position in its key, so twice the deviation.
+    step = 1.8 / 255 * 2.4 * 0.35 / EXPOSURE
+    assert np.std(moved - still) < 2 * step + 0.02 * still.mean()
+
+
+@pytest.mark.parametrize(
+    ("camera", "sun", "message"),
+    [
+        (Intrinsics(64, 48, 50, 50, 31, 23, "radtan", (0.1, 0, 0, 0)), SUN, "without distortion"),
+        (CAMERA, np.array([1.0, 0.0, -0.1]), "above the horizon"),
+    ],
+)
+def test_what_cannot_be_rendered_is_refused(camera: Intrinsics, sun: Float, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Renderer([], camera, sun=sun, seed=0)
