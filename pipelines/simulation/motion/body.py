@@ -71,7 +71,7 @@ def bodies(
 
     feet = [foot_over_time(rig, side, t_s, plan.feet[side], keys, ground) for side in (0, 1)]
     wanted = floor + _wanted_height(rig, plan, speed, run, stride) - keys.at("drop", t_s)
-    moving = np.clip(speed / 0.8, 0.0, 1.0)
+    moving = np.tanh(speed / 0.5)
     softness = _STANDING_SOFTNESS_M + moving * (_STEPPING_SOFTNESS_M - _STANDING_SOFTNESS_M)
     height = pelvis_height(rig, place, pelvis, feet, wanted, softness)
     root = np.concatenate([place, height[:, None]], axis=1)
@@ -108,9 +108,8 @@ def _kicking(
         toes=partly(foot.toes, kicked, share),
     )
     # What would scrape the ground is lifted by a bent knee.
-    lowest = np.full(len(t_s), np.inf)
-    for point in sole_of(rig, SIDES.index(side), moved):
-        lowest = np.minimum(lowest, point[:, 2] - ground(point[:, :2]))
+    heel, tip = (point[:, 2] - ground(point[:, :2]) for point in sole_of(rig, SIDES.index(side), moved))
+    lowest = -_SCRAPES_M / 4 * np.logaddexp(-4 * heel / _SCRAPES_M, -4 * tip / _SCRAPES_M)
     spare = (lowest - _SCRAPES_M) / _SCRAPES_M
     lifted = _SCRAPES_M * np.logaddexp(0.0, -2.0 * spare) / 2.0
     return replace(moved, ankle=moved.ankle + (share * lifted)[:, None] * np.array([0.0, 0.0, 1.0]))
@@ -133,7 +132,7 @@ def _wanted_height(rig: Rig, plan: Plan, speed: Float, run: Float, stride: Float
     upright = rig.height_of_pelvis + _HEADROOM_M
     step_s = 1 / np.array([gait.cadence(v, 1.0, plan.leg_m) for v in speed])
     flight = np.array([gait.swing_steps(v, 1.0) for v in speed]) - 1
-    runner = 0.97 * rig.height_of_pelvis + gait.bounce_m(stride, step_s, flight)
+    runner = 0.962 * rig.height_of_pelvis + gait.bounce_m(stride, step_s, flight)
     return (1 - run) * upright + run * runner
 
 
@@ -184,7 +183,7 @@ def _arms(
         out = rig.offset[BONE[f"{side}_upper_arm"]]
 
         level = shoulders[:, 2] + rotate(chest, joint + out)[:, 2] - floor
-        lift = np.radians(22.0) * reaching * np.clip((height - level) / 0.4 + 0.2, 0.0, 1.0)
+        lift = np.radians(22.0) * reaching * (0.5 + 0.5 * np.tanh((height - level) / 0.2))
         clavicle = multiply(chest, about(0, sign * lift))
         shoulder = shoulders + rotate(chest, joint) + rotate(clavicle, out)
 
@@ -194,9 +193,11 @@ def _arms(
         lower = multiply(arm, about(1, -elbow))
         if reaching.any():
             up = height + floor - shoulder[:, 2]
-            far = 0.97 * np.sqrt(np.sum(upper_arm**2)) + 0.97 * np.sqrt(np.sum(forearm**2))
-            up = np.clip(up, -far, far)
-            ahead = np.minimum(np.sqrt(np.maximum(far**2 - up**2, 0.0)), 0.75 * far)
+            far = 0.96 * (np.sqrt(np.sum(upper_arm**2)) + np.sqrt(np.sum(forearm**2)))
+            # Up to the arm's length, and ahead by what that leaves, no farther than is comfortable.
+            up = far * up / (far**12 + up**12) ** (1 / 12)
+            ahead = np.sqrt(far**2 - up**2 + 0.01 * far**2)
+            ahead = ahead * 0.75 * far / (ahead**4 + (0.75 * far) ** 4) ** 0.25
             towards = rotate(about(2, _yaw(chest)), np.stack([ahead, 0 * ahead, up], axis=1))
             hinge = rotate(chest, np.array([0.0, -1.0, sign * 0.6]))
             there = two_bones(upper_arm, forearm, towards, hinge)

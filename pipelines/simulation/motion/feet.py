@@ -28,6 +28,7 @@ _FULL_SWING_M = 1.3  # of a leg of 0.93 m
 _TOES_BEND = np.radians(42.0)
 _SOFTNESS_M = (0.0003, 0.02)  # over which the point changes about which a foot turns: planted, swung
 _LONGEST_ROLL_S = 0.8  # of a stance that lasts longer, the foot is flat for the rest
+_STILL_SHARE = 0.05  # of the swing at either end, in which the foot goes up or down only
 _SET_DOWN = 0.65  # share of the stance that belongs to the strike, the rest to the lift
 _HALF_WIDTH_M = 0.04
 
@@ -64,7 +65,7 @@ def foot_over_time(
     base, tilt, rise = _on_ground(place, curve["yaw"], heel[0], tip[0], ground)
     pitch = np.radians(keys.at("pitch_deg", t_s) - extra.at("heel_deg", t_s))
     # Uphill the heel behind rises as much more as the ground is steep.
-    pitch -= keys.at("leaves", t_s) * np.arctan(np.maximum(rise, 0.0))
+    pitch -= keys.at("leaves", t_s) * np.arctan((rise + np.hypot(rise, 0.02)) / 2)
 
     bend = curve["bent"] * _bent_toes(pitch)
     ankle_xz = _rolled(joint, heel, tip, pitch, bend, curve["soft"])
@@ -109,9 +110,11 @@ def _keys_of_steps(steps: Sequence[Footstep], leg_m: float) -> Keys:
         lift_s = steps[i + 1].lift_s if i < len(extents) else None
         rolled = roll(step.run, came, goes)
         for name, value in (("x", float(step.place[0])), ("y", float(step.place[1])), ("yaw", step.yaw)):
-            keys.add(name, (step.strike_s, value))
+            early_s = _STILL_SHARE * (step.strike_s - step.lift_s)
+            keys.add(name, (step.strike_s - early_s, value), (step.strike_s, value))
             if lift_s is not None:
-                keys.add(name, (lift_s, value))
+                late_s = _STILL_SHARE * (steps[i + 1].strike_s - lift_s)
+                keys.add(name, (lift_s, value), (lift_s + late_s, value))
         _stance(keys, step.strike_s, lift_s, rolled)
         if lift_s is not None:
             _swing(keys, lift_s, steps[i + 1].strike_s, roll(runs[i], goes, goes))

@@ -132,7 +132,7 @@ def swing(stride: Float, speed_mps: Float, run: Float, arm_share: float) -> Swin
         arm_share: how far the arms swing, by the usual.
     """
     walk = 1 - run
-    size = np.clip(speed_mps / WALK_SPEED_MPS, 0.0, 1.3)
+    size = 1.3 * np.tanh(speed_mps * np.arctanh(1 / 1.3) / WALK_SPEED_MPS)  # 1 at the usual speed
     in_front = np.cos(stride)  # 1 at the left strike
     carried = np.sin(stride)  # 1 where the left foot stands alone
     shoulders, elbows = [], []

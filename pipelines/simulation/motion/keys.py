@@ -46,7 +46,8 @@ class Keys:
         if not curve:
             return np.zeros(len(t_s))
         times, values = np.array(curve).T
-        if len(times) == 1:
-            return np.full(len(t_s), values[0])
+        # Held ends are keys as well, so that the slope is 0 where they begin.
+        times = np.concatenate([[times[0] - 1.0], times, [times[-1] + 1.0]])
+        values = np.concatenate([values[:1], values, values[-1:]])
         held = np.clip(t_s, times[0], times[-1])
         return np.asarray(PchipInterpolator(times, values)(held), dtype=np.float64)

@@ -20,6 +20,7 @@ _STANDING_HALF_M, _WALKING_HALF_M, _RUNNING_HALF_M = 0.085, 0.048, 0.025  # betw
 _TOE_OUT = np.radians(6.0)
 _TURN_RATE, _TURN_CADENCE = np.radians(65.0), 1.9
 _LAST_STEPS_CADENCE = 1.5
+_REACH = 0.72  # of the leg, ahead or behind: a foot farther away is lifted
 _SHORTER_UPHILL = 0.9  # cadence rises by this times the slope
 _STILL_M, _STILL_RAD = 0.01, np.radians(2.0)
 
@@ -176,9 +177,11 @@ class Plan:
         phase = self._phase(knots, least)
         lasting = stretch.end_s - stretch.start_s
         fine = np.linspace(-3.0, lasting + 5.0, int((lasting + 8.0) / 0.005))
-        place, _ = stretch.at(stretch.start_s + fine)
+        places, _ = stretch.at(stretch.start_s + fine)
         # Steps are shorter where it is steep.
-        climbed = np.abs(np.diff(self.ground(place))) / np.maximum(np.hypot(*np.diff(place, axis=0).T), 1e-9)
+        climbed = np.abs(np.diff(self.ground(places))) / np.maximum(
+            np.hypot(*np.diff(places, axis=0).T), 1e-9
+        )
         taken = np.diff(phase(fine)) * (1 + _SHORTER_UPHILL * np.minimum(climbed, 1.0))
         phases = np.concatenate([[0.0], np.cumsum(taken)])
         phases -= np.interp(0.0, fine, phases)
@@ -189,15 +192,29 @@ class Plan:
             return stretch.start_s + float(np.interp(at_phase, phases, fine))
 
         times, speeds, runs = np.array(knots).T
+
+        def gait_at(t_s: float) -> tuple[float, float]:
+            speed = float(np.interp(t_s - stretch.start_s, times, speeds))
+            return speed, float(np.interp(t_s - stretch.start_s, times, runs)) * gait.running(speed)
+
+        def outrun(step: Footstep) -> float:
+            """When the body is as far from a foot as a leg reaches."""
+            far = np.hypot(*(places - step.place).T) > _REACH * self.leg_m
+            later = np.flatnonzero(far & (stretch.start_s + fine > step.strike_s + 0.1))
+            return stretch.start_s + float(fine[later[0]]) if len(later) else np.inf
+
         landed, number = 0, 0
         while (landed < 2) if count is None else (number < count):
             number += 1
+            foot = first if number % 2 else 1 - first
             strike_s = when(number)
-            since = strike_s - stretch.start_s
-            speed = float(np.interp(since, times, speeds))
-            run = float(np.interp(since, times, runs)) * gait.running(speed)
+            speed, run = gait_at(strike_s)
             in_air = gait.swing_steps(speed, run)
-            lift_s = max(when(number - in_air), stretch.start_s)
+            # Who slows down lifts the foot behind as fast as it then still was.
+            lift_s = max(
+                when(number - max(in_air, gait.swing_steps(*gait_at(when(number - 1))))), stretch.start_s
+            )
+            lift_s = min(lift_s, outrun(self.feet[foot][-1]))
             # The stance lasts 2 - in_air steps.
             above_s = when(number + gait.above_foot(run) * (2 - in_air))
             (now, place), (_, heading) = stretch.at(np.array([strike_s, above_s]))
@@ -206,7 +223,6 @@ class Plan:
             if mean > 1.1 * speed:
                 early_s = strike_s + (above_s - strike_s) * 1.1 * speed / mean
                 (place,), (heading,) = stretch.at(np.array([early_s]))
-            foot = first if number % 2 else 1 - first
             self._put(foot, lift_s, strike_s, self._beside(foot, place, heading, speed, run), run)
             self.t_s = strike_s
             landed = landed + 1 if above_s >= stretch.end_s else 0

@@ -233,7 +233,7 @@ def _floor(rig: Rig, motion: BodyMotion) -> float:
     lowest = points[np.arange(len(points)), which]
     if len(points) < 2:
         return float(lowest[0, 2])
-    speed = np.sqrt(np.sum(np.gradient(points, motion.t_s, axis=0) ** 2, axis=2))
+    speed = np.sqrt(np.sum(np.asarray(np.gradient(points, motion.t_s, axis=0)) ** 2, axis=2))
     at_rest = speed[np.arange(len(points)), which] < _AT_REST_MPS
     return float(np.median(lowest[at_rest, 2]) if at_rest.any() else lowest[:, 2].min())
 
