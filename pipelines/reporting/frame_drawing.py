@@ -42,7 +42,7 @@ def draw_frame(picture: Picture, view: View, caption: Sequence[str]) -> Picture:
         picture: [height, width, 3]; of another size than the view's camera it is the same view at another
             scale.
         view: what to draw; its own picture is not looked at.
-        caption: lines of ASCII; left out where the picture is too small to read them.
+        caption: lines of ASCII, or none; left out where the picture is too small to read them.
     """
     drawn = picture.copy()
     height, width = drawn.shape[:2]
@@ -55,10 +55,11 @@ def draw_frame(picture: Picture, view: View, caption: Sequence[str]) -> Picture:
     _bones(drawn, view.joints, reprojected, bone)
     for k, joint in enumerate(view.joints):
         _dots(drawn, reprojected[:, k], 1.5 * bone, SIDES[side_of(joint)])
-    _rings(drawn, found[~view.rejected & ~view.unmeasured], 2.5 * bone, max(1, bone // 2), FOUND)
+    _rings(drawn, found[~view.rejected & ~view.unmeasured], 2.5 * bone, max(1, round(0.7 * bone)), FOUND)
     _crosses(drawn, found[view.rejected], 2.5 * bone, bone, REJECTED)
     _crosses(drawn, found[view.unmeasured], 2.5 * bone, bone, UNMEASURED)
-    _write(drawn, caption, top=True)
+    if caption:
+        _write(drawn, caption, top=True)
     return drawn
 
 

@@ -223,14 +223,16 @@ def _camera(camera: CameraRow, content: SessionContent, summary: Summary) -> Fil
 def status_at(motion: Motion, t_ns: Int64) -> NDArray[np.int8]:
     """What became of every joint at the skeleton's time nearest to each of [N] times, [N, P, J].
 
-    -1, as where the table has no row, where that time is further away than two neighbours may be apart.
+    -1, as where the table has no row, at times for which the skeleton is not interpolated: outside its own,
+    or in a gap.
     """
-    after = np.clip(np.searchsorted(motion.t_ns, t_ns), 1, max(len(motion.t_ns) - 1, 1))
-    around = np.minimum(np.stack([after - 1, after]), len(motion.t_ns) - 1)
-    apart = np.abs(motion.t_ns[around] - t_ns)
-    nearest = np.where(apart[1] < apart[0], around[1], around[0])
-    near = apart.min(axis=0) <= _longest_step_ns(motion)
-    return np.where(near[:, None, None], motion.status[nearest], np.int8(-1))
+    held = np.clip(t_ns, motion.t_ns[0], motion.t_ns[-1])
+    before = np.searchsorted(motion.t_ns, held, side="right") - 1
+    after = np.minimum(before + 1, len(motion.t_ns) - 1)
+    step, since = motion.t_ns[after] - motion.t_ns[before], held - motion.t_ns[before]
+    known = (held == t_ns) & ((since == 0) | (step <= _longest_step_ns(motion)))
+    nearest = np.where(2 * since > step, after, before)
+    return np.where(known[:, None, None], motion.status[nearest], np.int8(-1))
 
 
 def views_of(

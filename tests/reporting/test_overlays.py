@@ -10,8 +10,16 @@ from hypothesis import strategies as st
 
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.motion import motion_from_skeleton
-from pipelines.reporting.overlays import MOMENTS, View, choose_moments, collect_moments, match_people
+from pipelines.reporting.overlays import (
+    MOMENTS,
+    View,
+    choose_moments,
+    collect_moments,
+    match_people,
+    status_at,
+)
 from pipelines.reporting.summary import summarise
+from pipelines.session.tables import STATUS
 
 from .conftest import ASIDE_PX, CAMERAS, FRAMES, JOINTS, START_NS, make_skeleton, true_pixels
 
@@ -172,3 +180,28 @@ def test_people_are_found_in_any_order_and_each_once(order: list[int], jitter: f
     people = BODY + 60.0 * np.arange(4)[:, None, None]
     matches = match_people(people, people[order] + jitter)
     assert matches == [order.index(person) for person in range(4)]
+
+
+def test_status_holds_where_the_skeleton_is_interpolated_and_nowhere_else() -> None:
+    table = make_skeleton(30).assign(status="ok", x=1.0, y=0.0, z=0.0)
+    stamps = np.unique(table["t_ns"])
+    late = table["t_ns"] >= stamps[10]
+    table.loc[late, "status"] = "rejected"
+    table = table[~table["t_ns"].isin(stamps[20:25])]  # a gap of five
+    motion = motion_from_skeleton(table)
+    step = int(stamps[1] - stamps[0])
+    at = np.array(
+        [
+            stamps[0] - 1,
+            stamps[0],
+            stamps[9] + step // 3,
+            stamps[9] + 2 * step // 3,
+            stamps[19] + 1,
+            stamps[25],
+            stamps[29] + 1,
+        ]
+    )
+    ok, rejected = STATUS.index("ok"), STATUS.index("rejected")
+    assert status_at(motion, at)[:, 0, 0].tolist() == [-1, ok, ok, rejected, -1, rejected, -1]
+    lone = motion_from_skeleton(make_skeleton(1).assign(status="ok"))
+    assert status_at(lone, at[:2])[:, 0, 0].tolist() == [-1, ok]

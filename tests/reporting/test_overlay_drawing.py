@@ -1,0 +1,176 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pipelines.geometry.cameras import Intrinsics
+from pipelines.reporting.frame_drawing import (
+    FOUND,
+    GREY,
+    REJECTED,
+    SIDES,
+    UNMEASURED,
+    blank_frame,
+    caption_of,
+    draw_frame,
+    padded_to_even,
+)
+from pipelines.reporting.overlays import Picture, View
+from pipelines.session.tables import STATUS
+
+JOINTS = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
+BODY = np.array([[[620.0, 300.0], [520.0, 300.0], [615.0, 380.0], [525.0, 380.0]]])
+WIDTH, HEIGHT = 1280, 720
+MISSING = np.full_like(BODY, np.nan)
+GROUND = np.full((HEIGHT, WIDTH, 3), GREY, np.uint8)
+
+
+@pytest.fixture
+def view() -> View:
+    nobody = np.zeros((1, 4), dtype=np.bool_)
+    return View(
+        camera="drone1",
+        intrinsics=Intrinsics(WIDTH, HEIGHT, 900.0, 900.0, 639.5, 359.5),
+        joints=JOINTS,
+        frame=3,
+        t_s=0.1,
+        found=MISSING,
+        reprojected=BODY,
+        rejected=nobody,
+        unmeasured=nobody,
+        others=np.zeros((0, 4, 2)),
+        has_pose=True,
+        picture=None,
+    )
+
+
+def changed(picture: Picture) -> NDArray[np.bool_]:
+    return np.asarray((picture != GREY).any(axis=-1), np.bool_)
+
+
+def test_bones_have_the_colour_of_their_side_and_lie_on_pixel_centres(view: View) -> None:
+    drawn = draw_frame(GROUND, view, ())
+    for point, side in zip(BODY[0].astype(int), ("left", "right", "left", "right"), strict=True):
+        assert drawn[point[1], point[0]].tolist() == list(SIDES[side])
+    assert drawn[300, 570].tolist() == list(SIDES[""])  # halfway between the shoulders
+    assert drawn[340, 617].tolist() == list(SIDES["left"])
+    assert drawn[340, 523].tolist() == list(SIDES["right"])
+    # A dot about a pixel's centre is as large on both sides of it.
+    rows, columns = np.nonzero(changed(draw_frame(GROUND, replace(view, reprojected=_only(0)), ())))
+    assert (rows.min() + rows.max()) / 2 == 300
+    assert (columns.min() + columns.max()) / 2 == 620
+
+
+def _only(joint: int) -> NDArray[np.float64]:
+    alone = MISSING.copy()
+    alone[0, joint] = BODY[0, joint]
+    return alone
+
+
+def test_a_missing_joint_takes_its_bones_along(view: View) -> None:
+    lost = BODY.copy()
+    lost[0, 2] = np.nan
+    drawn = changed(draw_frame(GROUND, replace(view, reprojected=lost), ()))
+    assert not drawn[310:, 530:].any()  # nothing to, at or from the left hip
+    assert drawn[340, 523]
+    assert drawn[300, 570]
+    assert not changed(draw_frame(GROUND, replace(view, reprojected=MISSING), ())).any()
+
+
+def test_keypoints_are_rings_and_lost_ones_crosses(view: View) -> None:
+    flags = np.eye(4, dtype=np.bool_)
+    drawn = draw_frame(
+        GROUND,
+        replace(view, reprojected=MISSING, found=BODY, rejected=flags[[1]], unmeasured=flags[[2]]),
+        (),
+    )
+    for joint, colour in ((0, FOUND), (1, REJECTED), (2, UNMEASURED), (3, FOUND)):
+        x, y = BODY[0, joint].astype(int)
+        around = drawn[y - 8 : y + 9, x - 8 : x + 9]
+        strokes = np.linalg.norm(around - np.array(colour, float), axis=-1)
+        assert strokes.min() < np.linalg.norm(np.array(colour, float) - GREY) / 3  # thin, and smoothed
+        assert (drawn[y, x] == GREY).all() == (colour == FOUND)  # a ring leaves its middle free
+
+
+def test_people_who_are_not_part_of_the_skeleton_are_dots(view: View) -> None:
+    drawn = draw_frame(GROUND, replace(view, reprojected=MISSING, others=BODY + 50), ())
+    assert drawn[350, 670].tolist() == list(UNMEASURED)
+
+
+def test_a_picture_of_another_size_is_the_same_view_at_another_scale(view: View) -> None:
+    half = draw_frame(np.ascontiguousarray(GROUND[::2, ::2]), replace(view, reprojected=_only(0)), ())
+    rows, columns = np.nonzero(changed(half))
+    # Pixel 620 covers 619.5 to 620.5 of 1280, that is 309.75 to 310.25 of 640: (620 + 0.5) / 2 - 0.5.
+    assert abs((columns.min() + columns.max()) / 2 - 309.75) <= 0.5
+    assert abs((rows.min() + rows.max()) / 2 - 149.75) <= 0.5
+
+
+@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=8, max_size=8))
+def test_points_anywhere_leave_the_given_picture_alone(values: list[float]) -> None:
+    small = np.full((24, 32, 3), GREY, np.uint8)
+    points = np.array(values).reshape(1, 4, 2)
+    nobody = np.zeros((1, 4), dtype=np.bool_)
+    lens = Intrinsics(32, 24, 30.0, 30.0, 15.5, 11.5)
+    anywhere = View(
+        "drone1", lens, JOINTS, 0, 0.0, points, points, nobody, nobody, points, has_pose=True, picture=None
+    )
+    assert draw_frame(small, anywhere, ("too small for words",)).shape == small.shape
+    assert (small == GREY).all()
+
+
+@pytest.mark.parametrize("size", [(1280, 720), (1920, 1080), (480, 800), (320, 96)])
+def test_captions_fit_their_ground(view: View, size: tuple[int, int]) -> None:
+    width, height = size
+    lines = (
+        "drone1   frame 123456   1234.567 s",
+        "robust: 12 ok, 2 rejected, 1 low_parallax, 2 not_detected",
+    )
+    white = np.full((height, width, 3), 255, np.uint8)
+    drawn = draw_frame(white, replace(view, reprojected=MISSING), lines)
+    rows, columns = np.nonzero((drawn < 128).any(axis=-1))
+    right, lower = columns.max() + 1, rows.max() + 1
+    assert right <= width
+    assert lower < height / 2
+    # White letters on a ground of 85: some, none of them in its last columns or rows.
+    ground = drawn[:lower, :right]
+    assert (ground > 240).any()
+    assert (ground[:, -3:] < 100).all()
+    assert (ground[-2:] < 100).all()
+
+
+def test_no_words_where_nobody_could_read_them(view: View) -> None:
+    tiny = np.full((9, 16, 3), GREY, np.uint8)
+    assert not changed(draw_frame(tiny, replace(view, reprojected=MISSING), ("drone1", "robust"))).any()
+    assert not changed(blank_frame(16, 9, "frame 3 cannot be decoded")).any()
+
+
+def test_a_blank_frame_says_why_in_its_middle() -> None:
+    blank = blank_frame(WIDTH, HEIGHT, "frame 3 cannot be decoded")
+    rows, columns = np.nonzero(changed(blank))
+    assert abs((rows.min() + rows.max()) / 2 - (HEIGHT - 1) / 2) <= 1
+    assert abs((columns.min() + columns.max()) / 2 - (WIDTH - 1) / 2) <= 1
+    assert (blank[rows, columns] > 240).any()
+
+
+def test_what_a_caption_says(view: View) -> None:
+    status = np.full((1, 4), STATUS.index("ok"), np.int8)
+    status[0, 1] = STATUS.index("rejected")
+    assert caption_of(view, status, "robust") == ("drone1   frame 3   0.100 s", "robust: 3 ok, 1 rejected")
+    nothing = np.full((1, 4), -1, np.int8)
+    lines = caption_of(replace(view, has_pose=False), nothing, "refined")
+    assert lines[1] == "refined: no skeleton at this time, no camera pose at this time"
+
+
+@given(st.integers(1, 9), st.integers(1, 9))
+def test_padding_repeats_the_last_row_and_column(height: int, width: int) -> None:
+    picture = np.arange(height * width * 3, dtype=np.uint8).reshape(height, width, 3)
+    padded = padded_to_even(picture)
+    assert padded.shape == (height + height % 2, width + width % 2, 3)
+    assert (padded[:height, :width] == picture).all()
+    assert (padded[-1, :width] == picture[-1]).all()
+    assert (padded[:height, -1] == picture[:, -1]).all()
