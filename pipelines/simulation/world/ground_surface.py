@@ -19,10 +19,10 @@ _CELLS = 16  # along the ground's square, at least
 _GROWTH = 0.5  # cells outside are at most half as wide as their distance from it
 _FLATNESS_M = 0.02  # how far triangles may be from the ground
 _FINEST = 17  # halvings of the whole: cells of 3 to 6 cm, however steep a mound
-_PATCHES = 0.16  # how much darker meadows get in patches
+_GRASS = (0.115, 0.15, 0.055)  # mean reflectance of a meadow; the texture of the ground varies it
 
 
-def ground_surface(ground: scenario.Ground, terrain: Terrain, seed: int) -> Surface:
+def ground_surface(ground: scenario.Ground, terrain: Terrain) -> Surface:
     """Triangles over the corners of a quadtree, whose cells are halved until the ground in them is flat.
 
     A linear triangle within a circle of radius r errs by at most curvature r^2 / 2 (r = side / sqrt 2).
@@ -39,7 +39,8 @@ def ground_surface(ground: scenario.Ground, terrain: Terrain, seed: int) -> Surf
     turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     faces[turn < 0] = faces[turn < 0][:, ::-1]
     vertices = np.concatenate([xy, terrain.height(xy)[:, None]], axis=1)
-    return Surface(vertices, faces, _patches(xy, seed), smooth=True, ground=True)
+    colour = np.tile(np.array(_GRASS, np.float32), (len(vertices), 1))
+    return Surface(vertices, faces, colour, smooth=True, ground=True)
 
 
 def _corners(ground: scenario.Ground, terrain: Terrain, whole_m: float) -> tuple[Int64, float]:
@@ -65,19 +66,3 @@ def _too_wide(centre: Float, side_m: float, ground: scenario.Ground, terrain: Te
     curvature = terrain.curvature_within(centre + np.array(ground.centre), side_m * 1.5)
     wide: NDArray[np.bool_] = (side_m > allowed) | (curvature * side_m**2 / 4 > _FLATNESS_M)
     return wide
-
-
-def _patches(xy: Float, seed: int) -> NDArray[np.float32]:
-    """Slow changes of tone [V, 3], so that a texture that repeats is not seen to."""
-    rng = np.random.default_rng([seed, _LOOKS])
-    tone = np.zeros(len(xy))
-    for wavelength_m in (9.0, 15.0, 24.0, 41.0, 70.0):
-        bearing, phase = rng.uniform(0, 2 * np.pi, 2)
-        away = xy[:, 0] * np.cos(bearing) + xy[:, 1] * np.sin(bearing)
-        tone += np.sin(2 * np.pi * away / wavelength_m + phase) / 5
-    darker = _PATCHES * (0.5 - 0.5 * tone)[:, None]
-    colour: NDArray[np.float32] = (1 - darker * np.array([0.7, 1.0, 1.1])).astype(np.float32)
-    return colour
-
-
-_LOOKS = 2

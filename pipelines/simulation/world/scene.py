@@ -47,7 +47,7 @@ class World:
         `hidden` know; seen from anywhere, about nine tenths of both outlines' union is common to both.
         """
         return [
-            ground_surface(self.ground, self.terrain, self.seed),
+            ground_surface(self.ground, self.terrain),
             *tree_surfaces(self.obstacles, self.seed),
             *wall_surfaces(self.obstacles, self.seed),
         ]
