@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.compilation import cached
 from pipelines.simulation.rendering.meshes import GROUND, SMOOTH, Mesh
-from pipelines.simulation.rendering.raster import NOTHING, Band
+from pipelines.simulation.rendering.raster import NOTHING, SHIFTS_PX, SUBROWS, Band
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -47,18 +47,15 @@ def room_for(count: int) -> Fragments:
     return Fragments(pixel, share, on_ground, point, normal, colour, distance, slant)
 
 
-def gather(
-    band: Band, first_row: int, shifts_px: Float, view: View, mesh: Mesh, fragments: Fragments, sky: Float32
-) -> int:
+def gather(band: Band, first_row: int, view: View, mesh: Mesh, fragments: Fragments, sky: Float32) -> int:
     """Find what a band's pixels are made of.
 
     Samples of one face in one pixel become one fragment at their common centre, which lies on the face
     and inside it. Samples without a face see land below the horizon, and nothing above.
 
     Args:
-        band: what the samples see; `len(shifts_px)` sample rows per pixel row.
+        band: what the samples see, drawn with `SHIFTS_PX`.
         first_row: the picture's row that is the band's first.
-        shifts_px: of the sample rows, as they were drawn.
         view: the camera.
         mesh: what the band's faces index.
         fragments: room for as many as there are samples; filled.
@@ -71,7 +68,6 @@ def gather(
         band.nearness,
         band.source,
         first_row,
-        shifts_px,
         view.position,
         view.world_from_camera,
         view.pinhole,
@@ -98,7 +94,6 @@ def _gather(
     nearness: Float32,
     source: Int32,
     first_row: int,
-    shifts_px: Float,
     position: Float,
     turn: Float,
     pinhole: Float,
@@ -118,29 +113,29 @@ def _gather(
     slant: Float32,
     sky: Float32,
 ) -> int:
-    per_pixel, width = len(shifts_px), nearness.shape[1]
-    weight, per_fx, per_fy = 1.0 / per_pixel, 1.0 / pinhole[0], 1.0 / pinhole[1]
+    width = nearness.shape[1]
+    weight, per_fx, per_fy = 1.0 / SUBROWS, 1.0 / pinhole[0], 1.0 / pinhole[1]
     (ax, bx, cx), (ay, by, cy), (az, bz, cz) = turn
     ox, oy, oz = position
     count, known = 0, NOTHING
-    for row in range(nearness.shape[0] // per_pixel):
-        top = row * per_pixel
+    for row in range(nearness.shape[0] // SUBROWS):
+        top = row * SUBROWS
         for x in range(width):
             sky[row * width + x] = 0.0
             place = 1 + 4 * (row & 3) + (x & 3)
             done = 0  # a bit for each sample
-            for first in range(per_pixel):
+            for first in range(SUBROWS):
                 if done >> first & 1:
                     continue
                 face = source[top + first, x]
                 samples, near, right, down = 0, 0.0, 0.0, 0.0
-                for k in range(first, per_pixel):
-                    if source[top + k, x] == face:
+                for k in range(SUBROWS):  # unrolled: the bounds are constants
+                    if k >= first and source[top + k, x] == face:
                         done |= 1 << k
                         samples += 1
                         near += nearness[top + k, x]
-                        right += shifts_px[k]
-                        down += (k + 0.5) * weight - 0.5
+                        right += SHIFTS_PX[k]
+                        down += (k + 0.5) / SUBROWS - 0.5
                 mean = 1.0 / samples
                 right = (x + right * mean - pinhole[2]) * per_fx
                 down = (first_row + row + down * mean - pinhole[3]) * per_fy
@@ -170,6 +165,11 @@ def _gather(
                         # Barycentric coordinates are linear: areas opposite the corners, over the whole.
                         sx, sy, sz = vy * gz - vz * gy, vz * gx - vx * gz, vx * gy - vy * gx
                         tx, ty, tz = gy * uz - gz * uy, gz * ux - gx * uz, gx * uy - gy * ux
+                        # Level ground has one normal all over.
+                        bent = False
+                        for k in range(3):
+                            level = normals[a, k] == normals[b, k] and normals[a, k] == normals[c, k]
+                            bent = bent or (smooth and not level)
                         length = np.sqrt(inverse)
                         fx, fy, fz = gx * length, gy * length, gz * length
                     wx, wy, wz = ox + depth * dx - px, oy + depth * dy - py, oz + depth * dz - pz
@@ -181,7 +181,7 @@ def _gather(
                     red = o * colours[a, 0] + s * colours[b, 0] + t * colours[c, 0]
                     green = o * colours[a, 1] + s * colours[b, 1] + t * colours[c, 1]
                     blue = o * colours[a, 2] + s * colours[b, 2] + t * colours[c, 2]
-                    if smooth:
+                    if bent:
                         nx = o * normals[a, 0] + s * normals[b, 0] + t * normals[c, 0]
                         ny = o * normals[a, 1] + s * normals[b, 1] + t * normals[c, 1]
                         nz = o * normals[a, 2] + s * normals[b, 2] + t * normals[c, 2]

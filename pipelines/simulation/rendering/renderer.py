@@ -103,7 +103,7 @@ class Renderer:
             rows = light[first_row : first_row + _BAND_ROWS]
             band = empty_band(SUBROWS * len(rows), width)
             draw(triangles, chosen[start[k] : start[k + 1]], SHIFTS_PX, SUBROWS * first_row, band)
-            count = gather(band, first_row, SHIFTS_PX, view, mesh, fragments, sky)
+            count = gather(band, first_row, view, mesh, fragments, sky)
             paint(self._texture, fragments, count, view)
             sun = sunlight(shadows, self._axes, fragments, count)
             shade(fragments, count, sun, sky, first_row, view, rows)
