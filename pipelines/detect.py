@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.formats.pictures import open_pictures
-from pipelines.geometry.poses import interpolate_points, interpolate_poses, matrix_from_quaternion
+from pipelines.geometry.poses import interpolate_points, interpolate_poses
 from pipelines.keypoints.hints import Hint, project_actor
 from pipelines.keypoints.tracking import PeopleTracker
 from pipelines.session.description import CameraEntry, Description, MediaEntry, read_description
@@ -225,7 +225,7 @@ class _Work:
             t_ns,
             max_gap_ns=_ACTOR_GAP_NS,
         )
-        position, rotation = self._poses(block, t_ns)
+        position, quaternion = self._poses(block, t_ns)
         intrinsics = self.entry(block).intrinsics.intrinsics()
         return [
             project_actor(
@@ -237,7 +237,7 @@ class _Work:
             )
             if np.isfinite(at).all() and np.isfinite(centre).all()
             else None
-            for at, centre, turned in zip(actor, position, rotation, strict=True)
+            for at, centre, turned in zip(actor, position, quaternion, strict=True)
         ]
 
     def _poses(self, block: Block, t_ns: Int64) -> tuple[Float, Float]:
@@ -256,7 +256,7 @@ class _Work:
                 max_gap_ns=round(bounds.max_gap_s * 1e9),
                 max_extrapolation_ns=round(bounds.max_extrapolation_s * 1e9),
             )
-        return position, matrix_from_quaternion(quaternion)
+        return position, quaternion
 
 
 def _span_words(start_s: float | None, end_s: float | None) -> str:
