@@ -62,16 +62,17 @@ def reach(plan: Plan, side: str, height_m: float, seconds: float, shoulder_m: fl
 
 
 # Of a right-footed instep kick: seconds from the plant of the support foot, degrees. The thigh is measured
-# from straight down in the plane of the turned pelvis, forward is positive.
+# from straight down in a plane that leans out from the turned pelvis, forward is positive.
 _KICK_LEG = {
     "kick_thigh_deg": (
-        *((-0.14, -16.0), (-0.01, -32.0), (0.06, -26.0), (0.13, 8.0), (0.19, 31.0)),
-        *((0.24, 44.0), (0.36, 62.0), (0.50, 42.0), (0.66, 14.0)),
+        *((-0.14, -16.0), (-0.01, -32.0), (0.06, -26.0), (0.12, 5.0), (0.17, 25.0)),
+        *((0.22, 37.0), (0.36, 62.0), (0.50, 42.0), (0.66, 14.0)),
     ),
     "kick_knee_deg": (
-        *((-0.14, 45.0), (-0.01, 86.0), (0.065, 104.0), (0.125, 87.0), (0.195, 36.0)),
-        *((0.25, 12.0), (0.32, 6.0), (0.40, 16.0), (0.52, 34.0), (0.66, 20.0)),
+        *((-0.14, 45.0), (-0.01, 86.0), (0.065, 104.0), (0.125, 92.0), (0.195, 32.0)),
+        *((0.23, 10.0), (0.31, 6.0), (0.40, 16.0), (0.52, 34.0), (0.66, 20.0)),
     ),
+    "kick_out_deg": ((-0.14, 0.0), (0.05, 20.0), (0.20, 20.0), (0.36, 6.0), (0.66, 0.0)),
     "kick_ankle_deg": ((-0.14, -14.0), (0.0, -20.0), (0.24, -20.0), (0.42, -12.0), (0.66, 0.0)),
 }
 _KICK_TRUNK = {  # angles to the left are positive

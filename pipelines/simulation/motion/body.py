@@ -95,7 +95,8 @@ def _kicking(
     share = foot.kicks
     if not share.any():
         return foot
-    thigh = multiply(pelvis, about(1, -_deg(plan.keys, "kick_thigh_deg", t_s)))
+    out = _deg(plan.keys, "kick_out_deg", t_s) * (1 if side == SIDES[0] else -1)
+    thigh = multiply(multiply(pelvis, about(0, out)), about(1, -_deg(plan.keys, "kick_thigh_deg", t_s)))
     shank = multiply(thigh, about(1, _deg(plan.keys, "kick_knee_deg", t_s)))
     kicked = multiply(shank, about(1, -_deg(plan.keys, "kick_ankle_deg", t_s)))
     ankle = root

@@ -14,7 +14,7 @@ _SIDED = {
     "shank": ("leg", "lowerleg01", "lowerleg", "lowleg", "shin", "shin1", "calf", "tibia", "knee"),
     "foot": ("foot", "ankle"),
     "toes": ("toebase", "toe", "toes", "toe0", "toe11", "ball"),
-    "upper_arm": ("arm", "upperarm01", "upperarm", "uparm", "humerus", "shoulder"),
+    "upper_arm": ("arm", "upperarm01", "upperarm", "uparm", "shldr", "humerus", "shoulder"),
     "forearm": ("forearm", "lowerarm01", "lowerarm", "lowarm", "radius", "elbow"),
     "hand": ("hand", "wrist"),
     "clavicle": ("clavicle", "collar", "clav", "shoulder", "shoulder01"),
@@ -75,11 +75,7 @@ def match_bones(source: SkeletalMotion) -> dict[str, int]:
 def _parts_of(name: str) -> tuple[str, str]:
     """Side (left, right or nothing) and what is left of a name without it."""
     bare = re.sub(r"^(bip\d*|character\d*|def)(?=[\W_])", "", name.rsplit(":", 1)[-1], flags=re.IGNORECASE)
-    words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", bare)
-    # CMU's LHipJoint and MotionBuilder's lThigh: a lone letter before a capital.
-    lower = [word.lower() for word in words]
-    if lower and len(lower[0]) > 1 and words[0].isupper() and lower[0][0] in "lr" and len(words) > 1:
-        lower[:1] = [lower[0][0], lower[0][1:]]
+    lower = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", bare)]
     for position in (0, -1):
         for letter, side in (("l", "left"), ("r", "right")):
             if lower and lower[position] in (letter, side):

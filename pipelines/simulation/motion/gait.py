@@ -26,14 +26,14 @@ _LEG_OF_WALK_RATIO_M = 0.93
 _SLOWEST_CADENCE = 1.1  # steps per s, of a first or last step
 
 # Foot against the ground in stance: share of stance and degrees, toes up; the strike and the lift are added.
-_STANCE_WALK = ((0.13, 0.0), (0.50, 0.0), (0.66, -6.0), (0.82, -22.0))
-_STANCE_RUN = ((0.20, 0.0), (0.50, 0.0), (0.60, -8.0), (0.82, -33.0))
+_STANCE_WALK = ((0.13, 0.0), (0.47, 0.0), (0.66, -8.0), (0.82, -23.0))
+_STANCE_RUN = ((0.20, 0.0), (0.47, 0.0), (0.60, -8.0), (0.82, -33.0))
 # And in swing.
-_SWING_WALK = ((0.12, -69.0), (0.30, -50.0), (0.55, -12.0), (0.75, 9.0), (0.92, 22.0))
+_SWING_WALK = ((0.12, -72.0), (0.27, -58.0), (0.50, -20.0), (0.72, 6.0), (0.92, 21.0))
 _SWING_RUN = ((0.15, -80.0), (0.38, -84.0), (0.60, -48.0), (0.80, -6.0), (0.93, 10.0))
 _STRIKE_DEG, _LIFT_DEG = (20.0, 8.0), (-58.0, -66.0)  # walking, running
 # How high the lowest point of the foot is in swing, m.
-_CLEARANCE_WALK = ((0.25, 0.022), (0.40, 0.022), (0.60, 0.022), (0.80, 0.018))
+_CLEARANCE_WALK = ((0.20, 0.032), (0.40, 0.026), (0.60, 0.022), (0.80, 0.018))
 _CLEARANCE_RUN = ((0.18, 0.05), (0.40, 0.12), (0.60, 0.10), (0.80, 0.05))
 # The least flexion of the knee in stance, degrees.
 _KNEE_WALK = ((0.0, 5.0), (0.22, 15.0), (0.42, 11.0), (0.62, 5.0), (1.0, 5.0))

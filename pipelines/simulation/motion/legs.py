@@ -103,7 +103,7 @@ def leg_rotations(rig: Rig, root: Float, pelvis: Float, feet: Sequence[Foot]) ->
     left = np.array([0.0, 1.0, 0.0])
     for foot, side in zip(feet, SIDES, strict=True):
         hip = root + rotate(pelvis, rig.offset[BONE[f"{side}_thigh"]])
-        hinge = rotate(pelvis, left) + rotate(foot.rotation, left)
+        hinge = (1 - foot.kicks[:, None]) * rotate(pelvis, left) + rotate(foot.rotation, left)
         bones[f"{side}_thigh"], bones[f"{side}_shank"] = two_bones(
             rig.offset[BONE[f"{side}_shank"]], rig.offset[BONE[f"{side}_foot"]], foot.ankle - hip, hinge
         )

@@ -73,12 +73,15 @@ class Way:
         weight = 1 + np.cos(np.pi * np.arange(-half, half + 1) / (half + 1))
         weight /= weight.sum()
         smooth = np.stack([np.convolve(points[:, axis], weight, mode="valid") for axis in (0, 1)], axis=1)
-        self._spline = CubicSpline(along[half : len(along) - half], smooth)
-        tangent = self._spline(along[half : len(along) - half], 1)
+        inner = along[half : len(along) - half]
+        self._spline = CubicSpline(inner, smooth)
+        tangent = self._spline(inner, 1)
         heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
-        first = parts[0].heading
-        heading += first - np.interp(0.0, along[half : len(along) - half], heading)
-        self._heading = CubicSpline(along[half : len(along) - half], heading)
+        # Before and after an arc the way goes straight on, so that the mean bends less at its ends.
+        ends = np.interp([0.0, self.length_m], inner, heading)
+        missing = [parts[0].heading - ends[0], parts[-1].end_heading - ends[1]]
+        heading += np.interp(inner, [0.0, self.length_m], missing)
+        self._heading = CubicSpline(inner, heading)
 
     def place(self, along_m: Float) -> tuple[Float, Float]:
         """Where it is after some way, [N, 2] m, and the heading [N] in rad."""

@@ -1,0 +1,88 @@
+"""A performance and what is measured on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.poses import conjugate, multiply
+from pipelines.simulation.motion.script import perform
+from pipelines.simulation.rig import BONE, BodyMotion, Rig, average_rig, sole_points
+from pipelines.simulation.scenario import Step
+
+Float = NDArray[np.float64]
+
+RIG = average_rig()
+
+
+def flat(places: Float) -> Float:
+    return np.zeros(len(places))
+
+
+def slope(places: Float) -> Float:
+    rise: Float = 0.2 * places[:, 0] - 0.1 * places[:, 1]
+    return rise
+
+
+def mound(places: Float) -> Float:
+    """1.2 m high: at most 0.6 x 1.2 / 2 m = 20 deg steep."""
+    x, y = places.T
+    height: Float = 1.2 * np.exp(-((x - 6.0) ** 2 / 8.0 + y**2 / 12.5))
+    return height
+
+
+def performed(
+    *steps: dict[str, Any],
+    seconds: float,
+    step_s: float = 0.01,
+    ground: Callable[[Float], Float] = flat,
+    heading_deg: float = 0.0,
+    start: Sequence[float] = (0.0, 0.0),
+    repeat: bool = False,
+    seed: int = 1,
+    rig: Rig = RIG,
+) -> BodyMotion:
+    return perform(
+        [Step.model_validate(step) for step in steps],
+        rig,
+        np.arange(0.0, seconds, step_s),
+        ground=ground,
+        start=np.array(start, dtype=np.float64),
+        heading_deg=heading_deg,
+        repeat=repeat,
+        seed=seed,
+    )
+
+
+def bent_deg(motion: BodyMotion, above: str, below: str) -> Float:
+    """[T] how far a bone is turned forward about the axis to the left, against the one it hangs on."""
+    relative = multiply(conjugate(motion.rotation[:, BONE[above]]), motion.rotation[:, BONE[below]])
+    angle = np.degrees(2 * np.arctan2(relative[:, 1], relative[:, 3]))
+    wrapped: Float = (angle + 180.0) % 360.0 - 180.0
+    return wrapped
+
+
+def clearance_m(motion: BodyMotion, ground: Callable[[Float], Float] = flat, rig: Rig = RIG) -> Float:
+    """[T, 2, 3] how high heel, ball and tip of both feet are above the ground."""
+    points = sole_points(rig, motion)
+    under = ground(points[..., :2].reshape(-1, 2)).reshape(points.shape[:-1])
+    height: Float = points[..., 2] - under
+    return height
+
+
+def slid_m(motion: BodyMotion, touching_m: float, rig: Rig = RIG) -> list[float]:
+    """How far each contact's point moved over the ground: in every frame the slowest point that touches."""
+    points = sole_points(rig, motion)
+    touches = clearance_m(motion, rig=rig) < touching_m
+    slid = []
+    for foot in (0, 1):
+        both = touches[1:, foot] & touches[:-1, foot]
+        moved = np.sqrt(np.sum(np.diff(points[:, foot, :, :2], axis=0) ** 2, axis=2))
+        least = np.where(both, moved, np.inf).min(axis=1)
+        on = np.isfinite(least)
+        runs = np.split(np.where(on, least, 0.0), np.flatnonzero(np.diff(on.astype(int))) + 1)
+        slid += [float(run.sum()) for run in runs]
+    return slid

@@ -1,0 +1,151 @@
+"""Walking and jogging against published kinematics and the ground."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.simulation.motion import gait
+from pipelines.simulation.rig import BONE, average_rig, joint_centres, sole_points
+from tests.simulation.motion.performing import (
+    bent_deg,
+    clearance_m,
+    flat,
+    mound,
+    performed,
+    slid_m,
+    slope,
+)
+
+Float = NDArray[np.float64]
+
+PENETRATION_M = 0.003
+CONTACT_M = 0.004  # lower than that a point is said to touch: the toes clear the ground by 15 mm and more
+
+
+@pytest.mark.parametrize(
+    ("step", "seconds"),
+    [
+        ({"walk": {"distance_m": 10}}, 9.5),
+        ({"walk": {"distance_m": 5, "speed_mps": 0.5}}, 12.0),
+        ({"walk": {"distance_m": 12, "speed_mps": 2.0}}, 8.0),
+        ({"walk": {"distance_m": 8, "turn_deg": 300}}, 8.0),
+        ({"jog": {"distance_m": 15}}, 8.0),
+        ({"turn": {"deg": -150}}, 5.0),
+    ],
+)
+def test_feet_do_not_slide(step: dict[str, dict[str, float]], seconds: float) -> None:
+    slid = slid_m(performed(step, seconds=seconds), CONTACT_M)
+    assert len(slid) > 6
+    assert max(slid) < 0.02
+
+
+@pytest.mark.parametrize("ground", [flat, slope, mound])
+def test_feet_stay_on_top_of_the_ground_and_one_is_on_it(ground) -> None:  # type: ignore[no-untyped-def]
+    motion = performed({"walk": {"distance_m": 11}}, {"turn": {"deg": 90}}, seconds=14.0, ground=ground)
+    lowest = clearance_m(motion, ground).min(axis=2)
+    # The mound's curvature is at most 1.2 m / (2 m)^2 = 0.3 per m: over the 0.27 m of a sole that lies on
+    # heel and tip it departs from a line by 0.3 x 0.27^2 / 8 = 2.7 mm.
+    assert lowest.min() > -PENETRATION_M
+    assert lowest.min(axis=1).max() < 0.005
+
+
+def test_walking_angles_lie_in_the_published_bands() -> None:
+    """Perry & Burnfield 2010 and Winter 2009: mean curves with about one standard deviation (5 to 8 deg)."""
+    motion = performed({"walk": {"distance_m": 16, "speed_mps": 1.3}}, seconds=11.0, step_s=0.005)
+    (strikes,) = np.nonzero(
+        np.diff((sole_points(average_rig(), motion)[:, 0, 0, 2] < 0.002).astype(int)) == 1
+    )
+    first, last = (strikes[(motion.t_s[strikes] > 3) & (motion.t_s[strikes] < 10)][i] for i in (1, 2))
+    stride = slice(first, last)
+    share = np.linspace(0.0, 1.0, last - first)
+    hip = -bent_deg(motion, "pelvis", "left_thigh")[stride]
+    knee = bent_deg(motion, "left_thigh", "left_shank")[stride]
+    ankle = -bent_deg(motion, "left_shank", "left_foot")[stride]
+
+    assert -25 < hip.min() < -8
+    assert 22 < hip.max() < 38
+    assert 0.45 < share[hip.argmin()] < 0.65  # extended most about the other foot's strike
+    assert -25 < ankle.min() < -8  # push-off
+    assert 0.55 < share[ankle.argmin()] < 0.75
+    assert 5 < ankle[(share > 0.3) & (share < 0.5)].max() < 20
+
+    loading, middle, swing = (
+        knee[(share >= low) & (share < high)] for low, high in ((0.05, 0.3), (0.3, 0.48), (0.55, 0.95))
+    )
+    assert 10 < loading.max() < 26  # the first wave of flexion
+    assert 0 < middle.min() < loading.max() - 3
+    assert 52 < swing.max() < 70  # the second
+    assert 0.66 < share[knee.argmax()] < 0.80
+    assert knee.min() > 0
+    # Winter 2009: the pelvis rises and falls by 4 cm or so, twice a stride.
+    assert 0.02 < np.ptp(motion.root[stride, 2]) < 0.06
+    # A stride of 2 x 0.384 v m: the walk ratio of Sekiya & Nagasaki 1998.
+    assert (last - first) * 0.005 * 1.3 == pytest.approx(2 * np.sqrt(0.384 * 1.3), rel=0.02)
+
+
+def test_a_jog_flies_and_bends_its_knees_as_published() -> None:
+    """Novacheck 1998: stance below half of the stride, knee 40 to 45 deg in stance, 90 to 110 in swing."""
+    motion = performed({"jog": {"distance_m": 25, "speed_mps": 3.0}}, seconds=9.0, step_s=0.005)
+    steady = (motion.t_s > 3) & (motion.t_s < 7)
+    on = (clearance_m(motion).min(axis=2) < CONTACT_M)[steady]
+    assert 0.30 < on[:, 0].mean() < 0.47
+    assert 0.1 < (~on.any(axis=1)).mean() < 0.4
+    knee = bent_deg(motion, "left_thigh", "left_shank")[steady]
+    assert 35 < knee[on[:, 0]].max() < 60
+    assert 85 < knee.max() < 120
+    height = motion.root[steady, 2]
+    assert 0.04 < np.ptp(height) < 0.12
+
+
+def test_a_runner_in_the_air_falls_freely() -> None:
+    stride = np.linspace(0, np.pi * 0.999999, 4001)
+    step_s, flight = 0.36, 0.25
+    height = gait.bounce_m(stride, np.full(4001, step_s), np.full(4001, flight))
+    t = stride / np.pi * step_s
+    acceleration = np.gradient(np.gradient(height, t), t)
+    in_air = (t > (1 - flight) * step_s * 1.01) & (t < step_s * 0.99)
+    assert acceleration[in_air] == pytest.approx(-9.81, abs=1e-3)
+    assert np.diff(height[[0, -1]]) == pytest.approx(0.0, abs=1e-5)  # strikes as high as it lifted
+
+
+@pytest.mark.parametrize("kind", ["walk", "jog"])
+@pytest.mark.parametrize("speed", [0.8, 1.4, 2.6])
+def test_the_speed_is_the_one_asked_for(kind: str, speed: float) -> None:
+    motion = performed({kind: {"distance_m": 14 * speed, "speed_mps": speed}}, seconds=12.0, step_s=0.02)
+    # Acceleration takes 3 s at most; the body sways by 6 mm at most: 2 x 6 mm over 4 s.
+    steady = (motion.t_s >= 4.0) & (motion.t_s < 8.001)
+    way = np.ptp(motion.root[steady, 0])
+    assert way / np.ptp(motion.t_s[steady]) == pytest.approx(speed, abs=0.004)
+
+
+def test_small_people_take_shorter_steps() -> None:
+    tall, small = (
+        performed({"walk": {"distance_m": 10}}, seconds=9.0, rig=average_rig(height)) for height in (1.9, 1.4)
+    )
+    lifted = [
+        np.count_nonzero(
+            np.diff((clearance_m(m, rig=average_rig(h)).min(axis=2)[:, 0] > 0.01).astype(int)) == 1
+        )
+        for m, h in ((tall, 1.9), (small, 1.4))
+    ]
+    assert lifted[1] > lifted[0]
+    for motion, height in ((tall, 1.9), (small, 1.4)):
+        assert max(slid_m(motion, CONTACT_M, average_rig(height))) < 0.02
+
+
+def test_the_pelvis_follows_the_ground() -> None:
+    motion = performed({"walk": {"distance_m": 11}}, seconds=12.0, ground=mound)
+    above = motion.root[:, 2] - mound(motion.root[:, :2])
+    # Bent knees and the step up or down of half a step length (0.35 m) at 20 deg: 0.13 m.
+    assert above.min() > average_rig().height_of_pelvis - 0.05 - 0.13
+    assert above.max() < average_rig().height_of_pelvis + 0.05
+
+
+def test_arms_swing_against_the_legs() -> None:
+    motion = performed({"walk": {"distance_m": 16}}, seconds=10.0)
+    steady = (motion.t_s > 3) & (motion.t_s < 9)
+    centres = joint_centres(average_rig(), motion)[steady] - motion.root[steady, None]
+    hand, foot = centres[:, BONE["left_hand"], 0], centres[:, BONE["left_foot"], 0]
+    assert np.corrcoef(hand, foot)[0, 1] < -0.7

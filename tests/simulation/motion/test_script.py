@@ -1,0 +1,231 @@
+"""Scripts of actions: where they end, what they do, and that nothing jumps."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pipelines.geometry.poses import rotate
+from pipelines.simulation.rig import BONE, BONES, average_rig, joint_centres
+from tests.simulation.motion.performing import RIG, bent_deg, clearance_m, flat, mound, performed
+
+Float = NDArray[np.float64]
+
+SWAY_M = 0.012  # of somebody standing, both axes together
+
+
+def heading_deg(rotation: Float) -> float:
+    ahead = rotate(rotation, np.array([1.0, 0.0, 0.0]))
+    return float(np.degrees(np.arctan2(ahead[1], ahead[0])))
+
+
+def turned_by(one_deg: float, other_deg: float) -> float:
+    return (one_deg - other_deg + 180.0) % 360.0 - 180.0
+
+
+EVERYTHING: list[dict[str, Any]] = [
+    {"walk": {"distance_m": 4}},
+    {"jog": {"distance_m": 8, "turn_deg": 90}},
+    {"walk": {"distance_m": 3}},
+    {"turn": {"deg": -100}},
+    {"crouch": {"depth": 1.0, "seconds": 1}},
+    {"reach": {"side": "both", "height_m": 0.4, "seconds": 1}},
+    {"reach": {"seconds": 1}},
+    {"kick": {}},
+    {"kick": {"foot": "left", "run_up_m": 1}},
+    {"stand": {"seconds": 1}},
+]
+
+
+def test_nothing_jumps() -> None:
+    """Velocity is continuous: what it changes by in a step shrinks with the step.
+
+    A jump of the velocity would change it by as much within 1 ms as within 4 ms; accelerations that are
+    bounded make it a quarter. Half lies between the two.
+    """
+    coarse, fine = (
+        performed(*EVERYTHING, seconds=36.0, step_s=step_s, ground=mound) for step_s in (0.004, 0.001)
+    )
+    changes = [
+        np.sqrt(np.sum(np.diff(joint_centres(RIG, motion), 2, axis=0) ** 2, axis=2)).max(axis=0) / step_s
+        for motion, step_s in ((coarse, 0.004), (fine, 0.001))
+    ]
+    assert dict(zip(BONES, changes[1] / changes[0] < 0.5, strict=True)) == dict.fromkeys(BONES, True)
+    # Nothing of the body is faster than a kicking foot.
+    speed = np.sqrt(np.sum(np.diff(joint_centres(RIG, fine), axis=0) ** 2, axis=2)) / 0.001
+    assert speed.max() < 20.0
+
+
+def test_rotations_are_unit_and_turn_no_faster_than_a_kicking_shank() -> None:
+    motion = performed(*EVERYTHING, seconds=36.0, step_s=0.002)
+    assert np.sum(motion.rotation**2, axis=2) == pytest.approx(1.0, abs=1e-12)
+    cosine = np.abs(np.sum(motion.rotation[1:] * motion.rotation[:-1], axis=2))
+    rate = np.degrees(2 * np.arccos(np.minimum(cosine, 1.0))) / 0.002
+    # Nunome et al. 2002: shanks of skilled players reach 1,300 to 2,000 deg/s.
+    assert rate.max() < 2000
+    assert rate[:, [BONE[b] for b in ("pelvis", "chest", "head")]].max() < 400
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    distance=st.floats(3.0, 15.0),
+    curvature=st.floats(-0.8, 0.8),
+    heading=st.floats(-180.0, 180.0),
+    jogs=st.booleans(),
+)
+def test_arcs_end_where_they_should(distance: float, curvature: float, heading: float, jogs: bool) -> None:
+    turn = curvature * distance
+    motion = performed(
+        {"jog" if jogs else "walk": {"distance_m": distance, "turn_deg": float(np.degrees(turn))}},
+        seconds=24.0,
+        step_s=0.5,
+        heading_deg=heading,
+        start=(3.0, -2.0),
+    )
+    middle = np.radians(heading) + turn / 2  # of a circle: the chord
+    chord = distance * np.sinc(turn / 2 / np.pi)
+    end = np.array([3.0, -2.0]) + chord * np.array([np.cos(middle), np.sin(middle)])
+    assert np.hypot(*(motion.root[-1, :2] - end)) < SWAY_M
+    assert turned_by(heading_deg(motion.rotation[-1, 0]), heading + np.degrees(turn)) == pytest.approx(
+        0, abs=1.0
+    )
+
+
+def test_ways_lead_to_places_round_corners_and_back() -> None:
+    places = [[5.0, 0.0], [8.0, 2.0], [8.0, 6.0], [0.0, 0.0]]
+    motion = performed(*({"walk": {"to": place}} for place in places), seconds=40.0, step_s=0.05)
+    way = motion.root[:, :2]
+    for place, cut in zip(places, (0.15, 0.15, SWAY_M, SWAY_M), strict=True):
+        assert np.hypot(*(way - place).T).min() < cut + 0.03  # between two samples it goes 3 cm
+    assert np.hypot(*(way[-1] - places[-1])) < SWAY_M
+
+
+@pytest.mark.parametrize("angle", [-180.0, -40.0, 90.0, 400.0])
+def test_a_turn_ends_in_its_heading_on_the_spot(angle: float) -> None:
+    motion = performed({"turn": {"deg": angle}}, seconds=14.0, step_s=0.05, heading_deg=20.0)
+    headings = np.unwrap(np.radians([heading_deg(rotation) for rotation in motion.rotation[:, 0]]))
+    assert np.degrees(headings[-1] - headings[0]) == pytest.approx(angle, abs=1.0)
+    assert np.hypot(*motion.root[:, :2].T).max() < SWAY_M
+
+
+def test_a_crouch_lowers_the_pelvis_with_its_depth() -> None:
+    lowest = []
+    for depth in (0.25, 0.5, 1.0):
+        motion = performed({"crouch": {"depth": depth}}, seconds=6.0)
+        lowest.append(motion.root[:, 2].min())
+        # By 0.6 of the leg at depth 1, from 15 mm above the height of the neutral pose.
+        wanted = (1 - 0.6 * depth) * RIG.height_of_pelvis + 0.015
+        assert lowest[-1] == pytest.approx(wanted, abs=0.003)
+        assert clearance_m(motion).min() > -0.003
+        assert motion.root[-1, 2] == pytest.approx(motion.root[0, 2], abs=0.003)
+    knee = bent_deg(performed({"crouch": {"depth": 1.0}}, seconds=6.0), "left_thigh", "left_shank")
+    assert 120 < knee.max() < 155  # a deep squat
+
+
+@pytest.mark.parametrize("side", ["left", "right", "both"])
+@pytest.mark.parametrize("height", [0.5, 1.0, 1.5, 1.9])
+def test_a_reach_brings_the_hand_to_its_height(side: str, height: float) -> None:
+    motion = performed({"reach": {"side": side, "height_m": height}}, seconds=4.0)
+    hands = joint_centres(RIG, motion)[(motion.t_s > 0.75) & (motion.t_s < 2.65)]
+    for one in ("left", "right") if side == "both" else (side,):
+        assert hands[:, BONE[f"{one}_hand"], 2] == pytest.approx(height, abs=0.02)
+        ahead = hands[:, BONE[f"{one}_hand"], 0] - hands[:, BONE[f"{one}_upper_arm"], 0]
+        assert ahead.min() > 0.0
+
+
+def test_what_is_out_of_reach_is_reached_for() -> None:
+    motion = performed({"reach": {"height_m": 2.6}}, seconds=4.0)
+    hand = joint_centres(RIG, motion)[:, BONE["right_hand"], 2].max()
+    shoulder, arm = 0.818 * 1.75, 0.332 * 1.75
+    assert shoulder + 0.9 * arm < hand < shoulder + 1.1 * arm
+
+
+@pytest.mark.parametrize("foot", ["left", "right"])
+@pytest.mark.parametrize("run_up", [1.0, 3.0, 8.0])
+def test_a_kick_is_as_fast_as_published(foot: str, run_up: float) -> None:
+    """Nunome et al. 2002, Lees et al. 2010: feet of skilled players 15 to 20 m/s, of others from 10."""
+    motion = performed({"kick": {"foot": foot, "run_up_m": run_up}}, seconds=9.0, step_s=0.002)
+    support = "right" if foot == "left" else "left"
+    centres = joint_centres(RIG, motion)
+    velocity = np.diff(centres, axis=0) / 0.002
+    # Where the ball is met: in the middle between ankle and toes.
+    speed = (
+        np.sqrt(np.sum((velocity[:, BONE[f"{foot}_foot"]] + velocity[:, BONE[f"{foot}_toes"]]) ** 2, axis=1))
+        / 2
+    )
+    impact = int(speed.argmax())
+    assert 12.0 < speed[impact] < 18.0
+    # Ahead and hardly above the ground.
+    assert velocity[impact, BONE[f"{foot}_toes"], 0] > 0.9 * speed[impact]
+    assert centres[impact, BONE[f"{foot}_toes"], 2] < 0.25
+    knee = bent_deg(motion, f"{foot}_thigh", f"{foot}_shank")
+    before, after = (slice(impact - 100, impact), slice(impact, impact + 125))
+    assert 95 < knee[before].max() < 120  # backswing
+    assert knee[after].min() < 15  # extended
+    assert np.diff(knee[impact - 20 : impact]).min() / 0.002 < -800
+    hip = -bent_deg(motion, "pelvis", f"{foot}_thigh")
+    assert hip[before].min() < -25
+    assert hip[after].max() > 55  # follow-through
+    # The support foot stays where it was planted, the kicking foot clears the ground.
+    low = clearance_m(motion)
+    feet = {"left": 0, "right": 1}
+    assert np.ptp(centres[impact - 25 : impact + 50, BONE[f"{support}_foot"], :2], axis=0).max() < 0.02
+    assert low[impact - 25 : impact + 50, feet[support]].min() == pytest.approx(0.0, abs=0.002)
+    assert low.min() > -0.003
+    # And it ends in a stand.
+    ankles = centres[-1, [BONE["left_foot"], BONE["right_foot"]]]
+    assert np.ptp(ankles[:, 0]) < 0.02
+    assert motion.root[-1, 2] == pytest.approx(motion.root[0, 2], abs=0.003)
+
+
+def test_left_and_right_kicks_are_mirror_images_at_the_impact() -> None:
+    left, right = (
+        performed({"kick": {"foot": foot}}, seconds=3.0, step_s=0.005) for foot in ("left", "right")
+    )
+    ankles = [
+        (joint_centres(RIG, motion) - motion.root[:, None])[int(2.0 / 0.005), BONE[f"{side}_foot"]]
+        for motion, side in ((left, "left"), (right, "right"))
+    ]
+    # The sway of somebody standing is not mirrored.
+    assert ankles[0] * [1, -1, 1] == pytest.approx(ankles[1], abs=0.03)
+
+
+def test_whoever_is_done_stands_or_begins_again() -> None:
+    done = performed({"walk": {"distance_m": 2}}, seconds=12.0, step_s=0.05)
+    again = performed({"walk": {"distance_m": 2}}, seconds=12.0, step_s=0.05, repeat=True)
+    assert np.hypot(*(done.root[-1, :2] - [2.0, 0.0])) < SWAY_M
+    assert again.root[-1, 0] > 4.0
+    idle = performed({"turn": {"deg": 0.0}}, seconds=3.0, step_s=0.05, repeat=True)
+    assert np.hypot(*idle.root[:, :2].T).max() < SWAY_M
+
+
+def test_the_seed_decides_the_style_and_nothing_else_does() -> None:
+    one, same, other = (performed(*EVERYTHING[:2], seconds=6.0, seed=seed) for seed in (5, 5, 6))
+    assert one.rotation.tobytes() == same.rotation.tobytes()
+    assert one.root.tobytes() == same.root.tobytes()
+    assert 0.001 < np.abs(one.root - other.root).max() < 0.05
+
+
+def test_times_may_be_asked_for_one_by_one() -> None:
+    whole = performed({"walk": {"distance_m": 5}}, seconds=6.0, step_s=0.05)
+    part = performed({"walk": {"distance_m": 5}}, seconds=6.0, step_s=0.25)
+    assert part.root == pytest.approx(whole.root[::5], abs=1e-9)
+
+
+def test_a_long_flight_takes_seconds() -> None:
+    began = time.process_time()
+    motion = performed(*EVERYTHING, seconds=75.0, step_s=0.02, ground=mound, repeat=True)
+    assert time.process_time() - began < 4.0
+    assert np.isfinite(motion.rotation).all()
+
+
+def test_other_bodies_keep_their_feet_on_the_ground() -> None:
+    rig = average_rig(1.3)
+    motion = performed(*EVERYTHING, seconds=36.0, rig=rig)
+    assert clearance_m(motion, flat, rig).min() > -0.004
