@@ -16,6 +16,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from tests.commands.runner import MOCAP, content, refused, succeeds
+from tests.real_data import real_data
 
 EXACT = """
 schema: 1
@@ -203,6 +204,19 @@ def test_an_interrupted_rendering_goes_on_where_it_was(tmp_path: Path) -> None:
     summary = json.loads(succeeds("ingest", output / "flight.yaml", "--json"))
     stated = json.loads((output / "simulation.json").read_text())["frames"]
     assert summary["cameras"]["drone1"]["frames"]["count"] == stated["drone1"]
+
+
+@pytest.mark.parametrize("name", ["cmu_10_01_soccer_kick", "cmu_10_04_walk", "xia_neutral_01_000"])
+def test_recorded_motion_is_flown_around(tmp_path: Path, name: str) -> None:
+    recording = real_data(f"motion/{name}.bvh")
+    text = EXACT.replace("duration_s: 4", "duration_s: 2")
+    begin, end = text.index("  motion:"), text.index("drones:")
+    metrics = reconstructed(
+        simulated(tmp_path, f"{text[:begin]}  motion: {{bvh: {recording}}}\n{text[end:]}", "--no-video")
+    )
+    # Exact again, whoever moves: pictures are taken together, so that even a kick is not interpolated.
+    assert metrics["mpjpe_mm"] < 0.5
+    assert metrics["reconstructed_share"] > 0.99
 
 
 HOSTILE = {
