@@ -60,7 +60,7 @@ class PlannerConfig:
     sight_start_m: float = 1.5  # maps contain the actor
     speed_floor_mps: float = 1.0  # 0 is the literal form, in which obstacles do not push who stands
     separation_m: float = 3.0
-    soft_separation_m: float = 3.5
+    soft_separation_m: float = 4.5
     waypoints: int = 20
     waypoint_s: float = 0.5
     iterations: int = 40

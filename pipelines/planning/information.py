@@ -9,11 +9,17 @@ from pipelines.planning.config import PlannerConfig
 
 Float = NDArray[np.float64]
 
+# Share of joints that a detector places within 0.2 torso lengths, by tilt: BlazePose on people rendered from
+# 10 m at 720p, eight yaws by four phases of a step. Constant below and above.
+_TILT_RAD = np.radians([0.0, 15.0, 30.0, 45.0, 60.0])
+_PLACED_SHARE = np.array([0.96, 0.97, 0.91, 0.81, 0.61])
+
 
 def ray_information(offset: Float, config: PlannerConfig) -> Float:
-    """Information of one camera on a point: I = (1 - d d')/s^2, nothing along the ray d.
+    """Expected information of one camera on a point: I = p (1 - d d')/s^2, nothing along the ray d.
 
-    s^2 = (rho sigma_px/f)^2 + (rho sigma_rot)^2 + sigma_pos^2, rho the distance.
+    s^2 = (rho sigma_px/f)^2 + (rho sigma_rot)^2 + sigma_pos^2, rho the distance; p is the measured share of
+    joints that a detector places at that tilt. By geometry alone steep views would be as welcome.
 
     Args:
         offset: [..., 3] metres, from the point to the camera, not zero.
@@ -25,7 +31,9 @@ def ray_information(offset: Float, config: PlannerConfig) -> Float:
     square = np.sum(offset**2, axis=-1)[..., None, None]
     turned = config.pixel_sigma_rad**2 + np.radians(config.rotation_sigma_deg) ** 2
     across = np.eye(3) - offset[..., :, None] * offset[..., None, :] / square
-    information: Float = across / (square * turned + config.position_sigma_m**2)
+    tilt = np.arcsin(np.abs(offset[..., 2]) / np.sqrt(square[..., 0, 0]))
+    placed = np.interp(tilt, _TILT_RAD, _PLACED_SHARE)[..., None, None]
+    information: Float = placed * across / (square * turned + config.position_sigma_m**2)
     return information
 
 

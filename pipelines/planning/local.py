@@ -7,7 +7,7 @@ position and velocity, end free (t_f = N step_s):
     J_form    1/(2 t_f) int |x - slot|^2
     J_obs     int c(x; eps_obs) s dt, s = sqrt(|v|^2 + v0^2)
     J_occ     int int c(p; eps_occ) |dp| s dt along the sight line, up to `sight_start_m` from the actor
-    J_sep     1/t_f int sum max(0, 3.5 m - distance)^2 / 2 over the other drones' latest plans
+    J_sep     1/t_f int sum max(0, soft - distance)^2 / 2 over the other drones' latest plans
 
 c is CHOMP's hinge of the signed distance. With s = |v| (v0 = 0, as published) a drone that stands feels no
 obstacle at all. Gradients are exact derivatives of the discretised sums, so that a step that follows them

@@ -16,7 +16,7 @@ from pipelines.session.records import Occupancy
 from tests.planning.worlds import bare_ground, mound
 
 Float = NDArray[np.float64]
-CONFIG = PlannerConfig(eps_obs_m=1.5)
+CONFIG = PlannerConfig(eps_obs_m=1.5, soft_separation_m=3.5)
 NOBODY = np.empty((0, 20, 3))
 
 
@@ -246,14 +246,14 @@ def test_plans_that_would_meet_are_kept_apart() -> None:
 
 
 def test_where_pushing_does_not_help_the_plan_before_goes_on() -> None:
-    """Another drone comes through from above; sideways there is rock."""
+    """Another drone is beside the way; on the other side there is rock."""
     occupied = np.ones((60, 24, 60), dtype=np.float32)
     occupied[:, 11:13] = 0  # a gap 1 m wide along y = 0
     field = distance_field(Occupancy(occupied, np.array([-15.0, -6.0, -15.0]), 0.5))
     config = PlannerConfig(l_form=20.0, l_sep=0.0, eps_obs_m=0.3)
     here, still = np.zeros(3), np.zeros(3)
     slots = np.linspace([0.5, 0, 0], [10, 0, 0], 20)
-    beside = np.linspace([5.0, 2.9, 0], [5.0, 2.9, 0], 21)  # waits in the rock, seen from the gap
+    beside = np.tile([5.0, 1.0, 0.0], (21, 1))  # in the rock: 2 m to the side would be enough
     waiting = Plan(-0.2, np.zeros((21, 3)), still, 0.5)
     made = LocalPlanner(config).plan(
         0.0,
