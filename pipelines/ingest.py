@@ -9,16 +9,18 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
 from pipelines.formats.flight_sources import CameraFrames, FlightSources, losses, source_files
+from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.poses import gaps, interpolate_poses
 from pipelines.session.description import (
     ActorEntry,
@@ -33,7 +35,7 @@ from pipelines.session.description import (
     PosesEntry,
     TruthEntry,
 )
-from pipelines.session.errors import DataError, NotYetReadError
+from pipelines.session.errors import DataError, MocapError, NotYetReadError
 from pipelines.session.manifest import Camera, Flight, PoseSource, read_flight
 from pipelines.session.maps import store_map
 from pipelines.session.progress import Progress, Silent
@@ -58,6 +60,7 @@ INGEST = Stage("ingest", revision=1)
 _MUCH_SHORTER = 0.9  # a video that covers less than this share of its pose log is worth a word
 _SHORTER_S = 1.0
 _HASHERS = 4
+_AHEAD_ROWS = 200_000  # of cameras read while their sources are hashed: some 70 MB
 _FASTEST_MPS = 100.0  # no camera that films a person flies faster
 
 
@@ -102,7 +105,6 @@ def ingest(
     target = session or flight_path.with_suffix(".session")
     _refuse_other_flight(target, flight, overwrite)
     interpolation = Interpolation(max_gap_s=max_pose_gap_s, max_extrapolation_s=max_extrapolation_s)
-    sources = _hash_sources(flight, flight_path.parent, progress)
     settings = {
         "flight": flight.model_dump(mode="json"),
         "cameras": list(flight.cameras),  # their order decides between equals
@@ -110,42 +112,45 @@ def ingest(
         "flight_from_session": Path(os.path.relpath(flight_path.parent, target)).as_posix(),  # for media
     }
 
-    with locked(target, create=True, overwrite=overwrite) as writable:
-        run = writable.begin(INGEST, settings=settings, inputs=sources, force=force)
-        if run.finished:
-            return Ingested(target, run.record, _stored_description(target), skipped=True)
+    with _Reader(flight, flight_path, target, interpolation) as reader:
+        # Where nothing can be skipped, what is hashed is read at the same time.
+        meanwhile = reader.read_ahead() if force or _is_new(target) else iter(())
+        sources = _hash_sources(flight, flight_path.parent, progress, meanwhile)
+        with locked(target, create=True, overwrite=overwrite) as writable:
+            run = writable.begin(INGEST, settings=settings, inputs=sources, force=force)
+            if run.finished:
+                return Ingested(target, run.record, _stored_description(target), skipped=True)
 
-        reader = _Reader(flight, flight_path, target, interpolation)
-        progress.start("Reading cameras", len(flight.cameras))
-        entries: dict[str, CameraEntry] = {}
-        warnings: list[str] = []
-        for name in flight.cameras:
-            chunk = run.chunk(name, partial(reader.store_camera, name))
-            shutil.copytree(chunk / "tables", run.folder / "cameras" / name)
-            stored = read_json(chunk / "entry.json")
-            entries[name] = CameraEntry.model_validate(stored["entry"])
-            warnings += stored["warnings"]
-            progress.advance()
-        _check_overlap(flight_path, entries)
-        truth = reader.store_truth(run.folder, entries)
-        actor = reader.store_actor(run.folder, entries)
-        map_ = reader.store_map(run.folder)
-        warnings += reader.take_notes()
+            progress.start("Reading cameras", len(flight.cameras))
+            entries: dict[str, CameraEntry] = {}
+            warnings: list[str] = []
+            for name in flight.cameras:
+                chunk = run.chunk(name, partial(reader.store_camera, name))
+                shutil.copytree(chunk / "tables", run.folder / "cameras" / name)
+                stored = read_json(chunk / "entry.json")
+                entries[name] = CameraEntry.model_validate(stored["entry"])
+                warnings += stored["warnings"]
+                progress.advance()
+            _check_overlap(flight_path, entries)
+            truth = reader.store_truth(run.folder, entries)
+            actor = reader.store_actor(run.folder, entries)
+            map_ = reader.store_map(run.folder)
+            warnings += reader.take_notes()
 
-        description = Description(
-            schema_version=1,
-            flight=flight.name,
-            clock_reference=flight.reference_camera,
-            pose_interpolation=interpolation,
-            cameras=entries,
-            actor=actor,
-            map=map_,
-            truth=truth,
-            sources=sources,
-            warnings=warnings,
-        )
-        write_json(run.folder / "session.json", description.model_dump(mode="json", by_alias=True))
-        record = run.publish(counts=_counts(entries), warnings=warnings)
+            description = Description(
+                schema_version=1,
+                flight=flight.name,
+                clock_reference=flight.reference_camera,
+                pose_interpolation=interpolation,
+                cameras=entries,
+                actor=actor,
+                map=map_,
+                truth=truth,
+                sources=sources,
+                warnings=warnings,
+            )
+            write_json(run.folder / "session.json", description.model_dump(mode="json", by_alias=True))
+            record = run.publish(counts=_counts(entries), warnings=warnings)
     return Ingested(target, record, description, skipped=False)
 
 
@@ -184,8 +189,22 @@ def _refuse_other_flight(target: Path, flight: Flight, overwrite: bool) -> None:
         )
 
 
-def _hash_sources(flight: Flight, base: Path, progress: Progress) -> dict[str, str]:
-    """The sha256 of every file that is read, by the path that the manifest states."""
+def _is_new(target: Path) -> bool:
+    """Whether no ingest was finished or interrupted here."""
+    return not any((target / entry).exists() for entry in (INGEST.name, ".partial"))
+
+
+def _hash_sources(
+    flight: Flight, base: Path, progress: Progress, meanwhile: Iterator[object]
+) -> dict[str, str]:
+    """The sha256 of every file that is read, by the path that the manifest states.
+
+    Args:
+        flight: the manifest.
+        base: the folder that its paths are relative to.
+        progress: who watches.
+        meanwhile: steps to take until all is hashed.
+    """
     stated: list[str] = []
 
     def take(*paths: str | None) -> None:
@@ -217,9 +236,16 @@ def _hash_sources(flight: Flight, base: Path, progress: Progress) -> dict[str, s
     progress.start("Hashing sources", len(unique))
     hashes = {}
     with ThreadPoolExecutor(_HASHERS) as pool:  # hashing releases the interpreter: long logs side by side
-        for path, digest in zip(unique, pool.map(lambda path: _hash_of(base / path), unique), strict=True):
-            hashes[path] = digest
-            progress.advance()
+        hashing = {path: pool.submit(_hash_of, base / path) for path in unique}
+        try:
+            while not all(digest.done() for digest in hashing.values()) and next(meanwhile, None):
+                pass
+            for path, digest in hashing.items():
+                hashes[path] = digest.result()
+                progress.advance()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
     return hashes
 
 
@@ -262,8 +288,32 @@ def _span_of(names: Sequence[str], entries: Mapping[str, CameraEntry]) -> str:
     return _span(min(f.first_t_ns for f in frames), max(f.last_t_ns for f in frames))
 
 
+@dataclass(frozen=True)
+class _CameraData:
+    """What was read of one camera."""
+
+    detections: Detections | None
+    detector_format: str
+    intrinsics: Intrinsics
+    frames: CameraFrames
+    trajectory: Trajectory
+    notes: list[str]
+
+    @property
+    def rows(self) -> int:
+        """About how many rows it will have in all tables."""
+        return (
+            len(self.frames.t_ns)
+            + len(self.trajectory.t_ns)
+            + (len(self.detections.frame) if self.detections else 0)
+        )
+
+
 class _Reader:
-    """Stores the parts of one flight; what is doubted is collected as notes."""
+    """Reads and stores the parts of one flight; what is doubted is collected as notes.
+
+    A context manager that closes the logs.
+    """
 
     def __init__(
         self, flight: Flight, flight_path: Path, session: Path, interpolation: Interpolation
@@ -277,6 +327,30 @@ class _Reader:
         self._sources = FlightSources(
             flight, flight_path, max_gap_ns=self._max_gap_ns, note=self._notes.append
         )
+        self._ahead: dict[str, _CameraData] = {}
+
+    def __enter__(self) -> Self:
+        """The reader itself."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Close the logs."""
+        self._sources.__exit__(*exception)
+
+    def read_ahead(self) -> Iterator[str]:
+        """Read one camera after the other for `store_camera` to take, up to some amount of memory.
+
+        A fault ends it, and shows again when that camera is stored.
+        """
+        for name in self._flight.cameras:
+            if sum(data.rows for data in self._ahead.values()) > _AHEAD_ROWS:
+                return
+            try:
+                self._ahead[name] = self._read_camera(name)
+            except (MocapError, OSError):
+                self._notes.clear()
+                return
+            yield name
 
     def take_notes(self) -> list[str]:
         """What was noted since the last time this was asked."""
@@ -286,6 +360,50 @@ class _Reader:
 
     def store_camera(self, name: str, folder: Path) -> None:
         """Write the tables of one camera and what is to be said of them."""
+        camera = self._flight.cameras[name]
+        data = self._ahead.pop(name, None) or self._read_camera(name)
+        detections, frames, trajectory = data.detections, data.frames, data.trajectory
+
+        tables = folder / "tables"
+        tables.mkdir()
+        write_table(tables / "frames.parquet", frames_table(frames.frame, frames.t_ns, frames.pts_ns), FRAMES)
+        write_table(
+            tables / "poses.parquet",
+            pose_table(trajectory),
+            POSES if trajectory.covariance is None else POSES_WITH_COVARIANCE,
+        )
+        if detections is not None:
+            keypoints = keypoints_table(detections, frames.frame, frames.t_ns)
+            write_table(tables / "keypoints.parquet", keypoints, KEYPOINTS)
+        entry = CameraEntry(
+            intrinsics=IntrinsicsEntry.of(data.intrinsics),
+            frames=FramesEntry(
+                count=len(frames.t_ns),
+                first_t_ns=int(frames.t_ns[0]),
+                last_t_ns=int(frames.t_ns[-1]),
+                rate_hz=_rate(frames.t_ns),
+                dropped=frames.dropped,
+            ),
+            poses=self._poses_entry(name, camera, trajectory, frames.t_ns),
+            keypoints=_keypoints_entry(camera, detections, data.detector_format, len(frames.t_ns)),
+            clock=ClockEntry(
+                offset_s=camera.clock.offset_ns / 1e9 if camera.clock else 0.0,
+                sigma_s=camera.clock.sigma_s if camera.clock else 0.0,
+            ),
+            pose_noise=camera.pose_noise,
+            media=self._sources.media(camera, frames, self._session),
+        )
+        warnings = list(dict.fromkeys(data.notes + self.take_notes()))
+        for what, dropped in (
+            ("frames", entry.frames.dropped),
+            ("poses", entry.poses.dropped),
+            ("keypoints", entry.keypoints.dropped if entry.keypoints else {}),
+        ):
+            warnings += [f"{name}: {what} dropped: {losses(dropped)}"] if dropped else []
+        write_json(folder / "entry.json", {"entry": entry.model_dump(mode="json"), "warnings": warnings})
+
+    def _read_camera(self, name: str) -> _CameraData:
+        """Everything that is read of one camera, checked against each other."""
         camera, sources = self._flight.cameras[name], self._sources
         video = sources.video(camera)
         detections, detector_format = None, ""
@@ -304,44 +422,7 @@ class _Reader:
                     f"cameras.{name}: no frame of its keypoints is one of its pictures",
                     "check first_frame and frame_times",
                 )
-
-        tables = folder / "tables"
-        tables.mkdir()
-        write_table(tables / "frames.parquet", frames_table(frames.frame, frames.t_ns, frames.pts_ns), FRAMES)
-        write_table(
-            tables / "poses.parquet",
-            pose_table(trajectory),
-            POSES if trajectory.covariance is None else POSES_WITH_COVARIANCE,
-        )
-        if detections is not None:
-            keypoints = keypoints_table(detections, frames.frame, frames.t_ns)
-            write_table(tables / "keypoints.parquet", keypoints, KEYPOINTS)
-        entry = CameraEntry(
-            intrinsics=IntrinsicsEntry.of(intrinsics),
-            frames=FramesEntry(
-                count=len(frames.t_ns),
-                first_t_ns=int(frames.t_ns[0]),
-                last_t_ns=int(frames.t_ns[-1]),
-                rate_hz=_rate(frames.t_ns),
-                dropped=frames.dropped,
-            ),
-            poses=self._poses_entry(name, camera, trajectory, frames.t_ns),
-            keypoints=_keypoints_entry(camera, detections, detector_format, len(frames.t_ns)),
-            clock=ClockEntry(
-                offset_s=camera.clock.offset_ns / 1e9 if camera.clock else 0.0,
-                sigma_s=camera.clock.sigma_s if camera.clock else 0.0,
-            ),
-            pose_noise=camera.pose_noise,
-            media=sources.media(camera, frames, self._session),
-        )
-        warnings = self.take_notes()
-        for what, dropped in (
-            ("frames", entry.frames.dropped),
-            ("poses", entry.poses.dropped),
-            ("keypoints", entry.keypoints.dropped if entry.keypoints else {}),
-        ):
-            warnings += [f"{name}: {what} dropped: {losses(dropped)}"] if dropped else []
-        write_json(folder / "entry.json", {"entry": entry.model_dump(mode="json"), "warnings": warnings})
+        return _CameraData(detections, detector_format, intrinsics, frames, trajectory, self.take_notes())
 
     def store_truth(self, folder: Path, entries: Mapping[str, CameraEntry]) -> TruthEntry | None:
         """Write what is known to be true and say what it spans."""

@@ -7,6 +7,7 @@ messages are; a chunk without one is looked into.
 
 from __future__ import annotations
 
+import struct
 import zlib
 from abc import abstractmethod
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.formats.inflation import inflate
 from pipelines.formats.recordings import (
@@ -27,6 +29,7 @@ from pipelines.formats.recordings import (
     Channel,
     LogPart,
     MessageTable,
+    UnlikeError,
     require_content,
 )
 from pipelines.session.records import Int64
@@ -49,6 +52,16 @@ class Chunk:
     crc: int = 0  # 0: not stated
     cut: bool = False  # the file ends within it
     index: list[Int64] = field(default_factory=list)  # a channel's [n, 3] each: channel, stamp, place
+
+
+@dataclass(frozen=True)
+class RecordShape:
+    """How the record of a message is laid out, from its place in the chunk on."""
+
+    head: int  # bytes before the message
+    message: int  # bytes of the message
+    stamp: slice  # the stamp in the head
+    free: slice  # what differs from record to record of one channel, the stamp among it
 
 
 @dataclass(frozen=True)
@@ -102,9 +115,22 @@ class ChunkedPart(LogPart):
     def payload(self, content: memoryview, place: int, channel: int, stamp_ns: int) -> memoryview:
         """The bytes of the message that the index says is here; ValueError if it is not."""
 
+    @abstractmethod
+    def shape(self, content: memoryview, place: int) -> RecordShape:
+        """The shape of the record of a message; ValueError or struct.error if it is none."""
+
+    @abstractmethod
+    def stamp_bytes(self, stamp_ns: Int64) -> NDArray[np.uint8]:
+        """Stamps [n] as a record's head writes them [n, 8]."""
+
     def close(self) -> None:
         """Close the file."""
         self.file.close()
+
+    def forget(self) -> None:
+        """Forget what was lost, and the chunks that a reading left behind."""
+        super().forget()
+        self._cache.clear()
 
     def read(self, rows: Int64) -> Iterator[tuple[int, memoryview]]:
         """The bytes of messages, as views into their chunk."""
@@ -132,6 +158,46 @@ class ChunkedPart(LogPart):
                 self.lose(int(rows[k]), MISPLACED)
                 continue
             yield k, data
+
+    def read_alike(self, rows: Int64) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
+        """Gathered from each chunk at once; the heads of the records must be those of the index."""
+        table = self.table
+        shape: RecordShape | None = None
+        first: NDArray[np.uint8] | None = None
+        for block_rows in np.split(rows, np.flatnonzero(np.diff(table.block[rows])) + 1):
+            if not len(block_rows):
+                continue
+            number, places = int(table.block[block_rows[0]]), table.place[block_rows]
+            content = self._content(number)
+            del self._cache[number]
+            if content is None:
+                self.lose(block_rows, DAMAGED)
+                continue
+            if shape is None:
+                shape = self._first_shape(content, int(block_rows[0]))
+            records = _records(content, places, shape.head + shape.message)
+            if first is None:
+                first = records[0]
+            head = records[:, : shape.head]
+            same = head == first[: shape.head]
+            same[:, shape.free] = True
+            stamps = self.stamp_bytes(table.stamp_ns[block_rows])
+            if not same.all() or not np.array_equal(head[:, shape.stamp], stamps):
+                raise UnlikeError
+            yield block_rows, records[:, shape.head :]
+
+    def _first_shape(self, content: memoryview, row: int) -> RecordShape:
+        table = self.table
+        place = int(table.place[row])
+        try:
+            # Says whether it is of this channel, which no other record is asked again: their heads are alike.
+            self.payload(content, place, int(table.channel[row]), int(table.stamp_ns[row]))
+            shape = self.shape(content, place)
+        except (ValueError, struct.error, KeyError, IndexError) as error:
+            raise UnlikeError from error
+        if shape.message <= 0:
+            raise UnlikeError
+        return shape
 
     def bytes_at(self, offset: int, length: int) -> bytes:
         """Bytes of the file; fewer at its end."""
@@ -201,3 +267,12 @@ class ChunkedPart(LogPart):
         next_place = np.where(same_block, np.roll(rows[:, 2], -1), ends)
         size = np.maximum(next_place - rows[:, 2] - self.record_overhead, 0)
         return MessageTable(rows[:, 0], rows[:, 1], block, rows[:, 2], size)
+
+
+def _records(content: memoryview, places: Int64, length: int) -> NDArray[np.uint8]:
+    """The bytes [n, length] at some places; UnlikeError if one ends outside."""
+    if int(places.min()) < 0 or int(places.max()) + length > len(content):
+        raise UnlikeError
+    # Every stretch of that length, as a view: row k begins at byte k.
+    windows = np.ndarray((len(content) - length + 1, length), np.uint8, content, strides=(1, 1))
+    return windows[places]

@@ -8,23 +8,22 @@ nothing is said here and the messages are decoded one by one.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import islice
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.message_decoders import Schema, is_standard
+from pipelines.formats.recordings import UnlikeError
 from pipelines.session.records import Float, Int64
 
-Payload = tuple[int, memoryview | bytes]
-"""Stamp of receipt, and the bytes of a message; a view need be valid only until the next."""
+Messages = tuple[Int64, NDArray[np.uint8]]
+"""Stamps of receipt [n], and the bytes of messages of one length [n, length]."""
 
 _LATEST_NS = 2**62  # stamps beyond are no times, which is for others to say
-_BATCH = 4096  # messages of one array: 3 MB of Odometry
-_CDR_LITTLE_ENDIAN = b"\x00\x01\x00\x00"
+_CDR_LITTLE_ENDIAN = (0, 1, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -63,81 +62,63 @@ class _OtherLayoutError(Exception):
 class _Layout:
     """Where things are in every message of a topic."""
 
+    is_cdr: bool
     length: int
-    stamp_at: int  # seconds, then nanoseconds
+    stamp: slice  # seconds, then nanoseconds
     seconds: Literal["<i4", "<u4"]
     text: slice  # lengths and characters of the frames' names, with what pads them
+    text_bytes: NDArray[np.uint8]
     names: tuple[str, str]
-    doubles_at: int
+    doubles: slice  # position, quaternion xyzw, and the covariance of types that have one
 
 
-def read_poses(schema: Schema, payloads: Iterable[Payload]) -> PoseArrays | None:
-    """All poses of a topic; None where they are not of one known layout, or there are none.
+def read_poses(schema: Schema, messages: Iterable[Messages]) -> PoseArrays | None:
+    """All poses of a topic in the order of receipt; None where they are not of one known layout.
 
     Args:
         schema: of the topic.
-        payloads: its messages in the order of receipt; read to the end, or to the first that differs.
+        messages: in any order; those of equal stamps keep theirs. Read to the end, or to the first that
+            differs.
     """
     fields = _KNOWN.get(schema.type)
     if fields is None or schema.encoding not in {"cdr", "ros1"} or not is_standard(schema):
         return None
-    try:
-        copies = ((stamp, bytes(data)) for stamp, data in payloads)
-        blocks = list(_blocks(schema.encoding, fields, copies))
-    except _OtherLayoutError:
-        return None
-    if not blocks:
-        return None
-    return PoseArrays(
-        frames=blocks[0].frames,
-        header_ns=np.concatenate([block.header_ns for block in blocks]),
-        receive_ns=np.concatenate([block.receive_ns for block in blocks]),
-        pose=np.concatenate([block.pose for block in blocks]),
-        covariance=np.concatenate([b.covariance for b in blocks if b.covariance is not None])
-        if fields.has_covariance
-        else None,
-    )
-
-
-def _blocks(encoding: str, fields: _Fields, payloads: Iterator[tuple[int, bytes]]) -> Iterator[PoseArrays]:
+    stamps: list[Int64] = []
+    parts: list[NDArray[np.uint8]] = []
     layout: _Layout | None = None
-    text = b""
-    while batch := list(islice(payloads, _BATCH)):
-        if layout is None:
-            layout = _layout(encoding, fields, batch[0][1])
-            text = batch[0][1][layout.text]
-        if any(len(data) != layout.length for _, data in batch):
-            raise _OtherLayoutError
-        raw = np.frombuffer(b"".join(data for _, data in batch), np.uint8).reshape(-1, layout.length)
-        if encoding == "cdr" and (raw[:, :4] != np.frombuffer(_CDR_LITTLE_ENDIAN, np.uint8)).any():
-            raise _OtherLayoutError
-        if (raw[:, layout.text] != np.frombuffer(text, np.uint8)).any():
-            raise _OtherLayoutError
-        receive_ns = np.array([stamp for stamp, _ in batch], np.int64)
-        if np.abs(receive_ns).max() >= _LATEST_NS:
-            raise _OtherLayoutError
-        yield _block(layout, fields, raw, receive_ns)
-
-
-def _block(layout: _Layout, fields: _Fields, raw: NDArray[np.uint8], receive_ns: Int64) -> PoseArrays:
-    count = 43 if fields.has_covariance else 7
-    record = np.dtype(
-        {
-            "names": ["seconds", "nanoseconds", "doubles"],
-            "formats": [layout.seconds, "<u4", ("<f8", (count,))],
-            "offsets": [layout.stamp_at, layout.stamp_at + 4, layout.doubles_at],
-            "itemsize": layout.length,
-        }
-    )
-    rows = raw.reshape(-1).view(record)
-    doubles: Float = rows["doubles"].astype(np.float64)
+    try:
+        for receive_ns, raw in messages:
+            layout = layout or _layout(schema.encoding, fields, raw[0].tobytes())
+            stamps.append(receive_ns)
+            parts.append(_numbers(layout, raw))
+    except (_OtherLayoutError, UnlikeError):
+        return None
+    if layout is None:
+        return None
+    receive_ns = np.concatenate(stamps)
+    if np.abs(receive_ns).max() >= _LATEST_NS:
+        return None
+    order = np.argsort(receive_ns, kind="stable")
+    numbers = np.concatenate(parts)[order]
+    nanoseconds = numbers[:, 4:8].copy().view("<u4")[:, 0]
+    doubles: Float = numbers[:, 8:].copy().view("<f8").astype(np.float64, copy=False)
     return PoseArrays(
         frames=layout.names,
-        header_ns=rows["seconds"].astype(np.int64) * 1_000_000_000 + rows["nanoseconds"],
-        receive_ns=receive_ns,
+        header_ns=numbers[:, :4].copy().view(layout.seconds)[:, 0].astype(np.int64) * 1_000_000_000
+        + nanoseconds,
+        receive_ns=receive_ns[order],
         pose=doubles[:, :7],
         covariance=doubles[:, 7:] if fields.has_covariance else None,
     )
+
+
+def _numbers(layout: _Layout, raw: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The stamp and the doubles that are used; all else must be as in the first message."""
+    if raw.shape[1] != layout.length or (raw[:, layout.text] != layout.text_bytes).any():
+        raise _OtherLayoutError
+    if layout.is_cdr and (raw[:, :4] != _CDR_LITTLE_ENDIAN).any():
+        raise _OtherLayoutError
+    return np.concatenate([raw[:, layout.stamp], raw[:, layout.doubles]], axis=1)
 
 
 def _layout(encoding: str, fields: _Fields, first: bytes) -> _Layout:
@@ -167,10 +148,12 @@ def _layout(encoding: str, fields: _Fields, first: bytes) -> _Layout:
     if doubles_at + 8 * fields.doubles != len(first):
         raise _OtherLayoutError
     return _Layout(
+        is_cdr=cdr,
         length=len(first),
-        stamp_at=stamp_at,
+        stamp=slice(stamp_at, text_at),
         seconds="<i4" if cdr else "<u4",
         text=slice(text_at, position),
+        text_bytes=np.frombuffer(first, np.uint8)[text_at:position],
         names=(names[0], names[1]),
-        doubles_at=doubles_at,
+        doubles=slice(doubles_at, doubles_at + 8 * (43 if fields.has_covariance else 7)),
     )

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from pipelines.formats.log_trajectories import (
     trajectory_of_arrays,
     transforms_of,
 )
-from pipelines.formats.pictures import later_pictures, stamp_of
+from pipelines.formats.pictures import later_pictures, picture_samples, stamp_of
 from pipelines.formats.recordings import OpenLog
 from pipelines.geometry.poses import compose, matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.session.errors import DataError
@@ -37,6 +37,8 @@ from pipelines.session.records import Int64, IntrinsicsSample, PictureSample, Tr
 from pipelines.session.registries import Log, LogFormat, recognise
 
 _MAY_DISAGREE_S = 0.5  # header and receive stamps: transport and decoding take less
+_KEPT_MESSAGES = 4_000_000  # of all logs that stay open: their tables have 160 MB
+_KEPT_FILES = 64
 _MAY_JUMP_S = 1.0  # from one message to the next, beyond what time itself passed
 
 _NOUNS: dict[Kind, str] = {
@@ -58,7 +60,7 @@ class Frames:
 
 
 class FlightLogs:
-    """The logs of one flight.
+    """The logs of one flight; a context manager that closes those that it keeps open.
 
     Args:
         flight: the manifest.
@@ -70,6 +72,16 @@ class FlightLogs:
         self._flight = flight
         self._base = base
         self._note = note
+        self._kept: dict[tuple[Path, ...], OpenLog] = {}  # the one that was used last comes last
+
+    def __enter__(self) -> Self:
+        """The logs themselves."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Close the files."""
+        for paths in list(self._kept):
+            self._close(paths)
 
     def settings(self, log: str) -> LogSource:
         """What the manifest says of a log: one of its names, or a path."""
@@ -158,7 +170,7 @@ class FlightLogs:
 
             def pictures() -> Iterator[PictureSample]:
                 nonlocal seen
-                for sample in all_samples(recording.messages([name]), source):
+                for sample in picture_samples(recording, name, source):
                     if not isinstance(sample, PictureSample):
                         raise DataError(source, f"{name} holds no pictures", "name another topic")
                     seen += 1
@@ -177,10 +189,30 @@ class FlightLogs:
 
     @contextmanager
     def _open(self, log: str) -> Iterator[tuple[Log, str]]:
-        paths = self.paths(log)
-        recording_format = recognise(paths[0], LogFormat, "log")
-        with recording_format.open_log(paths) as recording:
-            yield recording, str(paths[0])
+        """A recording for one reading; those of our own formats stay open for the next."""
+        paths = tuple(self.paths(log))
+        recording: Log | None = self._kept.pop(paths, None)
+        if recording is None:
+            recording = recognise(paths[0], LogFormat, "log").open_log(paths)
+        if not isinstance(recording, OpenLog):
+            with recording:
+                yield recording, str(paths[0])
+            return
+        self._kept[paths] = recording
+        self._close_all_beyond_bounds()
+        recording.forget()  # what was lost in reading another topic
+        yield recording, str(paths[0])
+
+    def _close_all_beyond_bounds(self) -> None:
+        while len(self._kept) > 1 and (
+            sum(topic.count for log in self._kept.values() for topic in log.topics) > _KEPT_MESSAGES
+            or sum(len(log.parts) for log in self._kept.values()) > _KEPT_FILES
+        ):
+            self._close(next(iter(self._kept)))
+
+    def _close(self, paths: tuple[Path, ...]) -> None:
+        with self._kept.pop(paths):
+            pass
 
     def _choose(self, recording: Log, source: str, kind: Kind, topic: str | None) -> str:
         """The topic that is named, or the only one of its kind."""
@@ -296,7 +328,7 @@ def poses_at_once(recording: Log, topic: str) -> PoseArrays | None:
     schemas = {schema for known in of_that_name for schema in recording.schemas(known)}
     if len(of_that_name) != 1 or len(schemas) != 1:
         return None
-    return read_poses(schemas.pop(), recording.payloads(of_that_name[0]))
+    return read_poses(schemas.pop(), recording.arrays(of_that_name[0]))
 
 
 def in_world(trajectory: Trajectory, log: LogSource) -> Trajectory:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -77,7 +78,7 @@ class CameraFrames:
 
 
 class FlightSources:
-    """Reads the parts of one flight.
+    """Reads the parts of one flight; a context manager that closes the logs.
 
     Args:
         flight: the manifest.
@@ -96,6 +97,14 @@ class FlightSources:
         self._note = note
         self._logs = FlightLogs(flight, self._base, note)
         self._calibrations: dict[str, dict[str, CalibratedCamera]] = {}
+
+    def __enter__(self) -> Self:
+        """The sources themselves."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Close the logs."""
+        self._logs.__exit__(*exception)
 
     def stamps(self, log: str) -> str:
         """Which stamps of a log's messages count: header or receive."""

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.camera_matrices import intrinsics
+from pipelines.formats.picture_layouts import PictureFields
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import (
@@ -291,10 +292,16 @@ def _of_the_picture(full: Intrinsics, value: Any) -> Intrinsics:
 
 
 def _compressed_image(message: Message, _: Source) -> Iterator[Sample]:
+    if isinstance(message.value, PictureFields):
+        yield _laid_out_picture(message.value, message.receive_ns)
+        return
     yield _encoded_picture(message.value.header.stamp, message)
 
 
 def _image(message: Message, _: Source) -> Iterator[Sample]:
+    if isinstance(message.value, PictureFields):
+        yield _laid_out_picture(message.value, message.receive_ns)
+        return
     yield _raw_picture(message.value.header.stamp, message)
 
 
@@ -306,12 +313,18 @@ def _foxglove_raw_image(message: Message, _: Source) -> Iterator[Sample]:
     yield _raw_picture(message.value.timestamp, message)
 
 
+def _laid_out_picture(fields: PictureFields, receive_ns: int) -> PictureSample:
+    stamp_ns, stated, width, height, step, data = fields
+    encoding = _codec(data, stated) if width is None else stated
+    return PictureSample(stamp_ns, receive_ns, encoding, width, height, step, data)
+
+
 def _encoded_picture(stamp: Any, message: Message) -> PictureSample:
     data = _bytes(message.value.data)
     return PictureSample(
         stamp_ns=_nanoseconds(stamp),
         receive_ns=message.receive_ns,
-        encoding=_codec(data, message.value),
+        encoding=_codec(data, str(getattr(message.value, "format", ""))),
         width=None,
         height=None,
         step=None,
@@ -319,13 +332,13 @@ def _encoded_picture(stamp: Any, message: Message) -> PictureSample:
     )
 
 
-def _codec(data: NDArray[np.uint8], value: Any) -> str:
-    """By the first bytes: `format` may say "jpeg", "bgr8; jpeg compressed bgr8" or nothing."""
+def _codec(data: NDArray[np.uint8], stated: str) -> str:
+    """By the first bytes: the stated format may say "jpeg", "bgr8; jpeg compressed bgr8" or nothing."""
     start = data[:4].tobytes()
     for signature, name in _SIGNATURES.items():
         if start.startswith(signature):
             return name
-    return str(getattr(value, "format", "")).lower()
+    return stated.lower()
 
 
 def _raw_picture(stamp: Any, message: Message) -> PictureSample:

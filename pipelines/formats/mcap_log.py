@@ -15,8 +15,9 @@ import numpy as np
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
+from numpy.typing import NDArray
 
-from pipelines.formats.chunked_logs import CHUNK_LIMIT, Chunk, ChunkedPart, Content
+from pipelines.formats.chunked_logs import CHUNK_LIMIT, Chunk, ChunkedPart, Content, RecordShape
 from pipelines.formats.message_decoders import Schema, ros2_name
 from pipelines.formats.recordings import Channel, OpenLog, describe_log, open_file, open_parts
 from pipelines.session.errors import DataError
@@ -145,6 +146,16 @@ class McapPart(ChunkedPart):
         if kind != _MESSAGE or of_channel != channel or log_time != stamp_ns or end > len(content):
             raise ValueError("another record")
         return content[place + _MESSAGE_HEAD.size : end]
+
+    def shape(self, content: memoryview, place: int) -> RecordShape:
+        """Sequence number, log time and publish time differ."""
+        head = _MESSAGE_HEAD.size
+        length = _MESSAGE_HEAD.unpack_from(content, place)[1]
+        return RecordShape(head, length - (head - _HEAD.size), slice(15, 23), slice(11, head))
+
+    def stamp_bytes(self, stamp_ns: Int64) -> NDArray[np.uint8]:
+        """One unsigned number."""
+        return stamp_ns.astype("<u8").view(np.uint8).reshape(-1, 8)
 
     def _take_chunk(self, content_at: int, length: int) -> None:
         head = self.bytes_at(content_at, _CHUNK_HEAD.size)

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.log_messages import all_samples
+from pipelines.formats.picture_layouts import picture_decoder
+from pipelines.formats.recordings import OpenLog
 from pipelines.formats.video import VideoReader
 from pipelines.session.description import MediaEntry
-from pipelines.session.records import PictureSample
+from pipelines.session.records import PictureSample, Sample
 from pipelines.session.registries import Log, LogFormat, recognise
 
 Picture = NDArray[np.uint8]
@@ -88,9 +90,22 @@ class LoggedPictures:
         return None
 
     def _begin(self) -> Iterator[PictureSample]:
-        samples = all_samples(self._log.messages([self._topic]), self._source)
+        samples = picture_samples(self._log, self._topic, self._source)
         pictures = (sample for sample in samples if isinstance(sample, PictureSample))
         return later_pictures(pictures, self._stamps)
+
+
+def picture_samples(recording: Log, topic: str, source: Path | str) -> Iterator[Sample]:
+    """What a topic of pictures holds, in the order of receipt; see `all_samples`.
+
+    Args:
+        recording: an open log.
+        topic: its name.
+        source: the log, for messages to the user.
+    """
+    if isinstance(recording, OpenLog):
+        return all_samples(recording.messages([topic], picture_decoder), source)
+    return all_samples(recording.messages([topic]), source)
 
 
 def later_pictures(pictures: Iterator[PictureSample], stamps: str) -> Iterator[PictureSample]:

@@ -11,14 +11,14 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.formats.message_decoders import Schema, decoder
+from pipelines.formats.message_decoders import Decoder, Schema, decoder
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, Message, Topic
 
@@ -53,6 +53,10 @@ class MessageTable:
     size: Int64  # bytes, uncompressed; what lies between two messages counts to the first of them
 
 
+class UnlikeError(Exception):
+    """Messages that cannot be read as one array."""
+
+
 class LogPart(ABC):
     """One open file of a log."""
 
@@ -74,6 +78,21 @@ class LogPart(ABC):
     def read(self, rows: Int64) -> Iterator[tuple[int, memoryview | bytes]]:
         """The bytes of messages, by rows of the table; rows that cannot be read are given to `lose`."""
 
+    @abstractmethod
+    def read_alike(self, rows: Int64) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
+        """The bytes of messages that are all of one length, many at a time.
+
+        Yields:
+            Rows of the table, increasing, and their messages [n, length]. Rows that cannot be read are
+            given to `lose`.
+
+        Args:
+            rows: of one channel, increasing.
+
+        Raises:
+            UnlikeError: their records or lengths differ, or one is not where the index says.
+        """
+
     def take(self, table: MessageTable) -> None:
         """Hold the messages that were found, without those of channels that nothing names."""
         named = np.isin(table.channel, list(self.channels))
@@ -94,6 +113,10 @@ class LogPart(ABC):
         if cause not in self._causes:
             self._causes.append(cause)
         self._fates[rows] = self._causes.index(cause)
+
+    def forget(self) -> None:
+        """Forget what the readings so far lost; what the file as a whole lost stays."""
+        self._fates[:] = 0
 
     @property
     def dropped(self) -> Counter[str]:
@@ -135,21 +158,37 @@ class OpenLog:
         total = sum((part.dropped for part in self.parts), Counter(self._lost))
         return dict(sorted(total.items()))
 
-    def messages(self, topics: Collection[str]) -> Iterator[Message]:
-        """The messages of some topics in the order of receipt; others are neither read nor decoded."""
-        streams = [self._of_part(part, frozenset(topics)) for part in self.parts]
+    def forget(self) -> None:
+        """Forget what the readings so far lost, so that `dropped` is of the next one alone."""
+        for part in self.parts:
+            part.forget()
+
+    def messages(
+        self, topics: Collection[str], decoder_of: Callable[[Schema], Decoder] = decoder
+    ) -> Iterator[Message]:
+        """The messages of some topics in the order of receipt; others are neither read nor decoded.
+
+        Args:
+            topics: their names.
+            decoder_of: makes the function that decodes messages of a schema, as `decoder` does.
+        """
+        streams = [self._of_part(part, frozenset(topics), decoder_of) for part in self.parts]
         return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("receive_ns"))
 
-    def payloads(self, topic: Topic) -> Iterator[tuple[int, memoryview | bytes]]:
-        """Stamp of receipt and bytes of each message of a topic, in the order of receipt.
+    def arrays(self, topic: Topic) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
+        """The messages of a topic as arrays: stamps of receipt [n] and bytes [n, length].
 
-        A view is valid until the next message is asked for.
+        In the order of the files; a stable sort by the stamps gives that of `messages`.
+
+        Raises:
+            UnlikeError: the messages of a file are not of one channel and one length.
         """
-        streams = []
         for part in self.parts:
-            rows = part.rows_of(_channels_of(part, topic.name, topic.type, topic.encoding))
-            streams.append(_payloads_of(part, rows))
-        return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=itemgetter(0))
+            channels = _channels_of(part, topic.name, topic.type, topic.encoding)
+            if len(channels) > 1:
+                raise UnlikeError
+            for rows, data in part.read_alike(np.sort(part.rows_of(channels))):
+                yield part.table.stamp_ns[rows], data
 
     def schemas(self, topic: Topic) -> set[Schema]:
         """How the messages of a topic are written; parts may differ."""
@@ -188,12 +227,14 @@ class OpenLog:
                     return str(error)
         return ""
 
-    def _of_part(self, part: LogPart, topics: frozenset[str]) -> Iterator[Message]:
+    def _of_part(
+        self, part: LogPart, topics: frozenset[str], decoder_of: Callable[[Schema], Decoder]
+    ) -> Iterator[Message]:
         decoders = {}
         for number, channel in part.channels.items():
             if channel.topic in topics:
                 try:
-                    decoders[number] = decoder(channel.schema), self._topics[_key(channel)]
+                    decoders[number] = decoder_of(channel.schema), self._topics[_key(channel)]
                 except ValueError:
                     part.lose(part.rows_of([number]), UNDEFINED)
         rows = part.rows_of(decoders)
@@ -217,13 +258,6 @@ class OpenLog:
         stamps = self.stamps(Topic(name, type_, encoding, 0, None, None))
         first, last = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (None, None)
         return Topic(name, type_, encoding, len(stamps), first, last)
-
-
-def _payloads_of(part: LogPart, rows: Int64) -> Iterator[tuple[int, memoryview | bytes]]:
-    stamps = part.table.stamp_ns[rows].tolist()
-    for start in range(0, len(rows), _BATCH):
-        for k, data in part.read(rows[start : start + _BATCH]):
-            yield stamps[start + k], data
 
 
 def open_file(path: Path) -> tuple[IO[bytes], int]:

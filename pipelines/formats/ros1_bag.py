@@ -9,11 +9,13 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pipelines.formats.chunked_logs import Chunk, ChunkedPart, Content
+from pipelines.formats.chunked_logs import Chunk, ChunkedPart, Content, RecordShape
 from pipelines.formats.message_decoders import Schema, ros2_name
 from pipelines.formats.recordings import Channel, OpenLog, describe_log, open_file, open_parts
 from pipelines.session.errors import DataError
@@ -60,11 +62,32 @@ class Ros1Bag:
         return OpenLog(*open_parts(paths, _open_part))
 
 
+@dataclass(frozen=True)
+class _Head:
+    """The head of a channel's messages, which differ in the stamp alone where one writer wrote them."""
+
+    layout: struct.Struct  # what stands before the stamp, the stamp, what stands behind it, the length
+    before: bytes
+    behind: bytes
+
+    def message(self, content: memoryview, place: int, stamp_ns: int) -> memoryview | None:
+        """The message whose head is here and has this stamp; None if another thing is."""
+        data_at = place + self.layout.size
+        if place < 0 or data_at > len(content):
+            return None
+        before, seconds, nanoseconds, behind, length = self.layout.unpack_from(content, place)
+        same = before == self.before and behind == self.behind
+        if not same or seconds * 10**9 + nanoseconds != stamp_ns or data_at + length > len(content):
+            return None
+        return content[data_at : data_at + length]
+
+
 class _Bag(ChunkedPart):
     record_overhead = 46  # lengths of header and message, and the header's fields op, conn and time
 
     def walk(self) -> tuple[int, bool]:
         """Walk the records up to the end of the file or to the first that is not whole."""
+        self._heads: dict[int, _Head] = {}
         position, chunks_stated = self._bag_header()
         while position < self.file_size:
             try:
@@ -107,6 +130,9 @@ class _Bag(ChunkedPart):
 
     def payload(self, content: memoryview, place: int, channel: int, stamp_ns: int) -> memoryview:
         """The bytes of a message; some writers let the index point to the connection before it."""
+        head = self._heads.get(channel)
+        if head is not None and (data := head.message(content, place, stamp_ns)) is not None:
+            return data
         try:
             fields, data_at, length = _parse_record(content, place)
             while fields[b"op"][0] == _CONNECTION:
@@ -121,7 +147,20 @@ class _Bag(ChunkedPart):
             raise ValueError("no record here") from error
         if not right:
             raise ValueError("another record")
+        if channel not in self._heads:
+            self._heads[channel] = _head(bytes(content[place:data_at]), fields[b"time"])
         return content[data_at : data_at + length]
+
+    def shape(self, content: memoryview, place: int) -> RecordShape:
+        """Only the stamp differs."""
+        fields, data_at, length = _parse_record(content, place)
+        head = _head(bytes(content[place:data_at]), fields[b"time"])
+        stamp = slice(len(head.before), len(head.before) + _STAMP.size)
+        return RecordShape(head.layout.size, length, stamp, stamp)
+
+    def stamp_bytes(self, stamp_ns: Int64) -> NDArray[np.uint8]:
+        """Seconds and nanoseconds."""
+        return np.stack(np.divmod(stamp_ns, 10**9), axis=1).astype("<u4").view(np.uint8)
 
     def _bag_header(self) -> tuple[int, int]:
         """Where the first record after the bag's header begins, and how many chunks that header states."""
@@ -173,6 +212,14 @@ def _parse_record(content: memoryview, position: int) -> tuple[Fields, int, int]
     header_end = position + 4 + _U32.unpack_from(content, position)[0]
     (length,) = _U32.unpack_from(content, header_end)
     return _fields(bytes(content[position + 4 : header_end])), header_end + 4, length
+
+
+def _head(head: bytes, stamp: bytes) -> _Head:
+    """What stands about the stamp in the bytes from a message's place to its data."""
+    before, name, behind = head.partition(b"time=")
+    behind = behind[len(stamp) : -_U32.size]
+    layout = struct.Struct(f"<{len(before + name)}sII{len(behind)}sI")
+    return _Head(layout, before + name, behind)
 
 
 def _fields(header: bytes) -> Fields:

@@ -14,10 +14,12 @@ from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.formats.mcap_log import open_mcap
 from pipelines.formats.message_decoders import Schema, ros2_name
@@ -28,6 +30,7 @@ from pipelines.formats.recordings import (
     LogPart,
     MessageTable,
     OpenLog,
+    UnlikeError,
     describe_log,
     open_file,
     open_parts,
@@ -40,6 +43,7 @@ _MAGIC = b"SQLite format 3\0"
 _INFORMATION = "rosbag2_bagfile_information"
 _METADATA_LIMIT = 16 << 20  # bytes of a metadata.yaml
 _LARGEST_ROWID = 1 << 48
+_BATCH = 4096  # rows at a time
 _SMALLEST_ROW = 6  # bytes a row takes in a file at the least: its length, its number, a header of four
 _MOST_ATTEMPTS = 10_000  # to go on behind damage
 _SUFFIXES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
@@ -147,6 +151,16 @@ class _Sqlite3Part(LogPart):
             else:
                 yield k, message
 
+    def read_alike(self, rows: Int64) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
+        """Joined from the rows of a query."""
+        length = int(self.table.size[rows[0]]) if len(rows) else 0
+        messages = self.read(rows)
+        while batch := list(islice(messages, _BATCH)):
+            if not length or any(len(data) != length for _, data in batch):
+                raise UnlikeError
+            joined = np.frombuffer(b"".join(data for _, data in batch), np.uint8)
+            yield rows[[k for k, _ in batch]], joined.reshape(-1, length)
+
     def _in_one_query(self, rows: Int64, places: Sequence[int]) -> Iterator[tuple[int, bytes]]:
         """The messages up to the first that is damaged."""
         query = (
@@ -204,19 +218,38 @@ class _Sqlite3Part(LogPart):
         last, step, whole = -1, 1, False
         while not whole and last < _LARGEST_ROWID and attempts < _MOST_ATTEMPTS:
             attempts += 1
-            try:
-                for row in self.database.execute(query, (last,)):
-                    if row[0] <= last or len(numbers) >= most:
-                        raise sqlite3.DatabaseError
-                    numbers.extend(row)
-                    last, step = row[0], 1
-                whole = True
-            except sqlite3.DatabaseError:
+            begin = len(numbers)
+            whole = self._take_rows(query, last, numbers, most)
+            if len(numbers) > begin:
+                last, step = numbers[-4], 1
+            if not whole:
                 # A page is missing or damaged: go on behind it, in growing steps.
                 self.lost["gaps in the table of messages"] += step == 1
                 last, step = last + step, 2 * step
         rows = np.array(numbers, np.int64).reshape(-1, 4)
         return MessageTable(rows[:, 1], rows[:, 2], np.zeros(len(rows), np.int64), rows[:, 0], rows[:, 3])
+
+    def _take_rows(self, query: str, last: int, numbers: array[int], most: int) -> bool:
+        """Append rows of four numbers, the first of which must rise from `last` on; whether that was all."""
+        try:
+            found = self.database.execute(query, (last,))
+            while len(numbers) < most:
+                begin = len(numbers)
+                try:
+                    # What was taken before an error stays.
+                    numbers.extend(chain.from_iterable(islice(found, _BATCH)))
+                finally:
+                    risen = np.diff(np.array(numbers[begin::4], np.int64), prepend=last) > 0
+                    taken = len(risen) if risen.all() else int(np.argmin(risen))
+                    del numbers[begin + 4 * taken :]
+                if taken < len(risen):
+                    return False
+                if not taken:
+                    return True
+                last = numbers[-4]
+        except sqlite3.DatabaseError:
+            pass
+        return False
 
     def _check_length(self, database: Path) -> None:
         """Compare the file with the size its header states (sqlite.org/fileformat2.html, section 1.3)."""
