@@ -38,6 +38,8 @@ bench: setup
 	$(BIN)/python -m benchmarks.triangulation
 	$(BIN)/python -m benchmarks.loss
 	$(BIN)/python -m benchmarks.ingest_log
+	$(BIN)/python -m benchmarks.planning
+	$(BIN)/python -m benchmarks.rendering
 
 # Write the sample flight again: the same bytes as in the repository.
 sample: setup
