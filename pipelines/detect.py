@@ -8,7 +8,7 @@ either.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.formats.pictures import open_pictures
+from pipelines.formats.pictures import Picture, Pictures, open_pictures
 from pipelines.geometry.poses import interpolate_points, interpolate_poses
 from pipelines.keypoints.hints import Hint, project_actor
 from pipelines.keypoints.tracking import PeopleTracker
@@ -283,10 +283,10 @@ def _produce(work: _Work, detector: Detector, progress: Progress, block: Block, 
     found: list[tuple[int, int, Float, Float]] = []
     undecoded = 0
     with open_pictures(media, work.folder) as pictures:
-        for number, hint in zip(frame.tolist(), work.hints(block, t_ns), strict=True):
+        numbers, hints = frame.tolist(), work.hints(block, t_ns)
+        for number, picture, hint in zip(numbers, _decoded_ahead(pictures, numbers), hints, strict=True):
             if work.stopped.is_set():
                 raise InterruptedError("another block failed, or the user stopped it")
-            picture = pictures.read(number)
             progress.advance()
             if picture is None:
                 undecoded += 1
@@ -298,6 +298,18 @@ def _produce(work: _Work, detector: Detector, progress: Progress, block: Block, 
     write_table(folder / "keypoints.parquet", _table(found, networks, frame, t_ns), KEYPOINTS)
     counts = {**tracker.counts, "detections": len(found), "undecoded": undecoded}
     write_json(folder / "counts.json", {"joints": list(networks.joints), "counts": counts})
+
+
+def _decoded_ahead(pictures: Pictures, numbers: list[int]) -> Iterator[Picture | None]:
+    """The pictures of these numbers; the next one is decoded while the networks look at this one."""
+    with ThreadPoolExecutor(1) as decoder:
+        coming = deque(decoder.submit(pictures.read, number) for number in numbers[:1])
+        for number in numbers[1:]:
+            picture = coming.popleft().result()
+            coming.append(decoder.submit(pictures.read, number))
+            yield picture
+        for last in coming:
+            yield last.result()
 
 
 def _table(

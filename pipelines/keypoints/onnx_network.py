@@ -109,12 +109,13 @@ class OnnxNetwork:
 
     def _outputs(self, rgb: NDArray[np.float32], names: Sequence[str] | None) -> dict[str, NDArray[Any]]:
         ordered = rgb if self._colours.order == "rgb" else rgb[..., ::-1]
-        pixels = (ordered - np.array(self._colours.mean, np.float32)) / np.array(
-            self._colours.std, np.float32
-        )
+        mean, std = (np.array(of, np.float32) for of in (self._colours.mean, self._colours.std))
         if self._layout == "nchw":
-            pixels = np.moveaxis(pixels, -1, 1)
-        given = {self._input: np.ascontiguousarray(pixels, dtype=self._type)}
+            ordered, mean, std = np.moveaxis(ordered, -1, 1), mean[:, None, None], std[:, None, None]
+        pixels = np.array(ordered, order="C")  # in place is several times faster
+        pixels -= mean
+        pixels /= std
+        given = {self._input: pixels.astype(self._type, copy=False)}
         wanted = [output.name for output in self._session.get_outputs()] if names is None else list(names)
         try:
             values = self._session.run(wanted, given)

@@ -134,7 +134,7 @@ def _ballast(layers: int, constants: dict[str, NDArray[np.float32] | NDArray[np.
     constants["first_kernel"] = rng.normal(0, 0.1, (64, 3, 3, 3)).astype(np.float32)
     constants["kernel"] = rng.normal(0, 0.05, (64, 64, 3, 3)).astype(np.float32)
     constants["nothing"] = np.zeros(1, np.float32)
-    nodes = [
+    return [
         helper.make_node("Conv", ["input", "first_kernel"], ["layer0"], strides=[4, 4], pads=[1, 1, 1, 1]),
         *(
             helper.make_node("Conv", [f"layer{i}", "kernel"], [f"layer{i + 1}"], pads=[1, 1, 1, 1])
@@ -144,7 +144,6 @@ def _ballast(layers: int, constants: dict[str, NDArray[np.float32] | NDArray[np.
         helper.make_node("Mul", ["mean", "nothing"], ["zero"]),
         helper.make_node("Add", ["only_bright", "zero"], ["bright"]),
     ]
-    return nodes
 
 
 def _input_shape(size: tuple[int, int], batch: int | str, layout: str, open_size: bool) -> list[int | str]:

@@ -33,7 +33,7 @@ def person_at(t_s: Float) -> Float:
 
 
 def write_spotted_flight(folder: Path, frames: int, scale: int = 1) -> Path:
-    """A flight of two cameras with videos of 320x240, times `scale`, and without keypoints; its flight.yaml."""
+    """A flight of two cameras with videos of 320x240 times `scale`, without keypoints; its flight.yaml."""
     lens = rescaled(LENS, scale * LENS.width, scale * LENS.height)
     t_s = np.arange(frames) / FPS
     stamps = START_S * 10**9 + np.round(t_s * 1e9).astype(np.int64)
