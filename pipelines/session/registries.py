@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -225,6 +225,25 @@ class Export(Protocol):
         """Write into an existing empty folder; the paths written, sorted. DataError without content."""
 
 
+class Arm(Protocol):
+    """A way to plan formations.
+
+    What it is handed and what it makes are types of the planning room, above this one: there
+    `pipelines.planning.arms` states the same protocol with them.
+    """
+
+    @property
+    def name(self) -> str:
+        """What the user writes after `--arms`."""
+
+    @property
+    def title(self) -> str:
+        """What reports call it."""
+
+    def start(self, config: Any, *, drones: int, yaw_rad: float) -> Any:
+        """The `FormationPlanner` of a `PlannerConfig` for a flight whose first camera starts at that yaw."""
+
+
 class Registry(Generic[T]):
     """The objects that one group of entry points names, loaded when they are asked for."""
 
@@ -260,6 +279,7 @@ FORMATS: Registry[Format] = Registry("mocap.formats", "format")
 EXPORTS: Registry[Export] = Registry("mocap.exports", "export format")
 DETECTORS: Registry[Detector | DetectorFamily] = Registry("mocap.detectors", "detector")
 NOISE_MODELS: Registry[type[NoiseModel]] = Registry("mocap.noise_models", "pose noise model")
+PLANNER_ARMS: Registry[Arm] = Registry("mocap.planner_arms", "planner arm")
 
 F = TypeVar("F")
 
