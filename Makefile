@@ -40,6 +40,7 @@ bench: setup
 	$(BIN)/python -m benchmarks.ingest_log
 	$(BIN)/python -m benchmarks.planning
 	$(BIN)/python -m benchmarks.rendering
+	$(BIN)/python -m benchmarks.detection
 
 # Write the sample flight again: the same bytes as in the repository.
 sample: setup

@@ -13,13 +13,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.session.registries import DETECTORS
 from tests.commands.runner import MOCAP, content, refused, succeeds
 from tests.keypoints.spotted_flights import CAMERAS, FPS, person_at, spot_detector, write_spotted_flight
-
-pytestmark = pytest.mark.skipif(
-    "onnx" not in DETECTORS.names(), reason="installed before `onnx` was registered: run `make setup`"
-)
 
 
 def test_keypoints_of_the_users_model_become_a_skeleton(tmp_path: Path) -> None:

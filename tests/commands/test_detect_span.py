@@ -10,13 +10,8 @@ import pytest
 from pipelines.detect import detect
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
-from pipelines.session.registries import DETECTORS
 from pipelines.session.stages import StageRecord, locked
 from tests.keypoints.spotted_flights import CAMERAS, FPS, spot_detector, write_spotted_flight
-
-pytestmark = pytest.mark.skipif(
-    "onnx" not in DETECTORS.names(), reason="installed before `onnx` was registered: run `make setup`"
-)
 
 
 def test_only_the_pictures_of_the_span_are_looked_at(tmp_path: Path) -> None:
