@@ -10,7 +10,6 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,8 +63,7 @@ class _Layout:
 
     is_cdr: bool
     length: int
-    stamp: slice  # seconds, then nanoseconds
-    seconds: Literal["<i4", "<u4"]
+    stamp: slice  # seconds, signed as rosbags reads them, then nanoseconds
     text: slice  # lengths and characters of the frames' names, with what pads them
     text_bytes: NDArray[np.uint8]
     names: tuple[str, str]
@@ -100,12 +98,12 @@ def read_poses(schema: Schema, messages: Iterable[Messages]) -> PoseArrays | Non
         return None
     order = np.argsort(receive_ns, kind="stable")
     numbers = np.concatenate(parts)[order]
+    seconds = numbers[:, :4].copy().view("<i4")[:, 0].astype(np.int64)
     nanoseconds = numbers[:, 4:8].copy().view("<u4")[:, 0]
     doubles: Float = numbers[:, 8:].copy().view("<f8").astype(np.float64, copy=False)
     return PoseArrays(
         frames=layout.names,
-        header_ns=numbers[:, :4].copy().view(layout.seconds)[:, 0].astype(np.int64) * 1_000_000_000
-        + nanoseconds,
+        header_ns=seconds * 1_000_000_000 + nanoseconds,
         receive_ns=receive_ns[order],
         pose=doubles[:, :7],
         covariance=doubles[:, 7:] if fields.has_covariance else None,
@@ -151,7 +149,6 @@ def _layout(encoding: str, fields: _Fields, first: bytes) -> _Layout:
         is_cdr=cdr,
         length=len(first),
         stamp=slice(stamp_at, text_at),
-        seconds="<i4" if cdr else "<u4",
         text=slice(text_at, position),
         text_bytes=np.frombuffer(first, np.uint8)[text_at:position],
         names=(names[0], names[1]),

@@ -152,24 +152,38 @@ class _Sqlite3Part(LogPart):
                 yield k, message
 
     def read_alike(self, rows: Int64) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
-        """Joined from the rows of a query."""
-        length = int(self.table.size[rows[0]]) if len(rows) else 0
-        messages = self.read(rows)
-        while batch := list(islice(messages, _BATCH)):
-            if not length or any(len(data) != length for _, data in batch):
-                raise UnlikeError
-            joined = np.frombuffer(b"".join(data for _, data in batch), np.uint8)
-            yield rows[[k for k, _ in batch]], joined.reshape(-1, length)
+        """Joined from the rows of one query; where a row cannot be read, the messages count as unlike."""
+        if not len(rows):
+            return
+        places = self.table.place[rows]
+        length = int(self.table.size[rows[0]])
+        try:
+            found = self._query(rows, places.tolist())
+            for start in range(0, len(rows), _BATCH):
+                batch = found.fetchmany(min(_BATCH, len(rows) - start))
+                found_places, data = zip(*batch, strict=True) if batch else ((), ())
+                if not np.array_equal(found_places, places[start : start + _BATCH]):
+                    raise UnlikeError
+                if set(map(type, data)) != {bytes} or set(map(len, data)) != {length} or not length:
+                    raise UnlikeError
+                joined = np.frombuffer(b"".join(data), np.uint8)
+                yield rows[start : start + _BATCH], joined.reshape(-1, length)
+        except sqlite3.Error as error:
+            raise UnlikeError from error
 
-    def _in_one_query(self, rows: Int64, places: Sequence[int]) -> Iterator[tuple[int, bytes]]:
-        """The messages up to the first that is damaged."""
+    def _query(self, rows: Int64, places: Sequence[int]) -> sqlite3.Cursor:
+        """The rows of the table from the first place to the last, of the topics of some messages."""
         query = (
             "SELECT rowid, data FROM messages WHERE rowid BETWEEN ? AND ? "
             "AND topic_id IN (SELECT value FROM json_each(?)) ORDER BY rowid"
         )
         topics = json.dumps(np.unique(self.table.channel[rows]).tolist())
+        return self.database.execute(query, (places[0], places[-1], topics))
+
+    def _in_one_query(self, rows: Int64, places: Sequence[int]) -> Iterator[tuple[int, bytes]]:
+        """The messages up to the first that is damaged."""
         try:
-            found = self.database.execute(query, (places[0], places[-1], topics))
+            found = self._query(rows, places)
             for k, (place, (found_place, data)) in enumerate(zip(places, found, strict=False)):
                 if found_place != place or not isinstance(data, bytes):
                     return

@@ -1,0 +1,108 @@
+"""Pictures read from their bytes are those that are decoded, and are left to the decoder where unusual."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.formats.log_messages import all_samples
+from pipelines.formats.message_decoders import Schema, decoder
+from pipelines.formats.picture_layouts import PictureFields, picture_decoder
+from pipelines.formats.pictures import picture_samples
+from pipelines.formats.recordings import OpenLog
+from pipelines.formats.ros_messages import build
+from pipelines.session.records import PictureSample
+from pipelines.session.registries import LogFormat, recognise
+from tests.synthetic.logs import CONTAINERS, ROS1, ROS2, Container, Entry, write_log
+
+TOPIC = "/pictures"
+COMPRESSED, RAW = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
+START_NS = 1_700_000_000_000_000_000
+
+
+def fields(k: int, **others: Any) -> dict[str, Any]:
+    rng = np.random.default_rng(k)
+    data = rng.integers(0, 256, 24 + k, dtype=np.uint8)
+    data[:3] = (0xFF, 0xD8, 0xFF)
+    return {
+        "header": {"stamp": START_NS + k, "frame_id": "camera"},
+        "format": "JPEG",
+        "height": 3,
+        "width": 2 + k,
+        "encoding": "bgr8",
+        "step": 8,
+        "data": data,
+    } | others
+
+
+def serialized(encoding: str, type_: str, stated: dict[str, Any]) -> bytes:
+    if encoding == "ros1":
+        return bytes(ROS1.serialize_ros1(build(ROS1, type_, stated), type_))
+    return bytes(ROS2.serialize_cdr(build(ROS2, type_, stated), type_))
+
+
+@pytest.mark.parametrize("type_", [COMPRESSED, RAW])
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_the_same_as_decoded(tmp_path: Path, container: Container, type_: str) -> None:
+    # Lengths of names and data go through all remainders of the alignment; the last pictures differ.
+    stated = [
+        fields(k, header={"stamp": START_NS + k, "frame_id": "c" * (k // 2)}, format="x" * (k // 3))
+        for k in range(16)
+    ]
+    stated += [
+        fields(20, encoding="mono8", data=np.arange(9, dtype=np.uint8), format="png") for _ in range(3)
+    ]
+    entries = [Entry(TOPIC, type_, START_NS + 100 * k, each) for k, each in enumerate(stated)]
+    path = write_log(tmp_path, "log", container, entries)
+    with recognise(path, LogFormat, "log").open_log([path]) as log:
+        assert isinstance(log, OpenLog)
+        (topic,) = log.topics
+        (schema,) = log.schemas(topic)
+        values = [message.value for message in log.messages([TOPIC], picture_decoder)]
+        expected = list(all_samples(log.messages([TOPIC]), path))
+        found = list(picture_samples(log, TOPIC, path))
+    assert schema.encoding not in {"cdr", "ros1"} or all(isinstance(v, PictureFields) for v in values)
+    assert len(found) == len(expected) == len(stated)
+    for one, other in zip(found, expected, strict=True):
+        assert isinstance(one, PictureSample)
+        assert isinstance(other, PictureSample)
+        for name in ("stamp_ns", "receive_ns", "encoding", "width", "height", "step"):
+            assert getattr(one, name) == getattr(other, name)
+        np.testing.assert_array_equal(one.data, other.data, strict=True)
+
+
+@pytest.mark.parametrize("type_", [COMPRESSED, RAW])
+@pytest.mark.parametrize("encoding", ["cdr", "ros1"])
+def test_bytes_that_do_not_fit_are_refused_as_by_the_decoder(encoding: str, type_: str) -> None:
+    """Cut anywhere, or with any byte of the first 60 changed: both refuse, or both say the same."""
+    schema = Schema(type_, encoding)
+    whole = serialized(encoding, type_, fields(1))
+    damaged = [whole[:end] for end in range(len(whole))]
+    damaged += [whole + b"\x00" * more for more in (1, 2, 3, 4)]
+    for at in range(60):
+        for value in (0, 1, 0x80, 0xFF):
+            damaged.append(whole[:at] + bytes([value]) + whole[at + 1 :])
+    general = decoder(schema)
+    read = picture_decoder(schema)
+    for data in [whole, *damaged]:
+        assert outcome(read, data, type_) == outcome(general, data, type_)
+
+
+def outcome(decode: Any, data: bytes, type_: str) -> object:
+    try:
+        value = decode(data)
+    except ValueError:
+        return "refused"
+    if isinstance(value, PictureFields):
+        stated = (value.stamp_ns, value.format, value.width, value.height, value.step)
+    else:
+        stamp = value.header.stamp
+        stamp_ns = stamp.sec * 10**9 + stamp.nanosec
+        if type_ == RAW:
+            stated = (stamp_ns, value.encoding, value.width, value.height, value.step)
+        else:
+            stated = (stamp_ns, value.format, None, None, None)
+    return stated, np.asarray(value.data).tobytes()
