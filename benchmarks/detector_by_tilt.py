@@ -2,10 +2,11 @@
 
 python -m benchmarks.detector_by_tilt [--folder FOLDER] [--write]
 
-For every tilt four people walk on level ground while a drone circles each once at 10 m, filming 1280x720
-with a field of view of 80 degrees. The flights go through `mocap simulate`, `ingest` and the detection of
-`reconstruct`, as a user's would. The pictures are rendered; the detector is real. `--write` makes the data
-that simulation takes its detector's errors from.
+For every tilt four people walk on level ground while a drone circles each of them once at 10 m, filming
+1280x720 with a field of view of 80 degrees. The flights go through `mocap simulate`, `ingest` and the
+detection of `reconstruct`, as a user's would. The pictures are rendered; the detector is real. `--write`
+makes the data that simulation takes its detector's errors from, and those that turn its confidences into
+probabilities.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from numpy.typing import NDArray
 
 from pipelines.detect import detect
 from pipelines.ingest import ingest
+from pipelines.keypoints import calibration
+from pipelines.keypoints.calibration import Calibration, fit, write_calibration
 from pipelines.session.skeletons import get_skeleton
 from pipelines.session.stages import locked
 from pipelines.simulate import simulate
@@ -40,10 +43,13 @@ LOOKS = (
     "{sex: male, height_m: 1.84, build: heavy, outfit: dark}",
     "{sex: female, height_m: 1.72, build: average, outfit: bright}",
 )
-SECONDS, RATE_HZ = 8, 10
+SECONDS, RATE_HZ = 12, 10
+COMMAND = "python -m benchmarks.detector_by_tilt --write"
+CALIBRATED = Path(calibration.__file__).parent / "data" / "blazepose_confidence.csv"
 JOINTS = get_skeleton("coco17").joints
 TORSO = (JOINTS.index("left_shoulder"), JOINTS.index("right_hip"))
 PCK = 0.2  # of the torso's length in the picture
+GOOD = 0.05  # of the person's height
 GROSS = 0.1  # of the person's height: beyond that a joint counts as missed
 SOMEBODY_ELSE = 0.5  # of the person's height: a detection further off is not of the actor
 
@@ -63,7 +69,7 @@ def main() -> None:
     """Simulate, detect, compare, print; write the data when asked to."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, help="keep the flights there")
-    parser.add_argument("--write", action="store_true", help=f"write {MEASURED.name}")
+    parser.add_argument("--write", action="store_true", help=f"write {MEASURED.name}, {CALIBRATED.name}")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.folder or Path(temporary)
@@ -72,6 +78,7 @@ def main() -> None:
     print_table(by_tilt)
     if options.write:
         write_table(by_tilt)
+        write_calibration(CALIBRATED, calibrated(by_tilt))
 
 
 def scenario_text(tilt_deg: int, look: int) -> str:
@@ -162,7 +169,7 @@ def write_table(by_tilt: dict[int, list[Sightings]]) -> None:
     lines = [line for line in (__doc__ or "").splitlines() if line and not line.startswith("python")]
     with MEASURED.open("w", encoding="utf-8", newline="") as file:
         file.writelines(f"# {line}\n" for line in lines)
-        file.write("# Made by: python -m benchmarks.detector_by_tilt --write\n")
+        file.write(f"# Made by: {COMMAND}\n")
         file.write(
             "# median_error_share: of the person's height f H / d. missed_share: not found, or further\n"
         )
@@ -172,15 +179,30 @@ def write_table(by_tilt: dict[int, list[Sightings]]) -> None:
         writer.writerows(table_rows(by_tilt))
 
 
-def table_rows(by_tilt: dict[int, list[Sightings]]) -> Iterator[tuple[int, str, str, str, str]]:
+def calibrated(by_tilt: dict[int, list[Sightings]]) -> Calibration:
+    """What a confidence is worth, over all tilts alike."""
+    flights = [flight for own in by_tilt.values() for flight in own]
+    share = np.concatenate([flight.error_px / flight.height_px[:, None] for flight in flights])
+    return fit(
+        np.concatenate([flight.confidence for flight in flights]),
+        share <= GOOD,
+        JOINTS,
+        groups=("eye", "ear", "wrist", "hip", "knee", "ankle"),
+        origin=COMMAND,
+        good=f"within {100 * GOOD:g} % of the person's height in the picture",
+    )
+
+
+def table_rows(by_tilt: dict[int, list[Sightings]]) -> Iterator[tuple[str, ...]]:
     """Rows of the data, joint by joint."""
     for j, joint in [(slice(None), ANY_JOINT), *((slice(k, k + 1), name) for k, name in enumerate(JOINTS))]:
-        for tilt, flights in by_tilt.items():
+        for flights in by_tilt.values():
+            tilt = np.concatenate([f.tilt_deg for f in flights]).mean()  # as flown
             share = np.concatenate([(f.error_px / f.height_px[:, None])[:, j].ravel() for f in flights])
             confidence = np.concatenate([f.confidence[:, j].ravel() for f in flights])
             good = share <= GROSS  # not where it is NaN
             yield (
-                tilt,
+                f"{tilt:.1f}",
                 joint,
                 f"{np.median(share[good]):.4f}",
                 f"{1 - good.mean():.4f}",

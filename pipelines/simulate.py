@@ -25,23 +25,30 @@ from pipelines.formats.ros2_recording import Ros2Recording
 from pipelines.formats.video_writing import Picture, join_videos, write_h264
 from pipelines.geometry.pose_covariance import pose_covariance_in_body
 from pipelines.geometry.poses import conjugate
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.distance_field import distance_field
+from pipelines.planning.pilot import Pilot
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Int64, SkeletalMotion
-from pipelines.session.registries import noise_models
+from pipelines.session.records import Float, Int64, SkeletalMotion
+from pipelines.session.registries import PLANNER_ARMS, noise_models
 from pipelines.session.storage import canonical_json, read_json, sha256_of, write_json
 from pipelines.session.whole_folders import is_made, whole_folder
 from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, fly_scenario, keypoints_of
 from pipelines.simulation.flight_files import Sighting, write_alphapose, write_joints, write_tum
+from pipelines.simulation.flying import Known, Planner
 from pipelines.simulation.manifest_text import manifest_text
 from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.scenario import Scenario, read_scenario
+from pipelines.simulation.world.scene import World
 
 _REVISION = 1
 _MARK = "simulation.json"
 _BLOCK = 60  # pictures that are rendered and encoded together, and kept when the work is interrupted
 _RECEIVED_NS = 2_000_000  # after a message's own stamp, by the recorder on board
 _CAMERA_INFO_NS = 1_000_000_000
+_RING = "ring"
+_LEAST_SIGMA_M = 0.01  # of the actor's estimate, for a filter that cannot take none
 
 
 @dataclass(frozen=True)
@@ -85,11 +92,11 @@ def simulate(
         return Simulated(folder, read_json(folder / _MARK), skipped=True)
     noise = noise_models(f"{scenario_path}: drones.pose_noise", scenario.drones.pose_noise)
     bvh = _bvh(scenario, scenario_path)
-    _refuse_unknown_planner(scenario, scenario_path)
+    planner = _planner(scenario, scenario_path)
 
     with whole_folder(folder, key, mark=_MARK, overwrite=overwrite) as making:
         progress.start("Flying", 3 + scenario.drones.count)
-        flight = fly_scenario(scenario, noise, bvh=bvh)
+        flight = fly_scenario(scenario, noise, bvh=bvh, planner=planner)
         progress.advance()
         _write_truth(making.folder, flight)
         progress.advance()
@@ -133,10 +140,46 @@ def _bvh(scenario: Scenario, path: Path) -> SkeletalMotion | None:
     return read_motion(path.parent / motion.bvh, unit=motion.unit, axes=motion.axes)
 
 
-def _refuse_unknown_planner(scenario: Scenario, path: Path) -> None:
-    planner = scenario.drones.formation.planner
-    if planner != "ring":
-        raise DataError(path, f"drones.formation.planner: no such planner {planner!r}", "there is ring")
+def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | None:
+    """The formation planner that the scenario names; None for the ring."""
+    formation, count = scenario.drones.formation, scenario.drones.count
+    if formation.planner == _RING:
+        return None
+    if formation.planner not in PLANNER_ARMS.names():
+        known = ", ".join([_RING, *PLANNER_ARMS.names()])
+        place = f"{path}: drones.formation.planner"
+        raise DataError(place, f"no such planner {formation.planner!r}", f"there are {known}")
+    arm = PLANNER_ARMS.get(formation.planner)
+    try:
+        config = PlannerConfig(
+            radius_m=formation.radius_m,
+            tilt_deg=formation.tilt_deg,
+            actor_sigma_m=max(scenario.actor.estimate_sigma_m, _LEAST_SIGMA_M),
+            speed_mps=scenario.drones.limits.speed_mps,
+            acceleration_mps2=scenario.drones.limits.acceleration_mps2,
+        )
+    except ValueError as error:
+        raise DataError(f"{path}: drones", str(error), "take ring, or other numbers") from None
+
+    def start(world: World) -> Planner:
+        spec = scenario.world.map
+        field = distance_field(world.occupancy(spec.resolution_m, spec.height_m))
+        pilot = Pilot(arm, config, drones=count, yaw_rad=float(np.radians(formation.yaw_deg)))
+        measured = 0
+
+        def slots(known: Known) -> tuple[Float, Float]:
+            nonlocal measured
+            for t_s, place in zip(known.actor_t_s[measured:], known.actor[measured:], strict=True):
+                pilot.measure(float(t_s), place)
+            measured = len(known.actor_t_s)
+            if not measured:  # nobody knows yet where the actor is: hover
+                return known.position, np.zeros_like(known.position)
+            command = pilot.step(known.t_s, known.position, known.velocity, field)
+            return command.position, command.velocity
+
+        return slots
+
+    return start
 
 
 # --- logs and truth ------------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ Moving = Callable[[Float], BodyMotion]
 LEAD_S = 0.2
 """How long logs run, and the actor moves, before the first picture and after the last."""
 
-_PLANNER_HZ = 10.0
+_PLANNER_HZ = 50.0  # how often a planner is asked; it replans as often as it likes
 _WAY_S = 0.25  # between the points of the actor's way that the wood keeps clear of
 # What chance decides, each with numbers of its own: changing one thing leaves the others as they were.
 _FRAMES, _LOG, _NOISE, _ACTOR, _KEYPOINTS = range(5)
@@ -81,7 +81,7 @@ def fly_scenario(
     noise: Sequence[NoiseModel],
     *,
     bvh: SkeletalMotion | None = None,
-    planner: Callable[[World, Float], Planner] | None = None,
+    planner: Callable[[World], Planner] | None = None,
 ) -> SimulatedFlight:
     """Let the actor move, the drones fly, and the recorders run.
 
@@ -89,8 +89,8 @@ def fly_scenario(
         scenario: who, where and how.
         noise: the errors of the logged poses.
         bvh: the motion that the scenario names, if it names one.
-        planner: makes a planner for a world and the drones' start [N, 3]; drones fly on a ring that
-            heeds nothing without one, about where the actor truly is.
+        planner: makes a planner for a world; without one drones fly on a ring about where the actor
+            truly is, whatever stands in the way.
 
     Raises:
         DataError: the world cannot be built, or the motion is not that of a person.
@@ -197,7 +197,7 @@ def _paths(
     actor_s: Float,
     actor: Float,
     world: World,
-    planner: Callable[[World, Float], Planner] | None,
+    planner: Callable[[World], Planner] | None,
 ) -> DronePaths:
     drones = scenario.drones
     slots = ring_slots(drones.formation, drones.count, hip, t_s)
@@ -205,7 +205,7 @@ def _paths(
         return fly(slots, hip, t_s, drones.limits)
     start = slots[:, 0]
     return fly_with(
-        planner(world, start),
+        planner(world),
         start,
         hip,
         t_s,
