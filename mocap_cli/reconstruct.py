@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -27,11 +27,12 @@ if TYPE_CHECKING:
 @session_argument
 @click.option(
     "--method",
-    type=click.Choice(["dlt", "midpoint", "robust"]),
+    type=click.Choice(["dlt", "midpoint", "robust", "refined"]),
     default="robust",
     show_default=True,
     help="dlt: linear triangulation; midpoint: the point closest to the rays; robust: outlier views"
-    " rejected, then least squares on the reprojection.",
+    " rejected, then least squares on the reprojection; refined: robust, then skeleton, camera poses and"
+    " clocks estimated together.",
 )
 @click.option(
     "--rate",
@@ -87,7 +88,7 @@ if TYPE_CHECKING:
 @verbosity_options
 def reconstruct_command(
     session: Path,
-    method: Method,
+    method: Method | Literal["refined"],
     rate: float | None,
     persons: int,
     min_confidence: float,

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +26,23 @@ from pipelines.geometry.triangulation import (
     triangulate,
 )
 from pipelines.keypoints.association import Association, associate
-from pipelines.reconstruction.loading import load_actor, load_cameras, load_truth
-from pipelines.reconstruction.observations import Camera, Observations, candidates, observe, time_base
+from pipelines.reconstruction.loading import (
+    load_actor,
+    load_cameras,
+    load_clock_sigma,
+    load_pose_errors,
+    load_truth,
+)
+from pipelines.reconstruction.observations import (
+    Camera,
+    Candidates,
+    Observations,
+    candidates,
+    observe,
+    time_base,
+)
 from pipelines.reconstruction.quality import assess
+from pipelines.reconstruction.refining import RefinedFlight, refine_flight
 from pipelines.reconstruction.reweighting import triangulate_heavy_tailed
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
@@ -36,12 +50,12 @@ from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Float, Int64
 from pipelines.session.stages import Stage, StageRecord, locked
 from pipelines.session.storage import jsonable, read_json, write_json
-from pipelines.session.tables import SKELETON, write_table
+from pipelines.session.tables import CAMERA_POSES, SKELETON, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
 
-RECONSTRUCT = Stage("reconstruct", revision=1)
+RECONSTRUCT = Stage("reconstruct", revision=2)
 
 _UNKNOWN_SIGMA = (0.3, np.radians(1.0))
 """Camera pose noise (m, rad) taken for telling people apart where nobody states it: METHODS' medium level."""
@@ -51,7 +65,7 @@ _UNKNOWN_SIGMA = (0.3, np.radians(1.0))
 class Settings:
     """What decides the result, next to the session itself."""
 
-    method: Method = "robust"
+    method: Method | Literal["refined"] = "robust"
     rate_hz: float | None = None
     people: int = 1
     min_confidence: float = 0.3
@@ -113,7 +127,7 @@ def reconstruct(
             return Reconstructed(folder, run.record, metrics, skipped=True)
 
         description = read_description(folder)
-        progress.start("Reconstructing", 4)
+        progress.start("Reconstructing", 5)
         cameras, warnings = load_cameras(
             folder,
             description,
@@ -122,12 +136,21 @@ def reconstruct(
             pose_noise=settings.pose_noise,
         )
         progress.advance()
-        observations, association, seen = _observe(folder, cameras, description, settings)
+        found, observations, association, seen = _observe(folder, cameras, description, settings)
         progress.advance()
         views = _views(cameras, observations, settings, workers)
         solve = _solver(cameras, observations, settings, workers)
         result = _refused_people(solve(views), observations, seen)
         _refuse_nothing(folder, views, result, association)
+        progress.advance()
+        refined = None
+        if settings.method == "refined":
+            refined = _refine(
+                cameras, found, association, observations, views, result, description, settings, workers
+            )
+            observations, views = refined.observations, refined.views
+            result = _refused_people(refined.result, observations, seen)
+            warnings = [*warnings, *refined.warnings]
         progress.advance()
         metrics = jsonable(
             assess(
@@ -139,8 +162,11 @@ def reconstruct(
                 truth=load_truth(folder, description, observations.joints, observations.t_ns),
                 solve=solve,
             )
+            | (refined.metrics if refined else {})
         )
         write_table(run.folder / "skeleton.parquet", _skeleton_table(observations, result), SKELETON)
+        if refined is not None and refined.cameras is not None:
+            write_table(run.folder / "cameras.parquet", refined.cameras, CAMERA_POSES)
         write_json(run.folder / "metrics.json", metrics)
         record = run.publish(
             counts={**metrics["status_counts"], "association": _association_counts(association)},
@@ -157,11 +183,10 @@ def reconstruct(
 
 def _observe(
     folder: Path, cameras: list[Camera], description: Description, settings: Settings
-) -> tuple[Observations, Association, NDArray[np.bool_]]:
-    """What the cameras saw of each person, how people were told apart, and when [T] anybody was seen."""
-    max_gap_ns = round(description.pose_interpolation.max_gap_s * 1e9)
-    max_extrapolation_ns = round(description.pose_interpolation.max_extrapolation_s * 1e9)
-    found = candidates(cameras, max_gap_ns=max_gap_ns, max_extrapolation_ns=max_extrapolation_ns)
+) -> tuple[Candidates, Observations, Association, NDArray[np.bool_]]:
+    """All that was seen, what of each person, how people were told apart, when [T] anybody was seen."""
+    limits = _pose_limits(description)
+    found = candidates(cameras, **limits)
     association = associate(
         (found.t_ns - found.t_ns[0]) / 1e9,
         found.xy,
@@ -177,12 +202,46 @@ def _observe(
         found,
         association.choice,
         time_base(cameras, settings.rate_hz),
-        max_gap_ns=max_gap_ns,
-        max_extrapolation_ns=max_extrapolation_ns,
+        **limits,
     )
     nearest = np.clip(np.searchsorted(found.t_ns, observations.t_ns), 0, len(found.t_ns) - 1)
     seen = np.asarray((found.confidence > 0).any(axis=(1, 2, 3)), dtype=np.bool_)[nearest]
-    return observations, association, seen
+    return found, observations, association, seen
+
+
+def _pose_limits(description: Description) -> dict[str, int]:
+    """How far poses are trusted between and beyond the stamps of their log, ns."""
+    stated = description.pose_interpolation
+    return {
+        "max_gap_ns": round(stated.max_gap_s * 1e9),
+        "max_extrapolation_ns": round(stated.max_extrapolation_s * 1e9),
+    }
+
+
+def _refine(
+    cameras: list[Camera],
+    found: Candidates,
+    association: Association,
+    observations: Observations,
+    views: Views,
+    result: Triangulation,
+    description: Description,
+    settings: Settings,
+    workers: int,
+) -> RefinedFlight:
+    return refine_flight(
+        cameras,
+        found,
+        association.choice,
+        observations,
+        views,
+        result,
+        prior=load_pose_errors(description, cameras, settings.pose_noise),
+        clock_sigma_s=load_clock_sigma(description, cameras),
+        pixel_sigma=settings.pixel_sigma,
+        threads=workers,
+        **_pose_limits(description),
+    )
 
 
 def _ray_sigma(cameras: list[Camera], t_ns: Int64, position: Float, settings: Settings) -> Float:
@@ -235,7 +294,8 @@ def _solver(
     calibrated = observations.pose_sigma is None and all(camera.static for camera in cameras)
     if settings.method == "robust" and calibrated:
         return partial(triangulate_heavy_tailed, threads=workers)
-    return partial(triangulate, method=settings.method, threads=workers)
+    method = "robust" if settings.method == "refined" else settings.method
+    return partial(triangulate, method=method, threads=workers)
 
 
 def _refused_people(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 from pipelines.geometry.noise import sum_sigma
 from pipelines.geometry.poses import interpolate_points, rates
 from pipelines.reconstruction.observations import Camera
+from pipelines.reconstruction.refinement.problem import PoseErrors, pose_errors
 from pipelines.session.description import CameraEntry, Description
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Int64, Trajectory
@@ -140,6 +141,37 @@ def _stated_sigma(
     elapsed_s = (trajectory.t_ns - trajectory.t_ns[0]) / 1e9
     return sum_sigma(
         models, elapsed_s, *rates(trajectory.t_ns, trajectory.position, trajectory.quaternion_xyzw)
+    )
+
+
+def load_pose_errors(
+    description: Description, cameras: Sequence[Camera], pose_noise: str | None
+) -> list[PoseErrors] | None:
+    """What is known of each camera's pose errors over time; None where nobody stated it for all that move.
+
+    A logged covariance says how large errors are, not how long they last: it is no such statement. A still
+    camera of which nothing is said was calibrated, and counts as exact beside others that are stated.
+    """
+    stated: list[PoseErrors | None] = []
+    for camera in cameras:
+        entry = description.cameras[camera.name]
+        if pose_noise:
+            stated.append(pose_errors(parsed_noise_models("--pose-noise", pose_noise)))
+        elif entry.pose_noise:
+            stated.append(pose_errors(noise_models(f"pose_noise of {camera.name}", entry.pose_noise)))
+        else:
+            stated.append(PoseErrors((0.0, 0.0), ()) if camera.static else None)
+    known = [errors for errors in stated if errors is not None]
+    return known if len(known) == len(stated) else None
+
+
+def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> Float:
+    """How far each camera's clock may be off [C] in s; the reference camera's is held."""
+    held = description.clock_reference
+    if held not in {camera.name for camera in cameras}:
+        held = cameras[0].name
+    return np.array(
+        [0.0 if camera.name == held else description.cameras[camera.name].clock.sigma_s for camera in cameras]
     )
 
 

@@ -172,7 +172,7 @@ def observe(
     """
     views, weights, poses, sigmas = [], [], [], []
     for c, camera in enumerate(cameras):
-        xy, confidence = _of_people(camera, found, c, choice[:, c])
+        xy, confidence = sightings_of(camera, found, c, choice[:, c])
         views.append(_at(camera, xy, t_ns))
         weights.append(_at(camera, confidence, t_ns))
         poses.append(camera.poses_at(t_ns, max_gap_ns=max_gap_ns, max_extrapolation_ns=max_extrapolation_ns))
@@ -226,8 +226,8 @@ def _nearest_frame(frame_t_ns: Int64, t_ns: Int64) -> Int64:
     return np.where(np.abs(frame_t_ns[nearest] - t_ns) <= period, nearest, -1)
 
 
-def _of_people(camera: Camera, found: Candidates, c: int, choice: Int64) -> tuple[Float, Float]:
-    """Rays [F, P, J, 2] and confidence [F, P, J] of each person in the camera's own frames.
+def sightings_of(camera: Camera, found: Candidates, c: int, choice: Int64) -> tuple[Float, Float]:
+    """Rays [F, P, J, 2] and confidence [F, P, J] of each person in the camera's own frames, NaN where unseen.
 
     A frame of a slow camera stands at several times of the timeline: the time nearest to it decides.
     """

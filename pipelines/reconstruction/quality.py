@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.metrics import JointErrors, measure, measure_shape
-from pipelines.geometry.triangulation import STATUS, Method, Triangulation, Views
+from pipelines.geometry.triangulation import STATUS, Triangulation, Views
 from pipelines.reconstruction.observations import Observations
 from pipelines.reconstruction.reweighting import reprojection_px
 from pipelines.session.records import Float
@@ -32,7 +32,7 @@ def assess(
     result: Triangulation,
     *,
     cameras: Sequence[str],
-    method: Method,
+    method: str,
     truth: Float | None,
     solve: Callable[[Views], Triangulation],
 ) -> dict[str, Any]:

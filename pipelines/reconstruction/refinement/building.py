@@ -1,0 +1,109 @@
+"""From what every camera saw at its own times to a problem over the skeleton's times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.reconstruction.refinement.problem import Pictures, Problem
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+KNOT_S = 0.5
+"""Distance of the knots between which slow pose errors are linear; what strays between is white."""
+
+_NEAR = (
+    0.75  # steps of the skeleton: a picture further from its nearest time says nothing of the motion there
+)
+_GAP = 3.5  # usual steps: three times further apart than this cannot be interpolated between
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What one camera saw in its F pictures, and where its log says that it was."""
+
+    t_s: Float  # [F] strictly increasing, on the skeleton's clock
+    xy: Float  # [F, J, 2] normalised, undistorted; NaN where nothing was seen
+    confidence: Float  # [F, J]
+    position: Float  # [F, 3] m, logged world_from_camera; NaN without a pose
+    rotation: Float  # [F, 3, 3]
+    focal_px: float
+    pixel_sigma: float  # px per axis of a view of confidence 1
+
+    @property
+    def range_of(self) -> Bool:
+        """Which pictures [F] have a pose and a keypoint."""
+        return ~np.isnan(self.position[:, 0]) & ~np.isnan(self.xy[..., 0]).all(axis=1)
+
+
+def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64) -> Problem:
+    """Sort all pictures by the skeleton's times around them; those near none of them are left out.
+
+    Args:
+        t_s: [T] strictly increasing times of the skeleton, at least three.
+        sightings: what each camera saw.
+        bones: [B, 2] joints whose distance hardly changes.
+    """
+    parts = [_pictures(t_s, sighting, camera) for camera, sighting in enumerate(sightings)]
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    order = np.lexsort((columns[2], columns[1], columns[0]))
+    pictures = Pictures(*(np.ascontiguousarray(column[order]) for column in columns))
+    knots = max(int(np.ceil((t_s[-1] - t_s[0]) / KNOT_S)) + 1, 2)
+    return Problem(t_s, pictures, bones, np.linspace(t_s[0], t_s[-1], knots))
+
+
+def _pictures(t_s: Float, sighting: Sighting, camera: int) -> tuple[NDArray[np.generic], ...]:
+    step = float(np.median(np.diff(t_s)))
+    first, near = _first_of_three(t_s, sighting.t_s, step)
+    (kept,) = np.nonzero(near & sighting.range_of)
+    speed, turn = _rates(sighting)
+    seen = ~np.isnan(sighting.xy[kept, :, 0]) & (sighting.confidence[kept] > 0)
+    sharpness = np.where(seen, sighting.confidence[kept], 0.0) * sighting.focal_px / sighting.pixel_sigma
+    xy = np.where(seen[..., None], sighting.xy[kept], np.nan)
+    return (
+        first[kept],
+        np.full(len(kept), camera, dtype=np.int64),
+        sighting.t_s[kept],
+        xy,
+        sharpness,
+        seen.astype(np.float64),
+        sighting.position[kept],
+        sighting.rotation[kept],
+        speed[kept],
+        turn[kept],
+    )
+
+
+def _first_of_three(t_s: Float, at_s: Float, step: float) -> tuple[Int64, Bool]:
+    """The first of three consecutive times of the skeleton around each asked one, and whether there are."""
+    after = np.clip(np.searchsorted(t_s, at_s), 1, len(t_s) - 1)
+    nearest = np.where(at_s - t_s[after - 1] <= t_s[after] - at_s, after - 1, after)
+    span = np.full(len(t_s) + 2, np.inf)  # of the three times that begin at index - 2
+    span[2:-2] = t_s[2:] - t_s[:-2]
+    choices = np.stack([nearest - 1, nearest - 2, nearest], axis=1)
+    fits = span[np.clip(choices, -2, len(t_s) - 1) + 2] < _GAP * step
+    first = np.take_along_axis(choices, fits.argmax(axis=1)[:, None], axis=1)[:, 0]
+    near = fits.any(axis=1) & (np.abs(t_s[nearest] - at_s) <= _NEAR * step)
+    return first.astype(np.int64), near
+
+
+def _rates(sighting: Sighting) -> tuple[Float, Float]:
+    """Speed [F, 3] in the world and turn rate [F, 3] in the camera, over three pictures; 0 where unknown."""
+    count = len(sighting.t_s)
+    speed, turn = np.zeros((count, 3)), np.zeros((count, 3))
+    if count < 3:
+        return speed, turn
+    elapsed_s = (sighting.t_s[2:] - sighting.t_s[:-2])[:, None]
+    speed[1:-1] = (sighting.position[2:] - sighting.position[:-2]) / elapsed_s
+    turned = np.einsum("tji,tjk->tik", sighting.rotation[:-2], sighting.rotation[2:])
+    antisymmetric = (turned - np.swapaxes(turned, 1, 2)) / 2
+    turn[1:-1] = (
+        np.stack([antisymmetric[:, 2, 1], antisymmetric[:, 0, 2], antisymmetric[:, 1, 0]], 1) / elapsed_s
+    )
+    speed[[0, -1]], turn[[0, -1]] = speed[[1, -2]], turn[[1, -2]]
+    return np.nan_to_num(speed), np.nan_to_num(turn)

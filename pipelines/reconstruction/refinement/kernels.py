@@ -1,0 +1,803 @@
+"""What one camera's picture says of joints and cameras: residuals, their derivatives, normal equations.
+
+A joint X appears in a camera at y = exp(r) R' (X - p + s) + b, where (p, R) is the logged
+world_from_camera, s a shift in the world (m), r a rotation vector in the camera (rad) and b a shift in
+the camera (m): the inverse of how `geometry.noise` disturbs a pose. The ten numbers of a picture are s, r, b
+and its camera's clock offset; a white error adds to s and r and is eliminated picture by picture.
+Interpolation is quadratic over three times of the skeleton.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.compilation import cached, helper
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+NUMBERS = 10  # of a picture: shift in the world, rotation, shift in the camera, clock
+WHITE = 6  # the first of them have a white part
+_NEAREST_M = 0.1  # a joint nearer to the camera's plane says nothing
+
+
+@helper
+def exponential(rotation_vector: Float, rotation: Float, jacobian: Float) -> None:
+    """exp(r) [3, 3] and its left Jacobian: exp(r + dr) = exp(J dr) exp(r) (Barfoot 2017, 7.77 and 7.85)."""
+    x, y, z = rotation_vector
+    angle2 = x * x + y * y + z * z
+    if angle2 < 1e-8:
+        a, b, c = 1.0 - angle2 / 6, 0.5 - angle2 / 24, 1.0 / 6 - angle2 / 120
+    else:
+        angle = np.sqrt(angle2)
+        a = np.sin(angle) / angle
+        b = (1.0 - np.cos(angle)) / angle2
+        c = (1.0 - a) / angle2
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    for i in range(3):
+        for j in range(3):
+            square = 0.0
+            for k in range(3):
+                square += cross[i, k] * cross[k, j]
+            one = 1.0 if i == j else 0.0
+            rotation[i, j] = one + a * cross[i, j] + b * square
+            jacobian[i, j] = one + b * cross[i, j] + c * square
+
+
+@helper
+def weights_between(t0: float, t1: float, t2: float, t: float, weight: Float, slope: Float) -> None:
+    """Lagrange's quadratic through three times: weights of the values, and of the derivative, at t."""
+    weight[0] = (t - t1) * (t - t2) / ((t0 - t1) * (t0 - t2))
+    weight[1] = (t - t0) * (t - t2) / ((t1 - t0) * (t1 - t2))
+    weight[2] = (t - t0) * (t - t1) / ((t2 - t0) * (t2 - t1))
+    slope[0] = (2 * t - t1 - t2) / ((t0 - t1) * (t0 - t2))
+    slope[1] = (2 * t - t0 - t2) / ((t1 - t0) * (t1 - t2))
+    slope[2] = (2 * t - t0 - t1) / ((t2 - t0) * (t2 - t1))
+
+
+@helper
+def linearise(
+    joints: Float,
+    velocity: Float,
+    number: Float,
+    xy: Float,
+    sharpness: Float,
+    position: Float,
+    rotation: Float,
+    speed: Float,
+    turn: Float,
+    residual: Float,
+    by_joint: Float,
+    by_number: Float,
+) -> None:
+    """Whitened residuals of a picture, and their derivatives.
+
+    Args:
+        joints: [J, 3] m, world, at the picture's time.
+        velocity: [J, 3] m/s.
+        number: [10] the picture's corrections, see the module.
+        xy: [J, 2] normalised image points, NaN where nothing was seen.
+        sharpness: [J] 1 / standard deviation of an image point.
+        position: [3] m, the logged pose at the uncorrected time.
+        rotation: [3, 3] world_from_camera.
+        speed: [3] m/s of the camera in the world.
+        turn: [3] rad/s of the camera, in its own frame.
+        residual: [J, 2] out; NaN for joints that are not seen or behind the camera.
+        by_joint: [J, 2, 3] out.
+        by_number: [J, 2, 10] out.
+    """
+    turned, left, shutter, unused = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    exponential(number[3:6], turned, left)
+    exponential(-number[9] * turn, shutter, unused)
+    seen, before, by_rotation, by_clock = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
+    camera_from_world, corrected_from_world = np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for k in range(3):
+                total += shutter[i, k] * rotation[j, k]
+            camera_from_world[i, j] = total
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for k in range(3):
+                total += turned[i, k] * camera_from_world[k, j]
+            corrected_from_world[i, j] = total
+    for joint in range(len(joints)):
+        residual[joint] = np.nan
+        if np.isnan(xy[joint, 0]):
+            continue
+        for i in range(3):
+            before[i] = 0.0
+            for k in range(3):
+                away = joints[joint, k] - position[k] - speed[k] * number[9] + number[k]
+                before[i] += camera_from_world[i, k] * away
+        for i in range(3):
+            seen[i] = 0.0
+            for k in range(3):
+                seen[i] += turned[i, k] * before[k]
+        # d exp(r) v = -hat(exp(r) v) J dr
+        for j in range(3):
+            by_rotation[0, j] = left[1, j] * seen[2] - left[2, j] * seen[1]
+            by_rotation[1, j] = left[2, j] * seen[0] - left[0, j] * seen[2]
+            by_rotation[2, j] = left[0, j] * seen[1] - left[1, j] * seen[0]
+        swung0 = before[1] * turn[2] - before[2] * turn[1]
+        swung1 = before[2] * turn[0] - before[0] * turn[2]
+        swung2 = before[0] * turn[1] - before[1] * turn[0]
+        for i in range(3):
+            by_clock[i] = turned[i, 0] * swung0 + turned[i, 1] * swung1 + turned[i, 2] * swung2
+            for k in range(3):
+                by_clock[i] += corrected_from_world[i, k] * (velocity[joint, k] - speed[k])
+        for i in range(3):
+            seen[i] += number[6 + i]
+        if seen[2] < _NEAREST_M:
+            continue
+        scale = sharpness[joint] / seen[2]
+        for axis in range(2):
+            slant = seen[axis] / seen[2]
+            residual[joint, axis] = sharpness[joint] * (slant - xy[joint, axis])
+            for j in range(3):
+                gradient = corrected_from_world[axis, j] - slant * corrected_from_world[2, j]
+                by_joint[joint, axis, j] = scale * gradient
+                by_number[joint, axis, j] = scale * gradient
+                by_number[joint, axis, 3 + j] = scale * (by_rotation[axis, j] - slant * by_rotation[2, j])
+                by_number[joint, axis, 6 + j] = 0.0
+            by_number[joint, axis, 6 + axis] = scale
+            by_number[joint, axis, 8] = -scale * slant
+            by_number[joint, axis, 9] = scale * (by_clock[axis] - slant * by_clock[2])
+
+
+@helper
+def confidence_of(squared: float, bound2: float) -> float:
+    """Weight of a view by its whitened squared residual: full within the bound, redescending beyond.
+
+    The loss that it belongs to stays below bound2: what lies far out pulls at nothing.
+    """
+    if not squared > bound2:
+        return 1.0
+    return (bound2 / squared) ** 2
+
+
+@helper
+def loss_of(squared: float, bound2: float) -> float:
+    """The loss whose weights `confidence_of` gives: r^2 within the bound, 2 b - b^2 / r^2 beyond."""
+    if not squared > bound2:
+        return squared
+    return 2 * bound2 - bound2 * bound2 / squared
+
+
+@helper
+def normal_equations(
+    residual: Float,
+    by_joint: Float,
+    by_number: Float,
+    trust: Float,
+    of_joints: Float,
+    across: Float,
+    of_numbers: Float,
+    joint_gradient: Float,
+    number_gradient: Float,
+) -> None:
+    """Sums of squares of a picture: [J, 3, 3], [J, 3, 10], [10, 10] and gradients [J, 3], [10]."""
+    of_joints[:] = 0.0
+    across[:] = 0.0
+    of_numbers[:] = 0.0
+    joint_gradient[:] = 0.0
+    number_gradient[:] = 0.0
+    for joint in range(len(residual)):
+        weight = trust[joint]
+        if weight == 0.0 or np.isnan(residual[joint, 0]):
+            continue
+        for axis in range(2):
+            r = weight * residual[joint, axis]
+            for a in range(NUMBERS):
+                weighted = weight * by_number[joint, axis, a]
+                number_gradient[a] += by_number[joint, axis, a] * r
+                for b in range(a + 1):
+                    of_numbers[a, b] += weighted * by_number[joint, axis, b]
+                for i in range(3):
+                    across[joint, i, a] += by_joint[joint, axis, i] * weighted
+            for i in range(3):
+                joint_gradient[joint, i] += by_joint[joint, axis, i] * r
+                for j in range(3):
+                    of_joints[joint, i, j] += weight * by_joint[joint, axis, i] * by_joint[joint, axis, j]
+    for a in range(NUMBERS):
+        for b in range(a):
+            of_numbers[b, a] = of_numbers[a, b]
+
+
+@helper
+def factorise(matrix: Float) -> None:
+    """Lower Cholesky factor of a small matrix, in its place."""
+    n = len(matrix)
+    for j in range(n):
+        for i in range(j, n):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            if i == j:
+                matrix[j, j] = np.sqrt(total)
+            else:
+                matrix[i, j] = total / matrix[j, j]
+
+
+@helper
+def forward(factor: Float, vector: Float) -> None:
+    """L^-1 v in the place of v."""
+    for i in range(len(vector)):
+        for k in range(i):
+            vector[i] -= factor[i, k] * vector[k]
+        vector[i] /= factor[i, i]
+
+
+@helper
+def backward(factor: Float, vector: Float) -> None:
+    """L^-T v in the place of v."""
+    for i in range(len(vector) - 1, -1, -1):
+        for k in range(i + 1, len(vector)):
+            vector[i] -= factor[k, i] * vector[k]
+        vector[i] /= factor[i, i]
+
+
+@helper
+def at_picture(
+    first: int, t_s: Float, when: float, position: Float, weight: Float, slope: Float, out: Float, rate: Float
+) -> None:
+    """Joints and their velocities [J, 3] at a picture's time, from three times of the skeleton on `first`."""
+    weights_between(t_s[first], t_s[first + 1], t_s[first + 2], when, weight, slope)
+    for joint in range(len(out)):
+        for i in range(3):
+            out[joint, i] = 0.0
+            rate[joint, i] = 0.0
+            for k in range(3):
+                out[joint, i] += weight[k] * position[first + k, joint, i]
+                rate[joint, i] += slope[k] * position[first + k, joint, i]
+
+
+@helper
+def numbers_of(
+    camera: int,
+    fraction: float,
+    interval: int,
+    entry_start: Int64,
+    entry_number: Int64,
+    entry_knot: Int64,
+    entry_column: Int64,
+    knots: Float,
+    shared: Float,
+    white: Float,
+    out: Float,
+) -> None:
+    """The ten numbers of a picture out of the unknowns they are made of."""
+    out[:] = 0.0
+    for e in range(entry_start[camera], entry_start[camera + 1]):
+        column = entry_column[e]
+        if entry_knot[e]:
+            value = (1 - fraction) * knots[interval, column] + fraction * knots[interval + 1, column]
+        else:
+            value = shared[column]
+        out[entry_number[e]] += value
+    for i in range(WHITE):
+        out[i] += white[i]
+
+
+@cached
+def assemble(
+    first_picture: int,
+    last_picture: int,
+    first: int,
+    t_s: Float,
+    position: Float,
+    knots: Float,
+    shared: Float,
+    white: Float,
+    camera: Int64,
+    when: Float,
+    fraction: Float,
+    interval: int,
+    xy: Float,
+    sharpness: Float,
+    pose_position: Float,
+    pose_rotation: Float,
+    speed: Float,
+    turn: Float,
+    trust: Float,
+    bound2: float,
+    white_precision: Float,
+    entry_start: Int64,
+    entry_number: Int64,
+    entry_knot: Int64,
+    entry_column: Int64,
+    clock_column: Int64,
+    knot_count: int,
+    front: Float,
+    gradient: Float,
+) -> None:
+    """Add the pictures whose three times begin at `first` to the front.
+
+    The front's unknowns are the joints at three times, the knots on both sides of the interval, what all
+    share; only its lower triangle is kept. A `white_precision` [C, 6] of inf means no white part.
+    """
+    J = position.shape[1]
+    n = 3 * J
+    out, rate = np.empty((J, 3)), np.empty((J, 3))
+    weight, slope, number = np.empty(3), np.empty(3), np.empty(NUMBERS)
+    residual, by_joint, by_number = np.empty((J, 2)), np.zeros((J, 2, 3)), np.zeros((J, 2, NUMBERS))
+    of_joints, across = np.empty((J, 3, 3)), np.empty((J, 3, NUMBERS))
+    of_numbers = np.empty((NUMBERS, NUMBERS))
+    joint_gradient, number_gradient = np.empty((J, 3)), np.empty(NUMBERS)
+    believed = np.empty(J)
+    factor, by_white, z = np.empty((WHITE, WHITE)), np.empty((n + NUMBERS, WHITE)), np.empty(WHITE)
+    most = 2 * (entry_column.size + 1)
+    column, of_number, share = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
+    for g in range(first_picture, last_picture):
+        c = camera[g]
+        moved = when[g] + (shared[clock_column[c]] if clock_column[c] >= 0 else 0.0)
+        at_picture(first, t_s, moved, position, weight, slope, out, rate)
+        numbers_of(
+            c, fraction[g], interval, entry_start, entry_number, entry_knot, entry_column, knots, shared,
+            white[g], number,
+        )  # fmt: skip
+        linearise(
+            out, rate, number, xy[g], sharpness[g], pose_position[g], pose_rotation[g], speed[g], turn[g],
+            residual, by_joint, by_number,
+        )  # fmt: skip
+        for joint in range(J):
+            squared = residual[joint, 0] ** 2 + residual[joint, 1] ** 2
+            believed[joint] = trust[g, joint] * confidence_of(squared, bound2)
+        normal_equations(
+            residual, by_joint, by_number, believed, of_joints, across, of_numbers, joint_gradient,
+            number_gradient,
+        )  # fmt: skip
+        eliminated = np.isfinite(white_precision[c, 0])
+        if eliminated:
+            for a in range(WHITE):
+                for b in range(WHITE):
+                    factor[a, b] = of_numbers[a, b]
+                factor[a, a] += white_precision[c, a]
+                z[a] = number_gradient[a] + white_precision[c, a] * white[g, a]
+            factorise(factor)
+            forward(factor, z)
+            for joint in range(J):
+                for i in range(3):
+                    row = by_white[3 * joint + i]
+                    row[:] = across[joint, i, :WHITE]
+                    forward(factor, row)
+            for a in range(NUMBERS):
+                row = by_white[n + a]
+                row[:] = of_numbers[a, :WHITE]
+                forward(factor, row)
+        else:
+            by_white[:] = 0.0
+            z[:] = 0.0
+
+        entries = 0
+        for e in range(entry_start[c], entry_start[c + 1]):
+            if entry_knot[e]:
+                column[entries] = 3 * n + entry_column[e]
+                of_number[entries] = entry_number[e]
+                share[entries] = 1 - fraction[g]
+                entries += 1
+                column[entries] = 3 * n + knot_count + entry_column[e]
+                of_number[entries] = entry_number[e]
+                share[entries] = fraction[g]
+            else:
+                column[entries] = 3 * n + 2 * knot_count + entry_column[e]
+                of_number[entries] = entry_number[e]
+                share[entries] = 1.0
+            entries += 1
+
+        for k in range(3):
+            if weight[k] == 0.0:
+                continue
+            for m in range(k + 1):
+                both = weight[k] * weight[m]
+                if both == 0.0:
+                    continue
+                for joint in range(J):
+                    for i in range(3):
+                        for j in range(3):
+                            front[k * n + 3 * joint + i, m * n + 3 * joint + j] += (
+                                both * of_joints[joint, i, j]
+                            )
+                if eliminated:
+                    for q in range(n):
+                        for p in range(q if k == m else 0, n):
+                            total = 0.0
+                            for a in range(WHITE):
+                                total += by_white[p, a] * by_white[q, a]
+                            front[k * n + p, m * n + q] -= both * total
+            for p in range(n):
+                down = joint_gradient[p // 3, p % 3]
+                for a in range(WHITE):
+                    down -= by_white[p, a] * z[a]
+                gradient[k * n + p] += weight[k] * down
+            for e in range(entries):
+                a = of_number[e]
+                for p in range(n):
+                    total = across[p // 3, p % 3, a]
+                    for i in range(WHITE):
+                        total -= by_white[p, i] * by_white[n + a, i]
+                    front[column[e], k * n + p] += weight[k] * share[e] * total
+        for e in range(entries):
+            a = of_number[e]
+            down = number_gradient[a]
+            for i in range(WHITE):
+                down -= by_white[n + a, i] * z[i]
+            gradient[column[e]] += share[e] * down
+            for f in range(entries):
+                if column[f] <= column[e]:
+                    b = of_number[f]
+                    total = of_numbers[a, b]
+                    for i in range(WHITE):
+                        total -= by_white[n + a, i] * by_white[n + b, i]
+                    front[column[e], column[f]] += share[e] * share[f] * total
+
+
+@cached
+def whiten(
+    t_s: Float,
+    position: Float,
+    knots: Float,
+    shared: Float,
+    white: Float,
+    step_position: Float,
+    step_knots: Float,
+    step_shared: Float,
+    first: Int64,
+    camera: Int64,
+    when: Float,
+    fraction: Float,
+    interval: Int64,
+    xy: Float,
+    sharpness: Float,
+    pose_position: Float,
+    pose_rotation: Float,
+    speed: Float,
+    turn: Float,
+    trust: Float,
+    bound2: float,
+    white_precision: Float,
+    entry_start: Int64,
+    entry_number: Int64,
+    entry_knot: Int64,
+    entry_column: Int64,
+    clock_column: Int64,
+    step_white: Float,
+) -> None:
+    """The step of every picture's white error [G, 6] that belongs to a step of everything else."""
+    J = position.shape[1]
+    out, rate, moved_by, unused = np.empty((J, 3)), np.empty((J, 3)), np.empty((J, 3)), np.empty((J, 3))
+    weight, slope, number, numbers_by = np.empty(3), np.empty(3), np.empty(NUMBERS), np.empty(NUMBERS)
+    residual, by_joint, by_number = np.empty((J, 2)), np.zeros((J, 2, 3)), np.zeros((J, 2, NUMBERS))
+    factor, z, nothing = np.empty((WHITE, WHITE)), np.empty(WHITE), np.zeros(WHITE)
+    for g in range(len(camera)):
+        c = camera[g]
+        step_white[g] = 0.0
+        if not np.isfinite(white_precision[c, 0]):
+            continue
+        moved = when[g] + (shared[clock_column[c]] if clock_column[c] >= 0 else 0.0)
+        at_picture(first[g], t_s, moved, position, weight, slope, out, rate)
+        at_picture(first[g], t_s, moved, step_position, weight, slope, moved_by, unused)
+        numbers_of(
+            c, fraction[g], interval[g], entry_start, entry_number, entry_knot, entry_column, knots, shared,
+            white[g], number,
+        )  # fmt: skip
+        numbers_of(
+            c, fraction[g], interval[g], entry_start, entry_number, entry_knot, entry_column, step_knots,
+            step_shared, nothing, numbers_by,
+        )  # fmt: skip
+        linearise(
+            out, rate, number, xy[g], sharpness[g], pose_position[g], pose_rotation[g], speed[g], turn[g],
+            residual, by_joint, by_number,
+        )  # fmt: skip
+        factor[:] = 0.0
+        for a in range(WHITE):
+            factor[a, a] = white_precision[c, a]
+            z[a] = -white_precision[c, a] * white[g, a]
+        for joint in range(J):
+            if np.isnan(residual[joint, 0]):
+                continue
+            squared = residual[joint, 0] ** 2 + residual[joint, 1] ** 2
+            believed = trust[g, joint] * confidence_of(squared, bound2)
+            for axis in range(2):
+                after = residual[joint, axis]
+                for i in range(3):
+                    after += by_joint[joint, axis, i] * moved_by[joint, i]
+                for a in range(NUMBERS):
+                    after += by_number[joint, axis, a] * numbers_by[a]
+                for a in range(WHITE):
+                    z[a] -= believed * by_number[joint, axis, a] * after
+                    for b in range(WHITE):
+                        factor[a, b] += believed * by_number[joint, axis, a] * by_number[joint, axis, b]
+        factorise(factor)
+        forward(factor, z)
+        backward(factor, z)
+        step_white[g] = z
+
+
+@cached
+def misfit(
+    t_s: Float,
+    position: Float,
+    knots: Float,
+    shared: Float,
+    white: Float,
+    first: Int64,
+    camera: Int64,
+    when: Float,
+    fraction: Float,
+    interval: Int64,
+    xy: Float,
+    sharpness: Float,
+    pose_position: Float,
+    pose_rotation: Float,
+    speed: Float,
+    turn: Float,
+    trust: Float,
+    bound2: float,
+    entry_start: Int64,
+    entry_number: Int64,
+    entry_knot: Int64,
+    entry_column: Int64,
+    clock_column: Int64,
+    squared: Float,
+    numbers: Float,
+) -> float:
+    """The loss of all pictures; whitened squared residuals [G, J] (NaN unseen) and numbers [G, 10] beside."""
+    J = position.shape[1]
+    out, rate = np.empty((J, 3)), np.empty((J, 3))
+    weight, slope = np.empty(3), np.empty(3)
+    residual, by_joint, by_number = np.empty((J, 2)), np.zeros((J, 2, 3)), np.zeros((J, 2, NUMBERS))
+    total = 0.0
+    for g in range(len(camera)):
+        c = camera[g]
+        moved = when[g] + (shared[clock_column[c]] if clock_column[c] >= 0 else 0.0)
+        at_picture(first[g], t_s, moved, position, weight, slope, out, rate)
+        numbers_of(
+            c, fraction[g], interval[g], entry_start, entry_number, entry_knot, entry_column, knots, shared,
+            white[g], numbers[g],
+        )  # fmt: skip
+        linearise(
+            out, rate, numbers[g], xy[g], sharpness[g], pose_position[g], pose_rotation[g], speed[g], turn[g],
+            residual, by_joint, by_number,
+        )  # fmt: skip
+        for joint in range(J):
+            value = residual[joint, 0] ** 2 + residual[joint, 1] ** 2
+            squared[g, joint] = value
+            if not np.isnan(value):
+                total += trust[g, joint] * loss_of(value, bound2)
+    return total
+
+
+@cached
+def rows_of_picture(
+    g: int,
+    first: int,
+    t_s: Float,
+    position: Float,
+    knots: Float,
+    shared: Float,
+    white: Float,
+    camera: Int64,
+    when: Float,
+    fraction: Float,
+    interval: int,
+    xy: Float,
+    sharpness: Float,
+    pose_position: Float,
+    pose_rotation: Float,
+    speed: Float,
+    turn: Float,
+    trust: Float,
+    bound2: float,
+    white_precision: Float,
+    entry_start: Int64,
+    entry_number: Int64,
+    entry_knot: Int64,
+    entry_column: Int64,
+    clock_column: Int64,
+    knot_count: int,
+    believed: Float,
+    residual: Float,
+    rows: Float,
+    own: Float,
+) -> None:
+    """How a picture's residuals and white error follow the front: for their posterior variances.
+
+    Out come `believed` [J], the weight of each view, 0 where nothing was seen; `residual` [J, 2], whitened;
+    `rows` [2J + 6, N], derivatives of the residuals, then of the white error, by the front, the white error
+    following it; `own` [2J + 6], the variance that the white error's own posterior adds to each.
+    """
+    J = position.shape[1]
+    n = 3 * J
+    out, rate = np.empty((J, 3)), np.empty((J, 3))
+    weight, slope, number = np.empty(3), np.empty(3), np.empty(NUMBERS)
+    by_joint, by_number = np.zeros((J, 2, 3)), np.zeros((J, 2, NUMBERS))
+    of_joints, across = np.empty((J, 3, 3)), np.empty((J, 3, NUMBERS))
+    of_numbers = np.empty((NUMBERS, NUMBERS))
+    joint_gradient, number_gradient = np.empty((J, 3)), np.empty(NUMBERS)
+    factor, z = np.zeros((WHITE, WHITE)), np.empty(WHITE)
+    c = camera[g]
+    moved = when[g] + (shared[clock_column[c]] if clock_column[c] >= 0 else 0.0)
+    at_picture(first, t_s, moved, position, weight, slope, out, rate)
+    numbers_of(
+        c, fraction[g], interval, entry_start, entry_number, entry_knot, entry_column, knots, shared,
+        white[g], number,
+    )  # fmt: skip
+    linearise(
+        out, rate, number, xy[g], sharpness[g], pose_position[g], pose_rotation[g], speed[g], turn[g],
+        residual, by_joint, by_number,
+    )  # fmt: skip
+    for joint in range(J):
+        squared = residual[joint, 0] ** 2 + residual[joint, 1] ** 2
+        believed[joint] = 0.0 if np.isnan(squared) else trust[g, joint] * confidence_of(squared, bound2)
+    normal_equations(
+        residual, by_joint, by_number, believed, of_joints, across, of_numbers, joint_gradient,
+        number_gradient,
+    )  # fmt: skip
+    rows[:] = 0.0
+    own[:] = 0.0
+    has_white = np.isfinite(white_precision[c, 0])
+    white_rows = rows[2 * J :]
+    if has_white:
+        for a in range(WHITE):
+            for b in range(WHITE):
+                factor[a, b] = of_numbers[a, b]
+            factor[a, a] += white_precision[c, a]
+        factorise(factor)
+        for p in range(n):
+            z[:] = across[p // 3, p % 3, :WHITE]
+            forward(factor, z)
+            backward(factor, z)
+            for k in range(3):
+                for a in range(WHITE):
+                    white_rows[a, k * n + p] -= weight[k] * z[a]
+        for a in range(WHITE):
+            z[:] = 0.0
+            z[a] = 1.0
+            forward(factor, z)
+            for b in range(WHITE):
+                own[2 * J + a] += z[b] * z[b]
+    for e in range(entry_start[c], entry_start[c + 1]):
+        d = entry_number[e]
+        z[:] = 0.0
+        if has_white:
+            z[:] = of_numbers[d, :WHITE]
+            forward(factor, z)
+            backward(factor, z)
+        sides = 2 if entry_knot[e] else 1
+        for side in range(sides):
+            if entry_knot[e]:
+                column = 3 * n + side * knot_count + entry_column[e]
+                share = fraction[g] if side else 1 - fraction[g]
+            else:
+                column = 3 * n + 2 * knot_count + entry_column[e]
+                share = 1.0
+            for a in range(WHITE):
+                white_rows[a, column] -= share * z[a]
+            for joint in range(J):
+                if believed[joint] > 0:
+                    for axis in range(2):
+                        rows[2 * joint + axis, column] += share * by_number[joint, axis, d]
+    for joint in range(J):
+        if believed[joint] == 0:
+            continue
+        for axis in range(2):
+            row = rows[2 * joint + axis]
+            for k in range(3):
+                for i in range(3):
+                    row[k * n + 3 * joint + i] += weight[k] * by_joint[joint, axis, i]
+            if has_white:
+                for a in range(WHITE):
+                    by = by_number[joint, axis, a]
+                    for column in range(rows.shape[1]):
+                        row[column] += by * white_rows[a, column]
+                z[:] = by_number[joint, axis, :WHITE]
+                forward(factor, z)
+                for b in range(WHITE):
+                    own[2 * joint + axis] += z[b] * z[b]
+
+
+@cached
+def add_motion(
+    position: Float,
+    weights: Float,
+    precision: Float,
+    hold: float,
+    lengths: Float,
+    length_offset: int,
+    front: Float,
+    gradient: Float,
+) -> None:
+    """Add how unlikely the acceleration between three times is, in units of the body's size.
+
+    The size is the mean of the bone lengths. Without it the estimate would shrink: smaller bodies
+    accelerate less, and pictures do not tell the scale. `precision` [J, J] is for every axis at the size
+    that the lengths have now; `hold` is added to the diagonal of the first time, and pulls at nothing.
+    """
+    J, B = position.shape[1], len(lengths)
+    n = 3 * J
+    shrinking = 1.0 / lengths.sum() if B else 0.0  # d log(size) / d length
+    cost = 0.0
+    acceleration, pull = np.empty(J), np.empty(J)
+    for axis in range(3):
+        for b in range(J):
+            acceleration[b] = 0.0
+            for k in range(3):
+                acceleration[b] += weights[k] * position[k, b, axis]
+        for a in range(J):
+            pull[a] = 0.0
+            for b in range(J):
+                pull[a] += precision[a, b] * acceleration[b]
+            cost += pull[a] * acceleration[a]
+        for k in range(3):
+            for a in range(J):
+                gradient[k * n + 3 * a + axis] += weights[k] * pull[a]
+                for b in range(B):
+                    front[length_offset + b, k * n + 3 * a + axis] -= weights[k] * pull[a] * shrinking
+    for b in range(B):
+        gradient[length_offset + b] -= cost * shrinking
+        for d in range(b + 1):
+            front[length_offset + b, length_offset + d] += cost * shrinking * shrinking
+    for k in range(3):
+        for m in range(k + 1):
+            both = weights[k] * weights[m]
+            for b in range(J):
+                for a in range(b if k == m else 0, J):
+                    for axis in range(3):
+                        front[k * n + 3 * a + axis, m * n + 3 * b + axis] += both * precision[a, b]
+    for i in range(n):
+        front[i, i] += hold
+
+
+@cached
+def add_bones(
+    position: Float,
+    bones: Int64,
+    lengths: Float,
+    sigma: Float,
+    offset: int,
+    length_offset: int,
+    front: Float,
+    gradient: Float,
+) -> None:
+    """Add how far the bones of one time are from their lengths, in units of the body's size."""
+    shrinking = 1.0 / lengths.sum() if len(lengths) else 0.0
+    direction, by_length = np.empty(3), np.empty(len(lengths))
+    for b in range(len(bones)):
+        i, j = bones[b]
+        length = 0.0
+        for axis in range(3):
+            direction[axis] = position[j, axis] - position[i, axis]
+            length += direction[axis] ** 2
+        length = np.sqrt(length)
+        if length < 1e-6:
+            continue
+        weight = 1 / sigma[b] ** 2
+        residual = length - lengths[b]
+        for axis in range(3):
+            direction[axis] /= length
+        low, high = offset + 3 * min(i, j), offset + 3 * max(i, j)
+        sign = 1.0 if j > i else -1.0  # of the joint that stands later
+        by_length[:] = -residual * shrinking
+        by_length[b] -= 1.0
+        for d in range(len(lengths)):
+            gradient[length_offset + d] += weight * residual * by_length[d]
+            for e in range(d + 1):
+                front[length_offset + d, length_offset + e] += weight * by_length[d] * by_length[e]
+            for p in range(3):
+                product = sign * weight * direction[p] * by_length[d]
+                front[length_offset + d, high + p] += product
+                front[length_offset + d, low + p] -= product
+        for p in range(3):
+            gradient[high + p] += sign * weight * residual * direction[p]
+            gradient[low + p] -= sign * weight * residual * direction[p]
+            for q in range(3):
+                product = weight * direction[p] * direction[q]
+                front[high + p, low + q] -= product
+                if q <= p:
+                    front[high + p, high + q] += product
+                    front[low + p, low + q] += product

@@ -1,0 +1,369 @@
+"""Refinement of a whole flight: build, find the prior, estimate, and check before it is believed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.reconstruction.refinement.building import Sighting, build
+from pipelines.reconstruction.refinement.elimination import System, misfit
+from pipelines.reconstruction.refinement.estimate import covariances, initial_state, learn, solve
+from pipelines.reconstruction.refinement.kernels import exponential
+from pipelines.reconstruction.refinement.problem import (
+    ROTATION,
+    SHIFT_IN_CAMERA,
+    SHIFT_IN_WORLD,
+    Knowledge,
+    PoseErrors,
+    Problem,
+    Process,
+    State,
+)
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+_WINDOWS, _WINDOW = 3, 100  # stretches of the flight, in times, from which the prior is found
+_LEARNING_ROUNDS = 8
+_ROUNDS = 8
+_ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2 where the search begins: a walking body, its limbs
+_BONE_SIGMA_M = 0.02
+_FEWEST_TIMES = 20
+_UNEXPLAINED = 1.5  # times the image noise that the pictures show between neighbours: the prior is wrong
+_SIGMAS = 4.0
+_MEDIAN_OF_TWO = 2 * np.log(2)  # of the chi-square distribution with two degrees of freedom
+_FARTHEST = (
+    1.2  # times what the disagreement of the views lets expect: an estimate that moves more is a wrong one
+)
+
+
+@dataclass(frozen=True)
+class Refined:
+    """The estimate, or why there is none."""
+
+    position: Float  # [T, J, 3] m; NaN for joints that took no part
+    covariance: Float  # [T, J, 3, 3] m^2
+    corrections: tuple[tuple[Float, Float], ...]  # of each camera: times [F] and the ten numbers [F, 10]
+    clock_offset_s: Float  # [C] to be added to the pictures' times
+    levels: dict[str, float]
+    bone_lengths_m: Float  # [B]
+    learned: bool  # the levels of the pose errors were found from the pictures
+    warnings: tuple[str, ...]
+    fallback: str | None  # why the result must not be used
+
+
+def refine(
+    t_s: Float,
+    sightings: Sequence[Sighting],
+    start: Float,
+    bones: Int64,
+    prior: Sequence[PoseErrors] | None,
+    clock_sigma_s: Float,
+) -> Refined:
+    """One maximum a posteriori estimate of a skeleton, its cameras' pose errors and clocks.
+
+    Args:
+        t_s: [T] the skeleton's times, strictly increasing.
+        sightings: what each of C cameras saw, J joints.
+        start: [T, J, 3] m, from a triangulation that trusts the poses; NaN where it found nothing.
+        bones: [B, 2] pairs of joints whose distance hardly changes.
+        prior: what is known of each camera's pose errors; None when nobody stated anything.
+        clock_sigma_s: [C] how far each camera's clock may be off, 0 for one that is known.
+    """
+    part = _participating(start)
+    if part.sum() < 3 or len(t_s) < _FEWEST_TIMES:
+        return _none(sightings, start, "too few joints or times were triangulated")
+    sightings = [_take(sighting, part) for sighting in sightings]
+    bones = _renumbered(bones, part)
+    begun = _without_gaps(t_s, start[:, part])
+    try:
+        known, learned, warnings, expected_m = _find_prior(t_s, sightings, begun, bones, prior, clock_sigma_s)
+        problem = build(t_s, sightings, bones)
+        state = initial_state(problem, known, begun)
+        system, state, _ = solve(problem, known, state, rounds=_ROUNDS)
+        covariance = covariances(system, state)
+    except np.linalg.LinAlgError as error:
+        return _none(sightings, start, str(error))
+    fallback = _doubts(system, state, learned=learned) or _too_far(state, begun, expected_m)
+    position = np.full_like(start, np.nan)
+    position[:, part] = state.position
+    whole = np.full((*start.shape, 3), np.nan)
+    whole[:, part] = covariance
+    return Refined(
+        position=position,
+        covariance=whole,
+        corrections=_corrections(system, state, len(sightings)),
+        clock_offset_s=_clocks(system, state),
+        levels=_levels(known),
+        bone_lengths_m=state.shared[system.layout.bone_column :],
+        learned=learned,
+        warnings=tuple(warnings),
+        fallback=fallback,
+    )
+
+
+def corrected(position: Float, rotation: Float, numbers: Float) -> tuple[Float, Float]:
+    """What poses are once their errors are taken away: position [N, 3] and world_from_camera [N, 3, 3].
+
+    Args:
+        position: [N, 3] m, as logged.
+        rotation: [N, 3, 3] as logged.
+        numbers: [N, 10] the corrections at the same times; the clock's is left to the caller.
+    """
+    turned = np.empty_like(rotation)
+    unused = np.empty((3, 3))
+    for n in range(len(numbers)):
+        exponential(numbers[n, ROTATION : ROTATION + 3], turned[n], unused)
+    true_rotation = np.einsum("nij,nkj->nik", rotation, turned)
+    shift = numbers[:, :3] + np.einsum("nij,nj->ni", true_rotation, numbers[:, 6:9])
+    return position - shift, true_rotation
+
+
+# --- what takes part -----------------------------------------------------------------------------------
+
+
+def _participating(start: Float) -> NDArray[np.bool_]:
+    """Joints [J] that were triangulated often enough to be followed."""
+    part: NDArray[np.bool_] = (~np.isnan(start[..., 0])).sum(axis=0) >= _FEWEST_TIMES
+    return part
+
+
+def _take(sighting: Sighting, part: NDArray[np.bool_]) -> Sighting:
+    return replace(sighting, xy=sighting.xy[:, part], confidence=sighting.confidence[:, part])
+
+
+def _renumbered(bones: Int64, part: NDArray[np.bool_]) -> Int64:
+    number = np.cumsum(part) - 1
+    there = part[bones].all(axis=1)
+    renumbered: Int64 = number[bones[there]].astype(np.int64).reshape(-1, 2)
+    if not len(renumbered):
+        # The size of the body has to be measured by something.
+        renumbered = np.array([[0, 1]], dtype=np.int64)
+    return renumbered
+
+
+def _without_gaps(t_s: Float, start: Float) -> Float:
+    """Where the search begins: as triangulated, linear in between."""
+    filled = start.copy()
+    for joint in range(start.shape[1]):
+        there = ~np.isnan(start[:, joint, 0])
+        for axis in range(3):
+            filled[~there, joint, axis] = np.interp(t_s[~there], t_s[there], start[there, joint, axis])
+    return filled
+
+
+# --- the prior -----------------------------------------------------------------------------------------
+
+
+def _find_prior(
+    t_s: Float,
+    sightings: Sequence[Sighting],
+    start: Float,
+    bones: Int64,
+    prior: Sequence[PoseErrors] | None,
+    clock_sigma_s: Float,
+) -> tuple[Knowledge, bool, list[str], float]:
+    """The parameters of the prior from stretches of the flight; whether pose errors are among them.
+
+    At the end, by how many metres the views disagree at the actor.
+    """
+    chosen = _stretches(len(t_s))
+    problem = build(t_s[chosen], sightings, bones)
+    guess, image, disagreement_m = _first_guess(problem, start[chosen])
+    # n rays from all around, each off by s on two axes, leave a point off by s sqrt(9 / 2n) in space.
+    expected_m = _FARTHEST * disagreement_m * float(np.sqrt(4.5 / len(sightings)))
+    warnings: list[str] = []
+    if prior is not None:
+        known = _learned(problem, start[chosen], tuple(prior), clock_sigma_s, poses=False)
+        if known is not None and known.pixel_scale < _UNEXPLAINED * image:
+            return known, False, warnings, expected_m
+        warnings.append(
+            "refined: the stated pose noise does not explain the pictures; its levels were estimated instead"
+        )
+    known = _learned(problem, start[chosen], (guess,) * len(sightings), clock_sigma_s, poses=True)
+    if known is None:
+        raise np.linalg.LinAlgError("no level of pose noise explains the pictures")
+    return known, True, warnings, expected_m
+
+
+def _stretches(times: int) -> Int64:
+    """Times from which the prior is learned: all of a short flight, else stretches spread over it."""
+    if times <= _WINDOWS * _WINDOW:
+        return np.arange(times)
+    begins = np.linspace(0, times - _WINDOW, _WINDOWS).astype(np.int64)
+    return (begins[:, None] + np.arange(_WINDOW)).ravel()
+
+
+def _learned(
+    problem: Problem, start: Float, errors: tuple[PoseErrors, ...], clock_sigma_s: Float, *, poses: bool
+) -> Knowledge | None:
+    joints, bones = problem.joints, len(problem.bones)
+    acceleration = np.full((joints, joints), _ROOT_ACCELERATION**2)
+    acceleration[np.diag_indices(joints)] += _OWN_ACCELERATION**2
+    known = Knowledge(errors, clock_sigma_s, acceleration, np.full(bones, _BONE_SIGMA_M), 1.0, 1.0)
+    state = initial_state(problem, known, start)
+    known = replace(known, size_m=float(state.shared[-bones:].mean()))
+    try:
+        known, _ = learn(problem, known, state, poses=poses, rounds=_LEARNING_ROUNDS)
+    except np.linalg.LinAlgError:
+        return None
+    return known if np.isfinite(known.pixel_scale) else None
+
+
+def _first_guess(problem: Problem, start: Float) -> tuple[PoseErrors, float, float]:
+    """Levels of pose errors at which to begin, image noise between neighbouring pictures, disagreement in m.
+
+    The median residual of a picture's joints is common to them: the camera's. How it changes from one
+    picture to the next is white, the rest is slow. What joints do beyond it is the detector's.
+    """
+    pictures = problem.pictures
+    residual, distance = _residuals(problem, start)
+    cameras = int(pictures.camera.max()) + 1
+    common = np.nanmedian(residual, axis=1)
+    own = (residual - common[:, None]) * pictures.sharpness[..., None]
+    white, total, image = [], [], []
+    for c in range(cameras):
+        mine = pictures.camera == c
+        if mine.sum() < 3:
+            continue
+        white.append(_spread(np.diff(common[mine], axis=0)) / np.sqrt(2))
+        total.append(float(np.sqrt(np.nanmedian(np.sum(common[mine] ** 2, axis=1)) / _MEDIAN_OF_TWO)))
+        image.append(_spread(np.diff(own[mine], axis=0)) / np.sqrt(2))
+    # Of 2 n residuals of a joint three are lost to its position.
+    lost = np.sqrt(2 * cameras / (2 * cameras - 3))
+    quick, slow = 1.2 * lost * float(np.median(white)), 1.5 * lost * float(np.median(total))
+    range_m = float(np.nanmedian(distance))
+    guess = PoseErrors(
+        (max(0.8 * quick * range_m, 0.01), max(0.6 * quick, 1e-3)),
+        (
+            Process(SHIFT_IN_WORLD, max(0.8 * slow * range_m, 0.02), 0.03),
+            Process(ROTATION, max(0.6 * slow, 2e-3), 2e-3),
+            Process(SHIFT_IN_CAMERA, max(0.4 * slow * range_m, 0.02)),
+        ),
+    )
+    return guess, lost * float(np.median(image)), lost * float(np.median(total)) * range_m
+
+
+def _spread(values: Float) -> float:
+    """Standard deviation, by the median."""
+    return float(1.4826 * np.nanmedian(np.abs(values)))
+
+
+def _residuals(problem: Problem, position: Float) -> tuple[Float, Float]:
+    """Normalised residuals [G, J, 2] of the logged poses, and how far the joints are [G, J]."""
+    pictures = problem.pictures
+    when = pictures.when_s
+    nearest = pictures.first + np.argmin(
+        np.abs(problem.t_s[pictures.first[:, None] + np.arange(3)] - when[:, None]), axis=1
+    )
+    away = position[nearest] - pictures.position[:, None]
+    seen = np.einsum("gji,gkj->gki", pictures.rotation, away)
+    depth = np.where(seen[..., 2] > 0.1, seen[..., 2], np.nan)
+    return seen[..., :2] / depth[..., None] - pictures.xy, depth
+
+
+# --- what came out -------------------------------------------------------------------------------------
+
+
+def _doubts(system: System, state: State, *, learned: bool) -> str | None:
+    """Why the estimate must not be believed."""
+    if not np.isfinite(state.position).all():
+        return "the estimate did not converge"
+    pictures = system.problem.pictures
+    _, _, numbers = misfit(system, state)
+    # The scale of the constellation: the one thing that pictures alone do not tell.
+    centre = np.stack(
+        [pictures.position[pictures.camera == c].mean(axis=0) for c in np.unique(pictures.camera)]
+    )
+    moved, _ = corrected(pictures.position, pictures.rotation, numbers)
+    after = np.stack([moved[pictures.camera == c].mean(axis=0) for c in np.unique(pictures.camera)])
+    apart, apart_after = centre - centre.mean(axis=0), after - after.mean(axis=0)
+    grown = float(np.sum(apart * apart_after) / np.sum(apart**2)) - 1
+    sigma = _slow_sigma(system) / float(np.sqrt(np.sum(apart**2)))
+    if abs(grown) > max(_SIGMAS * sigma, 0.05 if learned else 0.02):
+        side = "wider" if grown > 0 else "closer"
+        return f"the cameras would stand {100 * abs(grown):.0f} % {side} than logged"
+    for (camera, process), (at_knots, column) in zip(
+        system.layout.processes, system.layout.place, strict=True
+    ):
+        value = state.knots[0] if at_knots else state.shared
+        surprise = float(np.sqrt(np.sum(value[column : column + 3] ** 2) / 3)) / process.sigma0
+        if surprise > _SIGMAS and not at_knots:
+            return f"camera {camera + 1} would be {surprise:.0f} standard deviations from its logged poses"
+    return None
+
+
+def _too_far(state: State, begun: Float, expected_m: float) -> str | None:
+    """Whether the skeleton was moved further than its views disagree."""
+    moved_m = float(np.median(np.linalg.norm(state.position - begun, axis=-1)))
+    if moved_m > expected_m:
+        return f"the skeleton would move by {moved_m:.2f} m where the views let expect {expected_m:.2f} m"
+    return None
+
+
+def _slow_sigma(system: System) -> float:
+    """Standard deviation in m of the mean shift of a camera."""
+    elapsed_s = float(system.problem.t_s[-1] - system.problem.t_s[0])
+    variance = 1e-6
+    for errors in system.knowledge.poses:
+        variance += errors.white[0] ** 2 / max(len(system.problem.t_s), 1)
+        for process in errors.processes:
+            if process.number in (SHIFT_IN_WORLD, SHIFT_IN_CAMERA):
+                variance += process.sigma0**2 + process.rate**2 * elapsed_s
+    return float(np.sqrt(variance / len(system.knowledge.poses)))
+
+
+def _corrections(system: System, state: State, cameras: int) -> tuple[tuple[Float, Float], ...]:
+    pictures = system.problem.pictures
+    _, _, numbers = misfit(system, state)
+    found = []
+    for c in range(cameras):
+        (mine,) = np.nonzero(pictures.camera == c)
+        order = mine[np.argsort(pictures.when_s[mine], kind="stable")]
+        found.append((pictures.when_s[order], numbers[order]))
+    return tuple(found)
+
+
+def _clocks(system: System, state: State) -> Float:
+    column = system.layout.clock_column
+    return np.where(column >= 0, state.shared[np.maximum(column, 0)], 0.0)
+
+
+def _levels(known: Knowledge) -> dict[str, float]:
+    """Median over the cameras of every level, in the units of the noise models."""
+    names = {SHIFT_IN_WORLD: "position_world", SHIFT_IN_CAMERA: "position_body", ROTATION: "rotation"}
+    found: dict[str, list[float]] = {}
+    for errors in known.poses:
+        if errors.white[0] > 0:
+            found.setdefault("white_position_m", []).append(errors.white[0])
+            found.setdefault("white_rotation_deg", []).append(float(np.degrees(errors.white[1])))
+        for process in errors.processes:
+            turn = process.number == ROTATION
+            unit, factor = ("deg", float(np.degrees(1.0))) if turn else ("m", 1.0)
+            kind = "gauss_markov" if np.isfinite(process.correlation_s) else "bias"
+            found.setdefault(f"{kind}_{names[process.number]}_{unit}", []).append(factor * process.sigma0)
+            if process.rate > 0:
+                name = f"drift_{names[process.number]}_{unit}_per_sqrt_s"
+                found.setdefault(name, []).append(factor * process.rate)
+    return {name: float(np.median(values)) for name, values in found.items()} | {
+        "pixel_scale": known.pixel_scale,
+        "acceleration_m_s2": float(np.sqrt(np.median(np.diagonal(known.acceleration)))),
+        "bone_sigma_mm": 1e3 * float(np.median(known.bone_sigma_m)) if len(known.bone_sigma_m) else 0.0,
+    }
+
+
+def _none(sightings: Sequence[Sighting], start: Float, reason: str) -> Refined:
+    return Refined(
+        position=np.full_like(start, np.nan),
+        covariance=np.full((*start.shape, 3), np.nan),
+        corrections=tuple((np.empty(0), np.empty((0, 10))) for _ in sightings),
+        clock_offset_s=np.zeros(len(sightings)),
+        levels={},
+        bone_lengths_m=np.empty(0),
+        learned=False,
+        warnings=(),
+        fallback=reason,
+    )

@@ -1,0 +1,202 @@
+"""Method `refined` for a flight: from cameras and who is who to a skeleton, poses and clocks.
+
+The refinement starts from `robust` and ends with it: which views are good, and which joints may be called
+reconstructed, is what `robust` says with the corrected poses. Positions and covariances are the estimate's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.geometry.poses import quaternion_from_matrix
+from pipelines.geometry.triangulation import STATUS, Triangulation, Views, estimate_noise, triangulate
+from pipelines.reconstruction.observations import Camera, Candidates, Observations, observe, sightings_of
+from pipelines.reconstruction.refinement.building import Sighting
+from pipelines.reconstruction.refinement.problem import PoseErrors
+from pipelines.reconstruction.refinement.refine import Refined, corrected, refine
+from pipelines.reconstruction.reweighting import reprojection_px
+from pipelines.session.records import Float, Int64
+from pipelines.session.skeletons import bones_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_HEAD = ("nose", "left_eye", "right_eye", "left_ear", "right_ear")  # as rigid as a bone
+
+
+@dataclass(frozen=True)
+class RefinedFlight:
+    """What the refinement made of a flight; what went in, where it must not be believed."""
+
+    observations: Observations
+    views: Views
+    result: Triangulation
+    cameras: pd.DataFrame | None  # t_ns, camera and pose of every picture; None after a fallback
+    metrics: dict[str, Any]
+    warnings: list[str]
+
+
+def refine_flight(
+    cameras: Sequence[Camera],
+    found: Candidates,
+    choice: Int64,
+    observations: Observations,
+    views: Views,
+    result: Triangulation,
+    *,
+    prior: Sequence[PoseErrors] | None,
+    clock_sigma_s: Float,
+    pixel_sigma: float,
+    max_gap_ns: int,
+    max_extrapolation_ns: int,
+    threads: int,
+) -> RefinedFlight:
+    """Refine what `robust` made of a flight.
+
+    Args:
+        cameras: all of them.
+        found: every detection, at the times where people were told apart.
+        choice: [T', C, P] each person's detection, see `observe`.
+        observations: at the skeleton's times.
+        views: the same, one row for each joint-frame.
+        result: `robust` of the views.
+        prior: what is known of each camera's pose errors, None when nobody stated anything.
+        clock_sigma_s: [C] how far each clock may be off, 0 for one that is known.
+        pixel_sigma: px, of a good keypoint.
+        max_gap_ns: the longest stretch between two logged poses that is bridged.
+        max_extrapolation_ns: how far outside its log a pose is trusted.
+        threads: see `triangulate`.
+    """
+    times, people, joints, _ = observations.confidence.shape
+    begin_ns = int(observations.t_ns[0])
+    t_s = (observations.t_ns - begin_ns) / 1e9
+    limits = {"max_gap_ns": max_gap_ns, "max_extrapolation_ns": max_extrapolation_ns}
+    sightings = [
+        _sighting(camera, found, c, choice, begin_ns, pixel_sigma, limits) for c, camera in enumerate(cameras)
+    ]
+    start = result.points.reshape(times, people * joints, 3)
+    bones = _rigid_pairs(observations.joints, people)
+    refined = refine(t_s, sightings, start, bones, prior, clock_sigma_s)
+    metrics = _metrics(refined, cameras)
+    if refined.fallback is not None:
+        warnings = [*refined.warnings, f"refined: fell back to robust, because {refined.fallback}"]
+        return RefinedFlight(observations, views, result, None, metrics, warnings)
+
+    shifted = [
+        replace(camera, frame_t_ns=camera.frame_t_ns + round(1e9 * offset))
+        for camera, offset in zip(cameras, refined.clock_offset_s, strict=True)
+    ]
+    observed = observe(shifted, found, choice, observations.t_ns, **limits)
+    position, rotation = observed.position.copy(), observed.rotation.copy()
+    for c in range(len(cameras)):
+        numbers = _numbers_at(refined.corrections[c], t_s - refined.clock_offset_s[c])
+        position[:, c], rotation[:, c] = corrected(position[:, c], rotation[:, c], numbers)
+    observed = replace(observed, position=position, rotation=rotation)
+    moved = replace(
+        views,
+        xy=observed.xy.reshape(views.xy.shape),
+        weight=observed.confidence.reshape(views.weight.shape),
+        position=position,
+        rotation=rotation,
+        pixel_sigma=np.full(len(cameras), pixel_sigma),
+        pose_sigma=np.zeros_like(views.pose_sigma),
+    )
+    moved = replace(moved, pixel_sigma=estimate_noise(moved, threads=threads))
+    gated = triangulate(moved, method="robust", threads=threads)
+    ok = (gated.status == STATUS.index("ok")) & ~np.isnan(refined.position.reshape(-1, 3)[:, 0])
+    final = replace(
+        gated,
+        points=np.where(ok[:, None], refined.position.reshape(-1, 3), gated.points),
+        covariance=np.where(ok[:, None, None], refined.covariance.reshape(-1, 3, 3), gated.covariance),
+    )
+    residual = reprojection_px(moved, final.points)
+    return RefinedFlight(
+        observed,
+        moved,
+        replace(final, residual_px=residual),
+        _camera_table(shifted, refined, begin_ns, limits),
+        metrics,
+        list(refined.warnings),
+    )
+
+
+def _sighting(
+    camera: Camera,
+    found: Candidates,
+    c: int,
+    choice: Int64,
+    begin_ns: int,
+    pixel_sigma: float,
+    limits: dict[str, int],
+) -> Sighting:
+    """What a camera saw in its own pictures, all people side by side."""
+    xy, confidence = sightings_of(camera, found, c, choice[:, c])
+    frames = len(camera.frame_t_ns)
+    position, rotation = camera.poses_at(camera.frame_t_ns, **limits)
+    return Sighting(
+        t_s=(camera.frame_t_ns - begin_ns) / 1e9,
+        xy=xy.reshape(frames, -1, 2),
+        confidence=np.nan_to_num(confidence.reshape(frames, -1)),
+        position=position,
+        rotation=rotation,
+        focal_px=camera.focal_px,
+        pixel_sigma=pixel_sigma,
+    )
+
+
+def _rigid_pairs(joints: tuple[str, ...], people: int) -> Int64:
+    """Pairs of joints [B, 2] whose distance hardly changes: bones, and the points of the head."""
+    number = {name: index for index, name in enumerate(joints)}
+    head = [number[name] for name in _HEAD if name in number]
+    pairs = {(number[a], number[b]) for a, b in bones_of(joints)} | {(i, j) for i in head for j in head}
+    own = np.array(sorted({(min(p), max(p)) for p in pairs if p[0] != p[1]}), dtype=np.int64).reshape(-1, 2)
+    return np.concatenate([own + person * len(joints) for person in range(people)])
+
+
+def _numbers_at(correction: tuple[Float, Float], t_s: Float) -> Float:
+    """The ten numbers [N, 10] of a camera at other times: linear between its pictures, held outside them."""
+    when, numbers = correction
+    if not len(when):
+        return np.zeros((len(t_s), 10))
+    return np.stack([np.interp(t_s, when, column) for column in numbers.T], axis=1)
+
+
+def _metrics(refined: Refined, cameras: Sequence[Camera]) -> dict[str, Any]:
+    used = refined.fallback is None
+    offsets = {
+        camera.name: float(offset) if used else 0.0
+        for camera, offset in zip(cameras, refined.clock_offset_s, strict=True)
+    }
+    return {
+        "clock_offsets_s": offsets,
+        "refinement": {
+            "fallback": refined.fallback,
+            "pose_noise": "estimated" if refined.learned else "stated",
+            "levels": refined.levels,
+            "bone_lengths_m": refined.bone_lengths_m.tolist() if used else [],
+        },
+    }
+
+
+def _camera_table(
+    cameras: Sequence[Camera], refined: Refined, begin_ns: int, limits: dict[str, int]
+) -> pd.DataFrame:
+    """The corrected pose of every picture that has one."""
+    import pandas as pd
+
+    parts = []
+    for c, camera in enumerate(cameras):
+        position, rotation = camera.poses_at(camera.frame_t_ns, **limits)
+        (posed,) = np.nonzero(~np.isnan(position[:, 0]))
+        stamped_s = (camera.frame_t_ns[posed] - begin_ns) / 1e9 - refined.clock_offset_s[c]
+        numbers = _numbers_at(refined.corrections[c], stamped_s)
+        true_position, true_rotation = corrected(position[posed], rotation[posed], numbers)
+        table = pd.DataFrame({"t_ns": camera.frame_t_ns[posed], "camera": camera.name})
+        table[["x", "y", "z"]] = true_position
+        table[["qx", "qy", "qz", "qw"]] = quaternion_from_matrix(true_rotation)
+        parts.append(table)
+    return pd.concat(parts, ignore_index=True)

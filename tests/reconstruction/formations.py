@@ -1,0 +1,141 @@
+"""Flights in memory for the refinement: a walk, cameras around it, noisy logs and keypoints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.noise import NoiseModel, disturb
+from pipelines.geometry.poses import matrix_from_quaternion
+from pipelines.geometry.triangulation import Views, estimate_noise, triangulate
+from pipelines.reconstruction.refinement.building import Sighting
+from pipelines.session.skeletons import bones_of
+from pipelines.simulation.drone_paths import orbit
+from pipelines.simulation.walk import COCO17, walk
+
+Float = NDArray[np.float64]
+
+FPS = 30.0
+FOCAL_PX = 1500.0
+STATED_PX = 3.0
+_HEAD = range(5)  # nose, eyes and ears are as rigid as a bone
+PAIRS = sorted(
+    {(COCO17.index(a), COCO17.index(b)) for a, b in bones_of(COCO17)}
+    | {(i, j) for i in _HEAD for j in _HEAD if i < j}
+)
+BONES = np.array(sorted({(min(pair), max(pair)) for pair in PAIRS}), dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class Formation:
+    """What the cameras saw, and what is true."""
+
+    t_s: Float  # [T]
+    truth: Float  # [T, 17, 3] m
+    sightings: list[Sighting]
+    start: Float  # [T, 17, 3] m, `robust` with the logged poses; NaN where it found nothing
+    position: Float  # [C, T, 3] m, true
+    rotation: Float  # [C, T, 3, 3]
+
+
+def formation(
+    times: int,
+    cameras: int,
+    models: Sequence[NoiseModel],
+    seed: int,
+    *,
+    pixel_px: float = 2.0,
+    bad_share: float = 0.0,
+    still: bool = False,
+    variation: float = 1.0,
+    tilt_deg: float = 15.0,
+    late_s: Sequence[float] = (),
+) -> Formation:
+    """A person who walks in a circle, filmed from 10 m.
+
+    Args:
+        times: frames of every camera, at 30 Hz.
+        cameras: how many.
+        models: what is wrong with their logs; nobody tells `robust`.
+        seed: of all chance.
+        pixel_px: noise of the keypoints, at f = 1500 px.
+        bad_share: of the keypoints are 100 to 300 px off, and as many are missing.
+        still: the cameras hover around the walk instead of following it.
+        variation: how far moving cameras leave the rigid ring.
+        tilt_deg: elevation of the cameras.
+        late_s: how much later than stamped each camera's pictures were taken; none by default.
+    """
+    rng = np.random.default_rng([seed, cameras])
+    t_s = np.arange(times) / FPS
+    truth = walk(t_s, radius_m=4.0)
+    t_ns = np.round(t_s * 1e9).astype(np.int64)
+    sightings, positions, rotations = [], [], []
+    for camera in range(cameras):
+        taken_s = t_s + (late_s[camera] if late_s else 0.0)
+        joints = walk(taken_s, radius_m=4.0)
+        target = joints.mean(axis=1)
+        if still:
+            target = np.tile(truth.mean(axis=(0, 1)), (times, 1))
+        position, quaternion = (
+            part[camera]
+            for part in orbit(
+                taken_s,
+                target,
+                cameras=cameras,
+                tilt_deg=tilt_deg,
+                variation=0.0 if still else variation,
+                yaw_rate_deg_per_s=0.0 if still else 4.0,
+            )
+        )
+        rotation = matrix_from_quaternion(quaternion)
+        seen = np.einsum("tij,tki->tkj", rotation, joints - position[:, None])
+        xy = seen[..., :2] / seen[..., 2:]
+        xy = xy + rng.normal(0, pixel_px / FOCAL_PX, xy.shape)
+        bad, missing = rng.random(xy.shape[:2]) < bad_share, rng.random(xy.shape[:2]) < bad_share
+        off = rng.uniform(100, 300, xy.shape) * rng.choice([-1, 1], xy.shape) / FOCAL_PX
+        xy = np.where(bad[..., None], xy + off, xy)
+        xy[missing] = np.nan
+        logged, logged_quaternion = disturb(models, t_ns, position, quaternion, rng)
+        sightings.append(
+            Sighting(
+                t_s,
+                xy,
+                (~missing).astype(np.float64),
+                logged,
+                matrix_from_quaternion(logged_quaternion),
+                FOCAL_PX,
+                STATED_PX,
+            )
+        )
+        positions.append(position)
+        rotations.append(rotation)
+    return Formation(t_s, truth, sightings, triangulated(sightings), np.stack(positions), np.stack(rotations))
+
+
+def triangulated(sightings: Sequence[Sighting]) -> Float:
+    """`robust` [T, J, 3] of cameras that share their times."""
+    times, joints = sightings[0].confidence.shape
+    count = len(sightings)
+    views = Views(
+        xy=np.stack([s.xy for s in sightings], axis=2).reshape(-1, count, 2),
+        weight=np.stack([s.confidence for s in sightings], axis=2).reshape(-1, count),
+        pose_index=np.repeat(np.arange(times), joints),
+        position=np.stack([s.position for s in sightings], axis=1),
+        rotation=np.stack([s.rotation for s in sightings], axis=1),
+        focal=np.array([s.focal_px for s in sightings]),
+        pixel_sigma=np.array([s.pixel_sigma for s in sightings]),
+        pose_sigma=np.zeros((times, count, 2)),
+    )
+    told = Views(**{**views.__dict__, "pixel_sigma": estimate_noise(views)})
+    return triangulate(told, method="robust").points.reshape(times, joints, 3)
+
+
+def mean_mm(estimate: Float, truth: Float, where: Float | None = None) -> float:
+    """Mean distance in mm, over the joint-frames that `where` has too."""
+    distance = np.linalg.norm(estimate - truth, axis=-1)
+    if where is not None:
+        distance = distance[~np.isnan(where[..., 0])]
+    return float(1e3 * np.nanmean(distance))

@@ -1,0 +1,235 @@
+"""The refinement: derivatives, equations and covariances against slow ways, results against the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.geometry.noise import Bias, Drift, NoiseModel, White
+from pipelines.reconstruction.refinement import kernels
+from pipelines.reconstruction.refinement.building import build
+from pipelines.reconstruction.refinement.elimination import System, misfit, prior_cost
+from pipelines.reconstruction.refinement.estimate import covariances, initial_state, solve
+from pipelines.reconstruction.refinement.problem import (
+    ROTATION,
+    SHIFT_IN_CAMERA,
+    SHIFT_IN_WORLD,
+    Knowledge,
+    PoseErrors,
+    Process,
+    State,
+    lay_out,
+    pose_errors,
+)
+from pipelines.reconstruction.refinement.refine import corrected, refine
+from tests.reconstruction.formations import BONES, Formation, formation, mean_mm
+
+Float = NDArray[np.float64]
+
+WHITE = White(position_m=0.3, rotation_deg=1.0)
+BIAS = Bias(position_m=0.3, rotation_deg=1.0)
+BODY_BIAS = Bias(position_m=0.3, rotation_deg=1.0, frame="body")
+
+
+# --- derivatives ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-5, 0.3])
+def test_derivatives_are_those_of_finite_differences(angle: float) -> None:
+    rng = np.random.default_rng(3)
+    joints, velocity = rng.normal(0, 1, (3, 3)), rng.normal(0, 2, (3, 3))
+    number = rng.normal(0, 0.1, kernels.NUMBERS)
+    number[3:6] *= angle / np.linalg.norm(number[3:6])
+    number[9] = 0.01
+    position, speed, turn = np.array([0.5, 0.3, -10.0]), rng.normal(0, 3, 3), rng.normal(0, 1, 3)
+    xy, sharpness = rng.normal(0, 0.1, (3, 2)), np.full(3, 700.0)
+
+    def linearised(at: Float, numbers: Float) -> tuple[Float, Float, Float]:
+        residual, by_joint, by_number = np.empty((3, 2)), np.zeros((3, 2, 3)), np.zeros((3, 2, 10))
+        # A joint moves on while the clock runs.
+        moved = at + velocity * (numbers[9] - number[9])
+        kernels.linearise(
+            moved, velocity, numbers, xy, sharpness, position, np.eye(3), speed, turn,
+            residual, by_joint, by_number,
+        )  # fmt: skip
+        return residual, by_joint, by_number
+
+    _, by_joint, by_number = linearised(joints, number)
+    step = 1e-6  # central differences of a function of size 1e2 and curvature 1e3: 1e-9 / 1e-6 and 1e-9 off
+    for i in range(3):
+        at = np.zeros((3, 3))
+        at[:, i] = step
+        numeric = (linearised(joints + at, number)[0] - linearised(joints - at, number)[0]) / (2 * step)
+        np.testing.assert_allclose(by_joint[..., i], numeric, atol=2e-4)
+    for i in range(kernels.NUMBERS):
+        by = np.zeros(kernels.NUMBERS)
+        by[i] = step
+        numeric = (linearised(joints, number + by)[0] - linearised(joints, number - by)[0]) / (2 * step)
+        np.testing.assert_allclose(by_number[..., i], numeric, atol=2e-4)
+
+
+# --- equations -----------------------------------------------------------------------------------------
+
+
+def small_system(*, exact: bool) -> tuple[System, State]:
+    """Five times, three joints, two cameras with every kind of unknown, one of them between the times."""
+    flight = formation(5, 2, [], 0, pixel_px=0.0 if exact else 4.0)
+    shown = np.array([5, 11, 15])
+    sightings = [replace(s, xy=s.xy[:, shown], confidence=s.confidence[:, shown]) for s in flight.sightings]
+    if not exact:
+        sightings[1] = replace(sightings[1], t_s=sightings[1].t_s + 0.008)
+    problem = build(flight.t_s, sightings, np.array([[0, 1], [1, 2]]))
+    problem = replace(problem, knot_t_s=np.array([0.0, flight.t_s[2] - 1e-9, flight.t_s[-1]]))
+    errors = PoseErrors(
+        (0.05, 0.01),
+        (Process(SHIFT_IN_WORLD, 0.3, 0.05), Process(ROTATION, 0.02), Process(SHIFT_IN_CAMERA, 0.1)),
+    )
+    acceleration = 30.0 * np.eye(3) + 5.0
+    known = Knowledge((errors, errors), np.array([0.0, 0.02]), acceleration, np.array([0.01, 0.02]), 0.4, 1.0)
+    state = initial_state(problem, known, flight.truth[:, shown])
+    known = replace(known, size_m=float(state.shared[-2:].mean()))
+    return System(problem, known, lay_out(known.poses, known.clock_sigma_s, 2, problem.knot_t_s), 9.0), state
+
+
+def packed(state: State) -> Float:
+    return np.concatenate([state.position.ravel(), state.knots.ravel(), state.shared, state.white.ravel()])
+
+
+def unpacked(vector: Float, like: State) -> State:
+    sizes = np.cumsum([like.position.size, like.knots.size, like.shared.size])
+    position, knots, shared, white = np.split(vector, sizes)
+    return State(
+        position.reshape(like.position.shape),
+        knots.reshape(like.knots.shape),
+        shared,
+        white.reshape(like.white.shape),
+    )
+
+
+def gradient(cost: Callable[[Float], float], at: Float, step: float = 1e-5) -> Float:
+    moves = step * np.eye(at.size)
+    return np.array([(cost(at + move) - cost(at - move)) / (2 * step) for move in moves])
+
+
+def cost_of(system: System, like: State) -> Callable[[Float], float]:
+    def cost(vector: Float) -> float:
+        state = unpacked(vector, like)
+        return misfit(system, state)[0] + prior_cost(system, state)
+
+    return cost
+
+
+def test_solution_is_where_the_cost_is_least() -> None:
+    system, state = small_system(exact=False)
+    system, solved, _ = solve(system.problem, system.knowledge, state, rounds=30)
+    at = packed(solved)
+    # Steps end below 0.2 mm; the curvature of the cost is at most (f / z / sigma)^2 = 2e4 per m^2 and view.
+    before = np.abs(gradient(cost_of(system, solved), packed(state))).max()
+    after = np.abs(gradient(cost_of(system, solved), at)).max()
+    assert after < 1e-3 * before
+
+
+def test_covariances_are_those_of_the_whole_inverse() -> None:
+    system, state = small_system(exact=True)
+    # Bones are as long as the lengths say and accelerations small: Gauss-Newton's matrix is the Hessian.
+    still = np.repeat(state.position[2:3], 5, axis=0)
+    ends = still[0][system.problem.bones]
+    shared = state.shared.copy()
+    shared[-2:] = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)
+    state = replace(state, position=still, shared=shared)
+    system = with_exact_pictures(system, state)
+    at = packed(state)
+    cost = cost_of(system, state)
+    step = 1e-4
+    moves = step * np.eye(at.size)
+    hessian = np.zeros((at.size, at.size))
+    for i, move in enumerate(moves):
+        for j in range(i + 1):
+            ahead = cost(at + move + moves[j]) - cost(at + move - moves[j])
+            behind = cost(at - move + moves[j]) - cost(at - move - moves[j])
+            hessian[i, j] = hessian[j, i] = (ahead - behind) / (8 * step**2)
+    # Lengths of which the estimate holds 1e-6 in addition, and joints 1e-4: far below what is measured.
+    inverse = np.linalg.inv(hessian)
+    times, joints = still.shape[:2]
+    own = inverse[: 3 * times * joints, : 3 * times * joints].reshape(times, joints, 3, times, joints, 3)
+    expected = np.einsum("tjatjb->tjab", own)
+    found = covariances(system, state)
+    # Second differences of costs of size 1 with steps of 1e-4 are good to 1e-8 of a curvature of 1e4.
+    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
+
+
+def with_exact_pictures(system: System, state: State) -> System:
+    """The same system, its cameras having seen exactly what the state says."""
+    pictures = system.problem.pictures
+    seen = np.einsum("gij,gki->gkj", pictures.rotation, state.position[0][None] - pictures.position[:, None])
+    pictures = replace(pictures, xy=np.ascontiguousarray(seen[..., :2] / seen[..., 2:]))
+    problem = replace(system.problem, pictures=pictures)
+    return System(problem, system.knowledge, system.layout, system.bound2)
+
+
+def test_long_flights_are_factorised_in_segments_with_the_same_result(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    system, state = small_system(exact=False)
+    _, whole, _ = solve(system.problem, system.knowledge, state, rounds=2)
+    monkeypatch.setattr("pipelines.reconstruction.refinement.elimination._SEGMENT", 2)
+    monkeypatch.setattr("pipelines.reconstruction.refinement.elimination._KEPT_BYTES", 0)
+    _, pieces, _ = solve(system.problem, system.knowledge, state, rounds=2)
+    np.testing.assert_array_equal(packed(pieces), packed(whole))
+
+
+# --- results -------------------------------------------------------------------------------------------
+
+
+def refined(flight: Formation, models: list[NoiseModel] | None) -> tuple[Float, Float, str | None]:
+    prior = None if models is None else [pose_errors(models)] * len(flight.sightings)
+    result = refine(flight.t_s, flight.sightings, flight.start, BONES, prior, np.zeros(len(flight.sightings)))
+    return result.position, result.covariance, result.fallback
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_white_noise_is_averaged_over_time(told: bool) -> None:
+    models: list[NoiseModel] = [WHITE]
+    flight = formation(60, 3, models, 0)
+    position, _, fallback = refined(flight, models if told else None)
+    assert fallback is None
+    # Without time the bound is 0.8 of it; a smooth walk shares its errors over a dozen pictures at least.
+    assert mean_mm(position, flight.truth) < 0.5 * mean_mm(flight.start, flight.truth)
+
+
+def test_constant_errors_in_the_body_show_when_the_formation_changes() -> None:
+    models: list[NoiseModel] = [BODY_BIAS]
+    flight = formation(150, 5, models, 1)
+    result = refine(flight.t_s, flight.sightings, flight.start, BONES, [pose_errors(models)] * 5, np.zeros(5))
+    position = result.position
+    assert result.fallback is None
+    assert mean_mm(position, flight.truth) < 0.2 * mean_mm(flight.start, flight.truth)
+    # And the cameras are where they were.
+    before, after = [], []
+    for c, sighting in enumerate(flight.sightings):
+        found, rotation = corrected(sighting.position, sighting.rotation, result.corrections[c][1])
+        after.append(np.linalg.norm(found - flight.position[c], axis=-1).mean())
+        before.append(np.linalg.norm(sighting.position - flight.position[c], axis=-1).mean())
+        unit = rotation @ np.swapaxes(rotation, 1, 2)
+        np.testing.assert_allclose(unit, np.tile(np.eye(3), (150, 1, 1)), atol=1e-9)
+    assert np.mean(after) < 0.3 * np.mean(before)
+
+
+def test_outliers_cost_at_most_a_fifth() -> None:
+    clean, dirty = (formation(60, 4, [], 2, bad_share=share) for share in (0.0, 0.05))
+    without, _, _ = refined(clean, [])
+    despite, _, _ = refined(dirty, [])
+    assert mean_mm(despite, dirty.truth) < 1.2 * mean_mm(without, clean.truth)
+    assert mean_mm(without, clean.truth) < 0.6 * mean_mm(clean.start, clean.truth)
+
+
+def test_a_wrong_prior_is_noticed() -> None:
+    # Told a constant error of the medium level, given a walk: never worse than trusting the log.
+    flight = formation(90, 3, [Drift(position_m_per_sqrt_s=0.03, rotation_deg_per_sqrt_s=0.15)], 4)
+    position, _, fallback = refined(flight, [BIAS])
+    if fallback is None:
+        assert mean_mm(position, flight.truth) < 1.05 * mean_mm(flight.start, flight.truth)
