@@ -1,0 +1,111 @@
+"""Ingest opens each log once, closes it whatever happens, and needs no more memory for a longer one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.ingest_log import CONTAINERS, RECORDER, in_a_process, ingested, timed, write
+from pipelines.formats.flight_logs import FlightLogs
+from pipelines.formats.mcap_log import McapLog
+from pipelines.formats.recordings import OpenLog
+from pipelines.ingest import ingest
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import read_flight
+from tests.synthetic.logged_flights import write_logged_flight
+from tests.synthetic.logs import Entry, write_log
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[OpenLog]:
+    """The MCAP logs that were opened."""
+    logs: list[OpenLog] = []
+    open_log = McapLog.open_log
+
+    def remembered(self: McapLog, paths: Sequence[Path]) -> OpenLog:
+        logs.append(open_log(self, paths))
+        return logs[-1]
+
+    monkeypatch.setattr(McapLog, "open_log", remembered)
+    return logs
+
+
+def all_closed(logs: list[OpenLog]) -> bool:
+    return all(part.file.closed for log in logs for part in log.parts)  # type: ignore[attr-defined]
+
+
+def test_each_log_is_opened_once(tmp_path: Path, opened: list[OpenLog]) -> None:
+    flight = write_logged_flight(tmp_path, "mcap-cdr")
+    flight.settings["actor"] = {"log": flight.settings["cameras"]["drone1"]["pose"]["log"]}
+    flight.settings["actor"]["topic"] = "/drone1/odometry"
+    flight.save()
+    ingest(flight.manifest)
+    assert len(opened) == 2
+    assert all_closed(opened)
+
+
+def test_nothing_is_opened_where_nothing_changed(tmp_path: Path, opened: list[OpenLog]) -> None:
+    flight = write_logged_flight(tmp_path, "mcap-cdr")
+    ingest(flight.manifest)
+    opened.clear()
+    assert ingest(flight.manifest).skipped
+    assert not opened
+
+
+def test_logs_are_closed_after_a_fault(tmp_path: Path, opened: list[OpenLog]) -> None:
+    flight = write_logged_flight(tmp_path, "mcap-cdr")
+    flight.settings["cameras"]["drone2"]["pose"]["topic"] = "/nothing"
+    flight.save()
+    with pytest.raises(DataError, match="has no topic /nothing"):
+        ingest(flight.manifest)
+    assert opened
+    assert all_closed(opened)
+    assert not flight.manifest.with_suffix(".session").exists()
+
+
+def test_losses_count_for_the_topic_that_lost_them(tmp_path: Path) -> None:
+    """The log stays open, yet what one topic lost is not said of the next."""
+    flight = write_logged_flight(tmp_path, "ros1")
+    stamp_ns = 1_700_000_000_000_000_000
+    header = {"stamp": stamp_ns}
+    pose = {"header": header, "pose": {"orientation": {"w": 1.0}}}
+    picture = {"header": header, "data": np.array([255, 216, 255], np.uint8)}
+    path = write_log(
+        tmp_path,
+        "lost",
+        "ros1",
+        [
+            Entry("/pose", "geometry_msgs/msg/PoseStamped", stamp_ns, pose),
+            Entry("/picture", "sensor_msgs/msg/CompressedImage", stamp_ns, picture),
+        ],
+    )
+    whole = path.read_bytes()
+    # The data of the picture, said to be twice as long as they are.
+    broken = whole.replace(b"\x03\0\0\0\xff\xd8\xff", b"\x06\0\0\0\xff\xd8\xff")
+    assert broken != whole
+    path.write_bytes(broken)
+    with FlightLogs(read_flight(flight.manifest), tmp_path, lambda _: None) as logs:
+        for _ in range(2):
+            with pytest.raises(DataError, match="/picture holds no picture"):
+                logs.frames(path.name, "/picture")
+            trajectory = logs.trajectory(path.name, "/pose", None, None, max_gap_ns=10**9)
+            assert trajectory.dropped == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_memory_is_bounded(tmp_path: Path, container: str) -> None:
+    """60 MB more of pictures, which nothing holds, cost less than a quarter of that."""
+    peaks = []
+    for megabytes in (1, 20, 80):
+        folder = tmp_path / str(megabytes)
+        log = in_a_process(write, folder, container, RECORDER, 200_000, megabytes)
+        if megabytes == 1:
+            small = log
+        else:
+            peaks.append(in_a_process(timed, ingested, small, log)["peak_mb"])
+    assert max(peaks) < 400
+    assert peaks[1] - peaks[0] < 15
