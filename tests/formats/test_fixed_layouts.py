@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -96,3 +97,21 @@ def test_many_more_than_one_batch(tmp_path: Path) -> None:
         *entries[8999].fields["pose"]["pose"]["position"].values(),
         *entries[8999].fields["pose"]["pose"]["orientation"].values(),
     ]
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_the_order_of_receipt_over_several_files(tmp_path: Path, container: Container) -> None:
+    """Messages of two files interleave, some were received at the same time, some are not in order."""
+    rng = np.random.default_rng(8)
+    entries = [entry("geometry_msgs/msg/PoseStamped", k, rng) for k in range(40)]
+    received = rng.integers(0, 15, len(entries)).tolist()
+    entries = [replace(e, stamp_ns=START_NS + r) for e, r in zip(entries, received, strict=True)]
+    paths = [
+        write_log(tmp_path, name, container, part)
+        for name, part in (("first", entries[:20]), ("second", entries[20:]))
+    ]
+    with recognise(paths[0], LogFormat, "log").open_log(paths) as log:
+        expected = [sample.stamp_ns for sample in all_samples(log.messages([TOPIC]), "log")]
+        read = poses_at_once(log, TOPIC)
+    assert read is not None
+    assert read.header_ns.tolist() == expected
