@@ -29,6 +29,18 @@ class DistanceField:
     grid: Grid
     from_ns: int = 0  # the time from which the map holds
 
+    @property
+    def has_obstacles(self) -> bool:
+        """Whether anything is occupied."""
+        return bool((self.grid.distance_m < 0.0).any())
+
+    def covers(self, points: Float) -> NDArray[np.bool_]:
+        """Which points [..., 3] lie in the grid's box."""
+        grid = self.grid
+        place = (points - grid.origin) / grid.resolution_m
+        inside = (place >= 0) & (place < np.array(grid.distance_m.shape))
+        return np.asarray(inside.all(axis=-1), dtype=np.bool_)
+
     def sample(self, points: Float) -> tuple[Float, Float]:
         """Distances [...] and their gradients [..., 3] at points [..., 3], metres, world.
 

@@ -90,8 +90,7 @@ def replay(
     noise = np.random.default_rng(seed).normal(size=measured.shape)
     noisy = measured + config.actor_noise_m * noise
     maps = sorted(fields, key=lambda field: field.from_ns)
-    period_ns = round(1e9 / config.tracking_hz)
-    replay_ns = t_ns[0] + period_ns * np.arange((t_ns[-1] - t_ns[0]) // period_ns + 1)
+    period_ns, replay_ns = round(1e9 / config.tracking_hz), replay_times(t_ns, config)
     map_at = np.searchsorted([field.from_ns for field in maps], replay_ns, side="right")
     known = [open_space(), *maps]
     taken_in = np.searchsorted(t_ns, replay_ns, side="right")
@@ -131,6 +130,13 @@ def replay(
         separation={kind.value: pilot.separation[kind] for kind in Separation},
         times=pilot.times,
     )
+
+
+def replay_times(actor_t_ns: Int64, config: PlannerConfig) -> Int64:
+    """The times [T] of a replay: every tracking step from the first measurement to the last."""
+    first_ns, last_ns = int(actor_t_ns[0]), int(actor_t_ns[-1])
+    period_ns = round(1e9 / config.tracking_hz)
+    return first_ns + period_ns * np.arange((last_ns - first_ns) // period_ns + 1, dtype=np.int64)
 
 
 def _checked(t_ns: Int64, actor: Float) -> tuple[Int64, Float]:

@@ -43,7 +43,8 @@ def score(
 
     Returns:
         JSON-able: degrees and metres by name; None where there is nothing to count (no pair of drones,
-        never near an obstacle). `limit_violations` counts episodes per drone (per pair for separation).
+        no obstacle at all, never near one). `limit_violations` counts episodes per drone (per pair for
+        separation).
         `predicted_error_m` is sqrt(tr S) of the ray model over the times at which two free views or more
         determine it, `undetermined_share` the share of the others.
     """
@@ -70,7 +71,7 @@ def score(
         "range_m": _spread(slots[..., RANGE]),
         "yaw_separation_deg": _spread(np.degrees(np.abs(turned))) if pairs else None,
         "occluded_share": float(1.0 - seen.mean()),
-        "min_clearance_m": float(clearance.min()),
+        "min_clearance_m": float(clearance.min()) if field.has_obstacles else None,
         "min_separation_m": float(apart.min()) if pairs else None,
         "max_speed_mps": float(motion["speed"].max()),
         "max_acceleration_mps2": float(motion["acceleration"].max()),
@@ -108,6 +109,7 @@ def near_obstacle(t_s: Float, slot_position: Float, actor: Float, field: Distanc
     occupied = grid.distance_m < 0.0
     levels = np.arange(1, occupied.shape[2] + 1)
     top_m = grid.origin[2] + grid.resolution_m * (occupied * levels).max(axis=2)
+    top_m[~occupied.any(axis=2)] = -np.inf  # the map may begin above the actor
     looks = np.unique(np.searchsorted(t_s, np.arange(t_s[0], t_s[-1] + 1e-9, 1.0 / _LOOKS_PER_S)))
     found = np.zeros(len(looks), dtype=np.bool_)
     centres = [grid.origin[a] + grid.resolution_m * (np.arange(top_m.shape[a]) + 0.5) for a in range(2)]

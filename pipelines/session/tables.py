@@ -74,6 +74,26 @@ SKELETON = pa.schema(
     ]
 )
 
+REPLAN = pa.schema(
+    [
+        ("t_ns", pa.int64()),
+        ("camera", pa.string()),
+        *_POSE,
+        ("formation_yaw_rad", pa.float64()),
+        ("slot_yaw_rad", pa.float64()),
+        ("slot_tilt_rad", pa.float64()),
+        ("slot_range_m", pa.float64()),
+        ("tilt_rad", pa.float64()),
+        ("visible", pa.bool_()),
+        ("predicted_error_m", pa.float64()),
+    ]
+)
+"""replan/<arm>/trajectories.parquet, sorted by time, then camera: the pose (world_from_camera), what
+was commanded (yaw continuous, NaN for what was flown), the tilt above the actor, whether nothing stands in
+the sight line, and what all cameras together are expected to err by (NaN where they determine nothing)."""
+COST_MAP = pa.schema([("t_ns", pa.int64()), ("yaw_rad", pa.float64()), ("cost", pa.float64())])
+"""replan/cost_map.parquet: what a formation whose first camera has that yaw would cost at that time."""
+
 
 def write_table(path: Path, frame: pd.DataFrame, schema: pa.Schema) -> None:
     """Write a table with exactly the columns of `schema`; NaN stays NaN."""

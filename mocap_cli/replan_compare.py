@@ -1,0 +1,157 @@
+"""`mocap replan-compare`: whether the adaptive formation would have been better than the fixed one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mocap_cli.options import (
+    FiniteRange,
+    any_path,
+    force_option,
+    json_option,
+    level,
+    session_argument,
+    verbosity_options,
+)
+from mocap_cli.terminal import print_json, print_table, say_warnings, watching
+
+if TYPE_CHECKING:
+    from pipelines.planning.replay import Mode
+
+
+@click.command("replan-compare", short_help="Fly other planners against the log, compare.")
+@session_argument
+@click.option(
+    "--arms",
+    metavar="NAME,...",
+    help="What is compared: adaptive, fixed, covariance, greedy, and flown, what the log says"
+    " [default: adaptive, fixed, and flown where cameras moved].",
+)
+@click.option(
+    "--drones", type=click.IntRange(2, 8), help="How many [default: the session's cameras, at least 2]."
+)
+@click.option("--radius", type=FiniteRange(0.5, 500), metavar="M", help="From the actor to the slots.")
+@click.option("--tilt", type=FiniteRange(-10, 85), metavar="DEG", help="Of the slots above the actor.")
+@click.option("--yaws", type=click.IntRange(1, 360), help="Cells of a full turn that are searched.")
+@click.option("--horizon", type=FiniteRange(0.1, 600), metavar="S", help="How far the search looks ahead.")
+@click.option(
+    "--yaw",
+    type=FiniteRange(-360, 360),
+    metavar="DEG",
+    help="Of the first camera at the start, counterclockwise from east [default: where it was].",
+)
+@click.option(
+    "--config",
+    type=any_path,
+    metavar="PLANNER.yaml",
+    help="Planner settings (docs/planner.md); the options above win over it.",
+)
+@click.option(
+    "--mode",
+    type=click.Choice(["closed-loop", "plan-only"]),
+    default="closed-loop",
+    show_default=True,
+    help="Fly the plans as point masses, or be exactly where they are.",
+)
+@click.option(
+    "--trials",
+    type=click.IntRange(1, 10_000),
+    default=20,
+    show_default=True,
+    help="Draws of detector and pose noise for the reconstruction error.",
+)
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help="Of all noise.")
+@click.option(
+    "--pose-noise",
+    metavar="MODEL",
+    help="Errors of the cameras' poses, instead of what the session says; for example"
+    ' "white:position_m=0.3,rotation_deg=1".',
+)
+@force_option
+@json_option
+@verbosity_options
+def replan_compare_command(
+    session: Path,
+    arms: str | None,
+    drones: int | None,
+    radius: float | None,
+    tilt: float | None,
+    yaws: int | None,
+    horizon: float | None,
+    yaw: float | None,
+    config: Path | None,
+    mode: Mode,
+    trials: int,
+    seed: int,
+    pose_noise: str | None,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+    verbose: int,
+) -> None:
+    """Replay formation planners against the logged actor and map, and compare them in numbers.
+
+    The actor's own skeleton is filmed again from each planner's cameras, with simulated errors of detector
+    and poses. Every figure of a replay is simulated; `flown` is what the log says.
+    """
+    from pipelines.replan import Settings, planner_settings, replan
+
+    stated = {"radius_m": radius, "tilt_deg": tilt, "yaws": yaws}
+    settings = Settings(
+        arms=None if arms is None else tuple(name.strip() for name in arms.split(",")),
+        drones=drones,
+        yaw_deg=yaw,
+        mode=mode,
+        trials=trials,
+        seed=seed,
+        pose_noise=pose_noise,
+        planner=planner_settings(
+            config, {name: value for name, value in stated.items() if value is not None}, horizon_s=horizon
+        ),
+    )
+    with watching(level(quiet, verbose)) as progress:
+        result = replan(session, settings, force=force, progress=progress)
+    say_warnings(result.record.warnings, quiet)
+    if as_json:
+        print_json(result.metrics)
+        return
+    if not quiet:
+        _print(result.metrics)
+    click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'replan'}")
+
+
+def _print(metrics: dict[str, Any]) -> None:
+    header = ["arm", "tilt deg", "max", "near obstacle", "occluded %", "clearance m", "separation m"]
+    header += ["MPJPE mm", "covered %", "violations"]
+    rows: list[list[object]] = []
+    for name, arm in metrics["arms"].items():
+        tilt, error = arm["tilt_deg"], arm["reconstruction_error"]
+        rows.append(
+            [
+                name,
+                tilt["mean"],
+                tilt["max"],
+                tilt["near_obstacle"],
+                100 * arm["occluded_share"],
+                arm["min_clearance_m"],
+                arm["min_separation_m"],
+                _with_interval(error["mpjpe_mm"]),
+                None if error["coverage"] is None else 100 * error["coverage"]["mean"],
+                sum(arm["limit_violations"].values()),
+            ]
+        )
+    print_table(header, rows)
+    click.echo(metrics["verdict"])
+
+
+def _with_interval(estimate: dict[str, Any] | None) -> str | None:
+    if estimate is None:
+        return None
+    text = f"{estimate['mean']:.1f}"
+    if estimate["interval"] is None:
+        return text
+    low, high = estimate["interval"]
+    return f"{text} [{low:.1f}, {high:.1f}]"

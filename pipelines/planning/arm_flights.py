@@ -1,0 +1,150 @@
+"""One arm of a comparison: flown, filmed, and as rows of a table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.noise import NoiseModel
+from pipelines.planning.arms import Arm
+from pipelines.planning.formation import TILT, slot_of
+from pipelines.planning.measuring import Detect, Filming, Measured, film
+from pipelines.planning.replay import replay
+from pipelines.planning.scene import Scene
+from pipelines.planning.scores import predicted_errors
+from pipelines.planning.sight import visible
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+FLOWN = "flown"
+"""The arm that is no planner: what the log says was flown."""
+
+_POSITION = ["x", "y", "z"]
+_QUATERNION = ["qx", "qy", "qz", "qw"]
+_SLOT = ["slot_yaw_rad", "slot_tilt_rad", "slot_range_m"]
+
+
+@dataclass(frozen=True)
+class ArmFlight:
+    """Where the N cameras of an arm were at the T times of the scene."""
+
+    names: tuple[str, ...]
+    position: Float  # [N, T, 3] m, world
+    quaternion_xyzw: Float  # [N, T, 4] world_from_camera
+    slots: Float  # [N, T, 3] commanded yaw (rad, continuous), tilt (rad), range (m); NaN for what was flown
+    known: Bool  # [N, T] False where a log has a gap and the position goes straight on
+    separation: dict[str, int]  # local plans by what kept them apart; empty for what was flown
+    central_s: Sequence[float] = ()  # measured planning times, different from run to run
+    local_s: Sequence[float] = ()
+
+
+def fly_arm(scene: Scene, arm: Arm | None) -> ArmFlight:
+    """Fly a scene again; None is what was flown."""
+    if arm is None:
+        position, quaternion, known = scene.flown
+        names = tuple(camera.name for camera in scene.flight.cameras)
+        return ArmFlight(names, position, quaternion, np.full_like(position, np.nan), known, {})
+    flight, rules = scene.flight, scene.rules
+    done = replay(
+        arm,
+        flight.actor_t_ns,
+        flight.actor,
+        scene.fields,
+        config=scene.config,
+        drones=scene.drones,
+        yaw_rad=scene.yaw_rad,
+        mode=rules.mode,
+        seed=rules.seed,
+    )
+    return ArmFlight(
+        names=tuple(scene.names),
+        position=done.position,
+        quaternion_xyzw=done.quaternion_xyzw,
+        slots=done.slots,
+        known=np.ones(done.position.shape[:2], dtype=np.bool_),
+        separation=done.separation,
+        central_s=done.times.central_s,
+        local_s=done.times.local_s,
+    )
+
+
+def film_arm(scene: Scene, flown: ArmFlight, detect: Detect) -> Measured | None:
+    """What its cameras would have measured of the actor's own skeleton; None without a skeleton."""
+    if scene.joints is None:
+        return None
+    lenses, noise = _equipment(scene, flown)
+    pictures = scene.pictures
+    filming = Filming(
+        t_ns=scene.t_ns[pictures],
+        position=flown.position[:, pictures],
+        quaternion_xyzw=flown.quaternion_xyzw[:, pictures],
+        known=flown.known[:, pictures],
+        intrinsics=lenses,
+        noise=noise,
+        joints=scene.joints,
+        middle=scene.actor[pictures],
+    )
+    return film(
+        filming,
+        scene.field,
+        detect,
+        start_m=scene.config.sight_start_m,
+        trials=scene.rules.trials,
+        seed=scene.rules.seed,
+    )
+
+
+def _equipment(scene: Scene, flown: ArmFlight) -> tuple[list[Intrinsics], list[tuple[NoiseModel, ...]]]:
+    """Lens and pose noise of each camera."""
+    cameras = scene.flight.cameras
+    carried = [cameras[k % len(cameras)] for k in range(len(flown.position))]
+    return [camera.intrinsics for camera in carried], [camera.noise for camera in carried]
+
+
+def trajectories(scene: Scene, flown: ArmFlight) -> pd.DataFrame:
+    """The rows of `tables.REPLAN`."""
+    import pandas as pd
+
+    count, times = flown.position.shape[:2]
+    position, slots = _rows(flown.position), _rows(flown.slots)
+    error = predicted_errors(flown.position, scene.actor, scene.field, scene.config)
+    seen = visible(scene.field, flown.position, scene.actor, start_m=scene.config.sight_start_m)
+    table = pd.DataFrame(
+        {
+            "t_ns": np.repeat(scene.t_ns, count),
+            "camera": np.tile(np.array(flown.names, dtype=object), times),
+        }
+    )
+    table[_POSITION] = position
+    table[_QUATERNION] = _rows(flown.quaternion_xyzw)
+    table["formation_yaw_rad"] = np.repeat(flown.slots[0, :, 0], count)
+    table[_SLOT] = slots
+    table["tilt_rad"] = _rows(slot_of(flown.position - scene.actor))[:, TILT]
+    table["visible"] = seen.T.ravel()
+    table["predicted_error_m"] = np.repeat(np.where(np.isfinite(error), error, np.nan), count)
+    return table
+
+
+def flight_from(table: pd.DataFrame, known: Bool, separation: dict[str, int]) -> ArmFlight:
+    """The flight that `trajectories` stored."""
+    names = tuple(dict.fromkeys(table["camera"]))
+
+    def array(columns: list[str]) -> Float:
+        rows = table[columns].to_numpy(np.float64).reshape(-1, len(names), len(columns))
+        return np.ascontiguousarray(rows.swapaxes(0, 1))
+
+    return ArmFlight(names, array(_POSITION), array(_QUATERNION), array(_SLOT), known, separation)
+
+
+def _rows(values: Float) -> Float:
+    """[N, T, K] as rows sorted by time, then camera."""
+    return values.swapaxes(0, 1).reshape(-1, values.shape[2])

@@ -1,0 +1,106 @@
+"""Whether one arm is better than another: means, differences, and how sure they are.
+
+Intervals are percentiles of bootstrap means (Efron & Tibshirani 1993, 13.3): of the trials for errors, which
+are independent draws, and of stretches of the flight for what the flight's course decides.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Bool = NDArray[np.bool_]
+
+RESAMPLES = 2000
+LEVEL = 0.95
+STRETCH_S = 5.0
+"""Neighbouring moments are alike: the flight is resampled in pieces of this length."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean and the interval that holds it with `LEVEL` probability; None where that cannot be told."""
+
+    mean: float
+    interval: tuple[float, float] | None
+
+    @property
+    def excludes_zero(self) -> bool:
+        """Whether the interval is all above or all below 0."""
+        return self.interval is not None and (self.interval[0] > 0 or self.interval[1] < 0)
+
+    def as_json(self) -> dict[str, object]:
+        """As it stands in metrics.json."""
+        return {"mean": self.mean, "interval": None if self.interval is None else list(self.interval)}
+
+
+def mean_of_trials(values: Float, seed: int) -> Estimate | None:
+    """The mean of a figure over trials [K]; None without any, no interval for a single one."""
+    return _weighted(values, np.ones(len(values)), seed)
+
+
+def mean_over_time(values: Float, counted: Bool, stretch: NDArray[np.int64], seed: int) -> Estimate | None:
+    """The mean over the moments that count, with the interval of whole stretches.
+
+    Args:
+        values: [T] or [N, T].
+        counted: [T].
+        stretch: [T] the number of the stretch of every moment (`stretches`).
+        seed: of the resampling.
+    """
+    flat = np.atleast_2d(values).mean(axis=0)
+    weight = np.bincount(stretch, weights=counted.astype(np.float64)).astype(np.float64)
+    total = np.bincount(stretch, weights=np.where(counted, flat, 0.0)).astype(np.float64)
+    used = weight > 0
+    return _weighted(total[used] / weight[used], weight[used], seed)
+
+
+def stretches(t_s: Float) -> NDArray[np.int64]:
+    """The stretch [T] that each moment belongs to."""
+    return (t_s // STRETCH_S).astype(np.int64)
+
+
+def common_frames(errors: Mapping[str, Float32]) -> Bool:
+    """Joint-frames [trials, T, J] that every arm measured; arms that measured none do not count."""
+    measured = [np.isfinite(error) for error in errors.values() if np.isfinite(error).any()]
+    shape = next(iter(errors.values())).shape
+    return np.logical_and.reduce(measured) if measured else np.zeros(shape, dtype=np.bool_)
+
+
+def mpjpe_mm(error_m: Float32, counted: Bool) -> Float:
+    """The mean error of each trial over the joint-frames [K, T, J] that count.
+
+    Returns:
+        [K], or fewer: trials in which none counts are left out.
+    """
+    number = counted.sum(axis=(1, 2))
+    total = np.where(counted, error_m, 0.0).sum(axis=(1, 2), dtype=np.float64)
+    has_any = number > 0
+    mean: Float = 1e3 * total[has_any] / number[has_any]
+    return mean
+
+
+def coverage(error_m: Float32, joint_frames: int) -> Float:
+    """Share [K] of the joint-frames with a truth that were measured, 0..1."""
+    share: Float = np.isfinite(error_m).sum(axis=(1, 2)) / max(joint_frames, 1)
+    return share
+
+
+def _weighted(values: Float, weight: Float, seed: int) -> Estimate | None:
+    """The weighted mean of independent values, and its bootstrap interval."""
+    if not len(values) or not math.isfinite(float(weight.sum())) or weight.sum() == 0:
+        return None
+    mean = float((values * weight).sum() / weight.sum())
+    if len(values) < 2:
+        return Estimate(mean, None)
+    rows = np.random.default_rng([seed, len(values)]).integers(len(values), size=(RESAMPLES, len(values)))
+    means = (values * weight)[rows].sum(axis=1) / weight[rows].sum(axis=1)
+    tail = 50 * (1 - LEVEL)
+    low, high = np.percentile(means, [tail, 100 - tail])
+    return Estimate(mean, (float(low), float(high)))

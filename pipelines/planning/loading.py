@@ -1,0 +1,329 @@
+"""What a replay needs of a session: the actor, the maps, the cameras, and a skeleton to look at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.noise import NoiseModel, White
+from pipelines.geometry.poses import gaps, interpolate_points, interpolate_poses
+from pipelines.session.description import CameraEntry, Description
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float, Int64, JointMotion, Trajectory
+from pipelines.session.registries import noise_models, parsed_noise_models
+from pipelines.session.stages import StageRecord
+from pipelines.session.tables import ACTOR, CAMERA_POSES, POSES, SKELETON, TRUTH, read_table
+from pipelines.session.tabular import motion_from, trajectory_from
+
+Bool = NDArray[np.bool_]
+Source = Literal["log", "reconstruction", "truth"]
+
+HIP_ABOVE_M = {"hip": 0.0, "centre": 0.0, "feet": 0.95, "head": -0.70}
+"""How far the hips are above the point that was logged, for a person of 1.75 m who stands."""
+
+_LONGEST_STEP_NS = 200_000_000  # joints are interpolated across this much at least: 10 Hz and a missed frame
+_STEPS = 1.5  # or this many median steps
+_GAP_NS = 1_000_000_000  # an actor who is not measured for longer is spoken of
+_SHORTEST_S = 1.0
+_HIPS = ("left_hip", "right_hip")
+_SANE_VARIANCE = (100.0, np.pi**2)  # m^2, rad^2: what ROS means by 1e6 is "unknown"
+
+
+@dataclass(frozen=True)
+class SessionCamera:
+    """A camera of the session, and what is known of it."""
+
+    name: str
+    intrinsics: Intrinsics
+    trajectory: Trajectory  # one row where it stands still
+    static: bool
+    noise: tuple[NoiseModel, ...]  # of its logged poses
+
+
+@dataclass(frozen=True)
+class LoggedFlight:
+    """What was flown, as far as the session knows."""
+
+    actor_t_ns: Int64  # [A] ascending
+    actor: Float  # [A, 3] m, world: what planners are told, the middle of the hips
+    actor_source: Source
+    hips: JointMotion | None  # the true hips, [T, 1, 1, 3], NaN where unknown; None without truth
+    skeleton: JointMotion | None  # [T, 1, J, 3] of the first person, NaN where unknown
+    skeleton_source: Source | None
+    cameras: tuple[SessionCamera, ...]
+    poses_source: Source
+    noise_source: str  # who states the noise of the poses
+    warnings: tuple[str, ...]
+
+    @property
+    def moves(self) -> bool:
+        """Whether any camera does."""
+        return not all(camera.static for camera in self.cameras)
+
+    def scored_actor(self, t_ns: Int64) -> tuple[Float, Source]:
+        """Where the actor was [T, 3], to score against: the true hips where they are known all the time."""
+        if self.hips is not None:
+            true_hips = points_at(self.hips, t_ns)[:, 0]
+            if np.isfinite(true_hips).all():
+                return true_hips, "truth"
+        axes = [np.interp(t_ns, self.actor_t_ns, self.actor[:, axis]) for axis in range(3)]
+        return np.stack(axes, axis=-1), self.actor_source
+
+
+def load_flight(
+    folder: Path, description: Description, reconstructed: StageRecord | None, *, pose_noise: str | None
+) -> LoggedFlight:
+    """Read it, cut to the time in which the actor and all moving cameras are known.
+
+    Args:
+        folder: the session.
+        description: its session.json.
+        reconstructed: the record of stage `reconstruct`, None where that has not run.
+        pose_noise: errors of the poses, in place of what the session states.
+
+    Raises:
+        DataError: nobody knows where the actor was, or not while the cameras flew; an unknown noise model.
+    """
+    warnings: list[str] = []
+    skeleton, skeleton_source = _skeleton(folder, description, reconstructed)
+    t_ns, actor, source = _actor(folder, description, reconstructed, warnings)
+    cameras, poses_source, noise_source = _cameras(folder, description, pose_noise)
+    if noise_source == "nobody":
+        warnings.append("nobody states the noise of the cameras' poses: taken as exact; state --pose-noise")
+    hips = _hips(skeleton) if skeleton is not None and skeleton_source == "truth" else None
+    spans = {f"the poses of {c.name}": c.trajectory.t_ns[[0, -1]] for c in cameras if not c.static}
+    if hips is not None:
+        spans["the truth"] = hips.t_ns[np.flatnonzero(np.isfinite(hips.position[:, 0, 0, 0]))[[0, -1]]]
+    t_ns, actor = _cut(folder, t_ns, actor, spans)
+    missing = gaps(t_ns, _GAP_NS)
+    if missing:
+        longest_s = max(last - first for first, last in missing) / 1e9
+        warnings.append(
+            f"the actor was not measured {len(missing)} times for more than {_GAP_NS / 1e9:g} s, at most"
+            f" {longest_s:.1f} s: planners take a straight way meanwhile"
+        )
+    return LoggedFlight(
+        actor_t_ns=t_ns,
+        actor=actor,
+        actor_source=source,
+        hips=hips,
+        skeleton=skeleton,
+        skeleton_source=skeleton_source,
+        cameras=cameras,
+        poses_source=poses_source,
+        noise_source=noise_source,
+        warnings=tuple(warnings),
+    )
+
+
+def has_true_joints(description: Description) -> bool:
+    """Whether the session knows where the joints really were."""
+    return description.truth is not None and bool(description.truth.joints)
+
+
+def points_at(motion: JointMotion, t_ns: Int64) -> Float:
+    """The first person's joints [T, J, 3] at given times, NaN where they are not known nearby."""
+    step_ns = float(np.median(np.diff(motion.t_ns))) if len(motion.t_ns) > 1 else 0.0
+    longest_ns = max(_LONGEST_STEP_NS, round(_STEPS * step_ns))
+    return interpolate_points(motion.t_ns, motion.position[:, 0], t_ns, max_gap_ns=longest_ns)
+
+
+def flown_poses(flight: LoggedFlight, description: Description, t_ns: Int64) -> tuple[Float, Float, Bool]:
+    """Where the cameras really were: positions [N, T, 3], quaternions [N, T, 4] and whether known [N, T].
+
+    Across gaps of the log positions go straight on, so that a flight can be scored as a whole.
+    """
+    limits = description.pose_interpolation
+    shape = (len(flight.cameras), len(t_ns))
+    position, quaternion = np.empty((*shape, 3)), np.empty((*shape, 4))
+    known = np.ones(shape, dtype=np.bool_)
+    for i, camera in enumerate(flight.cameras):
+        log = camera.trajectory
+        if camera.static:
+            position[i], quaternion[i] = log.position[0], log.quaternion_xyzw[0]
+            continue
+        found, _ = interpolate_poses(
+            log.t_ns,
+            log.position,
+            log.quaternion_xyzw,
+            t_ns,
+            max_gap_ns=round(limits.max_gap_s * 1e9),
+            max_extrapolation_ns=round(limits.max_extrapolation_s * 1e9),
+        )
+        known[i] = np.isfinite(found[:, 0])
+        position[i], quaternion[i] = interpolate_poses(
+            log.t_ns,
+            log.position,
+            log.quaternion_xyzw,
+            t_ns,
+            max_gap_ns=int(np.ptp(log.t_ns)),
+            max_extrapolation_ns=int(np.ptp(t_ns)),
+        )
+    return position, quaternion, known
+
+
+# --- the person ----------------------------------------------------------------------------------------
+
+
+def _skeleton(
+    folder: Path, description: Description, reconstructed: StageRecord | None
+) -> tuple[JointMotion | None, Source | None]:
+    """The truth, or else what was reconstructed."""
+    if has_true_joints(description):
+        joints = tuple(description.truth.joints) if description.truth else ()
+        return motion_from(read_table(folder / "truth.parquet", TRUTH), joints), "truth"
+    return (None, None) if reconstructed is None else (_reconstruction(folder), "reconstruction")
+
+
+def _reconstruction(folder: Path) -> JointMotion:
+    """What was reconstructed; joints that are not `ok` are not known."""
+    table = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON)
+    table = table[table["person"] == 0]
+    motion = motion_from(table, tuple(dict.fromkeys(table["joint"])))
+    if motion.status is not None:
+        motion.position[motion.status != "ok"] = np.nan
+    return motion
+
+
+def _hips(skeleton: JointMotion) -> JointMotion | None:
+    """The middle of the hips of the first person, [T, 1, 1, 3]."""
+    names = ("hip",) if "hip" in skeleton.joints else _HIPS
+    if not set(names) <= set(skeleton.joints):
+        return None
+    columns = [skeleton.joints.index(name) for name in names]
+    middle = skeleton.position[:, :1, columns].mean(axis=2, keepdims=True)
+    if not np.isfinite(middle).any():
+        return None
+    return JointMotion(skeleton.t_ns, ("hip",), middle)
+
+
+def _actor(
+    folder: Path,
+    description: Description,
+    reconstructed: StageRecord | None,
+    warnings: list[str],
+) -> tuple[Int64, Float, Source]:
+    """What planners are told of the actor: the log, or where there is none the reconstructed hips."""
+    if description.actor is not None:
+        table = read_table(folder / "actor.parquet", ACTOR)
+        table = table[table["person"] == table["person"].min()]
+        position = table[["x", "y", "z"]].to_numpy(np.float64)
+        above_m = HIP_ABOVE_M[description.actor.point]
+        if description.actor.point in ("feet", "head"):
+            warnings.append(
+                f"the actor's {description.actor.point} were logged: hips taken {above_m:+.2f} m above"
+            )
+        t_ns = table["t_ns"].to_numpy(np.int64)
+        return *_measured(folder, t_ns, position + np.array([0.0, 0.0, above_m]), "the actor's log"), "log"
+    if reconstructed is None:
+        raise DataError(
+            folder,
+            "has no logged actor and no reconstruction to take one from",
+            "run `mocap reconstruct`, or name the actor's topic under `actor:` in flight.yaml",
+        )
+    hips = _hips(_reconstruction(folder))
+    if hips is None:
+        raise DataError(
+            folder,
+            "has no logged actor, and the reconstruction has no time at which both hips are ok",
+            "name the actor's topic under `actor:` in flight.yaml, or mend the reconstruction",
+        )
+    return *_measured(
+        folder, hips.t_ns, hips.position[:, 0, 0], "the reconstruction's hips"
+    ), "reconstruction"
+
+
+def _measured(folder: Path, t_ns: Int64, position: Float, what: str) -> tuple[Int64, Float]:
+    rows = np.isfinite(position).all(axis=1)
+    if rows.sum() < 2:
+        raise DataError(
+            folder, f"{what} say where the actor is {int(rows.sum())} times", "a replay needs a way"
+        )
+    return t_ns[rows], position[rows]
+
+
+def _cut(folder: Path, t_ns: Int64, actor: Float, spans: dict[str, NDArray[np.int64]]) -> tuple[Int64, Float]:
+    """The actor while all else is known."""
+    first_ns = max([int(t_ns[0]), *(int(span[0]) for span in spans.values())])
+    last_ns = min([int(t_ns[-1]), *(int(span[1]) for span in spans.values())])
+    kept = (t_ns >= first_ns) & (t_ns <= last_ns)
+    lasting_s = float(np.ptp(t_ns[kept]) / 1e9) if kept.any() else 0.0
+    if lasting_s < _SHORTEST_S:
+        raise DataError(
+            folder,
+            f"the actor is known for {lasting_s:.2f} s while {' and '.join(spans) or 'nothing else'} are,"
+            f" less than {_SHORTEST_S:g} s",
+            "check the clocks of the logs",
+        )
+    return t_ns[kept], actor[kept]
+
+
+# --- the cameras ---------------------------------------------------------------------------------------
+
+
+def _cameras(
+    folder: Path, description: Description, pose_noise: str | None
+) -> tuple[tuple[SessionCamera, ...], Source, str]:
+    true_poses = _true_poses(folder, description)
+    cameras, stating = [], set()
+    for name, entry in description.cameras.items():
+        logged = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
+        noise, stated_by = _noise(name, entry, logged, pose_noise)
+        stating.add(stated_by)
+        cameras.append(
+            SessionCamera(
+                name=name,
+                intrinsics=entry.intrinsics.intrinsics(),
+                trajectory=true_poses.get(name, logged) if not entry.poses.static else logged,
+                static=entry.poses.static,
+                noise=noise,
+            )
+        )
+    return tuple(cameras), "truth" if true_poses else "log", _said_by(stating)
+
+
+def _true_poses(folder: Path, description: Description) -> dict[str, Trajectory]:
+    """Where every camera really was, if that is known of all of them."""
+    moving = {name for name, entry in description.cameras.items() if not entry.poses.static}
+    if description.truth is None or not moving or not moving <= set(description.truth.cameras):
+        return {}
+    table = read_table(folder / "truth_poses.parquet", CAMERA_POSES)
+    return {name: trajectory_from(table[table["camera"] == name]) for name in sorted(moving)}
+
+
+def _noise(
+    name: str, entry: CameraEntry, logged: Trajectory, pose_noise: str | None
+) -> tuple[tuple[NoiseModel, ...], str]:
+    """What is wrong with a camera's poses, and who says so."""
+    if pose_noise:
+        return tuple(parsed_noise_models("--pose-noise", pose_noise)), "--pose-noise"
+    if entry.pose_noise:
+        return tuple(noise_models(f"pose_noise of {name}", entry.pose_noise)), "flight.yaml"
+    sigma = _logged_sigma(logged)
+    if sigma is not None:
+        white = White(position_m=sigma[0], rotation_deg=float(np.degrees(sigma[1])))
+        return (white,), "the logs' covariances, as white noise"
+    return (), "still cameras are exact" if entry.poses.static else "nobody"
+
+
+def _said_by(stating: set[str]) -> str:
+    return "nobody" if "nobody" in stating else ", ".join(sorted(stating))
+
+
+def _logged_sigma(trajectory: Trajectory) -> tuple[float, float] | None:
+    """Median standard deviation per axis (m, rad) of the logged covariances; None where they say nothing."""
+    if trajectory.covariance is None:
+        return None
+    variances = np.diagonal(trajectory.covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
+    known = [
+        v[(v > 0) & (v < most)] for v, most in zip(np.moveaxis(variances, 1, 0), _SANE_VARIANCE, strict=True)
+    ]
+    if not all(values.size for values in known):
+        return None
+    position, rotation = (float(np.sqrt(np.median(values))) for values in known)
+    return position, rotation

@@ -1,0 +1,193 @@
+"""What all arms of a comparison share: the actor, the maps, the cameras and the times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.planning.comparison import stretches
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.costs import cost_map, costs_of_slots
+from pipelines.planning.distance_field import DistanceField, Unknown, distance_field, open_space
+from pipelines.planning.formation import YAW, formation_slots, slot_of, slot_offsets, yaw_set
+from pipelines.planning.loading import LoggedFlight, SessionCamera, Source, flown_poses, points_at
+from pipelines.planning.replay import Mode, replay_times
+from pipelines.planning.scores import near_obstacle
+from pipelines.session.description import Description
+from pipelines.session.records import Float, Int64, Occupancy
+
+Bool = NDArray[np.bool_]
+
+MOST_DRONES = 8
+PICTURES_HZ = 25.0
+"""Near enough to the 30 for which the detector's errors are modelled."""
+_COST_MAP_HZ, _COST_MAP_YAWS = 2.0, 72
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How arms are compared; None is what the session says."""
+
+    config: PlannerConfig
+    drones: int | None = None
+    yaw_rad: float | None = None
+    mode: Mode = "closed-loop"
+    trials: int = 20
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A flight that can be flown again. T times, one per tracking step; C cameras of the session."""
+
+    flight: LoggedFlight
+    rules: Rules
+    drones: int
+    yaw_rad: float  # of the first camera at the start
+    t_ns: Int64  # [T]
+    actor: Float  # [T, 3] what is scored against
+    actor_source: Source
+    fields: tuple[DistanceField, ...]  # by the time from which they hold
+    flown: tuple[Float, Float, Bool]  # positions [C, T, 3], quaternions [C, T, 4], whether logged [C, T]
+    notes: tuple[str, ...]  # what was chosen
+    warnings: tuple[str, ...]
+
+    @property
+    def config(self) -> PlannerConfig:
+        """Planner settings."""
+        return self.rules.config
+
+    @property
+    def t_s(self) -> Float:
+        """[T] seconds since the start."""
+        seconds: Float = (self.t_ns - self.t_ns[0]) / 1e9
+        return seconds
+
+    @property
+    def field(self) -> DistanceField:
+        """What stands around, as it is known in the end."""
+        return self.fields[-1] if self.fields else open_space()
+
+    @property
+    def cameras(self) -> list[SessionCamera]:
+        """What each drone carries: the session's cameras, and then the same again."""
+        cameras = self.flight.cameras
+        return [cameras[k % len(cameras)] for k in range(self.drones)]
+
+    @property
+    def names(self) -> list[str]:
+        """What the drones are called: as the session's cameras, and then drone1, ... as far as free."""
+        own = [camera.name for camera in self.flight.cameras]
+        free = [f"drone{k + 1}" for k in range(self.drones + len(own)) if f"drone{k + 1}" not in own]
+        return [*own, *free][: self.drones]
+
+    @property
+    def stretch(self) -> Int64:
+        """[T] the stretch of the flight that each moment belongs to."""
+        return stretches(self.t_s)
+
+    @property
+    def pictures(self) -> slice:
+        """The times at which pictures are taken."""
+        return slice(None, None, max(round(self.config.tracking_hz / PICTURES_HZ), 1))
+
+    @cached_property
+    def near(self) -> Bool:
+        """[T] when an obstacle is near a slot of the formation of the start: the same for all arms."""
+        return near_obstacle(self.t_s, self._first_slots(), self.actor, self.field)
+
+    @cached_property
+    def joints(self) -> Float | None:
+        """[P, J, 3] the person at the times of the pictures; None where no skeleton is known."""
+        skeleton = self.flight.skeleton
+        return None if skeleton is None else points_at(skeleton, self.t_ns[self.pictures])
+
+    def _first_slots(self) -> Float:
+        """[N, T, 3] where the slots of the start's formation are."""
+        slots = formation_slots(
+            np.array(self.yaw_rad), self.drones, tilt_rad=self.config.tilt_rad, range_m=self.config.radius_m
+        )
+        return self.actor + slot_offsets(slots)[:, None]
+
+    def start_slots_inside(self) -> int:
+        """How many slots of the start stand in an obstacle."""
+        return int((self.field_at_start.sample(self._first_slots()[:, 0])[0] <= 0.0).sum())
+
+    @property
+    def field_at_start(self) -> DistanceField:
+        """What is known when the replay begins."""
+        known = [field for field in self.fields if field.from_ns <= self.t_ns[0]]
+        return known[-1] if known else open_space()
+
+    def cost_map(self) -> tuple[Int64, Float, Float]:
+        """Times [M], yaws [D] of the first camera, and what the formation would cost there [M, D]."""
+        rows = slice(None, None, max(round(self.config.tracking_hz / _COST_MAP_HZ), 1))
+        yaws = yaw_set(_COST_MAP_YAWS, self.yaw_rad)
+        slots = formation_slots(
+            yaws, self.drones, tilt_rad=self.config.tilt_rad, range_m=self.config.radius_m
+        )
+        costs = costs_of_slots(self.field, self.actor[rows], slot_offsets(slots), self.config)
+        return self.t_ns[rows], yaws, cost_map(costs, self.config)
+
+
+def build_scene(
+    flight: LoggedFlight,
+    maps: Sequence[Occupancy],
+    description: Description,
+    rules: Rules,
+) -> Scene:
+    """Prepare a comparison: distance fields, times, where the first camera starts, and what is doubtful."""
+    notes, warnings = [], list(flight.warnings)
+    unknown: Unknown = "occupied" if description.map and description.map.unknown == "occupied" else "free"
+    fields = tuple(
+        sorted((distance_field(one, unknown=unknown) for one in maps), key=lambda field: field.from_ns)
+    )
+    notes.append(
+        f"unknown voxels of the map count as {unknown}" if fields else "no map: open space, nothing is hidden"
+    )
+    t_ns = replay_times(flight.actor_t_ns, rules.config)
+    actor, actor_source = flight.scored_actor(t_ns)
+    flown = flown_poses(flight, description, t_ns)
+    drones = rules.drones or min(max(len(flight.cameras), 2), MOST_DRONES)
+    if rules.drones is None and drones != len(flight.cameras):
+        notes.append(f"{drones} drones are replayed, the session has {len(flight.cameras)} cameras")
+    yaw_rad = rules.yaw_rad
+    if yaw_rad is None:
+        yaw_rad = float(slot_of(flown[0][0, 0] - actor[0])[YAW])
+        first = flight.cameras[0].name
+        notes.append(f"formations start at {np.degrees(yaw_rad):.1f} deg, where {first} was")
+    scene = Scene(
+        flight=flight,
+        rules=rules,
+        drones=drones,
+        yaw_rad=yaw_rad,
+        t_ns=t_ns,
+        actor=actor,
+        actor_source=actor_source,
+        fields=fields,
+        flown=flown,
+        notes=tuple(notes),
+        warnings=(),
+    )
+    if fields and not scene.field.has_obstacles:
+        warnings.append("nothing in the map is occupied")
+    outside = float(1.0 - scene.field.covers(actor).mean()) if fields else 0.0
+    if outside > 0.0:
+        warnings.append(
+            f"the map does not cover {100 * outside:.0f} % of the actor's way: what lies outside is free"
+        )
+    if fields and fields[0].from_ns > t_ns[0]:
+        late_s = min((fields[0].from_ns - int(t_ns[0])) / 1e9, float(scene.t_s[-1]))
+        warnings.append(f"the first map comes {late_s:.1f} s after the start: nothing is known until then")
+    inside = scene.start_slots_inside()
+    if inside:
+        warnings.append(
+            f"{inside} of {drones} drones start inside an obstacle: choose another --yaw, --radius or --tilt"
+        )
+    if flight.skeleton is None:
+        warnings.append("no skeleton to look at, so no reconstruction error: run `mocap reconstruct` first")
+    return replace(scene, warnings=tuple(warnings))

@@ -1,0 +1,51 @@
+"""One plain sentence: whether the first arm is better than the second, as far as that can be told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+_ALIKE_DEG = 2.0  # mean or largest tilts that differ by less are not worth a word
+
+
+def verdict(
+    arm: str, against: str, arms: Mapping[str, Mapping[str, Any]], difference: Mapping[str, Any]
+) -> str:
+    """Say it.
+
+    Args:
+        arm: of which something is said.
+        against: with which it is compared.
+        arms: scores by arm, as they stand in metrics.json.
+        difference: of the two, arm minus against, as it stands there.
+    """
+    return f"{_about_tilt(arm, against, arms)}; {_about_error(difference)}"
+
+
+def _about_tilt(arm: str, against: str, arms: Mapping[str, Mapping[str, Any]]) -> str:
+    own, other = (arms[name]["tilt_deg"]["max"] for name in (arm, against))
+    if abs(own - other) < _ALIKE_DEG:
+        return f"{arm} and {against} tilt alike, up to {own:.0f} and {other:.0f} deg"
+    if own < other:
+        return f"{arm} keeps the tilt at {own:.0f} deg where {against} climbs to {other:.0f}"
+    return f"{arm} climbs to a tilt of {own:.0f} deg where {against} keeps it at {other:.0f}"
+
+
+def _about_error(difference: Mapping[str, Any]) -> str:
+    found = difference["mpjpe_mm"]
+    if found is None:
+        return "its reconstruction error could not be compared"
+    mean, interval = found["mean"], found["interval"]
+    if interval is None:
+        return f"its reconstruction error differs by {mean:+.0f} mm in the only trial (simulated)"
+    low, high = interval
+    if low <= 0 <= high:
+        return (
+            "no difference in reconstruction error was found"
+            f" ({mean:+.1f} mm [{low:+.1f}, {high:+.1f}], simulated)"
+        )
+    nearest, farthest = sorted((abs(low), abs(high)))
+    which = "smaller" if mean < 0 else "larger"
+    return (
+        f"its reconstruction error is {abs(mean):.1f} mm [{nearest:.1f}, {farthest:.1f}] {which} (simulated)"
+    )

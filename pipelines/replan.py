@@ -1,0 +1,286 @@
+"""Stage `replan`: the formation planners flown again, offline, against the logged actor and the maps.
+
+Load what was flown; fly every arm and film the actor's own skeleton from its cameras; score all alike and
+compare; store. What was simulated says so in metrics.json; how long planning took stands in run.json.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.formats.yaml_text import read_yaml
+from pipelines.planning.arm_flights import FLOWN, film_arm, flight_from, fly_arm, trajectories
+from pipelines.planning.config import PlannerConfig, planner_config
+from pipelines.planning.contest import Entrant, compare
+from pipelines.planning.loading import LoggedFlight, has_true_joints, load_flight
+from pipelines.planning.replay import Mode
+from pipelines.planning.scene import Rules, Scene, build_scene
+from pipelines.session.description import Description, read_description
+from pipelines.session.errors import DataError
+from pipelines.session.maps import load_maps
+from pipelines.session.progress import Progress, Silent
+from pipelines.session.records import Float, JointMotion
+from pipelines.session.registries import PLANNER_ARMS
+from pipelines.session.stages import Stage, StageRecord, WritableSession, locked
+from pipelines.session.storage import jsonable, read_json, write_json
+from pipelines.session.tables import ACTOR, COST_MAP, REPLAN, TRUTH, read_table, write_table
+from pipelines.session.tabular import motion_table
+from pipelines.simulation.detector_errors import detect_keypoints, view_of
+from pipelines.simulation.scenario import DetectorErrors
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+REPLAN_STAGE = Stage("replan", revision=1)
+
+_HEIGHT_M = 1.75  # of the person, for how large a detector sees them
+_SKELETON = "reconstruct/skeleton.parquet"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What decides the result, next to the session itself; None is what the session says."""
+
+    arms: tuple[str, ...] | None = None  # adaptive, fixed, and flown where cameras moved
+    drones: int | None = None  # as many as there are cameras, 2 to 8
+    yaw_deg: float | None = None  # where the first camera was
+    mode: Mode = "closed-loop"
+    trials: int = 20
+    seed: int = 0
+    pose_noise: str | None = None
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+
+
+@dataclass(frozen=True)
+class Replanned:
+    """What a comparison left behind."""
+
+    folder: Path
+    record: StageRecord
+    metrics: dict[str, Any]
+    skipped: bool  # nothing had changed
+
+
+def planner_settings(
+    path: Path | None, changes: Mapping[str, object], *, horizon_s: float | None = None
+) -> PlannerConfig:
+    """Planner settings of a YAML file (docs/planner.md), if there is one, with some of them changed.
+
+    Args:
+        path: the file.
+        changes: settings that win over it.
+        horizon_s: how far the search looks ahead, rounded up to whole knots.
+
+    Raises:
+        DataError: the file cannot be read, or a setting is unknown or out of range.
+    """
+    stated = {} if path is None else read_yaml(path)
+    source = "planner settings" if path is None else path
+    config = planner_config({**stated, **changes}, source)
+    if horizon_s is None:
+        return config
+    knots = math.ceil(horizon_s / config.knot_s - 1e-9)
+    return planner_config({**stated, **changes, "horizon_knots": knots}, source)
+
+
+def replan(
+    folder: Path,
+    settings: Settings | None = None,
+    *,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Replanned:
+    """Fly the planners again and compare them.
+
+    Args:
+        folder: the session.
+        settings: what decides the result.
+        force: do it again although nothing changed.
+        progress: who watches.
+
+    Raises:
+        DataError: the session cannot be used (nobody knows where the actor was), or a setting is wrong.
+        BusyError: another process writes the session.
+    """
+    settings = settings or Settings()
+    progress = progress or Silent()
+    with locked(folder) as session:
+        description, reconstructed, inputs = _inputs(session)
+        _refuse_unknown(settings.arms or ())
+        run = session.begin(REPLAN_STAGE, settings=asdict(settings), inputs=inputs, force=force)
+        if run.finished:
+            metrics = read_json(folder / "replan" / "metrics.json")
+            return Replanned(folder, run.record, metrics, skipped=True)
+
+        flight = load_flight(folder, description, reconstructed, pose_noise=settings.pose_noise)
+        arms = _arms(folder, settings.arms, flight)
+        scene = build_scene(flight, load_maps(folder), description, _rules(settings))
+        for note in scene.notes:
+            progress.note(note)
+        progress.start("Replaying", len(arms))
+        entrants, times = {}, {}
+        for arm in arms:
+            made = run.chunk(arm, partial(_fly, scene, arm))
+            entrants[arm] = _read_entrant(made)
+            times[arm] = read_json(made / "times.json")
+            (run.folder / arm).mkdir()
+            for table in made.glob("*.parquet"):
+                shutil.copyfile(table, run.folder / arm / table.name)
+            progress.advance()
+        metrics = jsonable(compare(scene, entrants))
+        write_table(run.folder / "actor.parquet", _actor_table(scene), ACTOR)
+        write_table(run.folder / "cost_map.parquet", _cost_table(scene), COST_MAP)
+        write_json(run.folder / "metrics.json", metrics)
+        counts = {
+            "moments": len(scene.t_ns),
+            "pictures": len(scene.t_ns[scene.pictures]),
+            "joint_frames": {name: entrant.joint_frames for name, entrant in entrants.items()},
+            "local_plans": {name: entrant.flown.separation for name, entrant in entrants.items()},
+        }
+        record = run.publish(counts=counts, warnings=metrics["warnings"])
+        _note_planning_times(folder, times)
+        for name, (before, now) in run.replaces.items():
+            progress.note(f"replaced the comparison made with {name} = {before} (now {now})")
+    return Replanned(folder, record, metrics, skipped=False)
+
+
+# --- what is compared ----------------------------------------------------------------------------------
+
+
+def _inputs(session: WritableSession) -> tuple[Description, StageRecord | None, dict[str, str]]:
+    """What is read: all that was ingested, and the reconstruction where truth or actor are not known."""
+    ingested = session.record("ingest")
+    if ingested is None:
+        raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
+    description = read_description(session.folder)
+    inputs = dict(ingested.outputs)
+    needs_it = description.actor is None or not has_true_joints(description)
+    reconstructed = session.record("reconstruct") if needs_it else None
+    if reconstructed is not None:
+        inputs[_SKELETON] = reconstructed.outputs[_SKELETON]
+    return description, reconstructed, inputs
+
+
+def _refuse_unknown(arms: tuple[str, ...]) -> None:
+    known = [*PLANNER_ARMS.names(), FLOWN]
+    for arm in arms:
+        if arm not in known:
+            raise DataError(f"--arms {arm}", "no such planner arm", f"there are {', '.join(known)}")
+
+
+def _arms(folder: Path, asked: tuple[str, ...] | None, flight: LoggedFlight) -> list[str]:
+    if asked is None:
+        return ["adaptive", "fixed", *([FLOWN] if flight.moves else [])]
+    if FLOWN in asked and not flight.moves:
+        raise DataError(
+            folder, "has no flight to compare with: its cameras stand still", f"leave {FLOWN} out"
+        )
+    return list(dict.fromkeys(asked))
+
+
+def _rules(settings: Settings) -> Rules:
+    yaw = settings.yaw_deg
+    return Rules(
+        config=settings.planner,
+        drones=settings.drones,
+        yaw_rad=None if yaw is None else float(np.radians(yaw)),
+        mode=settings.mode,
+        trials=settings.trials,
+        seed=settings.seed,
+    )
+
+
+def _detect(
+    pixels: Float,
+    free: np.ndarray[Any, np.dtype[np.bool_]],
+    camera: Float,
+    target: Float,
+    focal_px: float,
+    rng: np.random.Generator,
+    *,
+    joints: tuple[str, ...],
+) -> tuple[Float, Float]:
+    """The modelled detector, by tilt and distance (`measuring.Detect`)."""
+    tilt_deg, height_px = view_of(camera, target, height_m=_HEIGHT_M, focal_px=focal_px)
+    return detect_keypoints(pixels, free, tilt_deg, height_px, DetectorErrors(), rng, joints=joints)
+
+
+# --- what is stored ------------------------------------------------------------------------------------
+
+
+def _fly(scene: Scene, arm: str, folder: Path) -> None:
+    """Fly and film one arm; all that the comparison needs of it goes into the folder."""
+    flown = fly_arm(scene, None if arm == FLOWN else PLANNER_ARMS.get(arm))
+    joints = scene.flight.skeleton.joints if scene.flight.skeleton else ()
+    measured = film_arm(scene, flown, partial(_detect, joints=joints))
+    write_table(folder / "trajectories.parquet", trajectories(scene, flown), REPLAN)
+    np.save(folder / "known.npy", flown.known)
+    facts: dict[str, object] = {"separation": flown.separation, "seen_share": None, "joint_frames": 0}
+    if measured is not None:
+        np.save(folder / "error_m.npy", measured.error_m)
+        first = JointMotion(scene.t_ns[scene.pictures], joints, measured.first[:, None])
+        write_table(folder / "skeleton.parquet", motion_table(first), TRUTH)
+        facts |= {"seen_share": measured.seen_share, "joint_frames": measured.joint_frames}
+    write_json(folder / "facts.json", facts)
+    write_json(folder / "times.json", _percentiles({"central": flown.central_s, "local": flown.local_s}))
+
+
+def _read_entrant(folder: Path) -> Entrant:
+    facts = read_json(folder / "facts.json")
+    table = read_table(folder / "trajectories.parquet", REPLAN)
+    errors = folder / "error_m.npy"
+    return Entrant(
+        flown=flight_from(table, np.load(folder / "known.npy"), facts["separation"]),
+        error_m=np.load(errors) if errors.exists() else None,
+        seen_share=facts["seen_share"],
+        joint_frames=facts["joint_frames"],
+    )
+
+
+def _percentiles(planning_s: Mapping[str, Any]) -> dict[str, object]:
+    """Milliseconds that calls of each planner took."""
+    found: dict[str, object] = {}
+    for name, seconds in planning_s.items():
+        if len(seconds):
+            median, p95 = (1e3 * float(value) for value in np.percentile(seconds, [50, 95]))
+            mean = 1e3 * float(np.mean(seconds))
+            found[f"{name}_ms"] = {"mean": mean, "median": median, "p95": p95, "calls": len(seconds)}
+    return found
+
+
+def _note_planning_times(folder: Path, times: Mapping[str, object]) -> None:
+    """Beside the stage's own time: measured durations live in run.json alone."""
+    path = folder / "run.json"
+    runs = read_json(path)
+    runs["runs"][-1]["planning"] = dict(times)
+    write_json(path, runs)
+
+
+def _actor_table(scene: Scene) -> pd.DataFrame:
+    """The actor that arms were scored against, as rows of `tables.ACTOR`."""
+    import pandas as pd
+
+    table = pd.DataFrame({"t_ns": scene.t_ns, "person": 0})
+    table[["x", "y", "z"]] = scene.actor
+    return table
+
+
+def _cost_table(scene: Scene) -> pd.DataFrame:
+    import pandas as pd
+
+    t_ns, yaws, cost = scene.cost_map()
+    return pd.DataFrame(
+        {
+            "t_ns": np.repeat(t_ns, len(yaws)),
+            "yaw_rad": np.tile(yaws, len(t_ns)),
+            "cost": cost.ravel(),
+        }
+    )
