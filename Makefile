@@ -19,11 +19,13 @@ $(STAMP): requirements.lock pyproject.toml
 
 demo: setup
 	mkdir -p $(DEMO)
-	$(BIN)/mocap ingest sample_data/ring_walk/flight.yaml -o $(DEMO)/ring_walk.session
-	$(BIN)/mocap reconstruct $(DEMO)/ring_walk.session
-	$(BIN)/mocap report $(DEMO)/ring_walk.session
-	$(BIN)/mocap export $(DEMO)/ring_walk.session --to trc,csv,tum --overwrite
-	@echo "Open $(DEMO)/ring_walk.session/report/index.html in a browser."
+	$(BIN)/mocap models fetch blazepose
+	$(BIN)/mocap ingest sample_data/mound_walk/flight.yaml -o $(DEMO)/mound_walk.session
+	$(BIN)/mocap reconstruct $(DEMO)/mound_walk.session --workers 2
+	$(BIN)/mocap replan-compare $(DEMO)/mound_walk.session
+	$(BIN)/mocap report $(DEMO)/mound_walk.session
+	$(BIN)/mocap export $(DEMO)/mound_walk.session --to trc,csv,tum --overwrite
+	@echo "Open $(DEMO)/mound_walk.session/report/index.html in a browser."
 
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist loadfile
@@ -42,9 +44,9 @@ bench: setup
 	$(BIN)/python -m benchmarks.rendering
 	$(BIN)/python -m benchmarks.detection
 
-# Write the sample flight again: the same bytes as in the repository.
+# Make the sample flight again: the same logs and truth as in the repository, byte for byte.
 sample: setup
-	$(BIN)/python sample_data/make_sample.py
+	$(BIN)/mocap simulate sample_data/mound_walk.yaml -o sample_data/mound_walk --force
 
 # Pin the newest versions that pyproject.toml allows (needs uv).
 lock:

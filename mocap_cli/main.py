@@ -14,6 +14,7 @@ from mocap_cli.ingest import ingest_command
 from mocap_cli.init import init_command
 from mocap_cli.models import models_command
 from mocap_cli.reconstruct import reconstruct_command
+from mocap_cli.replan_compare import replan_compare_command
 from mocap_cli.report import report_command
 from mocap_cli.simulate import simulate_command
 from mocap_cli.terminal import one_line
@@ -56,6 +57,7 @@ for command in (
     init_command,
     ingest_command,
     reconstruct_command,
+    replan_compare_command,
     report_command,
     export_command,
     simulate_command,

@@ -42,7 +42,7 @@ from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.scenario import Scenario, read_scenario
 from pipelines.simulation.world.scene import World
 
-_REVISION = 1
+_REVISION = 2
 _MARK = "simulation.json"
 _BLOCK = 60  # pictures that are rendered and encoded together, and kept when the work is interrupted
 _RECEIVED_NS = 2_000_000  # after a message's own stamp, by the recorder on board
@@ -113,8 +113,9 @@ def simulate(
             for drone in flight.drones:
                 _write_keypoints(making.folder, flight, drone)
         shutil.copyfile(scenario_path, making.folder / "scenario.yaml")
-        text = manifest_text(flight, video=video)
-        (making.folder / "flight.yaml").write_text(text, encoding="utf-8", newline="\n")
+        for name, true_poses in (("flight.yaml", False), ("true_poses.yaml", True)):
+            text = manifest_text(flight, video=video, true_poses=true_poses)
+            (making.folder / name).write_text(text, encoding="utf-8", newline="\n")
         summary = _summary(flight, key, video)
         write_json(making.folder / _MARK, summary)
         making.publish()

@@ -8,8 +8,15 @@ from pipelines.simulation.flying import LEVER_ARM
 _UNKNOWN_CLOCK_SIGMA_S = 0.3
 
 
-def manifest_text(flight: SimulatedFlight, *, video: bool) -> str:
-    """What ties the files together; it states what a user would know, the truth only under `truth`."""
+def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = False) -> str:
+    """What ties the files together.
+
+    Args:
+        flight: the flight.
+        video: whether there are videos, or keypoints in their place.
+        true_poses: take the true poses for logged ones. Else it states what a user would know, and the
+            truth only under `truth`.
+    """
     scenario = flight.scenario
     name = scenario.name.replace("\\", "\\\\").replace('"', '\\"')
     lines = [
@@ -22,7 +29,7 @@ def manifest_text(flight: SimulatedFlight, *, video: bool) -> str:
         "cameras:",
     ]
     for drone in flight.drones:
-        lines += _camera(flight, drone, video)
+        lines += [*_pictures(flight, drone, video), *_poses(flight, drone, true_poses)]
     poses = ", ".join(f"{drone.name}: truth/{drone.name}.tum" for drone in flight.drones)
     lines += [
         "actor: {log: drone1, topic: /actor, point: hip}",
@@ -35,33 +42,40 @@ def manifest_text(flight: SimulatedFlight, *, video: bool) -> str:
     return "\n".join(lines)
 
 
-def _camera(flight: SimulatedFlight, drone: SimulatedDrone, video: bool) -> list[str]:
-    scenario, name = flight.scenario, drone.name
+def _pictures(flight: SimulatedFlight, drone: SimulatedDrone, video: bool) -> list[str]:
+    name = drone.name
     known = not any(other.clock_offset_s for other in flight.drones)
-    start_ns = int(drone.at_frames.t_ns[0]) + scenario.start_ns - round(drone.clock_offset_s * 1e9)
+    start_ns = int(drone.at_frames.t_ns[0]) + flight.scenario.start_ns - round(drone.clock_offset_s * 1e9)
     whole, fraction = divmod(start_ns, 10**9)
-    pictures = (
-        [f"    video: {name}.mp4", f"    frame_times: {{start: {whole}.{fraction:09d}}}"]
-        if video
-        else [
+    if video:
+        pictures = [f"    video: {name}.mp4", f"    frame_times: {{start: {whole}.{fraction:09d}}}"]
+    else:
+        pictures = [
             f"    frame_times: {{csv: {name}_frames.csv}}",
             f"    keypoints: {{path: {name}_keypoints.json, format: alphapose, skeleton: coco17}}",
         ]
-    )
-    noise = []
-    if scenario.drones.pose_noise and scenario.drones.state_pose_noise:
-        noise = ["    pose_noise:"] + [
-            f"      {model}: {{{', '.join(f'{k}: {v}' for k, v in parameters.items())}}}"
-            for model, parameters in scenario.drones.pose_noise.items()
-        ]
-    arm = ", ".join(f"{v:g}" for v in LEVER_ARM)
+    sigma_s = 0 if known else _UNKNOWN_CLOCK_SIGMA_S
     return [
         f"  {name}:",
         *pictures,
-        f"    clock: {{offset_s: 0, sigma_s: {0 if known else _UNKNOWN_CLOCK_SIGMA_S}}}",
+        f"    clock: {{offset_s: 0, sigma_s: {sigma_s}}}",
+        f"    intrinsics: {name}_camera.yaml",
+    ]
+
+
+def _poses(flight: SimulatedFlight, drone: SimulatedDrone, true_poses: bool) -> list[str]:
+    name, drones = drone.name, flight.scenario.drones
+    if true_poses:
+        return [f"    pose: {{tum: truth/{name}.tum}}"]
+    arm = ", ".join(f"{v:g}" for v in LEVER_ARM)
+    lines = [
         f"    pose: {{log: {name}, topic: /{name}/odometry, of: body}}",
         f"    mount: {{looks: forward, translation: [{arm}]}}",
         f"    gimbal: {{log: {name}, topic: /{name}/gimbal, relative_to: world}}",
-        f"    intrinsics: {name}_camera.yaml",
-        *noise,
     ]
+    if drones.pose_noise and drones.state_pose_noise:
+        lines.append("    pose_noise:")
+        for model, parameters in drones.pose_noise.items():
+            stated = ", ".join(f"{key}: {value}" for key, value in parameters.items())
+            lines.append(f"      {model}: {{{stated}}}")
+    return lines

@@ -1,0 +1,32 @@
+"""The sample flight through the real detector: what the README says of it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipelines.session.registries import find_detector
+from tests.commands.runner import mocap, succeeds
+
+SAMPLE = Path(__file__).parents[2] / "sample_data" / "mound_walk"
+
+
+@pytest.mark.slow
+def test_the_detector_and_true_poses_give_the_skeleton(tmp_path: Path) -> None:
+    """At most 45 mm at 95 %: about half is the detector's idea of hips and shoulders, which stays constant."""
+    if None in find_detector("blazepose").models().values():
+        fetched = mocap("models", "fetch", "blazepose", timeout=300)
+        if fetched.returncode:
+            pytest.skip(f"the detector's networks cannot be fetched here: {fetched.stderr.strip()}")
+    shutil.copytree(SAMPLE, tmp_path / "flight")
+    session = tmp_path / "flight" / "true_poses.session"
+    succeeds("ingest", tmp_path / "flight" / "true_poses.yaml")
+    metrics: dict[str, Any] = json.loads(
+        succeeds("reconstruct", session, "--every", "3", "--workers", "2", "--json")
+    )
+    assert metrics["mpjpe_mm"] < 45
+    assert metrics["reconstructed_share"] > 0.95
