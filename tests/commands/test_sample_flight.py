@@ -17,7 +17,7 @@ SAMPLE = Path(__file__).parents[2] / "sample_data" / "mound_walk"
 
 @pytest.mark.slow
 def test_the_detector_and_true_poses_give_the_skeleton(tmp_path: Path) -> None:
-    """At most 45 mm at 95 %: about half is the detector's idea of hips and shoulders, which stays constant."""
+    """At most 45 mm at 95 %: about half is what the detector means by hips and shoulders."""
     if None in find_detector("blazepose").models().values():
         fetched = mocap("models", "fetch", "blazepose", timeout=300)
         if fetched.returncode:
