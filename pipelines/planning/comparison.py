@@ -6,7 +6,6 @@ are independent draws, and of stretches of the flight for what the flight's cour
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -29,11 +28,6 @@ class Estimate:
 
     mean: float
     interval: tuple[float, float] | None
-
-    @property
-    def excludes_zero(self) -> bool:
-        """Whether the interval is all above or all below 0."""
-        return self.interval is not None and (self.interval[0] > 0 or self.interval[1] < 0)
 
     def as_json(self) -> dict[str, object]:
         """As it stands in metrics.json."""
@@ -94,7 +88,7 @@ def coverage(error_m: Float32, joint_frames: int) -> Float:
 
 def _weighted(values: Float, weight: Float, seed: int) -> Estimate | None:
     """The weighted mean of independent values, and its bootstrap interval."""
-    if not len(values) or not math.isfinite(float(weight.sum())) or weight.sum() == 0:
+    if not len(values):
         return None
     mean = float((values * weight).sum() / weight.sum())
     if len(values) < 2:

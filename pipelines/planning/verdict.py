@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-_ALIKE_DEG = 2.0  # mean or largest tilts that differ by less are not worth a word
+_ALIKE_DEG = 2.0  # tilts that differ by less are not worth a word
+_ALIKE_PERCENT = 1.0  # of the joints, likewise
 
 
 def verdict(
@@ -19,7 +20,9 @@ def verdict(
         arms: scores by arm, as they stand in metrics.json.
         difference: of the two, arm minus against, as it stands there.
     """
-    return f"{_about_tilt(arm, against, arms)}; {_about_error(difference)}"
+    return (
+        f"{_about_tilt(arm, against, arms)}; {_about_error(difference)}{_about_coverage(arm, against, arms)}"
+    )
 
 
 def _about_tilt(arm: str, against: str, arms: Mapping[str, Mapping[str, Any]]) -> str:
@@ -29,6 +32,17 @@ def _about_tilt(arm: str, against: str, arms: Mapping[str, Mapping[str, Any]]) -
     if own < other:
         return f"{arm} keeps the tilt at {own:.0f} deg where {against} climbs to {other:.0f}"
     return f"{arm} climbs to a tilt of {own:.0f} deg where {against} keeps it at {other:.0f}"
+
+
+def _about_coverage(arm: str, against: str, arms: Mapping[str, Mapping[str, Any]]) -> str:
+    """Errors are compared on what both measured: who measured more deserves a word."""
+    found = [arms[name]["reconstruction_error"]["coverage"] for name in (arm, against)]
+    if None in found:
+        return ""
+    own, other = (100 * each["mean"] for each in found)
+    if abs(own - other) < _ALIKE_PERCENT:
+        return ""
+    return f", and it measures {own:.0f} % of the joints where {against} measures {other:.0f} %"
 
 
 def _about_error(difference: Mapping[str, Any]) -> str:

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from pipelines.planning.distance_field import distance_field, open_space
 from pipelines.session.records import Occupancy
+from tests.planning.worlds import wall
 
 RES = 0.25
 
@@ -86,3 +87,14 @@ def test_maps_without_anything_and_of_one_layer() -> None:
     layer[0, 0, 0] = 1
     distance, _ = distance_field(Occupancy(layer, np.zeros(3), RES)).sample(np.array([5.0, 1.0, -5.0]))
     assert distance == pytest.approx(1.0 - RES, abs=1e-6)
+
+
+def test_what_a_map_covers() -> None:
+    """The box of `worlds`: 80 x 60 x 30 m from (-25, -30, 0), its lower faces included."""
+    field = wall()
+    inside = np.array([[-25.0, -30.0, 0.0], [54.99, 29.99, 29.99], [0.0, 0.0, 1.0]])
+    outside = np.array([[-25.01, 0.0, 1.0], [55.01, 0.0, 1.0], [0.0, 0.0, -0.1]])
+    assert field.covers(inside).all()
+    assert not field.covers(outside).any()
+    assert field.has_obstacles
+    assert not open_space().has_obstacles

@@ -31,6 +31,7 @@ def test_a_still_formation_in_the_open() -> None:
     assert figures["range_m"] == pytest.approx({"mean": 10, "min": 10, "max": 10})
     assert figures["yaw_separation_deg"] == pytest.approx({"mean": 90, "min": 90, "max": 90})
     assert figures["occluded_share"] == 0
+    assert figures["min_clearance_m"] is None
     assert figures["undetermined_share"] == 0
     assert figures["max_speed_mps"] == pytest.approx(0)
     assert figures["limit_violations"] == dict.fromkeys(
@@ -100,3 +101,10 @@ def test_near_is_what_stands_above_the_actor_within_fifteen_metres() -> None:
     assert near[np.argmax(near) :].all()
     assert not near_obstacle(T_S, slot, actor, bare_ground()).any()
     assert not near_obstacle(T_S, slot, actor + np.array([0, 0, 6.0]), wall()).any()
+
+
+def test_empty_columns_of_a_map_that_begins_above_the_actor_are_no_obstacles() -> None:
+    slot = np.tile([12.0, -20.0, 3.0], (len(T_S), 1))[None]
+    actor = np.tile([12.0, -25.0, -4.0], (len(T_S), 1))  # the map begins at 0
+    assert not near_obstacle(T_S, slot, actor, wall()).any()
+    assert not near_obstacle(T_S, slot, actor, open_space()).any()
