@@ -115,7 +115,7 @@ def replan(
     with locked(folder) as session:
         description, reconstructed, inputs = _inputs(session)
         _refuse_unknown(settings.arms or ())
-        run = session.begin(REPLAN_STAGE, settings=asdict(settings), inputs=inputs, force=force)
+        run = session.begin(REPLAN_STAGE, settings=_flat(settings), inputs=inputs, force=force)
         if run.finished:
             metrics = read_json(folder / "replan" / "metrics.json")
             return Replanned(folder, run.record, metrics, skipped=True)
@@ -167,6 +167,13 @@ def _inputs(session: WritableSession) -> tuple[Description, StageRecord | None, 
     if reconstructed is not None:
         inputs[_SKELETON] = reconstructed.outputs[_SKELETON]
     return description, reconstructed, inputs
+
+
+def _flat(settings: Settings) -> dict[str, object]:
+    """Settings by name, the planner's one by one: what replaces what can be said of each."""
+    stated = asdict(settings)
+    planner = stated.pop("planner")
+    return stated | {f"planner.{name}": value for name, value in planner.items()}
 
 
 def _refuse_unknown(arms: tuple[str, ...]) -> None:

@@ -217,8 +217,8 @@ def test_the_options_reach_the_planner(calm: Path, tmp_path: Path) -> None:
     assert arm["range_m"]["mean"] == pytest.approx(6, abs=0.3)
     assert arm["tilt_deg"]["mean"] == pytest.approx(30, abs=3)
     assert metrics["verdict"] == "fixed flew alone: there is nothing to compare it with"
-    planner = json.loads((calm / "replan" / "stage.json").read_text())["settings"]["planner"]
-    assert (planner["horizon_knots"], planner["yaws"]) == (4, 12)
+    stated = json.loads((calm / "replan" / "stage.json").read_text())["settings"]
+    assert (stated["planner.horizon_knots"], stated["planner.yaws"]) == (4, 12)
     table = pd.read_parquet(calm / "replan" / "fixed" / "trajectories.parquet")
     assert list(table["camera"][:4]) == ["drone1", "drone2", "drone3", "drone4"]
 
