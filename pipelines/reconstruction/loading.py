@@ -32,7 +32,7 @@ class _Keypoints:
 
     table: Path
     joints: tuple[str, ...]
-    every: int = 1  # the detector looked at every k-th picture only
+    looked_at: slice  # of the camera's frames
 
 
 def _keypoints(folder: Path, description: Description, detected: StageRecord | None) -> dict[str, _Keypoints]:
@@ -41,11 +41,13 @@ def _keypoints(folder: Path, description: Description, detected: StageRecord | N
     for name, entry in description.cameras.items():
         if entry.keypoints is not None:
             table = folder / "cameras" / name / "keypoints.parquet"
-            sources[name] = _Keypoints(table, tuple(entry.keypoints.joints))
+            sources[name] = _Keypoints(table, tuple(entry.keypoints.joints), slice(None))
         elif detected is not None and name in detected.counts["cameras"]:
             table = folder / "detect" / name / "keypoints.parquet"
-            joints, every = tuple(detected.counts["joints"]), int(detected.settings["every"])
-            sources[name] = _Keypoints(table, joints, every)
+            first, stop = detected.counts["rows"][name]
+            if first < stop:  # else none of its pictures lies in the span that was asked for
+                looked_at = slice(first, stop, int(detected.settings["every"]))
+                sources[name] = _Keypoints(table, tuple(detected.counts["joints"]), looked_at)
     return sources
 
 
@@ -107,19 +109,19 @@ def _load_camera(
 ) -> Camera:
     tables = folder / "cameras" / name
     trajectory = trajectory_from(read_table(tables / "poses.parquet", POSES))
-    frames = read_table(tables / "frames.parquet", FRAMES).iloc[:: source.every]
+    frames = read_table(tables / "frames.parquet", FRAMES).iloc[source.looked_at]
     keypoints = read_table(source.table, KEYPOINTS)
     confident = keypoints[keypoints["confidence"] >= min_confidence]
     detections = detections_from(confident, joints)
     detections, crowd = most_confident(detections, _MOST_PEOPLE)
     if crowd:
         warnings.append(f"{name}: {crowd} detections left out, more than {_MOST_PEOPLE} in a picture")
-    frame = frames["frame"].to_numpy(np.int64)
+    frame, every = frames["frame"].to_numpy(np.int64), source.looked_at.step or 1
     return Camera(
         name=name,
         intrinsics=entry.intrinsics.intrinsics(),
         frame_t_ns=frames["t_ns"].to_numpy(np.int64),
-        follows=np.diff(frame, prepend=frame[0] - source.every) == source.every,
+        follows=np.diff(frame, prepend=frame[0] - every) == every,
         trajectory=trajectory,
         static=entry.poses.static,
         sigma=None,

@@ -32,7 +32,8 @@ _ROUNDS = 8
 _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2 where the search begins: a walking body, its limbs
 _BONE_SIGMA_M = 0.02
 _FEWEST_TIMES = 20
-_UNEXPLAINED = 1.5  # times the image noise that the pictures show between neighbours: the prior is wrong
+_UNEXPLAINED = 1.15  # times the image noise that the pictures show between neighbours: the prior is wrong
+_UNEXPLAINED_BY_TWO = 1.5  # two views show one residual of four, and image noise only roughly
 _SIGMAS = 4.0
 _MEDIAN_OF_TWO = 2 * np.log(2)  # of the chi-square distribution with two degrees of freedom
 _FARTHEST = (
@@ -172,21 +173,23 @@ def _find_prior(
     """
     chosen = _stretches(len(t_s))
     problem = build(t_s[chosen], sightings, bones)
-    guess, image, disagreement_m = _first_guess(problem, start[chosen])
+    guess, image, disagreement_m, range_m = _first_guess(problem, start[chosen])
     # n rays from all around, each off by s on two axes, leave a point off by s sqrt(9 / 2n) in space.
-    expected_m = _FARTHEST * disagreement_m * float(np.sqrt(4.5 / len(sightings)))
+    stated_m = 0.0 if prior is None else float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
+    spread = _FARTHEST * float(np.sqrt(4.5 / len(sightings)))
     warnings: list[str] = []
     if prior is not None:
         known = _learned(problem, start[chosen], tuple(prior), clock_sigma_s, poses=False)
-        if known is not None and known.pixel_scale < _UNEXPLAINED * image:
-            return known, False, warnings, expected_m
+        allowed = _UNEXPLAINED if len(sightings) > 2 else _UNEXPLAINED_BY_TWO
+        if known is not None and known.pixel_scale < allowed * image:
+            return known, False, warnings, spread * max(disagreement_m, stated_m)
         warnings.append(
             "refined: the stated pose noise does not explain the pictures; its levels were estimated instead"
         )
     known = _learned(problem, start[chosen], (guess,) * len(sightings), clock_sigma_s, poses=True)
     if known is None:
         raise np.linalg.LinAlgError("no level of pose noise explains the pictures")
-    return known, True, warnings, expected_m
+    return known, True, warnings, spread * disagreement_m
 
 
 def _stretches(times: int) -> Int64:
@@ -213,8 +216,8 @@ def _learned(
     return known if np.isfinite(known.pixel_scale) else None
 
 
-def _first_guess(problem: Problem, start: Float) -> tuple[PoseErrors, float, float]:
-    """Levels of pose errors at which to begin, image noise between neighbouring pictures, disagreement in m.
+def _first_guess(problem: Problem, start: Float) -> tuple[PoseErrors, float, float, float]:
+    """Levels of pose errors at which to begin, image noise between neighbours, disagreement and range in m.
 
     The median residual of a picture's joints is common to them: the camera's. How it changes from one
     picture to the next is white, the rest is slow. What joints do beyond it is the detector's.
@@ -244,7 +247,21 @@ def _first_guess(problem: Problem, start: Float) -> tuple[PoseErrors, float, flo
             Process(SHIFT_IN_CAMERA, max(0.4 * slow * range_m, 0.02)),
         ),
     )
-    return guess, lost * float(np.median(image)), lost * float(np.median(total)) * range_m
+    noise = lost * float(np.median(image))
+    blur = noise / float(np.median(pictures.sharpness[pictures.sharpness > 0]))
+    disagreement = float(np.hypot(lost * float(np.median(total)), blur))
+    return guess, noise, disagreement * range_m, range_m
+
+
+def _ray_sigma_m(errors: PoseErrors, range_m: float) -> float:
+    """How far a viewing ray misses the actor by the stated errors, per axis."""
+    shift, turn = errors.white[0] ** 2, errors.white[1] ** 2
+    for process in errors.processes:
+        if process.number == ROTATION:
+            turn += process.sigma0**2
+        else:
+            shift += process.sigma0**2
+    return float(np.sqrt(shift + range_m**2 * turn))
 
 
 def _spread(values: Float) -> float:
