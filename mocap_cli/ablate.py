@@ -1,0 +1,208 @@
+"""`mocap ablate`: what the reconstruction error depends on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mocap_cli.options import (
+    Command,
+    FiniteRange,
+    any_path,
+    force_option,
+    json_option,
+    level,
+    overwrite_option,
+    verbosity_options,
+)
+from mocap_cli.terminal import print_json, print_table, watching
+
+if TYPE_CHECKING:
+    from pipelines.simulation.study.settings import Study
+
+
+@click.group("ablate", short_help="What the error depends on: tilt, drones, noise.")
+def ablate_command() -> None:
+    """Measure how the reconstruction error depends on tilt, the number of drones, or the noise of poses.
+
+    A simulated person walks, drones film from ideal positions, keypoints and logged poses err by known
+    numbers, and every method reconstructs the same data. Everything is simulated.
+    """
+
+
+def _shared_options(command: Command) -> Command:
+    """What every study takes."""
+    for option in reversed(
+        [
+            click.option("-o", "--output", type=any_path, required=True, help="Folder of the results."),
+            click.option(
+                "--levels",
+                metavar="NAME,...",
+                help="Pose noise: none, low (0.1 m, 0.5 deg), medium (0.3, 1), high (0.5, 2), per axis"
+                " [default: all; for noise: medium].",
+            ),
+            click.option(
+                "--noise",
+                metavar="MODEL",
+                multiple=True,
+                help='Pose noise instead of levels, such as "bias:position_m=0.3,rotation_deg=1"; repeat'
+                " it for several.",
+            ),
+            click.option(
+                "--methods",
+                metavar="NAME,...",
+                default="dlt,midpoint,robust",
+                show_default=True,
+                help="Compared side by side.",
+            ),
+            click.option(
+                "--keypoints",
+                type=click.Choice(["model", "exact"]),
+                help="With the measured errors of a detector, or without any [default: model].",
+            ),
+            click.option(
+                "--detector",
+                metavar="NAME",
+                help="Render pictures and let this detector look at them (`mocap models`).",
+            ),
+            click.option(
+                "--seconds",
+                type=FiniteRange(0.1, 600),
+                default=75.0,
+                show_default=True,
+                help="Length of the walk.",
+            ),
+            click.option(
+                "--rate",
+                type=FiniteRange(0.1, 240),
+                metavar="HZ",
+                help="Of the pictures [default: 30; 1 with --detector].",
+            ),
+            click.option(
+                "--trials",
+                type=click.IntRange(1, 10_000),
+                default=10,
+                show_default=True,
+                help="Draws of all noise.",
+            ),
+            click.option(
+                "--seed",
+                type=click.IntRange(0, 2**32 - 1),
+                default=0,
+                show_default=True,
+                help="Of all noise.",
+            ),
+            click.option(
+                "--workers",
+                type=click.IntRange(1, 256),
+                default=2,
+                show_default=True,
+                help="Conditions worked on at once; the results do not depend on them.",
+            ),
+            overwrite_option,
+            force_option,
+            json_option,
+            verbosity_options,
+        ]
+    ):
+        command = option(command)
+    return command
+
+
+_drones_option = click.option(
+    "--drones", type=click.IntRange(2, 8), default=2, show_default=True, help="How many film."
+)
+_tilt_option = click.option(
+    "--tilt", type=FiniteRange(-10, 85), default=15.0, show_default=True, metavar="DEG", help="Of the slots."
+)
+
+
+@ablate_command.command("tilt", short_help="Error against the tilt of the formation.")
+@click.option("--tilts", metavar="DEG,...", default="0,15,30,45,60", show_default=True, help="Of the slots.")
+@_drones_option
+@_shared_options
+def tilt_command(tilts: str, drones: int, **shared: Any) -> None:
+    """Error against tilt, for every level of pose noise and every method."""
+    _run("tilt", {"tilts_deg": _numbers("--tilts", tilts, float), "drones": [drones]}, shared)
+
+
+@ablate_command.command("robots", short_help="Error against the number of drones.")
+@click.option("--robots", metavar="N,...", default="2,3,4,5", show_default=True, help="How many film.")
+@_tilt_option
+@_shared_options
+def robots_command(robots: str, tilt: float, **shared: Any) -> None:
+    """Error against the number of drones, for every level of pose noise and every method."""
+    _run("robots", {"tilts_deg": [tilt], "drones": _numbers("--robots", robots, int)}, shared)
+
+
+@ablate_command.command("noise", short_help="Error against the kind of pose noise.")
+@_drones_option
+@_tilt_option
+@_shared_options
+def noise_command(drones: int, tilt: float, **shared: Any) -> None:
+    """Error against the kind of pose noise, equally large on the average, for every method."""
+    _run("noise", {"tilts_deg": [tilt], "drones": [drones]}, shared)
+
+
+def _run(study: Study, varied: Mapping[str, Any], shared: Mapping[str, Any]) -> None:
+    from pipelines.ablate import ablate
+    from pipelines.simulation.study.settings import settings_for
+
+    levels = shared["levels"]
+    settings = settings_for(
+        study,
+        **varied,
+        levels=None if levels is None else _words(levels),
+        noise=shared["noise"],
+        methods=_words(shared["methods"]),
+        keypoints=shared["keypoints"],
+        detector=shared["detector"],
+        seconds=shared["seconds"],
+        rate_hz=shared["rate"],
+        trials=shared["trials"],
+        seed=shared["seed"],
+    )
+    quiet = shared["quiet"]
+    with watching(level(quiet, shared["verbose"])) as progress:
+        result = ablate(
+            settings,
+            shared["output"],
+            workers=shared["workers"],
+            overwrite=shared["overwrite"],
+            force=shared["force"],
+            progress=progress,
+        )
+    if shared["as_json"]:
+        print_json(result.summary)
+        return
+    if not quiet:
+        _print(result.summary)
+    click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder}")
+
+
+def _print(summary: Mapping[str, Any]) -> None:
+    from pipelines.reporting.ablation import tables
+
+    settings = summary["settings"]
+    click.echo(
+        f"Simulated: {settings['seconds']:g} s of walking at {settings['rate_hz']:g} Hz, keypoints:"
+        f" {summary['keypoints']}; mean [95 % interval] of {settings['trials']} trials"
+    )
+    for table in tables(summary):
+        click.echo(f"\n{table.title}")
+        print_table(table.header, table.rows)
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",")]
+
+
+def _numbers(option: str, text: str, number: Callable[[str], Any]) -> list[Any]:
+    from pipelines.session.errors import DataError
+
+    try:
+        return [number(word) for word in _words(text)]
+    except ValueError:
+        raise DataError(option, f"{text!r} is no list of numbers", "write them like 2,3,4") from None

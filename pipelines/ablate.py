@@ -1,0 +1,348 @@
+"""Stage `ablate`: what the reconstruction error depends on - tilt, number of drones, noise of the poses.
+
+Film a simulated walk from every formation, disturb poses and keypoints in several trials, triangulate by
+every method, measure on what all methods measured, and tell means with their intervals. Everything here
+is simulated.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+
+from pipelines.geometry.metrics import PCK_THRESHOLD_M, common, measure
+from pipelines.geometry.triangulation import Method, Views, estimate_noise, locate
+from pipelines.keypoints.hints import project_actor
+from pipelines.keypoints.tracking import PeopleTracker
+from pipelines.reporting.ablation import Row, draw, estimates, results_csv
+from pipelines.session.errors import DataError
+from pipelines.session.progress import Progress, Silent
+from pipelines.session.records import Float
+from pipelines.session.registries import Detector, find_detector
+from pipelines.session.storage import canonical_json, jsonable, read_json, sha256_of, write_json
+from pipelines.session.whole_folders import is_made, whole_folder
+from pipelines.simulation.detector_errors import MEASURED
+from pipelines.simulation.rendering.renderer import Renderer
+from pipelines.simulation.scenario import World
+from pipelines.simulation.study.filming import (
+    Formation,
+    Sightings,
+    Walk,
+    exact_keypoints,
+    formation,
+    model_keypoints,
+    views_of,
+    walk,
+)
+from pipelines.simulation.study.settings import Noise, Settings
+from pipelines.simulation.world.scene import build_world
+
+_REVISION = 1
+_MARK = "summary.json"
+_PER_JOINT = ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm")
+_HINT_SIGMA_M = 0.1  # of what the detector is told of the person's place: the camera looks straight there
+
+
+# --- the study -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Ablated:
+    """What a study left behind."""
+
+    folder: Path
+    summary: dict[str, Any]
+    skipped: bool  # it was there already
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One condition of a study."""
+
+    tilt_deg: float
+    drones: int
+    noise: Noise
+
+    @property
+    def filmed(self) -> tuple[float, int]:
+        """What its keypoints depend on."""
+        return self.tilt_deg, self.drones
+
+
+def ablate(
+    settings: Settings,
+    folder: Path,
+    *,
+    workers: int = 1,
+    overwrite: bool = False,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Ablated:
+    """Run a study; conditions that an interrupted run finished are kept.
+
+    Args:
+        settings: the study.
+        folder: where to; an earlier study there is replaced.
+        workers: conditions worked on at once; the results do not depend on them.
+        overwrite: replace a folder that is no study.
+        force: do it again although nothing changed.
+        progress: who watches.
+
+    Raises:
+        DataError: the folder cannot be written, the detector is not there, nothing was reconstructed.
+        BusyError: another process makes the same folder.
+    """
+    progress = progress or Silent()
+    detector = None if settings.detector is None else find_detector(settings.detector)
+    key = _key(settings, detector)
+    if not force and is_made(folder, key, mark=_MARK):
+        return Ablated(folder, read_json(folder / _MARK), skipped=True)
+    if detector is not None:
+        detector.load(threads=1)  # says at once what is missing
+    with whole_folder(folder, key, mark=_MARK, overwrite=overwrite) as making:
+        filmed = walk(settings.seconds, settings.rate_hz, settings.seed)
+        cells = list(_cells(settings))
+        seen: dict[tuple[float, int], Sightings] = {}
+        if detector is not None:
+            seen = _detect_all(filmed, cells, detector, settings.seed, workers, making.part, progress)
+        progress.start("Measuring", len(cells) * settings.trials)
+        stopped = Event()
+        work = [
+            (f"cell-{k:04d}", partial(_measure_cell, settings, filmed, cell, seen, stopped, progress))
+            for k, cell in enumerate(cells)
+        ]
+        parts = _side_by_side(work, making.part, workers, stopped)
+        rows = [row for part in parts for row in read_json(part / "rows.json")["rows"]]
+        summary = jsonable(_summary(settings, key, rows))
+        _refuse_nothing(folder, summary)
+        (making.folder / "results.csv").write_text(results_csv(rows), encoding="utf-8", newline="\n")
+        draw(making.folder, summary)
+        write_json(making.folder / _MARK, summary)
+        making.publish()
+    return Ablated(folder, summary, skipped=False)
+
+
+def _key(settings: Settings, detector: Detector | None) -> str:
+    """Equal for equal results."""
+    ingredients: dict[str, object] = {"revision": _REVISION, "settings": asdict(settings)}
+    if detector is None:
+        ingredients["errors"] = sha256_of(MEASURED)
+    else:
+        models = {name: path for name, path in detector.models().items() if path is not None}
+        ingredients["detector"] = detector.name
+        ingredients["models"] = {name: sha256_of(path) for name, path in models.items()}
+    return hashlib.sha256(canonical_json(ingredients).encode()).hexdigest()
+
+
+def _cells(settings: Settings) -> Iterator[Cell]:
+    for noise in settings.noise:
+        for tilt_deg in settings.tilts_deg:
+            for drones in settings.drones:
+                yield Cell(tilt_deg, drones, noise)
+
+
+Part = Callable[[str, Callable[[Path], None]], Path]
+
+
+def _side_by_side(
+    work: Sequence[tuple[str, Callable[[Path], None]]], part: Part, workers: int, stopped: Event
+) -> list[Path]:
+    """The folders of the finished parts, in the order of the work."""
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            return list(pool.map(lambda each: part(*each), work))
+        except BaseException:
+            stopped.set()  # or Ctrl-C would wait for what is under way
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _go_on(stopped: Event) -> None:
+    if stopped.is_set():
+        raise InterruptedError("another part failed, or the user stopped it")
+
+
+def _refuse_nothing(folder: Path, summary: Mapping[str, Any]) -> None:
+    """An empty study would look like success."""
+    if not any(cell["metrics"]["mpjpe_mm"] for cell in summary["cells"]):
+        raise DataError(folder, "nothing was reconstructed by all methods", "film longer, or at lower tilts")
+
+
+# --- one condition -------------------------------------------------------------------------------------
+
+
+def _measure_cell(
+    settings: Settings,
+    filmed: Walk,
+    cell: Cell,
+    seen: Mapping[tuple[float, int], Sightings],
+    stopped: Event,
+    progress: Progress,
+    folder: Path,
+) -> None:
+    """Write the rows of every trial and method."""
+    cameras = formation(filmed, cameras=cell.drones, tilt_deg=cell.tilt_deg)
+    exact = exact_keypoints(filmed, cameras)
+    models = cell.noise.models()
+    rows: list[Row] = []
+    for trial in range(settings.trials):
+        _go_on(stopped)
+        if settings.detector is not None:
+            sightings = seen[cell.filmed]
+        elif settings.keypoints == "model":
+            sightings = model_keypoints(filmed, cameras, exact, seed=settings.seed, trial=trial)
+        else:
+            sightings = exact
+        views = views_of(filmed, cameras, sightings, models, seed=settings.seed, trial=trial)
+        points = {method: reconstructed(method, views) for method in settings.methods}
+        for method, errors in compared(points, filmed).items():
+            rows.append({**_condition(cell), "trial": trial, "method": method, **errors})
+        progress.advance()
+    write_json(folder / "rows.json", {"rows": rows})
+
+
+def _condition(cell: Cell) -> Row:
+    return {
+        "tilt_deg": cell.tilt_deg,
+        "drones": cell.drones,
+        "noise": cell.noise.label,
+        "noise_model": cell.noise.model,
+    }
+
+
+def reconstructed(method: Method, views: Views) -> Float:
+    """The points [N, 3] m that a method makes of views, NaN for none; noise is estimated for `robust`."""
+    if method == "robust":
+        views = replace(views, pixel_sigma=estimate_noise(views))
+    return locate(views, method=method).points
+
+
+def compared(points: Mapping[Method, Float], filmed: Walk) -> dict[Method, Row]:
+    """Errors of several methods on one walk.
+
+    Args:
+        points: [T * J, 3] m of every method, joints fastest.
+        filmed: what is true.
+
+    Returns:
+        By method what `measure` says of the joint-frames that all of them have, per joint only the three
+        MPJPEs. Of the method's own joint-frames `reconstructed_share`, `own_mpjpe_mm`, and `pck150` and
+        `pck150_auc`, which count missing joints as wrong.
+    """
+    truth = filmed.joints[:, None]
+    estimates = {method: own.reshape(truth.shape) for method, own in points.items()}
+    shared = common(*estimates.values())
+    rows: dict[Method, Row] = {}
+    for method, own in estimates.items():
+        errors = measure(np.where(shared[..., None], own, np.nan), truth, filmed.person.joints, filmed.t_ns)
+        distance = np.linalg.norm(own - truth, axis=-1)
+        there = distance[np.isfinite(distance)]
+        errors["common_share"] = errors["reconstructed_share"]
+        errors["reconstructed_share"] = there.size / distance.size
+        errors["own_mpjpe_mm"] = 1e3 * float(there.mean()) if there.size else None
+        errors["pck150"] = int((there <= PCK_THRESHOLD_M).sum()) / distance.size
+        near = np.maximum(0.0, 1 - there / PCK_THRESHOLD_M)
+        errors["pck150_auc"] = float(near.sum()) / distance.size
+        of_joints: Any = errors["per_joint"]
+        errors["per_joint"] = {
+            joint: {name: told[name] for name in _PER_JOINT} for joint, told in of_joints.items()
+        }
+        rows[method] = errors
+    return rows
+
+
+# --- pictures ------------------------------------------------------------------------------------------
+
+
+def _detect_all(
+    filmed: Walk,
+    cells: Sequence[Cell],
+    detector: Detector,
+    seed: int,
+    workers: int,
+    part: Part,
+    progress: Progress,
+) -> dict[tuple[float, int], Sightings]:
+    """Film the walk from every formation and look for keypoints in the pictures."""
+    geometries = sorted({cell.filmed for cell in cells})
+    cameras = [(tilt, drones, k) for tilt, drones in geometries for k in range(drones)]
+    progress.start("Filming", len(cameras) * len(filmed.t_ns))
+    stopped = Event()
+    world = World()
+    surfaces = build_world(world, seed, keep_clear=filmed.motion.root[:, :2]).surfaces()
+    lens = formation(filmed, cameras=2, tilt_deg=0.0).lens
+    renderer = Renderer(surfaces, lens, sun=np.array(world.sun), seed=seed)
+
+    def film(tilt_deg: float, drones: int, camera: int) -> Callable[[Path], None]:
+        seen_by = formation(filmed, cameras=drones, tilt_deg=tilt_deg)
+        return partial(_film, filmed, seen_by, camera, renderer, detector, stopped, progress)
+
+    work = [(f"pictures-{tilt:g}-{drones}-{k}", film(tilt, drones, k)) for tilt, drones, k in cameras]
+    found: dict[tuple[float, int], list[tuple[Float, Float]]] = {}
+    for (tilt, drones, _), made in zip(cameras, _side_by_side(work, part, workers, stopped), strict=True):
+        with np.load(made / "keypoints.npz") as stored:
+            found.setdefault((tilt, drones), []).append((stored["xy"], stored["confidence"]))
+    return {
+        geometry: Sightings(*(np.stack(each) for each in zip(*own, strict=True)))
+        for geometry, own in found.items()
+    }
+
+
+def _film(
+    filmed: Walk,
+    seen_by: Formation,
+    camera: int,
+    renderer: Renderer,
+    detector: Detector,
+    stopped: Event,
+    progress: Progress,
+    folder: Path,
+) -> None:
+    """Write what a detector finds in the pictures of one camera: xy [T, J, 2] and confidence [T, J]."""
+    networks = detector.load(threads=1)
+    tracker = PeopleTracker(networks)
+    names = filmed.person.joints
+    column = [networks.joints.index(name) if name in networks.joints else None for name in names]
+    xy = np.full((len(filmed.t_ns), len(names), 2), np.nan)
+    confidence = np.zeros(xy.shape[:-1])
+    for frame in range(len(filmed.t_ns)):
+        _go_on(stopped)
+        pose = seen_by.position[camera, frame], seen_by.quaternion_xyzw[camera, frame]
+        surface = filmed.person.surface(filmed.motion.root[frame], filmed.motion.rotation[frame])
+        picture = renderer.picture(*pose, [surface], frame)
+        hint = project_actor(filmed.aim[frame], pose, seen_by.lens, sigma_m=_HINT_SIGMA_M, sigma_rad=0.0)
+        people = tracker.step(picture, hint=hint)
+        if people:  # there is only one to be seen
+            person = max(people, key=lambda seen: seen.person.presence).person
+            for j, k in enumerate(column):
+                if k is not None:
+                    xy[frame, j], confidence[frame, j] = person.xy[k], person.confidence[k]
+        progress.advance()
+    confidence[np.isnan(xy).any(axis=-1)] = 0.0
+    np.savez(folder / "keypoints.npz", xy=xy, confidence=confidence)
+
+
+def _summary(settings: Settings, key: str, rows: Sequence[Row]) -> dict[str, Any]:
+    return {
+        "schema": 1,
+        "key": key,
+        "study": settings.study,
+        "simulated": True,
+        "keypoints": _keypoints(settings),
+        "settings": {**asdict(settings), "noise": {each.label: each.model for each in settings.noise}},
+        "cells": estimates(rows, settings.study, seed=settings.seed),
+    }
+
+
+def _keypoints(settings: Settings) -> str:
+    if settings.detector is not None:
+        return f"{settings.detector} on rendered pictures"
+    return "exact" if settings.keypoints == "exact" else "modelled detector"

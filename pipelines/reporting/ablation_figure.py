@@ -1,0 +1,128 @@
+"""The figure of a study: errors with their intervals, one panel for every method or level of noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any
+
+from pipelines.reporting.svg import CAMERAS, GRID, INK, MUTED, page_style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_PANEL_IN, _ROW_IN, _SMALLEST_IN = 2.7, 2.0, 5.4
+_ORDERED = ("#9db8c9", "#5f97bd", "#1f6da5", "#123f66")  # light to dark: levels have an order
+_MARKERS = "osD^vPX*"
+_BESIDE = 0.012  # of the axis, between the error bars of neighbouring curves
+_LETTERS_PER_IN = 16  # of the title
+_LONG_LABEL = 14  # letters; longer ones are written aslant
+_DPI = 160
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line of a panel; None where nothing could be measured."""
+
+    label: str
+    mean: Sequence[float | None]
+    interval: Sequence[tuple[float, float] | None]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes."""
+
+    title: str
+    curves: Sequence[Curve]
+
+
+def draw_study(
+    folder: Path,
+    rows: Sequence[tuple[str, Sequence[Panel]]],
+    *,
+    at: Sequence[float] | Sequence[str],
+    axis: str,
+    legend: str,
+    title: str,
+    ordered: bool,
+) -> None:
+    """Write `figure.svg`, `.png` and `.pdf`; equal arguments give equal bytes.
+
+    Args:
+        folder: where to.
+        rows: name of what is measured, and its panels, the same number in every row.
+        at: the values along the horizontal axis; words are put side by side.
+        axis: what they are.
+        legend: what the curves are.
+        title: above everything.
+        ordered: whether the curves have an order, which their colours then show.
+    """
+    from matplotlib.figure import Figure
+
+    columns = len(rows[0][1])
+    with page_style():
+        width = max(0.6 + _PANEL_IN * columns, _SMALLEST_IN)
+        figure = Figure((width, 0.9 + _ROW_IN * len(rows)), layout="constrained")
+        grid = figure.subplots(len(rows), columns, sharex=True, sharey="row", squeeze=False)
+        for (measured, panels), line in zip(rows, grid, strict=True):
+            for panel, axes in zip(panels, line, strict=True):
+                _draw(axes, panel, at, ordered=ordered)
+            line[0].set_ylabel(measured)
+            line[0].set_ylim(bottom=0)
+        for panel, axes in zip(rows[0][1], grid[0], strict=True):
+            axes.set_title(panel.title, color=INK, fontsize=8.4)
+        for axes in grid[-1]:
+            axes.set_xlabel(axis)
+        handles, labels = grid[0][0].get_legend_handles_labels()
+        figure.legend(
+            handles, labels, title=legend, loc="outside lower center", ncols=min(len(labels), 3 * columns)
+        )
+        lines = wrap(title, int(_LETTERS_PER_IN * width))
+        figure.suptitle("\n".join(lines), color=MUTED, fontsize=8.0)
+        # Neither dates nor versions: the same study gives the same files.
+        figure.savefig(folder / "figure.svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(folder / "figure.png", dpi=_DPI, metadata={"Software": None})
+        figure.savefig(
+            folder / "figure.pdf", metadata={"CreationDate": None, "Creator": None, "Producer": None}
+        )
+
+
+def _draw(axes: Axes, panel: Panel, at: Sequence[float] | Sequence[str], *, ordered: bool) -> None:
+    numbers = [float(value) if isinstance(value, int | float) else k for k, value in enumerate(at)]
+    words = any(isinstance(value, str) for value in at)
+    step = _BESIDE * ((max(numbers) - min(numbers)) or 1.0)
+    for k, curve in enumerate(panel.curves):
+        shift = (k - (len(panel.curves) - 1) / 2) * step
+        there = [
+            (x + shift, y, interval or (y, y))
+            for x, y, interval in zip(numbers, curve.mean, curve.interval, strict=True)
+            if y is not None
+        ]
+        below, above = ([abs(y - interval[end]) for _, y, interval in there] for end in (0, 1))
+        axes.errorbar(
+            [x for x, *_ in there],
+            [y for _, y, _ in there],
+            [below, above],
+            label=curve.label,
+            color=_colour(k, len(panel.curves), ordered),
+            marker=_MARKERS[k % len(_MARKERS)],
+            markersize=3.2,
+            linestyle="none" if words else "-",
+            capsize=2.0,
+            elinewidth=0.8,
+        )
+    axes.set_xticks(numbers, [value if isinstance(value, str) else f"{value:g}" for value in at])
+    if max(len(str(value)) for value in at) > _LONG_LABEL:
+        for label in axes.get_xticklabels():
+            label.set(rotation=20, ha="right", rotation_mode="anchor")
+    axes.grid(axis="y", color=GRID)
+    axes.tick_params(length=0)
+
+
+def _colour(k: int, count: int, ordered: bool) -> Any:
+    if ordered and count <= len(_ORDERED):
+        return _ORDERED[k + len(_ORDERED) - count]
+    return CAMERAS[k % len(CAMERAS)]

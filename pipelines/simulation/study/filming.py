@@ -1,0 +1,224 @@
+"""What the studies of formations film: a long walk on level ground, from ideal positions.
+
+A study flies nothing: its cameras stand in their slots about the walking person at every moment and look
+at them, as in the simulated experiments of Ho et al., "3D Human Reconstruction in the Wild with
+Collaborative Aerial Cameras". What errs is the keypoints and the logged poses, and that by known numbers:
+trial k of camera i has the same chance behind it whatever the formation and the size of the errors, so
+that differences between formations are not those of luck.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.geometry.cameras import Intrinsics, undistort
+from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
+from pipelines.geometry.poses import matrix_from_quaternion, rates
+from pipelines.geometry.triangulation import Views
+from pipelines.session.records import Float, Int64
+from pipelines.simulation.body import Person, make_body
+from pipelines.simulation.detector_errors import detect_keypoints, view_of
+from pipelines.simulation.drone_paths import orbit
+from pipelines.simulation.flight import intrinsics_of
+from pipelines.simulation.motion.script import perform
+from pipelines.simulation.observe import see
+from pipelines.simulation.rig import BodyMotion
+from pipelines.simulation.scenario import Body, DetectorErrors, Lens, Step, Travel
+
+RANGE_M = 10.0
+"""From the person to every camera."""
+
+LONGEST_S = 600.0
+"""Of a walk."""
+
+CIRCLE_M = 15.0
+"""Radius of the way: the person is seen from all sides."""
+
+PIXEL_SIGMA = 3.0
+"""Standard deviation of a good keypoint that triangulation is told, as `mocap reconstruct` is by default."""
+
+MIN_CONFIDENCE = 0.3
+"""Keypoints below are not used, likewise."""
+
+_SPEED_MPS = 1.2
+_UNDER_WAY_S = 2.0  # the person starts from a stand; filmed is a walk
+_AIM_S, _AIM_STEP_S = 1.0, 0.05  # cameras follow the mean over a stride, not every bob of the hip
+# What chance decides, each with numbers of its own.
+_POSES, _KEYPOINTS = range(2)
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A person under way at the moments T of the pictures."""
+
+    t_ns: Int64  # [T]
+    person: Person
+    height_m: float
+    motion: BodyMotion  # at those moments
+    joints: Float  # [T, J, 3] m, world, of `person.joints`
+    aim: Float  # [T, 3] m, world: the hip, smoothed
+
+
+@dataclass(frozen=True)
+class Formation:
+    """Cameras N in their slots at the moments T."""
+
+    position: Float  # [N, T, 3] m, world
+    quaternion_xyzw: Float  # [N, T, 4] world_from_camera
+    lens: Intrinsics  # of all of them
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Keypoints of the person in every camera."""
+
+    xy: Float  # [N, T, J, 2] px, NaN for what was not found
+    confidence: Float  # [N, T, J], 0 for that
+
+
+def walk(seconds: float, rate_hz: float, seed: int) -> Walk:
+    """A person who walks on a circle at an even pace.
+
+    Args:
+        seconds: how long, at most `LONGEST_S`.
+        rate_hz: of the pictures.
+        seed: of the person's way of walking.
+    """
+    look = Body()
+    person = make_body(look)
+    distance_m = _SPEED_MPS * (seconds + 2 * _UNDER_WAY_S + _AIM_S)
+    way = Travel(
+        distance_m=distance_m, turn_deg=float(np.degrees(distance_m / CIRCLE_M)), speed_mps=_SPEED_MPS
+    )
+
+    def at(t_s: Float) -> BodyMotion:
+        return perform(
+            [Step(walk=way)],
+            person.rig,
+            t_s + _UNDER_WAY_S,
+            ground=lambda xy: np.zeros(np.shape(xy)[:-1]),
+            start=np.array([0.0, -CIRCLE_M]),
+            heading_deg=0.0,
+            repeat=False,
+            seed=seed,
+        )
+
+    t_ns = np.round(np.arange(max(round(seconds * rate_hz), 2)) * (1e9 / rate_hz)).astype(np.int64)
+    t_s = t_ns / 1e9
+    motion = at(t_s)
+    return Walk(t_ns, person, look.height_m, motion, person.keypoints(motion), _smoothed(at, t_s))
+
+
+def _smoothed(at: Callable[[Float], BodyMotion], t_s: Float) -> Float:
+    """The pelvis [T, 3], each moment the mean over `_AIM_S`."""
+    samples = round(_AIM_S / _AIM_STEP_S) + 1
+    middle_s = np.arange(t_s[0] - _AIM_STEP_S, t_s[-1] + 2 * _AIM_STEP_S, _AIM_STEP_S)
+    grid_s = middle_s[0] + _AIM_STEP_S * (np.arange(len(middle_s) + samples - 1) - samples // 2)
+    root = at(grid_s).root
+    total = np.cumsum(np.concatenate([np.zeros((1, 3)), root]), axis=0)
+    mean = (total[samples:] - total[:-samples]) / samples
+    return np.stack([np.interp(t_s, middle_s, mean[:, k]) for k in range(3)], axis=-1)
+
+
+def formation(of: Walk, *, cameras: int, tilt_deg: float) -> Formation:
+    """Cameras in their slots: 360/n degrees apart, 90 for two, `RANGE_M` from the person.
+
+    Args:
+        of: who is filmed.
+        cameras: how many.
+        tilt_deg: of their slots above the person.
+    """
+    position, quaternion = orbit(
+        of.t_ns / 1e9,
+        of.aim,
+        cameras=cameras,
+        range_m=RANGE_M,
+        tilt_deg=tilt_deg,
+        yaw_rate_deg_per_s=0.0,
+    )
+    return Formation(position, quaternion, intrinsics_of(Lens()))
+
+
+def exact_keypoints(of: Walk, seen_by: Formation) -> Sightings:
+    """Where the keypoints really are in every picture."""
+    xy = np.stack(
+        [
+            see(of.joints, *pose, seen_by.lens)
+            for pose in zip(seen_by.position, seen_by.quaternion_xyzw, strict=True)
+        ]
+    )
+    return Sightings(xy, np.isfinite(xy[..., 0]).astype(np.float64))
+
+
+def model_keypoints(of: Walk, seen_by: Formation, exact: Sightings, *, seed: int, trial: int) -> Sightings:
+    """What a detector would have found, by the errors that were measured of one (`detector_errors`).
+
+    They grow with tilt and hold what a body hides of itself; nothing else stands in the way.
+    """
+    errors = DetectorErrors()
+    found = []
+    for camera, pixels in enumerate(exact.xy):
+        tilt_deg, height_px = view_of(
+            seen_by.position[camera], of.motion.root, height_m=of.height_m, focal_px=seen_by.lens.fx
+        )
+        found.append(
+            detect_keypoints(
+                pixels,
+                np.ones(pixels.shape[:-1], dtype=np.bool_),
+                tilt_deg,
+                height_px,
+                errors,
+                np.random.default_rng([seed, _KEYPOINTS, trial, camera]),
+                joints=of.person.joints,
+            )
+        )
+    xy, confidence = (np.stack(part) for part in zip(*found, strict=True))
+    return Sightings(xy, confidence)
+
+
+def views_of(
+    of: Walk,
+    seen_by: Formation,
+    sightings: Sightings,
+    noise: Sequence[NoiseModel],
+    *,
+    seed: int,
+    trial: int,
+) -> Views:
+    """What triangulation is given: keypoints, the poses that a log would have stated, and how far it errs.
+
+    Args:
+        of: who is filmed.
+        seen_by: from where.
+        sightings: what was found.
+        noise: the errors of the logged poses; what is told of them is their own standard deviation.
+        seed: where chance comes from.
+        trial: which draw.
+
+    Returns:
+        Views with N = T * J rows, joints fastest.
+    """
+    cameras, times, joints = sightings.confidence.shape
+    position, rotation = np.empty((times, cameras, 3)), np.empty((times, cameras, 3, 3))
+    sigma = np.empty((times, cameras, 2))
+    elapsed_s = (of.t_ns - of.t_ns[0]) / 1e9
+    for camera, true in enumerate(zip(seen_by.position, seen_by.quaternion_xyzw, strict=True)):
+        rng = np.random.default_rng([seed, _POSES, trial, camera])
+        position[:, camera], turned = disturb(noise, of.t_ns, *true, rng)
+        rotation[:, camera] = matrix_from_quaternion(turned)
+        sigma[:, camera] = sum_sigma(noise, elapsed_s, *rates(of.t_ns, *true))
+    rays = undistort(sightings.xy, seen_by.lens)
+    trusted = np.where(sightings.confidence >= MIN_CONFIDENCE, sightings.confidence, 0.0)
+    return Views(
+        xy=np.moveaxis(rays, 0, 2).reshape(times * joints, cameras, 2),
+        weight=np.moveaxis(trusted, 0, 2).reshape(times * joints, cameras),
+        pose_index=np.repeat(np.arange(times), joints),
+        position=position,
+        rotation=rotation,
+        focal=np.full(cameras, (seen_by.lens.fx + seen_by.lens.fy) / 2),
+        pixel_sigma=np.full(cameras, PIXEL_SIGMA),
+        pose_sigma=sigma,
+    )

@@ -1,0 +1,181 @@
+"""What a study is asked: which formations, which pose noise, which methods."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from pipelines.geometry.noise import NoiseModel
+from pipelines.geometry.triangulation import Method
+from pipelines.session.errors import DataError
+from pipelines.session.registries import find_detector, parsed_noise_models
+from pipelines.simulation.study.filming import LONGEST_S
+
+Study = Literal["tilt", "robots", "noise"]
+Keypoints = Literal["model", "exact"]
+
+LEVELS = {"none": (0.0, 0.0), "low": (0.1, 0.5), "medium": (0.3, 1.0), "high": (0.5, 2.0)}
+"""Pose noise per axis, m and degrees."""
+
+METHODS: tuple[Method, ...] = get_args(Method)
+
+_CORRELATION_S = 10.0  # of gauss-markov
+_DRONES, _TILT_DEG, _STEEPEST_DEG = (2, 8), 15.0, 85.0
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Errors of the logged poses."""
+
+    label: str
+    model: str  # as users write it; empty for exact poses
+
+    def models(self) -> list[NoiseModel]:
+        """What they are.
+
+        Raises:
+            DataError: the text does not read so, or names what there is not.
+        """
+        return parsed_noise_models("--noise", self.model) if self.model else []
+
+
+@dataclass(frozen=True)
+class Settings:
+    """A study. Made by `settings_for`, which checks what it is given."""
+
+    study: Study
+    tilts_deg: tuple[float, ...]
+    drones: tuple[int, ...]
+    noise: tuple[Noise, ...]
+    methods: tuple[Method, ...]
+    keypoints: Keypoints
+    detector: str | None  # looks at rendered pictures in place of `keypoints`
+    seconds: float
+    rate_hz: float
+    trials: int
+    seed: int
+
+
+def settings_for(
+    study: Study,
+    *,
+    tilts_deg: Sequence[float] | None = None,
+    drones: Sequence[int] | None = None,
+    levels: Sequence[str] | None = None,
+    noise: Sequence[str] = (),
+    methods: Sequence[str] = METHODS,
+    keypoints: Keypoints | None = None,
+    detector: str | None = None,
+    seconds: float = 75.0,
+    rate_hz: float | None = None,
+    trials: int = 10,
+    seed: int = 0,
+) -> Settings:
+    """The settings of a study, with those of the paper where nothing else is said.
+
+    Args:
+        study: `tilt` varies tilts, `robots` the number of drones, `noise` the kind of noise.
+        tilts_deg: of the formations; 0 to 60 by 15, or 15.
+        drones: how many fly; 2 to 5, or 2.
+        levels: names out of `LEVELS`; all four, or medium.
+        noise: models instead of levels, as users write them.
+        methods: side by side.
+        keypoints: with the errors of a detector (by default), or exact.
+        detector: one that looks at rendered pictures instead.
+        seconds: length of the walk.
+        rate_hz: of the pictures; 30, or 1 where they are rendered.
+        trials: independent draws of all noise.
+        seed: where they come from.
+
+    Raises:
+        DataError: something there is not, twice the same, or a number out of range.
+    """
+    if noise and levels is not None:
+        raise DataError("--noise", "cannot be given together with --levels", "leave one of them out")
+    if detector is not None:
+        find_detector(detector)
+        if keypoints is not None:
+            raise DataError(
+                "--detector", "cannot be given together with --keypoints", "leave one of them out"
+            )
+    tilts_deg = tilts_deg or ((0.0, 15.0, 30.0, 45.0, 60.0) if study == "tilt" else (_TILT_DEG,))
+    drones = drones or ((2, 3, 4, 5) if study == "robots" else (2,))
+    levels = levels or (("medium",) if study == "noise" else tuple(LEVELS))
+    rate_hz = rate_hz or (30.0 if detector is None else 1.0)
+    _check_names("--methods", methods, METHODS)
+    _check_names("--levels", levels, tuple(LEVELS))
+    _check_range("--tilts", tilts_deg, -10.0, _STEEPEST_DEG)
+    _check_range("--robots", drones, *_DRONES)
+    _check_range("--seconds", [seconds], 0.1, LONGEST_S)
+    _check_range("--rate", [rate_hz], 0.1, 240.0)
+    _check_range("--trials", [trials], 1, 10_000)
+    for name, values in (("--tilts", tilts_deg), ("--robots", drones), ("--noise", noise)):
+        _check_once(name, values)
+    if seconds * rate_hz < 2:
+        raise DataError("--seconds", f"{seconds:g} s at {rate_hz:g} Hz are not two pictures", "film longer")
+    asked = [Noise(text, text) for text in noise] or _levels(study, levels, seconds)
+    for each in asked:
+        each.models()
+    chosen: tuple[Method, ...] = tuple(name for name in METHODS if name in methods)
+    return Settings(
+        study,
+        tuple(float(tilt) for tilt in tilts_deg),
+        tuple(drones),
+        tuple(asked),
+        chosen,
+        keypoints or "model",
+        detector,
+        seconds,
+        rate_hz,
+        trials,
+        seed,
+    )
+
+
+def _levels(study: Study, levels: Sequence[str], seconds: float) -> list[Noise]:
+    """White noise of every level; for the study of noise every kind of it, equally large on the average."""
+    asked: list[Noise] = []
+    for level in levels:
+        position_m, rotation_deg = LEVELS[level]
+        size = f"position_m={position_m:g},rotation_deg={rotation_deg:g}"
+        if not position_m:
+            asked.append(Noise(level, ""))
+        elif study != "noise":
+            asked.append(Noise(level, f"white:{size}"))
+        else:
+            # The mean square of a random walk over its length is half its last variance.
+            per_sqrt_s = 1 / math.sqrt(seconds / 2)
+            drift = (
+                f"drift:position_m_per_sqrt_s={position_m * per_sqrt_s:.4g},"
+                f"rotation_deg_per_sqrt_s={rotation_deg * per_sqrt_s:.4g}"
+            )
+            of = "" if len(levels) == 1 else f" {level}"
+            asked += [
+                Noise(f"white{of}", f"white:{size}"),
+                Noise(f"bias{of}", f"bias:{size}"),
+                Noise(f"body bias{of}", f"bias:{size},frame=body"),
+                Noise(f"drift{of}", drift),
+                Noise(f"gauss-markov{of}", f"gauss-markov:{size},correlation_s={_CORRELATION_S:g}"),
+            ]
+    return asked
+
+
+def _check_names(option: str, given: Sequence[str], known: Sequence[str]) -> None:
+    unknown = [name for name in given if name not in known]
+    if unknown or not given:
+        said = f"no such name: {', '.join(unknown)}" if unknown else "names nothing"
+        raise DataError(option, said, f"there are {', '.join(known)}")
+    _check_once(option, given)
+
+
+def _check_once(option: str, given: Sequence[object]) -> None:
+    if len(set(given)) < len(given):
+        raise DataError(option, "says something twice", "name each once")
+
+
+def _check_range(option: str, given: Sequence[float], least: float, most: float) -> None:
+    for number in given:
+        if not least <= number <= most:  # NaN, too
+            raise DataError(option, f"{number:g} is not between {least:g} and {most:g}", "change it")

@@ -1,0 +1,224 @@
+"""The studies: exact data give nothing, errors have the size and the shape that geometry gives them."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from mocap_cli.ablate import ablate_command
+from mocap_cli.main import Mocap
+from pipelines import ablate as stage
+from pipelines.geometry.noise import White
+from pipelines.simulation.study.filming import RANGE_M, exact_keypoints, formation, views_of, walk
+from tests.commands.runner import content
+
+SMALL = ("--seconds", "8", "--rate", "5", "--trials", "2", "--workers", "1")
+
+
+def run(*arguments: str | Path) -> Any:
+    """The command in this process, as the group runs it."""
+    return CliRunner().invoke(Mocap(commands=[ablate_command]), ["ablate", *map(str, arguments)])
+
+
+def succeeds(*arguments: str | Path) -> str:
+    done = run(*arguments)
+    assert done.exit_code == 0, (done.output, done.exception)
+    return str(done.stdout)
+
+
+def study(*arguments: str | Path) -> dict[tuple[float, int, str, str], dict[str, Any]]:
+    """The cells of a study by tilt, drones, noise and method."""
+    cells = json.loads(succeeds(*arguments, "--json"))["cells"]
+    return {(cell["tilt_deg"], cell["drones"], cell["noise"], cell["method"]): cell for cell in cells}
+
+
+def covariance_trace(cameras: int, tilt_deg: float) -> float:
+    """Trace of the covariance of a point in units of one ray's variance: rays err across themselves."""
+    yaw = (np.pi / 2 if cameras == 2 else 2 * np.pi / cameras) * np.arange(cameras)
+    tilt = np.radians(tilt_deg)
+    ray = np.stack([np.cos(yaw) * np.cos(tilt), np.sin(yaw) * np.cos(tilt), np.full(cameras, np.sin(tilt))])
+    return float(np.trace(np.linalg.inv(cameras * np.eye(3) - ray @ ray.T)))
+
+
+def rms_m(cell: dict[str, Any]) -> float:
+    return float(np.sqrt(cell["metrics"]["e_recon_per_joint_frame_m2"]["mean"]))
+
+
+def test_exact_keypoints_and_poses_give_nothing(tmp_path: Path) -> None:
+    """Only rounding is left: 1e-16 of 30 m, a thousandfold for the conditioning of two rays."""
+    cells = study("tilt", *SMALL, "--keypoints", "exact", "--levels", "none", "-o", tmp_path / "out")
+    assert {cell[0] for cell in cells} == {0, 15, 30, 45, 60}
+    for cell in cells.values():
+        assert cell["metrics"]["mpjpe_mm"]["mean"] < 1e-6
+        assert cell["metrics"]["reconstructed_share"]["mean"] == 1
+        assert cell["ratio"] is None  # a ratio of rounding errors means nothing
+
+
+@pytest.mark.parametrize("what", ["tilt", "robots"])
+def test_errors_of_poses_have_the_size_and_shape_of_the_geometry(tmp_path: Path, what: str) -> None:
+    """Small white pose noise, exact keypoints: RMS = s sqrt(trace), s^2 = (range sigma_rot)^2 + sigma_pos^2.
+
+    All joints of a frame share its errors, so that there are as many independent draws as frames and
+    trials: 8 s x 25 Hz x 4 = 800, each with about 2 effective degrees of freedom. The RMS of so many
+    scatters by 1 / sqrt(2 x 2 x 800) = 1.8 %; four times that, and 1 % for joints up to 1 m off the middle
+    of the ring (the mean of (distance / 10 m)^2), are allowed.
+    """
+    noise = "white:position_m=0.02,rotation_deg=0.1"
+    cells = study(
+        what, "--seconds", "8", "--rate", "25", "--trials", "4", "--keypoints", "exact", "--noise", noise,
+        "-o", tmp_path / "out",
+    )  # fmt: skip
+    ray_m = np.hypot(0.02, RANGE_M * np.radians(0.1))
+    assert len(cells) == 3 * (5 if what == "tilt" else 4)
+    for (tilt, drones, _, _), cell in cells.items():
+        assert rms_m(cell) == pytest.approx(ray_m * np.sqrt(covariance_trace(drones, tilt)), rel=0.082)
+
+
+def test_the_studies_of_the_paper_have_its_shapes(tmp_path: Path) -> None:
+    """High noise. By `covariance_trace` 30 deg cost 3 % more than 0, 60 deg 43 %; 5 drones 38 % less than 2.
+
+    Trials have the same chance behind them everywhere, but rays differ: 8 s x 15 Hz x 3 trials = 360 draws
+    scatter by 2.6 % in a mean, 3.7 % in a ratio; the bounds are 2.5 of those away and more.
+    """
+    options = ("--seconds", "8", "--rate", "15", "--trials", "3", "--levels", "high")
+    tilted = study("tilt", *options, "--tilts", "0,30,60", "-o", tmp_path / "tilt")
+    crowded = study("robots", *options, "-o", tmp_path / "robots")
+    for method in ("dlt", "midpoint", "robust"):
+        low, steep = (tilted[tilt, 2, "high", method]["ratio"]["mean"] for tilt in (30, 60))
+        assert low < 1.15
+        assert steep > 1.3
+        error = [crowded[15, n, "high", method]["metrics"]["mpjpe_mm"]["mean"] for n in (2, 3, 4, 5)]
+        assert crowded[15, 5, "high", method]["ratio"]["mean"] < 0.7
+        assert error[0] > error[1] > error[2] > error[3]
+        assert error[0] - error[1] > error[2] - error[3]  # falling gains: 20 % against 7 %
+
+
+def test_modelled_keypoints_and_exact_poses_stay_below_60_mm(tmp_path: Path) -> None:
+    cells = study(
+        "tilt", "--seconds", "20", "--rate", "10", "--trials", "2", "--tilts", "0,15,30,60",
+        "--levels", "none", "-o", tmp_path / "out",
+    )  # fmt: skip
+    for (tilt, *_), cell in cells.items():
+        error_mm = cell["metrics"]["mpjpe_mm"]["mean"]
+        assert error_mm <= 60 if tilt <= 30 else error_mm > 60
+
+
+def test_trials_of_two_formations_share_their_chance() -> None:
+    """The same draws move the first camera by the same vectors wherever it is, twice the sigma by twice."""
+    of = walk(2.0, 5.0, 0)
+    moved = []
+    for tilt_deg, sigma in ((0.0, 0.1), (45.0, 0.2)):
+        seen_by = formation(of, cameras=2, tilt_deg=tilt_deg)
+        views = views_of(
+            of, seen_by, exact_keypoints(of, seen_by), [White(position_m=sigma)], seed=3, trial=1
+        )
+        moved.append((views.position - np.moveaxis(seen_by.position, 0, 1)) / sigma)
+    assert moved[0] == pytest.approx(moved[1], abs=1e-9)
+    assert not np.allclose(moved[0][:, 0], moved[0][:, 1])
+
+
+def test_every_kind_of_noise_is_there_and_drift_is_as_large_as_the_rest(tmp_path: Path) -> None:
+    summary = json.loads(succeeds("noise", *SMALL, "-o", tmp_path / "out", "--json"))
+    models = summary["settings"]["noise"]
+    assert list(models) == ["white", "bias", "body bias", "drift", "gauss-markov"]
+    # The mean square of a random walk over 8 s is sigma^2 8 / 2.
+    assert "position_m_per_sqrt_s=0.15," in models["drift"]
+    assert summary["simulated"] is True
+    first = {cell["noise"]: cell["ratio"]["mean"] for cell in summary["cells"] if cell["method"] == "dlt"}
+    assert first == dict.fromkeys(models, 1.0)
+
+
+def test_methods_are_compared_where_all_of_them_have_a_point(tmp_path: Path) -> None:
+    """At n = 2 robust rejects what does not agree; the others are judged without it, and say so."""
+    output = tmp_path / "out"
+    cells = study("tilt", *SMALL, "--tilts", "45", "--levels", "none", "-o", output)
+    linear, robust = (cells[45, 2, "none", method]["metrics"] for method in ("dlt", "robust"))
+    assert linear["common_share"] == robust["common_share"]
+    assert robust["reconstructed_share"]["mean"] < linear["reconstructed_share"]["mean"]
+    assert linear["mpjpe_mm"]["mean"] < linear["own_mpjpe_mm"]["mean"]
+    with (output / "results.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["method"], row["trial"]) for row in rows] == [
+        (method, str(trial)) for trial in range(2) for method in ("dlt", "midpoint", "robust")
+    ]
+    told = np.mean([float(row["mpjpe_mm"]) for row in rows if row["method"] == "robust"])
+    assert told == pytest.approx(robust["mpjpe_mm"]["mean"])
+
+
+def test_workers_do_not_matter_and_a_study_that_is_there_is_not_made_again(tmp_path: Path) -> None:
+    made = []
+    for workers in ("1", "2"):
+        options = ("--seconds", "4", "--rate", "5", "--trials", "2", "--workers", workers)
+        text = succeeds("robots", *options, "-o", tmp_path / workers, "--levels", "none,low")
+        assert text.startswith("Simulated: ")
+        made.append((text.replace(str(tmp_path / workers), ""), content(tmp_path / workers)))
+    assert made[0] == made[1]
+    assert set(made[0][1]) == {"results.csv", "summary.json", "figure.svg", "figure.png", "figure.pdf"}
+    again = succeeds("robots", *options, "-o", tmp_path / "2", "--levels", "none,low", "-q")
+    assert again == f"unchanged: {tmp_path / '2'}\n"
+
+
+def test_what_an_interrupted_study_finished_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = ("tilt", *SMALL, "--tilts", "0,15,30", "--levels", "low", "-o", tmp_path / "out", "-q")
+    measured: list[float] = []
+    measure_cell = stage._measure_cell
+
+    def counted(*of: Any) -> None:
+        measured.append(of[2].tilt_deg)
+        if len(measured) == 3:
+            raise KeyboardInterrupt
+        measure_cell(*of)
+
+    monkeypatch.setattr(stage, "_measure_cell", counted)
+    assert run(*arguments).exit_code == 130
+    assert not (tmp_path / "out").exists()
+    succeeds(*arguments)
+    assert measured == [0, 15, 30, 30]
+    succeeds(*arguments[:-2], tmp_path / "whole", "-q")
+    assert content(tmp_path / "out") == content(tmp_path / "whole")
+    # Nothing else is left beside the two.
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
+
+
+HOSTILE = {
+    "no such level": (("tilt", "--levels", "low,awful"), "awful"),
+    "no such method": (("tilt", "--methods", "magic"), "magic"),
+    "no method": (("tilt", "--methods", ""), "--methods"),
+    "a method twice": (("tilt", "--methods", "dlt,dlt"), "twice"),
+    "a tilt straight above": (("tilt", "--tilts", "0,90"), "90"),
+    "a tilt that is none": (("tilt", "--tilts", "nan"), "nan"),
+    "words for tilts": (("tilt", "--tilts", "0;15"), "0;15"),
+    "no tilts": (("tilt", "--tilts", ","), "--tilts"),
+    "a single drone": (("robots", "--robots", "1,2"), "--robots"),
+    "half a drone": (("robots", "--robots", "2.5"), "2.5"),
+    "noise that does not read": (("noise", "--noise", "loud"), "loud"),
+    "noise that there is not": (("noise", "--noise", "pink:position_m=1"), "pink"),
+    "noise and levels": (("noise", "--noise", "white:position_m=1", "--levels", "low"), "--levels"),
+    "a single picture": (("tilt", "--seconds", "0.1", "--rate", "1"), "two pictures"),
+    "no such detector": (("tilt", "--detector", "oracle"), "oracle"),
+    "detector and exact": (("tilt", "--detector", "blazepose", "--keypoints", "exact"), "--keypoints"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_options_get_one_line(tmp_path: Path, case: str) -> None:
+    arguments, said = HOSTILE[case]
+    done = run(*arguments, "-o", tmp_path / "out")
+    assert done.exit_code == 1, (done.output, done.exception)
+    (line,) = done.stderr.strip().splitlines()
+    assert said in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_of_somebody_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("")
+    done = run("tilt", *SMALL, "-o", tmp_path)
+    assert done.exit_code == 1
+    assert "--overwrite" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
