@@ -8,15 +8,26 @@ from functools import partial
 from pathlib import Path
 
 from pipelines.formats.pictures import Picture, Pictures, open_pictures
-from pipelines.reporting.content import SessionContent
+from pipelines.reporting.content import ReplanContent, SessionContent, section
 from pipelines.reporting.page import render_page
 from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
+from pipelines.session.maps import load_maps
 from pipelines.session.stages import Stage, StageRecord, WritableSession, locked, session_name
 from pipelines.session.storage import read_json
-from pipelines.session.tables import FRAMES, KEYPOINTS, POSES, SKELETON, TRUTH, read_table
+from pipelines.session.tables import (
+    ACTOR,
+    COST_MAP,
+    FRAMES,
+    KEYPOINTS,
+    POSES,
+    REPLAN,
+    SKELETON,
+    TRUTH,
+    read_table,
+)
 
-REPORT = Stage("report", revision=1)
+REPORT = Stage("report", revision=2)
 
 
 @dataclass(frozen=True)
@@ -56,7 +67,7 @@ def report(folder: Path, *, force: bool = False) -> Reported:
 
 
 def _finished_stages(session: WritableSession) -> dict[str, StageRecord]:
-    records = {name: session.record(name) for name in ("ingest", "detect", "reconstruct")}
+    records = {name: session.record(name) for name in ("ingest", "detect", "reconstruct", "replan")}
     if records["ingest"] is None:
         raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
     return {name: record for name, record in records.items() if record is not None}
@@ -114,4 +125,22 @@ def _load(folder: Path, records: dict[str, StageRecord]) -> SessionContent:
             name: read_table(place / "keypoints.parquet", KEYPOINTS) for name, place in keypoints.items()
         },
         stages={name: asdict(record) for name, record in records.items()},
+        replan=_load_replan(folder, records["replan"]) if "replan" in records else None,
+    )
+
+
+def _load_replan(folder: Path, record: StageRecord) -> ReplanContent:
+    place = folder / "replan"
+    metrics = read_json(place / "metrics.json")
+    costs = place / "cost_map.parquet"
+    return ReplanContent(
+        metrics=metrics,
+        arms={
+            arm: read_table(place / arm / "trajectories.parquet", REPLAN)
+            for arm in section(metrics, "arms")
+            if f"replan/{arm}/trajectories.parquet" in record.outputs
+        },
+        actor=read_table(place / "actor.parquet", ACTOR),
+        cost_map=read_table(costs, COST_MAP) if costs.exists() else None,
+        map=max(load_maps(folder), key=lambda one: one.from_ns, default=None),
     )

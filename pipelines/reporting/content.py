@@ -6,8 +6,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from pipelines.session.records import Occupancy
+
 if TYPE_CHECKING:
     import pandas as pd
+
+
+@dataclass(frozen=True)
+class ReplanContent:
+    """What a comparison of planners left in a session."""
+
+    metrics: dict[str, object]  # replan/metrics.json
+    arms: dict[str, pd.DataFrame]  # arm: tables.REPLAN
+    actor: pd.DataFrame  # tables.ACTOR at the same times: whom the arms were scored against
+    cost_map: pd.DataFrame | None = None  # tables.COST_MAP
+    map: Occupancy | None = None  # the session's last map
 
 
 @dataclass(frozen=True)
@@ -23,6 +36,7 @@ class SessionContent:
     frames: dict[str, pd.DataFrame]  # camera: tables.FRAMES
     keypoints: dict[str, pd.DataFrame]  # camera: tables.KEYPOINTS, of cameras that have any
     stages: dict[str, dict[str, object]]  # stage: its stage.json
+    replan: ReplanContent | None = None
 
 
 def section(mapping: Mapping[str, object], key: str) -> dict[str, object]:

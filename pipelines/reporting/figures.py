@@ -8,7 +8,6 @@ the captions say so.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,10 +15,10 @@ import numpy as np
 from pipelines.geometry.poses import rotate
 from pipelines.reporting.bones import side_of
 from pipelines.reporting.motion import Motion
+from pipelines.reporting.plates import LINE_STYLES, MOST_POINTS, Plate, axis_label, every, near_zero, quiet
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.svg import (
     CAMERAS,
-    GRID,
     INK,
     LEFT,
     MIDDLE,
@@ -50,25 +49,11 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
-MOST_POINTS = 600
 MOST_BINS = 300
 SNAPSHOTS = 7
-_LINE_STYLES = ("-", (0, (4, 1.5)), (0, (1, 1.2)))
 _STRIDE_M = 1.3  # between two snapshots of the body
 # Above a raised hand, and below the ground by more than errors explain: what lies beyond is cut off.
 _TALLEST_M, _DEEPEST_M = 2.6, 0.5
-# World coordinates beyond this are shown relative to a round number near them.
-_FAR_M = 10_000.0
-
-
-@dataclass(frozen=True)
-class Plate:
-    """A figure with its words."""
-
-    key: str
-    title: str
-    caption: str
-    svg: str
 
 
 def draw_all(summary: Summary, poses: Mapping[str, pd.DataFrame]) -> dict[str, Plate]:
@@ -107,7 +92,7 @@ def _timeline(cameras: tuple[CameraRow, ...]) -> Plate:
         axes.set_yticks(range(rows), [shortened(camera.name) for camera in cameras])
         axes.set_ylim(rows - 0.5, -0.5)
         axes.set_xlabel("time (s)")
-        _quiet(axes)
+        quiet(axes)
         title = "When each camera had frames and poses"
         told = [_spoken(camera) for camera in cameras]
         svg = inline_svg(figure, "figure-timeline", title, " ".join(told))
@@ -138,7 +123,7 @@ def _top_view(
     )
     everything = everything[np.isfinite(everything).all(axis=1)]
     low, high = (everything.min(axis=0), everything.max(axis=0)) if len(everything) else (np.zeros(2),) * 2
-    origin = np.where(np.abs(low) > _FAR_M, np.floor(low / 1000) * 1000, 0.0)
+    origin = near_zero(low)
     extent = np.maximum(high - low, 2.0)
     height_in = float(np.clip(0.75 * WIDTH_IN * extent[1] / extent[0], 3.2, 6.2))
 
@@ -151,27 +136,27 @@ def _top_view(
             if camera.name in tracks:
                 track = tracks[camera.name]
                 look = rotate(track.quaternion_xyzw, np.array([0.0, 0.0, 1.0]))[:, :2]
-                style = (CAMERAS[k % len(CAMERAS)], _LINE_STYLES[k // len(CAMERAS) % len(_LINE_STYLES)])
+                style = (CAMERAS[k % len(CAMERAS)], LINE_STYLES[k // len(CAMERAS) % len(LINE_STYLES)])
                 gaps_ns = camera.entry.poses.gaps_ns
                 ground = track.position[:, :2] - origin
-                path, every = _drawn_path(track.t_ns, ground, [start for start, _ in gaps_ns])
-                step = max(step, every)
+                path, stride = _drawn_path(track.t_ns, ground, [start for start, _ in gaps_ns])
+                step = max(step, stride)
                 _draw_camera(axes, shortened(camera.name), path, ground, look, style, float(extent.max()))
         for k, person in enumerate(people):
-            every = _every(len(person), MOST_POINTS)
-            path = person[::every] - origin
-            step = max(step, every)
+            stride = every(len(person), MOST_POINTS)
+            path = person[::stride] - origin
+            step = max(step, stride)
             label = "actor" if len(people) == 1 else f"person {k}"
-            line = _LINE_STYLES[k % len(_LINE_STYLES)]
+            line = LINE_STYLES[k % len(LINE_STYLES)]
             axes.plot(*path.T, color=INK, linewidth=2.0, linestyle=line, label=label, zorder=4)
             start = path[np.isfinite(path[:, 0])][:1]
             axes.plot(*start.T, "o", color=INK, markerfacecolor=PAPER, markersize=5, zorder=5)
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.06)
-        axes.set_xlabel(_axis_label("east", origin[0]))
-        axes.set_ylabel(_axis_label("north", origin[1]))
+        axes.set_xlabel(axis_label("east", origin[0]))
+        axes.set_ylabel(axis_label("north", origin[1]))
         figure.legend(loc="outside right upper")
-        _quiet(axes, grid=False)
+        quiet(axes, grid=False)
         title = "Seen from above"
         paths = [f"{name} over {quantity(_length_m(t.position), 'm')}" for name, t in tracks.items()]
         paths += [f"the actor over {quantity(_length_m(person), 'm')}" for person in people]
@@ -207,14 +192,14 @@ def _draw_camera(
 
 def _drawn_path(t_ns: Int64, path: Float, gap_starts_ns: list[int]) -> tuple[Float, int]:
     """A decimated path, broken where the poses have a gap, and every how many poses were drawn."""
-    every = _every(len(path), MOST_POINTS)
+    stride = every(len(path), MOST_POINTS)
     breaks = np.unique(np.searchsorted(t_ns, gap_starts_ns, side="right"))
     pieces = []
     for rows in np.split(np.arange(len(path)), breaks):
         if rows.size:
-            kept = np.unique([*rows[::every], rows[-1]])
+            kept = np.unique([*rows[::stride], rows[-1]])
             pieces += [path[kept], np.full((1, 2), np.nan)]
-    return (np.concatenate(pieces), every) if pieces else (path, every)
+    return (np.concatenate(pieces), stride) if pieces else (path, stride)
 
 
 def _middles(motion: Motion) -> list[Float]:
@@ -234,10 +219,6 @@ def _middles(motion: Motion) -> list[Float]:
 def _length_m(path: Float) -> float:
     steps = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1)
     return float(steps[np.isfinite(steps)].sum())
-
-
-def _axis_label(direction: str, origin_m: float) -> str:
-    return f"{direction} (m)" if origin_m == 0 else f"{direction} of {fixed(origin_m, 0)} m (m)"
 
 
 # --- errors over time ----------------------------------------------------------------------------------
@@ -261,7 +242,7 @@ def _over_time(summary: Summary, motion: Motion) -> Plate:
         upper.plot(centres, middle, color=STATUS_COLOURS["ok"])
         upper.set_ylim(0, 1.08 * np.nanmax(high, initial=0.0) or 1.0)
         upper.set_ylabel(f"{what} ({unit})")
-        _quiet(upper, grid=False)
+        quiet(upper, grid=False)
         base = np.zeros(len(centres))
         for word in _present(summary):
             top = base + 100 * shares[STATUS.index(word)]
@@ -273,7 +254,7 @@ def _over_time(summary: Summary, motion: Motion) -> Plate:
         lower.set_xlim(bins[0], bins[-1])
         lower.set_ylabel("joints (%)")
         lower.set_xlabel("time (s)")
-        _quiet(lower)
+        quiet(lower)
         figure.legend(loc="outside upper left", ncols=len(STATUS))
         title = f"{what.capitalize()} over time, and what became of the joints"
         worst = int(np.nanargmax(middle)) if np.isfinite(middle).any() else None
@@ -347,7 +328,7 @@ def _joint_bars(summary: Summary) -> Plate:
         axes.set_ylim(len(rows) - 0.5, -0.5)
         axes.set_xlim(0, 100)
         axes.set_xlabel("share of times (%)")
-        _quiet(axes)
+        quiet(axes)
         axes.tick_params(axis="y", length=0)
         title = "What became of every joint"
         told = listing(f"{joint_label(row.name)} {percent(row.share)}" for row in rows)
@@ -379,7 +360,7 @@ def _bone_lengths(summary: Summary) -> Plate:
         axes.set_ylim(len(names) - 0.5, -0.5)
         axes.set_xlim(left=0)
         axes.set_xlabel("length (cm)")
-        _quiet(axes, grid=False)
+        quiet(axes, grid=False)
         axes.tick_params(axis="y", length=0)
         title = "Bone lengths"
         told = listing(
@@ -421,7 +402,7 @@ def _snapshots(summary: Summary, motion: Motion) -> Plate:
         axes.set_xticks(_STRIDE_M * np.arange(len(chosen)), labels)
         axes.set_ylabel("height (m)")
         axes.grid(visible=True, axis="y")
-        _quiet(axes, grid=False)
+        quiet(axes, grid=False)
         axes.spines["bottom"].set_visible(False)
         axes.tick_params(axis="x", length=0)
         title = "The body at a few moments"
@@ -481,18 +462,5 @@ def _present(summary: Summary) -> list[str]:
     return [word for word in STATUS if summary.counts.get(word)]
 
 
-def _every(count: int, most: int) -> int:
-    """The stride that leaves at most `most` of `count`."""
-    return max(1, -(-count // most))
-
-
 def _decimation(step: int, noun: str) -> str:
     return f" One {noun} in {step} is drawn." if step > 1 else ""
-
-
-def _quiet(axes: Axes, *, grid: bool = True) -> None:
-    """Light axes: no frame on the left, a thin line below."""
-    axes.spines["left"].set_visible(False)
-    axes.tick_params(axis="y", length=0)
-    if grid:
-        axes.grid(visible=True, axis="x", color=GRID)

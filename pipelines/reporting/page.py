@@ -11,10 +11,12 @@ from importlib.resources import files
 from markupsafe import Markup
 
 from pipelines.reporting import wording
+from pipelines.reporting.arm_figures import draw_arms
 from pipelines.reporting.content import SessionContent, number, section, text
 from pipelines.reporting.figures import draw_all
 from pipelines.reporting.overlays import Moment, ReadFrame, collect_moments
 from pipelines.reporting.panels import draw_panel, picture_width
+from pipelines.reporting.replanned import summarise_replan
 from pipelines.reporting.summary import Summary, errors_per_camera, give_verdict, measures, summarise
 from pipelines.reporting.viewer import make_scene
 from pipelines.session.tables import STATUS
@@ -80,7 +82,12 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
         percent=wording.percent,
         joint=wording.joint_label,
     )
-    plates = draw_all(summary, content.poses)
+    replan = (
+        None
+        if content.replan is None
+        else summarise_replan(content.replan, summary.origin_ns, len(summary.cameras))
+    )
+    plates = draw_all(summary, content.poses) | (draw_arms(replan) if replan is not None else {})
     script = (files("pipelines.reporting") / "templates" / "viewer.js").read_text(encoding="utf-8")
     overlays = _overlays(content, summary, read_frame)
     return environment.get_template("page.html.j2").render(
@@ -96,7 +103,8 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
         measures=measures(summary),
         errors_per_camera=errors_per_camera(summary),
         plates=plates,
-        scene=make_scene(summary, content.poses),
+        replan=replan,
+        scene=make_scene(summary, content.poses, replan),
         viewer_script=Markup(script),  # noqa: S704 - our own file
         policy=_policy(script, pictures=overlays is not None and overlays.pictures > 0),
         overlays=overlays,

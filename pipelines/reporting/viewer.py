@@ -17,8 +17,10 @@ import numpy as np
 from pipelines.geometry.poses import interpolate_poses
 from pipelines.reporting.bones import side_of
 from pipelines.reporting.motion import Motion
+from pipelines.reporting.replanned import Arm, Replan
 from pipelines.reporting.summary import CameraRow, Summary
-from pipelines.reporting.wording import joint_label, plural, whole
+from pipelines.reporting.terrain import surface
+from pipelines.reporting.wording import joint_label, plural, quantity, whole
 from pipelines.session.records import Float, Int64
 from pipelines.session.skeletons import DERIVED, bones_of
 from pipelines.session.tabular import trajectory_from
@@ -42,9 +44,13 @@ class Scene:
     truth: bool
     ellipsoids: bool
     notes: tuple[str, ...]  # what is not as the tables have it, in whole sentences
+    arms: tuple[str, ...] = ()  # of a comparison of planners: whose cameras can be shown as well
+    surface: bool = False  # whether the map's surface is there
 
 
-def make_scene(summary: Summary, poses: Mapping[str, pd.DataFrame]) -> Scene | None:
+def make_scene(
+    summary: Summary, poses: Mapping[str, pd.DataFrame], replan: Replan | None = None
+) -> Scene | None:
     """Pack a session for the viewer; None where there is nothing to be seen.
 
     Every camera's pose is interpolated to the times of the skeleton, never across what the session calls
@@ -53,6 +59,8 @@ def make_scene(summary: Summary, poses: Mapping[str, pd.DataFrame]) -> Scene | N
     Args:
         summary: the session in numbers.
         poses: camera: tables.POSES.
+        replan: planners that flew again. The cameras of simulated arms are packed beside those of the
+            session, and what the map holds around them.
     """
     motion = summary.motion if summary.motion is not None and summary.motion.measured.any() else None
     cameras = [camera for camera in summary.cameras if camera.name in poses]
@@ -60,12 +68,19 @@ def make_scene(summary: Summary, poses: Mapping[str, pd.DataFrame]) -> Scene | N
         return None
     all_t_ns = motion.t_ns if motion is not None else _times_without_skeleton(summary)
     body = _Body.of(motion, summary.truth) if motion is not None else None
-    every = -(-len(all_t_ns) * _bytes_per_time(body, len(cameras)) // MOST_BYTES)
+    arms = [arm for arm in replan.arms if arm.simulated] if replan is not None else []
+    all_cameras = len(cameras) + sum(len(arm.cameras) for arm in arms)
+    every = -(-len(all_t_ns) * _bytes_per_time(body, all_cameras) // MOST_BYTES)
     kept = slice(None, None, every)
     t_ns = all_t_ns[kept]
     placed = [_placed(camera, poses[camera.name], t_ns, summary) for camera in cameras]
+    replanned = [
+        (arm, k, _placed_again(arm, k, t_ns, summary)) for arm in arms for k in range(len(arm.cameras))
+    ]
     everywhere = np.concatenate(
-        [position for position, _ in placed] + ([body.middle[kept].reshape(-1, 3)] if body else [])
+        [position for position, _ in placed]
+        + [position for _, _, (position, _) in replanned]
+        + ([body.middle[kept].reshape(-1, 3)] if body else [])
     )
     low, high = _bounds(everywhere)
     origin = np.round((low + high) / 2)
@@ -76,13 +91,13 @@ def make_scene(summary: Summary, poses: Mapping[str, pd.DataFrame]) -> Scene | N
         "high": _rounded(high - origin),
         "ground": round(ground - float(origin[2]), 3),
         "cameras": [
-            {
-                "name": camera.name,
-                "corners": _picture_corners(camera),
-                "position": _packed(1000 * (position - origin), np.int32),
-                "rotation": _packed(32767 * quaternion, np.int16),
-            }
+            _packed_camera(camera.name, camera, position - origin, quaternion)
             for camera, (position, quaternion) in zip(cameras, placed, strict=True)
+        ]
+        + [
+            _packed_camera(arm.cameras[k], summary.cameras[k % len(summary.cameras)], position - origin, turn)
+            | {"arm": arms.index(arm), "colour": arm.colour}
+            for arm, k, (position, turn) in replanned
         ],
     }
     notes = []
@@ -94,12 +109,22 @@ def make_scene(summary: Summary, poses: Mapping[str, pd.DataFrame]) -> Scene | N
     if body is not None:
         data["body"] = body.packed(kept, origin)
         notes += body.notes()
+    around = surface(replan.terrain) if replan is not None and replan.terrain is not None else None
+    if around is not None and around.voxels:
+        points = _packed(1000 * (around.points - origin), np.int32)
+        data["surface"] = {"cube": around.cube_m, "points": points}
+        notes.append(
+            f"The map: {plural(around.voxels, 'voxel')} of the surface above the ground, drawn as "
+            f"{plural(len(around.points), 'cube')} of {quantity(around.cube_m, 'm', 2)}."
+        )
     return Scene(
         data=data,
         people=body.people if body is not None else 0,
         truth=body is not None and body.truth is not None,
         ellipsoids=body is not None and body.root is not None,
         notes=tuple(notes),
+        arms=tuple(arm.name for arm in arms),
+        surface="surface" in data,
     )
 
 
@@ -225,6 +250,28 @@ def _placed(camera: CameraRow, table: pd.DataFrame, t_ns: Int64, summary: Summar
         max_gap_ns=round(between.max_gap_s * 1e9),
         max_extrapolation_ns=round(between.max_extrapolation_s * 1e9),
     )
+
+
+def _placed_again(arm: Arm, k: int, t_ns: Int64, summary: Summary) -> tuple[Float, Float]:
+    """The same of camera `k` of an arm."""
+    between = summary.description.pose_interpolation
+    return interpolate_poses(
+        arm.t_ns,
+        arm.position[k],
+        arm.quaternion_xyzw[k],
+        t_ns,
+        max_gap_ns=round(between.max_gap_s * 1e9),
+        max_extrapolation_ns=round(between.max_extrapolation_s * 1e9),
+    )
+
+
+def _packed_camera(name: str, lens: CameraRow, position: Float, quaternion: Float) -> dict[str, object]:
+    return {
+        "name": name,
+        "corners": _picture_corners(lens),
+        "position": _packed(1000 * position, np.int32),
+        "rotation": _packed(32767 * quaternion, np.int16),
+    }
 
 
 def _picture_corners(camera: CameraRow) -> list[float]:

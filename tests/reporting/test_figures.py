@@ -5,6 +5,7 @@ import pytest
 
 from pipelines.reporting import figures
 from pipelines.reporting.motion import motion_from_skeleton
+from pipelines.reporting.plates import MOST_POINTS
 from pipelines.session.tables import STATUS
 
 from .conftest import FRAMES, JOINTS, RATE_HZ, make_skeleton, statuses, true_positions
@@ -56,7 +57,7 @@ def test_a_path_is_thinned_and_broken_at_gaps() -> None:
     # Both ends of the gap are drawn, nothing within it.
     assert drawn[breaks[0] - 1, 0] == pytest.approx(999 * 0.02)
     assert drawn[breaks[0] + 1, 0] == pytest.approx(1500 * 0.02)
-    assert len(drawn) <= figures.MOST_POINTS + 4
+    assert len(drawn) <= MOST_POINTS + 4
 
 
 def test_middle_of_the_body_ignores_a_stray_joint() -> None:

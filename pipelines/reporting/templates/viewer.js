@@ -24,6 +24,7 @@
     truth: scene.body.truth && numbers(scene.body.truth, Int16Array),
     root: scene.body.root && numbers(scene.body.root, Int16Array),
   };
+  const surface = scene.surface && { ...scene.surface, points: numbers(scene.surface.points, Int32Array) };
   const people = body ? body.people : 0;
   const jointCount = body ? body.joints.length : 0;
 
@@ -158,7 +159,7 @@
     colours = {
       paper: colour("paper"), ink: colour("ink"), muted: colour("muted"), grid: colour("grid"),
       sides: [colour("middle"), colour("left"), colour("right")],
-      cameras: cameras.map((_, k) => colour(`camera-${k % 6}`)),
+      cameras: cameras.map((camera, k) => colour(`camera-${camera.colour ?? k % 6}`)),
       font: `11px ${style.getPropertyValue("--sans")}`,
     };
   }
@@ -309,7 +310,7 @@
       stroke(eye, { strokeStyle: colours.ink, lineWidth: 1, globalAlpha: 0.3 }, () => path(eye, Infinity, pointAt));
       stroke(eye, { strokeStyle: colours.ink, lineWidth: 1.8, globalAlpha: 0.8 }, () => path(eye, t, pointAt));
     }
-    cameras.forEach((camera, c) => {
+    shownCameras().forEach(([camera, c]) => {
       const pointAt = (k) => (known(camera.position, k) ? triple(camera.position, k) : null);
       stroke(eye, { strokeStyle: colours.cameras[c], lineWidth: 1, globalAlpha: 0.35 }, () => path(eye, Infinity, pointAt));
       stroke(eye, { strokeStyle: colours.cameras[c], lineWidth: 1.6 }, () => path(eye, t, pointAt));
@@ -320,6 +321,34 @@
       );
       dotAt(eye, onGround(position), 1.8, colours.cameras[c]);
     });
+  }
+
+  /** The cameras of the session, or those of a planner that flew again, each with its number. */
+  function shownCameras() {
+    const arm = element("arm")?.value ?? "";
+    return cameras.map((camera, c) => [camera, c]).filter(([camera]) => String(camera.arm ?? "") === arm);
+  }
+
+  const cubes = surface
+    ? Array.from({ length: surface.points.length / 3 }, (_, row) => triple(surface.points, row))
+    : [];
+  const highest = cubes.reduce((most, cube) => Math.max(most, cube[2]), scene.ground + 1);
+
+  /** What the map holds: a square for each cube, the stronger the higher. */
+  function drawSurface(eye) {
+    const { context } = eye;
+    context.save();
+    context.fillStyle = colours.muted;
+    for (const cube of cubes) {
+      const q = eye.inside(cube);
+      if (q[2] < eye.near) continue;
+      const side = Math.max((0.7 * surface.cube * eye.focal) / q[2], 1);
+      const [x, y] = eye.flat(q);
+      const height = Math.max((cube[2] - scene.ground) / (highest - scene.ground), 0);
+      context.globalAlpha = 0.12 + 0.4 * height;
+      context.fillRect(x - side / 2, y - side / 2, side, side);
+    }
+    context.restore();
   }
 
   function cameraParts(eye, camera, c, at) {
@@ -443,6 +472,7 @@
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, eye.width, eye.height);
     const step = drawGround(eye);
+    if (view.whole && surface && shown("surface")) drawSurface(eye);
     if (shown("paths")) drawPaths(eye, at, t);
     const parts = [];
     // Bones as thick as 4 cm, but never lost from afar nor clumsy from near.
@@ -459,7 +489,7 @@
         parts.push(...boneParts(eye, jointsAt(body.truth, p, at), style));
       }
     }
-    cameras.forEach((camera, c) => parts.push(...cameraParts(eye, camera, c, at)));
+    shownCameras().forEach(([camera, c]) => parts.push(...cameraParts(eye, camera, c, at)));
     parts.sort((a, b) => b.depth - a.depth);
     for (const part of parts) part.draw();
     drawCompass(eye, step);
@@ -635,7 +665,7 @@
   element("play").addEventListener("click", () => play(!clock.playing));
   element("reset").addEventListener("click", reset);
   element("above").addEventListener("click", fromAbove);
-  for (const name of ["truth", "ellipsoids", "paths", "person"]) element(name)?.addEventListener("change", showSoon);
+  for (const name of ["truth", "ellipsoids", "paths", "person", "arm", "surface"]) element(name)?.addEventListener("change", showSoon);
   addEventListener("hashchange", () => goTo(location.hash));
   document.addEventListener("click", (event) => {
     const link = event.target.closest?.('a[href^="#t="]');

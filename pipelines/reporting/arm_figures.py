@@ -1,0 +1,415 @@
+"""The figures of a comparison of planners: from above, over time, and the yaw over what it would cost.
+
+The colour is the arm's in every figure and in the 3D viewer; the stroke tells the drones apart.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.reporting.plates import LINE_STYLES, MOST_POINTS, Plate, axis_label, every, near_zero, quiet
+from pipelines.reporting.replanned import Arm, CostMap, Replan, bounds_of
+from pipelines.reporting.svg import (
+    CAMERAS,
+    INK,
+    MUTED,
+    PAPER,
+    STATUS_COLOURS,
+    WIDTH_IN,
+    inline_svg,
+    page_style,
+)
+from pipelines.reporting.terrain import LOWEST_M, Heights, heights
+from pipelines.reporting.wording import fixed, listing, percent, plural, quantity, shortened, significant
+from pipelines.session.records import Float
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+KEYFRAMES = 6
+HEIGHT_LEVELS_M = (LOWEST_M, 1.0, 2.0, 4.0, 8.0, 16.0)
+_SHADE = 0.17  # opacity of one level on those below
+_HIDDEN = STATUS_COLOURS["rejected"]
+_MOST_TIMES = 200
+_TURN_DEG = 360.0
+
+
+def draw_arms(replan: Replan) -> dict[str, Plate]:
+    """Every figure of a comparison, by its key; none where nothing flew."""
+    if not replan.arms:
+        return {}
+    plates = [_from_above(replan), _over_time(replan.arms), _yaw(replan.arms, replan.costs)]
+    return {plate.key: plate for plate in plates}
+
+
+# --- from above ----------------------------------------------------------------------------------------
+
+
+def _from_above(replan: Replan) -> Plate:
+    from matplotlib.figure import Figure
+
+    arms = replan.arms
+    low, high = bounds_of(arms)
+    margin = 0.08 * float((high - low).max()) + 2.0
+    low, high = low - margin, high + margin
+    origin = near_zero(low)
+    columns = min(len(arms), 2 if (high - low)[0] > 1.3 * (high - low)[1] else 3)
+    rows = -(-len(arms) // columns)
+    panel_in = (WIDTH_IN - 0.5) / columns
+    height_in = float(np.clip(panel_in * (high - low)[1] / (high - low)[0], 0.5 * panel_in, 6.0))
+    ground = None if replan.terrain is None else heights(replan.terrain)
+    with page_style():
+        figure = Figure((WIDTH_IN, 0.75 + rows * (height_in + 0.25)), layout="constrained")
+        panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        for k, axes in enumerate(panels.flat):
+            if k >= len(arms):
+                axes.set_visible(False)
+                continue
+            arm = arms[k]
+            axes.set_xlim(low[0] - origin[0], high[0] - origin[0])
+            axes.set_ylim(low[1] - origin[1], high[1] - origin[1])
+            axes.set_aspect("equal")
+            axes.grid(visible=True)
+            if ground is not None:
+                _draw_heights(axes, ground, origin)
+            _draw_arm(axes, arm, origin)
+            axes.set_title(shortened(arm.name), fontsize=8.2, color=CAMERAS[arm.colour], loc="left")
+            if k + columns >= len(arms):
+                axes.set_xlabel(axis_label("east", origin[0]))
+                axes.tick_params(labelbottom=True)
+            if k % columns == 0:
+                axes.set_ylabel(axis_label("north", origin[1]))
+            quiet(axes, grid=False)
+        levels = [] if ground is None else [m for m in HEIGHT_LEVELS_M if ground.above_m.max() >= m]
+        _legend(figure, arms, levels)
+        title = "The arms from above"
+        svg = inline_svg(figure, "figure-arms-top", title, " ".join(_told_from_above(arm) for arm in arms))
+    caption = (
+        f"Paths of the drones and of the actor (thick); open circles mark the start. At {KEYFRAMES} moments, "
+        "whose seconds stand beside the first drone, a line leads from each drone to the actor: "
+        "red and dotted where something stands in the sight line."
+    )
+    if ground is not None and replan.terrain is not None:
+        caption += (
+            " Shades: how high the map's highest occupied voxel reaches above the ground, "
+            f"which is at {quantity(replan.terrain.ground_m, 'm', 2)}."
+            if levels
+            else f" Nothing in the map rises {quantity(LOWEST_M, 'm')} above the ground."
+        )
+    step = every(len(arms[0].t_s), MOST_POINTS)
+    caption += f" One pose in {step} is drawn." if step > 1 else ""
+    return Plate("arms-top", title, caption, svg)
+
+
+def keyframes(arm: Arm) -> NDArray[np.intp]:
+    """Where in an arm's times its keyframes are: evenly spread, the first and the last among them."""
+    chosen = np.round(np.linspace(0, len(arm.t_s) - 1, KEYFRAMES)).astype(np.intp)
+    return np.unique(chosen)
+
+
+def _draw_heights(axes: Axes, ground: Heights, origin: Float) -> None:
+    if min(ground.above_m.shape) < 2:
+        return
+    for level in HEIGHT_LEVELS_M:
+        if ground.above_m.max() >= level:
+            axes.contourf(
+                ground.east_m - origin[0],
+                ground.north_m - origin[1],
+                ground.above_m.T,
+                levels=[level, np.inf],
+                colors=[MUTED],
+                alpha=_SHADE,
+                zorder=1,
+            )
+
+
+def _draw_arm(axes: Axes, arm: Arm, origin: Float) -> None:
+    stride = every(len(arm.t_s), MOST_POINTS)
+    actor, places = arm.actor[:, :2] - origin, arm.position[..., :2] - origin
+    axes.plot(*actor[::stride].T, color=INK, linewidth=1.8, zorder=4)
+    chosen = keyframes(arm)
+    axes.plot(*actor[chosen].T, "o", color=INK, markersize=2.6, zorder=5)
+    axes.plot(*actor[:1].T, "o", color=INK, markerfacecolor=PAPER, markersize=4.2, zorder=6)
+    colour = CAMERAS[arm.colour]
+    for c, path in enumerate(places):
+        axes.plot(*path[::stride].T, color=colour, linestyle=LINE_STYLES[c % len(LINE_STYLES)], zorder=4)
+        axes.plot(*path[chosen].T, "o", color=colour, markersize=2.6, zorder=5)
+        axes.plot(*path[:1].T, "o", color=colour, markerfacecolor=PAPER, markersize=4.2, zorder=6)
+        for k in chosen:
+            hidden = not arm.visible[c, k]
+            axes.plot(
+                *np.stack([path[k], actor[k]]).T,
+                color=_HIDDEN if hidden else colour,
+                linestyle=LINE_STYLES[2] if hidden else "-",
+                linewidth=1.1 if hidden else 0.7,
+                alpha=1.0 if hidden else 0.7,
+                zorder=3,
+            )
+    for k in chosen:
+        if np.isfinite(places[0, k]).all() and np.isfinite(actor[k]).all():
+            outward = places[0, k] - actor[k]
+            outward = outward / max(float(np.sqrt((outward**2).sum())), 1e-9)
+            axes.annotate(
+                fixed(float(arm.t_s[k]), 0),
+                (float(places[0, k, 0]), float(places[0, k, 1])),
+                (7.5 * float(outward[0]), 7.5 * float(outward[1])),
+                textcoords="offset points",
+                fontsize=6.4,
+                color=MUTED,
+                ha="center",
+                va="center",
+                zorder=7,
+            )
+
+
+def _legend(figure: Figure, arms: tuple[Arm, ...], levels: list[float]) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    cameras = max((arm.cameras for arm in arms), key=len)
+    entries: list[Line2D | Patch] = [Line2D([], [], color=INK, linewidth=1.8, label="actor")]
+    entries += [
+        Line2D([], [], color=MUTED, linestyle=LINE_STYLES[c % len(LINE_STYLES)], label=shortened(name))
+        for c, name in enumerate(cameras)
+    ]
+    if not all(arm.visible[:, keyframes(arm)].all() for arm in arms):
+        entries.append(Line2D([], [], color=_HIDDEN, linestyle=LINE_STYLES[2], linewidth=1.0, label="hidden"))
+    entries += [
+        Patch(color=MUTED, alpha=1 - (1 - _SHADE) ** (k + 1), linewidth=0, label=f"above {level:g} m")
+        for k, level in enumerate(levels)
+    ]
+    figure.legend(handles=entries, loc="outside upper left", ncols=min(len(entries), 10))
+
+
+def _told_from_above(arm: Arm) -> str:
+    paths = zip(arm.cameras, arm.position, strict=True)
+    ways = [f"{name} {quantity(_way_m(path), 'm')}" for name, path in paths]
+    chosen = keyframes(arm)
+    hidden = int((~arm.visible[:, chosen]).sum())
+    return (
+        f"{arm.name}: {listing(ways)} over ground, the actor {quantity(_way_m(arm.actor), 'm')}; "
+        f"{hidden} of {plural(len(arm.cameras) * len(chosen), 'sight line')} hidden."
+    )
+
+
+def _way_m(path: Float) -> float:
+    steps = np.sqrt((np.diff(path[:, :2], axis=0) ** 2).sum(axis=1))
+    return float(steps[np.isfinite(steps)].sum())
+
+
+# --- over time -----------------------------------------------------------------------------------------
+
+
+def _over_time(arms: tuple[Arm, ...]) -> Plate:
+    from matplotlib.figure import Figure
+
+    strips = sum(len(arm.cameras) for arm in arms)
+    heights_in = [1.35, 1.15, 0.3 + 0.085 * strips, 1.15]
+    with page_style():
+        figure = Figure((WIDTH_IN, 0.7 + sum(heights_in)), layout="constrained")
+        tilt, reach, sight, error = figure.subplots(4, 1, sharex=True, height_ratios=heights_in)
+        for arm in arms:
+            _band(tilt, arm, arm.tilt_deg)
+            _band(reach, arm, arm.range_m)
+            expected = _thinned(arm.t_s, 100 * arm.predicted_error_m)
+            error.plot(*expected, color=CAMERAS[arm.colour], label=shortened(arm.name))
+        _draw_sight(sight, arms)
+        tilt.set_ylabel("tilt (deg)")
+        reach.set_ylabel("range (m)")
+        sight.set_ylabel("hidden")
+        error.set_ylabel("predicted error (cm)")
+        error.set_ylim(0, _top(arms))
+        error.set_xlabel("time (s)")
+        for axes in (tilt, reach, error):
+            axes.grid(visible=True, axis="y")
+            quiet(axes, grid=False)
+        quiet(sight)
+        sight.spines["bottom"].set_visible(False)
+        error.set_xlim(min(float(arm.t_s[0]) for arm in arms), max(float(arm.t_s[-1]) for arm in arms))
+        figure.align_ylabels([tilt, reach, sight, error])
+        handles, labels = error.get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper left", ncols=len(arms))
+        title = "Tilt, range, sight and predicted error over time"
+        svg = inline_svg(figure, "figure-arms-time", title, " ".join(_told_over_time(arm) for arm in arms))
+    caption = (
+        "Above: tilt of the cameras over the actor and their range, the mean of an arm's drones as a line "
+        "and all of them within the band. Middle: a row per drone, drawn while something stands between it "
+        "and the actor. Below: the error to be expected of the position from all cameras together; "
+        "no line where they determine none."
+    )
+    step = every(len(arms[0].t_s), MOST_POINTS)
+    if step > 1:
+        caption += f" A point of a line stands for {step} poses, the band holds them all."
+    cut = [arm for arm in arms if np.nanmax(arm.predicted_error_m, initial=0.0) * 100 > _top(arms)]
+    if cut:
+        caption += f" Errors above {quantity(_top(arms), 'cm', 0)} are cut off."
+    return Plate("arms-time", title, caption, svg)
+
+
+def _band(axes: Axes, arm: Arm, values: Float) -> None:
+    """The mean over cameras of [C, T] as a line, on the range of all of them."""
+    colour = CAMERAS[arm.colour]
+    starts = np.arange(0, len(arm.t_s), every(len(arm.t_s), MOST_POINTS))
+    seconds, mean = _thinned(arm.t_s, values.mean(axis=0))
+    low = np.minimum.reduceat(values.min(axis=0), starts)
+    high = np.maximum.reduceat(values.max(axis=0), starts)
+    axes.fill_between(seconds, low, high, color=colour, alpha=0.16, linewidth=0)
+    axes.plot(seconds, mean, color=colour)
+
+
+def _thinned(seconds: Float, values: Float) -> tuple[Float, Float]:
+    """Times and means of at most `MOST_POINTS` stretches of equally many values; NaN where one is."""
+    starts = np.arange(0, len(seconds), every(len(seconds), MOST_POINTS))
+    count = np.diff([*starts, len(seconds)])
+    return np.add.reduceat(seconds, starts) / count, np.add.reduceat(values, starts) / count
+
+
+def _draw_sight(axes: Axes, arms: tuple[Arm, ...]) -> None:
+    row, middles = 0, []
+    for arm in arms:
+        middles.append(row + (len(arm.cameras) - 1) / 2)
+        for seen in arm.visible:
+            spans = [(start, end - start) for start, end in hidden_spans(arm.t_s, seen)]
+            axes.broken_barh(spans, (row - 0.36, 0.72), facecolor=CAMERAS[arm.colour])
+            row += 1
+    axes.set_yticks(middles, [shortened(arm.name) for arm in arms])
+    axes.set_ylim(row - 0.4, -0.6)
+
+
+def hidden_spans(seconds: Float, seen: NDArray[np.bool_]) -> list[tuple[float, float]]:
+    """From when to when a drone sees nothing; each moment lasts until the next one."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], ~seen, [False]]).astype(np.int8)))
+    ends = np.append(seconds, seconds[-1])
+    return [(float(ends[a]), float(ends[b])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _top(arms: tuple[Arm, ...]) -> float:
+    """Where the axis of predicted errors ends: cameras on one line make them grow without bound."""
+    every_error = np.concatenate([100 * arm.predicted_error_m for arm in arms])
+    known = every_error[np.isfinite(every_error)]
+    if not len(known):
+        return 1.0
+    return float(min(1.08 * known.max(), 3.0 * np.percentile(known, 90))) or 1.0
+
+
+def _told_over_time(arm: Arm) -> str:
+    known = arm.predicted_error_m[np.isfinite(arm.predicted_error_m)]
+    median_cm = 100 * float(np.median(known)) if len(known) else None
+    return (
+        f"{arm.name}: tilt {quantity(float(arm.tilt_deg.mean()), 'deg')} on average and "
+        f"{quantity(float(arm.tilt_deg.max()), 'deg')} at most, range {fixed(float(arm.range_m.min()))} to "
+        f"{quantity(float(arm.range_m.max()), 'm')}, hidden {percent(float((~arm.visible).mean()))} of the "
+        f"time, predicted error {quantity(median_cm, 'cm')} (median)."
+    )
+
+
+# --- the yaw -------------------------------------------------------------------------------------------
+
+
+def _yaw(arms: tuple[Arm, ...], costs: CostMap | None) -> Plate:
+    from matplotlib.figure import Figure
+
+    lines = [line for arm in arms for line in (arm.yaw_deg, arm.commanded_yaw_deg)]
+    everything = np.concatenate(lines)
+    known = everything[np.isfinite(everything)]
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+    spare = max(_TURN_DEG - (high - low), 40.0) / 2  # one turn at least: no yaw is left out
+    low, high = low - spare, high + spare
+    with page_style():
+        figure = Figure((WIDTH_IN, 3.3), layout="constrained")
+        axes = figure.subplots()
+        axes.grid(visible=True, axis="y")
+        levels, step = ([], 1) if costs is None else _draw_costs(axes, costs, low, high)
+        for arm in arms:
+            stride = every(len(arm.t_s), MOST_POINTS)
+            t_s, colour, name = arm.t_s[::stride], CAMERAS[arm.colour], shortened(arm.name)
+            chosen = arm.commanded_yaw_deg[::stride]
+            commanded = np.isfinite(arm.commanded_yaw_deg).any()
+            if commanded:
+                axes.plot(t_s, chosen, color=PAPER, linewidth=3.0, zorder=3)
+                axes.plot(t_s, chosen, color=colour, linewidth=1.6, zorder=4, label=name)
+            axes.plot(
+                t_s,
+                arm.yaw_deg[::stride],
+                color=colour,
+                linewidth=0.9,
+                linestyle=LINE_STYLES[1],
+                zorder=4,
+                label=None if commanded else name,
+            )
+        axes.set_ylim(low, high)
+        axes.set_yticks(np.arange(np.ceil(low / 90) * 90, high, 90))
+        axes.set_xlim(min(float(arm.t_s[0]) for arm in arms), max(float(arm.t_s[-1]) for arm in arms))
+        axes.set_xlabel("time (s)")
+        axes.set_ylabel("formation yaw (deg)")
+        quiet(axes, grid=False)
+        _legend_of_yaw(figure, axes, levels)
+        title = "The formation's yaw" + ("" if costs is None else " over what it would cost")
+        svg = inline_svg(figure, "figure-arms-yaw", title, " ".join(_told_of_yaw(arm) for arm in arms))
+    caption = (
+        "Solid: the yaw that an arm chose for its first drone, counterclockwise from east and without "
+        "jumps of a turn; dashed: where that drone was."
+    )
+    if costs is not None:
+        caption += (
+            " Shades: what a formation at the stated tilt and radius would cost there, the stronger the "
+            "more; it repeats after a full turn."
+            if levels
+            else " Every yaw would have cost the same at any time."
+        )
+        caption += f" One column in {step} is drawn." if step > 1 else ""
+    return Plate("arms-yaw", title, caption, svg)
+
+
+def _draw_costs(axes: Axes, costs: CostMap, low: float, high: float) -> tuple[list[float], int]:
+    """Shade the cost map over as many turns as are drawn; its levels, and every how many times were taken."""
+    from matplotlib.ticker import MaxNLocator
+
+    step = every(len(costs.t_s), _MOST_TIMES)
+    t_s, cost = costs.t_s[::step], costs.cost[::step]
+    least, most = float(np.nanmin(cost)), float(np.nanpercentile(cost, 98))
+    levels = [float(v) for v in MaxNLocator(5).tick_values(least, most) if least < v < float(np.nanmax(cost))]
+    if most <= least or not levels:
+        return [], step
+    turns = range(int(np.floor((low - costs.yaw_deg[0]) / _TURN_DEG)) - 1, int(np.ceil(high / _TURN_DEG)) + 2)
+    yaw_deg = np.concatenate([costs.yaw_deg + _TURN_DEG * turn for turn in turns])
+    drawn = (yaw_deg > low - 20) & (yaw_deg < high + 20)
+    over_turns = np.tile(cost, (1, len(turns)))[:, drawn]
+    for level in levels:
+        axes.contourf(
+            t_s, yaw_deg[drawn], over_turns.T, levels=[level, np.inf], colors=[MUTED], alpha=_SHADE, zorder=1
+        )
+    return levels, step
+
+
+def _legend_of_yaw(figure: Figure, axes: Axes, levels: list[float]) -> None:
+    from matplotlib.patches import Patch
+
+    entries, _ = axes.get_legend_handles_labels()
+    shades = [
+        Patch(
+            color=MUTED,
+            alpha=1 - (1 - _SHADE) ** (k + 1),
+            linewidth=0,
+            label=f"cost above {significant(level, 2)}" if k == 0 else significant(level, 2),
+        )
+        for k, level in enumerate(levels)
+    ]
+    figure.legend(handles=[*entries, *shades], loc="outside upper left", ncols=len(entries) + len(shades))
+
+
+def _told_of_yaw(arm: Arm) -> str:
+    chosen = arm.commanded_yaw_deg[np.isfinite(arm.commanded_yaw_deg)]
+    found = chosen if len(chosen) else arm.yaw_deg[np.isfinite(arm.yaw_deg)]
+    if not len(found):
+        return f"{arm.name}: nothing is known of its yaw."
+    way = sum(abs(b - a) for a, b in pairwise(found.tolist()))
+    return (
+        f"{arm.name}: from {quantity(float(found[0]), 'deg')} to {quantity(float(found[-1]), 'deg')}, "
+        f"turning by {quantity(way, 'deg')} in all."
+    )

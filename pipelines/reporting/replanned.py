@@ -1,0 +1,277 @@
+"""The comparison of planners in numbers: how every arm flew, and the rows of its tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.reporting.content import ReplanContent, items, number, section, text
+from pipelines.reporting.terrain import Terrain, terrain_around
+from pipelines.reporting.wording import ABSENT, THIN, fixed, listing, percent, plural
+from pipelines.session.records import Float, Int64
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_MARGIN_M = 12.0  # of the map that is shown around the flight
+
+
+@dataclass(frozen=True)
+class Arm:
+    """How one arm flew: T times, C cameras. Angles are continuous where they are drawn over time."""
+
+    name: str
+    simulated: bool  # False for what was flown
+    colour: int  # of the page's camera colours, one that no camera of the session has if any is free
+    t_ns: Int64  # [T]
+    t_s: Float  # [T] since the page's zero
+    cameras: tuple[str, ...]
+    position: Float  # [C, T, 3] m, world
+    quaternion_xyzw: Float  # [C, T, 4] world_from_camera
+    actor: Float  # [T, 3] m, world
+    visible: NDArray[np.bool_]  # [C, T]
+    tilt_deg: Float  # [C, T] of the camera above the actor
+    range_m: Float  # [C, T] from the actor
+    yaw_deg: Float  # [T] of the first camera around the actor, counterclockwise from east
+    commanded_yaw_deg: Float  # [T] of the formation; NaN for what was flown
+    predicted_error_m: Float  # [T] NaN where the cameras determine nothing
+
+
+@dataclass(frozen=True)
+class CostMap:
+    """What a formation would cost: M times, D yaws of its first camera over one turn, ascending."""
+
+    t_s: Float  # [M]
+    yaw_deg: Float  # [D]
+    cost: Float  # [M, D]
+
+
+@dataclass(frozen=True)
+class ArmRow:
+    """One arm in the table; numbers as they are printed."""
+
+    name: str
+    simulated: bool
+    tilt_deg: tuple[str, str, str]  # mean, largest, mean near an obstacle
+    hidden: str
+    range_m: str
+    clearance_m: str
+    separation_m: str
+    predicted_cm: str
+    error: tuple[str, str]  # mm, and its interval
+    coverage: tuple[str, str]
+    violations: str
+
+
+@dataclass(frozen=True)
+class DifferenceRow:
+    """One arm less another: what was found, and the interval of each."""
+
+    names: tuple[str, str]
+    tilt_deg: tuple[str, str]
+    hidden: tuple[str, str]
+    error: tuple[str, str]
+    coverage: tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Replan:
+    """A comparison of planners."""
+
+    arms: tuple[Arm, ...]
+    costs: CostMap | None
+    terrain: Terrain | None
+    verdict: str
+    setting: str  # a sentence on what was compared
+    rows: tuple[ArmRow, ...]
+    differences: tuple[DifferenceRow, ...]
+    level: str  # of the intervals
+    notes: tuple[str, ...]
+
+
+def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Replan:
+    """Everything that the page says and draws of a comparison.
+
+    Args:
+        content: what is stored of it.
+        origin_ns: the page's zero of time.
+        cameras: how many the session has.
+    """
+    metrics = content.metrics
+    stated = section(metrics, "arms")
+    arms = tuple(
+        _arm(name, table, content, origin_ns=origin_ns, colour=cameras + k)
+        for k, (name, table) in enumerate(content.arms.items())
+        if len(table)
+    )
+    return Replan(
+        arms=arms,
+        costs=None if content.cost_map is None else _costs(content.cost_map, origin_ns),
+        terrain=_terrain(content, arms),
+        verdict=text(metrics, "verdict"),
+        setting=_setting(metrics),
+        rows=tuple(_row(name, section(stated, name)) for name in stated),
+        differences=tuple(_difference(found) for found in items(metrics, "differences")),
+        level=_level(number(section(metrics, "intervals"), "level")),
+        notes=tuple(str(note) for note in items(metrics, "notes")),
+    )
+
+
+def bounds_of(arms: tuple[Arm, ...]) -> tuple[Float, Float]:
+    """The corners [2] of the box that holds all arms and the actor, seen from above, in m."""
+    points = [path[..., :2].reshape(-1, 2) for arm in arms for path in (arm.position, arm.actor)]
+    everywhere = np.concatenate([np.zeros((0, 2)), *points])
+    everywhere = everywhere[np.isfinite(everywhere).all(axis=1)]
+    if not len(everywhere):
+        return np.zeros(2), np.zeros(2)
+    return everywhere.min(axis=0), everywhere.max(axis=0)
+
+
+# --- tracks --------------------------------------------------------------------------------------------
+
+
+def _arm(name: str, table: pd.DataFrame, content: ReplanContent, *, origin_ns: int, colour: int) -> Arm:
+    t_ns, time = np.unique(table["t_ns"].to_numpy(np.int64), return_inverse=True)
+    cameras = tuple(dict.fromkeys(table["camera"]))
+    camera = table["camera"].map({name: k for k, name in enumerate(cameras)}).to_numpy(np.intp)
+
+    def dense(*columns: str) -> Float:
+        values = np.full((len(cameras), len(t_ns), len(columns)), np.nan)
+        values[camera, time] = table[list(columns)].to_numpy(np.float64)
+        return values
+
+    position = dense("x", "y", "z")
+    actor = _at(content.actor, t_ns)
+    offset = position - actor
+    metrics = section(section(content.metrics, "arms"), name)
+    commanded = np.degrees(dense("formation_yaw_rad")[0, :, 0])
+    start = commanded[0] if np.isfinite(commanded[0]) else number(content.metrics, "yaw_deg") or 0.0
+    return Arm(
+        name=name,
+        simulated=metrics.get("simulated") is not False,
+        colour=colour % 6,
+        t_ns=t_ns,
+        t_s=(t_ns - origin_ns) / 1e9,
+        cameras=cameras,
+        position=position,
+        quaternion_xyzw=dense("qx", "qy", "qz", "qw"),
+        actor=actor,
+        visible=dense("visible")[..., 0] > 0.5,
+        tilt_deg=np.degrees(dense("tilt_rad")[..., 0]),
+        range_m=np.sqrt((offset**2).sum(axis=-1)),
+        yaw_deg=_continuous_deg(np.arctan2(offset[0, :, 1], offset[0, :, 0]), start),
+        commanded_yaw_deg=commanded,
+        predicted_error_m=dense("predicted_error_m")[0, :, 0],
+    )
+
+
+def _at(actor: pd.DataFrame, t_ns: Int64) -> Float:
+    """The actor [T, 3] at the times of an arm."""
+    stamps = actor["t_ns"].to_numpy(np.int64)
+    seconds, wanted = (stamps - t_ns[0]) / 1e9, (t_ns - t_ns[0]) / 1e9
+    return np.stack([np.interp(wanted, seconds, actor[axis].to_numpy(np.float64)) for axis in "xyz"], axis=-1)
+
+
+def _continuous_deg(angle_rad: Float, start_deg: float) -> Float:
+    """Degrees without jumps of a turn, the first one within half a turn of `start_deg`; NaN stays NaN."""
+    known = np.isfinite(angle_rad)
+    result = np.full(angle_rad.shape, np.nan)
+    if known.any():
+        degrees = np.degrees(np.unwrap(angle_rad[known]))
+        result[known] = degrees - 360.0 * np.round((degrees[0] - start_deg) / 360.0)
+    return result
+
+
+def _costs(table: pd.DataFrame, origin_ns: int) -> CostMap | None:
+    t_ns, time = np.unique(table["t_ns"].to_numpy(np.int64), return_inverse=True)
+    yaw_rad, yaw = np.unique(table["yaw_rad"].to_numpy(np.float64), return_inverse=True)
+    if len(t_ns) < 2 or len(yaw_rad) < 2:
+        return None
+    cost = np.full((len(t_ns), len(yaw_rad)), np.nan)
+    cost[time, yaw] = table["cost"].to_numpy(np.float64)
+    return CostMap((t_ns - origin_ns) / 1e9, np.degrees(yaw_rad), cost)
+
+
+def _terrain(content: ReplanContent, arms: tuple[Arm, ...]) -> Terrain | None:
+    if content.map is None or not arms:
+        return None
+    low, high = bounds_of(arms)
+    return terrain_around(content.map, low - _MARGIN_M, high + _MARGIN_M)
+
+
+# --- tables --------------------------------------------------------------------------------------------
+
+
+def _setting(metrics: Mapping[str, object]) -> str:
+    """What flew, and against what it was scored."""
+    names = list(section(metrics, "arms"))
+    flown = [name for name in names if section(section(metrics, "arms"), name).get("simulated") is False]
+    drones, duration_s = number(metrics, "drones"), number(metrics, "duration_s")
+    trials, skeleton = number(metrics, "trials"), text(metrics, "skeleton")
+    said = [
+        f"{plural(drones or 0, 'drone')} over {fixed(duration_s)} s, {text(metrics, 'mode') or 'replayed'}.",
+        f"Simulated: {listing(name for name in names if name not in flown)}"
+        + (f"; {listing(flown)} is what the log says." if flown else "."),
+        "No skeleton was known, so there is no reconstruction error."
+        if not skeleton
+        else f"Every reconstruction error is simulated: {plural(trials or 0, 'draw')} of noise, filming "
+        + ("the true skeleton." if skeleton == "truth" else f"the skeleton of {skeleton}."),
+    ]
+    return " ".join(said)
+
+
+def _level(level: float | None) -> str:
+    return ABSENT if level is None else f"{100 * level:g}{THIN}%"
+
+
+def _row(name: str, stated: Mapping[str, object]) -> ArmRow:
+    tilt, errors = section(stated, "tilt_deg"), section(stated, "reconstruction_error")
+    predicted_m = number(section(stated, "predicted_error_m"), "median")
+    least, most = (number(section(stated, "range_m"), key) for key in ("min", "max"))
+    violations = section(stated, "limit_violations")
+    broken = [f"{kind} {fixed(count, 0)}" for kind in violations if (count := number(violations, kind))]
+    return ArmRow(
+        name=name,
+        simulated=stated.get("simulated") is not False,
+        tilt_deg=(
+            fixed(number(tilt, "mean")),
+            fixed(number(tilt, "max")),
+            fixed(number(tilt, "near_obstacle")),
+        ),
+        hidden=percent(number(stated, "occluded_share")),
+        range_m=ABSENT if least is None else f"{fixed(least)} to {fixed(most)}",
+        clearance_m=fixed(number(stated, "min_clearance_m")),
+        separation_m=fixed(number(stated, "min_separation_m")),
+        predicted_cm=fixed(None if predicted_m is None else 100 * predicted_m),
+        error=_estimate(section(errors, "mpjpe_mm")),
+        coverage=_estimate(section(errors, "coverage"), 100),
+        violations=", ".join(broken) or "none",
+    )
+
+
+def _difference(found: object) -> DifferenceRow:
+    stated = section({"found": found}, "found")
+    return DifferenceRow(
+        names=(text(stated, "arm"), text(stated, "against")),
+        tilt_deg=_estimate(section(stated, "tilt_deg"), digits=2, signed=True),
+        hidden=_estimate(section(stated, "occluded_share"), 100, digits=2, signed=True),
+        error=_estimate(section(stated, "mpjpe_mm"), digits=2, signed=True),
+        coverage=_estimate(section(stated, "coverage"), 100, digits=2, signed=True),
+    )
+
+
+def _estimate(
+    stated: Mapping[str, object], scale: float = 1.0, *, digits: int = 1, signed: bool = False
+) -> tuple[str, str]:
+    """A mean and its interval, `4.2` and `4.0 to 4.4`; a dash and nothing where there is none."""
+    mean = number(stated, "mean")
+    if mean is None:
+        return ABSENT, ""
+    ends = [float(end) for end in items(stated, "interval") if isinstance(end, int | float)]
+    plus = "+" if signed and round(scale * mean, digits) > 0 else ""
+    between = " to ".join(fixed(scale * end, digits) for end in ends) if len(ends) == 2 else ""
+    return plus + fixed(scale * mean, digits), between
