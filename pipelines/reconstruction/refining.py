@@ -90,7 +90,9 @@ def refine_flight(
         replace(camera, frame_t_ns=camera.frame_t_ns + round(1e9 * offset))
         for camera, offset in zip(cameras, refined.clock_offset_s, strict=True)
     ]
-    observed = observe(shifted, found, choice, observations.t_ns, **limits)
+    observed = observations
+    if refined.clock_offset_s.any():
+        observed = observe(shifted, found, choice, observations.t_ns, **limits)
     position, rotation = observed.position.copy(), observed.rotation.copy()
     for c in range(len(cameras)):
         numbers = _numbers_at(refined.corrections[c], t_s - refined.clock_offset_s[c])

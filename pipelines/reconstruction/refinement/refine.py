@@ -33,7 +33,6 @@ _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2 where the search begi
 _BONE_SIGMA_M = 0.02
 _FEWEST_TIMES = 20
 _UNEXPLAINED = 1.15  # times the image noise that the pictures show between neighbours: the prior is wrong
-_UNEXPLAINED_BY_TWO = 1.5  # two views show one residual of four, and image noise only roughly
 _SIGMAS = 4.0
 _MEDIAN_OF_TWO = 2 * np.log(2)  # of the chi-square distribution with two degrees of freedom
 _FARTHEST = (
@@ -180,8 +179,7 @@ def _find_prior(
     warnings: list[str] = []
     if prior is not None:
         known = _learned(problem, start[chosen], tuple(prior), clock_sigma_s, poses=False)
-        allowed = _UNEXPLAINED if len(sightings) > 2 else _UNEXPLAINED_BY_TWO
-        if known is not None and known.pixel_scale < allowed * image:
+        if known is not None and known.pixel_scale < _UNEXPLAINED * image:
             return known, False, warnings, spread * max(disagreement_m, stated_m)
         warnings.append(
             "refined: the stated pose noise does not explain the pictures; its levels were estimated instead"
@@ -248,6 +246,9 @@ def _first_guess(problem: Problem, start: Float) -> tuple[PoseErrors, float, flo
         ),
     )
     noise = lost * float(np.median(image))
+    if cameras == 2:
+        # Two views disagree across one line only: what they show is less than the stated noise of an image.
+        noise = max(noise, 1.0)
     blur = noise / float(np.median(pictures.sharpness[pictures.sharpness > 0]))
     disagreement = float(np.hypot(lost * float(np.median(total)), blur))
     return guess, noise, disagreement * range_m, range_m
