@@ -134,7 +134,7 @@ def ingest(
             _check_overlap(flight_path, entries)
             truth = reader.store_truth(run.folder, entries)
             actor = reader.store_actor(run.folder, entries)
-            map_ = reader.store_map(run.folder)
+            map_ = reader.store_map(run.folder, entries)
             warnings += reader.take_notes()
 
             description = Description(
@@ -162,7 +162,6 @@ def _refuse_unread_parts(flight: Flight, path: Path) -> None:
     """Refuse, in one line, what is valid in a manifest but has no reader in this version."""
     unread = ["plan"] if flight.plan else []
     unread += ["actors"] if flight.actors else []
-    unread += ["map.log"] if flight.map and flight.map.log else []
     for name, camera in flight.cameras.items():
         unread += [f"cameras.{name}.pose.{key}" for key in ("dji", "ulog") if getattr(camera.pose, key)]
     if unread:
@@ -230,6 +229,7 @@ def _hash_sources(
         take_log(flight.actor.log)
     if flight.map:
         take(flight.map.path)
+        take_log(flight.map.log)
     if flight.truth:
         take(flight.truth.joints.path if flight.truth.joints else None, *flight.truth.poses.values())
     unique = list(dict.fromkeys(stated))
@@ -461,25 +461,46 @@ class _Reader:
             source=actor.log, point=actor.point, count=len(trajectory.t_ns), dropped=trajectory.dropped
         )
 
-    def store_map(self, folder: Path) -> MapEntry | None:
-        """Write what stands around."""
+    def store_map(self, folder: Path, entries: Mapping[str, CameraEntry]) -> MapEntry | None:
+        """Write what stands around: one map, or those of a log that replaced each other.
+
+        What is said of several is said of the last one.
+        """
         stated = self._flight.map
-        if stated is None or stated.path is None:
+        if stated is None:
             return None
-        occupancy = self._sources.map(stated.path, stated.resolution_m)
-        if self._flight.world.frame == "ned":
-            self._notes.append(f"{stated.path}: the map is taken to be in ENU axes although the world is NED")
-        store_map(folder, [occupancy])
+        if stated.log:
+            logged = self._sources.logged_maps(stated)
+            self._refuse_later_map(stated.log, int(logged.from_ns[0]), entries)
+            occupancy, dropped = store_map(folder, logged.maps), logged.dropped
+        else:
+            path = stated.path or ""
+            occupancy = store_map(folder, [self._sources.map(path, stated.resolution_m)])
+            dropped = occupancy.dropped
+            if self._flight.world.frame == "ned":
+                self._notes.append(f"{path}: the map is taken to be in ENU axes although the world is NED")
+        if dropped:
+            self._notes.append(f"map: dropped: {losses(dropped)}")
         known = occupancy.probability[~np.isnan(occupancy.probability)]
         return MapEntry(
-            source=stated.path,
+            source=stated.log or stated.path or "",
             unknown=stated.unknown,
             resolution_m=occupancy.resolution_m,
             shape=list(occupancy.probability.shape),
             occupied=int((known >= 0.5).sum()),
             free=int((known < 0.5).sum()),
-            dropped=occupancy.dropped,
+            dropped=dropped,
         )
+
+    def _refuse_later_map(self, log: str, from_ns: int, entries: Mapping[str, CameraEntry]) -> None:
+        last = max(entry.frames.last_t_ns for entry in entries.values())
+        if from_ns > last:
+            first = min(entry.frames.first_t_ns for entry in entries.values())
+            raise DataError(
+                f"{self._flight_path}: map.log {log}",
+                f"has its first map at {from_ns / 1e9:.3f} s, after the pictures ({_span(first, last)})",
+                "check its clock, or take `stamps: receive`",
+            )
 
     def _poses_entry(
         self, name: str, camera: Camera, trajectory: Trajectory, frames_t_ns: Int64

@@ -17,6 +17,8 @@ from typing import Literal, Self
 import numpy as np
 
 from pipelines.formats.fixed_layouts import PoseArrays, read_poses
+from pipelines.formats.log_frames import frames_of_poses, place_of_frame, transforms_in
+from pipelines.formats.log_maps import read_maps
 from pipelines.formats.log_messages import Kind, all_samples, kind_of
 from pipelines.formats.log_trajectories import (
     Gathered,
@@ -25,7 +27,14 @@ from pipelines.formats.log_trajectories import (
     chained,
     trajectory_of,
     trajectory_of_arrays,
-    transforms_of,
+)
+from pipelines.formats.map_topics import (
+    MAP_TYPES,
+    LoggedMaps,
+    MapTopic,
+    frame_of,
+    map_messages,
+    nothing_usable,
 )
 from pipelines.formats.pictures import later_pictures, picture_samples, stamp_of
 from pipelines.formats.recordings import OpenLog
@@ -33,7 +42,16 @@ from pipelines.geometry.poses import compose, matrix_from_quaternion, quaternion
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight
 from pipelines.session.manifest import Log as LogSource
-from pipelines.session.records import Int64, IntrinsicsSample, PictureSample, Trajectory
+from pipelines.session.manifest import Map as MapSource
+from pipelines.session.records import (
+    Int64,
+    IntrinsicsSample,
+    Message,
+    Occupancy,
+    PictureSample,
+    Topic,
+    Trajectory,
+)
 from pipelines.session.registries import Log, LogFormat, recognise
 
 _MAY_DISAGREE_S = 0.5  # header and receive stamps: transport and decoding take less
@@ -41,13 +59,19 @@ _KEPT_MESSAGES = 4_000_000  # of all logs that stay open: their tables have 160 
 _KEPT_FILES = 64
 _MAY_JUMP_S = 1.0  # from one message to the next, beyond what time itself passed
 
-_NOUNS: dict[Kind, str] = {
+_Wanted = Kind | Literal["maps"]
+
+_NOUNS: dict[_Wanted, str] = {
     "poses": "poses",
     "transforms": "transforms",
     "angles": "gimbal angles",
     "intrinsics": "camera info",
     "pictures": "pictures",
+    "maps": "maps",
 }
+
+DEFAULT_HEIGHT_M = 2.5
+"""Of what stands on a floor plan: an ordinary storey."""
 
 
 @dataclass(frozen=True)
@@ -187,6 +211,74 @@ class FlightLogs:
         times = np.frombuffer(t_ns, dtype=np.int64)
         return Frames(name, self._world_times(log, times, started_ns), dict(lost))
 
+    def maps(
+        self, stated: MapSource, to_world: Callable[[Trajectory], Trajectory], *, max_gap_ns: int
+    ) -> LoggedMaps:
+        """The maps of a topic, in the world, at world times.
+
+        Args:
+            stated: the log and topic.
+            to_world: takes poses from the axes and origin of the log to those of the world.
+            max_gap_ns: the longest stretch between two transforms that is bridged.
+
+        Raises:
+            DataError: no such topic, several candidates, no map that could be read, or one in a frame of
+                which the log does not say where it is.
+        """
+        log = stated.log or ""
+        with self._open(log) as (recording, source):
+            topic = self._choose(recording, source, "maps", stated.topic)
+            type_ = next(each.type for each in recording.topics if each.name == topic)
+            first = next(map_messages(recording, topic), None)
+            if first is None:
+                raise nothing_usable(f"{source} {topic}", recording.dropped)
+            place, frame = f"{source} {topic}", frame_of(first, f"{source} {topic}")
+            log_from_frame = place_of_frame(
+                recording,
+                source,
+                place,
+                frame,
+                parent=stated.parent,
+                poses_in=frames_of_poses(recording, source, self._poses_taken(log)),
+                stamps=self.settings(log).stamps,
+                max_gap_ns=max_gap_ns,
+                note=self._note,
+            )
+            started_ns = _start_ns(recording)
+        lost: dict[str, int] = {}
+
+        def read() -> Iterator[Message]:
+            with self._open(log) as (recording, _):
+                yield from map_messages(recording, topic)
+                lost.update(recording.dropped)
+
+        about = MapTopic(
+            source=place,
+            frame=frame,
+            stamps=self.settings(log).stamps,
+            world_from_frame=to_world(log_from_frame),
+            max_gap_ns=max_gap_ns,
+            resolution_m=stated.resolution_m,
+            height_m=DEFAULT_HEIGHT_M if stated.height_m is None else stated.height_m,
+        )
+        found = read_maps(read, type_, about)
+        from_ns = self._world_times(log, found.from_ns, started_ns)
+        return replace(
+            found,
+            maps=_at_times(found.maps, from_ns),
+            from_ns=from_ns,
+            dropped=dict(Counter(found.dropped) + Counter(lost)),
+        )
+
+    def _poses_taken(self, log: str) -> list[tuple[str | None, str | None]]:
+        """Topic and parent of all poses that the flight takes from a log."""
+        paths = self.paths(log)
+        poses = [camera.pose for camera in self._flight.cameras.values()]
+        taken = [(pose.log, pose.topic, pose.parent) for pose in poses]
+        if actor := self._flight.actor:
+            taken.append((actor.log, actor.topic, None))
+        return [(topic, parent) for name, topic, parent in taken if name and self.paths(name) == paths]
+
     @contextmanager
     def _open(self, log: str) -> Iterator[tuple[Log, str]]:
         """A recording for one reading; those of our own formats stay open for the next."""
@@ -214,9 +306,9 @@ class FlightLogs:
         with self._kept.pop(paths):
             pass
 
-    def _choose(self, recording: Log, source: str, kind: Kind, topic: str | None) -> str:
+    def _choose(self, recording: Log, source: str, kind: _Wanted, topic: str | None) -> str:
         """The topic that is named, or the only one of its kind."""
-        there = {candidate.name: candidate for candidate in recording.topics if kind_of(candidate) == kind}
+        there = {candidate.name: candidate for candidate in recording.topics if _kind_of(candidate) == kind}
         listed = ", ".join(sorted(there)) or "none"
         if topic is not None:
             every = {candidate.name: candidate for candidate in recording.topics}
@@ -257,18 +349,9 @@ class FlightLogs:
         child: str,
         max_gap_ns: int,
     ) -> Gathered:
-        names = [candidate.name for candidate in recording.topics if kind_of(candidate) == "transforms"]
-        if topic is not None:
-            names = [self._choose(recording, source, "transforms", topic)]
-        static = [name for name in names if name.endswith("static")]
-        moving = [name for name in names if name not in static]
-        transforms = transforms_of(
-            all_samples(recording.messages(moving), source),
-            source,
-            static=all_samples(recording.messages(static), source),
-        )
+        named = None if topic is None else self._choose(recording, source, "transforms", topic)
         return chained(
-            transforms,
+            transforms_in(recording, source, named),
             source,
             parent=parent,
             child=child,
@@ -315,9 +398,18 @@ class FlightLogs:
             )
 
 
+def _kind_of(topic: Topic) -> _Wanted | None:
+    return "maps" if topic.type in MAP_TYPES else kind_of(topic)
+
+
 def _start_ns(recording: Log) -> int:
     """When the first message of a recording was received: what its clock's drift counts from."""
     return min((topic.first_ns for topic in recording.topics if topic.first_ns is not None), default=0)
+
+
+def _at_times(maps: Iterator[Occupancy], from_ns: Int64) -> Iterator[Occupancy]:
+    for occupancy, since_ns in zip(maps, from_ns.tolist(), strict=True):
+        yield replace(occupancy, from_ns=since_ns)
 
 
 def poses_at_once(recording: Log, topic: str) -> PoseArrays | None:

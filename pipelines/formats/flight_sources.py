@@ -18,6 +18,7 @@ import numpy as np
 
 from pipelines.formats.flight_logs import FlightLogs, Frames, in_world
 from pipelines.formats.frame_times import read_frame_times, times_of_frames
+from pipelines.formats.map_topics import LoggedMaps
 from pipelines.formats.ros_map import FORMAT as ROS_MAP
 from pipelines.geometry.cameras import Intrinsics, fit_to_size
 from pipelines.geometry.mounting import (
@@ -38,6 +39,7 @@ from pipelines.session.manifest import (
     FrameTimes,
     IntrinsicsSource,
     KeypointSource,
+    Map,
     Mount,
     TruthJoints,
 )
@@ -432,6 +434,17 @@ class FlightSources:
         """What stands around, from a file."""
         path = self._base / stated
         return recognise(path, MapFormat, "map").read_map(path, resolution_m=resolution_m)
+
+    def logged_maps(self, stated: Map) -> LoggedMaps:
+        """What stands around, from a log: maps that replace each other, in ENU axes at world times."""
+        settings = self._logs.settings(stated.log or "")
+        axes = self._axes(settings.axes)
+        found = self._logs.maps(
+            stated, lambda poses: in_world(_in_enu(poses, axes), settings), max_gap_ns=self._max_gap_ns
+        )
+        for note in found.notes:
+            self._note(note)
+        return found
 
     def true_joints(self, source: TruthJoints) -> JointMotion:
         """The true joints."""

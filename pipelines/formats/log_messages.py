@@ -49,6 +49,7 @@ def kind_of(topic: Topic) -> Kind | None:
 
     "poses" are those of one thing, "transforms" those of any number of frames. Left out are arrays of
     poses at one moment (PoseArray, foxglove.PosesInFrame): they say not which thing each pose is of.
+    Nor maps, which are no samples: see `log_maps`.
     """
     known = _READERS.get(topic.type)
     return known[0] if known else None
@@ -130,7 +131,7 @@ def _pose_with_covariance(message: Message, _: Source) -> Iterator[Sample]:
 
 def _path(message: Message, source: Source) -> Iterator[Sample]:
     poses = message.value.poses
-    stamps = [_nanoseconds(pose.header.stamp) for pose in poses]
+    stamps = [nanoseconds(pose.header.stamp) for pose in poses]
     if 0 in stamps:
         raise DataError(
             source,
@@ -153,7 +154,7 @@ def _transforms(message: Message, _: Source) -> Iterator[Sample]:
 def _foxglove_pose(message: Message, _: Source) -> Iterator[Sample]:
     value = message.value
     yield PoseSample(
-        stamp_ns=_nanoseconds(value.timestamp),
+        stamp_ns=nanoseconds(value.timestamp),
         receive_ns=message.receive_ns,
         target=str(value.frame_id),
         source="",
@@ -173,7 +174,7 @@ def _foxglove_transforms(message: Message, _: Source) -> Iterator[Sample]:
 
 def _pose(header: Any, receive_ns: int, frame: str, pose: Any, covariance: Any = None) -> PoseSample:
     return PoseSample(
-        stamp_ns=_nanoseconds(header.stamp),
+        stamp_ns=nanoseconds(header.stamp),
         receive_ns=receive_ns,
         target=str(header.frame_id),
         source=frame,
@@ -185,7 +186,7 @@ def _pose(header: Any, receive_ns: int, frame: str, pose: Any, covariance: Any =
 
 def _link(stated: Any, receive_ns: int) -> PoseSample:
     return PoseSample(
-        stamp_ns=_nanoseconds(stated.header.stamp),
+        stamp_ns=nanoseconds(stated.header.stamp),
         receive_ns=receive_ns,
         target=str(stated.header.frame_id),
         source=str(stated.child_frame_id),
@@ -196,7 +197,7 @@ def _link(stated: Any, receive_ns: int) -> PoseSample:
 
 def _foxglove_link(stated: Any, receive_ns: int) -> PoseSample:
     return PoseSample(
-        stamp_ns=_nanoseconds(stated.timestamp),
+        stamp_ns=nanoseconds(stated.timestamp),
         receive_ns=receive_ns,
         target=str(stated.parent_frame_id),
         source=str(stated.child_frame_id),
@@ -211,13 +212,13 @@ def _foxglove_link(stated: Any, receive_ns: int) -> PoseSample:
 def _quaternion_stamped(message: Message, _: Source) -> Iterator[Sample]:
     value = message.value
     yield AngleSample(
-        _nanoseconds(value.header.stamp), message.receive_ns, None, _quaternion(value.quaternion)
+        nanoseconds(value.header.stamp), message.receive_ns, None, _quaternion(value.quaternion)
     )
 
 
 def _vector_stamped(message: Message, _: Source) -> Iterator[Sample]:
     value = message.value
-    yield AngleSample(_nanoseconds(value.header.stamp), message.receive_ns, _vector(value.vector), None)
+    yield AngleSample(nanoseconds(value.header.stamp), message.receive_ns, _vector(value.vector), None)
 
 
 # --- intrinsics ----------------------------------------------------------------------------------------
@@ -225,12 +226,12 @@ def _vector_stamped(message: Message, _: Source) -> Iterator[Sample]:
 
 def _camera_info(message: Message, source: Source) -> Iterator[Sample]:
     stamp = message.value.header.stamp
-    yield IntrinsicsSample(_nanoseconds(stamp), message.receive_ns, _lens(message, source))
+    yield IntrinsicsSample(nanoseconds(stamp), message.receive_ns, _lens(message, source))
 
 
 def _foxglove_calibration(message: Message, source: Source) -> Iterator[Sample]:
     stamp = message.value.timestamp
-    yield IntrinsicsSample(_nanoseconds(stamp), message.receive_ns, _lens(message, source))
+    yield IntrinsicsSample(nanoseconds(stamp), message.receive_ns, _lens(message, source))
 
 
 def _lens(message: Message, source: Source) -> Intrinsics:
@@ -320,9 +321,9 @@ def _laid_out_picture(fields: PictureFields, receive_ns: int) -> PictureSample:
 
 
 def _encoded_picture(stamp: Any, message: Message) -> PictureSample:
-    data = _bytes(message.value.data)
+    data = bytes_of(message.value.data)
     return PictureSample(
-        stamp_ns=_nanoseconds(stamp),
+        stamp_ns=nanoseconds(stamp),
         receive_ns=message.receive_ns,
         encoding=_codec(data, str(getattr(message.value, "format", ""))),
         width=None,
@@ -344,20 +345,20 @@ def _codec(data: NDArray[np.uint8], stated: str) -> str:
 def _raw_picture(stamp: Any, message: Message) -> PictureSample:
     value = message.value
     return PictureSample(
-        stamp_ns=_nanoseconds(stamp),
+        stamp_ns=nanoseconds(stamp),
         receive_ns=message.receive_ns,
         encoding=str(value.encoding),
         width=operator.index(value.width),
         height=operator.index(value.height),
         step=operator.index(value.step),
-        data=_bytes(value.data),
+        data=bytes_of(value.data),
     )
 
 
 # --- fields --------------------------------------------------------------------------------------------
 
 
-def _nanoseconds(stamp: Any) -> int:
+def nanoseconds(stamp: Any) -> int:
     """A stamp of ROS (sec, nanosec), protobuf (seconds, nanos) or Foxglove's JSON (sec, nsec)."""
     if hasattr(stamp, "seconds"):
         whole, fraction = stamp.seconds, stamp.nanos
@@ -386,7 +387,7 @@ def _covariance(value: Any) -> Float:
     return np.asarray(value, dtype=np.float64).reshape(6, 6)
 
 
-def _bytes(data: Any) -> NDArray[np.uint8]:
+def bytes_of(data: Any) -> NDArray[np.uint8]:
     """An array as it is, bytes viewed, base64 (JSON) decoded."""
     if isinstance(data, np.ndarray):
         if data.dtype.itemsize != 1:

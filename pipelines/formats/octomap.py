@@ -160,6 +160,29 @@ def occupancy_from(
     return Occupancy(grid, first.astype(np.float64) * side_m, side_m)
 
 
+def leaves_of(source: Path | str, payload: Bytes, *, is_binary: bool, tree: str) -> Leaves:
+    """The leaves of a tree without a header, as octomap_msgs/Octomap carries it.
+
+    Args:
+        source: the file or topic, for messages.
+        payload: what follows the header in a file.
+        is_binary: whether it is laid out as in a .bt, else as in a .ot.
+        tree: what kind of tree it is; a .bt has one layout for all.
+
+    Raises:
+        DataError: as `binary_leaves` and `full_leaves`, or nodes of a kind that is not known.
+    """
+    if is_binary:
+        return binary_leaves(source, payload)
+    if tree not in _RECORD_BYTES:
+        raise DataError(
+            source,
+            f"is a {tree[:40]}, whose nodes are not known",
+            f"save it as {' or '.join(_RECORD_BYTES)}, or as .bt",
+        )
+    return full_leaves(source, payload, _RECORD_BYTES[tree])
+
+
 def binary_leaves(source: Path | str, payload: Bytes) -> Leaves:
     """The leaves of a .bt's data, also as octomap_msgs/Octomap carries it.
 
@@ -206,16 +229,7 @@ def _read(path: Path) -> tuple[_Header, Leaves]:
     content = read_bytes(path)
     header, payload = _split(path, content)
     check_resolution(path, header.resolution_m)
-    if header.kind == "ot":
-        if header.id not in _RECORD_BYTES:
-            raise DataError(
-                path,
-                f"is a {header.id[:40]}, whose nodes are not known",
-                f"save it as {' or '.join(_RECORD_BYTES)}, or as .bt",
-            )
-        leaves = full_leaves(path, payload, _RECORD_BYTES[header.id])
-    else:
-        leaves = binary_leaves(path, payload)
+    leaves = leaves_of(path, payload, is_binary=header.kind != "ot", tree=header.id)
     if header.nodes is not None and header.nodes != leaves.nodes:
         raise DataError(path, f"has {leaves.nodes} nodes where its header states {header.nodes}", _COPY_AGAIN)
     if not len(leaves.depth):

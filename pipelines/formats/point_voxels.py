@@ -6,6 +6,7 @@ A cloud says where something was hit, not what the rays passed through: no voxel
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,9 @@ from pipelines.session.maps import MOST_VOXELS, check_resolution, check_size, de
 from pipelines.session.records import Float, Occupancy
 
 DEFAULT_RESOLUTION_M = 0.2
+
+_BITS = 20  # of a voxel's index along each axis: three fit an int64
+_REACH = 1 << (_BITS - 1)  # voxels from the world's origin
 
 
 def occupancy_of(source: Path | str, points: Float, resolution_m: float | None) -> Occupancy:
@@ -40,6 +44,77 @@ def occupancy_of(source: Path | str, points: Float, resolution_m: float | None) 
     grid = np.full(shape.astype(np.int64).tolist(), np.nan, dtype=np.float32)
     grid[*_indices(finite, low, side).T] = 1.0
     return Occupancy(grid, low * side, side, dropped=dropped)
+
+
+class VoxelSet:
+    """The voxels of many clouds, each with the time at which a point was first seen in it.
+
+    Memory grows with the voxels, not with the points.
+
+    Args:
+        source: the log and topic, for messages.
+        resolution_m: the side of a voxel; None for 0.2 m.
+
+    Raises:
+        DataError: an impossible resolution.
+    """
+
+    def __init__(self, source: str, resolution_m: float | None) -> None:
+        self._source = source
+        self._side = check_resolution(source, DEFAULT_RESOLUTION_M if resolution_m is None else resolution_m)
+        self._keys: NDArray[np.int64] = np.zeros(0, np.int64)  # sorted
+        self._since_ns: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._low, self._high = np.full(3, _REACH, np.int64), np.full(3, -_REACH, np.int64)
+        self.dropped: Counter[str] = Counter()
+
+    def add(self, points: Float, t_ns: int) -> None:
+        """Take in the points [N, 3] of one moment; those without a place are left out and counted.
+
+        Raises:
+            DataError: the box of all voxels is too large.
+        """
+        usable = np.isfinite(points).all(axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            place = np.floor(points / self._side)
+            near = usable & (np.abs(place) < _REACH).all(axis=1)
+        self.dropped["points that are not finite"] += int((~usable).sum())
+        self.dropped[f"points beyond {_REACH * self._side:g} m"] += int((usable & ~near).sum())
+        index = place[near].astype(np.int64)
+        if not len(index):
+            return
+        self._low = np.minimum(self._low, index.min(axis=0))
+        self._high = np.maximum(self._high, index.max(axis=0))
+        remedy = "state a larger resolution_m, or give a topic without stray points"
+        check_size(self._source, self.shape, self._side, remedy)
+        shifted = index + _REACH
+        keys = np.unique((shifted[:, 0] << 2 * _BITS) | (shifted[:, 1] << _BITS) | shifted[:, 2])
+        at = np.searchsorted(self._keys, keys)
+        known = np.zeros(len(keys), dtype=np.bool_)
+        if len(self._keys):
+            known = self._keys[np.minimum(at, len(self._keys) - 1)] == keys
+        self._since_ns[at[known]] = np.minimum(self._since_ns[at[known]], t_ns)
+        self._keys = np.insert(self._keys, at[~known], keys[~known])
+        self._since_ns = np.insert(self._since_ns, at[~known], t_ns)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """How many voxels the box of all points has along x, y, z."""
+        x, y, z = np.maximum(self._high - self._low + 1, 0).tolist()
+        return x, y, z
+
+    @property
+    def grew_ns(self) -> NDArray[np.int64]:
+        """The times at which something new was seen, ascending; empty while there is no voxel."""
+        return np.unique(self._since_ns)
+
+    def occupancy(self, at_ns: int) -> Occupancy:
+        """What was seen by some time, in the box of everything; the map holds from that time."""
+        keys = self._keys[self._since_ns <= at_ns]
+        mask = (1 << _BITS) - 1
+        index = np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], axis=1) - _REACH
+        grid = np.full(self.shape, np.nan, dtype=np.float32)
+        grid[*(index - self._low).T] = 1.0
+        return Occupancy(grid, self._low.astype(np.float64) * self._side, self._side, at_ns)
 
 
 def describe_points(source: Path | str, points: Float) -> dict[str, object]:

@@ -275,8 +275,17 @@ class Map(Part):
     path: str | None = None
     log: str | None = None
     topic: str | None = None
+    parent: str | None = None  # the frame that is the log's world
     unknown: Literal["free", "occupied"] = "free"
     resolution_m: float | None = Field(None, gt=0)
+    height_m: float | None = Field(None, gt=0, le=1000)  # of what stands on a logged floor plan
+
+    @model_validator(mode="after")
+    def _only_of_logs(self) -> Map:
+        stated = [name for name in ("topic", "parent", "height_m") if getattr(self, name) is not None]
+        if stated and self.log is None:
+            raise ValueError(f"{', '.join(stated)}: only a map from a log has that")
+        return self
 
 
 class TruthJoints(Part):

@@ -111,10 +111,17 @@ def describe_grid(
     }
 
 
-def store_map(folder: Path, occupancies: Iterable[Occupancy]) -> None:
+def store_map(folder: Path, occupancies: Iterable[Occupancy]) -> Occupancy:
     """Write `map/` into an existing folder (a session, or a stage that is being written).
 
     The maps are taken one at a time, so that a log's many maps need not be in memory together.
+
+    Args:
+        folder: the session or stage.
+        occupancies: at least one, in the order of the times from which they hold.
+
+    Returns:
+        The last of them.
     """
     place = folder / "map"
     place.mkdir()
@@ -131,6 +138,7 @@ def store_map(folder: Path, occupancies: Iterable[Occupancy]) -> None:
             }
         )
     write_json(place / "index.json", jsonable({"maps": index}))
+    return occupancy
 
 
 def load_maps(session: Path) -> list[Occupancy]:

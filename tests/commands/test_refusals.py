@@ -29,7 +29,6 @@ def test_unknown_key_names_the_nearest(flight: SyntheticFlight) -> None:
 @pytest.mark.parametrize(
     ("change", "part"),
     [
-        ({"map": {"log": "d1", "topic": "/octomap"}}, "map.log"),
         ({"plan": {"log": "d1"}}, "plan"),
         ({"actors": {"anna": {"log": "d1", "topic": "/actor"}}}, "actors"),
     ],
