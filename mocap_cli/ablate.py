@@ -188,7 +188,8 @@ def _print(summary: Mapping[str, Any]) -> None:
     settings = summary["settings"]
     click.echo(
         f"Simulated: {settings['seconds']:g} s of walking at {settings['rate_hz']:g} Hz, keypoints:"
-        f" {summary['keypoints']}; mean [95 % interval] of {settings['trials']} trials"
+        f" {summary['keypoints']}; mean [95 % interval] of {settings['trials']} trials;"
+        " MPJPE, root-relative and PA on the joint-frames that every method has"
     )
     for table in tables(summary):
         click.echo(f"\n{table.title}")

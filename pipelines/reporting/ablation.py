@@ -21,12 +21,13 @@ Row = dict[str, Any]
 
 METRICS = {
     "mpjpe_mm": "MPJPE, mm",
-    "root_mpjpe_mm": "root-relative MPJPE, mm",
+    "root_mpjpe_mm": "Root-relative MPJPE, mm",
     "pa_mpjpe_mm": "PA-MPJPE, mm",
-    "pck150": "PCK@150 mm, %",
-    "reconstructed_share": "reconstructed, %",
+    "own_mpjpe_mm": "MPJPE of everything that the method itself reconstructed, mm",
+    "pck150": "PCK@150 mm, missing joints counted as wrong, %",
+    "reconstructed_share": "Reconstructed, %",
 }
-"""What tables show of what is measured."""
+"""What tables show of what is measured; the first three on the joint-frames that every method has."""
 
 _SHARES = {"pck150", "reconstructed_share"}  # in percent there
 _DRAWN = ("mpjpe_mm", "root_mpjpe_mm")

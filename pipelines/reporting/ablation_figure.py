@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _PANEL_IN, _ROW_IN, _SMALLEST_IN = 2.7, 2.0, 5.4
 _ORDERED = ("#9db8c9", "#5f97bd", "#1f6da5", "#123f66")  # light to dark: levels have an order
 _MARKERS = "osD^vPX*"
-_BESIDE = 0.012  # of the axis, between the error bars of neighbouring curves
+_BESIDE = 0.012  # of the axis, between the error bars of neighbouring curves above words
 _LETTERS_PER_IN = 16  # of the title
 _LONG_LABEL = 14  # letters; longer ones are written aslant
 _DPI = 160
@@ -93,7 +93,7 @@ def draw_study(
 def _draw(axes: Axes, panel: Panel, at: Sequence[float] | Sequence[str], *, ordered: bool) -> None:
     numbers = [float(value) if isinstance(value, int | float) else k for k, value in enumerate(at)]
     words = any(isinstance(value, str) for value in at)
-    step = _BESIDE * ((max(numbers) - min(numbers)) or 1.0)
+    step = _BESIDE * (len(at) - 1 or 1) if words else 0.0
     for k, curve in enumerate(panel.curves):
         shift = (k - (len(panel.curves) - 1) / 2) * step
         there = [

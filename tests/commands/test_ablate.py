@@ -15,6 +15,10 @@ from mocap_cli.ablate import ablate_command
 from mocap_cli.main import Mocap
 from pipelines import ablate as stage
 from pipelines.geometry.noise import White
+from pipelines.keypoints.tracking import TrackedPerson
+from pipelines.session.registries import Person, Region
+from pipelines.session.skeletons import get_skeleton
+from pipelines.simulation.study import settings
 from pipelines.simulation.study.filming import RANGE_M, exact_keypoints, formation, views_of, walk
 from tests.commands.runner import content
 
@@ -121,6 +125,62 @@ def test_trials_of_two_formations_share_their_chance() -> None:
         moved.append((views.position - np.moveaxis(seen_by.position, 0, 1)) / sigma)
     assert moved[0] == pytest.approx(moved[1], abs=1e-9)
     assert not np.allclose(moved[0][:, 0], moved[0][:, 1])
+
+
+class _Networks:
+    """Knows all joints but the last of COCO, in another order."""
+
+    joints = tuple(reversed(get_skeleton("coco17").joints[:-1]))
+
+
+class _Pointing:
+    """A detector that has every joint where it was told that the person is."""
+
+    name, title = "pointing", "Pointing"
+
+    def models(self) -> dict[str, Path | None]:
+        return {}
+
+    def load(self, *, threads: int) -> _Networks:  # noqa: ARG002  # a detector's signature
+        return _Networks()
+
+
+class _Follower:
+    """In place of the tracker: who is there stands at the hint, each joint a pixel right of the last."""
+
+    def __init__(self, networks: _Networks) -> None:
+        self.right = np.array([1.0, 0.0]) * np.arange(len(networks.joints))[:, None]
+
+    def step(self, picture: Any, *, hint: Any) -> list[TrackedPerson]:
+        # The camera looks at the smoothed hip, and the person stands there: not only ground is seen.
+        x, y = (round(value) for value in hint.centre)
+        assert picture[y - 60 : y + 60, x - 60 : x + 60].std() > 5
+        xy = np.array(hint.centre, dtype=np.float64) + self.right
+        return [TrackedPerson(1, Person(xy, np.full(len(xy), 0.9), 1.0, Region(hint.centre, 100.0, 0.0)))]
+
+
+@pytest.mark.slow
+def test_a_detector_looks_at_rendered_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Joint k is k pixels right of the middle in two views at right angles: as far off in the world."""
+    for module in (stage, settings):
+        monkeypatch.setattr(module, "find_detector", lambda _: _Pointing())
+    monkeypatch.setattr(stage, "PeopleTracker", _Follower)
+    asked = settings.settings_for(
+        "tilt", tilts_deg=[0.0], levels=["none"], detector="pointing", seconds=2.0, trials=1
+    )
+    (cell, *_) = stage.ablate(asked, tmp_path / "out").summary["cells"]
+    of = walk(2.0, 1.0, 0)
+    seen_by = formation(of, cameras=2, tilt_deg=0.0)
+    metre_per_px = RANGE_M / seen_by.lens.fx
+    # Cameras look west and south from their slots in the east and north: right is north, and west.
+    steps = metre_per_px * np.array([-1.0, 1.0, 0.0])
+    for j, joint in enumerate(of.person.joints[:-1]):
+        place = of.aim + (len(_Networks.joints) - 1 - j) * steps
+        expected_mm = 1e3 * np.linalg.norm(of.joints[:, j] - place, axis=-1).mean()
+        # Rays that are 0.01 rad aslant meet 1 % nearer or farther: some millimetres of 0.3 m.
+        assert cell["per_joint"][joint]["mpjpe_mm"] == pytest.approx(expected_mm, abs=5)
+    assert cell["per_joint"][of.person.joints[-1]]["mpjpe_mm"] is None
+    assert cell["metrics"]["reconstructed_share"]["mean"] == pytest.approx(16 / 17)
 
 
 def test_every_kind_of_noise_is_there_and_drift_is_as_large_as_the_rest(tmp_path: Path) -> None:
