@@ -230,7 +230,7 @@ def _over_time(arms: tuple[Arm, ...]) -> Plate:
             quiet(axes, grid=False)
         quiet(sight)
         sight.spines["bottom"].set_visible(False)
-        error.set_xlim(min(float(arm.t_s[0]) for arm in arms), max(float(arm.t_s[-1]) for arm in arms))
+        error.set_xlim(*_span_s(arms))
         figure.align_ylabels([tilt, reach, sight, error])
         handles, labels = error.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper left", ncols=len(arms))
@@ -286,6 +286,12 @@ def hidden_spans(seconds: Float, seen: NDArray[np.bool_]) -> list[tuple[float, f
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ~seen, [False]]).astype(np.int8)))
     ends = np.append(seconds, seconds[-1])
     return [(float(ends[a]), float(ends[b])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _span_s(arms: tuple[Arm, ...]) -> tuple[float, float]:
+    """From the first to the last moment, or a tenth of a second around a single one."""
+    first, last = min(float(arm.t_s[0]) for arm in arms), max(float(arm.t_s[-1]) for arm in arms)
+    return (first, last) if last > first else (first - 0.05, last + 0.05)
 
 
 def _top(arms: tuple[Arm, ...]) -> float:
@@ -344,7 +350,7 @@ def _yaw(arms: tuple[Arm, ...], costs: CostMap | None) -> Plate:
             )
         axes.set_ylim(low, high)
         axes.set_yticks(np.arange(np.ceil(low / 90) * 90, high, 90))
-        axes.set_xlim(min(float(arm.t_s[0]) for arm in arms), max(float(arm.t_s[-1]) for arm in arms))
+        axes.set_xlim(*_span_s(arms))
         axes.set_xlabel("time (s)")
         axes.set_ylabel("formation yaw (deg)")
         quiet(axes, grid=False)

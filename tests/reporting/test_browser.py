@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from pipelines.reporting.content import SessionContent
 from pipelines.reporting.page import render_page
 
 from .browser import Browser, browser
+from .comparisons import make_comparison
 
 # Of the pixels that have exactly the colour of the left limbs: how many, and their middle.
 _LEFT_LIMBS = """(() => {
@@ -210,3 +212,56 @@ def test_without_scripts_a_sentence_says_so(chromium: Browser, page: Path) -> No
         assert "needs JavaScript" in str(text)
     finally:
         chromium.send("Emulation.setScriptExecutionDisabled", value=False)
+
+
+# How many pixels of a canvas have exactly the colour of a variable.
+_PIXELS = """(() => {
+  const canvas = document.getElementById('viewer-flight');
+  const colour = getComputedStyle(document.documentElement).getPropertyValue('NAME').trim();
+  const rgb = [1, 3, 5].map((k) => parseInt(colour.slice(k, k + 2), 16));
+  const { width, height } = canvas;
+  const copy = new OffscreenCanvas(width, height).getContext('2d', { willReadFrequently: true });
+  copy.drawImage(canvas, 0, 0);
+  const data = copy.getImageData(0, 0, width, height).data;
+  let count = 0;
+  for (let k = 0; k < data.length; k += 4) {
+    const solid = data[k + 3] === 255;
+    if (solid ? rgb.every((value, c) => data[k + c] === value) : ANY && data[k + 3] > 0) count += 1;
+  }
+  return count;
+})()"""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_arms_and_the_map_are_shown_as_chosen(
+    chromium: Browser, content: SessionContent, tmp_path: Path, scheme: str
+) -> None:
+    path = tmp_path / "index.html"
+    path.write_text(render_page(replace(content, replan=make_comparison())), encoding="utf-8")
+    chromium.complaints.clear()
+    chromium.show_as(scheme=scheme)
+    chromium.open(path)
+    chromium.wait_for("document.getElementById('viewer').dataset.ready === 'true'")
+
+    def pixels(name: str, *, any_drawn: bool = False) -> int:
+        assert chromium.evaluate(_DRAWN)
+        asked = _PIXELS.replace("NAME", name).replace("ANY", "true" if any_drawn else "false")
+        return int(chromium.evaluate(asked))
+
+    def choose(element: str, change: str) -> None:
+        chromium.evaluate(
+            f"(() => {{ const e = document.getElementById('{element}'); {change};"
+            "e.dispatchEvent(new Event('change')); })()"
+        )
+
+    _go_to(chromium, 5.0)
+    # Colours of the session's first drone, and of the first arm of a session of three cameras.
+    assert pixels("--camera-0") > 50
+    assert pixels("--camera-3") == 0
+    choose("viewer-arm", "e.value = '0'")
+    assert pixels("--camera-0") == 0
+    assert pixels("--camera-3") > 50
+    with_map = pixels("--ink", any_drawn=True)
+    choose("viewer-surface", "e.checked = false")
+    assert with_map - pixels("--ink", any_drawn=True) > 200
+    assert chromium.complaints == []

@@ -21,6 +21,7 @@ from pipelines.reporting.page import render_page
 from pipelines.reporting.svg import PALETTE
 from pipelines.reporting.wording import THIN
 
+from .comparisons import make_comparison
 from .conftest import (
     CAMERAS,
     FRAMES,
@@ -317,6 +318,66 @@ def test_names_from_files_stay_text(content: SessionContent, tame: _Outline, nam
     (data,) = outline.data
     assert json.loads(data)["cameras"][0]["name"] == name
     assert " ".join(name.replace("\x00", "\ufffd").split())[:30] in outline.text.replace("\x00", "\ufffd")
+
+
+@pytest.fixture(scope="module")
+def compared(content: SessionContent) -> str:
+    return render_page(replace(content, replan=make_comparison()))
+
+
+def test_a_comparison_of_planners_is_a_section(page: str, compared: str) -> None:
+    before, after = _Outline(page), _Outline(compared)
+    assert after.count("figure") == before.count("figure") + 3
+    assert after.count("table") == before.count("table") + 2
+    assert "adaptive is better." in after.text
+    assert "Simulated: adaptive and fixed; flown is what the log says." in after.text
+    assert "adaptive simulated 17.2 23.5 – 12.5 % 9.2 to 10.8" in after.text
+    assert "61.0 58.5 to 63.5 87.5 81.2 to 93.8 collision 3" in after.text
+    assert "flown as logged" in after.text
+    assert "adaptive less fixed −5.00 −5.50 to −4.50" in after.text
+    assert "The map: 240 voxels of the surface above the ground" in after.text
+    assert "Planners compared" not in before.text
+    assert [name for name, count in Counter(after.ids).items() if count > 1] == []
+    assert set(after.references) <= set(after.ids)
+
+
+def test_the_rest_of_the_page_is_as_without_a_comparison(page: str, compared: str) -> None:
+    start, end = compared.index('<section id="replan"'), compared.index('<section id="made"')
+    rest = compared[:start] + compared[end:]
+    viewer = re.compile(
+        r'<section id="motion".*?</section>|<script type="application/json".*?</script>', re.DOTALL
+    )
+    assert "".join(viewer.sub("", rest).split()) == "".join(viewer.sub("", page).split())
+
+
+@pytest.fixture(scope="module")
+def tame_arms(content: SessionContent) -> _Outline:
+    return _Outline(render_page(_compared_as(content, "tame")))
+
+
+def _compared_as(content: SessionContent, name: str) -> SessionContent:
+    """A comparison in which everything that is a text is `name`."""
+    stored = make_comparison(name, "fixed", verdict=name)
+    metrics = stored.metrics | {"mode": name, "skeleton": name, "notes": [name]}
+    arms = {
+        arm: table.assign(camera=table["camera"].replace("drone1", name))
+        for arm, table in stored.arms.items()
+    }
+    return replace(
+        content, skeleton=None, metrics=None, truth=None, replan=replace(stored, metrics=metrics, arms=arms)
+    )
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_names_of_arms_stay_text(content: SessionContent, tame_arms: _Outline, name: str) -> None:
+    outline = _Outline(render_page(_compared_as(content, name)))
+    assert outline.outside_drawings == tame_arms.outside_drawings
+    assert set(outline.elements) <= set(tame_arms.elements)
+    assert outline.scripts == tame_arms.scripts
+    (data,) = outline.data
+    assert json.loads(data)["cameras"][3]["name"] == name
+    shown = " ".join(name.replace("\x00", "\ufffd").split())[:30]
+    assert outline.text.replace("\x00", "\ufffd").count(shown) >= 6
 
 
 def test_long_flight_stays_small_and_says_what_is_left_out(content: SessionContent) -> None:

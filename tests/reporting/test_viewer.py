@@ -9,9 +9,11 @@ import pandas as pd
 import pytest
 
 from pipelines.reporting.content import SessionContent
+from pipelines.reporting.replanned import summarise_replan
 from pipelines.reporting.summary import summarise
 from pipelines.reporting.viewer import MOST_BYTES, Scene, make_scene
 
+from .comparisons import DRONES, TIMES, make_comparison, positions
 from .conftest import (
     CAMERAS,
     FRAMES,
@@ -199,3 +201,29 @@ def test_cameras_alone_before_the_reconstruction(content: SessionContent) -> Non
 
 def test_nothing_to_show(content: SessionContent) -> None:
     assert make_scene(summarise(replace(content, skeleton=None, truth=None)), {}) is None
+
+
+def test_simulated_arms_bring_their_cameras_and_the_map(content: SessionContent) -> None:
+    summary = summarise(content)
+    replan = summarise_replan(make_comparison(), START_NS, len(CAMERAS))
+    scene = make_scene(summary, content.poses, replan)
+    assert scene is not None
+    assert scene.arms == ("adaptive", "fixed")  # what was flown is there as the session's own cameras
+    cameras: Any = scene.data["cameras"]
+    assert [camera["name"] for camera in cameras] == [*CAMERAS, *DRONES, *DRONES]
+    assert [camera.get("arm") for camera in cameras] == [None] * 3 + [0, 0, 1, 1]
+    assert [camera.get("colour") for camera in cameras] == [None] * 3 + [3, 3, 4, 4]
+    origin = _origin(scene, content)
+    t_s = np.arange(FRAMES) / 30
+    for arm, k in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        found = _numbers(cameras[3 + 2 * arm + k]["position"], np.int32, 3) / 1000 + origin
+        wanted = positions(scene.arms[arm], k)
+        stored_s = np.arange(TIMES) / 50
+        expected = np.stack([np.interp(t_s, stored_s, wanted[:, axis]) for axis in range(3)], axis=-1)
+        inside = t_s <= stored_s[-1]
+        np.testing.assert_allclose(found[inside], expected[inside], atol=ROUNDING_M)
+        assert np.isnan(found[t_s > stored_s[-1] + 0.1]).all()  # the comparison ends, the session goes on
+    drawn: Any = scene.data["surface"]
+    points = _numbers(drawn["points"], np.int32, 3) / 1000 + origin
+    assert len(points) == 240
+    np.testing.assert_allclose(points.max(axis=0), [-6.25, 2.75, 4.75], atol=ROUNDING_M)

@@ -1,0 +1,156 @@
+"""The figures of a comparison show what its tables hold."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipelines.reporting.arm_figures import KEYFRAMES, draw_arms, hidden_spans
+from pipelines.reporting.plates import Plate
+from pipelines.reporting.replanned import Replan, summarise_replan
+
+from .comparisons import make_comparison, make_cost_map
+from .conftest import START_NS
+
+
+@pytest.fixture(scope="module")
+def compared() -> Replan:
+    return summarise_replan(make_comparison(), START_NS, 2)
+
+
+@pytest.fixture(scope="module")
+def plates(compared: Replan) -> dict[str, Plate]:
+    return draw_arms(compared)
+
+
+def _told(plate: Plate) -> str:
+    found = re.search(r"<desc[^>]*>(.*?)</desc>", plate.svg)
+    assert found is not None
+    return found.group(1).replace("\u202f", " ")
+
+
+def test_descriptions_state_the_numbers_of_the_tables(plates: dict[str, Plate]) -> None:
+    assert list(plates) == ["arms-top", "arms-time", "arms-yaw"]
+    over_time = _told(plates["arms-time"])
+    assert "adaptive: tilt 15.0 deg on average and 15.0 deg at most" in over_time
+    # 15 deg + 1 deg/s over 10 s; hidden for 100 of 501 moments, one of two drones.
+    assert "fixed: tilt 20.0 deg on average and 25.0 deg at most, range 10.0 to 10.0 m" in over_time
+    assert "hidden 10.0 % of the time, predicted error 50.0 cm (median)" in over_time
+    # Keyframes at 0, 2, ... 10 s: of them 2 s alone lies in the hidden stretch.
+    assert "1 of 12 sight lines hidden" in _told(plates["arms-top"])
+    assert "the actor 10.0 m" in _told(plates["arms-top"])
+    assert "adaptive: from 45.0 deg to 145.0 deg, turning by 100.0 deg in all" in _told(plates["arms-yaw"])
+
+
+def _path(svg: str, colour: str, width: str) -> np.ndarray:
+    """The points of the first line of a colour and width, [N, 2] in the drawing's units."""
+    style = rf'style="[^"]*stroke: var\({colour}\)[^"]*stroke-width: {re.escape(width)}[;"]'
+    for d, tag in re.findall(r'<path d="([^"]*)"([^>]*)>', svg):
+        if re.search(style, tag) and "fill: none" in tag:
+            return np.array(re.findall(r"[-\d.]+", d), dtype=np.float64).reshape(-1, 2)
+    raise AssertionError(f"no line of {colour} and {width}")
+
+
+def _ticks(svg: str, axis: str) -> dict[float, float]:
+    """Where the numbers beside an axis stand, by number."""
+    anchor = {"x": "middle", "y": "end"}[axis]
+    found = re.findall(
+        rf'<text style="font-size: 7.2px; text-anchor: {anchor}[^"]*"'
+        r' x="([\d.]+)" y="([\d.]+)">(−?[\d.]+)</text>',
+        svg,
+    )
+    return {float(value.replace("−", "-")): float(x if axis == "x" else y) for x, y, value in found}
+
+
+def test_the_line_of_the_yaw_rises_as_commanded(plates: dict[str, Plate]) -> None:
+    svg = plates["arms-yaw"].svg
+    turned, kept = _path(svg, "--camera-2", "1.6"), _path(svg, "--camera-3", "1.6")
+    up, along = _ticks(svg, "y"), _ticks(svg, "x")
+    deg_per_unit = 90 / (up[90] - up[180])
+    s_per_unit = 10 / (along[10] - along[0])
+    # Both ends and both numbers are rounded to 0.01 units: at 2 deg a unit, 0.04 deg.
+    assert (turned[0, 1] - turned[-1, 1]) * deg_per_unit == pytest.approx(100, abs=0.05)
+    assert (turned[-1, 0] - turned[0, 0]) * s_per_unit == pytest.approx(10, abs=0.01)
+    assert np.ptp(kept[:, 1]) == 0
+    assert kept[0, 1] == turned[0, 1]
+
+
+def test_the_actor_is_drawn_to_scale(plates: dict[str, Plate]) -> None:
+    svg = plates["arms-top"].svg
+    way, along = _path(svg, "--ink", "1.8"), _ticks(svg, "x")
+    m_per_unit = 5 / (along[5] - along[0])
+    assert np.ptp(way[:, 0]) * m_per_unit == pytest.approx(10, abs=0.01)
+    assert np.ptp(way[:, 1]) == 0
+
+
+def test_hidden_sight_lines_are_told_apart(plates: dict[str, Plate]) -> None:
+    svg = plates["arms-top"].svg
+    # One sight line, and the key that explains it.
+    assert svg.count("stroke: var(--status-rejected)") == 2
+    content = make_comparison("adaptive", "flown")
+    clear = draw_arms(summarise_replan(content, START_NS, 2))["arms-top"].svg
+    assert "--status-rejected" not in clear
+
+
+def test_hidden_spans_last_until_the_next_moment() -> None:
+    seconds = np.arange(6) / 2
+    seen = np.array([False, True, False, False, True, False])
+    assert hidden_spans(seconds, seen) == [(0.0, 0.5), (1.0, 2.0), (2.5, 2.5)]
+    assert hidden_spans(seconds, np.ones(6, dtype=np.bool_)) == []
+
+
+def test_heights_of_the_map_are_shaded_as_far_as_they_go(plates: dict[str, Plate]) -> None:
+    # 4.5 m: above 0.5, 1, 2 and 4 m; 8 m is not reached.
+    svg = plates["arms-top"].svg
+    assert [f"above {m:g} m" in svg for m in (0.5, 1, 2, 4, 8)] == [True] * 4 + [False]
+    assert "which is at 0.50 m" in plates["arms-top"].caption.replace("\u202f", " ")
+    bare = draw_arms(summarise_replan(replace(make_comparison(), map=None), START_NS, 2))["arms-top"]
+    assert "above 0.5 m" not in bare.svg
+    assert "map" not in bare.caption
+
+
+def test_without_a_cost_map_the_yaw_stands_alone() -> None:
+    plate = draw_arms(summarise_replan(replace(make_comparison(), cost_map=None), START_NS, 2))["arms-yaw"]
+    assert "cost" not in plate.title + plate.caption + plate.svg
+
+
+def test_a_flat_cost_map_is_said_to_be_flat() -> None:
+    flat = make_cost_map().assign(cost=0.0)
+    plate = draw_arms(summarise_replan(replace(make_comparison(), cost_map=flat), START_NS, 2))["arms-yaw"]
+    assert "Every yaw would have cost the same" in plate.caption
+    assert "cost above" not in plate.svg
+
+
+@pytest.mark.parametrize("rows", [2, 40])  # a single moment, and twenty
+def test_short_flights_are_drawn(rows: int) -> None:
+    content = make_comparison()
+    short = {name: table[:rows] for name, table in content.arms.items()}
+    plates = draw_arms(summarise_replan(replace(content, arms=short), START_NS, 2))
+    assert len(plates) == 3
+    assert f"of {2 * min(rows // 2, KEYFRAMES)} sight lines" in _told(plates["arms-top"])
+
+
+def test_arms_without_rows_are_not_drawn() -> None:
+    content = make_comparison()
+    empty = {name: table[:0] for name, table in content.arms.items()}
+    assert draw_arms(summarise_replan(replace(content, arms=empty), START_NS, 2)) == {}
+
+
+def test_errors_without_bound_do_not_flatten_the_others() -> None:
+    content = make_comparison("adaptive", "fixed")
+    table: pd.DataFrame = content.arms["fixed"].copy()
+    table.loc[table.index[:4], "predicted_error_m"] = 1000.0
+    arms = content.arms | {"fixed": table}
+    plate = draw_arms(summarise_replan(replace(content, arms=arms), START_NS, 2))["arms-time"]
+    # Three times the 90th percentile, 50 cm.
+    assert "Errors above 150 cm are cut off." in plate.caption.replace("\u202f", " ")
+
+
+def test_the_same_comparison_gives_the_same_bytes(compared: Replan, plates: dict[str, Plate]) -> None:
+    assert draw_arms(compared) == plates
+    for plate in plates.values():
+        assert not re.search(r"#[0-9a-f]{6}\b", "".join(re.findall(r"<[^>]+>", plate.svg)))

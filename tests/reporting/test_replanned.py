@@ -1,0 +1,175 @@
+"""A comparison in numbers: the tracks of every arm, the rows of the tables, the map around."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.reporting.replanned import Replan, bounds_of, summarise_replan
+from pipelines.reporting.terrain import Terrain, heights, surface, terrain_around
+from pipelines.session.records import Occupancy
+
+from .comparisons import (
+    BLOCK,
+    RANGE_M,
+    TIMES,
+    actor,
+    make_comparison,
+    make_map,
+    positions,
+    seconds,
+    tilt_deg,
+    yaw_deg,
+)
+from .conftest import START_NS
+
+ARMS = ("adaptive", "fixed", "flown")
+
+
+@pytest.fixture(scope="module")
+def compared() -> Replan:
+    return summarise_replan(make_comparison(), START_NS, 2)
+
+
+def test_tracks_are_those_of_the_tables(compared: Replan) -> None:
+    assert [arm.name for arm in compared.arms] == list(ARMS)
+    assert [arm.simulated for arm in compared.arms] == [True, True, False]
+    # The session's two cameras have the first two colours.
+    assert [arm.colour for arm in compared.arms] == [2, 3, 4]
+    for arm in compared.arms:
+        np.testing.assert_allclose(arm.t_s, seconds(), atol=1e-9)
+        np.testing.assert_allclose(arm.actor, actor(), atol=1e-12)
+        for k in range(2):
+            np.testing.assert_allclose(arm.position[k], positions(arm.name, k), atol=1e-12)
+            np.testing.assert_allclose(arm.tilt_deg[k], tilt_deg(arm.name), atol=1e-9)
+        np.testing.assert_allclose(arm.range_m, RANGE_M, atol=1e-9)
+        np.testing.assert_allclose(arm.yaw_deg, yaw_deg(arm.name), atol=1e-9)
+    adaptive, fixed, flown = compared.arms
+    np.testing.assert_allclose(adaptive.commanded_yaw_deg, yaw_deg("adaptive"), atol=1e-9)
+    assert np.isnan(flown.commanded_yaw_deg).all()
+    # From 2 s until 4 s at 50 Hz, drone1 alone.
+    assert (~fixed.visible).sum(axis=1).tolist() == [100, 0]
+    assert np.isnan(fixed.predicted_error_m).sum() == 100
+
+
+def test_rows_in_any_order_give_the_same_tracks(compared: Replan) -> None:
+    content = make_comparison()
+    shuffled = {
+        name: table.sort_values(["camera", "t_ns"], ascending=[True, False])
+        for name, table in content.arms.items()
+    }
+    again = summarise_replan(replace(content, arms=shuffled), START_NS, 2)
+    for one, other in zip(compared.arms, again.arms, strict=True):
+        np.testing.assert_array_equal(one.position, other.position)
+        np.testing.assert_array_equal(one.visible, other.visible)
+
+
+def test_a_yaw_beyond_half_a_turn_does_not_jump() -> None:
+    content = make_comparison()
+    table = content.arms["adaptive"].copy()
+    table["formation_yaw_rad"] += 2 * np.pi  # commanded from 405 deg on, past 495
+    arm = summarise_replan(replace(content, arms={"adaptive": table}), START_NS, 2).arms[0]
+    np.testing.assert_allclose(arm.yaw_deg, yaw_deg("adaptive") + 360, atol=1e-9)
+
+
+def test_the_table_says_what_the_metrics_say(compared: Replan) -> None:
+    row = compared.rows[0]
+    assert row.tilt_deg == ("17.2", "23.5", "–")
+    assert row.hidden.replace("\u202f", " ") == "12.5 %"
+    assert row.range_m == "9.2 to 10.8"
+    assert (row.clearance_m, row.separation_m, row.predicted_cm) == ("−0.2", "14.1", "31.2")
+    assert row.error == ("61.0", "58.5 to 63.5")
+    assert row.coverage == ("87.5", "81.2 to 93.8")
+    assert row.violations == "collision 3"
+    assert [row.simulated for row in compared.rows] == [True, True, False]
+    assert compared.level == "95\u202f%"
+    difference = compared.differences[0]
+    assert difference.names == ("adaptive", "fixed")
+    assert difference.tilt_deg == ("−5.00", "−5.50 to −4.50")
+    assert difference.error == ("+1.50", "1.25 to 1.75")
+    assert difference.coverage == ("–", "")
+
+
+def test_metrics_that_say_nothing_leave_dashes() -> None:
+    content = make_comparison()
+    bare = summarise_replan(replace(content, metrics={"arms": {"adaptive": {}}}), START_NS, 2)
+    assert bare.rows[0].error == ("–", "")
+    assert bare.rows[0].hidden == "–"
+    assert bare.level == "–"
+    assert "no reconstruction error" in bare.setting
+
+
+# --- the map -------------------------------------------------------------------------------------------
+
+
+def _terrain(occupancy: Occupancy, low: tuple[float, float], high: tuple[float, float]) -> Terrain:
+    found = terrain_around(occupancy, np.array(low), np.array(high))
+    assert found is not None
+    return found
+
+
+def test_heights_count_from_the_ground() -> None:
+    terrain = _terrain(make_map(), (-100.0, -100.0), (100.0, 100.0))
+    assert terrain.ground_m == 0.5  # the top of the lowest layer
+    found = heights(terrain)
+    assert found.above_m.shape == (80, 100)
+    assert found.above_m[BLOCK[:2]].min() == 4.5
+    assert found.above_m.sum() == 8 * 6 * 4.5
+    # The middle of the block's first column: 20.5 voxels from -20 m and 50.5 from -25 m.
+    assert (found.east_m[20], found.north_m[50]) == (-9.75, 0.25)
+
+
+def test_a_part_of_the_map_lies_where_it_lay() -> None:
+    whole, part = (
+        heights(_terrain(make_map(), low, high))
+        for low, high in (((-100.0, -100.0), (100.0, 100.0)), ((-12.1, -3.0), (0.3, 4.0)))
+    )
+    assert (part.above_m > 0).sum() == 8 * 6
+    inside = np.isin(whole.east_m, part.east_m), np.isin(whole.north_m, part.north_m)
+    np.testing.assert_array_equal(whole.above_m[np.ix_(*inside)], part.above_m)
+    # From -12.5 m to 0.5 m: whole voxels.
+    assert (part.east_m[0], part.east_m[-1]) == (-12.25, 0.25)
+
+
+def test_large_maps_keep_their_highest_columns() -> None:
+    probability = np.zeros((500, 40, 8), dtype=np.float32)
+    probability[:, :, 0] = 1.0
+    probability[333, 17, 5] = 1.0  # a single voxel, 6 voxels up
+    found = heights(_terrain(Occupancy(probability, np.zeros(3), 0.2), (-1.0, -1.0), (200.0, 200.0)))
+    assert found.above_m.shape == (100, 8)  # five columns to a cell
+    assert np.argwhere(found.above_m > 0).tolist() == [[66, 3]]
+    assert found.above_m.max() == pytest.approx(1.0)
+    assert (found.east_m[66], found.north_m[3]) == (pytest.approx(66.5), pytest.approx(3.5))
+
+
+def test_the_surface_is_the_shell_of_what_rises() -> None:
+    terrain = _terrain(make_map(), (-100.0, -100.0), (100.0, 100.0))
+    found = surface(terrain)
+    # Layer 0 is ground. Of 8 x 6 columns eight layers show their 24 edge voxels, the last one all 48.
+    assert found.voxels == len(found.points) == 8 * 24 + 48
+    assert found.cube_m == 0.5
+    assert found.points.min(axis=0).tolist() == [-9.75, 0.25, 0.75]
+    assert found.points.max(axis=0).tolist() == [-6.25, 2.75, 4.75]
+    thin = surface(terrain, most=100)
+    assert thin.voxels == 240
+    assert len(thin.points) <= 100
+    assert thin.cube_m == 1.0
+    # Every voxel lies in one of the cubes.
+    offset = np.abs(found.points[:, None] - thin.points[None]).max(axis=-1)
+    assert (offset.min(axis=1) < thin.cube_m / 2).all()
+
+
+def test_nothing_around_is_no_terrain() -> None:
+    assert terrain_around(make_map(), np.array([500.0, 0.0]), np.array([600.0, 10.0])) is None
+    empty = Occupancy(np.full((4, 4, 4), np.nan, dtype=np.float32), np.zeros(3), 1.0)
+    assert terrain_around(empty, np.zeros(2), np.ones(2)) is None
+
+
+def test_bounds_hold_all_arms_and_the_actor(compared: Replan) -> None:
+    low, high = bounds_of(compared.arms)
+    paths = [positions(arm, k) for arm in ARMS for k in range(2)] + [actor()]
+    assert len(paths[0]) == TIMES
+    np.testing.assert_allclose(low, np.concatenate(paths)[:, :2].min(axis=0))
+    np.testing.assert_allclose(high, np.concatenate(paths)[:, :2].max(axis=0))
