@@ -1,0 +1,244 @@
+"""Maps from logs as commands see them: stored with their times, like those of files, and replayed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.formats.octomap import FORMAT
+from pipelines.session.maps import load_maps
+from pipelines.session.records import Occupancy
+from tests.commands.runner import content, mocap, refused, succeeds
+from tests.commands.test_real_logs import facts, session_of, write_flight
+from tests.real_data import real_data
+from tests.synthetic.flights import SyntheticFlight
+from tests.synthetic.flights import write_flight as write_synthetic_flight
+from tests.synthetic.logs import Container, write_log
+from tests.synthetic.map_logs import as_bt, grid_entry, octomap_entry
+
+SECOND = 10**9
+
+
+def site(side: int) -> Occupancy:
+    grid = np.full((40, 40, 12), np.nan, dtype=np.float32)
+    grid[:, :, 0] = 0.1192
+    grid[4 : 4 + side, 6, :8] = 0.971
+    return Occupancy(grid, np.array([-10.0, -10.0, 0.0]), 0.5)
+
+
+def flight_with_maps(
+    folder: Path, container: Container = "mcap-cdr", *, seconds: float = 1.0
+) -> SyntheticFlight:
+    """A flight during which the map grows once; it is published five times."""
+    flight = write_synthetic_flight(
+        folder, cameras=2, seconds=seconds, clean=True, keypoint_format="alphapose"
+    )
+    files = [as_bt(site(side), folder / "site") for side in (3, 3, 3, 6, 6)]
+    start_ns = int(flight.t_ns[0])
+    entries = [octomap_entry(file, start_ns + k * SECOND // 5) for k, file in enumerate(files)]
+    log = write_log(folder / "logs", "ground", container, entries)
+    flight.settings["map"] = {"log": str(log.relative_to(folder))}
+    flight.save()
+    return flight
+
+
+@pytest.mark.parametrize("container", ["ros1", "ros2-sqlite3"])
+def test_maps_of_a_log_are_stored_with_their_times(tmp_path: Path, container: Container) -> None:
+    flight = flight_with_maps(tmp_path, container)
+    done = mocap("ingest", flight.manifest)
+    assert done.returncode == 0, done.stderr
+    assert "took maps from /octomap, the only candidate" in done.stderr
+    assert "2 maps that follow each other (3 repeat the one before)" in done.stderr
+    session = tmp_path / "flight.session"
+    start_ns = int(flight.t_ns[0])
+    index = json.loads((session / "map" / "index.json").read_text(encoding="utf-8"))["maps"]
+    assert [(one["file"], one["from_ns"]) for one in index] == [
+        ("0.npz", start_ns),
+        ("1.npz", start_ns + 3 * SECOND // 5),
+    ]
+    for one, side in zip(load_maps(session), (3, 6), strict=True):
+        assert int((one.probability >= 0.5).sum()) == 8 * side
+        np.testing.assert_allclose(one.origin, [-10, -10, 0], rtol=0, atol=1e-9)
+    stored = json.loads((session / "session.json").read_text(encoding="utf-8"))
+    assert stored["map"]["occupied"] == 48  # of the last one
+    assert stored["map"]["dropped"] == {}
+    assert any(flight.settings["map"]["log"] in path for path in stored["sources"])
+
+
+def test_the_same_map_from_a_file_and_from_a_log(tmp_path: Path) -> None:
+    """Byte for byte, but for the time from which it holds."""
+    flight = flight_with_maps(tmp_path)
+    start_ns = int(flight.t_ns[0])
+    file = as_bt(site(6), tmp_path / "site")
+    log = write_log(tmp_path / "logs", "once", "ros1", [octomap_entry(file, start_ns)])
+    flight.settings["map"] = {"log": str(log.relative_to(tmp_path))}
+    flight.save()
+    succeeds("ingest", flight.manifest)
+    (logged,) = load_maps(tmp_path / "flight.session")
+    before = content(tmp_path / "flight.session")
+    assert "unchanged" in succeeds("ingest", flight.manifest)
+    assert content(tmp_path / "flight.session") == before
+    flight.settings["map"] = "site/map.bt"
+    flight.save()
+    succeeds("ingest", flight.manifest)
+    (filed,) = load_maps(tmp_path / "flight.session")
+    np.testing.assert_array_equal(logged.probability, filed.probability)
+    np.testing.assert_array_equal(logged.origin, filed.origin)
+    assert (logged.from_ns, filed.from_ns) == (start_ns, 0)
+
+
+def test_place_clock_and_axes_of_the_log_are_applied(tmp_path: Path) -> None:
+    flight = flight_with_maps(tmp_path)
+    place = {"translation": [100.0, 0.0, 5.0], "yaw_deg": 90}
+    flight.settings["logs"] = {
+        "ground": {
+            "path": flight.settings["map"]["log"],
+            "world_from_log": place,
+            "clock": {"offset_s": -0.25},
+            "axes": "ned",
+        }
+    }
+    flight.settings["map"] = {"log": "ground"}
+    flight.save()
+    succeeds("ingest", flight.manifest)
+    maps = load_maps(tmp_path / "flight.session")
+    assert [one.from_ns - int(flight.t_ns[0]) for one in maps] == [-SECOND // 4, 7 * SECOND // 20]
+    # NED [4..9, 6, 0..7] voxels are x -8..-5, y -7..-6.5, z 0..4; in ENU x -7..-6.5, y -8..-5, z -4..0;
+    # turned by 90 degrees x 5..8, y -7..-6.5; then moved.
+    occupied = np.argwhere(maps[-1].probability >= 0.5)
+    low = maps[-1].origin + occupied.min(axis=0) * 0.5
+    high = maps[-1].origin + (occupied.max(axis=0) + 1) * 0.5
+    assert low == pytest.approx([105, -7, 1], abs=1e-9)
+    assert high == pytest.approx([108, -6.5, 5], abs=1e-9)
+
+
+def test_maps_change_during_the_replay(tmp_path: Path) -> None:
+    """The replay knows nothing before the first map, and says so."""
+    flight = flight_with_maps(tmp_path, seconds=2.0)
+    flight.settings["logs"] = {"ground": {"path": flight.settings["map"]["log"], "clock": {"offset_s": 0.5}}}
+    flight.settings["map"] = {"log": "ground"}
+    flight.save()
+    succeeds("ingest", flight.manifest)
+    succeeds("reconstruct", tmp_path / "flight.session")
+    done = mocap("replan-compare", tmp_path / "flight.session", "--arms", "adaptive,fixed")
+    assert done.returncode == 0, done.stderr
+    assert "the first map comes 0.5 s after the start" in done.stderr
+
+
+def test_height_belongs_to_plans_of_logs(tmp_path: Path) -> None:
+    flight = flight_with_maps(tmp_path)
+    cells = np.zeros((8, 8), np.int8)
+    cells[2, 3] = 100
+    log = write_log(tmp_path / "logs", "plan", "ros2-mcap", [grid_entry(cells, int(flight.t_ns[0]))])
+    flight.settings["map"] = {"log": str(log.relative_to(tmp_path)), "height_m": 4}
+    flight.save()
+    succeeds("ingest", flight.manifest)
+    assert json.loads((tmp_path / "flight.session/session.json").read_text())["map"]["shape"] == [8, 8, 8]
+    flight.settings["map"] = {"path": "site/map.bt", "height_m": 4}
+    flight.save()
+    assert "height_m: only a map from a log has that" in refused("ingest", flight.manifest)
+
+
+def test_maps_of_another_day_are_refused(tmp_path: Path) -> None:
+    flight = flight_with_maps(tmp_path)
+    flight.settings["logs"] = {
+        "ground": {"path": flight.settings["map"]["log"], "clock": {"offset_s": 86400}}
+    }
+    flight.settings["map"]["log"] = "ground"
+    flight.save()
+    line = refused("ingest", flight.manifest)
+    assert "has its first map at" in line
+    assert "after the pictures" in line
+
+
+def test_truncated_maps_are_counted_or_refused(tmp_path: Path) -> None:
+    flight = flight_with_maps(tmp_path)
+    start_ns, file = int(flight.t_ns[0]), as_bt(site(6), tmp_path / "site")
+    entries = [octomap_entry(file[:-2], start_ns), octomap_entry(file, start_ns + 1)]
+    for count in (1, 2):
+        log = write_log(tmp_path / "logs", f"cut{count}", "mcap-cdr", entries[:count])
+        flight.settings["map"]["log"] = str(log.relative_to(tmp_path))
+        flight.save()
+        if count == 1:
+            assert "/octomap: its tree breaks off" in refused("ingest", flight.manifest)
+        else:
+            assert (
+                "map: dropped: 1 map messages that cannot be used" in mocap("ingest", flight.manifest).stderr
+            )
+
+
+# --- real recordings -----------------------------------------------------------------------------------
+
+HUSKY = "logs/ros1/husky_gps_imu_odom.bag"
+
+
+@pytest.mark.parametrize("name", ["octomap_geb079.bt", "octomap_ecmrv4_withfree.ot"])
+def test_real_octomap_in_a_log(tmp_path: Path, name: str) -> None:
+    """Real trees as the messages that would carry them: counted as OctoMap's own library counts."""
+    told = facts(f"maps/{name}")
+    first_s = facts(HUSKY)["topics"]["/husky_velocity_controller/odom"]["header_stamp_range"][0]
+    entry = octomap_entry(real_data(f"maps/{name}").read_bytes(), round(first_s * 1e9))
+    log = write_log(tmp_path, "map", "ros2-sqlite3", [entry])
+    pose = {"log": str(real_data(HUSKY)), "of": "body"}
+    path = write_flight(tmp_path, pose, start_s=first_s + 1, map={"log": log.name})
+    succeeds("ingest", path)
+    stored = session_of(path)["map"]
+    assert stored["resolution_m"] == told["resolution"]
+    assert stored["occupied"] == told["occupied_voxels_at_finest"]
+    assert stored["free"] == told["free_voxels_at_finest"]
+    (logged,) = load_maps(tmp_path / "flight.session")
+    filed = FORMAT.read_map(real_data(f"maps/{name}"))
+    np.testing.assert_array_equal(logged.probability, filed.probability)
+
+
+def test_real_lidar(tmp_path: Path) -> None:
+    """Five clouds of a car's lidar; the log does not say where the sensor is."""
+    name = "logs/ros1/embag_pointcloud2_lidar.bag"
+    told = facts(name)["topics"]["/luminar_pointcloud"]
+    first_s = facts(HUSKY)["topics"]["/husky_velocity_controller/odom"]["header_stamp_range"][0]
+    lidar: dict[str, Any] = {
+        "path": str(real_data(name)),
+        "clock": {"offset_s": first_s - told["header_stamp_range"][0]},
+    }
+    pose = {"log": str(real_data(HUSKY)), "of": "body"}
+    about: dict[str, Any] = {"log": "lidar", "topic": "/luminar_pointcloud"}
+    path = write_flight(tmp_path, pose, start_s=first_s + 1, logs={"lidar": lidar}, map=about)
+    assert "lies in 'luminar_lidar', which no transforms of the log connect" in refused("ingest", path)
+    about |= {"parent": "luminar_lidar", "resolution_m": 0.5}
+    path = write_flight(tmp_path, pose, start_s=first_s + 1, logs={"lidar": lidar}, map=about)
+    done = mocap("ingest", path)
+    assert done.returncode == 0, done.stderr
+    assert f"{told['count']} clouds make {told['count']} maps" in done.stderr
+    maps = load_maps(tmp_path / "flight.session")
+    assert len(maps) == told["count"]
+    counts = [int((one.probability == 1).sum()) for one in maps]
+    assert counts == sorted(set(counts))
+    # The points of the last map lie in no more voxels than there are points, and in those alone.
+    assert counts[-1] == _voxels_of_lidar(name, 0.5)
+
+
+def _voxels_of_lidar(name: str, side: float) -> int:
+    """Counted with the ordinary reader of bags."""
+    from rosbags.highlevel import AnyReader
+
+    found: set[tuple[int, ...]] = set()
+    with AnyReader([real_data(name)]) as reader:
+        clouds = [each for each in reader.connections if each.topic == "/luminar_pointcloud"]
+        for connection, _, data in reader.messages(clouds):
+            cloud: Any = reader.deserialize(data, connection.msgtype)
+            words = cloud.data.reshape(-1, cloud.point_step)
+            offsets = {each.name: (each.offset, each.datatype) for each in cloud.fields}
+            columns = []
+            for axis in "xyz":
+                offset, kind = offsets[axis]
+                width = {7: 4, 8: 8}[kind]
+                raw = np.ascontiguousarray(words[:, offset : offset + width])
+                columns.append(raw.view(f"<f{width}")[:, 0].astype(float))
+            points = np.stack(columns, axis=1)
+            points = points[np.isfinite(points).all(axis=1)]
+            found |= set(map(tuple, np.floor(points / side).astype(int).tolist()))
+    return len(found)
