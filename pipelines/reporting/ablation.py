@@ -49,10 +49,12 @@ def estimates(rows: Sequence[Row], study: str, *, seed: int) -> list[dict[str, A
         seed: of the resampling.
 
     Returns:
-        In the order of the rows, each with the condition and method, `metrics` (by name `mean`, `interval`
-        and the number of `trials` that had the figure; None where none had it), `ratio` (of `mpjpe_mm` to
-        the first tilt or number of drones, or for `noise` to the first method, trials paired; None where that
-        is nothing) and `per_joint` (means).
+        In the order of the rows, each with the condition and method, and with
+        - `metrics`: by name `mean`, `interval` (None where all trials are alike) and the number of `trials`
+          that had the figure; None where none had it;
+        - `ratio`: of `mpjpe_mm` to the first tilt or number of drones, or for `noise` to the first method,
+          trials paired; None where that is nothing;
+        - `per_joint`: means.
     """
     by_condition: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
@@ -108,7 +110,7 @@ def _ratio(rows: Sequence[Row], others: Sequence[Row], seed: int) -> dict[str, A
 
 def _estimate(mean: float, drawn: Float, trials: int) -> dict[str, Any]:
     interval = None
-    if trials > 1:
+    if drawn.min() < drawn.max():  # trials without chance (exact poses, pictures filmed once) have none
         low, high = np.percentile(drawn, [_TAIL_PERCENT, 100 - _TAIL_PERCENT])
         interval = [float(low), float(high)]
     return {"mean": mean, "interval": interval, "trials": trials}

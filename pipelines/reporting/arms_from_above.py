@@ -1,0 +1,186 @@
+"""The arms of a comparison from above: their paths, their sight lines at a few moments, and the map."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.reporting.plates import LINE_STYLES, MOST_POINTS, Plate, axis_label, every, near_zero, quiet
+from pipelines.reporting.replanned import Arm, Replan, bounds_of
+from pipelines.reporting.svg import (
+    CAMERAS,
+    INK,
+    MUTED,
+    PAPER,
+    STATUS_COLOURS,
+    WIDTH_IN,
+    inline_svg,
+    page_style,
+)
+from pipelines.reporting.terrain import LOWEST_M, Heights, heights
+from pipelines.reporting.wording import fixed, listing, plural, quantity, shortened
+from pipelines.session.records import Float
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+KEYFRAMES = 6
+HEIGHT_LEVELS_M = (LOWEST_M, 1.0, 2.0, 4.0, 8.0, 16.0)
+SHADE = 0.17  # opacity of one level on those below
+_HIDDEN = STATUS_COLOURS["rejected"]
+
+
+def draw_from_above(replan: Replan) -> Plate:
+    """One panel for each arm, all of the same stretch of land."""
+    from matplotlib.figure import Figure
+
+    arms = replan.arms
+    low, high = bounds_of(arms)
+    margin = 0.08 * float((high - low).max()) + 2.0
+    low, high = low - margin, high + margin
+    origin = near_zero(low)
+    columns = min(len(arms), 2 if (high - low)[0] > 1.3 * (high - low)[1] else 3)
+    rows = -(-len(arms) // columns)
+    panel_in = (WIDTH_IN - 0.5) / columns
+    height_in = float(np.clip(panel_in * (high - low)[1] / (high - low)[0], 0.5 * panel_in, 6.0))
+    ground = None if replan.terrain is None else heights(replan.terrain)
+    with page_style():
+        figure = Figure((WIDTH_IN, 0.75 + rows * (height_in + 0.25)), layout="constrained")
+        panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        for k, axes in enumerate(panels.flat):
+            if k >= len(arms):
+                axes.set_visible(False)
+                continue
+            arm = arms[k]
+            axes.set_xlim(low[0] - origin[0], high[0] - origin[0])
+            axes.set_ylim(low[1] - origin[1], high[1] - origin[1])
+            axes.set_aspect("equal")
+            axes.grid(visible=True)
+            if ground is not None:
+                _draw_heights(axes, ground, origin)
+            _draw_arm(axes, arm, origin)
+            axes.set_title(shortened(arm.name), fontsize=8.2, color=CAMERAS[arm.colour], loc="left")
+            if k + columns >= len(arms):
+                axes.set_xlabel(axis_label("east", origin[0]))
+                axes.tick_params(labelbottom=True)
+            if k % columns == 0:
+                axes.set_ylabel(axis_label("north", origin[1]))
+            quiet(axes, grid=False)
+        levels = [] if ground is None else [m for m in HEIGHT_LEVELS_M if ground.above_m.max() >= m]
+        _legend(figure, arms, levels)
+        title = "The arms from above"
+        svg = inline_svg(figure, "figure-arms-top", title, " ".join(_told_from_above(arm) for arm in arms))
+    caption = (
+        f"Paths of the drones and of the actor (thick); open circles mark the start. At {KEYFRAMES} moments, "
+        "whose seconds stand beside the first drone, a line leads from each drone to the actor: "
+        "red and dotted where something stands in the sight line."
+    )
+    if ground is not None and replan.terrain is not None:
+        caption += (
+            " Shades: how high the map's highest occupied voxel reaches above the ground, "
+            f"which is at {quantity(replan.terrain.ground_m, 'm', 2)}."
+            if levels
+            else f" Nothing in the map rises {quantity(LOWEST_M, 'm')} above the ground."
+        )
+    step = every(len(arms[0].t_s), MOST_POINTS)
+    caption += f" One pose in {step} is drawn." if step > 1 else ""
+    return Plate("arms-top", title, caption, svg)
+
+
+def keyframes(arm: Arm) -> NDArray[np.intp]:
+    """Where in an arm's times its keyframes are: evenly spread, the first and the last among them."""
+    chosen = np.round(np.linspace(0, len(arm.t_s) - 1, KEYFRAMES)).astype(np.intp)
+    return np.unique(chosen)
+
+
+def _draw_heights(axes: Axes, ground: Heights, origin: Float) -> None:
+    if min(ground.above_m.shape) < 2:
+        return
+    for level in HEIGHT_LEVELS_M:
+        if ground.above_m.max() >= level:
+            axes.contourf(
+                ground.east_m - origin[0],
+                ground.north_m - origin[1],
+                ground.above_m.T,
+                levels=[level, np.inf],
+                colors=[MUTED],
+                alpha=SHADE,
+                zorder=1,
+            )
+
+
+def _draw_arm(axes: Axes, arm: Arm, origin: Float) -> None:
+    stride = every(len(arm.t_s), MOST_POINTS)
+    actor, places = arm.actor[:, :2] - origin, arm.position[..., :2] - origin
+    axes.plot(*actor[::stride].T, color=INK, linewidth=1.8, zorder=4)
+    chosen = keyframes(arm)
+    axes.plot(*actor[chosen].T, "o", color=INK, markersize=2.6, zorder=5)
+    axes.plot(*actor[:1].T, "o", color=INK, markerfacecolor=PAPER, markersize=4.2, zorder=6)
+    colour = CAMERAS[arm.colour]
+    for c, path in enumerate(places):
+        axes.plot(*path[::stride].T, color=colour, linestyle=LINE_STYLES[c % len(LINE_STYLES)], zorder=4)
+        axes.plot(*path[chosen].T, "o", color=colour, markersize=2.6, zorder=5)
+        axes.plot(*path[:1].T, "o", color=colour, markerfacecolor=PAPER, markersize=4.2, zorder=6)
+        for k in chosen:
+            hidden = not arm.visible[c, k]
+            axes.plot(
+                *np.stack([path[k], actor[k]]).T,
+                color=_HIDDEN if hidden else colour,
+                linestyle=LINE_STYLES[2] if hidden else "-",
+                linewidth=1.1 if hidden else 0.7,
+                alpha=1.0 if hidden else 0.7,
+                zorder=3,
+            )
+    for k in chosen:
+        if np.isfinite(places[0, k]).all() and np.isfinite(actor[k]).all():
+            outward = places[0, k] - actor[k]
+            outward = outward / max(float(np.sqrt((outward**2).sum())), 1e-9)
+            axes.annotate(
+                fixed(float(arm.t_s[k]), 0),
+                (float(places[0, k, 0]), float(places[0, k, 1])),
+                (7.5 * float(outward[0]), 7.5 * float(outward[1])),
+                textcoords="offset points",
+                fontsize=6.4,
+                color=MUTED,
+                ha="center",
+                va="center",
+                zorder=7,
+            )
+
+
+def _legend(figure: Figure, arms: tuple[Arm, ...], levels: list[float]) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    cameras = max((arm.cameras for arm in arms), key=len)
+    entries: list[Line2D | Patch] = [Line2D([], [], color=INK, linewidth=1.8, label="actor")]
+    entries += [
+        Line2D([], [], color=MUTED, linestyle=LINE_STYLES[c % len(LINE_STYLES)], label=shortened(name))
+        for c, name in enumerate(cameras)
+    ]
+    if not all(arm.visible[:, keyframes(arm)].all() for arm in arms):
+        entries.append(Line2D([], [], color=_HIDDEN, linestyle=LINE_STYLES[2], linewidth=1.0, label="hidden"))
+    entries += [
+        Patch(color=MUTED, alpha=1 - (1 - SHADE) ** (k + 1), linewidth=0, label=f"above {level:g} m")
+        for k, level in enumerate(levels)
+    ]
+    figure.legend(handles=entries, loc="outside upper left", ncols=min(len(entries), 10))
+
+
+def _told_from_above(arm: Arm) -> str:
+    paths = zip(arm.cameras, arm.position, strict=True)
+    ways = [f"{name} {quantity(_way_m(path), 'm')}" for name, path in paths]
+    chosen = keyframes(arm)
+    hidden = int((~arm.visible[:, chosen]).sum())
+    return (
+        f"{arm.name}: {listing(ways)} over ground, the actor {quantity(_way_m(arm.actor), 'm')}; "
+        f"{hidden} of {plural(len(arm.cameras) * len(chosen), 'sight line')} hidden."
+    )
+
+
+def _way_m(path: Float) -> float:
+    steps = np.sqrt((np.diff(path[:, :2], axis=0) ** 2).sum(axis=1))
+    return float(steps[np.isfinite(steps)].sum())
