@@ -77,6 +77,18 @@ if TYPE_CHECKING:
     help="Let the detector look at every N-th picture only.",
 )
 @click.option(
+    "--start",
+    type=FiniteRange(0, 1e9),
+    metavar="SECONDS",
+    help="Let the detector look at pictures from then on, since the flight's first.",
+)
+@click.option("--end", type=FiniteRange(0, 1e9), metavar="SECONDS", help="And at pictures before then only.")
+@click.option(
+    "--overlay",
+    is_flag=True,
+    help="Draw the skeleton over every picture: SESSION/overlay/CAMERA.mp4.",
+)
+@click.option(
     "--workers",
     type=click.IntRange(1, 256),
     default=lambda: os.cpu_count() or 1,
@@ -96,6 +108,9 @@ def reconstruct_command(
     pose_noise: str | None,
     detector: str,
     every: int,
+    start: float | None,
+    end: float | None,
+    overlay: bool,
     workers: int,
     force: bool,
     as_json: bool,
@@ -103,8 +118,11 @@ def reconstruct_command(
     verbose: int,
 ) -> None:
     """Find the actor's joints in the pictures, triangulate them, and measure the errors."""
+    from pipelines.overlay import write_overlays
     from pipelines.reconstruct import Settings, reconstruct
 
+    if start is not None and end is not None and start >= end:
+        raise click.BadParameter(f"{end:g} is not after --start {start:g}", param_hint="--end")
     settings = Settings(
         method=method,
         rate_hz=rate,
@@ -114,9 +132,14 @@ def reconstruct_command(
         pose_noise=pose_noise,
         detector=detector,
         every=every,
+        start_s=start,
+        end_s=end,
     )
     with watching(level(quiet, verbose)) as progress:
         result = reconstruct(session, settings, workers=workers, force=force, progress=progress)
+        videos = (
+            write_overlays(session, workers=workers, overwrite=force, progress=progress) if overlay else []
+        )
     say_warnings(result.record.warnings, quiet)
     if as_json:
         print_json(result.metrics)
@@ -124,6 +147,8 @@ def reconstruct_command(
     if not quiet:
         _print(result)
     click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'reconstruct'}")
+    for video in videos:
+        click.echo(f"written: {video}")
 
 
 def _print(result: Reconstructed) -> None:

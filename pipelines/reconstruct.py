@@ -7,6 +7,7 @@ status that says why.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -26,6 +27,8 @@ from pipelines.geometry.triangulation import (
     triangulate,
 )
 from pipelines.keypoints.association import Association, associate
+from pipelines.keypoints.swaps import undo_swaps_of_tracks
+from pipelines.keypoints.swaps_across_views import swaps_across_views
 from pipelines.reconstruction.loading import (
     load_actor,
     load_cameras,
@@ -55,7 +58,7 @@ from pipelines.session.tables import CAMERA_POSES, SKELETON, write_table
 if TYPE_CHECKING:
     import pandas as pd
 
-RECONSTRUCT = Stage("reconstruct", revision=2)
+RECONSTRUCT = Stage("reconstruct", revision=3)
 
 _UNKNOWN_SIGMA = (0.3, np.radians(1.0))
 """Camera pose noise (m, rad) taken for telling people apart where nobody states it: METHODS' medium level."""
@@ -73,6 +76,8 @@ class Settings:
     pose_noise: str | None = None
     detector: str = "blazepose"  # for cameras with pictures and without keypoints
     every: int = 1  # of their pictures
+    start_s: float | None = None  # since the flight's first picture: what the detector looks at
+    end_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -117,11 +122,15 @@ def reconstruct(
             session,
             detector=settings.detector,
             every=settings.every,
+            start_s=settings.start_s,
+            end_s=settings.end_s,
             workers=workers,
             progress=progress,
         )
         inputs = dict(ingested.outputs) | (detected.outputs if detected else {})
-        run = session.begin(RECONSTRUCT, settings=asdict(settings), inputs=inputs, force=force)
+        # A model of the user's is known by what it found, not by where it lies.
+        stated = asdict(settings) | {"detector": detected.settings["detector"] if detected else None}
+        run = session.begin(RECONSTRUCT, settings=stated, inputs=inputs, force=force)
         if run.finished:
             metrics = read_json(folder / "reconstruct" / "metrics.json")
             return Reconstructed(folder, run.record, metrics, skipped=True)
@@ -135,8 +144,11 @@ def reconstruct(
             min_confidence=settings.min_confidence,
             pose_noise=settings.pose_noise,
         )
+        cameras, swaps = _without_swaps(cameras)
         progress.advance()
         found, observations, association, seen = _observe(folder, cameras, description, settings)
+        sigma = _ray_sigma(cameras, observations.t_ns, observations.position, settings)
+        observations, between_views = _agreeing_sides(observations, sigma)
         progress.advance()
         views = _views(cameras, observations, settings, workers)
         solve = _solver(cameras, observations, settings, workers)
@@ -169,7 +181,11 @@ def reconstruct(
             write_table(run.folder / "cameras.parquet", refined.cameras, CAMERA_POSES)
         write_json(run.folder / "metrics.json", metrics)
         record = run.publish(
-            counts={**metrics["status_counts"], "association": _association_counts(association)},
+            counts={
+                **metrics["status_counts"],
+                "association": _association_counts(association),
+                "left_right_swaps": {"undone_over_time": swaps, "between_views": between_views},
+            },
             warnings=[*warnings, *association.reasons, *_unused(cameras, result)],
         )
         progress.advance()
@@ -207,6 +223,32 @@ def _observe(
     nearest = np.clip(np.searchsorted(found.t_ns, observations.t_ns), 0, len(found.t_ns) - 1)
     seen = np.asarray((found.confidence > 0).any(axis=(1, 2, 3)), dtype=np.bool_)[nearest]
     return found, observations, association, seen
+
+
+def _without_swaps(cameras: list[Camera]) -> tuple[list[Camera], dict[str, dict[str, int]]]:
+    """Left and right given back to the side they belong to, by how they move in each camera."""
+    mended, counts = [], {}
+    for camera in cameras:
+        detections, counts[camera.name] = undo_swaps_of_tracks(camera.detections, camera.frame_t_ns)
+        mended.append(replace(camera, detections=detections))
+    return mended, counts
+
+
+def _agreeing_sides(observations: Observations, sigma: Float) -> tuple[Observations, dict[str, int]]:
+    """Left and right as most cameras see them; dropped where nobody knows which of them are right."""
+    xy, confidence = observations.xy.copy(), observations.confidence.copy()
+    total: Counter[str] = Counter()
+    for person in range(xy.shape[1]):
+        xy[:, person], confidence[:, person], counts = swaps_across_views(
+            xy[:, person],
+            confidence[:, person],
+            observations.position,
+            observations.rotation,
+            sigma,
+            observations.joints,
+        )
+        total.update(counts)
+    return replace(observations, xy=xy, confidence=confidence), dict(sorted(total.items()))
 
 
 def _pose_limits(description: Description) -> dict[str, int]:

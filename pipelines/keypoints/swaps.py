@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.compilation import cached
-from pipelines.session.records import Float
+from pipelines.session.records import Detections, Float, Int64
 from pipelines.session.skeletons import mirrored
 
 Bools = NDArray[np.bool_]
@@ -31,7 +32,8 @@ _LIMBS = {
     "legs": ("hip", "knee", "ankle", "heel", "toe"),
 }
 _CHANGE = 16.0  # what a change between the hypotheses costs: four standard deviations of one coordinate
-_EXCHANGED = 0.5  # what each picture costs in which left and right are exchanged: the majority is right
+_EXCHANGED = 2.0  # what each picture costs in which left and right are exchanged: the majority is right
+_JUMP = 45.0  # what each end of an exchange must save against going on unchanged
 _CAP = 25.0  # an error of prediction counts up to five standard deviations
 _LEAST_NOISE = 0.01  # of the body's size (median distance of joints from their middle), 4 mm
 _GAP_S = 0.5  # nothing is predicted over more
@@ -76,6 +78,26 @@ def undo_swaps(
     return xy, confidence, dict(+counts)
 
 
+def undo_swaps_of_tracks(found: Detections, frame_t_ns: Int64) -> tuple[Detections, dict[str, int]]:
+    """The same for everybody whom one camera followed: detections with one number are one person.
+
+    Args:
+        found: of one camera, sorted by frame.
+        frame_t_ns: [F] when each of its frames was taken.
+
+    Returns:
+        The detections, and the pictures with an exchange by limb, summed over the people.
+    """
+    xy, confidence = found.xy.copy(), found.confidence.copy()
+    total: Counter[str] = Counter()
+    for person in np.unique(found.person):
+        (rows,) = np.nonzero(found.person == person)
+        t_s = (frame_t_ns[found.frame[rows]] - frame_t_ns[0]) / 1e9
+        xy[rows], confidence[rows], counts = undo_swaps(t_s, xy[rows], confidence[rows], found.joints)
+        total.update(counts)
+    return replace(found, xy=xy, confidence=confidence), dict(sorted(total.items()))
+
+
 def mirrored_pairs(joints: Sequence[str]) -> dict[str, Pair]:
     """The columns of a left joint and of its mirror, by the left one's name."""
     column = {joint: index for index, joint in enumerate(joints)}
@@ -111,19 +133,34 @@ def exchanged_pictures(t_s: Float, xy: Float, pairs: Sequence[Pair], *, least_no
     cost, linked, noise = _costs(t_s[rows], left[rows], right[rows], least_noise)
     path = _shortest_path(cost, linked, _CHANGE, _EXCHANGED)
     apart2 = np.nansum(((left - right)[rows] ** 2).sum(-1), axis=-1)
-    exchanged[rows] = _with_visible_ends(path, linked, apart2 > VISIBLE * noise**2)
+    exchanged[rows] = _with_visible_ends(path, linked, apart2 > VISIBLE * noise**2, cost)
     return exchanged
 
 
-def _with_visible_ends(path: Bools, linked: Bools, visible: Bools) -> Bools:
-    """The runs of a path [R] at whose ends the joints are far enough apart for a jump to be seen."""
+def _with_visible_ends(path: Bools, linked: Bools, visible: Bools, cost: Float) -> Bools:
+    """The runs of a path [R] at whose ends something jumps.
+
+    Where legs cross, either hypothesis may go on: a run is taken for an exchange only where both of its ends
+    were seen, the joints far enough apart, and each costs much less than not to change there.
+    """
     kept = path.copy()
     edges = np.flatnonzero(np.diff(path, prepend=False, append=False))
     for first, stop in edges.reshape(-1, 2):
-        for end in (first, stop):
-            if 0 < end < len(path) and linked[end] and not visible[end - 1 : end + 1].all():
-                kept[first:stop] = False
+        if not all(_jumps(end, path, linked, visible, cost) for end in (first, stop)):
+            kept[first:stop] = False
     return kept
+
+
+def _jumps(end: int, path: Bools, linked: Bools, visible: Bools, cost: Float) -> bool:
+    """Whether the change before row `end` was seen as a jump; at the ends of what was seen none was."""
+    if not 0 < end < len(path) or not linked[end]:
+        return False
+    before, now = int(path[end - 1]), int(path[end])
+    changed, kept = cost[end, before, before, now], cost[end, before, before, before]
+    if end + 1 < len(path) and linked[end + 1]:
+        changed += cost[end + 1, before, now, int(path[end + 1])]
+        kept += cost[end + 1, before, before, before]
+    return bool(visible[end - 1 : end + 1].all() and kept - changed > _JUMP)
 
 
 def _body_size(xy: Float) -> float:
