@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from mocap_cli.ablate import ablate_command
 from mocap_cli.export import export_command
 from mocap_cli.info import info_command
 from mocap_cli.ingest import ingest_command
@@ -61,6 +62,7 @@ for command in (
     report_command,
     export_command,
     simulate_command,
+    ablate_command,
     info_command,
     models_command,
 ):
