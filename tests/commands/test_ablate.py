@@ -60,6 +60,7 @@ def test_exact_keypoints_and_poses_give_nothing(tmp_path: Path) -> None:
     assert {cell[0] for cell in cells} == {0, 15, 30, 45, 60}
     for cell in cells.values():
         assert cell["metrics"]["mpjpe_mm"]["mean"] < 1e-6
+        assert cell["metrics"]["mpjpe_mm"]["interval"] is None  # no chance, no interval
         assert cell["metrics"]["reconstructed_share"]["mean"] == 1
         assert cell["ratio"] is None  # a ratio of rounding errors means nothing
 
