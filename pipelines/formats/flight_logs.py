@@ -30,6 +30,7 @@ from pipelines.formats.log_trajectories import (
 )
 from pipelines.formats.map_topics import (
     MAP_TYPES,
+    OCCUPANCY_GRID,
     LoggedMaps,
     MapTopic,
     frame_of,
@@ -232,6 +233,9 @@ class FlightLogs:
             first = next(map_messages(recording, topic), None)
             if first is None:
                 raise nothing_usable(f"{source} {topic}", recording.dropped)
+            if stated.height_m is not None and type_ != OCCUPANCY_GRID:
+                problem = f"{topic} holds {type_}, which has heights of its own"
+                raise DataError(source, problem, "leave `height_m` out")
             place, frame = f"{source} {topic}", frame_of(first, f"{source} {topic}")
             log_from_frame = place_of_frame(
                 recording,

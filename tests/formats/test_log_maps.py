@@ -564,6 +564,11 @@ def test_stray_points_are_one_clear_line(tmp_path: Path) -> None:
     assert found.dropped == {"points beyond 104858 m": 1}
 
 
+def test_only_plans_take_a_height(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="PointCloud2, which has heights of its own"):
+        Read(tmp_path, [cloud_entry(cloud_fields(POINTS), T0)], height_m=3.0)
+
+
 def test_no_topic_of_maps(tmp_path: Path) -> None:
     pose = {"header": {"stamp": T0, "frame_id": "odom"}, "pose": {"orientation": {"w": 1.0}}}
     poses = [Entry("/pose", "geometry_msgs/msg/PoseStamped", T0, pose)]
