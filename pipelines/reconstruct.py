@@ -27,6 +27,7 @@ from pipelines.geometry.triangulation import (
     triangulate,
 )
 from pipelines.keypoints.association import Association, associate
+from pipelines.keypoints.calibration import measured_for, read_calibration
 from pipelines.keypoints.swaps import undo_swaps_of_tracks
 from pipelines.keypoints.swaps_across_views import swaps_across_views
 from pipelines.reconstruction.loading import (
@@ -52,7 +53,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Float, Int64
 from pipelines.session.stages import Stage, StageRecord, locked
-from pipelines.session.storage import jsonable, read_json, write_json
+from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import CAMERA_POSES, SKELETON, write_table
 
 if TYPE_CHECKING:
@@ -128,6 +129,9 @@ def reconstruct(
             progress=progress,
         )
         inputs = dict(ingested.outputs) | (detected.outputs if detected else {})
+        measured = measured_for(detected.settings["detector"]) if detected else None
+        if measured is not None:
+            inputs["calibration of confidences"] = sha256_of(measured)
         # A model of the user's is known by what it found, not by where it lies.
         stated = asdict(settings) | {"detector": detected.settings["detector"] if detected else None}
         run = session.begin(RECONSTRUCT, settings=stated, inputs=inputs, force=force)
@@ -143,6 +147,7 @@ def reconstruct(
             detected,
             min_confidence=settings.min_confidence,
             pose_noise=settings.pose_noise,
+            calibrated=read_calibration(measured).probabilities if measured else None,
         )
         cameras, swaps = _without_swaps(cameras)
         progress.advance()

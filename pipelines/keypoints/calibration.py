@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float
 
+_MEASURED = Path(__file__).parent / "data"
 COLUMNS = ("joints", "confidence", "probability", "count")
 ANY_JOINT = "*"
 _FEWEST = 20  # keypoints behind a knot: its probability is then known to about 0.1
@@ -51,6 +52,20 @@ class Calibration:
             values = np.interp(confidence[..., column], knots[:, 0], knots[:, 1])
             calibrated[..., column] = np.where(confidence[..., column] == 0, 0.0, values)
         return np.where(np.isnan(confidence), np.nan, calibrated)
+
+    def probabilities(self, confidence: Float, joint: NDArray[np.str_]) -> Float:
+        """The same of keypoints [N] in any order, each with the name of its joint."""
+        calibrated = np.empty(len(confidence))
+        for name in np.unique(joint):
+            rows = joint == name
+            calibrated[rows] = self.probability(confidence[rows, None], [str(name)])[:, 0]
+        return calibrated
+
+
+def measured_for(detector: str) -> Path | None:
+    """Where the calibration of a detector lies, if its confidences were measured."""
+    path = _MEASURED / f"{detector}_confidence.csv"
+    return path if path.is_file() else None
 
 
 def fit(

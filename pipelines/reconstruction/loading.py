@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.geometry.noise import sum_sigma
 from pipelines.geometry.poses import interpolate_points, rates
@@ -24,6 +25,9 @@ _TRUTH_GAP = 1.5  # median steps: truth is never bridged across a missing sample
 _ACTOR_GAP_NS = 2_000_000_000
 _MOST_PEOPLE = 12  # in one picture; more are mistakes of a detector, and memory goes with their number
 _SANE_VARIANCE = (100.0, np.pi**2)  # m^2, rad^2: what ROS means by 1e6 is "unknown"
+
+
+Calibrated = Callable[[Float, NDArray[np.str_]], Float]
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,7 @@ def load_cameras(
     *,
     min_confidence: float,
     pose_noise: str | None,
+    calibrated: Calibrated | None = None,
 ) -> tuple[list[Camera], list[str]]:
     """Every camera with keypoints, and what is to be said of them.
 
@@ -67,6 +72,8 @@ def load_cameras(
         detected: the record of the detector's stage, if it ran.
         min_confidence: keypoints below are not used.
         pose_noise: what is known of the poses' errors, in place of what the flight says.
+        calibrated: what the detector's own confidences [N] of joints [N] are worth; they are taken as they
+            are without it, as those of imported keypoints always are.
 
     Raises:
         DataError: fewer than two cameras have keypoints, or they share no joint.
@@ -81,7 +88,7 @@ def load_cameras(
     cameras = []
     for name, source in sources.items():
         entry = description.cameras[name]
-        camera = _load_camera(folder, name, entry, source, joints, min_confidence, warnings)
+        camera = _load_camera(folder, name, entry, source, joints, min_confidence, calibrated, warnings)
         sigma = _stated_sigma(name, entry, camera.trajectory, pose_noise)
         cameras.append(replace(camera, sigma=sigma))
     return cameras, warnings
@@ -105,12 +112,16 @@ def _load_camera(
     source: _Keypoints,
     joints: tuple[str, ...],
     min_confidence: float,
+    calibrated: Calibrated | None,
     warnings: list[str],
 ) -> Camera:
     tables = folder / "cameras" / name
     trajectory = trajectory_from(read_table(tables / "poses.parquet", POSES))
     frames = read_table(tables / "frames.parquet", FRAMES).iloc[source.looked_at]
     keypoints = read_table(source.table, KEYPOINTS)
+    if calibrated is not None and entry.keypoints is None:
+        raw = keypoints["confidence"].to_numpy(np.float64)
+        keypoints["confidence"] = calibrated(raw, keypoints["joint"].to_numpy(str))
     confident = keypoints[keypoints["confidence"] >= min_confidence]
     detections = detections_from(confident, joints)
     detections, crowd = most_confident(detections, _MOST_PEOPLE)

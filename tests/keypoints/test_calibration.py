@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import isotonic_regression
 
-from pipelines.keypoints.calibration import fit, isotonic, read_calibration, write_calibration
+from pipelines.keypoints.calibration import fit, isotonic, measured_for, read_calibration, write_calibration
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float
 from pipelines.session.skeletons import get_skeleton
@@ -91,3 +91,22 @@ def test_what_is_no_calibration_is_refused(tmp_path: Path, text: str) -> None:
     path.write_text(text)
     with pytest.raises(DataError, match="is no calibration"):
         read_calibration(path)
+
+
+def test_keypoints_in_any_order_are_worth_the_same() -> None:
+    path = measured_for("blazepose")
+    assert path is not None
+    assert measured_for("onnx:somebody's") is None
+    calibration = read_calibration(path)
+    assert "benchmarks.detector_by_tilt" in calibration.origin
+    joints = ("left_wrist", "nose", "right_hip")
+    confidence = np.random.default_rng(4).uniform(0.0, 1.0, (50, 3))
+    expected = calibration.probability(confidence, joints)
+    order = np.random.default_rng(5).permutation(150)
+    names = np.tile(np.array(joints), 50)
+    assert np.array_equal(
+        calibration.probabilities(confidence.ravel()[order], names[order]), expected.ravel()[order]
+    )
+    # What the detector is sure of is right more often than not, and the other way round.
+    assert calibration.probability(np.array([[0.9]]), ("left_knee",))[0, 0] > 0.9
+    assert calibration.probability(np.array([[0.2]]), ("left_knee",))[0, 0] < 0.5
