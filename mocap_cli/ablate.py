@@ -188,7 +188,7 @@ def _print(summary: Mapping[str, Any]) -> None:
     settings = summary["settings"]
     click.echo(
         f"Simulated: {settings['seconds']:g} s of walking at {settings['rate_hz']:g} Hz, keypoints:"
-        f" {summary['keypoints']}; mean [95 % interval] of {settings['trials']} trials;"
+        f" {summary['keypoints']}; mean [95 % interval], trials: {settings['trials']};"
         " MPJPE, root-relative and PA on the joint-frames that every method has"
     )
     for table in tables(summary):

@@ -227,7 +227,7 @@ def draw(folder: Path, summary: Mapping[str, Any]) -> None:
         axis=axis,
         legend="method" if study == "noise" else "pose noise",
         title=f"Simulated: {fixed}, {settings['seconds']:g} s of walking, keypoints: {summary['keypoints']};"
-        f" mean and 95 % interval of {settings['trials']} trials",
+        f" mean and 95 % interval, trials: {settings['trials']}",
         ordered=study != "noise",
     )
 

@@ -18,7 +18,7 @@ _ORDERED = ("#9db8c9", "#5f97bd", "#1f6da5", "#123f66")  # light to dark: levels
 _MARKERS = "osD^vPX*"
 _BESIDE = 0.012  # of the axis, between the error bars of neighbouring curves above words
 _LETTERS_PER_IN = 16  # of the title
-_LONG_LABEL = 14  # letters; longer ones are written aslant
+_HEADROOM, _LEAST_TOP = 1.04, 1.0  # above the highest marker; of an axis where errors are rounding alone
 _DPI = 160
 
 
@@ -71,7 +71,7 @@ def draw_study(
             for panel, axes in zip(panels, line, strict=True):
                 _draw(axes, panel, at, ordered=ordered)
             line[0].set_ylabel(measured)
-            line[0].set_ylim(bottom=0)
+            line[0].set_ylim(0, _HEADROOM * max(line[0].get_ylim()[1], _LEAST_TOP))
         for panel, axes in zip(rows[0][1], grid[0], strict=True):
             axes.set_title(panel.title, color=INK, fontsize=8.4)
         for axes in grid[-1]:
@@ -114,10 +114,7 @@ def _draw(axes: Axes, panel: Panel, at: Sequence[float] | Sequence[str], *, orde
             capsize=2.0,
             elinewidth=0.8,
         )
-    axes.set_xticks(numbers, [value if isinstance(value, str) else f"{value:g}" for value in at])
-    if max(len(str(value)) for value in at) > _LONG_LABEL:
-        for label in axes.get_xticklabels():
-            label.set(rotation=20, ha="right", rotation_mode="anchor")
+    axes.set_xticks(numbers, [_label(value, len(at)) for value in at])
     axes.grid(axis="y", color=GRID)
     axes.tick_params(length=0)
 
@@ -126,3 +123,10 @@ def _colour(k: int, count: int, ordered: bool) -> Any:
     if ordered and count <= len(_ORDERED):
         return _ORDERED[k + len(_ORDERED) - count]
     return CAMERAS[k % len(CAMERAS)]
+
+
+def _label(value: float | str, count: int) -> str:
+    """What stands below the axis: words in lines that leave room for those beside them."""
+    if not isinstance(value, str):
+        return f"{value:g}"
+    return "\n".join(wrap(value.replace(",", ", "), max(int(_LETTERS_PER_IN * _SMALLEST_IN / count) - 1, 1)))
