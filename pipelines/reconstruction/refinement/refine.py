@@ -35,9 +35,8 @@ _FEWEST_TIMES = 20
 _UNEXPLAINED = 1.15  # times the image noise that the pictures show between neighbours: the prior is wrong
 _SIGMAS = 4.0
 _MEDIAN_OF_TWO = 2 * np.log(2)  # of the chi-square distribution with two degrees of freedom
-_FARTHEST = (
-    1.2  # times what the disagreement of the views lets expect: an estimate that moves more is a wrong one
-)
+_FARTHEST = 1.8
+"""Times what the disagreement of the views lets expect; good estimates moved by up to 1.6 of it."""
 
 
 @dataclass(frozen=True)
