@@ -33,6 +33,9 @@ Float = NDArray[np.float64]
 
 # Of a prototype's measurement, the same for all joints; what comes along is measured again now and then.
 EXAMPLE = read_errors(Path(__file__).parent / "example_detector_errors.csv")
+# As many as the example has at 15 degrees.
+USUAL = DetectorErrors(missed_share=0.02, outlier_share=0.01)
+WITHOUT_SWAPS = USUAL.model_copy(update={"swap_share": 0.0})
 CLEAN = DetectorErrors(missed_share=0.0, outlier_share=0.0, swap_share=0.0)
 FRAMES = 6000
 PLACES = np.random.default_rng(9).uniform(100, 600, (17, 2))
@@ -281,7 +284,7 @@ def test_confidence_has_the_measured_mean_and_falls_with_the_error(tilt_deg: flo
 @pytest.mark.parametrize("tilt_deg", [15.0, 30.0, 45.0, 60.0])
 def test_confidence_tells_bad_joints_as_well_as_the_measured_one(tilt_deg: float) -> None:
     """The measured area under the ROC curve, for errors above 5 % of the height, is 0.88 over all tilts."""
-    xy, confidence = detect(DetectorErrors(swap_share=0.0), tilt_deg=tilt_deg)
+    xy, confidence = detect(WITHOUT_SWAPS, tilt_deg=tilt_deg)
     found = np.isfinite(xy).all(axis=-1)
     bad = lengths(xy)[found] > 0.05 * HEIGHT_PX
     rank = np.argsort(np.argsort(-confidence[found], kind="stable"), kind="stable") + 1.0
@@ -299,7 +302,7 @@ def test_the_measured_share_of_correct_keypoints_comes_out(tilt_deg: float, pck:
     Missed joints and outliers are drawn apart, so that their shares overlap: at 60 degrees, where they
     grow fivefold to 0.10 and 0.05 and a quarter of the rest errs as far by chance, that is 0.03.
     """
-    xy, _ = detect(DetectorErrors(swap_share=0.0), tilt_deg=tilt_deg)
+    xy, _ = detect(WITHOUT_SWAPS, tilt_deg=tilt_deg)
     assert (lengths(xy) < 0.0576 * HEIGHT_PX).mean() == pytest.approx(pck, abs=0.04)
 
 
@@ -327,7 +330,7 @@ def test_what_is_not_in_the_picture_is_never_found() -> None:
 
 
 def test_what_is_seen_does_not_depend_on_what_is_not() -> None:
-    errors = DetectorErrors(swap_share=0.0)
+    errors = WITHOUT_SWAPS
     pixels = np.tile(PLACES, (40, 1, 1))
     rest = np.full(40, 15.0), np.full(40, HEIGHT_PX), errors
     everything = detect_keypoints(
@@ -342,13 +345,13 @@ def test_what_is_seen_does_not_depend_on_what_is_not() -> None:
 
 
 def test_no_frames_give_no_keypoints() -> None:
-    xy, confidence = detect(DetectorErrors(), frames=0)
+    xy, confidence = detect(USUAL, frames=0)
     assert xy.shape == (0, 17, 2)
     assert confidence.shape == (0, 17)
 
 
 def test_the_same_seed_gives_the_same_keypoints() -> None:
-    first, second, other = (detect(DetectorErrors(), seed=seed, frames=50) for seed in (4, 4, 5))
+    first, second, other = (detect(USUAL, seed=seed, frames=50) for seed in (4, 4, 5))
     assert first[0].tobytes() == second[0].tobytes()
     assert first[1].tobytes() == second[1].tobytes()
     assert not np.array_equal(first[0], other[0], equal_nan=True)
