@@ -43,6 +43,8 @@ bench: setup
 	$(BIN)/python -m benchmarks.planning
 	$(BIN)/python -m benchmarks.rendering
 	$(BIN)/python -m benchmarks.detection
+	$(BIN)/python -m benchmarks.detector_by_tilt
+	$(BIN)/python -m benchmarks.refine
 
 # Make the sample flight again: the same logs and truth as in the repository, byte for byte.
 sample: setup
