@@ -30,11 +30,17 @@ from pipelines.planning.distance_field import distance_field
 from pipelines.planning.pilot import Pilot
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Float, Int64, SkeletalMotion
+from pipelines.session.records import Float, Int64, Occupancy, SkeletalMotion
 from pipelines.session.registries import PLANNER_ARMS, noise_models
 from pipelines.session.storage import canonical_json, read_json, sha256_of, write_json
 from pipelines.session.whole_folders import is_made, whole_folder
-from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, fly_scenario, keypoints_of
+from pipelines.simulation.flight import (
+    SimulatedDrone,
+    SimulatedFlight,
+    fly_scenario,
+    keypoints_of,
+    visible_joints,
+)
 from pipelines.simulation.flight_files import Sighting, write_alphapose, write_joints, write_tum
 from pipelines.simulation.flying import Known, Planner
 from pipelines.simulation.manifest_text import manifest_text
@@ -42,7 +48,7 @@ from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.scenario import Scenario, read_scenario
 from pipelines.simulation.world.scene import World
 
-_REVISION = 2
+_REVISION = 3
 _MARK = "simulation.json"
 _BLOCK = 60  # pictures that are rendered and encoded together, and kept when the work is interrupted
 _RECEIVED_NS = 2_000_000  # after a message's own stamp, by the recorder on board
@@ -102,6 +108,7 @@ def simulate(
         progress.advance()
         occupancy = flight.world.occupancy(scenario.world.map.resolution_m, scenario.world.map.height_m)
         write_octomap(making.folder / "site.bt", occupancy)
+        _write_grid(making.folder / "site.npz", occupancy)
         progress.advance()
         for drone in flight.drones:
             _write_log(making.folder / f"{drone.name}.mcap", flight, drone)
@@ -200,8 +207,23 @@ def _write_truth(folder: Path, flight: SimulatedFlight) -> None:
             poses.camera_position,
             poses.camera_quaternion_xyzw,
         )
+        _, visible = visible_joints(flight, drone)
+        lines = [",".join(["frame", *flight.person.joints])]
+        lines += [",".join([str(frame), *row]) for frame, row in enumerate(visible.astype(int).astype(str))]
+        path = truth / f"{drone.name}_visible.csv"
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
     offsets = {drone.name: drone.clock_offset_s for drone in flight.drones}
     write_json(truth / "clocks.json", {"clock_offsets_s": offsets})
+
+
+def _write_grid(path: Path, occupancy: Occupancy) -> None:
+    """The map as `map:` takes arrays, too."""
+    np.savez_compressed(
+        path,
+        probability=occupancy.probability,
+        origin=occupancy.origin,
+        resolution_m=np.float64(occupancy.resolution_m),
+    )
 
 
 def _write_log(path: Path, flight: SimulatedFlight, drone: SimulatedDrone) -> None:

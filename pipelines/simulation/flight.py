@@ -33,6 +33,7 @@ from pipelines.simulation.world.terrain import raise_mounds
 
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
 Moving = Callable[[Float], BodyMotion]
 
 LEAD_S = 0.2
@@ -123,6 +124,19 @@ def fly_scenario(
     )
 
 
+def visible_joints(flight: SimulatedFlight, drone: SimulatedDrone) -> tuple[Float, Bool]:
+    """Where a drone's pictures show the joints, and whether they do.
+
+    Returns:
+        [F, J, 2] exact px, NaN outside the picture; [F, J] whether a joint is in the picture and nothing of
+        the world stands before it. The person's own body hides nothing here.
+    """
+    truth, joints = drone.at_frames, flight.joints[flight.moments_of(drone)]
+    pixels = see(joints, truth.camera_position, truth.camera_quaternion_xyzw, drone.intrinsics)
+    hidden = flight.world.hidden(truth.camera_position[:, None], joints)
+    return pixels, np.isfinite(pixels).all(axis=-1) & ~hidden
+
+
 def keypoints_of(flight: SimulatedFlight, drone: SimulatedDrone) -> tuple[Float, Float]:
     """What a detector would find in a drone's pictures, by the measured errors of one.
 
@@ -131,18 +145,16 @@ def keypoints_of(flight: SimulatedFlight, drone: SimulatedDrone) -> tuple[Float,
     """
     scenario, truth = flight.scenario, drone.at_frames
     rows = flight.moments_of(drone)
-    joints = flight.joints[rows]
-    eye = truth.camera_position
-    pixels = see(joints, eye, truth.camera_quaternion_xyzw, drone.intrinsics)
+    pixels, visible = visible_joints(flight, drone)
     tilt_deg, height_px = view_of(
-        eye,
+        truth.camera_position,
         flight.motion.root[rows],
         height_m=scenario.actor.body.height_m,
         focal_px=drone.intrinsics.fx,
     )
     return detect_keypoints(
         pixels,
-        ~flight.world.hidden(eye[:, None], joints),
+        visible,
         tilt_deg,
         height_px,
         scenario.keypoints,

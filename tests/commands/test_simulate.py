@@ -96,7 +96,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path: Path)
     same = {name for name in flights[0] if flights[0][name] == flights[2][name]}
     # What a seed cannot change: the lens, the map, the offsets, and how the files hang together.
     lenses = {"drone1_camera.yaml", "drone2_camera.yaml"}
-    assert same == {*lenses, "flight.yaml", "site.bt", "truth/clocks.json"}
+    assert same == {*lenses, "flight.yaml", "true_poses.yaml", "site.bt", "site.npz", "truth/clocks.json"}
 
 
 def test_videos_have_the_frames_that_were_kept_and_workers_do_not_matter(tmp_path: Path) -> None:
@@ -164,6 +164,26 @@ def test_the_map_is_read_by_octomap_itself(tmp_path: Path) -> None:
     for place, occupied in {(6.2, 6.2, 1.2): True, (6.2, 6.2, 4.2): False, (0.2, -8.0, 1.2): True}.items():
         node = tree.search(np.array(place))
         assert tree.isNodeOccupied(node) is occupied
+
+
+def test_what_stands_in_the_way_is_told(tmp_path: Path) -> None:
+    """A wall between the actor and the first drone hides the actor from it, and from no other."""
+    wall = "world: {walls: [{start: [3, -6], end: [3, 6], height_m: 5}]}\ndrones:"
+    text = EXACT.replace("drones:", wall).replace("count: 3", "count: 2")
+    begin, end = text.index("  motion:"), text.index("world:")
+    flight = simulated(
+        tmp_path, text[:begin] + "  motion: [stand: {seconds: 4}]\n" + text[end:], "--no-video"
+    )
+    first, second = (
+        pd.read_csv(flight.parent / "truth" / f"drone{k}_visible.csv", index_col="frame") for k in (1, 2)
+    )
+    assert len(first) == len(second) == 120
+    assert not first.to_numpy().any()
+    assert second.to_numpy().all()
+    grid, tree = (
+        json.loads(succeeds("info", flight.parent / f"site.{kind}", "--json")) for kind in ("npz", "bt")
+    )
+    assert grid["readings"][0]["occupied_voxels"] == tree["readings"][0]["occupied_voxels"] > 0
 
 
 def test_a_flight_that_is_there_is_not_made_again(tmp_path: Path) -> None:
