@@ -8,10 +8,12 @@ either.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
@@ -19,28 +21,35 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.formats.pictures import Picture, Pictures, open_pictures
-from pipelines.geometry.poses import interpolate_points, interpolate_poses
+from pipelines.geometry.poses import interpolate_poses
 from pipelines.keypoints.hints import Hint, project_actor
 from pipelines.keypoints.tracking import PeopleTracker
-from pipelines.session.description import CameraEntry, Description, MediaEntry, read_description
+from pipelines.reconstruction.loading import load_actor, stated_sigma
+from pipelines.session.description import (
+    CameraEntry,
+    Description,
+    Interpolation,
+    MediaEntry,
+    read_description,
+)
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Detections, Float, Int64
+from pipelines.session.records import Detections, Float, Int64, Trajectory
 from pipelines.session.registries import Detector, KeypointNetworks, find_detector
 from pipelines.session.stages import Stage, StageRecord, WritableSession
-from pipelines.session.storage import read_json, sha256_of, write_json
-from pipelines.session.tables import ACTOR, FRAMES, KEYPOINTS, POSES, read_table, write_table
+from pipelines.session.storage import canonical_json, read_json, sha256_of, write_json
+from pipelines.session.tables import FRAMES, KEYPOINTS, POSES, read_table, write_table
 from pipelines.session.tabular import keypoints_table, trajectory_from
 
 if TYPE_CHECKING:
     import pandas as pd
 
-DETECT = Stage("detect", revision=1)
+DETECT = Stage("detect", revision=2)
 
 _BLOCK = 300  # pictures; ten seconds are worth little when lost, and a search at each start costs little
-_ACTOR_GAP_NS = 2_000_000_000
-_ACTOR_SIGMA_M = 1.0
-_POSE_SIGMA_RAD = np.radians(1.0)  # margin of the projected actor, METHODS' medium level of pose noise
+_ACTOR_SIGMA_M = 1.0  # of the actor's log, as it is taken for telling people apart
+_UNKNOWN_SIGMA = (0.0, np.radians(1.0))
+"""Camera pose noise (m, rad) behind the hints where nobody states it: the position's is in the actor's."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +120,7 @@ def detect(
         "end_s": end_s,
     }
     inputs = {f"model {name}": sha256_of(path) for name, path in models.items()}
-    inputs |= _inputs(session, description, media)
+    inputs |= _inputs(session, description, media, in_span=(start_s, end_s) != (None, None))
     run = session.begin(DETECT, settings=settings, inputs=inputs, force=force)
     if run.finished:
         return run.record
@@ -145,17 +154,33 @@ def detect(
 
 
 def _inputs(
-    session: WritableSession, description: Description, media: Mapping[str, MediaEntry]
+    session: WritableSession, description: Description, media: Mapping[str, MediaEntry], *, in_span: bool
 ) -> dict[str, str]:
-    """The hashes of what decides the keypoints: pictures, frame times, and what the hints are made of."""
+    """The hashes of what decides the keypoints: pictures, frame times, and what the hints are made of.
+
+    A span of the flight counts from the first frame of all cameras, those with keypoints among them.
+    """
     ingested = session.record("ingest")
     if ingested is None:
         raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
-    tables = {f"cameras/{name}/{table}.parquet" for name in media for table in ("frames", "poses")}
-    inputs = {name: digest for name, digest in ingested.outputs.items() if name in tables | {"actor.parquet"}}
-    for entry in media.values():
-        inputs |= {source: description.sources[source] for source in entry.sources}
-    return inputs
+    tables = {f"cameras/{name}/frames.parquet" for name in (description.cameras if in_span else media)}
+    inputs = {}
+    if description.actor is not None:
+        tables |= {"actor.parquet", *(f"cameras/{name}/poses.parquet" for name in media)}
+        inputs["actor"] = _hash_of([description.actor.point, description.pose_interpolation.model_dump()])
+    for name, of_pictures in media.items():
+        files = [description.sources[source] for source in of_pictures.sources]
+        inputs[f"pictures of {name}"] = _hash_of([files, of_pictures.topic, of_pictures.stamps])
+        if description.actor is not None:
+            entry = description.cameras[name]
+            inputs[f"camera {name}"] = _hash_of(
+                [entry.intrinsics.model_dump(), entry.poses.static, entry.pose_noise]
+            )
+    return inputs | {name: digest for name, digest in ingested.outputs.items() if name in tables}
+
+
+def _hash_of(values: list[object]) -> str:
+    return sha256(canonical_json(values).encode()).hexdigest()
 
 
 class _Work:
@@ -171,7 +196,7 @@ class _Work:
         self.folder = folder
         self.every = every
         self.stopped = Event()
-        self._description = description
+        self.description = description
         self._frames = {
             name: read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
             for name in cameras_to_detect(description)
@@ -212,51 +237,72 @@ class _Work:
 
     def entry(self, block: Block) -> CameraEntry:
         """The camera as it was ingested."""
-        return self._description.cameras[block.camera]
+        return self.description.cameras[block.camera]
 
-    def hints(self, block: Block, t_ns: Int64) -> list[Hint | None]:
-        """Where the logged actor should be in each picture; None without a log or a pose."""
-        if self._description.actor is None:
-            return [None] * len(t_ns)
-        table = read_table(self.folder / "actor.parquet", ACTOR)
-        actor = interpolate_points(
-            table["t_ns"].to_numpy(np.int64),
-            table[["x", "y", "z"]].to_numpy(np.float64),
+
+def actor_hints(folder: Path, description: Description, camera: str, t_ns: Int64) -> list[Hint | None]:
+    """Where the hips of the logged actor should be in a camera's pictures; None without a log or a pose.
+
+    Args:
+        folder: the session.
+        description: its session.json.
+        camera: one of its cameras.
+        t_ns: [T] when the pictures were taken.
+    """
+    actor = load_actor(folder, description, t_ns)
+    if actor is None:
+        return [None] * len(t_ns)
+    entry = description.cameras[camera]
+    trajectory = trajectory_from(read_table(folder / "cameras" / camera / "poses.parquet", POSES))
+    position, quaternion = _poses(entry, trajectory, t_ns, description.pose_interpolation)
+    sigma = hint_sigma(camera, entry, trajectory, t_ns)
+    intrinsics = entry.intrinsics.intrinsics()
+    return [
+        project_actor(at, (centre, turned), intrinsics, sigma_m=float(off_m), sigma_rad=float(off_rad))
+        if np.isfinite(at).all() and np.isfinite(centre).all()
+        else None
+        for at, centre, turned, (off_m, off_rad) in zip(actor, position, quaternion, sigma, strict=True)
+    ]
+
+
+def _poses(
+    entry: CameraEntry, trajectory: Trajectory, t_ns: Int64, bounds: Interpolation
+) -> tuple[Float, Float]:
+    if entry.poses.static:
+        position = np.repeat(trajectory.position, len(t_ns), axis=0)
+        quaternion = np.repeat(trajectory.quaternion_xyzw, len(t_ns), axis=0)
+    else:
+        position, quaternion = interpolate_poses(
+            trajectory.t_ns,
+            trajectory.position,
+            trajectory.quaternion_xyzw,
             t_ns,
-            max_gap_ns=_ACTOR_GAP_NS,
+            max_gap_ns=round(bounds.max_gap_s * 1e9),
+            max_extrapolation_ns=round(bounds.max_extrapolation_s * 1e9),
         )
-        position, quaternion = self._poses(block, t_ns)
-        intrinsics = self.entry(block).intrinsics.intrinsics()
-        return [
-            project_actor(
-                at,
-                (centre, turned),
-                intrinsics,
-                sigma_m=_ACTOR_SIGMA_M,
-                sigma_rad=float(_POSE_SIGMA_RAD),
-            )
-            if np.isfinite(at).all() and np.isfinite(centre).all()
-            else None
-            for at, centre, turned in zip(actor, position, quaternion, strict=True)
-        ]
+    return position, quaternion
 
-    def _poses(self, block: Block, t_ns: Int64) -> tuple[Float, Float]:
-        table = read_table(self.folder / "cameras" / block.camera / "poses.parquet", POSES)
-        trajectory = trajectory_from(table)
-        if self.entry(block).poses.static:
-            position = np.repeat(trajectory.position, len(t_ns), axis=0)
-            quaternion = np.repeat(trajectory.quaternion_xyzw, len(t_ns), axis=0)
-        else:
-            bounds = self._description.pose_interpolation
-            position, quaternion = interpolate_poses(
-                trajectory.t_ns,
-                trajectory.position,
-                trajectory.quaternion_xyzw,
-                t_ns,
-                max_gap_ns=round(bounds.max_gap_s * 1e9),
-                max_extrapolation_ns=round(bounds.max_extrapolation_s * 1e9),
-            )
-        return position, quaternion
+
+def hint_sigma(name: str, entry: CameraEntry, trajectory: Trajectory, t_ns: Int64) -> Float:
+    """How far the logged actor may be from where a camera's logged pose has them.
+
+    Args:
+        name: of the camera.
+        entry: what session.json says of it; its pose noise, else the log's covariances, are taken.
+        trajectory: its logged poses.
+        t_ns: [T] when pictures were taken.
+
+    Returns:
+        Standard deviation per axis [T, 2]: of the actor's position relative to the camera's (m), the errors
+        of both together, and of the camera's rotation (rad); of the logged pose before each picture.
+    """
+    stated = stated_sigma(name, entry, trajectory)
+    if stated is None:
+        at_pictures = np.tile(_UNKNOWN_SIGMA, (len(t_ns), 1))
+    else:
+        before = np.searchsorted(trajectory.t_ns, t_ns, side="right") - 1
+        at_pictures = stated[np.clip(before, 0, len(stated) - 1)]
+    return np.column_stack([np.hypot(_ACTOR_SIGMA_M, at_pictures[:, 0]), at_pictures[:, 1]])
 
 
 def _span_words(start_s: float | None, end_s: float | None) -> str:
@@ -282,9 +328,14 @@ def _produce(work: _Work, detector: Detector, progress: Progress, block: Block, 
     tracker = PeopleTracker(networks)
     found: list[tuple[int, int, Float, Float]] = []
     undecoded = 0
-    with open_pictures(media, work.folder) as pictures:
-        numbers, hints = frame.tolist(), work.hints(block, t_ns)
-        for number, picture, hint in zip(numbers, _decoded_ahead(pictures, numbers), hints, strict=True):
+    numbers = frame.tolist()
+    hints = actor_hints(work.folder, work.description, block.camera, t_ns)
+    # Left early, the pictures must not be closed while the next one is being decoded.
+    with (
+        open_pictures(media, work.folder) as pictures,
+        closing(_decoded_ahead(pictures, numbers)) as decoded,
+    ):
+        for number, picture, hint in zip(numbers, decoded, hints, strict=True):
             if work.stopped.is_set():
                 raise InterruptedError("another block failed, or the user stopped it")
             progress.advance()
@@ -300,7 +351,7 @@ def _produce(work: _Work, detector: Detector, progress: Progress, block: Block, 
     write_json(folder / "counts.json", {"joints": list(networks.joints), "counts": counts})
 
 
-def _decoded_ahead(pictures: Pictures, numbers: list[int]) -> Iterator[Picture | None]:
+def _decoded_ahead(pictures: Pictures, numbers: list[int]) -> Generator[Picture | None]:
     """The pictures of these numbers; the next one is decoded while the networks look at this one."""
     with ThreadPoolExecutor(1) as decoder:
         coming = deque(decoder.submit(pictures.read, number) for number in numbers[:1])

@@ -59,7 +59,7 @@ from pipelines.session.tables import CAMERA_POSES, SKELETON, write_table
 if TYPE_CHECKING:
     import pandas as pd
 
-RECONSTRUCT = Stage("reconstruct", revision=3)
+RECONSTRUCT = Stage("reconstruct", revision=4)
 
 _UNKNOWN_SIGMA = (0.3, np.radians(1.0))
 """Camera pose noise (m, rad) taken for telling people apart where nobody states it: METHODS' medium level."""

@@ -23,9 +23,6 @@ from pipelines.session.tabular import motion_from, trajectory_from
 Bool = NDArray[np.bool_]
 Source = Literal["log", "reconstruction", "truth"]
 
-HIP_ABOVE_M = {"hip": 0.0, "centre": 0.0, "feet": 0.95, "head": -0.70}
-"""How far the hips are above the point that was logged, for a person of 1.75 m who stands."""
-
 _LONGEST_STEP_NS = 200_000_000  # joints are interpolated across this much at least: 10 Hz and a missed frame
 _STEPS = 1.5  # or this many median steps
 _GAP_NS = 1_000_000_000  # an actor who is not measured for longer is spoken of
@@ -213,7 +210,7 @@ def _actor(
         table = read_table(folder / "actor.parquet", ACTOR)
         table = table[table["person"] == table["person"].min()]
         position = table[["x", "y", "z"]].to_numpy(np.float64)
-        above_m = HIP_ABOVE_M[description.actor.point]
+        above_m = description.actor.hip_above_m
         if description.actor.point in ("feet", "head"):
             warnings.append(
                 f"the actor's {description.actor.point} were logged: hips taken {above_m:+.2f} m above"

@@ -89,7 +89,7 @@ def load_cameras(
     for name, source in sources.items():
         entry = description.cameras[name]
         camera = _load_camera(folder, name, entry, source, joints, min_confidence, calibrated, warnings)
-        sigma = _stated_sigma(name, entry, camera.trajectory, pose_noise)
+        sigma = stated_sigma(name, entry, camera.trajectory, pose_noise)
         cameras.append(replace(camera, sigma=sigma))
     return cameras, warnings
 
@@ -141,10 +141,23 @@ def _load_camera(
     )
 
 
-def _stated_sigma(
-    name: str, entry: CameraEntry, trajectory: Trajectory, pose_noise: str | None
+def stated_sigma(
+    name: str, entry: CameraEntry, trajectory: Trajectory, pose_noise: str | None = None
 ) -> Float | None:
-    """The pose noise [N, 2] as somebody states it: the command line, flight.yaml, or the log itself."""
+    """The pose noise of a camera as somebody states it: the command line, flight.yaml, or the log itself.
+
+    Args:
+        name: of the camera.
+        entry: what session.json says of it.
+        trajectory: its N logged poses.
+        pose_noise: what the command line says.
+
+    Returns:
+        Standard deviation per axis [N, 2] of position (m) and rotation (rad); None where nobody states it.
+
+    Raises:
+        DataError: the models are none that are known.
+    """
     if pose_noise:
         models = parsed_noise_models("--pose-noise", pose_noise)
     elif entry.pose_noise:
@@ -220,9 +233,12 @@ def load_truth(folder: Path, description: Description, joints: tuple[str, ...], 
 
 
 def load_actor(folder: Path, description: Description, t_ns: Int64) -> Float | None:
-    """The logged actor [T, 3] at given times, NaN where the log says nothing."""
+    """The hips [T, 3] of the logged actor at given times, NaN where the log says nothing.
+
+    Of an actor whose head or feet were logged, the hips of somebody 1.75 m tall who stands there.
+    """
     if description.actor is None:
         return None
     table = read_table(folder / "actor.parquet", ACTOR)
-    position = table[["x", "y", "z"]].to_numpy(np.float64)
-    return interpolate_points(table["t_ns"].to_numpy(np.int64), position, t_ns, max_gap_ns=_ACTOR_GAP_NS)
+    hips = table[["x", "y", "z"]].to_numpy(np.float64) + np.array([0.0, 0.0, description.actor.hip_above_m])
+    return interpolate_points(table["t_ns"].to_numpy(np.int64), hips, t_ns, max_gap_ns=_ACTOR_GAP_NS)

@@ -109,6 +109,9 @@ class CameraEntry(Entry):
     media: MediaEntry | None
 
 
+_HIP_ABOVE_M = {"hip": 0.0, "centre": 0.0, "feet": 0.95, "head": -0.70}  # of 1.75 m, standing
+
+
 class ActorEntry(Entry):
     """Where the actor was, as logged."""
 
@@ -116,6 +119,11 @@ class ActorEntry(Entry):
     point: str  # of the body: hip, head, feet, centre
     count: int
     dropped: dict[str, int]
+
+    @property
+    def hip_above_m(self) -> float:
+        """How far the hips are above the point that was logged, for a person of 1.75 m who stands."""
+        return _HIP_ABOVE_M[self.point]
 
 
 class MapEntry(Entry):

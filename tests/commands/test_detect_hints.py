@@ -1,0 +1,172 @@
+"""What the log tells the detector of the actor's place, and what makes the stage run again."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from pipelines.detect import actor_hints, detect, hint_sigma
+from pipelines.ingest import ingest
+from pipelines.keypoints.hints import Hint
+from pipelines.reconstruction.loading import load_actor
+from pipelines.session.description import read_description
+from pipelines.session.records import Trajectory
+from pipelines.session.stages import StageRecord, locked
+from tests.keypoints.spotted_flights import CAMERAS, FPS, LENS, START_S, spot_detector, write_spotted_flight
+from tests.synthetic.logged_flights import header
+from tests.synthetic.logs import Entry, write_log
+
+FRAMES = 3
+NOISE = {"white": {"position_m": 0.4, "rotation_deg": 2.0}, "bias": {"position_m": 0.3}}
+DISTANCE_M = math.dist(CAMERAS["left"], (0.0, 0.0, 1.0))
+
+
+class Flight:
+    """A spotted flight whose settings can be changed, and its session."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.manifest = write_spotted_flight(folder, FRAMES)
+        self.session = folder / "flight.session"
+        self.settings: dict[str, Any] = YAML(typ="safe").load(self.manifest)
+
+    def log_actor(self, point: str, height_m: float) -> None:
+        """Someone who stands in the origin, at which both cameras look at 1 m."""
+        stamps = [START_S * 10**9 + round(k * 1e9 / FPS) for k in range(FRAMES)]
+        pose = {"position": {"x": 0.0, "y": 0.0, "z": height_m}, "orientation": {"w": 1.0}}
+        entries = [
+            Entry("/actor", "geometry_msgs/msg/PoseStamped", t, {"header": header(t, "map"), "pose": pose})
+            for t in stamps
+        ]
+        write_log(self.folder, "actor", "mcap-cdr", entries)
+        self.settings["actor"] = {"log": "actor.mcap", "topic": "/actor", "point": point}
+
+    def ingest(self) -> None:
+        YAML(typ="safe").dump(self.settings, self.manifest)
+        ingest(self.manifest, self.session)
+
+    def hints(self) -> list[Hint | None]:
+        self.ingest()
+        stamps = START_S * 10**9 + np.round(np.arange(FRAMES) * 1e9 / FPS).astype(np.int64)
+        return actor_hints(self.session, read_description(self.session), "left", stamps)
+
+    def key(self, detector: str, start_s: float | None = None) -> str:
+        """The key of the stage, which is run where that is not there yet."""
+        self.ingest()
+        record: StageRecord | None
+        with locked(self.session) as writable:
+            record = detect(writable, detector=detector, start_s=start_s)
+        assert record is not None
+        return record.key
+
+
+@pytest.mark.parametrize(
+    ("point", "height_m"), [("hip", 1.0), ("centre", 1.0), ("feet", 0.05), ("head", 1.7)]
+)
+def test_the_hint_is_at_the_hips_whatever_point_was_logged(
+    tmp_path: Path, point: str, height_m: float
+) -> None:
+    flight = Flight(tmp_path)
+    flight.log_actor(point, height_m)
+
+    hints = flight.hints()
+
+    # The cameras look at the hips, 0.95 m above the feet and 0.7 m below the head.
+    assert len(hints) == FRAMES
+    for hint in hints:
+        assert hint is not None
+        assert hint.centre == pytest.approx((LENS.cx, LENS.cy), abs=1e-3)
+        assert hint.height_px == pytest.approx(LENS.fx * 1.75 / DISTANCE_M, rel=1e-3)
+    hips = load_actor(flight.session, read_description(flight.session), np.array([START_S * 10**9]))
+    assert hips == pytest.approx(np.array([[0.0, 0.0, 1.0]]))
+
+
+def test_the_margin_is_what_is_stated_of_the_poses(tmp_path: Path) -> None:
+    flight = Flight(tmp_path)
+    flight.log_actor("hip", 1.0)
+
+    def margin() -> float:
+        hint = flight.hints()[0]
+        assert hint is not None
+        return hint.margin_px
+
+    # Three sigma of angle times the focal length; the actor's log has 1 m, unknown poses 1 deg.
+    assert margin() == pytest.approx(3 * LENS.fx * math.hypot(1 / DISTANCE_M, math.radians(1)), rel=1e-3)
+    flight.settings["cameras"]["left"]["pose_noise"] = NOISE
+    apart_m = math.sqrt(1 + 0.4**2 + 0.3**2)
+    stated = math.hypot(apart_m / DISTANCE_M, math.radians(2))
+    assert margin() == pytest.approx(3 * LENS.fx * stated, rel=1e-3)
+
+
+def test_logged_covariances_count_where_nothing_is_stated(tmp_path: Path) -> None:
+    flight = Flight(tmp_path)
+    flight.log_actor("hip", 1.0)
+    flight.ingest()
+    entry = read_description(flight.session).cameras["left"]
+    sigmas = np.array([[0.2, 0.03], [0.5, 0.01]])
+    covariance = np.stack([np.diag(np.repeat(sigma**2, 3)) for sigma in sigmas])
+    trajectory = Trajectory(
+        np.array([0, 1000]), np.zeros((2, 3)), np.tile([0.0, 0, 0, 1], (2, 1)), covariance
+    )
+
+    found = hint_sigma("left", entry, trajectory, np.array([-5, 0, 999, 1000, 2000]))
+
+    # Of the pose before each picture, the first where there is none.
+    at_pictures = sigmas[[0, 0, 0, 1, 1]]
+    assert found[:, 0] == pytest.approx(np.hypot(1.0, at_pictures[:, 0]))
+    assert found[:, 1] == pytest.approx(at_pictures[:, 1])
+    stated = entry.model_copy(update={"pose_noise": NOISE})
+    assert hint_sigma("left", stated, trajectory, np.array([0]))[0] == pytest.approx(
+        [math.sqrt(1 + 0.4**2 + 0.3**2), math.radians(2)]
+    )
+
+
+def test_what_decides_the_hints_decides_the_key(tmp_path: Path) -> None:
+    flight, detector = Flight(tmp_path), spot_detector(tmp_path)
+    camera = flight.settings["cameras"]["left"]
+    keys = [flight.key(detector)]
+    # Without an actor nothing is made of the poses' noise.
+    camera["pose_noise"] = NOISE
+    assert flight.key(detector) == keys[0]
+    flight.log_actor("hip", 1.0)
+    keys.append(flight.key(detector))
+    assert flight.key(detector) == keys[-1]
+    camera["pose_noise"] = {"white": {"position_m": 0.4}}
+    keys.append(flight.key(detector))
+    flight.settings["actor"]["point"] = "feet"
+    keys.append(flight.key(detector))
+    camera["intrinsics"]["fx"] = 290.0
+    keys.append(flight.key(detector))
+    assert len(set(keys)) == len(keys)
+
+
+def test_a_camera_that_gets_anothers_pictures_is_looked_at_again(tmp_path: Path) -> None:
+    # Both videos have the same stamps: nothing but the pictures changes.
+    flight, detector = Flight(tmp_path), spot_detector(tmp_path)
+    before = flight.key(detector)
+    left, right = (flight.settings["cameras"][name] for name in CAMERAS)
+    left["video"], right["video"] = right["video"], left["video"]
+
+    assert flight.key(detector) != before
+
+
+def test_a_span_counts_from_the_first_frame_of_cameras_with_keypoints_too(tmp_path: Path) -> None:
+    flight, detector = Flight(tmp_path), spot_detector(tmp_path)
+    right = flight.settings["cameras"]["right"]
+    keypoints = np.column_stack([np.full((17, 2), 100.0), np.ones(17)]).ravel().tolist()
+    seen = [
+        {"image_id": f"{k}.jpg", "category_id": 1, "keypoints": keypoints, "score": 1} for k in range(FRAMES)
+    ]
+    (tmp_path / "right.json").write_text(str(seen).replace("'", '"'), encoding="utf-8")
+    right["keypoints"] = {"path": "right.json", "format": "alphapose", "skeleton": "coco17"}
+    spanned, whole = flight.key(detector, start_s=0.5 / FPS), flight.key(detector)
+    # Its clock moves, and with it the moment from which the span is counted.
+    right["clock"]["offset_s"] = -0.5 / FPS
+
+    assert flight.key(detector) == whole
+    assert flight.key(detector, start_s=0.5 / FPS) != spanned
