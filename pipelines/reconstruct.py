@@ -43,6 +43,7 @@ from pipelines.reconstruction.observations import (
     Observations,
     candidates,
     observe,
+    on_sides,
     time_base,
 )
 from pipelines.reconstruction.quality import assess
@@ -59,7 +60,7 @@ from pipelines.session.tables import CAMERA_POSES, SKELETON, write_table
 if TYPE_CHECKING:
     import pandas as pd
 
-RECONSTRUCT = Stage("reconstruct", revision=4)
+RECONSTRUCT = Stage("reconstruct", revision=5)
 
 _UNKNOWN_SIGMA = (0.3, np.radians(1.0))
 """Camera pose noise (m, rad) taken for telling people apart where nobody states it: METHODS' medium level."""
@@ -153,7 +154,9 @@ def reconstruct(
         progress.advance()
         found, observations, association, seen = _observe(folder, cameras, description, settings)
         sigma = _ray_sigma(cameras, observations.t_ns, observations.position, settings)
-        observations, between_views = _agreeing_sides(observations, sigma)
+        sides, between_views = _agreeing_sides(observations, sigma)
+        xy, confidence = on_sides(observations.xy, observations.confidence, sides)
+        observations = replace(observations, xy=xy, confidence=confidence)
         progress.advance()
         views = _views(cameras, observations, settings, workers)
         solve = _solver(cameras, observations, settings, workers)
@@ -163,7 +166,16 @@ def reconstruct(
         refined = None
         if settings.method == "refined":
             refined = _refine(
-                cameras, found, association, observations, views, result, description, settings, workers
+                cameras,
+                found,
+                association,
+                observations,
+                sides,
+                views,
+                result,
+                description,
+                settings,
+                workers,
             )
             observations, views = refined.observations, refined.views
             result = _refused_people(refined.result, observations, seen)
@@ -239,21 +251,20 @@ def _without_swaps(cameras: list[Camera]) -> tuple[list[Camera], dict[str, dict[
     return mended, counts
 
 
-def _agreeing_sides(observations: Observations, sigma: Float) -> tuple[Observations, dict[str, int]]:
-    """Left and right as most cameras see them; dropped where nobody knows which of them are right."""
-    xy, confidence = observations.xy.copy(), observations.confidence.copy()
+def _agreeing_sides(observations: Observations, sigma: Float) -> tuple[Int64, dict[str, int]]:
+    """Left and right as most cameras see them [T, P, J, C]; see `swaps_across_views`."""
+    sides = np.empty(observations.confidence.shape, dtype=np.int64)
     total: Counter[str] = Counter()
-    for person in range(xy.shape[1]):
-        xy[:, person], confidence[:, person], counts = swaps_across_views(
-            xy[:, person],
-            confidence[:, person],
+    for person in range(observations.xy.shape[1]):
+        sides[:, person], counts = swaps_across_views(
+            observations.xy[:, person],
             observations.position,
             observations.rotation,
             sigma,
             observations.joints,
         )
         total.update(counts)
-    return replace(observations, xy=xy, confidence=confidence), dict(sorted(total.items()))
+    return sides, dict(sorted(total.items()))
 
 
 def _pose_limits(description: Description) -> dict[str, int]:
@@ -270,6 +281,7 @@ def _refine(
     found: Candidates,
     association: Association,
     observations: Observations,
+    sides: Int64,
     views: Views,
     result: Triangulation,
     description: Description,
@@ -281,6 +293,7 @@ def _refine(
         found,
         association.choice,
         observations,
+        sides,
         views,
         result,
         prior=load_pose_errors(description, cameras, settings.pose_noise),

@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from pipelines.keypoints.swaps import VISIBLE, Bools, limb_pairs, mirrored_pairs
-from pipelines.session.records import Float
+from pipelines.session.records import Float, Int64
 
 _MOST = 2  # cameras that are wrong at once
 _GAIN = 16.0  # squared misses, in variances, that an exchange must save
@@ -22,40 +22,39 @@ _CAP = 25.0  # a single ray counts up to five standard deviations
 
 
 def swaps_across_views(
-    xy: Float, confidence: Float, position: Float, rotation: Float, sigma: Float, joints: Sequence[str]
-) -> tuple[Float, Float, dict[str, int]]:
-    """Give joints back to the side where the rays of the other cameras meet.
+    xy: Float, position: Float, rotation: Float, sigma: Float, joints: Sequence[str]
+) -> tuple[Int64, dict[str, int]]:
+    """Find the side of each joint where the rays of the other cameras meet.
 
     Where an exchange in exactly half of the cameras mends it (one of two), nobody knows which half is
     right: the limb is dropped from all of them at that time.
 
     Args:
         xy: [T, J, C, 2] one person's joints, undistorted normalised picture coordinates, NaN not seen.
-        confidence: [T, J, C].
         position: [T, C, 3] m, world_from_camera, NaN without a pose.
         rotation: [T, C, 3, 3] world_from_camera.
         sigma: [T, C] rad, standard deviation of a ray on each axis: of pixels and poses together.
         joints: the names of the J joints.
 
     Returns:
-        Positions and confidences, exchanged back, or NaN and 0 where dropped; and how many joint views were
-        `undone` and `dropped`. What agreed is the same to the last bit.
+        Which joint's view is the one of each joint [T, J, C]: its own number, its mirror's where the two are
+        exchanged, -1 where it is dropped; and how many joint views were `undone` and `dropped`.
     """
-    xy, confidence = xy.copy(), confidence.copy()
+    xy, sides = xy.copy(), np.tile(np.arange(xy.shape[1])[:, None], (len(xy), 1, xy.shape[2]))
     counts: Counter[str] = Counter()
     limbs = [pairs for pairs in limb_pairs(joints).values() if len(pairs) > 1]
     for group in [*limbs, *([pair] for pair in mirrored_pairs(joints).values())]:
         flipped, undecided = _wrong_views(xy[:, np.ravel(group)], position, rotation, sigma, len(group))
         for left, right in group:
-            for values in (xy, confidence):
+            for values in (xy, sides):
                 a, b = values[:, left], values[:, right]
                 a[flipped], b[flipped] = b[flipped], a[flipped]
             for side in (left, right):
                 counts["undone"] += int((flipped & np.isfinite(xy[:, side, :, 0])).sum())
                 counts["dropped"] += int((undecided[:, None] & np.isfinite(xy[:, side, :, 0])).sum())
                 xy[undecided, side] = np.nan
-                confidence[undecided, side] = 0.0
-    return xy, confidence, dict(+counts)
+                sides[undecided, side] = -1
+    return sides, dict(+counts)
 
 
 def _wrong_views(

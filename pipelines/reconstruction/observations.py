@@ -190,6 +190,23 @@ def observe(
     )
 
 
+def on_sides(xy: Float, confidence: Float, sides: Int64) -> tuple[Float, Float]:
+    """Each joint with the view that is its own, where left and right were taken for each other.
+
+    Args:
+        xy: [T, P, J, ..., 2].
+        confidence: [T, P, J, ...].
+        sides: [T, P, J, ...] which joint's view is the one of each joint; -1 for none.
+
+    Returns:
+        Both in the same shape; NaN and 0 where no view is left.
+    """
+    kept, joint = sides >= 0, np.maximum(sides, 0)
+    own_xy = np.take_along_axis(xy, joint[..., None], axis=2)
+    own_confidence = np.take_along_axis(confidence, joint, axis=2)
+    return np.where(kept[..., None], own_xy, np.nan), np.where(kept, own_confidence, 0.0)
+
+
 def _all_sigmas(cameras: list[Camera], sigmas: list[Float | None]) -> Float:
     """The pose noise [T, C, 2]: as stated; for moving cameras of which nobody states it, the others' median.
 

@@ -14,7 +14,14 @@ import numpy as np
 
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views, estimate_noise, triangulate
-from pipelines.reconstruction.observations import Camera, Candidates, Observations, observe, sightings_of
+from pipelines.reconstruction.observations import (
+    Camera,
+    Candidates,
+    Observations,
+    observe,
+    on_sides,
+    sightings_of,
+)
 from pipelines.reconstruction.refinement.building import Sighting
 from pipelines.reconstruction.refinement.problem import PoseErrors
 from pipelines.reconstruction.refinement.refine import Refined, corrected, refine
@@ -45,6 +52,7 @@ def refine_flight(
     found: Candidates,
     choice: Int64,
     observations: Observations,
+    sides: Int64,
     views: Views,
     result: Triangulation,
     *,
@@ -61,7 +69,8 @@ def refine_flight(
         cameras: all of them.
         found: every detection, at the times where people were told apart.
         choice: [T', C, P] each person's detection, see `observe`.
-        observations: at the skeleton's times.
+        observations: at the skeleton's times, on those sides.
+        sides: [T, P, J, C] which joint's view is the one of each joint, -1 for none, see `on_sides`.
         views: the same, one row for each joint-frame.
         result: `robust` of the views.
         prior: what is known of each camera's pose errors, None when nobody stated anything.
@@ -76,7 +85,8 @@ def refine_flight(
     t_s = (observations.t_ns - begin_ns) / 1e9
     limits = {"max_gap_ns": max_gap_ns, "max_extrapolation_ns": max_extrapolation_ns}
     sightings = [
-        _sighting(camera, found, c, choice, begin_ns, pixel_sigma, limits) for c, camera in enumerate(cameras)
+        _sighting(camera, found, c, choice, observations.t_ns, sides[..., c], pixel_sigma, limits)
+        for c, camera in enumerate(cameras)
     ]
     start = result.points.reshape(times, people * joints, 3)
     bones = _rigid_pairs(observations.joints, people)
@@ -93,6 +103,8 @@ def refine_flight(
     observed = observations
     if refined.clock_offset_s.any():
         observed = observe(shifted, found, choice, observations.t_ns, **limits)
+        xy, confidence = on_sides(observed.xy, observed.confidence, sides)
+        observed = replace(observed, xy=xy, confidence=confidence)
     position, rotation = observed.position.copy(), observed.rotation.copy()
     for c in range(len(cameras)):
         numbers = _numbers_at(refined.corrections[c], t_s - refined.clock_offset_s[c])
@@ -131,16 +143,21 @@ def _sighting(
     found: Candidates,
     c: int,
     choice: Int64,
-    begin_ns: int,
+    t_ns: Int64,
+    sides: Int64,
     pixel_sigma: float,
     limits: dict[str, int],
 ) -> Sighting:
-    """What a camera saw in its own pictures, all people side by side."""
-    xy, confidence = sightings_of(camera, found, c, choice[:, c])
+    """What a camera saw in its own pictures, all people side by side.
+
+    Left and right are on the sides [T, P, J] of the nearest of the skeleton's times.
+    """
+    nearest = np.searchsorted((t_ns[:-1] + t_ns[1:]) // 2, camera.frame_t_ns)
+    xy, confidence = on_sides(*sightings_of(camera, found, c, choice[:, c]), sides[nearest])
     frames = len(camera.frame_t_ns)
     position, rotation = camera.poses_at(camera.frame_t_ns, **limits)
     return Sighting(
-        t_s=(camera.frame_t_ns - begin_ns) / 1e9,
+        t_s=(camera.frame_t_ns - t_ns[0]) / 1e9,
         xy=xy.reshape(frames, -1, 2),
         confidence=np.nan_to_num(confidence.reshape(frames, -1)),
         position=position,

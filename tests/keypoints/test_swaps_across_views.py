@@ -9,6 +9,7 @@ from pipelines.geometry.cameras import undistort
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.keypoints.swaps import Pair, mirrored_pairs
 from pipelines.keypoints.swaps_across_views import swaps_across_views
+from pipelines.reconstruction.observations import on_sides
 from pipelines.session.records import Float
 from pipelines.simulation.drone_paths import look_at
 from pipelines.simulation.observe import see
@@ -39,9 +40,10 @@ class Views:
         self.xy = np.moveaxis(undistort(self.pixels, LENS), 0, 2)
 
     def undone(self, xy: Float) -> tuple[Float, dict[str, int]]:
-        found, _, counts = swaps_across_views(
-            xy, np.ones(xy.shape[:-1]), self.position, self.rotation, self.sigma, COCO17
-        )
+        sides, counts = swaps_across_views(xy, self.position, self.rotation, self.sigma, COCO17)
+        seen = np.ones(xy.shape[:-1])
+        found, kept = (values[:, 0] for values in on_sides(xy[:, None], seen[:, None], sides[:, None]))
+        assert ((sides >= 0) == (kept == 1)).all()
         return found, counts
 
 
