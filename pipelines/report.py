@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from pipelines.formats.pictures import Picture, Pictures, open_pictures
+from pipelines.keypoints.calibration import with_probabilities
 from pipelines.reporting.content import ReplanContent, SessionContent, section
 from pipelines.reporting.page import render_page
 from pipelines.session.description import read_description
@@ -27,7 +28,7 @@ from pipelines.session.tables import (
     read_table,
 )
 
-REPORT = Stage("report", revision=2)
+REPORT = Stage("report", revision=3)
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,9 @@ def report(folder: Path, *, force: bool = False) -> Reported:
     with locked(folder) as session:
         records = _finished_stages(session)
         inputs = {name: digest for record in records.values() for name, digest in record.outputs.items()}
+        inputs |= {
+            f"key of {name}": record.key for name, record in records.items()
+        }  # their settings are shown
         settings = {"name": session_name(folder), "pictures": _pictures_there(folder)}
         run = session.begin(REPORT, settings=settings, inputs=inputs, force=force)
         page = folder / "report" / "index.html"
@@ -102,11 +106,20 @@ def _load(folder: Path, records: dict[str, StageRecord]) -> SessionContent:
     reconstructed = "reconstruct" in records
     has_truth = description.truth is not None and bool(description.truth.joints)
     keypoints = {
-        name: folder / "cameras" / name for name, entry in description.cameras.items() if entry.keypoints
+        name: read_table(folder / "cameras" / name / "keypoints.parquet", KEYPOINTS)
+        for name, entry in description.cameras.items()
+        if entry.keypoints
     }
     if "detect" in records:
-        detected = records["detect"].counts["cameras"]
-        keypoints |= {name: folder / "detect" / name for name in detected if name not in keypoints}
+        detected = records["detect"]
+        keypoints |= {
+            name: with_probabilities(
+                read_table(folder / "detect" / name / "keypoints.parquet", KEYPOINTS),
+                detected.settings["detector"],
+            )
+            for name in detected.counts["cameras"]
+            if name not in keypoints
+        }
     return SessionContent(
         name=session_name(folder),
         session=description.model_dump(mode="json", by_alias=True),
@@ -121,9 +134,7 @@ def _load(folder: Path, records: dict[str, StageRecord]) -> SessionContent:
             name: read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
             for name in description.cameras
         },
-        keypoints={
-            name: read_table(place / "keypoints.parquet", KEYPOINTS) for name, place in keypoints.items()
-        },
+        keypoints=keypoints,
         stages={name: asdict(record) for name, record in records.items()},
         replan=_load_replan(folder, records["replan"]) if "replan" in records else None,
     )

@@ -1,0 +1,53 @@
+"""What a detector's confidences are worth decides in pictures of a reconstruction as in itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pipelines.overlay
+import pipelines.reporting.overlays
+from pipelines.ingest import ingest
+from pipelines.keypoints.calibration import Calibration, write_calibration
+from pipelines.overlay import write_overlays
+from pipelines.reconstruct import Settings, reconstruct
+from pipelines.report import report
+from pipelines.reporting.overlays import FilmedCamera, views_of
+from tests.keypoints.spotted_flights import CAMERAS, spot_detector, write_spotted_flight
+
+
+def test_only_keypoints_that_the_reconstruction_used_are_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Wrists are worth 0.1 whatever the detector says, less than is used; all others 0.9.
+    knots = {name: np.array([[0.5, worth, 100.0]]) for name, worth in (("*", 0.9), ("wrist", 0.1))}
+    measured = tmp_path / "measured.csv"
+    write_calibration(measured, Calibration("a test", "near", knots))
+    for place in ("pipelines.keypoints.calibration", "pipelines.reconstruct"):
+        monkeypatch.setattr(f"{place}.measured_for", lambda _: measured)
+    session = tmp_path / "flight.session"
+    ingest(write_spotted_flight(tmp_path, 6), session)
+    made = reconstruct(session, Settings(detector=spot_detector(tmp_path)))
+    assert made.metrics["per_joint"]["left_wrist"]["reconstructed_share"] == 0
+    assert made.metrics["per_joint"]["left_elbow"]["reconstructed_share"] == 1
+
+    drawn: list[FilmedCamera] = []
+
+    def watched(camera: FilmedCamera, *others: object) -> object:
+        drawn.append(camera)
+        return views_of(camera, *others)  # type: ignore[arg-type]
+
+    for module in (pipelines.overlay, pipelines.reporting.overlays):
+        monkeypatch.setattr(module, "views_of", watched)
+        drawn.clear()
+        if module is pipelines.overlay:
+            write_overlays(session)
+        else:
+            report(session)
+        assert {camera.name for camera in drawn} == set(CAMERAS)
+        for camera in drawn:
+            joints = set(camera.keypoints["joint"])
+            assert "left_elbow" in joints
+            assert not joints & {"left_wrist", "right_wrist"}
