@@ -70,7 +70,7 @@ def load_cameras(
         folder: the session.
         description: its session.json.
         detected: the record of the detector's stage, if it ran.
-        min_confidence: keypoints below are not used.
+        min_confidence: keypoints below are not used, by their detector's own confidence.
         pose_noise: what is known of the poses' errors, in place of what the flight says.
         calibrated: what the detector's own confidences [N] of joints [N] are worth; they are taken as they
             are without it, as those of imported keypoints always are.
@@ -119,10 +119,10 @@ def _load_camera(
     trajectory = trajectory_from(read_table(tables / "poses.parquet", POSES))
     frames = read_table(tables / "frames.parquet", FRAMES).iloc[source.looked_at]
     keypoints = read_table(source.table, KEYPOINTS)
-    if calibrated is not None and entry.keypoints is None:
-        raw = keypoints["confidence"].to_numpy(np.float64)
-        keypoints["confidence"] = calibrated(raw, keypoints["joint"].to_numpy(str))
     confident = keypoints[keypoints["confidence"] >= min_confidence]
+    if calibrated is not None and entry.keypoints is None:
+        raw, joint = confident["confidence"].to_numpy(np.float64), confident["joint"].to_numpy(str)
+        confident = confident.assign(confidence=calibrated(raw, joint))
     detections = detections_from(confident, joints)
     detections, crowd = most_confident(detections, _MOST_PEOPLE)
     if crowd:
