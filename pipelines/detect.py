@@ -144,13 +144,26 @@ def detect(
             raise
     counts = _assemble(run.folder, media, blocks, folders)
     if not any(camera["detections"] for camera in counts.values()):
+        lost = sum(camera["undecoded"] for camera in counts.values())
         raise DataError(
-            session.folder, "nobody was found in any picture", "look at the pictures, or give keypoints"
+            session.folder,
+            "nobody was found in any picture" + (f": {lost} of {pictures} cannot be decoded" if lost else ""),
+            "look at the pictures, or give keypoints",
         )
     joints = list(read_json(folders[0] / "counts.json")["joints"])
     rows = {name: list(work.span(name)) for name in media}
     progress.note(f"keypoints detected by {chosen.title}")
-    return run.publish(counts={"detector": chosen.title, "joints": joints, "cameras": counts, "rows": rows})
+    warnings = [
+        f"{name}: {gone} of {gone + camera.get('frames', 0)} pictures cannot be decoded"
+        for name, camera in counts.items()
+        if (gone := camera["undecoded"])
+    ]
+    for warning in warnings:
+        progress.note(warning)
+    return run.publish(
+        counts={"detector": chosen.title, "joints": joints, "cameras": counts, "rows": rows},
+        warnings=warnings,
+    )
 
 
 def _inputs(

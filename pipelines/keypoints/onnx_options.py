@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -104,6 +105,8 @@ def _three(place: str, value: str) -> Three:
         red, green, blue = (float(part) for part in value.split("/"))
     except ValueError:
         raise DataError(place, "is not three numbers", "write 123.675/116.28/103.53") from None
+    if not all(math.isfinite(number) for number in (red, green, blue)):
+        raise DataError(place, "is not finite", "write 123.675/116.28/103.53")
     return red, green, blue
 
 

@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from pipelines.detect import detect
+from pipelines.formats.video import VideoReader
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
 from pipelines.session.stages import StageRecord, locked
@@ -41,3 +42,22 @@ def test_only_the_pictures_of_the_span_are_looked_at(tmp_path: Path) -> None:
     assert run(None, 20 / FPS).key != run(None, None).key
     with pytest.raises(DataError, match="no picture lies in the flight from 9 s on"):
         run(9.0, None)
+
+
+def test_pictures_that_cannot_be_decoded_are_spoken_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = tmp_path / "flight.session"
+    ingest(write_spotted_flight(tmp_path, 6), session)
+    detector, read = spot_detector(tmp_path), VideoReader.read
+    damaged = {2, 3}
+    monkeypatch.setattr(
+        VideoReader, "read", lambda self, number: None if number in damaged else read(self, number)
+    )
+    with locked(session) as writable:
+        record = detect(writable, detector=detector)
+    assert record is not None
+    assert record.warnings == [f"{name}: 2 of 6 pictures cannot be decoded" for name in CAMERAS]
+    damaged |= set(range(6))
+    with locked(session) as writable, pytest.raises(DataError, match="12 of 12 cannot be decoded"):
+        detect(writable, detector=detector, force=True)

@@ -165,6 +165,8 @@ def test_what_decides_the_result_is_in_the_name_and_paths_are_not(tmp_path: Path
         ("size=192", "is no size"),
         ("mean=1/2", "is not three numbers"),
         ("std=1/0/1", "must be above 0"),
+        ("mean=nan/0/0", "is not finite"),
+        ("std=1/inf/1", "is not finite"),
         ("heatmap=other", "there are udp, msra"),
         ("magic=1", "no option 'magic'"),
         ("layout=nchw,layout=nhwc", "states layout twice"),
