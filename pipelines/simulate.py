@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from functools import partial
 from pathlib import Path
 from threading import Event
@@ -50,6 +51,7 @@ from pipelines.simulation.world.scene import World
 
 _REVISION = 3
 _MARK = "simulation.json"
+_OWN = ("drone*", "flight.yaml", "true_poses.yaml", "scenario.yaml", "site.*", "truth", _MARK)
 _BLOCK = 60  # pictures that are rendered and encoded together, and kept when the work is interrupted
 _RECEIVED_NS = 2_000_000  # after a message's own stamp, by the recorder on board
 _CAMERA_INFO_NS = 1_000_000_000
@@ -80,10 +82,10 @@ def simulate(
 
     Args:
         scenario_path: the scenario.
-        folder: where to; an earlier simulation there is replaced.
+        folder: where to; an earlier simulation there is replaced if nothing else lies beside its files.
         video: render videos; else keypoints with the errors of a detector take their place.
         workers: pictures rendered at once; logs, truth and pictures do not depend on them.
-        overwrite: replace a folder that is no simulation.
+        overwrite: replace a folder that is no simulation, or holds more than one.
         force: do it again although nothing changed.
         progress: who watches.
 
@@ -96,6 +98,8 @@ def simulate(
     key = _key(scenario, scenario_path, video)
     if not force and is_made(folder, key, mark=_MARK):
         return Simulated(folder, read_json(folder / _MARK), skipped=True)
+    if not overwrite:
+        _refuse_to_lose_others(folder)
     noise = noise_models(f"{scenario_path}: drones.pose_noise", scenario.drones.pose_noise)
     bvh = _bvh(scenario, scenario_path)
     planner = _planner(scenario, scenario_path)
@@ -127,6 +131,19 @@ def simulate(
         write_json(making.folder / _MARK, summary)
         making.publish()
     return Simulated(folder, summary, skipped=False)
+
+
+def _refuse_to_lose_others(folder: Path) -> None:
+    """A session that was made beside its flight.yaml would go with the old flight."""
+    if not (folder / _MARK).is_file():
+        return  # whole_folder looks at what is no simulation
+    names = sorted(path.name for path in folder.iterdir())
+    if others := [name for name in names if not any(fnmatch(name, own) for own in _OWN)]:
+        raise DataError(
+            folder,
+            f"holds more than an earlier flight ({len(others)} entries, the first {others[0]})",
+            "move that away, choose another place with --output, or replace all of it with --overwrite",
+        )
 
 
 def _key(scenario: Scenario, path: Path, video: bool) -> str:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel
+from pipelines.session.errors import DataError
 from pipelines.session.records import SkeletalMotion
 from pipelines.simulation.body import Person, make_body
 from pipelines.simulation.detector_errors import detect_keypoints, view_of
@@ -94,7 +95,8 @@ def fly_scenario(
             truly is, whatever stands in the way.
 
     Raises:
-        DataError: the world cannot be built, or the motion is not that of a person.
+        DataError: the world cannot be built, the motion is not that of a person, or the flight is over
+            before a drone takes its first picture.
     """
     seed = scenario.seed
     person = make_body(scenario.actor.body)
@@ -237,11 +239,18 @@ def _drone(
     span_s: tuple[float, float],
 ) -> SimulatedDrone:
     drones, seed = scenario.drones, scenario.seed
-    frames_ns = frame_times(drones.camera, scenario.duration_s, np.random.default_rng([seed, _FRAMES, index]))
+    name, lens_spec = f"drone{index + 1}", drones.camera
+    frames_ns = frame_times(lens_spec, scenario.duration_s, np.random.default_rng([seed, _FRAMES, index]))
+    if not len(frames_ns):
+        raise DataError(
+            "duration_s",
+            f"{name} takes no picture within {scenario.duration_s:g} s at {lens_spec.rate_hz:g} Hz",
+            "film longer, or more often",
+        )
     at_log = sample_log(paths, index, drones.odometry_hz, span_s, np.random.default_rng([seed, _LOG, index]))
     offsets = drones.clock_offsets_s
     return SimulatedDrone(
-        name=f"drone{index + 1}",
+        name=name,
         intrinsics=lens,
         clock_offset_s=offsets[index] if index < len(offsets) else 0.0,
         at_frames=poses_at(paths, index, frames_ns),

@@ -18,11 +18,10 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
             truth only under `truth`.
     """
     scenario = flight.scenario
-    name = scenario.name.replace("\\", "\\\\").replace('"', '\\"')
     lines = [
         "# Simulated by `mocap simulate` from scenario.yaml; simulation.json says how.",
         "schema: 1",
-        f'name: "{name}"',
+        f"name: {_quoted(scenario.name)}",
         "world: {frame: enu}",
         "logs:",
         *(f"  {drone.name}: {{path: {drone.name}.mcap}}" for drone in flight.drones),
@@ -40,6 +39,12 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
         "",
     ]
     return "\n".join(lines)
+
+
+def _quoted(text: str) -> str:
+    """Any text as a scalar of YAML on one line."""
+    plain = text.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in plain) + '"'
 
 
 def _pictures(flight: SimulatedFlight, drone: SimulatedDrone, video: bool) -> list[str]:

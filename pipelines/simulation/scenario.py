@@ -10,13 +10,16 @@ import math
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from pipelines.session.manifest import SecondsAsNs
 from pipelines.session.yaml_models import Part, read_yaml_model
 
 SCHEMA = 1
 _MOST_VOXELS = 20_000_000
+_FARTHEST_VOXEL = 32_768  # from the origin along an axis, in an OctoMap
+# Logs begin before the flight and clocks run off; stamps in ROS are neither negative nor after January 2038.
+_EARLIEST_NS, _LATEST_NS = 60 * 10**9, (2**31 - 60) * 10**9
 
 Place = Annotated[list[Annotated[float, Field(ge=-10_000, le=10_000)]], Field(min_length=2, max_length=2)]
 """East and north, m."""
@@ -57,7 +60,7 @@ class Travel(Part):
 class Stand(Part):
     """Stay, breathing and swaying a little."""
 
-    seconds: Seconds
+    seconds: float = Field(ge=0.05, le=3600)
 
 
 class Turn(Part):
@@ -101,13 +104,19 @@ class Step(Part):
     kick: Kick | None = None
 
 
+def _is_path(text: str) -> str:
+    if not text or "\0" in text:
+        raise ValueError("is no path of a file")
+    return text
+
+
 class Motion(Part):
     """What the actor does one after another, or a BVH file. Whoever is done stands still, or begins again."""
 
     shorthand = "steps"
     one_of = ("steps", "bvh")
     steps: Annotated[list[Step], Field(min_length=1, max_length=1000)] | None = None
-    bvh: str | None = None
+    bvh: Annotated[str, AfterValidator(_is_path)] | None = None
     unit: Literal["m", "cm", "mm", "inch"] = "cm"  # of the BVH file
     axes: Literal["y-up", "z-up"] = "y-up"
     repeat: bool = False
@@ -197,6 +206,12 @@ class World(Part):
                 f"map: {voxels:.3g} voxels are more than {_MOST_VOXELS:,}: take a coarser resolution_m, "
                 "a smaller ground or a lower height_m"
             )
+        reach_m = max(map(abs, self.ground.centre)) + self.ground.size_m / 2
+        if max(reach_m, self.map.height_m) / self.map.resolution_m > _FARTHEST_VOXEL - 1:
+            raise ValueError(
+                f"map: it reaches {max(reach_m, self.map.height_m):g} m from the origin, further than "
+                f"{_FARTHEST_VOXEL:,} voxels: take a coarser resolution_m or a ground nearer to the origin"
+            )
         if self.sun[2] <= 0.1:
             raise ValueError("sun: it must stand above the horizon: z above 0.1")
         return self
@@ -269,6 +284,12 @@ class Scenario(Part):
     world: World = World()
     drones: Drones = Drones()
     keypoints: DetectorErrors = DetectorErrors()
+
+    @model_validator(mode="after")
+    def _has_stamps(self) -> Scenario:
+        if not _EARLIEST_NS <= self.start_ns <= _LATEST_NS - self.duration_s * 1e9:
+            raise ValueError("start: stamps in ROS lie between 1970 and January 2038, the flight does not")
+        return self
 
     @model_validator(mode="after")
     def _an_offset_for_each(self) -> Scenario:

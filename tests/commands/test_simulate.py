@@ -200,6 +200,46 @@ def test_a_flight_that_is_there_is_not_made_again(tmp_path: Path) -> None:
     assert "--overwrite" in line
 
 
+def test_what_was_made_beside_a_flight_does_not_go_with_it(tmp_path: Path) -> None:
+    flight = simulated(tmp_path, SMALL, "--no-video")
+    succeeds("ingest", flight)
+    session = flight.with_suffix(".session")
+    again = (
+        "simulate",
+        scenario(tmp_path, SMALL.replace("Small", "Other")),
+        "-o",
+        flight.parent,
+        "--no-video",
+    )
+    line = refused(*again, "--force")
+    assert session.name in line
+    assert "--overwrite" in line
+    assert session.is_dir()
+    succeeds(*again, "--overwrite")
+    assert not session.exists()
+
+
+def test_any_name_reads_back(tmp_path: Path) -> None:
+    """Quotes, line breaks and control characters stay inside of the manifest's one scalar."""
+    name = 'said "hi" \\ \n#: {a}\t\x07\x7f\x85\u2028\ufeff \U0001f6b6'
+    text = SMALL.replace("name: Small", f"name: {json.dumps(name)}".replace("\x7f", "\\x7f"))
+    text = text.replace("\\ud83d\\udeb6", "\\U0001f6b6")  # JSON has pairs of surrogates, YAML has not
+    stated = json.loads(succeeds("ingest", simulated(tmp_path, text, "--no-video"), "--json"))
+    assert stated["flight"] == name
+
+
+def test_ways_to_where_the_actor_stands_are_no_ways(tmp_path: Path) -> None:
+    for name, motion in {
+        "once": "[walk: {to: [0, 0]}]",
+        "again": "{steps: [walk: {to: [0, 0]}], repeat: true}",
+    }.items():
+        (tmp_path / name).mkdir()
+        text = SMALL.replace("[walk: {distance_m: 5}]", motion).replace("duration_s: 2", "duration_s: 1")
+        flight = simulated(tmp_path / name, text, "--no-video")
+        joints = pd.read_csv(flight.parent / "truth" / "joints.csv")
+        assert len(joints) > 0
+
+
 @pytest.mark.slow
 def test_an_interrupted_rendering_goes_on_where_it_was(tmp_path: Path) -> None:
     path = scenario(tmp_path, SMALL.replace("duration_s: 2", "duration_s: 5"))
@@ -279,6 +319,11 @@ HOSTILE = {
     "an odd picture": ("width: 320", "width: 321", "width"),
     "more offsets than drones": ("[0, 0.12]", "[0, 0.12, 0.3]", "clock_offsets_s"),
     "newer schema": ("schema: 1", "schema: 2", "schema"),
+    "a flight shorter than a picture": ("duration_s: 2", "duration_s: 0.001", "no picture"),
+    "before the epoch": ("duration_s: 2", "duration_s: 2\nstart: 0", "start"),
+    "after what ROS can say": ("duration_s: 2", "duration_s: 2\nstart: 2147483647", "start"),
+    "no rest between repetitions": ("[walk: {distance_m: 5}]", "[stand: {seconds: 1.0e-9}]", "seconds"),
+    "a BVH that no system can name": ("[walk: {distance_m: 5}]", '{bvh: "a\\0b"}', "bvh"),
     "a BVH that is not there": ("[walk: {distance_m: 5}]", "{bvh: dance.bvh}", "dance.bvh"),
 }
 
@@ -290,6 +335,12 @@ def test_hostile_scenarios_get_one_line(tmp_path: Path, case: str) -> None:
     path = scenario(tmp_path, SMALL.replace(old, new))
     assert said in refused("simulate", path, "-o", tmp_path / "flight", "--no-video")
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["scenario.yaml"]
+
+
+def test_a_map_that_octomap_cannot_hold_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    world = "world: {ground: {size_m: 30, centre: [0, -9999]}, map: {resolution_m: 0.25}}\ndrones:"
+    path = scenario(tmp_path, EXACT.replace("drones:", world))
+    assert "32,768 voxels" in refused("simulate", path, "-o", tmp_path / "flight", "--no-video")
 
 
 def test_no_yaml_and_no_file(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ _LAST_STEPS_CADENCE = 1.5
 _REACH = 0.72  # of the leg, ahead or behind: a foot farther away is lifted
 _SHORTER_UPHILL = 0.9  # cadence rises by this times the slope
 _STILL_M, _STILL_RAD = 0.01, np.radians(2.0)
+_LOOKED_AHEAD = 400  # moments, 2 s
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,8 @@ class Plan:
         phase = self._phase(knots, least)
         lasting = stretch.end_s - stretch.start_s
         fine = np.linspace(-3.0, lasting + 5.0, int((lasting + 8.0) / 0.005))
-        places, _ = stretch.at(stretch.start_s + fine)
+        moments_s = stretch.start_s + fine
+        places, _ = stretch.at(moments_s)
         # Steps are shorter where it is steep.
         climbed = np.abs(np.diff(self.ground(places))) / np.maximum(
             np.hypot(*np.diff(places, axis=0).T), 1e-9
@@ -199,9 +201,13 @@ class Plan:
 
         def outrun(step: Footstep) -> float:
             """When the body is as far from a foot as a leg reaches."""
-            far = np.hypot(*(places - step.place).T) > _REACH * self.leg_m
-            later = np.flatnonzero(far & (stretch.start_s + fine > step.strike_s + 0.1))
-            return stretch.start_s + float(fine[later[0]]) if len(later) else np.inf
+            soonest = int(np.searchsorted(moments_s, step.strike_s + 0.1, side="right"))
+            for begin in range(soonest, len(fine), _LOOKED_AHEAD):  # long ways have many steps
+                ahead = slice(begin, begin + _LOOKED_AHEAD)
+                far = np.hypot(*(places[ahead] - step.place).T) > _REACH * self.leg_m
+                if far.any():
+                    return float(moments_s[begin + int(far.argmax())])
+            return np.inf
 
         landed, number = 0, 0
         while (landed < 2) if count is None else (number < count):

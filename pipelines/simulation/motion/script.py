@@ -62,6 +62,8 @@ def _once(steps: Sequence[Step], rig: Rig, plan: Plan, end_s: float) -> None:
             plan.travel(parts)
             plan.stay(_PAUSE_S)
             continue
+        if not waiting:  # ways to where the actor stands already
+            break
         step = waiting.pop(0)
         if step.stand:
             plan.stay(step.stand.seconds)
