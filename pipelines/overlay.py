@@ -21,7 +21,6 @@ import numpy as np
 
 from pipelines.formats.pictures import Picture, open_pictures
 from pipelines.formats.video_writing import TICK_S, join_videos, write_h264
-from pipelines.keypoints.calibration import with_probabilities
 from pipelines.reporting.frame_drawing import blank_frame, caption_of, draw_frame, padded_to_even
 from pipelines.reporting.motion import Motion, motion_from_skeleton
 from pipelines.reporting.overlays import FilmedCamera, status_at, views_of
@@ -38,7 +37,7 @@ from pipelines.session.whole_folders import Making, is_made, whole_folder
 if TYPE_CHECKING:
     import pandas as pd
 
-_REVISION = 2
+_REVISION = 3
 _MARK = "overlay.json"
 _BLOCK = 300  # pictures that are drawn and encoded together, and kept when the work is interrupted
 _TICK_NS = int(TICK_S * 10**9) + 1
@@ -253,8 +252,6 @@ def _camera(
     entry, bounds = description.cameras[name], description.pose_interpolation
     stage = "cameras" if entry.keypoints is not None else "detect"
     keypoints = read_table(folder / stage / name / "keypoints.parquet", KEYPOINTS)
-    if entry.keypoints is None:
-        keypoints = with_probabilities(keypoints, record.settings["detector"])
     logged = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
     return FilmedCamera(
         name=name,

@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 
 from pipelines.formats.pictures import Picture, Pictures, open_pictures
-from pipelines.keypoints.calibration import with_probabilities
 from pipelines.reporting.content import ReplanContent, SessionContent, section
 from pipelines.reporting.page import render_page
 from pipelines.session.description import read_description
@@ -111,13 +110,9 @@ def _load(folder: Path, records: dict[str, StageRecord]) -> SessionContent:
         if entry.keypoints
     }
     if "detect" in records:
-        detected = records["detect"]
         keypoints |= {
-            name: with_probabilities(
-                read_table(folder / "detect" / name / "keypoints.parquet", KEYPOINTS),
-                detected.settings["detector"],
-            )
-            for name in detected.counts["cameras"]
+            name: read_table(folder / "detect" / name / "keypoints.parquet", KEYPOINTS)
+            for name in records["detect"].counts["cameras"]
             if name not in keypoints
         }
     return SessionContent(

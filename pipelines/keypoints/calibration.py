@@ -13,16 +13,12 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 _MEASURED = Path(__file__).parent / "data"
 COLUMNS = ("joints", "confidence", "probability", "count")
@@ -70,18 +66,6 @@ def measured_for(detector: str) -> Path | None:
     """Where the calibration of a detector lies, if its confidences were measured."""
     path = _MEASURED / f"{detector}_confidence.csv"
     return path if path.is_file() else None
-
-
-def with_probabilities(keypoints: pd.DataFrame, detector: str) -> pd.DataFrame:
-    """What a detector found, as `tables.KEYPOINTS`, with probabilities where its confidences were measured.
-
-    This is what a reconstruction weighs and compares with its least confidence.
-    """
-    path = measured_for(detector)
-    if path is None:
-        return keypoints
-    raw, joint = keypoints["confidence"].to_numpy(np.float64), keypoints["joint"].to_numpy(str)
-    return keypoints.assign(confidence=read_calibration(path).probabilities(raw, joint))
 
 
 def fit(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,7 +15,6 @@ from pipelines.keypoints.calibration import (
     isotonic,
     measured_for,
     read_calibration,
-    with_probabilities,
     write_calibration,
 )
 from pipelines.session.errors import DataError
@@ -118,15 +116,3 @@ def test_keypoints_in_any_order_are_worth_the_same() -> None:
     # What the detector is sure of is right more often than not, and the other way round.
     assert calibration.probability(np.array([[0.9]]), ("left_knee",))[0, 0] > 0.9
     assert calibration.probability(np.array([[0.2]]), ("left_knee",))[0, 0] < 0.5
-
-
-def test_a_table_of_keypoints_says_what_they_are_worth() -> None:
-    path = measured_for("blazepose")
-    assert path is not None
-    raw = pd.DataFrame({"joint": ["nose", "left_wrist"], "x": [1.0, 2.0], "confidence": [0.4, 0.4]})
-    worth = with_probabilities(raw, "blazepose")
-    expected = read_calibration(path).probability(np.full((1, 2), 0.4), ["nose", "left_wrist"])[0]
-    assert worth["confidence"].tolist() == expected.tolist()
-    assert worth["x"].tolist() == raw["x"].tolist()
-    # Of another detector nothing was measured.
-    assert with_probabilities(raw, "onnx:somebody's").equals(raw)
