@@ -38,6 +38,7 @@ lint: setup
 
 bench: setup
 	$(BIN)/python -m benchmarks.triangulation
+	$(BIN)/python -m benchmarks.association
 	$(BIN)/python -m benchmarks.loss
 	$(BIN)/python -m benchmarks.ingest_log
 	$(BIN)/python -m benchmarks.planning
