@@ -140,6 +140,7 @@ def ingest(
             description = Description(
                 schema_version=1,
                 flight=flight.name,
+                simulated=flight.simulated,
                 clock_reference=flight.reference_camera,
                 pose_interpolation=interpolation,
                 cameras=entries,

@@ -154,7 +154,7 @@ def tables(summary: Mapping[str, Any]) -> list[Table]:
     head, columns = _heads(summary)
     first = summary["settings"]["methods"][0] if summary["study"] == "noise" else columns[0]
     told = []
-    for name, title in [*METRICS.items(), ("ratio", f"MPJPE relative to {first}")]:
+    for name, title in [*METRICS.items(), ("ratio", f"MPJPE relative to {first}, on common joint-frames")]:
         rows = [[*label, *(_text(cell, name) for cell in cells)] for label, cells in _lines(summary)]
         told.append(Table(title, [*head, *columns], rows))
     return told

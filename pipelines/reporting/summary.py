@@ -271,7 +271,7 @@ _KNOWN_MEASURES = (
     ("root_frames_left_out", "Frames without root", "", 0, "left out of the root-relative error"),
     ("pa_frames_left_out", "Frames not aligned", "", 0, "too few joints in common for PA-MPJPE"),
 )
-_STATED_ELSEWHERE = {"reconstructed_share", "joint_frames", "schema"}
+_STATED_ELSEWHERE = {"reconstructed_share", "reconstructed_share_of_truth", "joint_frames", "schema"}
 
 
 def give_verdict(content: SessionContent, summary: Summary) -> Verdict:

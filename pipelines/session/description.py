@@ -160,6 +160,7 @@ class Description(Entry):
 
     schema_version: int = Field(alias="schema")
     flight: str  # the name in the manifest
+    simulated: bool = False  # as the manifest states it: nobody flew
     clock_reference: str
     pose_interpolation: Interpolation
     cameras: dict[str, CameraEntry]

@@ -319,6 +319,7 @@ class Flight(Part):
     schema_version: Literal[1] = Field(alias="schema")
     name: str = Field("", max_length=1000)
     world: World = World()
+    simulated: bool = False
     clock_reference: str | None = None
     logs: dict[str, Log] = {}
     cameras: dict[str, Camera] = Field(min_length=1)

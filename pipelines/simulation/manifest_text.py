@@ -22,6 +22,7 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
         "# Simulated by `mocap simulate` from scenario.yaml; simulation.json says how.",
         "schema: 1",
         f"name: {_quoted(scenario.name)}",
+        "simulated: true",
         "world: {frame: enu}",
         "logs:",
         *(f"  {drone.name}: {{path: {drone.name}.mcap}}" for drone in flight.drones),

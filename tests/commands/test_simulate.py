@@ -116,6 +116,7 @@ def test_videos_have_the_frames_that_were_kept_and_workers_do_not_matter(tmp_pat
     camera = stated["cameras"]["drone2"]
     assert camera["frames"]["count"] == summary["frames"]["drone2"]
     assert (camera["intrinsics"]["width"], camera["intrinsics"]["height"]) == (320, 180)
+    assert stated["simulated"] is True
     assert stated["map"] is not None
     assert stated["actor"] is not None
 
