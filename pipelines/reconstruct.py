@@ -129,6 +129,12 @@ def reconstruct(
             workers=workers,
             progress=progress,
         )
+        if detected is None and (settings.start_s, settings.end_s) != (None, None):
+            raise DataError(
+                folder,
+                "every camera came with keypoints: no picture is looked at",
+                "leave --start and --end out",
+            )
         inputs = dict(ingested.outputs) | (detected.outputs if detected else {})
         measured = measured_for(detected.settings["detector"]) if detected else None
         if measured is not None:

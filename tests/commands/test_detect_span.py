@@ -12,7 +12,9 @@ from pipelines.formats.video import VideoReader
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
 from pipelines.session.stages import StageRecord, locked
+from tests.commands.runner import refused, succeeds
 from tests.keypoints.spotted_flights import CAMERAS, FPS, spot_detector, write_spotted_flight
+from tests.synthetic.flights import write_flight
 
 
 def test_only_the_pictures_of_the_span_are_looked_at(tmp_path: Path) -> None:
@@ -61,3 +63,11 @@ def test_pictures_that_cannot_be_decoded_are_spoken_of(
     damaged |= set(range(6))
     with locked(session) as writable, pytest.raises(DataError, match="12 of 12 cannot be decoded"):
         detect(writable, detector=detector, force=True)
+
+
+def test_a_span_without_pictures_to_look_at_is_refused(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path)
+    succeeds("ingest", flight.manifest)
+    session = flight.manifest.with_suffix(".session")
+    assert "every camera came with keypoints" in refused("reconstruct", session, "--start", "1")
+    succeeds("reconstruct", session)
