@@ -1,0 +1,82 @@
+"""From latitude, longitude and height to metres east, north and up of a place (WGS84).
+
+By way of earth-centred, earth-fixed coordinates (ECEF: x to the meridian of Greenwich, z to the north
+pole), in closed form: exact at any distance, where "metres per degree" is off by 0.1 % within some
+kilometres. Formulas: IOGP Guidance Note 7-2 (EPSG methods 9602 and 9837), whose worked examples the tests
+repeat. NaN in gives NaN out.
+
+Heights are metres above the ellipsoid. Heights above sea level may be given where all are: they move
+everything up or down together, and stretch horizontal distances by less than 2e-5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+_SEMI_MAJOR_M = 6_378_137.0
+_FLATTENING = 1 / 298.257223563
+_ECCENTRICITY_SQUARED = _FLATTENING * (2 - _FLATTENING)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A point on Earth, WGS84."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+
+
+def ecef_from_geodetic(latitude_deg: Float, longitude_deg: Float, altitude_m: Float) -> Float:
+    """Earth-centred coordinates [..., 3] m of points on Earth; arguments broadcast."""
+    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
+    # The radius of curvature in the prime vertical.
+    normal_m = _SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)
+    from_axis = (normal_m + altitude_m) * np.cos(latitude)
+    z = ((1 - _ECCENTRICITY_SQUARED) * normal_m + altitude_m) * np.sin(latitude)
+    return np.stack(
+        np.broadcast_arrays(from_axis * np.cos(longitude), from_axis * np.sin(longitude), z), axis=-1
+    )
+
+
+def enu_from_geodetic(latitude_deg: Float, longitude_deg: Float, altitude_m: Float, origin: Place) -> Float:
+    """Metres [..., 3] east, north and up of a place, of points on Earth; arguments broadcast."""
+    from_centre = ecef_from_geodetic(latitude_deg, longitude_deg, altitude_m) - _ecef_of(origin)
+    turned: Float = from_centre @ _enu_axes(origin).T
+    return turned
+
+
+def enu_from_enu(of: Place, origin: Place) -> tuple[Float, Float]:
+    """What takes metres east, north and up of one place to those of another.
+
+    Returns:
+        The rotation [3, 3] (north is not the same direction at both, nor is up) and the position [3] m of
+        the first in the second.
+    """
+    axes = _enu_axes(origin)
+    return axes @ _enu_axes(of).T, axes @ (_ecef_of(of) - _ecef_of(origin))
+
+
+def _ecef_of(place: Place) -> Float:
+    return ecef_from_geodetic(
+        np.asarray(place.latitude_deg), np.asarray(place.longitude_deg), np.asarray(place.altitude_m)
+    )
+
+
+def _enu_axes(place: Place) -> Float:
+    """East, north and up [3, 3] at a place, a row each, in earth-centred coordinates."""
+    latitude, longitude = np.radians(place.latitude_deg), np.radians(place.longitude_deg)
+    sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
+    sin_lon, cos_lon = np.sin(longitude), np.cos(longitude)
+    return np.array(
+        [
+            [-sin_lon, cos_lon, 0.0],
+            [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+            [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
+        ]
+    )
