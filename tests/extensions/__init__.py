@@ -1,0 +1,1 @@
+"""What docs/extending.md shows, added from outside the package."""
