@@ -2,8 +2,8 @@
 
     python docs/diagram.py
 
-Rows are the layers that the import contracts of pyproject.toml keep. An arrow from a box to one below means that
-some module in it imports one there; each step of thickness stands for twice as many.
+Rows are the layers that the import contracts of pyproject.toml keep. An arrow from a box to one below
+means that some module in it imports one there; each step of thickness stands for twice as many.
 """
 
 from __future__ import annotations
