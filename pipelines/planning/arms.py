@@ -186,7 +186,7 @@ def _all_states(yaws: Float, tilts: Float, ranges: Float) -> Float:
 def _path(t_s: float, commanded: Float, slots: Float, config: PlannerConfig) -> FormationPath:
     """From the commanded slots [n, 3] through slots [T, n, 3], each turn the shorter way round."""
     through = np.concatenate([commanded[None], slots])
-    turns = wrapped(np.diff(through[..., YAW], axis=0))
-    through[1:, :, YAW] = commanded[:, YAW] + np.cumsum(turns, axis=0)
+    yaw = through[..., YAW]
+    yaw[1:] = commanded[:, YAW] + np.cumsum(wrapped(yaw[1:] - yaw[:-1]), axis=0)
     knots = t_s + config.knot_s * np.arange(len(through), dtype=np.float64)
     return FormationPath(knots, through, np.array(config.slot_rates))

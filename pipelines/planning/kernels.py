@@ -103,40 +103,77 @@ def _nearest(grid: Grid, x: float, y: float, z: float) -> float:
 
 
 @helper
-def _line_share(grid: Grid, actor: Float, camera: Float, start_m: float) -> float:
-    """Occupied share of the samples of a sight line, every half voxel at most, from `start_m` off the actor.
+def _sampling(x: float, y: float, z: float, start_m: float, side_m: float, rule: Float) -> int:
+    """How a sight line is sampled, in voxels of that side: the number of samples, every half voxel at most.
 
-    A free voxel says how far it is to the next occupied one; the samples that far are free without a look.
+    Args:
+        x: m, the camera from the actor, as the next two.
+        y: see there.
+        z: see there.
+        start_m: where the line begins.
+        side_m: of a voxel.
+        rule: [11] is filled: the first sample from the actor, the step to the next, one over it by axis,
+            samples per metre, and how many the way from a point to the centres of its voxel and of another
+            one takes at most, less half a voxel.
     """
-    lx, ly, lz = camera[0] - actor[0], camera[1] - actor[1], camera[2] - actor[2]
-    length = math.sqrt(lx * lx + ly * ly + lz * lz)
+    length = math.sqrt(x * x + y * y + z * z)
     if length <= start_m:
-        return 0.0
-    count = math.ceil((length - start_m) / (0.5 * grid.resolution_m))
-    # In voxels from here: along the line, u + along * (lx, ly, lz), and what the field says.
-    per_m = 1.0 / grid.resolution_m
-    ux = (actor[0] - grid.origin[0]) * per_m
-    uy = (actor[1] - grid.origin[1]) * per_m
-    uz = (actor[2] - grid.origin[2]) * per_m
-    lx, ly, lz = lx / length, ly / length, lz / length
-    start, step = start_m * per_m, (length - start_m) * per_m / count
-    per_step = 1.0 / step
+        return 0
+    count = math.ceil((length - start_m) / (0.5 * side_m) - 1e-9)
+    step_m = (length - start_m) / count
+    for axis, way in enumerate((x, y, z)):
+        per_m = way / (length * side_m)
+        rule[axis], rule[3 + axis] = per_m * (start_m + step_m / 2.0), per_m * step_m
+        rule[6 + axis] = 1.0 / rule[3 + axis]
+    rule[9], rule[10] = 1.0 / step_m, (_DIAGONAL - 0.5) * side_m / step_m
+    return count
+
+
+@helper
+def _samples_inside(first: float, per: float, size: int, low: float, high: float) -> tuple[float, float]:
+    """Which of the samples `low` to `high` lie in the grid along an axis; `per` is one over the step."""
+    if math.isinf(per):
+        return (low, high) if 0.0 <= first < size else (high, high)
+    one, other = -first * per, (size - first) * per
+    return max(low, min(one, other)), min(high, max(one, other))
+
+
+@helper
+def _look(d: NDArray[np.float32], x: float, y: float, z: float, rule: Float) -> tuple[bool, int]:
+    """Whether a voxel is occupied, and how many samples to either side are as it is, without a look."""
+    i = min(max(int(x), 0), d.shape[0] - 1)
+    j = min(max(int(y), 0), d.shape[1] - 1)
+    k = min(max(int(z), 0), d.shape[2] - 1)
+    distance = float(d[np.uintp(i), np.uintp(j), np.uintp(k)])
+    return distance < 0.0, max(int(abs(distance) * rule[9] - rule[10]), 0)
+
+
+@helper
+def _occupied_samples(grid: Grid, actor: Float, rule: Float, count: int) -> int:
+    """How many samples of a sight line from an actor [3] lie in occupied voxels.
+
+    A voxel's distance says how far all is alike; that many samples need no look. Taken from both ends at
+    once, because the processor can follow two leaps that do not depend on each other.
+    """
     d = grid.distance_m
-    nx, ny, nz = d.shape
-    k = occupied = 0
-    while k < count:
-        along = start + (k + 0.5) * step
-        x, y, z = ux + along * lx, uy + along * ly, uz + along * lz
-        k += 1
-        if x >= 0.0 and y >= 0.0 and z >= 0.0 and x < nx and y < ny and z < nz:
-            distance = d[np.uintp(x), np.uintp(y), np.uintp(z)] * per_m
-            # The nearest occupied centre is `distance` and half a voxel away from the centre of this one.
-            leap = (distance + (0.5 - _DIAGONAL)) * per_step
-            if distance < 0.0:
-                occupied += 1
-            elif leap >= 1.0:
-                k += int(leap)
-    return occupied / count
+    x = (actor[0] - grid.origin[0]) / grid.resolution_m + rule[0]
+    y = (actor[1] - grid.origin[1]) / grid.resolution_m + rule[1]
+    z = (actor[2] - grid.origin[2]) / grid.resolution_m + rule[2]
+    first, end = _samples_inside(x, rule[6], d.shape[0], 0.0, float(count))
+    first, end = _samples_inside(y, rule[7], d.shape[1], first, end)
+    first, end = _samples_inside(z, rule[8], d.shape[2], first, end)
+    if not first < end:
+        return 0
+    low, high = math.ceil(first), math.ceil(end)
+    occupied = 0
+    while low < high:
+        top = high - 1
+        near_is, near = _look(d, x + low * rule[3], y + low * rule[4], z + low * rule[5], rule)
+        far_is, far = _look(d, x + top * rule[3], y + top * rule[4], z + top * rule[5], rule)
+        after, before = low + 1 + near, top - far
+        occupied += near_is * (min(after, high) - low) + far_is * max(high - max(before, after), 0)
+        low, high = after, before
+    return occupied
 
 
 @cached
@@ -151,8 +188,11 @@ def sample(grid: Grid, points: Float, distance: Float, gradient: Float) -> None:
 @cached
 def line_shares(grid: Grid, actor: Float, camera: Float, start_m: float, share: Float) -> None:
     """Occupied shares [P] of the sight lines between points [P, 3] and [P, 3], written into `share`."""
+    rule = np.zeros(11)
     for p in range(actor.shape[0]):
-        share[p] = _line_share(grid, actor[p], camera[p], start_m)
+        x, y, z = camera[p, 0] - actor[p, 0], camera[p, 1] - actor[p, 1], camera[p, 2] - actor[p, 2]
+        count = _sampling(x, y, z, start_m, grid.resolution_m, rule)
+        share[p] = _occupied_samples(grid, actor[p], rule, count) / count if count else 0.0
 
 
 @cached
@@ -168,19 +208,26 @@ def slot_costs(
         eps_obs_m: the distance from which obstacles count.
         start_m: how far off the actor sight lines begin.
     """
-    shape = (actor.shape[0], offsets.shape[0], offsets.shape[1])
-    obstacle, share = np.zeros(shape), np.zeros(shape)
-    camera = np.zeros(3)
-    for t in range(shape[0]):
-        for s in range(shape[1]):
-            for i in range(shape[2]):
-                for axis in range(3):
-                    camera[axis] = actor[t, axis] + offsets[s, i, axis]
-                spare = _nearest(grid, camera[0], camera[1], camera[2]) - eps_obs_m
+    times, states, cameras = actor.shape[0], offsets.shape[0], offsets.shape[1]
+    obstacle, share = np.zeros((times, states, cameras)), np.zeros((times, states, cameras))
+    # Neighbouring sight lines follow each other, and find what they look up near at hand.
+    rules, counts = np.zeros((cameras, states, 11)), np.zeros((cameras, states), np.int64)
+    for i in range(cameras):
+        for s in range(states):
+            x, y, z = offsets[s, i]
+            counts[i, s] = _sampling(x, y, z, start_m, grid.resolution_m, rules[i, s])
+    for t in range(times):
+        for i in range(cameras):
+            for s in range(states):
+                x, y = actor[t, 0] + offsets[s, i, 0], actor[t, 1] + offsets[s, i, 1]
+                z = actor[t, 2] + offsets[s, i, 2]
+                spare = _nearest(grid, x, y, z) - eps_obs_m
                 if spare < _DIAGONAL * grid.resolution_m:
-                    distance = _interpolate(grid, camera[0], camera[1], camera[2])[0]
+                    distance = _interpolate(grid, x, y, z)[0]
                     obstacle[t, s, i] = min(max(1.0 - distance / eps_obs_m, 0.0), 1.0)
-                share[t, s, i] = _line_share(grid, actor[t], camera, start_m)
+                count = counts[i, s]
+                if count:
+                    share[t, s, i] = _occupied_samples(grid, actor[t], rules[i, s], count) / count
     return obstacle, share
 
 
