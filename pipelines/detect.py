@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from threading import Event
+from threading import Event, local
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -209,6 +209,7 @@ class _Work:
         self.folder = folder
         self.every = every
         self.stopped = Event()
+        self._of_thread = local()
         self.description = description
         self._frames = {
             name: read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
@@ -247,6 +248,13 @@ class _Work:
         """Numbers and times of the frames that are looked at."""
         rows = self._frames[block.camera].iloc[list(self.rows(block))]
         return rows["frame"].to_numpy(np.int64), rows["t_ns"].to_numpy(np.int64)
+
+    def networks(self, detector: Detector) -> KeypointNetworks:
+        """The detector, loaded once by each thread: its networks may be used by one at a time."""
+        if not hasattr(self._of_thread, "networks"):
+            self._of_thread.networks = detector.load(threads=1)
+        networks: KeypointNetworks = self._of_thread.networks
+        return networks
 
     def entry(self, block: Block) -> CameraEntry:
         """The camera as it was ingested."""
@@ -333,7 +341,7 @@ def _rows_between(since_ns: Int64, start_s: float | None, end_s: float | None) -
 
 def _produce(work: _Work, detector: Detector, progress: Progress, block: Block, folder: Path) -> None:
     """Write what the detector finds in the pictures of one block."""
-    networks = detector.load(threads=1)
+    networks = work.networks(detector)
     media = work.entry(block).media
     if media is None:
         raise ValueError(f"{block.camera} has no pictures")

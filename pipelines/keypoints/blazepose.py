@@ -47,7 +47,7 @@ class PersonFinder:
     """The person detector alone. Not to be shared by threads: each takes its own."""
 
     def __init__(self, person_model: Path, *, threads: int) -> None:
-        self._people = _Network(person_model, threads)
+        self._people = _Network(person_model, threads, lowest=-1, outputs=("Identity", "Identity_1"))
         self._anchors = _anchors()
 
     def find_people(self, picture: Picture) -> list[tuple[Region, float]]:
@@ -61,7 +61,7 @@ class PersonFinder:
         corner = (np.array([width, height]) - _PICTURE_SIDE * scale) / 2
         placed = np.column_stack([np.eye(2) * scale, corner])
         fitted = sampled(picture, placed, (_PICTURE_SIDE, _PICTURE_SIDE), beyond="black")
-        raw = self._people(fitted * np.float32(2 / 255) - np.float32(1))
+        raw = self._people(fitted)
         score = _sigmoid(raw["Identity_1"][0, :, 0])
         sure = score >= _SURE
         numbers = raw["Identity"][0, sure].astype(np.float64) / _PICTURE_SIDE
@@ -79,7 +79,8 @@ class BlazePose(PersonFinder):
 
     def __init__(self, person_model: Path, landmark_model: Path, *, threads: int) -> None:
         super().__init__(person_model, threads=threads)
-        self._landmarks = _Network(landmark_model, threads)
+        outputs = ("Identity", "Identity_1", "Identity_3")
+        self._landmarks = _Network(landmark_model, threads, lowest=0, outputs=outputs)
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -97,9 +98,9 @@ class BlazePose(PersonFinder):
     def _locate(self, picture: Picture, region: Region) -> Person:
         picture_from_crop = _picture_from_crop(region)
         crop = sampled(picture, picture_from_crop, (_CROP_SIDE, _CROP_SIDE), beyond="edge")
-        raw = self._landmarks(crop * np.float32(1 / 255))
+        raw = self._landmarks(crop)
         landmarks = raw["Identity"].reshape(_LANDMARKS, 5).astype(np.float64)
-        in_crop, peak = _refined(landmarks[:, :2], raw["Identity_3"][0].astype(np.float64))
+        in_crop, peak = _refined(landmarks[:, :2], raw["Identity_3"][0])
         xy = (in_crop - 0.5) @ picture_from_crop[:, :2].T + picture_from_crop[:, 2]
         inside = _sigmoid(landmarks[:, 4])
         count = len(self.joints)
@@ -147,9 +148,9 @@ DETECTOR = BlazePoseDetector(BLAZEPOSE_MODELS)
 
 
 class _Network:
-    """One LiteRT model with one input: picture in, named tensors out."""
+    """One LiteRT model of one picture whose values lie in [lowest, 1]; some of its tensors come out."""
 
-    def __init__(self, path: Path, threads: int) -> None:
+    def __init__(self, path: Path, threads: int, *, lowest: int, outputs: tuple[str, ...]) -> None:
         from ai_edge_litert.interpreter import Interpreter
 
         with _quiet_stderr():
@@ -159,10 +160,17 @@ class _Network:
                 raise DataError(path, f"is no readable model ({error})") from None
             self._interpreter.allocate_tensors()
         self._input = self._interpreter.get_input_details()[0]["index"]
-        self._outputs = {tensor["name"]: tensor["index"] for tensor in self._interpreter.get_output_details()}
+        tensors = {tensor["name"]: tensor["index"] for tensor in self._interpreter.get_output_details()}
+        self._outputs = {name: tensors[name] for name in outputs}
+        self._lowest = np.float32(lowest)
+        self._step = np.float32((1 - lowest) / 255)
 
-    def __call__(self, picture: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
-        self._interpreter.set_tensor(self._input, picture[None])
+    def __call__(self, rgb: Picture) -> dict[str, NDArray[Any]]:
+        values = self._interpreter.tensor(self._input)()[0]  # where the network reads them
+        np.multiply(rgb, self._step, out=values)
+        if self._lowest:
+            values += self._lowest
+        del values  # LiteRT does not run while anybody else holds its memory
         self._interpreter.invoke()
         return {name: self._interpreter.get_tensor(index) for name, index in self._outputs.items()}
 
@@ -256,7 +264,7 @@ def _picture_from_crop(region: Region) -> Float:
     return np.column_stack([axes, np.array(region.centre) - axes @ np.full(2, (_CROP_SIDE - 1) / 2)])
 
 
-def _refined(in_crop: Float, heatmap: Float) -> tuple[Float, Float]:
+def _refined(in_crop: Float, heatmap: NDArray[np.floating[Any]]) -> tuple[Float, Float]:
     """Positions moved to the middle of the heatmap around them, and the heatmap's peak there.
 
     RefineLandmarksFromHeatmapCalculator, 9 x 9 cells, for peaks of at least 0.5; others stay.

@@ -14,10 +14,8 @@ from pipelines.session.registries import Region
 Picture = NDArray[np.uint8]
 
 
-def sampled(
-    picture: Picture, picture_from_crop: Float, size: tuple[int, int], *, beyond: str
-) -> NDArray[np.float32]:
-    """The RGB values 0..255 [height, width, 3] of a BGR picture where a crop's pixels lie, bilinear.
+def sampled(picture: Picture, picture_from_crop: Float, size: tuple[int, int], *, beyond: str) -> Picture:
+    """The RGB values [height, width, 3] of a BGR picture where a crop's pixels lie, bilinear.
 
     OpenCV 4 rounds positions to 1/32 px when it warps, as does the one inside MediaPipe; OpenCV 5 does
     not, which moves landmarks by 0.6 px (median) where the crop is coarser than the picture. Fixed-point
@@ -31,13 +29,15 @@ def sampled(
     """
     import cv2
 
+    x, y = np.empty((2, size[1], size[0]), np.float32)
     column, row = np.arange(size[0]), np.arange(size[1])[:, None]
-    x, y = ((line[0] * column + (line[1] * row + line[2])).astype(np.float32) for line in picture_from_crop)
+    for place, line in zip((x, y), picture_from_crop, strict=True):
+        # Added up in float64 and rounded once, without an array of float64 in between.
+        np.add(line[0] * column, line[1] * row + line[2], out=place, casting="same_kind")
     whole, part = cv2.convertMaps(x, y, cv2.CV_16SC2)
     border = cv2.BORDER_REPLICATE if beyond == "edge" else cv2.BORDER_CONSTANT
     values = cv2.remap(picture, whole, part, cv2.INTER_LINEAR, borderMode=border)
-    rgb: NDArray[np.float32] = values[:, :, ::-1].astype(np.float32)
-    return rgb
+    return np.asarray(cv2.cvtColor(values, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def upright_crop(region: Region, size: tuple[int, int]) -> Float:

@@ -87,32 +87,32 @@ class OnnxNetwork:
         self._batch: int | None = shape[0] if isinstance(shape[0], int) else None
         self.size = _size(path, shape[2:] if self._layout == "nchw" else shape[1:3], size)
         width, height = self.size
-        blank = np.zeros((self._batch or 1, height, width, 3), np.float32)
+        blank = np.zeros((self._batch or 1, height, width, 3), np.uint8)
         self.shapes = {name: values.shape for name, values in self._outputs(blank, None).items()}
 
-    def batch(self, rgb: NDArray[np.float32], outputs: Sequence[str]) -> dict[str, NDArray[Any]]:
+    def batch(self, rgb: NDArray[np.uint8], outputs: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Some outputs [N, ...], by name, for pictures [N, H, W, 3] of RGB values 0..255, N > 0.
 
         A graph of a fixed batch is run as often as it takes, the last time filled up with zeros.
         """
         step = self._batch or len(rgb)
         short = -len(rgb) % step
-        filled = np.concatenate([rgb, np.zeros((short, *rgb.shape[1:]), np.float32)])
+        filled = np.concatenate([rgb, np.zeros((short, *rgb.shape[1:]), np.uint8)])
         parts = [
             self._outputs(filled[first : first + step], outputs) for first in range(0, len(filled), step)
         ]
         return {name: np.concatenate([part[name] for part in parts])[: len(rgb)] for name in outputs}
 
-    def single(self, rgb: NDArray[np.float32]) -> dict[str, NDArray[Any]]:
+    def single(self, rgb: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
         """All outputs, by name, for one picture [H, W, 3]; their first axis need not be the batch's."""
         return self._outputs(rgb[None], None)
 
-    def _outputs(self, rgb: NDArray[np.float32], names: Sequence[str] | None) -> dict[str, NDArray[Any]]:
+    def _outputs(self, rgb: NDArray[np.uint8], names: Sequence[str] | None) -> dict[str, NDArray[Any]]:
         ordered = rgb if self._colours.order == "rgb" else rgb[..., ::-1]
         mean, std = (np.array(of, np.float32) for of in (self._colours.mean, self._colours.std))
         if self._layout == "nchw":
             ordered, mean, std = np.moveaxis(ordered, -1, 1), mean[:, None, None], std[:, None, None]
-        pixels = np.array(ordered, order="C")  # in place is several times faster
+        pixels = np.array(ordered, np.float32, order="C")  # in place is several times faster
         pixels -= mean
         pixels /= std
         given = {self._input: pixels.astype(self._type, copy=False)}

@@ -16,7 +16,7 @@ from pipelines.session.records import Float
 _SURE = 0.3  # as RTMLib draws boxes
 _SAME_PERSON = 0.45  # intersection over union, YOLOX's own
 _STRIDES = (8, 16, 32)
-_AROUND = 114.0  # grey beside the picture, which these networks were trained with
+_AROUND = 114  # grey beside the picture, which these networks were trained with
 _PERSON = 0  # the class, in COCO and in every list of persons alone
 
 

@@ -31,12 +31,8 @@ def heatmap_model(
     open_size: bool = False,
     bands: int = 2,
     channel: tuple[float, float, float] = (1 / 3, 1 / 3, 1 / 3),
-    ballast: int = 0,
 ) -> Path:
-    """Cell k is the brightness at pixel k (W - 1) / (w - 1) (`udp`) or at k `stride` (`msra`).
-
-    `ballast` layers of 64 channels take the time of a real network and add nothing.
-    """
+    """Cell k is the brightness at pixel k (W - 1) / (w - 1) (`udp`) or at k `stride` (`msra`)."""
     width, height = size
     columns, rows = width // stride, height // stride
     constants = _pose_constants(size, joints, channel, bands)
@@ -58,11 +54,7 @@ def heatmap_model(
             "steps": np.array([stride, stride], np.int64),
         }
         last = helper.make_node("Slice", ["bright", "from", "to", "axes", "steps"], ["heatmap"])
-    nodes = [
-        *_brightness(layout, "only_bright" if ballast else "bright"),
-        *_ballast(ballast, constants),
-        last,
-    ]
+    nodes = [*_brightness(layout), last]
     shape = _input_shape(size, batch, layout, open_size)
     return _save(path, nodes, shape, {"heatmap": [batch, joints, rows, columns]}, constants)
 
@@ -117,32 +109,13 @@ def _pose_constants(
     }
 
 
-def _brightness(layout: str, name: str = "bright") -> list[Node]:
+def _brightness(layout: str) -> list[Node]:
     first = [helper.make_node("Transpose", ["input"], ["planes"], perm=[0, 3, 1, 2])]
     planes = "planes" if layout == "nhwc" else "input"
     return [
         *(first if layout == "nhwc" else []),
         helper.make_node("Conv", [planes, "weight"], ["grey"]),
-        helper.make_node("Mul", ["grey", "mask"], [name]),
-    ]
-
-
-def _ballast(layers: int, constants: dict[str, NDArray[np.float32] | NDArray[np.int64]]) -> list[Node]:
-    if not layers:
-        return []
-    rng = np.random.default_rng(0)
-    constants["first_kernel"] = rng.normal(0, 0.1, (64, 3, 3, 3)).astype(np.float32)
-    constants["kernel"] = rng.normal(0, 0.05, (64, 64, 3, 3)).astype(np.float32)
-    constants["nothing"] = np.zeros(1, np.float32)
-    return [
-        helper.make_node("Conv", ["input", "first_kernel"], ["layer0"], strides=[4, 4], pads=[1, 1, 1, 1]),
-        *(
-            helper.make_node("Conv", [f"layer{i}", "kernel"], [f"layer{i + 1}"], pads=[1, 1, 1, 1])
-            for i in range(layers)
-        ),
-        helper.make_node("ReduceMean", [f"layer{layers}"], ["mean"], keepdims=1),
-        helper.make_node("Mul", ["mean", "nothing"], ["zero"]),
-        helper.make_node("Add", ["only_bright", "zero"], ["bright"]),
+        helper.make_node("Mul", ["grey", "mask"], ["bright"]),
     ]
 
 

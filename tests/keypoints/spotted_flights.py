@@ -10,7 +10,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.cameras import Intrinsics, rescaled
+from pipelines.geometry.cameras import Intrinsics
 from pipelines.simulation.drone_paths import look_at
 from pipelines.simulation.flight_files import write_tum
 from pipelines.simulation.observe import see
@@ -32,9 +32,8 @@ def person_at(t_s: Float) -> Float:
     )
 
 
-def write_spotted_flight(folder: Path, frames: int, scale: int = 1) -> Path:
-    """A flight of two cameras with videos of 320x240 times `scale`, without keypoints; its flight.yaml."""
-    lens = rescaled(LENS, scale * LENS.width, scale * LENS.height)
+def write_spotted_flight(folder: Path, frames: int) -> Path:
+    """A flight of two cameras with videos of 320x240, without keypoints; its flight.yaml."""
     t_s = np.arange(frames) / FPS
     stamps = START_S * 10**9 + np.round(t_s * 1e9).astype(np.int64)
     lines = ["schema: 1", "name: Spots", "world: {frame: enu}", "cameras:"]
@@ -42,11 +41,11 @@ def write_spotted_flight(folder: Path, frames: int, scale: int = 1) -> Path:
         position = np.tile(place, (frames, 1))
         quaternion = look_at(position, np.tile([0.0, 0.0, 1.0], (frames, 1)))
         write_tum(folder / f"{name}.tum", stamps, position, quaternion)
-        pixels = see(person_at(t_s), position, quaternion, lens)
-        pictures = (spots(lens.width, lens.height, places, scale * _SPOT_PX) for places in pixels.tolist())
+        pixels = see(person_at(t_s), position, quaternion, LENS)
+        pictures = (spots(LENS.width, LENS.height, places, _SPOT_PX) for places in pixels.tolist())
         write_pictures(folder / f"{name}.mp4", pictures)
         numbers = ("width", "height", "fx", "fy", "cx", "cy")
-        stated = ", ".join(f"{number}: {getattr(lens, number):g}" for number in numbers)
+        stated = ", ".join(f"{number}: {getattr(LENS, number):g}" for number in numbers)
         lines.append(
             f"  {name}: {{video: {name}.mp4, frame_times: {{start: {START_S}}}, pose: {{tum: {name}.tum}},"
             f" intrinsics: {{{stated}}}, clock: {{offset_s: 0, sigma_s: 0}}}}"
@@ -56,9 +55,9 @@ def write_spotted_flight(folder: Path, frames: int, scale: int = 1) -> Path:
     return path
 
 
-def spot_detector(folder: Path, size: tuple[int, int] = (96, 128), ballast: int = 0) -> str:
+def spot_detector(folder: Path) -> str:
     """What to write after `--detector`: models that see the spots, and a person in every picture."""
-    pose = heatmap_model(folder / "pose.onnx", size=size, bands=3, ballast=ballast)
+    pose = heatmap_model(folder / "pose.onnx", bands=3)
     box = np.array([(100.0, 60.0, 220.0, 180.0, 0.9)], np.float32)
     people = constant_model(folder / "people.onnx", (320, 320), {"dets": box})
     return f"onnx:{pose},people={people},mean=0/0/0,std=255/255/255,provider=cpu"

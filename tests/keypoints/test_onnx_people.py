@@ -67,7 +67,7 @@ def test_outputs_that_are_not_understood_are_listed(tmp_path: Path) -> None:
 
 def test_the_picture_is_fitted_into_the_top_left(tmp_path: Path) -> None:
     class Seen(OnnxNetwork):
-        def single(self, rgb: NDArray[np.float32]) -> Outputs:
+        def single(self, rgb: NDArray[np.uint8]) -> Outputs:
             self.seen = rgb
             return super().single(rgb)
 
