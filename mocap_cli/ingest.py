@@ -78,6 +78,7 @@ def ingest_command(
     if not quiet:
         _print(result)
         _print_stamps(result)
+        _print_origin(result)
     click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder}")
 
 
@@ -87,6 +88,15 @@ def _print_stamps(result: Ingested) -> None:
         names = [name for name, c in result.description.cameras.items() if c.poses.stamps == stamps]
         if names:
             click.echo(f"poses are timed by the {stamps} stamps of their logs: {', '.join(names)}")
+
+
+def _print_origin(result: Ingested) -> None:
+    """Where on Earth the world's origin was laid."""
+    if origin := result.description.origin:
+        click.echo(
+            f"world origin: {origin.latitude_deg:.7f}, {origin.longitude_deg:.7f}, {origin.altitude_m:.2f} m"
+            f" ({one_line(origin.source)})"
+        )
 
 
 def _print(result: Ingested) -> None:

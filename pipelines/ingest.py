@@ -11,7 +11,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -21,6 +21,7 @@ import numpy as np
 
 from pipelines.formats.flight_sources import CameraFrames, FlightSources, losses, source_files
 from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.poses import gaps, interpolate_poses
 from pipelines.session.description import (
     ActorEntry,
@@ -31,7 +32,9 @@ from pipelines.session.description import (
     Interpolation,
     IntrinsicsEntry,
     KeypointsEntry,
+    LogClockEntry,
     MapEntry,
+    OriginEntry,
     PosesEntry,
     TruthEntry,
 )
@@ -135,6 +138,7 @@ def ingest(
             truth = reader.store_truth(run.folder, entries)
             actor = reader.store_actor(run.folder, entries)
             map_ = reader.store_map(run.folder, entries)
+            origin = reader.origin()
             warnings += reader.take_notes()
 
             description = Description(
@@ -143,6 +147,7 @@ def ingest(
                 simulated=flight.simulated,
                 clock_reference=flight.reference_camera,
                 pose_interpolation=interpolation,
+                origin=origin,
                 cameras=entries,
                 actor=actor,
                 map=map_,
@@ -163,8 +168,6 @@ def _refuse_unread_parts(flight: Flight, path: Path) -> None:
     """Refuse, in one line, what is valid in a manifest but has no reader in this version."""
     unread = ["plan"] if flight.plan else []
     unread += ["actors"] if flight.actors else []
-    for name, camera in flight.cameras.items():
-        unread += [f"cameras.{name}.pose.{key}" for key in ("dji", "ulog") if getattr(camera.pose, key)]
     if unread:
         raise NotYetReadError(
             path,
@@ -218,11 +221,13 @@ def _hash_sources(
         pose, times, video = camera.pose, camera.frame_times, camera.video
         take(pose.tum, pose.csv, pose.static.path if pose.static else None, camera.intrinsics.path)
         take(camera.keypoints.path if camera.keypoints else None)
-        for log in (pose.log, camera.intrinsics.log, camera.gimbal.log if camera.gimbal else None):
+        gimbal_log = camera.gimbal.log if camera.gimbal else None
+        for log in (pose.log, pose.dji, pose.ulog, pose.ardupilot, camera.intrinsics.log, gimbal_log):
             take_log(log)
         if times:
             take(times.csv, times.srt)
-            take_log(times.log)
+            for log in (times.log, times.ulog, times.ardupilot):
+                take_log(log)
         if video:
             take(video.path)
             take_log(video.log)
@@ -391,6 +396,7 @@ class _Reader:
                 offset_s=camera.clock.offset_ns / 1e9 if camera.clock else 0.0,
                 sigma_s=camera.clock.sigma_s if camera.clock else 0.0,
             ),
+            log_clock=_log_clock_entry(self._sources.log_clock(camera)),
             pose_noise=camera.pose_noise,
             media=self._sources.media(camera, frames, self._session),
         )
@@ -424,6 +430,19 @@ class _Reader:
                     "check first_frame and frame_times",
                 )
         return _CameraData(detections, detector_format, intrinsics, frames, trajectory, self.take_notes())
+
+    def origin(self) -> OriginEntry | None:
+        """Where on Earth the world lies, and what is doubtful about heights counted from there."""
+        found = self._sources.origin()
+        if found is None:
+            return None
+        place = found.place
+        return OriginEntry(
+            latitude_deg=place.latitude_deg,
+            longitude_deg=place.longitude_deg,
+            altitude_m=place.altitude_m,
+            source=found.source,
+        )
 
     def store_truth(self, folder: Path, entries: Mapping[str, CameraEntry]) -> TruthEntry | None:
         """Write what is known to be true and say what it spans."""
@@ -608,8 +627,13 @@ def _within(detections: Detections, frames: CameraFrames) -> Detections:
     )
 
 
+def _log_clock_entry(fit: ClockFit | None) -> LogClockEntry | None:
+    return None if fit is None else LogClockEntry(**asdict(fit))
+
+
 def _pose_source(pose: PoseSource) -> str:
-    return pose.tum or pose.csv or (pose.static.path if pose.static else pose.log) or ""
+    drones_own = pose.dji or pose.ulog or pose.ardupilot
+    return pose.tum or pose.csv or drones_own or (pose.static.path if pose.static else pose.log) or ""
 
 
 def _rate(t_ns: Int64) -> float | None:

@@ -20,6 +20,7 @@ from pipelines.formats.fixed_layouts import PoseArrays, read_poses
 from pipelines.formats.log_frames import frames_of_poses, place_of_frame, transforms_in
 from pipelines.formats.log_maps import read_maps
 from pipelines.formats.log_messages import Kind, all_samples, kind_of
+from pipelines.formats.log_presets import Preset, read_preset
 from pipelines.formats.log_trajectories import (
     Gathered,
     StampCheck,
@@ -54,6 +55,7 @@ from pipelines.session.records import (
     Trajectory,
 )
 from pipelines.session.registries import Log, LogFormat, recognise
+from pipelines.session.telemetry import Telemetry, TelemetryChoice
 
 _MAY_DISAGREE_S = 0.5  # header and receive stamps: transport and decoding take less
 _KEPT_MESSAGES = 4_000_000  # of all logs that stay open: their tables have 160 MB
@@ -134,12 +136,25 @@ class FlightLogs:
             started_ns = _start_ns(recording)
         return self._at_world_times(log, source, gathered, lost, started_ns)
 
+    def telemetry(
+        self, log: str, preset: Preset, namespace: str | None, choice: TelemetryChoice
+    ) -> Telemetry:
+        """What a driver's usual topics say of a drone, at the log's own times.
+
+        Raises:
+            DataError: no such topics, those of several drones, or nothing usable.
+        """
+        with self._open(log) as (recording, source):
+            found = read_preset(recording, source, preset, namespace, choice, self.settings(log).stamps)
+            lost = Counter(recording.dropped)
+        return replace(found, dropped=dict(Counter(found.dropped) + lost))
+
     def attitudes(
         self,
         log: str,
         topic: str,
         *,
-        order: Literal["ypr", "rpy"],
+        order: Literal["ypr", "rpy", "pry"],
         units: Literal["deg", "rad"],
     ) -> Trajectory:
         """A gimbal's attitude in the log's axes, at world times; its positions mean nothing."""

@@ -12,24 +12,27 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 
 from pipelines.formats.flight_logs import FlightLogs, Frames, in_world
 from pipelines.formats.frame_times import read_frame_times, times_of_frames
+from pipelines.formats.gimbal_angles import attitudes_at, stated_angles
 from pipelines.formats.map_topics import LoggedMaps
 from pipelines.formats.ros_map import FORMAT as ROS_MAP
+from pipelines.formats.telemetry_poses import Origin, TelemetryPoses
+from pipelines.formats.video import created_ns
 from pipelines.geometry.cameras import Intrinsics, fit_to_size
+from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.mounting import (
-    attitude_in_enu,
     body_from_camera,
     compose_gimbal,
     compose_mount,
     flu_body_from_frd,
 )
 from pipelines.geometry.pose_covariance import mounted_covariance
-from pipelines.geometry.poses import enu_from_ned, interpolate_poses
+from pipelines.geometry.poses import enu_from_ned
 from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import (
@@ -98,6 +101,7 @@ class FlightSources:
         self._max_gap_ns = max_gap_ns
         self._note = note
         self._logs = FlightLogs(flight, self._base, note)
+        self._telemetry = TelemetryPoses(flight, manifest, self._logs, max_gap_ns=max_gap_ns, note=note)
         self._calibrations: dict[str, dict[str, CalibratedCamera]] = {}
 
     def __enter__(self) -> Self:
@@ -107,6 +111,15 @@ class FlightSources:
     def __exit__(self, *exception: object) -> None:
         """Close the logs."""
         self._logs.__exit__(*exception)
+
+    def origin(self) -> Origin | None:
+        """Where on Earth the world lies, where that is known; heights that do not go together are noted."""
+        self._telemetry.doubt_heights()
+        return self._telemetry.origin()
+
+    def log_clock(self, camera: Camera) -> ClockFit | None:
+        """How the clock of a drone's own log was taken to GPS time; None where it was not."""
+        return self._telemetry.fit(camera.pose) if camera.pose.is_telemetry else None
 
     def stamps(self, log: str) -> str:
         """Which stamps of a log's messages count: header or receive."""
@@ -164,11 +177,17 @@ class FlightSources:
             count = len(pictures.t_ns) if pictures else self._listed_frames(camera, detections)
             since_start = _ticks_ns(count, times.fps)
             topic, lost = (pictures.topic, pictures.dropped) if pictures else (None, {})
-            return CameraFrames(np.arange(count), times.start_ns + since_start, since_start, topic, lost)
+            start_ns = self._start_ns(name, camera, times)
+            return CameraFrames(np.arange(count), start_ns + since_start, since_start, topic, lost)
         if times.csv or times.srt:
             return self._frames_of_file(self._base / (times.csv or times.srt or ""), pictures)
         if times.log is not None:
-            return self._frames_of_log(times.log, times.topic, pictures)
+            stamped = self._logs.frames(times.log, times.topic)
+            return self._frames_by_stamps(stamped.t_ns, stamped.dropped, pictures)
+        if times.ulog or times.ardupilot:
+            kind: Literal["ulog", "ardupilot"] = "ulog" if times.ulog else "ardupilot"
+            triggered = self._telemetry.triggers(kind, times.ulog or times.ardupilot or "")
+            return self._frames_by_stamps(triggered, {}, pictures)
         if pictures is None:
             raise DataError(
                 self._manifest,
@@ -176,7 +195,7 @@ class FlightSources:
                 "write frame_times: {start: SECONDS, fps: 30}",
             )
         if logged is None:
-            return replace(pictures, t_ns=times.start_ns + pictures.pts_ns)
+            return replace(pictures, t_ns=self._start_ns(name, camera, times) + pictures.pts_ns)
         if times.start_ns:
             raise DataError(
                 self._manifest,
@@ -230,22 +249,40 @@ class FlightSources:
             dropped=dict(+lost),
         )
 
-    def _frames_of_log(self, log: str, topic: str | None, pictures: CameraFrames | None) -> CameraFrames:
-        """Frame times that a topic of pictures states, for the frames of a video in the same order."""
-        stamped = self._logs.frames(log, topic)
-        if pictures is None:
-            since_start = stamped.t_ns - stamped.t_ns[0]
-            return CameraFrames(
-                np.arange(len(since_start)), stamped.t_ns, since_start, dropped=stamped.dropped
+    def _start_ns(self, name: str, camera: Camera, times: FrameTimes) -> int:
+        """When a video begins that has stamps of its own."""
+        if times.start_from is None:
+            return times.start_ns
+        path = self._base / (camera.video.path or "") if camera.video else None
+        made_ns = created_ns(path) if path is not None and camera.video and camera.video.path else None
+        if made_ns is None:
+            raise DataError(
+                path or self._manifest,
+                "does not say when it was made",
+                f"write frame_times: {{start: SECONDS}} for camera {name}",
             )
-        count = min(len(pictures.t_ns), len(stamped.t_ns))
-        lost = Counter(pictures.dropped) + Counter(stamped.dropped)
+        if camera.clock is None:
+            self._note(
+                f"{name}: its video says that it was made at {made_ns / 1e9:.0f} s, to a second at best:"
+                " say clock: {sigma_s: 1}"
+            )
+        return times.start_ns + made_ns
+
+    def _frames_by_stamps(
+        self, t_ns: Int64, dropped: dict[str, int], pictures: CameraFrames | None
+    ) -> CameraFrames:
+        """Frame times that a log states, for the frames of a video in the same order."""
+        if pictures is None:
+            since_start = t_ns - t_ns[0]
+            return CameraFrames(np.arange(len(since_start)), t_ns, since_start, dropped=dropped)
+        count = min(len(pictures.t_ns), len(t_ns))
+        lost = Counter(pictures.dropped) + Counter(dropped)
         lost["without a stamp in the log"] += len(pictures.t_ns) - count
-        lost["stamp in the log without a picture"] += len(stamped.t_ns) - count
+        lost["stamp in the log without a picture"] += len(t_ns) - count
         return replace(
             pictures,
             frame=pictures.frame[:count],
-            t_ns=stamped.t_ns[:count],
+            t_ns=t_ns[:count],
             pts_ns=pictures.pts_ns[:count],
             dropped=dict(+lost),
         )
@@ -327,6 +364,8 @@ class FlightSources:
                 quaternion_xyzw=calibrated.quaternion_xyzw[None],
             )
             return _in_enu(still, self._axes(pose.axes))
+        if pose.is_telemetry:
+            return self._telemetry.trajectory(name, camera, self._mounted(name, camera.mount))
         if pose.log:
             return self._logged_trajectory(name, camera, pose.log)
         trajectory = self._filed_trajectory(pose.tum or pose.csv or "", "tum" if pose.tum else "csv")
@@ -364,13 +403,17 @@ class FlightSources:
         moved = in_world(in_enu, settings)
         return moved if of_camera else self._on_body(name, camera, moved)
 
-    def _on_body(self, name: str, camera: Camera, body: Trajectory) -> Trajectory:
-        """The poses of the camera, from those of the body that carries it."""
+    def _mounted(self, name: str, mount: Mount | None) -> tuple[Float, Float]:
+        """Lever arm [3] and rotation [4] of a camera in its body, or in its gimbal if there is one."""
         try:
-            lever_arm, rotation = _mounted(camera.mount)
+            return _mounted(mount)
         except ValueError as error:
             place = f"{self._manifest}: cameras.{name}.mount"
             raise DataError(place, str(error), "say how the camera sits on the body") from None
+
+    def _on_body(self, name: str, camera: Camera, body: Trajectory) -> Trajectory:
+        """The poses of the camera, from those of the body that carries it."""
+        lever_arm, rotation = self._mounted(name, camera.mount)
         world_from_body = (body.position, body.quaternion_xyzw)
         dropped = dict(body.dropped)
         if camera.gimbal is None:
@@ -403,22 +446,14 @@ class FlightSources:
         gimbal = camera.gimbal
         if gimbal is None:
             raise ValueError("the camera has no gimbal")
-        angles = self._logs.attitudes(gimbal.log, gimbal.topic, order=gimbal.order, units=gimbal.units)
-        axes = self._axes(gimbal.axes, self._logs.settings(gimbal.log).axes)
-        _, attitude = interpolate_poses(
-            angles.t_ns,
-            angles.position,
-            attitude_in_enu(angles.quaternion_xyzw, relative_to=gimbal.relative_to, axes=axes),
-            body.t_ns,
-            max_gap_ns=self._max_gap_ns,
-            max_extrapolation_ns=0,
-        )
+        track = stated_angles(gimbal, self._logs, self._flight.world.frame)
+        attitude = attitudes_at(track, body.t_ns, max_gap_ns=self._max_gap_ns)
         position, quaternion = compose_gimbal(
             (body.position, body.quaternion_xyzw),
             lever_arm,
             attitude,
             rotation,
-            relative_to=gimbal.relative_to,
+            relative_to=track.relative_to,
         )
         return position, quaternion, int(np.isnan(attitude[:, 0]).sum())
 
@@ -463,7 +498,7 @@ class FlightSources:
         motion = reader.read_joints(path, unit=source.unit, axes="z-up" if is_ned else source.axes)
         if is_ned:
             motion = replace(motion, position=motion.position[..., [1, 0, 2]] * [1, 1, -1])
-        return motion
+        return replace(motion, t_ns=motion.t_ns + round(source.offset_s * 1e9))
 
     def true_poses(self, stated: str) -> Trajectory:
         """The true poses of one camera."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 
+from pipelines.formats.dji_srt import parse_subtitles, read_subtitles
 from pipelines.formats.stamps import Bool, cell_name, format_seconds, parse_stamps, stamp_column
 from pipelines.formats.summaries import describe_times
 from pipelines.formats.text_tables import parse_table, read_head, read_text
@@ -16,12 +16,6 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Int64
 
 _FRAME_NAMES = {"frame", "frame_id", "frame_index", "frame_number"}
-_TIMECODE = r"(\d+):([0-5]\d):([0-5]\d)[,.](\d{3})"
-_BLOCK = re.compile(rf"(?m)^{_TIMECODE} --> {_TIMECODE}[ \t]*$")
-_CLOCK = re.compile(
-    r"(\d{4})[-.](\d{1,2})[-.](\d{1,2}) +(\d{1,2}):(\d{2}):(\d{2})(?:[.,](\d{3}))?(?:,(\d{3}))?(?!\d)"
-)
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 @dataclass(frozen=True)
@@ -46,12 +40,13 @@ class FrameTimesFormat:
     suffixes: tuple[str, ...] = (".csv", ".srt", ".txt", ".tsv")
 
     def recognises(self, path: Path) -> bool:
-        """Whether it is a table of times, with or without frame numbers and nothing else, or subtitles."""
+        """Whether it is a table of times, with frame numbers or without, or subtitles of each frame."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         head = read_head(path)
         if path.suffix.lower() == ".srt":
-            return _BLOCK.search(head) is not None
+            subtitles = parse_subtitles(head)
+            return bool(subtitles.has_clock.any()) and not subtitles.are_slow
         header = _find_header(head)
         return header is not None and header.columns == (1 if header.frame is None else 2)
 
@@ -181,41 +176,25 @@ def _frame_numbers(cells: list[str]) -> tuple[Int64, Bool]:
 
 
 def _read_subtitles(path: Path) -> FrameStamps:
-    text = read_text(path)
-    blocks = list(_BLOCK.finditer(text))
-    if not blocks:
+    subtitles = read_subtitles(path)
+    known, media_ns = subtitles.has_clock, subtitles.media_ns
+    start_ns = subtitles.start_ns()
+    if start_ns is None:
         raise DataError(
-            path, "holds no subtitles" if text.strip() else "is empty", "copy it from the drone again"
+            path, f"its {len(media_ns)} subtitles show no clock time", "state frame_times: {start: SECONDS}"
         )
-    ends = [block.start() for block in blocks[1:]] + [len(text)]
-    clocks = [_clock_ns(text[block.end() : end]) for block, end in zip(blocks, ends, strict=True)]
-    known = np.array([clock is not None for clock in clocks], dtype=np.bool_)
-    t_ns = np.array([clock or 0 for clock in clocks], dtype=np.int64)
-    media_ns = np.array([_timecode_ns(block) for block in blocks], dtype=np.int64)
-    if not known.any():
+    if subtitles.are_slow:  # with whole seconds: not the time of each frame
         raise DataError(
-            path, f"its {len(blocks)} subtitles show no clock time", "state frame_times: {start: SECONDS}"
+            path,
+            f"shows a time every {np.median(np.diff(media_ns)) / 1e9:g} s, not for each frame",
+            f"write frame_times: {{start: {_plain_seconds(start_ns)}}} and let clock.sigma_s be 1",
         )
-    _refuse_slow(path, t_ns[known], media_ns[known])
-    return _clean(path, _slots(media_ns), t_ns, media_ns, {"no time": ~known}, {})
+    return _clean(path, _slots(media_ns), subtitles.clock_ns, media_ns, {"no time": ~known}, {})
 
 
-def _clock_ns(text: str) -> int | None:
-    """The clock time in a subtitle: 2022-08-07 13:40:40,774,808 and its variants."""
-    match = _CLOCK.search(text)
-    if match is None:
-        return None
-    *whole, milliseconds, microseconds = (int(part or 0) for part in match.groups())
-    try:
-        elapsed = datetime(*whole, tzinfo=UTC) - _EPOCH  # type: ignore[misc,arg-type]  # six integers
-    except ValueError:
-        return None
-    return elapsed // timedelta(microseconds=1) * 1000 + milliseconds * 1_000_000 + microseconds * 1000
-
-
-def _timecode_ns(block: re.Match[str]) -> int:
-    hours, minutes, seconds, milliseconds = (int(part) for part in block.groups()[:4])
-    return (((hours * 60 + minutes) * 60 + seconds) * 1000 + milliseconds) * 1_000_000
+def _plain_seconds(t_ns: int) -> str:
+    """Seconds without zeros behind the dot."""
+    return format_seconds(np.array([t_ns]))[0].rstrip("0").rstrip(".")
 
 
 def _slots(media_ns: Int64) -> Int64:
@@ -227,18 +206,6 @@ def _slots(media_ns: Int64) -> Int64:
     typical = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
     counts = np.where(steps > 0, np.maximum(np.rint(steps / typical), 1), 0)
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-
-
-def _refuse_slow(path: Path, t_ns: Int64, media_ns: Int64) -> None:
-    """Old drones write one subtitle a second, with whole seconds: not the time of each frame."""
-    if len(media_ns) < 2 or np.median(np.diff(media_ns)) < 500_000_000:
-        return
-    start = format_seconds(t_ns[:1] - media_ns[:1])[0].split(".")[0]
-    raise DataError(
-        path,
-        f"shows a time every {np.median(np.diff(media_ns)) / 1e9:g} s, not for each frame",
-        f"write frame_times: {{start: {start}}} and let clock.sigma_s be 1",
-    )
 
 
 def _clean(

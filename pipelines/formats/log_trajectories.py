@@ -209,7 +209,7 @@ def attitudes_of(
     source: Source,
     *,
     stamps: Stamps,
-    order: Literal["ypr", "rpy"] = "ypr",
+    order: Literal["ypr", "rpy", "pry"] = "ypr",
     units: Literal["deg", "rad"] = "deg",
     may_disagree_s: float = 0.5,
     may_jump_s: float = 1.0,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
@@ -30,6 +31,8 @@ Picture = NDArray[np.uint8]  # [height, width, 3] blue, green, red
 
 _MOST_PIXELS = 1 << 27  # 16384 x 8192; a header that states more is damaged, and memory is finite
 _LATEST_S = 4 * 10**9  # after the year 2096, counted from the epoch; int64 ns hold 292 years
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_NO_DATE_BEFORE = timedelta(days=365 * 15)  # 1985: there were no drones
 _MOST_KEY_FRAMES = 3  # to seek before a frame counts as undecodable
 _MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
 _PACKET_TS, _PACKET_M2TS = 188, 192
@@ -63,6 +66,7 @@ class VideoContainer:
             "rate": "variable" if index.variable else "constant",
             **{key: times[key] for key in ("gaps", "longest_gap_s") if key in times},
             "start_s": round(index.start_ns / 1e9, 6),
+            **({"created_s": made / 1e9} if (made := created_ns(path)) is not None else {}),
             "picture": f"{index.width} x {index.height} px",
             "turned_deg": index.rotation_deg,
             "codec": index.codec,
@@ -91,6 +95,31 @@ def index_video(path: Path) -> VideoIndex:
     """
     with VideoReader(path) as reader:
         return reader.index
+
+
+def created_ns(path: Path) -> int | None:
+    """When a video says that it was made, ns since the epoch; None where it does not say.
+
+    MP4 and MOV hold whole seconds of UTC, by definition; some cameras write local time, some the moment
+    when they closed the file.
+
+    Raises:
+        DataError: it cannot be opened as a video.
+    """
+    container, stream = _open(path)
+    with container:
+        texts = [{**container.metadata}.get("creation_time"), {**stream.metadata}.get("creation_time")]
+    for text in texts:
+        if not text:
+            continue
+        try:
+            made = datetime.fromisoformat(text)
+        except ValueError:
+            continue
+        elapsed = (made if made.tzinfo else made.replace(tzinfo=UTC)) - _EPOCH
+        if elapsed > _NO_DATE_BEFORE:  # 1904 is the zero of MP4, 1970 that of a clock that was never set
+            return elapsed // timedelta(microseconds=1) * 1000
+    return None
 
 
 def frames(

@@ -44,6 +44,33 @@ def ecef_from_geodetic(latitude_deg: Float, longitude_deg: Float, altitude_m: Fl
     )
 
 
+def geodetic_from_ecef(from_centre: Float) -> tuple[Float, Float, Float]:
+    """Latitude and longitude in degrees and height in metres of earth-centred points [..., 3].
+
+    Bowring 1976, one step: below 10 km of height its error is less than a micrometre. At the poles
+    themselves the height is that along the axis.
+    """
+    x, y, z = np.moveaxis(from_centre, -1, 0)
+    from_axis = np.hypot(x, y)
+    semi_minor_m = _SEMI_MAJOR_M * (1 - _FLATTENING)
+    reduced = np.arctan2(z * _SEMI_MAJOR_M, from_axis * semi_minor_m)
+    second_squared = _ECCENTRICITY_SQUARED / (1 - _ECCENTRICITY_SQUARED)
+    latitude = np.arctan2(
+        z + second_squared * semi_minor_m * np.sin(reduced) ** 3,
+        from_axis - _ECCENTRICITY_SQUARED * _SEMI_MAJOR_M * np.cos(reduced) ** 3,
+    )
+    # The projection on the normal has no division that vanishes, at the equator or at the poles.
+    to_surface_m = _SEMI_MAJOR_M * np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)
+    altitude = from_axis * np.cos(latitude) + z * np.sin(latitude) - to_surface_m
+    return np.degrees(latitude), np.degrees(np.arctan2(y, x)), altitude
+
+
+def place_at(enu: Float, origin: Place) -> Place:
+    """The place that lies at metres [3] east, north and up of another."""
+    latitude, longitude, altitude = geodetic_from_ecef(enu @ _enu_axes(origin) + _ecef_of(origin))
+    return Place(float(latitude), float(longitude), float(altitude))
+
+
 def enu_from_geodetic(latitude_deg: Float, longitude_deg: Float, altitude_m: Float, origin: Place) -> Float:
     """Metres [..., 3] east, north and up of a place, of points on Earth; arguments broadcast."""
     from_centre = ecef_from_geodetic(latitude_deg, longitude_deg, altitude_m) - _ecef_of(origin)

@@ -77,7 +77,7 @@ def compose_mount(world_from_body: Pose, body_from_camera: Pose) -> Pose:
 
 
 def attitude_from_angles(
-    angles: Float, *, order: Literal["ypr", "rpy"], units: Literal["deg", "rad"]
+    angles: Float, *, order: Literal["ypr", "rpy", "pry"], units: Literal["deg", "rad"]
 ) -> Float:
     """Yaw about z, then pitch about the turned y, then roll about the twice turned x; right-handed.
 
@@ -85,14 +85,14 @@ def attitude_from_angles(
 
     Args:
         angles: [..., 3].
-        order: how the log lists them; the rotation is the same for both.
+        order: how the log lists them; the rotation is the same for all.
         units: degrees or radians.
 
     Returns:
         [..., 4] reference_from_gimbal, in the axes that the angles are stated in.
     """
     in_rad = np.radians(angles) if units == "deg" else angles
-    yaw, pitch, roll = np.moveaxis(in_rad if order == "ypr" else in_rad[..., ::-1], -1, 0)
+    yaw, pitch, roll = np.moveaxis(in_rad[..., [order.index(letter) for letter in "ypr"]], -1, 0)
     return multiply(multiply(_turn("z", yaw), _turn("y", pitch)), _turn("x", roll))
 
 

@@ -97,6 +97,27 @@ class MediaEntry(Entry):
     stamps: str = "header"  # by which the log's pictures are ordered
 
 
+class LogClockEntry(Entry):
+    """How the clock of a drone's own log was taken to UTC, by the time of its GPS; applied to the tables."""
+
+    at_ns: int  # the log's own clock, in the middle of the fixes
+    offset_ns: int  # UTC less that, there
+    drift_ppm: float
+    drift_sigma_ppm: float
+    residual_s: float  # scatter of the fixes
+    events: int
+    rejected: int
+
+
+class OriginEntry(Entry):
+    """Where on Earth the world's origin lies; all cameras with positions on Earth share it."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    source: str  # "world.origin", or the log whose first position it is
+
+
 class CameraEntry(Entry):
     """One camera."""
 
@@ -105,6 +126,7 @@ class CameraEntry(Entry):
     poses: PosesEntry
     keypoints: KeypointsEntry | None
     clock: ClockEntry
+    log_clock: LogClockEntry | None = None
     pose_noise: dict[str, dict[str, float | str]] | None
     media: MediaEntry | None
 
@@ -163,6 +185,7 @@ class Description(Entry):
     simulated: bool = False  # as the manifest states it: nobody flew
     clock_reference: str
     pose_interpolation: Interpolation
+    origin: OriginEntry | None = None
     cameras: dict[str, CameraEntry]
     actor: ActorEntry | None = None
     map: MapEntry | None = None

@@ -117,11 +117,14 @@ class FrameTimes(Part):
     """When each frame was taken; container stamps from `start` on where nothing else is said."""
 
     start_ns: SecondsAsNs = Field(0, alias="start")
+    start_from: Literal["container"] | None = None  # the time of its creation that a video states
     fps: Fps | None = None
     csv: str | None = None
     log: str | None = None
     topic: str | None = None
     srt: str | None = None
+    ulog: str | None = None  # triggers that an autopilot logged, one for each frame
+    ardupilot: str | None = None
 
 
 class Clock(Part):
@@ -142,27 +145,51 @@ class StaticPose(Part):
 class PoseSource(Part):
     """Where a camera's poses come from."""
 
-    one_of = ("log", "tum", "csv", "static", "dji", "ulog")
+    one_of = ("log", "tum", "csv", "static", "dji", "ulog", "ardupilot")
     log: str | None = None
     topic: str | None = None
     parent: str | None = None
     child: str | None = None
+    preset: Literal["dji_osdk", "mavros"] | None = None  # the usual topics of a driver, in a log
+    namespace: str | None = None  # of these topics, where a log holds several drones: /uav1
     tum: str | None = None
     csv: str | None = None
     static: StaticPose | None = None
-    dji: str | None = None
-    ulog: str | None = None
+    dji: str | None = None  # subtitles beside a video
+    ulog: str | None = None  # PX4
+    ardupilot: str | None = None  # DataFlash .bin
+    position: Literal["local", "global", "gps"] | None = None  # which of a drone's own estimates
+    instance: int | None = Field(None, ge=0, le=255)
+    time: Literal["gps", "boot"] | None = None
+    altitude: Literal["relative", "absolute"] | float | None = None  # or metres, held throughout
     of: Literal["camera", "body"] | None = None
     axes: Axes | None = None
 
     @model_validator(mode="after")
-    def _only_of_logs(self) -> PoseSource:
-        stated = [name for name in ("topic", "parent", "child") if getattr(self, name) is not None]
-        if stated and self.log is None:
-            raise ValueError(f"{', '.join(stated)}: only a pose from a log has that")
+    def _only_where_it_belongs(self) -> PoseSource:
+        autopilot = self.ulog is not None or self.ardupilot is not None
+        allowed = {
+            ("topic", "parent", "child", "preset"): (self.log is not None, "from a log"),
+            ("namespace",): (self.preset is not None, "by a preset"),
+            ("position",): (autopilot or self.preset is not None, "by ulog, ardupilot or a preset"),
+            ("instance", "time"): (autopilot, "by ulog or ardupilot"),
+            ("altitude",): (self.dji is not None, "by dji"),
+            ("axes",): (not self.is_telemetry, "that is no drone's own log (those state theirs)"),
+        }
+        for names, (may, whose) in allowed.items():
+            stated = [name for name in names if getattr(self, name) is not None]
+            if stated and not may:
+                raise ValueError(f"{', '.join(stated)}: only a pose {whose} has that")
         if (self.parent is None) != (self.child is None):
             raise ValueError("needs both parent and child, or neither")
+        if self.preset and (self.topic or self.parent):
+            raise ValueError("has a preset and names topics or frames: leave one of them out")
         return self
+
+    @property
+    def is_telemetry(self) -> bool:
+        """Whether a drone's own log, or its driver's topics, say position and attitude apart."""
+        return any(part is not None for part in (self.dji, self.ulog, self.ardupilot, self.preset))
 
 
 class RigidTransform(Part):
@@ -182,15 +209,38 @@ class Mount(Part):
     one_of = ("looks", "body_from_camera")
 
 
-class Gimbal(Part):
-    """Angles of the gimbal over time."""
+class FixedAngles(Part):
+    """Where a camera looked throughout, as DJI states it: yaw from north to east, pitch up, roll right."""
 
-    log: str
-    topic: str
-    relative_to: Literal["world", "body"]
-    order: Literal["ypr", "rpy"] = "ypr"
+    yaw_deg: float = Field(ge=-360, le=360)
+    pitch_deg: float = Field(ge=-180, le=180)
+    roll_deg: float = Field(0.0, ge=-180, le=180)
+
+
+class Gimbal(Part):
+    """Angles of the gimbal over time: of a topic, fixed, or of the drone's own log that states the pose."""
+
+    log: str | None = None
+    topic: str | None = None
+    fixed: FixedAngles | None = None
+    relative_to: Literal["world", "body"] | None = None
+    order: Literal["ypr", "rpy", "pry"] = "ypr"
     units: Literal["deg", "rad"] = "deg"
     axes: Axes | None = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> Gimbal:
+        if self.fixed is not None and self.log is not None:
+            raise ValueError("has a log and fixed angles: leave one of them out")
+        if self.log is not None:
+            missing = [name for name in ("topic", "relative_to") if getattr(self, name) is None]
+            if missing:
+                raise ValueError(f"lacks {', '.join(missing)}")
+        elif self.topic is not None:
+            raise ValueError("topic: needs the log that holds it")
+        elif self.fixed is None and self.relative_to is None:
+            raise ValueError("needs log and topic, fixed angles, or what the drone's own are relative_to")
+        return self
 
 
 class IntrinsicsSource(Part):
@@ -252,8 +302,12 @@ class Camera(Part):
         carried = self.mount is not None or self.gimbal is not None
         if self.pose.of == "body" and not carried:
             raise ValueError("pose is of the body: say how the camera sits on it with `mount` or `gimbal`")
-        if carried and self.pose.of != "body" and not (self.pose.log and self.pose.of is None):
+        may_carry = (self.pose.log or self.pose.is_telemetry) and self.pose.of is None
+        if carried and self.pose.of != "body" and not may_carry:
             raise ValueError("a mount or gimbal needs the pose of the body: add `of: body` to `pose`")
+        gimbal = self.gimbal
+        if gimbal and gimbal.log is None and gimbal.fixed is None and not self.pose.is_telemetry:
+            raise ValueError("gimbal: needs log and topic, or fixed: {yaw_deg: 90, pitch_deg: -30}")
         if self.pose.static and self.pose.of == "body":
             raise ValueError("a still camera's pose is its own: leave `of: body` and the mount out")
         return self
@@ -296,6 +350,7 @@ class TruthJoints(Part):
     format: str | None = None
     unit: Literal["m", "cm", "mm"] | None = None
     axes: Literal["z-up", "y-up", "ned"] | None = None
+    offset_s: float = 0.0  # added to the times of the file: those of a C3D begin at 0
 
 
 class Truth(Part):

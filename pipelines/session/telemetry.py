@@ -28,7 +28,7 @@ class PositionTrack:
     on_earth: bool  # which of the two
     height: Height = "unknown"  # of positions on Earth
     origin: Place | None = None  # of metres: where on Earth they count from, where that is known
-    sigma_m: Float | None = None  # [N, 3] east, north, up, where the log says so
+    accuracy_m: tuple[float, float] | None = None  # horizontal and vertical sigma, as the log itself has it
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,11 @@ class TelemetryFormat(Format, Protocol):
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
         """Read position and attitudes, in ENU and FLU; DataError where there is no position."""
+
+
+@runtime_checkable
+class TriggerFormat(Format, Protocol):
+    """Logs that say when pictures were triggered."""
 
     def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
         """When pictures were triggered, ns, increasing; DataError where the log does not say."""

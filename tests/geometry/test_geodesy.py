@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.geometry.geodesy import Place, ecef_from_geodetic, enu_from_enu, enu_from_geodetic
+from pipelines.geometry.geodesy import (
+    Place,
+    ecef_from_geodetic,
+    enu_from_enu,
+    enu_from_geodetic,
+    geodetic_from_ecef,
+    place_at,
+)
 
 Float = NDArray[np.float64]
 
@@ -47,6 +54,35 @@ def test_an_independent_inverse_gives_the_degrees_back(origin: Place) -> None:
     np.testing.assert_allclose(back[:, 0], latitude, atol=1e-9)  # 0.1 mm
     np.testing.assert_allclose((back[:, 1] - longitude + 180) % 360 - 180, 0, atol=1e-6)
     np.testing.assert_allclose(back[:, 2], altitude, atol=1e-3)
+
+
+def test_the_inverse_gives_the_degrees_back_anywhere() -> None:
+    rng = np.random.default_rng(5)
+    latitude, longitude = rng.uniform(-90, 90, 500), rng.uniform(-180, 180, 500)
+    altitude = rng.uniform(-400, 9000, 500)
+    latitude[:2], latitude[2] = (90, -90), 0
+    back = geodetic_from_ecef(ecef_from_geodetic(latitude, longitude, altitude))
+    np.testing.assert_allclose(back[0], latitude, atol=1e-11)  # 1 micrometre
+    np.testing.assert_allclose(back[2], altitude, atol=1e-6)
+    inland = np.abs(latitude) < 89
+    np.testing.assert_allclose(back[1][inland], longitude[inland], atol=1e-9)
+
+
+def test_the_inverse_of_the_published_example() -> None:
+    latitude, longitude, altitude = geodetic_from_ecef(np.array([3771793.968, 140253.342, 5124304.349]))
+    # Coordinates to the millimetre: 1e-8 degrees.
+    assert latitude == pytest.approx(_deg(53, 48, 33.820), abs=2e-7)
+    assert longitude == pytest.approx(_deg(2, 7, 46.380), abs=4e-7)
+    assert altitude == pytest.approx(73.0, abs=0.02)
+
+
+def test_a_place_some_metres_away() -> None:
+    away = np.array([120.0, -340.0, 25.0])
+    place = place_at(away, NORTH_SEA)
+    back = enu_from_geodetic(
+        np.array(place.latitude_deg), np.array(place.longitude_deg), np.array(place.altitude_m), NORTH_SEA
+    )
+    np.testing.assert_allclose(back, away, atol=1e-6)
 
 
 def test_directions() -> None:

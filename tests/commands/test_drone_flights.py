@@ -1,0 +1,203 @@
+"""Flights whose poses come from the drones' own logs, through the commands: every camera where it was."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipelines.geometry.poses import conjugate, multiply, rotate
+from pipelines.ingest import ingest
+from pipelines.session.errors import DataError
+from tests.commands.runner import refused, succeeds
+from tests.synthetic.drone_logs import (
+    HOME,
+    LEVER_ARM,
+    DroneTruth,
+    drone_of,
+    ulog_rows,
+    write_dataflash,
+    write_srt,
+    write_ulog,
+)
+from tests.synthetic.flights import SyntheticFlight, write_flight
+from tests.synthetic.logged_flights import header
+from tests.synthetic.logs import Entry, write_log
+
+WORLD = {
+    "origin": {
+        "latitude_deg": HOME.latitude_deg,
+        "longitude_deg": HOME.longitude_deg,
+        "altitude_m": HOME.altitude_m,
+    }
+}
+ON_GIMBAL = {"looks": "forward", "translation": LEVER_ARM.tolist()}
+
+
+def session_of(flight: SyntheticFlight) -> dict[str, Any]:
+    stored = flight.manifest.with_suffix(".session") / "session.json"
+    described: dict[str, Any] = json.loads(stored.read_text(encoding="utf-8"))
+    return described
+
+
+def poses_of(flight: SyntheticFlight, name: str) -> pd.DataFrame:
+    return pd.read_parquet(flight.manifest.with_suffix(".session") / "cameras" / name / "poses.parquet")
+
+
+def errors(flight: SyntheticFlight, k: int) -> tuple[float, float]:
+    """The largest errors of a camera's poses, in m and deg, at those frames that have one."""
+    poses = poses_of(flight, flight.cameras[k]).set_index("t_ns")
+    # Clocks in whole microseconds or milliseconds: cameras move by 1 mm in a ms at most.
+    times = poses.index.to_numpy()
+    nearest = np.abs(flight.t_ns[:, None] - times[None]).argmin(axis=0)
+    assert np.abs(flight.t_ns[nearest] - times).max() < 1_100_000
+    position = poses[["x", "y", "z"]].to_numpy() - flight.camera_position[k][nearest]
+    turned = multiply(
+        conjugate(flight.camera_quaternion[k][nearest]), poses[["qx", "qy", "qz", "qw"]].to_numpy()
+    )
+    return float(np.abs(position).max()), float(np.degrees(2 * np.abs(turned[:, :3])).max())
+
+
+def with_poses(folder: Path, poses: Any, mount: dict[str, Any] | None = None) -> SyntheticFlight:
+    """A clean flight of two cameras; `poses` writes a drone's log and says what the manifest states of it."""
+    flight = write_flight(folder, cameras=2, seconds=1.0, clean=True)
+    flight.settings["world"] |= WORLD
+    for k, name in enumerate(flight.cameras):
+        camera = flight.settings["cameras"][name]
+        camera["pose"] = poses(folder, name, drone_of(flight, k))
+        if mount is not None:
+            camera["mount"] = mount
+    flight.save()
+    return flight
+
+
+def test_subtitles_with_gimbal_angles_on_two_drones(tmp_path: Path) -> None:
+    # Their body's attitude is not in them: the lever arm turns with a level body that heads with the gimbal.
+    flight = with_poses(tmp_path, _srt)
+    said = succeeds("ingest", flight.manifest)
+    assert f"world origin: {HOME.latitude_deg:.7f}, {HOME.longitude_deg:.7f}, 280.00 m (world.origin)" in said
+    assert session_of(flight)["origin"]["source"] == "world.origin"
+    for k in range(2):
+        metres, degrees = errors(flight, k)
+        # Without a mount the camera is where the body is: off by the lever arm, 0.147 m.
+        assert metres == pytest.approx(np.abs(rotate(drone_of(flight, k).body, LEVER_ARM)).max(), abs=1e-3)
+        assert degrees < 1e-4
+
+
+def _srt(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+    write_srt(folder / f"{name}.SRT", truth)
+    return {"dji": f"{name}.SRT", "altitude": "absolute"}
+
+
+def _ulog(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+    write_ulog(folder / f"{name}.ulg", ulog_rows(truth))
+    return {"ulog": f"{name}.ulg"}
+
+
+def _dataflash(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+    write_dataflash(folder / f"{name}.bin", truth)
+    return {"ardupilot": f"{name}.bin", "position": "local"}
+
+
+def _osdk(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+    entries: list[Entry] = []
+    for row, stamp_ns in enumerate(truth.t_ns.tolist()):
+        yaw, pitch, roll = truth.gimbal_ypr_deg[row].tolist()
+        entries += [
+            Entry("/dji_sdk/gps_position", "sensor_msgs/msg/NavSatFix", stamp_ns, _fix(truth, row)),
+            Entry(
+                "/dji_sdk/attitude",
+                "geometry_msgs/msg/QuaternionStamped",
+                stamp_ns,
+                {
+                    "header": header(stamp_ns, "/body_FLU"),
+                    "quaternion": dict(zip("xyzw", truth.body[row].tolist(), strict=True)),
+                },
+            ),
+            Entry(
+                "/dji_sdk/gimbal_angle",
+                "geometry_msgs/msg/Vector3Stamped",
+                stamp_ns,
+                {"header": header(stamp_ns, ""), "vector": {"x": pitch, "y": roll, "z": yaw}},
+            ),
+        ]
+    write_log(folder, name, "ros1", entries)
+    return {"log": f"{name}.bag", "preset": "dji_osdk"}
+
+
+def _fix(truth: DroneTruth, row: int) -> dict[str, Any]:
+    return {
+        "header": header(int(truth.t_ns[row]), "/gps"),
+        "latitude": truth.latitude_deg[row],
+        "longitude": truth.longitude_deg[row],
+        "altitude": truth.altitude_m[row],
+    }
+
+
+@pytest.mark.parametrize(
+    ("write", "metres", "degrees"),
+    [
+        # Floats of 32 bits hold 10 m to 1e-6, quaternions to 1e-7; clocks are whole microseconds.
+        (_ulog, 1e-4, 1e-4),
+        # Angles of the body to 0.005 deg on a lever arm of 0.15 m; GPS time, by which the clock is set, to a
+        # ms (at 1 m/s), and the origin to 1e-7 deg (11 mm).
+        (_dataflash, 0.013, 0.1),
+        (_osdk, 1e-4, 1e-4),
+    ],
+)
+def test_drones_that_log_body_and_gimbal(tmp_path: Path, write: Any, metres: float, degrees: float) -> None:
+    flight = with_poses(tmp_path, write, ON_GIMBAL)
+    ingest(flight.manifest)
+    for k in range(2):
+        off_m, off_deg = errors(flight, k)
+        assert off_m < metres
+        assert off_deg < degrees
+
+
+def test_one_origin_for_all_where_none_is_stated(tmp_path: Path) -> None:
+    flight = with_poses(tmp_path, _osdk, ON_GIMBAL)
+    del flight.settings["world"]["origin"]
+    flight.save()
+    ingest(flight.manifest)
+    origin, truth = session_of(flight)["origin"], drone_of(flight, 0)
+    assert (origin["latitude_deg"], origin["longitude_deg"]) == (
+        truth.latitude_deg[0],
+        truth.longitude_deg[0],
+    )
+    assert origin["source"] == "drone1.bag"
+    first, second = (poses_of(flight, name)[["x", "y", "z"]].to_numpy()[0] for name in flight.cameras)
+    true = flight.camera_position[1][0] - flight.camera_position[0][0]
+    # 15 m from HOME the vertical is turned by 2.4e-6: 15 m apart, 0.04 mm.
+    np.testing.assert_allclose(second - first, true, atol=1e-4)
+
+
+def test_what_is_missing_is_told_in_one_line(tmp_path: Path) -> None:
+    flight = with_poses(tmp_path, _srt)
+    write_srt(tmp_path / "drone1.SRT", drone_of(flight, 0), gimbal=False)
+    assert "not how it was turned; add gimbal: {log, topic" in refused("ingest", flight.manifest)
+    camera = flight.settings["cameras"]["drone1"]
+    camera["gimbal"] = {"fixed": {"yaw_deg": 1, "pitch_deg": 1}, "relative_to": "body"}
+    flight.save()
+    with pytest.raises(DataError, match=r"relative to the body, but drone1\.SRT does not say"):
+        ingest(flight.manifest)
+    camera["gimbal"] = {"relative_to": "world"}
+    flight.save()
+    with pytest.raises(DataError, match=r"drone1\.SRT holds no gimbal angles"):
+        ingest(flight.manifest)
+
+
+def test_a_camera_that_never_turned_has_fixed_angles(tmp_path: Path) -> None:
+    flight = with_poses(tmp_path, _srt)
+    write_srt(tmp_path / "drone1.SRT", drone_of(flight, 0), gimbal=False)
+    yaw, pitch, roll = drone_of(flight, 0).gimbal_ypr_deg[0].tolist()
+    fixed = {"yaw_deg": yaw, "pitch_deg": pitch, "roll_deg": roll}
+    flight.settings["cameras"]["drone1"]["gimbal"] = {"fixed": fixed}
+    flight.save()
+    ingest(flight.manifest)
+    turned = poses_of(flight, "drone1")[["qx", "qy", "qz", "qw"]].to_numpy()
+    off = multiply(conjugate(flight.camera_quaternion[0][:1]), turned)
+    assert np.abs(off[:, :3]).max() < 1e-7

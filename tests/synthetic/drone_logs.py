@@ -1,0 +1,299 @@
+"""Logs as drones write them themselves, byte for byte: DJI's subtitles, DataFlash (.bin), ULog (.ulg).
+
+Written by the published formats with `struct` alone, so that no library of the readers has a part in them.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.geodesy import Place, place_at
+from pipelines.geometry.poses import (
+    matrix_from_quaternion,
+    multiply,
+    quaternion_from_rotation_vector,
+    rotate,
+)
+from tests.synthetic.flights import SyntheticFlight
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+HOME = Place(40.4433, -79.9436, 280.0)
+LEVER_ARM = np.array([0.12, -0.03, -0.08])
+BOOT_NS = 83_000_000_000  # on the autopilot's clock when the flight's own time begins
+GPS_LEAP_S = 18
+
+
+@dataclass(frozen=True)
+class DroneTruth:
+    """What a drone that carries one camera of a flight would log: [N] rows each."""
+
+    t_ns: Int64  # UTC
+    enu: Float  # [N, 3] m from HOME, of the body
+    latitude_deg: Float
+    longitude_deg: Float
+    altitude_m: Float
+    body: Float  # [N, 4] ENU from FLU
+    body_ypr_deg: Float  # [N, 3] of FRD in NED
+    gimbal_ypr_deg: Float  # [N, 3] of FRD in NED
+
+    @property
+    def boot_us(self) -> Int64:
+        """[N] the autopilot's own clock."""
+        since_boot: Int64 = (self.t_ns - self.t_ns[0] + BOOT_NS) // 1000
+        return since_boot
+
+
+def drone_of(flight: SyntheticFlight, k: int, *, tilted: bool = True) -> DroneTruth:
+    """The drone below which camera k hangs on a gimbal, at LEVER_ARM of its body.
+
+    The body heads elsewhere than the camera and, if it is tilted, pitches and rolls as it flies. Angles are
+    taken from where things point, not by the formulas of the readers.
+    """
+    yaw = 0.4 + 0.8 * k + 0.3 * (flight.t_ns - flight.t_ns[0]) / 1e9
+    still = np.zeros_like(yaw)
+    body = quaternion_from_rotation_vector(np.stack([still, still, yaw], axis=1))
+    if tilted:
+        lean = np.broadcast_to([0.05, -0.08, 0.0], (len(yaw), 3))
+        body = multiply(body, quaternion_from_rotation_vector(lean))
+    enu = flight.camera_position[k] - rotate(body, LEVER_ARM)
+    places = [place_at(row, HOME) for row in enu]
+    axes = matrix_from_quaternion(flight.camera_quaternion[k])
+    return DroneTruth(
+        t_ns=flight.t_ns,
+        enu=enu,
+        latitude_deg=np.array([place.latitude_deg for place in places]),
+        longitude_deg=np.array([place.longitude_deg for place in places]),
+        altitude_m=np.array([place.altitude_m for place in places]),
+        body=body,
+        body_ypr_deg=_angles(rotate(body, np.array([1.0, 0, 0])), -rotate(body, np.array([0, 1.0, 0]))),
+        gimbal_ypr_deg=_angles(axes[:, :, 2], axes[:, :, 0]),
+    )
+
+
+def _angles(ahead: Float, right: Float) -> Float:
+    """Yaw, pitch, roll [N, 3] of an FRD thing in NED, by where its nose and its right side point in ENU."""
+    yaw = np.arctan2(ahead[:, 0], ahead[:, 1])  # from north to east
+    pitch = np.arcsin(np.clip(ahead[:, 2], -1, 1))  # up
+    level_right = np.stack([np.cos(yaw), -np.sin(yaw), np.zeros_like(yaw)], axis=1)
+    level_down = np.cross(ahead, level_right)
+    roll = np.arctan2(np.sum(right * level_down, axis=1), np.sum(right * level_right, axis=1))
+    return np.degrees(np.stack([yaw, pitch, roll], axis=1))
+
+
+# --- DJI's subtitles -----------------------------------------------------------------------------------
+
+
+def write_srt(
+    path: Path,
+    truth: DroneTruth,
+    *,
+    gimbal: bool = True,
+    clock: bool = True,
+    decimals: int = 9,
+    newline: str = "\n",
+) -> Path:
+    """Subtitles of each frame in the form since 2018; more decimals than drones write, unless told."""
+    blocks = []
+    for row, stamp_ns in enumerate(truth.t_ns.tolist()):
+        since = (stamp_ns - int(truth.t_ns[0])) // 1_000_000
+        shown = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=stamp_ns // 1000)
+        yaw, pitch, roll = truth.gimbal_ypr_deg[row]
+        said = [
+            f"[latitude: {truth.latitude_deg[row]:.{decimals}f}]",
+            f"[longitude: {truth.longitude_deg[row]:.{decimals}f}]",
+            f"[rel_alt: {truth.enu[row, 2]:.6f} abs_alt: {truth.altitude_m[row]:.6f}]",
+        ]
+        if gimbal:
+            said.append(f"[gb_yaw: {yaw:.6f} gb_pitch: {pitch:.6f} gb_roll: {roll:.6f}]")
+        lines = [
+            str(row + 1),
+            f"{_timecode(since)} --> {_timecode(since + 33)}",
+            f'<font size="28">FrameCnt: {row + 1}, DiffTime: 33ms',
+            *(
+                [f"{shown:%Y-%m-%d %H:%M:%S},{shown.microsecond // 1000:03d},{shown.microsecond % 1000:03d}"]
+                * clock
+            ),
+            f"[iso: 100] [shutter: 1/80.0] [fnum: 280] [color_md : default] {' '.join(said)} </font>",
+            "",
+        ]
+        blocks.append(newline.join(lines))
+    path.write_bytes(newline.join(blocks).encode())
+    return path
+
+
+def _timecode(milliseconds: int) -> str:
+    seconds, rest = divmod(milliseconds, 1000)
+    return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d},{rest:03d}"
+
+
+# --- DataFlash -----------------------------------------------------------------------------------------
+
+DATAFLASH = {
+    "FMT": (128, "BBnNZ", "Type,Length,Name,Format,Columns"),
+    "GPS": (8, "QBBIHBcLLeffffB", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"),
+    "POS": (10, "QLLfff", "TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt"),
+    "ATT": (11, "QccccCCCCB", "TimeUS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw,ErrRP,ErrYaw,AEKF"),
+    "XKF1": (12, "QBccCfffffffccce", "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD,dPD,PN,PE,PD,GX,GY,GZ,OH"),
+    "ORGN": (13, "QBLLe", "TimeUS,Type,Lat,Lng,Alt"),
+    "MNT": (14, "QBffffffff", "TimeUS,I,DesRoll,Roll,DesPitch,Pitch,DesYawB,YawB,DesYawE,YawE"),
+    "CAM": (15, "QBHIHLLeeefff", "TimeUS,I,Img,GPSTime,GPSWeek,Lat,Lng,Alt,RelAlt,GPSAlt,R,P,Y"),
+}
+_STRUCTS = {"n": "4s", "N": "16s", "Z": "64s", "c": "h", "C": "H", "e": "i", "E": "I", "L": "i", "M": "B"}
+
+
+def dataflash(name: str, *values: Any) -> bytes:
+    """One message: two marks, its number, and its fields without any padding."""
+    number, letters, _ = DATAFLASH[name]
+    layout = "<" + "".join(_STRUCTS.get(letter, letter) for letter in letters)
+    return b"\xa3\x95" + bytes([number]) + struct.pack(layout, *values)
+
+
+def definition(name: str) -> bytes:
+    """The FMT message that defines another."""
+    number, letters, columns = DATAFLASH[name]
+    layout = "<" + "".join(_STRUCTS.get(letter, letter) for letter in letters)
+    length = 3 + struct.calcsize(layout)
+    return dataflash("FMT", number, length, name.encode(), letters.encode(), columns.encode())
+
+
+def write_dataflash(
+    path: Path,
+    truth: DroneTruth,
+    *,
+    kinds: Sequence[str] = ("GPS", "POS", "ATT", "XKF1", "ORGN", "MNT", "CAM"),
+    yaw_from_north: bool = True,
+    drift_ppm: float = 0.0,
+) -> Path:
+    """A log of ArduCopter; the autopilot's clock goes slow against GPS time by `drift_ppm`."""
+    log = [definition(name) for name in ("FMT", *kinds)]
+    if "ORGN" in kinds:
+        place = (
+            round(HOME.latitude_deg * 1e7),
+            round(HOME.longitude_deg * 1e7),
+            round(HOME.altitude_m * 100),
+        )
+        log += [dataflash("ORGN", BOOT_NS // 1000, 1, 0, 0, 0), dataflash("ORGN", BOOT_NS // 1000, 0, *place)]
+    for row, stamp_ns in enumerate(truth.t_ns.tolist()):
+        since_ns = stamp_ns - int(truth.t_ns[0])
+        us = (BOOT_NS + since_ns - round(since_ns * drift_ppm * 1e-6)) // 1000
+        week, ms = divmod(stamp_ns // 1_000_000 + GPS_LEAP_S * 1000 - 315_964_800_000, 7 * 86_400_000)
+        lat, lng = round(truth.latitude_deg[row] * 1e7), round(truth.longitude_deg[row] * 1e7)
+        alt_cm = round(truth.altitude_m[row] * 100)
+        yaw, pitch, roll = truth.body_ypr_deg[row].tolist()
+        turned = round(roll * 100), round(pitch * 100), round(yaw % 360 * 100)
+        mount_yaw, mount_pitch, mount_roll = truth.gimbal_ypr_deg[row].tolist()
+        from_nose = (mount_yaw - yaw + 180) % 360 - 180
+        from_north = mount_yaw if yaw_from_north else float("nan")
+        east, north, up = truth.enu[row].tolist()
+        messages = {
+            "GPS": (us, 0, 3 if row else 1, ms, week, 12, 80, lat, lng, alt_cm, 0, 0, 0, 0, 1),
+            "POS": (us, lat, lng, truth.altitude_m[row], up, up),
+            "ATT": (us, 0, turned[0], 0, turned[1], 0, turned[2], 0, 0, 3),
+            "XKF1": (us, 0, *turned, 0, 0, 0, 0, north, east, -up, 0, 0, 0, 0),
+            "MNT": (us, 0, 0, mount_roll, 0, mount_pitch, 0, from_nose, 0, from_north),
+            "CAM": (us, 0, row, ms, week, lat, lng, alt_cm, 0, alt_cm, roll, pitch, yaw % 360),
+        }
+        log += [dataflash(name, *messages[name]) for name in kinds if name in messages]
+    path.write_bytes(b"".join(log))
+    return path
+
+
+# --- ULog ----------------------------------------------------------------------------------------------
+
+ULOG = {
+    # Padding at the end of a message is defined but not written.
+    "vehicle_local_position": (
+        "uint64_t timestamp;uint64_t timestamp_sample;uint64_t ref_timestamp;double ref_lat;double ref_lon;"
+        "float x;float y;float z;float ref_alt;float eph;float epv;bool xy_valid;bool z_valid;"
+        "uint8_t xy_reset_counter;bool xy_global;bool z_global;uint8_t[3] _padding0;",
+        "<QQQddffffff??B??",
+    ),
+    "vehicle_attitude": ("uint64_t timestamp;uint64_t timestamp_sample;float[4] q;", "<QQffff"),
+    "vehicle_gps_position": (
+        "uint64_t timestamp;uint64_t time_utc_usec;int32_t lat;int32_t lon;int32_t alt;float eph;float epv;"
+        "uint8_t fix_type;uint8_t[3] _padding0;",
+        "<QQiiiffB",
+    ),
+    "gimbal_device_attitude_status": (
+        "uint64_t timestamp;float[4] q;uint16_t device_flags;uint8_t[6] _padding0;",
+        "<QffffH",
+    ),
+    "camera_trigger": (
+        "uint64_t timestamp;uint64_t timestamp_utc;uint32_t seq;uint8_t[4] _padding0;",
+        "<QQI",
+    ),
+}
+
+
+def ulog_record(kind: str, body: bytes) -> bytes:
+    """Length, kind and body."""
+    return struct.pack("<HB", len(body), ord(kind)) + body
+
+
+def write_ulog(
+    path: Path, rows: Sequence[tuple[str, int, tuple[Any, ...]]], *, formats: Mapping[str, str] | None = None
+) -> Path:
+    """A log of rows (topic, instance, fields in the order of ULOG), stamped in microseconds since boot."""
+    log = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", BOOT_NS // 1000), ulog_record("B", bytes(40))]
+    stated = formats or {name: fields for name, (fields, _) in ULOG.items()}
+    log += [ulog_record("F", f"{name}:{fields}".encode()) for name, fields in stated.items()]
+    numbers = {key: number for number, key in enumerate(dict.fromkeys(row[:2] for row in rows))}
+    for (name, instance), number in numbers.items():
+        log.append(ulog_record("A", struct.pack("<BH", instance, number) + name.encode()))
+    for name, instance, fields in rows:
+        body = struct.pack("<H", numbers[name, instance]) + struct.pack(ULOG[name][1], *fields)
+        log.append(ulog_record("D", body))
+    path.write_bytes(b"".join(log))
+    return path
+
+
+def ulog_rows(
+    truth: DroneTruth, *, from_north: bool = True, origin: Place | None = HOME
+) -> list[tuple[str, int, tuple[Any, ...]]]:
+    """What PX4 would log: local position, attitude, GPS, gimbal and a trigger for each row."""
+    rows: list[tuple[str, int, tuple[Any, ...]]] = []
+    for row, us in enumerate(truth.boot_us.tolist()):
+        east, north, up = truth.enu[row].tolist()
+        reference = (origin.latitude_deg, origin.longitude_deg) if origin else (float("nan"),) * 2
+        height = origin.altitude_m if origin else float("nan")
+        known = origin is not None
+        stamps = (us + 2000, us)  # published 2 ms after it was sampled
+        place = (*stamps, 0, *reference, north, east, -up, height, 0.3, 0.5, True, True, 0, known, known)
+        utc_us = int(truth.t_ns[row]) // 1000
+        lat, lon = round(truth.latitude_deg[row] * 1e7), round(truth.longitude_deg[row] * 1e7)
+        fix = (us, utc_us, lat, lon, round(truth.altitude_m[row] * 1000), 1.2, 2.0, 3)
+        yaw, pitch, roll = truth.gimbal_ypr_deg[row]
+        flags = 4 | 8 | (64 if from_north else 32)
+        counted = yaw if from_north else yaw - truth.body_ypr_deg[row, 0]
+        rows += [
+            ("vehicle_local_position", 0, place),
+            ("vehicle_attitude", 0, (*stamps, *_wxyz(*truth.body_ypr_deg[row]))),
+            ("vehicle_gps_position", 0, fix),
+            ("gimbal_device_attitude_status", 0, (us, *_wxyz(counted, pitch, roll), flags)),
+            ("camera_trigger", 0, (us, utc_us, row)),
+        ]
+    return rows
+
+
+def _wxyz(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, ...]:
+    """Quaternion of yaw, pitch, roll by the textbook formula (Diebel 2006, eq. 290), w first."""
+    (cy, sy), (cp, sp), (cr, sr) = (
+        (np.cos(np.radians(angle) / 2), np.sin(np.radians(angle) / 2))
+        for angle in (yaw_deg, pitch_deg, roll_deg)
+    )
+    return (
+        float(cr * cp * cy + sr * sp * sy),
+        float(sr * cp * cy - cr * sp * sy),
+        float(cr * sp * cy + sr * cp * sy),
+        float(cr * cp * sy - sr * sp * cy),
+    )
