@@ -6,30 +6,88 @@ from pathlib import Path
 
 import click
 
-from mocap_cli.options import any_path, json_option, overwrite_option, session_argument
-from mocap_cli.terminal import print_json
+from mocap_cli.options import (
+    FiniteRange,
+    any_path,
+    json_option,
+    level,
+    overwrite_option,
+    session_argument,
+    verbosity_options,
+)
+from mocap_cli.terminal import print_json, watching
 
 
-@click.command("export", short_help="Write TRC, CSV or TUM.")
+class _ListsFormats(click.Command):
+    """Its help ends with the formats there are, those of other packages among them."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        """One line for each format: its name, what it is, and the units and axes that it has."""
+        from pipelines.session.registries import EXPORTS, ChoiceOfAxes
+
+        rows = []
+        for format_ in EXPORTS.all():
+            line = format_.title
+            if isinstance(format_, ChoiceOfAxes):
+                line += f"; {'|'.join(format_.units)}, {'|'.join(format_.axes)}"
+            rows.append((format_.name, line))
+        with formatter.section("Formats (the first unit and axes are the usual ones, else metres with z up)"):
+            formatter.write_dl(rows)
+
+
+@click.command("export", cls=_ListsFormats, short_help="Write TRC, C3D, BVH, CSV, TUM, MCAP, Rerun.")
 @session_argument
 @click.option(
     "--to",
     "formats",
     required=True,
     metavar="FORMAT[,FORMAT...]",
-    help="trc (OpenSim, metres, Y up), csv (everything, long), tum (camera trajectories).",
+    help="What to write, as listed below; several at once.",
 )
 @click.option("-o", "--output", type=any_path, help="Folder [default: the session's name with .export].")
+@click.option("--unit", metavar="m|cm|mm|inch", help="Unit of lengths, for formats that have a choice.")
+@click.option("--axes", metavar="z-up|y-up", help="Which way is up, for formats that have a choice.")
+@click.option(
+    "--pictures-hz",
+    type=FiniteRange(0, 1000),
+    help="Pictures per camera and second in mcap and rerun; 0 is none. [default: 2]",
+)
 @overwrite_option
 @json_option
-def export_command(session: Path, formats: str, output: Path | None, overwrite: bool, as_json: bool) -> None:
-    """Write the skeleton and the cameras in the formats of other programs."""
-    from pipelines.export import export
+@verbosity_options
+def export_command(
+    session: Path,
+    formats: str,
+    output: Path | None,
+    unit: str | None,
+    axes: str | None,
+    pictures_hz: float | None,
+    overwrite: bool,
+    as_json: bool,
+    quiet: bool,
+    verbose: int,
+) -> None:
+    """Write the skeleton and the cameras in the formats of other programs.
+
+    Beside the files, export.json says what each is, in which unit and axes, and what was left out or held.
+    Files of an earlier export are replaced; what else lies there only with --overwrite.
+    """
+    from pipelines.export import PICTURES_HZ, export
 
     names = [name.strip() for name in formats.split(",") if name.strip()]
     if not names:
         raise click.BadParameter("names no format", param_hint="--to")
-    result = export(session, names, output, overwrite=overwrite)
+    with watching(level(quiet, verbose)) as progress:
+        result = export(
+            session,
+            names,
+            output,
+            unit=unit,
+            axes=axes,
+            pictures_hz=PICTURES_HZ if pictures_hz is None else pictures_hz,
+            overwrite=overwrite,
+            progress=progress,
+        )
     if as_json:
         print_json(
             {

@@ -3,18 +3,35 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
-from pipelines.session.description import read_description
+import numpy as np
+
+from pipelines.formats.even_frames import thinned
+from pipelines.formats.pictures import Picture, open_pictures
+from pipelines.reporting.filmed import origin_ns, read_filmed, refined_poses
+from pipelines.reporting.frame_drawing import caption_of, draw_frame
+from pipelines.reporting.motion import motion_from_skeleton
+from pipelines.reporting.overlays import status_at, views_of
+from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
-from pipelines.session.records import Recording
-from pipelines.session.registries import EXPORTS
-from pipelines.session.stages import open_session, session_name
-from pipelines.session.storage import as_data_error, sha256_of
-from pipelines.session.tables import POSES, SKELETON, read_table
+from pipelines.session.maps import read_grid
+from pipelines.session.progress import Progress, Silent
+from pipelines.session.records import Int64, Occupancy, Recording
+from pipelines.session.registries import EXPORTS, ChoiceOfAxes, Export
+from pipelines.session.stages import StageRecord, open_session, session_name
+from pipelines.session.storage import as_data_error, read_json, sha256_of, write_json
+from pipelines.session.tables import FRAMES, POSES, SKELETON, read_table
 from pipelines.session.tabular import motion_from, trajectory_from
+
+PICTURES_HZ = 2.0
+"""How many pictures of a camera go into a recording each second, unless the user says otherwise."""
+
+_RECORD = "export.json"
+_SCHEMA = 1
 
 
 @dataclass(frozen=True)
@@ -27,31 +44,60 @@ class Exported:
 
 
 def export(
-    folder: Path, formats: Sequence[str], output: Path | None = None, *, overwrite: bool = False
+    folder: Path,
+    formats: Sequence[str],
+    output: Path | None = None,
+    *,
+    unit: str | None = None,
+    axes: str | None = None,
+    pictures_hz: float = PICTURES_HZ,
+    overwrite: bool = False,
+    progress: Progress | None = None,
 ) -> Exported:
-    """Write a session in other formats.
+    """Write a session in other formats, and `export.json`: what each file is, and what was noted on the way.
+
+    Nothing appears under its own name before everything is written. Files of an earlier export that nobody
+    touched since are replaced.
 
     Args:
         folder: the session.
         formats: registered names.
         output: where to; by default beside the session, `.export` in the place of `.session`.
-        overwrite: replace files that are there and differ.
+        unit: of lengths, for formats that have a choice; each format's usual one by default.
+        axes: z-up or y-up, likewise.
+        pictures_hz: how many pictures of each camera go into recordings that hold pictures, per second; 0
+            is none.
+        overwrite: replace files that are there and were not written by an export, or were changed since.
+        progress: who watches.
 
     Raises:
-        DataError: no such format, nothing to export, or a file would be overwritten.
+        DataError: no such format, none that has a choice of the unit or axes, nothing to export, or a file
+            would be overwritten.
     """
+    progress = progress or Silent()
     exports = [EXPORTS.get(name) for name in dict.fromkeys(name.lower() for name in formats)]
-    recording = load_recording(folder)
+    shapes = {format_.name: _shape(format_, unit, axes) for format_ in exports}
+    _refuse_idle_choice(shapes, unit, axes)
+    recording = load_recording(folder, pictures_hz=pictures_hz)
     target = output or folder.resolve().with_name(f"{session_name(folder)}.export")
     is_new = not target.exists()
     try:
         target.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=target, prefix=".writing-") as temporary:
-            made = []
+            made: dict[Path, dict[str, Any]] = {}
             for format_ in exports:
                 own = Path(temporary) / format_.name
                 own.mkdir()
-                made += format_.write(recording, own)
+                notes = _Notes(progress)
+                unit_, axes_ = shapes[format_.name] or (None, None)
+                asked = replace(recording, unit=unit_, axes=axes_, progress=notes)
+                for path in format_.write(asked, own):
+                    made[path] = {
+                        "format": format_.name,
+                        "unit": unit_ or "m",
+                        "axes": axes_ or "z-up",
+                        "notes": notes.said,
+                    }
             return _move(made, target, overwrite)
     except OSError as error:
         raise as_data_error(error, target) from error
@@ -60,35 +106,177 @@ def export(
             target.rmdir()
 
 
-def load_recording(folder: Path) -> Recording:
-    """The skeleton and the cameras of a session.
+@dataclass(frozen=True)
+class _Notes:
+    """Hands on what is said, and keeps the notes for those who read the files later."""
+
+    whom: Progress
+    said: list[str] = field(default_factory=list)
+
+    def start(self, task: str, total: int) -> None:
+        self.whom.start(task, total)
+
+    def advance(self, steps: int = 1) -> None:
+        self.whom.advance(steps)
+
+    def note(self, message: str) -> None:
+        self.said.append(message)
+        self.whom.note(message)
+
+
+# --- units and axes ------------------------------------------------------------------------------------
+
+
+def _shape(format_: Export, unit: str | None, axes: str | None) -> tuple[str, str] | None:
+    """The unit and axes that a format is written in; None where it has no choice."""
+    if not isinstance(format_, ChoiceOfAxes):
+        return None
+    for wanted, there, what in ((unit, format_.units, "unit"), (axes, format_.axes, "axes")):
+        if wanted is not None and wanted not in there:
+            raise DataError(format_.name, f"has no {what} {wanted}", f"there are {', '.join(there)}")
+    return unit or format_.units[0], axes or format_.axes[0]
+
+
+def _refuse_idle_choice(
+    shapes: Mapping[str, tuple[str, str] | None], unit: str | None, axes: str | None
+) -> None:
+    """Refuse a choice for formats that are always metres with z up."""
+    fixed = [name for name, shape in shapes.items() if shape is None]
+    if fixed and (unit is not None or axes is not None):
+        raise DataError(
+            ", ".join(fixed),
+            f"{'are' if len(fixed) > 1 else 'is'} always in metres with z up",
+            "leave --unit and --axes out, or export the others by themselves",
+        )
+
+
+# --- what is exported ----------------------------------------------------------------------------------
+
+
+def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
+    """The skeleton and the cameras of a session, its maps, and so many pictures per second.
 
     Raises:
         DataError: not a session, or damaged.
     """
     session = open_session(folder)
     description = read_description(folder)
+    record = session.record("reconstruct")
     motion = None
-    if session.record("reconstruct"):
+    if record is not None:
         table = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON)
         motion = motion_from(table, tuple(dict.fromkeys(table["joint"])))
     cameras = {
         name: trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
         for name in description.cameras
     }
-    return Recording(description.flight, motion, cameras)
+    return Recording(
+        description.flight,
+        motion,
+        cameras,
+        refined=refined_poses(folder) if record is not None else {},
+        lenses={name: camera.intrinsics.intrinsics() for name, camera in description.cameras.items()},
+        maps=lambda: _maps(folder),
+        pictures=_pictures(folder, description, record, pictures_hz),
+        overlays=_overlays(folder, description, record, pictures_hz),
+    )
 
 
-def _move(made: Sequence[Path], target: Path, overwrite: bool) -> Exported:
+def _maps(folder: Path) -> Iterator[Occupancy]:
+    """The maps of a session, one in memory at a time."""
+    if (folder / "map").exists():
+        for k in range(len(read_json(folder / "map" / "index.json").get("maps", []))):
+            yield read_grid(folder / "map" / f"{k}.npz")
+
+
+Stills = Callable[[str], Iterable[tuple[int, Picture]]]
+
+
+def _pictures(folder: Path, description: Description, record: StageRecord | None, rate_hz: float) -> Stills:
+    """The pictures of a camera that are still there, by world time."""
+
+    def of(camera: str) -> Iterator[tuple[int, Picture]]:
+        frames = read_table(folder / "cameras" / camera / "frames.parquet", FRAMES)
+        t_ns = frames["t_ns"].to_numpy(np.int64)
+        if record is not None:
+            offsets = read_json(folder / "reconstruct" / "metrics.json").get("clock_offsets_s", {})
+            t_ns = t_ns + round((offsets.get(camera) or 0.0) * 1e9)
+        frame = frames["frame"].to_numpy(np.int64)
+        for row, picture in _stills(folder, description, camera, frame, thinned(t_ns, rate_hz)):
+            yield int(t_ns[row]), picture
+
+    return of
+
+
+def _overlays(folder: Path, description: Description, record: StageRecord | None, rate_hz: float) -> Stills:
+    """The same with the skeleton drawn over them."""
+
+    def of(camera: str) -> Iterator[tuple[int, Picture]]:
+        entry = description.cameras[camera]
+        if record is None or entry.media is None or not rate_hz:
+            return
+        filmed = read_filmed(folder, description, record, [camera])[camera]
+        motion = motion_from_skeleton(read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON))
+        rows = thinned(filmed.frame_t_ns, rate_hz)
+        status = status_at(motion, filmed.frame_t_ns[rows])
+        views = views_of(filmed, rows, motion, status, origin_ns(description))
+        place = {row: k for k, row in enumerate(rows.tolist())}
+        for row, picture in _stills(folder, description, camera, filmed.frame, rows):
+            view, of_joints = views[place[row]], status[place[row]]
+            caption = caption_of(view, of_joints, str(record.settings["method"]))
+            yield int(filmed.frame_t_ns[row]), draw_frame(picture, view, caption)
+
+    return of
+
+
+def _stills(
+    folder: Path, description: Description, camera: str, frame: Int64, rows: Int64
+) -> Iterator[tuple[int, Picture]]:
+    """Row and picture, as far as they can be decoded; none of a camera whose pictures are gone."""
+    media = description.cameras[camera].media
+    if media is None or not len(rows) or any(not (folder / path).exists() for path in media.paths):
+        return
+    with open_pictures(media, folder) as pictures:
+        for row in rows.tolist():
+            picture = pictures.read(int(frame[row]))
+            if picture is not None:
+                yield row, picture
+
+
+# --- where it goes -------------------------------------------------------------------------------------
+
+
+def _move(made: Mapping[Path, dict[str, Any]], target: Path, overwrite: bool) -> Exported:
     """Move finished files to their place: all of them, or none where one may not be replaced."""
+    record = target / _RECORD
+    ours = _earlier(record)
     unchanged: list[tuple[Path, Path]] = []
     written: list[tuple[Path, Path]] = []
-    for path in made:
+    for path, facts in made.items():
         place = target / path.name
-        same = place.is_file() and sha256_of(place) == sha256_of(path)
-        if place.exists() and not same and not overwrite:
-            raise DataError(place, "exists and differs", "choose another --output, or add --overwrite")
-        (unchanged if same else written).append((path, place))
+        facts["sha256"] = sha256_of(path)
+        there = sha256_of(place) if place.is_file() else None
+        own = there is not None and there == ours.get(path.name, {}).get("sha256")
+        if place.exists() and there != facts["sha256"] and not own and not overwrite:
+            raise DataError(
+                place, "exists and was not exported so", "choose another --output, or add --overwrite"
+            )
+        (unchanged if there == facts["sha256"] else written).append((path, place))
     for path, place in written:
         path.replace(place)
+    files = ours | {path.name: facts for path, facts in made.items()}
+    write_json(record, {"schema": _SCHEMA, "files": {name: files[name] for name in sorted(files)}})
     return Exported(target, [place for _, place in written], [place for _, place in unchanged])
+
+
+def _earlier(record: Path) -> dict[str, dict[str, Any]]:
+    """What earlier exports wrote into a folder, by name; a record that cannot be read vouches for nothing."""
+    if not record.is_file():
+        return {}
+    try:
+        files = read_json(record).get("files")
+    except DataError:
+        return {}
+    if not isinstance(files, dict):
+        return {}
+    return {name: facts for name, facts in files.items() if isinstance(facts, dict)}

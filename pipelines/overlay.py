@@ -15,27 +15,23 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipelines.formats.pictures import Picture, open_pictures
 from pipelines.formats.video_writing import TICK_S, join_videos, write_h264
+from pipelines.reporting.filmed import origin_ns, read_filmed
 from pipelines.reporting.frame_drawing import blank_frame, caption_of, draw_frame, padded_to_even
 from pipelines.reporting.motion import Motion, motion_from_skeleton
 from pipelines.reporting.overlays import FilmedCamera, status_at, views_of
 from pipelines.session.description import Description, MediaEntry, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Int64, Trajectory
+from pipelines.session.records import Int64
 from pipelines.session.stages import StageRecord, locked
 from pipelines.session.storage import canonical_json, read_json, write_json
-from pipelines.session.tables import CAMERA_POSES, FRAMES, KEYPOINTS, POSES, SKELETON, read_table
-from pipelines.session.tabular import trajectory_from
+from pipelines.session.tables import FRAMES, SKELETON, read_table
 from pipelines.session.whole_folders import Making, is_made, whole_folder
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 _REVISION = 3
 _MARK = "overlay.json"
@@ -202,16 +198,14 @@ def _films(
     span_s: tuple[float | None, float | None],
     progress: Progress,
 ) -> list[_Film]:
-    offsets_s = read_json(folder / "reconstruct" / "metrics.json").get("clock_offsets_s", {})
-    refined = _refined_poses(folder)
+    filmed = read_filmed(folder, description, record, cameras)
     films = []
-    for name in cameras:
+    for name, camera in filmed.items():
         frames = read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
-        rows = _rows_between(frames["t_ns"].to_numpy(np.int64) - _origin_ns(description), *span_s)
+        rows = _rows_between(frames["t_ns"].to_numpy(np.int64) - origin_ns(description), *span_s)
         if not rows:
             progress.note(f"{name}: no overlay, none of its pictures lies in the span")
             continue
-        camera = _camera(folder, description, record, name, frames, refined, offsets_s.get(name) or 0.0)
         pts_ns = frames["pts_ns"].to_numpy(np.int64)[rows.start : rows.stop]
         media = _media(description, name)
         size = _picture_size(folder, media, camera, rows)
@@ -219,10 +213,6 @@ def _films(
     if not films:
         raise DataError(folder, "has no picture in that span", "look at `mocap info`, or leave the span out")
     return films
-
-
-def _origin_ns(description: Description) -> int:
-    return min(entry.frames.first_t_ns for entry in description.cameras.values())
 
 
 def _rows_between(since_ns: Int64, start_s: float | None, end_s: float | None) -> range:
@@ -237,42 +227,6 @@ def _apart(pts_ns: Int64) -> Int64:
     least = np.arange(len(pts_ns)) * _TICK_NS
     spread: Int64 = np.maximum.accumulate(pts_ns - least) + least
     return spread
-
-
-def _camera(
-    folder: Path,
-    description: Description,
-    record: StageRecord,
-    name: str,
-    frames: pd.DataFrame,
-    refined: dict[str, Trajectory],
-    offset_s: float,
-) -> FilmedCamera:
-    """A camera as the reconstruction took it, or as it was refined."""
-    entry, bounds = description.cameras[name], description.pose_interpolation
-    stage = "cameras" if entry.keypoints is not None else "detect"
-    keypoints = read_table(folder / stage / name / "keypoints.parquet", KEYPOINTS)
-    logged = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
-    return FilmedCamera(
-        name=name,
-        intrinsics=entry.intrinsics.intrinsics(),
-        frame=frames["frame"].to_numpy(np.int64),
-        frame_t_ns=frames["t_ns"].to_numpy(np.int64) + round(offset_s * 1e9),
-        keypoints=keypoints[keypoints["confidence"] >= record.settings["min_confidence"]],
-        track=refined.get(name, logged),
-        static=entry.poses.static,
-        max_gap_ns=round(bounds.max_gap_s * 1e9),
-        max_extrapolation_ns=round(bounds.max_extrapolation_s * 1e9),
-    )
-
-
-def _refined_poses(folder: Path) -> dict[str, Trajectory]:
-    """The poses of the cameras that the reconstruction refined."""
-    path = folder / "reconstruct" / "cameras.parquet"
-    if not path.exists():
-        return {}
-    table = read_table(path, CAMERA_POSES)
-    return {str(name): trajectory_from(own.sort_values("t_ns")) for name, own in table.groupby("camera")}
 
 
 def _picture_size(folder: Path, media: MediaEntry, camera: FilmedCamera, rows: range) -> tuple[int, int]:
@@ -299,7 +253,7 @@ class _Show:
 
 def _show(folder: Path, description: Description, record: StageRecord) -> _Show:
     skeleton = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON)
-    return _Show(motion_from_skeleton(skeleton), record.settings["method"], _origin_ns(description))
+    return _Show(motion_from_skeleton(skeleton), record.settings["method"], origin_ns(description))
 
 
 def _draw(

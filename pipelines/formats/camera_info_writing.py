@@ -9,7 +9,7 @@ from pipelines.geometry.cameras import Intrinsics
 
 def write_camera_info(path: Path, name: str, intrinsics: Intrinsics) -> None:
     """Write one camera; numbers are exact."""
-    model, distortion = _distortion(intrinsics)
+    model, distortion = ros_distortion(intrinsics)
     fx, fy, cx, cy = (float(v) for v in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
     matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
     projection = [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
@@ -26,7 +26,7 @@ def write_camera_info(path: Path, name: str, intrinsics: Intrinsics) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
 
 
-def _distortion(intrinsics: Intrinsics) -> tuple[str, list[float]]:
+def ros_distortion(intrinsics: Intrinsics) -> tuple[str, list[float]]:
     """The model's name in ROS, and as many coefficients as it takes there."""
     coefficients = [float(v) for v in intrinsics.distortion]
     if intrinsics.model == "fisheye":

@@ -3,8 +3,39 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.session.errors import DataError
+from pipelines.session.records import JointMotion, Recording, Trajectory
 
 
 def safe_file_name(name: str) -> str:
     """A recording's free-text name as part of a file name: letters, digits, dot, dash, underscore."""
     return re.sub(r"[^\w.-]+", "_", name).strip("._")[:80] or "recording"
+
+
+def people_of(recording: Recording, folder: Path, suffix: str) -> tuple[JointMotion, dict[int, Path]]:
+    """A recording's motion, and a file for each person of whom a joint is known.
+
+    `<name>.trc`, or `<name>_person<k>.trc` where there are several people.
+
+    Raises:
+        DataError: nobody is known.
+    """
+    motion = recording.motion
+    if motion is None or np.isnan(motion.position).all():
+        raise DataError(recording.name, "holds no joints to export", "run `mocap reconstruct` first")
+    people = motion.position.shape[1]
+    known = [person for person in range(people) if not np.isnan(motion.position[:, person]).all()]
+    which = {person: f"_person{person}" if people > 1 else "" for person in known}
+    name = safe_file_name(recording.name)
+    return motion, {person: folder / f"{name}{which[person]}{suffix}" for person in known}
+
+
+def tracks_of(recording: Recording) -> dict[str, Trajectory]:
+    """The cameras' poses by the name of their file: `<camera>` as logged, `<camera>_refined` as corrected."""
+    tracks = dict(recording.cameras)
+    tracks |= {f"{camera}_refined": track for camera, track in recording.refined.items()}
+    return {name: track for name, track in tracks.items() if len(track.t_ns)}

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats import pose_csv
-from pipelines.formats.export_names import safe_file_name
+from pipelines.formats.export_names import safe_file_name, tracks_of
 from pipelines.formats.joint_axes import to_metres_z_up
 from pipelines.formats.stamps import cell_name, parse_stamps, stamp_column
 from pipelines.formats.summaries import describe_motion
@@ -181,7 +181,7 @@ class CsvExport:
     """`<name>.csv`, the skeleton as a long table, and `<name>_<camera>.csv`, the poses of each camera."""
 
     name = "csv"
-    title = "CSV tables of the skeleton and the cameras"
+    title = "long tables of the skeleton and of each camera's poses, as text"
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
         """Write what the recording has.
@@ -194,10 +194,9 @@ class CsvExport:
         if recording.motion is not None and recording.motion.position.size:
             paths.append(folder / f"{name}.csv")
             write_joints(paths[-1], recording.motion)
-        for camera, trajectory in recording.cameras.items():
-            if len(trajectory.t_ns):
-                paths.append(folder / f"{name}_{safe_file_name(camera)}.csv")
-                pose_csv.write_trajectory(paths[-1], trajectory)
+        for camera, trajectory in tracks_of(recording).items():
+            paths.append(folder / f"{name}_{safe_file_name(camera)}.csv")
+            pose_csv.write_trajectory(paths[-1], trajectory)
         if not paths:
             raise DataError(recording.name, "holds neither joints nor camera poses", "reconstruct it first")
         return sorted(paths)

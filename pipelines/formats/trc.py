@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.export_names import safe_file_name
-from pipelines.formats.joint_axes import to_metres_z_up, to_y_up
+from pipelines.formats.export_names import people_of
+from pipelines.formats.joint_axes import METRES, to_metres_z_up, to_y_up
 from pipelines.formats.stamps import format_seconds, parse_stamps
 from pipelines.formats.summaries import describe_motion, median_step_ns
 from pipelines.formats.text_tables import read_head, read_text
@@ -33,6 +33,11 @@ _UNITS = {
     "millimeters": "mm",
 }
 _DECIMALS = 7  # of a metre: far below anything measured, and rows stay readable
+
+
+def metric_unit(stated: str) -> str:
+    """m, cm or mm for what files call them; anything else as it is."""
+    return _UNITS.get(stated.lower(), stated)
 
 
 def marker_name(joint: str) -> str:
@@ -103,8 +108,7 @@ class TrcFormat:
         """
         header, rows, first_line = _split(path, read_text(path))
         if unit is None:
-            stated = header.keys.get("Units", "")
-            unit = _UNITS.get(stated.lower(), stated)
+            unit = metric_unit(header.keys.get("Units", ""))
         times, values = _numbers(path, rows, len(header.markers), first_line)
         t_ns, readable = parse_stamps(path, times)
         if not readable.all() or (np.diff(t_ns) <= 0).any():
@@ -113,7 +117,7 @@ class TrcFormat:
                 path, f"the time of row {bad[0] + 1} ({times[bad[0]]!r}) does not increase", "export it again"
             )
         position = to_metres_z_up(path, values, unit, axes or "y-up")
-        return JointMotion(t_ns=t_ns, joints=_joint_names(header.markers), position=position[:, None])
+        return JointMotion(t_ns=t_ns, joints=joint_names(header.markers), position=position[:, None])
 
 
 def _split(path: Path, text: str) -> tuple[_Header, list[str], int]:
@@ -160,7 +164,7 @@ def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tup
     return times, np.array(values).reshape(len(times), markers, 3)
 
 
-def _joint_names(markers: tuple[str, ...]) -> tuple[str, ...]:
+def joint_names(markers: tuple[str, ...]) -> tuple[str, ...]:
     """Our names where they are known and free: of Hip and MidHip in one file only the first becomes hip."""
     names: list[str] = []
     for marker in markers:
@@ -170,14 +174,17 @@ def _joint_names(markers: tuple[str, ...]) -> tuple[str, ...]:
 
 
 class TrcExport:
-    """`<name>.trc`, or `<name>_person<k>.trc` for each of several people: metres, y up, for OpenSim.
+    """`<name>.trc`, or `<name>_person<k>.trc` for each of several people: metres and y up unless asked.
 
-    OpenSim's (x, y, z) is our world's (y, z, x). Times are the session's own (seconds, nine decimals), so
-    that a file lines up with its flight and reads back as truth.
+    OpenSim's (x, y, z) is our world's (y, z, x). The header states the unit; no TRC states its axes. Times
+    are the session's own (seconds, nine decimals), so that a file lines up with its flight and reads back
+    as truth.
     """
 
     name = "trc"
-    title = "OpenSim markers (TRC)"
+    title = "markers for OpenSim and Pose2Sim"
+    units = ("m", "cm", "mm")
+    axes = ("y-up", "z-up")
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
         """Write every person of whom a joint is known.
@@ -185,21 +192,15 @@ class TrcExport:
         Raises:
             DataError: there is none.
         """
-        motion, paths = recording.motion, []
-        people = 0 if motion is None else motion.position.shape[1]
-        for person in range(people):
-            if motion is None or np.isnan(motion.position[:, person]).all():
-                continue
-            which = f"_person{person}" if people > 1 else ""
-            path = folder / f"{safe_file_name(recording.name)}{which}.trc"
-            write_joints(path, motion, person)
-            paths.append(path)
-        if not paths:
-            raise DataError(recording.name, "holds no joints to export", "run `mocap reconstruct` first")
-        return sorted(paths)
+        motion, files = people_of(recording, folder, ".trc")
+        for person, path in files.items():
+            write_joints(path, motion, person, unit=recording.unit or "m", axes=recording.axes or "y-up")
+        return sorted(files.values())
 
 
-def write_joints(path: Path, motion: JointMotion, person: int) -> None:
+def write_joints(
+    path: Path, motion: JointMotion, person: int, *, unit: str = "m", axes: str = "y-up"
+) -> None:
     """Write one person's joints; a joint that is missing at a time has three blank cells."""
     step = median_step_ns(motion.t_ns)
     rate = f"{1e9 / step:.6g}" if step else "1"
@@ -208,16 +209,18 @@ def write_joints(path: Path, motion: JointMotion, person: int) -> None:
     lines = [
         f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
         "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
-        f"{rate}\t{rate}\t{frames}\t{count}\tm\t{rate}\t1\t{frames}",
+        f"{rate}\t{rate}\t{frames}\t{count}\t{unit}\t{rate}\t1\t{frames}",
         "Frame#\tTime\t" + "\t\t\t".join(markers) + "\t\t",
         "\t\t" + "\t".join(f"{axis}{k}" for k in range(1, count + 1) for axis in "XYZ"),
         "",
     ]
-    rows = to_y_up(motion.position[:, person]).reshape(frames, 3 * count)
+    position = motion.position[:, person] / METRES[unit]
+    rows = (to_y_up(position) if axes == "y-up" else position).reshape(frames, 3 * count)
+    decimals = _DECIMALS + round(math.log10(METRES[unit]))
     for frame, (stamp, row) in enumerate(
         zip(format_seconds(motion.t_ns), rows.tolist(), strict=True), start=1
     ):
-        cells = ["" if math.isnan(value) else f"{value:.{_DECIMALS}f}" for value in row]
+        cells = ["" if math.isnan(value) else f"{value:.{decimals}f}" for value in row]
         lines.append("\t".join([str(frame), stamp, *cells]))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
 

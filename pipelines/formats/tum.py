@@ -5,14 +5,16 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pipelines.formats.export_names import safe_file_name
+import numpy as np
+
+from pipelines.formats.export_names import safe_file_name, tracks_of
 from pipelines.formats.pose_csv import find_header
 from pipelines.formats.pose_rows import clean_poses
 from pipelines.formats.stamps import format_seconds, parse_stamps
 from pipelines.formats.summaries import describe_trajectory
 from pipelines.formats.text_tables import parse_table, read_head, read_text
 from pipelines.session.errors import DataError
-from pipelines.session.records import Recording, Trajectory
+from pipelines.session.records import JointMotion, Recording, Trajectory
 
 _COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 
@@ -66,28 +68,51 @@ class TumFormat:
 
 
 class TumExport:
-    """One file per camera, `<name>_<camera>.tum`: world_from_camera, metres, stamps with nine decimals."""
+    """One file for each camera and for each joint, in metres, z up, stamps with nine decimals.
+
+    `<name>_<camera>.tum` is world_from_camera as logged, `<name>_<camera>_refined.tum` as the reconstruction
+    corrected it; `<name>_<joint>.tum` (with several people `<name>_person<k>_<joint>.tum`) a joint without
+    a rotation (0 0 0 1). A time at which a joint is missing has no row.
+    """
 
     name = "tum"
-    title = "TUM trajectories of the cameras"
+    title = "trajectories of the cameras and of every joint, for evo"
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write the cameras that have poses.
+        """Write the cameras that have poses and the joints that were ever measured.
 
         Raises:
-            DataError: none has.
+            DataError: there is neither.
         """
-        paths = []
-        for camera, trajectory in recording.cameras.items():
-            if len(trajectory.t_ns):
-                path = folder / f"{safe_file_name(recording.name)}_{safe_file_name(camera)}.tum"
-                write_trajectory(path, trajectory)
-                paths.append(path)
+        paths: list[Path] = []
+        for what, trajectory in {**tracks_of(recording), **_joint_tracks(recording.motion)}.items():
+            path = folder / f"{safe_file_name(recording.name)}_{safe_file_name(what)}.tum"
+            while path in paths:  # names that differ in what no file name has
+                path = path.with_stem(f"{path.stem}_")
+            write_trajectory(path, trajectory)
+            paths.append(path)
         if not paths:
             raise DataError(
-                recording.name, "holds no camera poses", "export csv or trc for the skeleton alone"
+                recording.name, "holds neither camera poses nor joints", "ingest or reconstruct it first"
             )
         return sorted(paths)
+
+
+def _joint_tracks(motion: JointMotion | None) -> dict[str, Trajectory]:
+    """The times at which each joint of each person is known, without rotation."""
+    tracks: dict[str, Trajectory] = {}
+    if motion is None:
+        return tracks
+    people = motion.position.shape[1]
+    for person in range(people):
+        for k, joint in enumerate(motion.joints):
+            position = motion.position[:, person, k]
+            known = np.isfinite(position).all(axis=1)
+            if known.any():
+                which = f"person{person}_{joint}" if people > 1 else joint
+                unturned = np.tile([0.0, 0.0, 0.0, 1.0], (int(known.sum()), 1))
+                tracks[which] = Trajectory(motion.t_ns[known], position[known], unturned)
+    return tracks
 
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:

@@ -6,6 +6,7 @@ quaternions xyzw, transforms named target_from_source, missing is NaN and never 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics
+from pipelines.session.progress import Progress, Silent
 
 POINT_COVARIANCE_COLUMNS = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
 """Upper triangle of a joint's covariance, m^2, as tables name it."""
@@ -97,11 +99,30 @@ class SkeletalMotion:
 
 @dataclass(frozen=True)
 class Recording:
-    """Everything an export may need: the skeleton and the cameras' poses that it was made with."""
+    """Everything an export may need: the skeleton, the cameras that it was made with, and what stood around.
+
+    Maps and pictures are many: they are handed out one at a time, each call from the start.
+    """
 
     name: str
     motion: JointMotion | None
-    cameras: dict[str, Trajectory]
+    cameras: dict[str, Trajectory]  # world_from_camera, as logged
+    refined: dict[str, Trajectory] = field(default_factory=dict)  # and as the reconstruction corrected them
+    lenses: dict[str, Intrinsics] = field(default_factory=dict)
+    maps: Callable[[], Iterable[Occupancy]] = tuple
+    pictures: Callable[[str], Iterable[tuple[int, NDArray[np.uint8]]]] = field(default=lambda _: ())
+    """Of a camera: world time and [height, width, 3] BGR, in order, as often as was asked for."""
+    overlays: Callable[[str], Iterable[tuple[int, NDArray[np.uint8]]]] = field(default=lambda _: ())
+    """The same pictures with the skeleton drawn into them."""
+    unit: str | None = None  # of lengths, where the user asks for one that the export has
+    axes: str | None = None  # z-up or y-up, likewise
+    progress: Progress = field(default_factory=Silent)  # who is told what was held, moved or thinned out
+
+    @property
+    def tracks(self) -> dict[str, Trajectory]:
+        """The best known poses of every camera that has any: refined ones, else those of the log."""
+        best = {name: self.refined.get(name, logged) for name, logged in self.cameras.items()}
+        return {name: track for name, track in best.items() if len(track.t_ns)}
 
 
 @dataclass(frozen=True)

@@ -219,10 +219,26 @@ class Export(Protocol):
 
     @property
     def title(self) -> str:
-        """What the help text calls it."""
+        """What the help text says of it, on one line."""
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write into an existing empty folder; the paths written, sorted. DataError without content."""
+        """Write into an existing empty folder; the paths written, sorted. DataError without content.
+
+        What is held, moved or thinned out is counted in a note to `recording.progress`.
+        """
+
+
+@runtime_checkable
+class ChoiceOfAxes(Export, Protocol):
+    """An export that heeds `recording.unit` and `recording.axes`; others write metres with z up."""
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The units of length that it can be written in, the usual one first."""
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The axes (z-up, y-up) that it can be written in, the usual ones first."""
 
 
 class Arm(Protocol):

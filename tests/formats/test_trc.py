@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given
 
@@ -12,6 +14,7 @@ from pipelines.formats import trc
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording
 from pipelines.session.registries import Export, JointFormat
+from tests.formats.exported import recording
 from tests.formats.motions import motions
 from tests.real_data import real_data
 
@@ -174,3 +177,29 @@ def test_nothing_to_export(tmp_path: Path, motion: JointMotion | None) -> None:
 def test_one_person_keeps_the_plain_name(tmp_path: Path) -> None:
     motion = JointMotion(np.array([0]), ("nose",), np.zeros((1, 1, 1, 3)))
     assert [path.name for path in WRITER.write(Recording("../x:y", motion, {}), tmp_path)] == ["x_y.trc"]
+
+
+def as_pose2sim_reads(path: Path) -> tuple[list[str], pd.DataFrame]:
+    """Marker names of the fourth line, numbers below the fifth: what Pose2Sim's own tools do."""
+    names = pd.read_csv(path, sep="\t", skiprows=3, nrows=0).columns[2:].tolist()
+    return names[::3], pd.read_csv(path, sep="\t", skiprows=4)
+
+
+def test_another_reader_finds_the_same(tmp_path: Path) -> None:
+    walked = recording()
+    motion = walked.motion
+    assert motion is not None
+    (path,) = WRITER.write(replace(walked, unit="mm", axes="z-up"), tmp_path)
+    names, table = as_pose2sim_reads(path)
+    assert names == [trc.marker_name(joint) for joint in motion.joints]
+    assert path.read_text().split("\n")[2].split("\t")[4] == "mm"
+    values = table.to_numpy()[:, 2:].reshape(60, -1, 3)
+    # Four decimals of a millimetre.
+    np.testing.assert_allclose(values / 1000, motion.position[:, 0], rtol=0, atol=0.5001e-7)
+    assert np.isnan(values[7, names.index("LWrist")]).all()
+    back = read(path, axes="z-up")
+    np.testing.assert_allclose(back.position, motion.position, rtol=0, atol=0.5001e-7)
+    # The same on a file of theirs: the reader above is theirs, not ours.
+    names, table = as_pose2sim_reads(real_data("motion/pose2sim_markers.trc"))
+    assert names[0] == "RHip"
+    assert table.iloc[0, 2:5].tolist() == pytest.approx([-0.065, 0.90151, -1.40057], abs=1e-5)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +12,9 @@ from hypothesis import given
 
 from pipelines.formats import tum
 from pipelines.session.errors import DataError
-from pipelines.session.records import Recording, Trajectory
+from pipelines.session.records import JointMotion, Recording, Trajectory
 from pipelines.session.registries import Export, TrajectoryFormat
+from tests.formats.exported import flown, recording
 from tests.formats.trajectories import trajectories
 from tests.real_data import real_data
 
@@ -185,5 +188,45 @@ def test_export_writes_each_camera(tmp_path: Path) -> None:
     assert [path.name for path in paths] == ["Mound_walk_2_a.tum", "Mound_walk_2_b.tum"]
     assert paths[0].read_text().splitlines()[1].split()[0] == "0.000000005"
     assert READER.recognises(paths[0])
-    with pytest.raises(DataError, match="no camera poses"):
+    with pytest.raises(DataError, match="neither camera poses nor joints"):
         WRITER.write(Recording("x", None, {"empty": none}), tmp_path)
+
+
+def test_cameras_and_joints_as_evo_reads_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))  # evo writes its settings there when it is imported
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        file_interface = pytest.importorskip("evo.tools.file_interface")
+    walked = recording()
+    motion = walked.motion
+    assert motion is not None
+    better = replace(flown(), position=flown().position + 0.1)
+    (tmp_path / "out").mkdir()
+    paths = {
+        path.stem.removeprefix("Mound_walk_"): path
+        for path in WRITER.write(replace(walked, refined={"cam-1": better}), tmp_path / "out")
+    }
+    assert set(paths) == {"cam-1", "cam-1_refined", *motion.joints}
+    for name, track in (("cam-1", flown()), ("cam-1_refined", better)):
+        read = file_interface.read_tum_trajectory_file(str(paths[name]))
+        np.testing.assert_array_equal(read.positions_xyz, track.position)
+        np.testing.assert_array_equal(read.orientations_quat_wxyz[:, [1, 2, 3, 0]], track.quaternion_xyzw)
+        # evo keeps seconds as float64: a quarter of a microsecond so far from 1970.
+        np.testing.assert_allclose(read.timestamps, track.t_ns / 1e9, rtol=0, atol=2.5e-7)
+    wrist = motion.position[:, 0, motion.joints.index("left_wrist")]
+    read = file_interface.read_tum_trajectory_file(str(paths["left_wrist"]))
+    np.testing.assert_array_equal(read.positions_xyz, np.delete(wrist, 7, axis=0))
+    assert (read.orientations_quat_wxyz == [1, 0, 0, 0]).all()
+
+
+def test_joints_whose_names_are_alike_get_their_own_files(tmp_path: Path) -> None:
+    motion = JointMotion(np.array([0]), ("a b", "a/b"), np.arange(6.0).reshape(1, 1, 2, 3))
+    paths = WRITER.write(Recording("x", motion, {}), tmp_path)
+    assert [path.name for path in paths] == ["x_a_b.tum", "x_a_b_.tum"]
+    assert [READER.read_trajectory(path).position[0, 0] for path in paths] == [0, 3]
+
+
+def test_people_are_told_apart(tmp_path: Path) -> None:
+    motion = JointMotion(np.array([0]), ("nose",), np.ones((1, 2, 1, 3)))
+    paths = WRITER.write(Recording("x", motion, {}), tmp_path)
+    assert [path.name for path in paths] == ["x_person0_nose.tum", "x_person1_nose.tum"]

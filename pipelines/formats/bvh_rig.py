@@ -1,0 +1,247 @@
+"""A rig of constant bones for a measured skeleton, and how its bones turn: what animation programs take.
+
+The bones are as long as they were in the median of all times at which both ends were measured. At rest the
+body stands in a T: arms to the sides, legs down, facing +x with the left towards +y (in a y-up file +z and
++x). The turns follow in closed form, bone by bone from the root:
+
+- Hips stand in the middle of the two hips. Their left is the line between the hips, exactly; their up is as
+  near to the neck as that allows.
+- Spine, at the same place, points from there to the neck, exactly; its left is as near to the line between
+  the shoulders as that allows.
+- Every other bone points from its joint to the next by the smallest turn from where its parent leaves it:
+  it has no twist of its own (joint positions do not show any). A turn of 180 degrees is about the bone's
+  own x, or y where the bone lies along x.
+
+So each joint lies in its measured direction from the one before, at the rig's distance: what is left between
+rig and measurement is how far the measured lengths vary.
+
+BVH has no word for missing. Times before the hips are first seen and after they are last seen are left out;
+in between, hips that are not seen stay where they were last, and a bone with a missing end keeps its last
+turn against its parent (before the first, its first). All of this is counted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.poses import conjugate, multiply, quaternion_from_matrix, rotate
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float, JointMotion, SkeletalMotion
+from pipelines.session.skeletons import take_joints, with_derived
+
+Bool = NDArray[np.bool_]
+
+_AHEAD_UP = (0.5, 0.0, np.sqrt(0.75))
+_AHEAD_DOWN = (np.sqrt(0.75), 0.0, -0.5)
+_LEFT, _RIGHT, _DOWN, _UP, _HERE = (0, 1, 0), (0, -1, 0), (0, 0, -1), (0, 0, 1), (0, 0, 0)
+
+
+@dataclass(frozen=True)
+class _Bone:
+    """A bone as files name it: the joint it begins at, and which way that lies from its parent's at rest."""
+
+    name: str
+    parent: str | None
+    joint: str
+    rest: tuple[float, float, float]
+
+
+def _arm(side: str, out: tuple[float, float, float]) -> tuple[_Bone, ...]:
+    word = side.capitalize()
+    return (
+        _Bone(f"{word}Shoulder", "Spine", "neck", _UP),
+        _Bone(f"{word}Arm", f"{word}Shoulder", f"{side}_shoulder", out),
+        _Bone(f"{word}ForeArm", f"{word}Arm", f"{side}_elbow", out),
+        _Bone(f"{word}Hand", f"{word}ForeArm", f"{side}_wrist", out),
+    )
+
+
+def _leg(side: str, out: tuple[float, float, float]) -> tuple[_Bone, ...]:
+    word = side.capitalize()
+    return (
+        _Bone(f"{word}UpLeg", "Hips", f"{side}_hip", out),
+        _Bone(f"{word}Leg", f"{word}UpLeg", f"{side}_knee", _DOWN),
+        _Bone(f"{word}Foot", f"{word}Leg", f"{side}_ankle", _DOWN),
+        _Bone(f"{word}ToeBase", f"{word}Foot", f"{side}_big_toe", _AHEAD_DOWN),
+    )
+
+
+_TRUNK = (
+    _Bone("Hips", None, "hip", _HERE),
+    _Bone("Spine", "Hips", "hip", _HERE),
+    _Bone("Neck", "Spine", "neck", _UP),
+)
+_HEADS = (_Bone("Head", "Neck", "head", _UP), _Bone("Head", "Neck", "nose", _AHEAD_UP))
+_LIMBS = (*_arm("left", _LEFT), *_arm("right", _RIGHT), *_leg("left", _LEFT), *_leg("right", _RIGHT))
+_MUST = ("left_hip", "right_hip", "neck")
+
+
+@dataclass(frozen=True)
+class Rigged:
+    """A motion on a rig, and what had to be made up for it."""
+
+    motion: SkeletalMotion
+    joints: tuple[str, ...]  # at which each bone begins
+    first: int  # of the frames: those before it are left out
+    without_hips: int  # frames in which the hips stay where they were
+    turns_held: int  # bones' turns that are those of a frame before (or after)
+    turns: int  # of all
+
+
+def fit_rig(source: str, motion: JointMotion, person: int) -> Rigged:
+    """Fit a rig to one person's joints at a constant rate.
+
+    Args:
+        source: what messages call it.
+        motion: at least one time; missing joints are NaN.
+        person: which one.
+
+    Raises:
+        DataError: hips, shoulders or neck are never seen together.
+    """
+    joints, position = with_derived(motion.joints, motion.position[:, person])
+    middle = take_joints(position, joints, ("left_hip", "right_hip")).mean(axis=1)
+    place = {joint: position[:, k] for k, joint in enumerate(joints)} | {"hip": middle}
+    seen = np.flatnonzero(np.isfinite(middle).all(axis=1))
+    lacking = [joint for joint in _MUST if joint not in place]
+    whole = not lacking and any(np.isfinite(place["neck"][seen]).all(axis=1))
+    if not whole:
+        lack = f"lacks {', '.join(lacking)}" if lacking else "never shows hips and neck at one time"
+        raise DataError(source, f"{lack}: no rig can be fitted", "use a skeleton with hips and shoulders")
+    span = slice(int(seen[0]), int(seen[-1]) + 1)
+    place = {joint: points[span] for joint, points in place.items()}
+    bones, lengths = _bones(place)
+    index = {bone.name: k for k, bone in enumerate(bones)}
+    parent = tuple(-1 if bone.parent is None else index[bone.parent] for bone in bones)
+    offset = np.array([np.array(bone.rest) * length for bone, length in zip(bones, lengths, strict=True)])
+    rotation, held = _turns(bones, parent, place)
+    root, without_hips = _held(place["hip"])
+    skeletal = SkeletalMotion(
+        t_s=(motion.t_ns[span] - motion.t_ns[span][0]) / 1e9,
+        bones=tuple(bone.name for bone in bones),
+        parent=parent,
+        offset=offset,
+        end={},
+        root=root,
+        rotation=rotation,
+    )
+    return Rigged(skeletal, tuple(bone.joint for bone in bones), int(seen[0]), int(without_hips.sum()), *held)
+
+
+def joint_positions(motion: SkeletalMotion) -> Float:
+    """Where the bones of a rig begin, [T, B, 3] m, world."""
+    place = np.empty((len(motion.t_s), len(motion.bones), 3))
+    turned = np.empty((len(motion.t_s), len(motion.bones), 4))
+    for bone, parent in enumerate(motion.parent):
+        if parent < 0:
+            place[:, bone], turned[:, bone] = motion.root, motion.rotation[:, bone]
+        else:
+            place[:, bone] = place[:, parent] + rotate(turned[:, parent], motion.offset[bone])
+            turned[:, bone] = multiply(turned[:, parent], motion.rotation[:, bone])
+    return place
+
+
+def _bones(place: dict[str, Float]) -> tuple[list[_Bone], list[float]]:
+    """The bones whose joints are there, parents first, and how far each begins from its parent's joint."""
+    head = next((bone for bone in _HEADS if bone.joint in place), None)
+    candidates = [*_TRUNK, *([head] if head else []), *_LIMBS]  # in the order in which files have them
+    kept: dict[str, _Bone] = {}
+    lengths = []
+    for bone in candidates:
+        parent = kept.get(bone.parent or "")
+        if bone.parent is not None and parent is None:
+            continue  # what hangs on a joint that is never seen
+        if bone.joint not in place:
+            continue
+        start = place[parent.joint] if parent is not None else place[bone.joint]
+        length = np.linalg.norm(place[bone.joint] - start, axis=1)
+        if np.isfinite(length).any():
+            kept[bone.name] = bone
+            lengths.append(float(np.median(length[np.isfinite(length)])))
+    return list(kept.values()), lengths
+
+
+def _turns(
+    bones: list[_Bone], parent: tuple[int, ...], place: dict[str, Float]
+) -> tuple[Float, tuple[int, int]]:
+    """parent_from_bone [T, B, 4], and how many of them are held, of how many."""
+    frames = len(place["hip"])
+    local, world = (np.zeros((frames, len(bones), 4)) for _ in range(2))
+    held = turns = 0
+    for k, bone in enumerate(bones):
+        above = world[:, parent[k]] if parent[k] >= 0 else np.tile([0.0, 0.0, 0.0, 1.0], (frames, 1))
+        next_ = next((b for b in bones if b.parent == bone.name and b.rest != _HERE), None)
+        if bone.name == "Hips":
+            known = multiply(
+                conjugate(above), _frame(_between(place, "right_hip", "left_hip"), _spine(place))
+            )
+        elif bone.name == "Spine" and _has_shoulders(place):
+            across = _between(place, "right_shoulder", "left_shoulder")
+            known = multiply(conjugate(above), _frame(across, _spine(place), up_first=True))
+        elif next_ is None:
+            known = np.tile([0.0, 0.0, 0.0, 1.0], (frames, 1))
+        else:
+            aim = rotate(conjugate(above), place[next_.joint] - place[bone.joint])
+            known = _swing(np.array(next_.rest, float), aim)
+        local[:, k], missing = _held(known)
+        world[:, k] = multiply(above, local[:, k])
+        if next_ is not None:
+            held += int(missing.sum())
+            turns += frames
+    return local, (held, turns)
+
+
+def _has_shoulders(place: dict[str, Float]) -> bool:
+    return {"left_shoulder", "right_shoulder"} <= place.keys()
+
+
+def _between(place: dict[str, Float], start: str, end: str) -> Float:
+    return place[end] - place[start]
+
+
+def _spine(place: dict[str, Float]) -> Float:
+    return _between(place, "hip", "neck")
+
+
+def _frame(left: Float, up: Float, *, up_first: bool = False) -> Float:
+    """world_from_bone [T, 4] with y along `left` and z near `up`, or z along `up` and y near `left`."""
+    exact, near = (up, left) if up_first else (left, up)
+    first = _unit(exact)
+    second = _unit(near - (near * first).sum(axis=1, keepdims=True) * first)
+    y, z = (second, first) if up_first else (first, second)
+    matrix = np.stack([np.cross(y, z), y, z], axis=-1)
+    known = np.isfinite(matrix).all(axis=(1, 2))
+    turned = np.full((len(matrix), 4), np.nan)
+    turned[known] = quaternion_from_matrix(matrix[known])
+    return turned
+
+
+def _swing(start: Float, towards: Float) -> Float:
+    """The smallest turns [T, 4] that bring the unit vector `start` [3] to the directions [T, 3]."""
+    end = _unit(towards)
+    turn = np.concatenate([np.cross(start, end), 1 + (end @ start)[:, None]], axis=1)
+    size = np.linalg.norm(turn, axis=1, keepdims=True)
+    x = np.array([1.0, 0.0, 0.0])
+    about = _unit((x if abs(start[0]) < 0.9 else np.roll(x, 1))[None])[0]
+    about = about - (about @ start) * start
+    half_turn = np.append(about / np.linalg.norm(about), 0.0)
+    return np.where(size < 1e-6, half_turn, turn / np.where(size < 1e-6, 1.0, size))
+
+
+def _unit(vectors: Float) -> Float:
+    """Of length 1; NaN where there is no direction."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length > 0, length, np.nan)
+
+
+def _held(rows: Float) -> tuple[Float, Bool]:
+    """Rows [T, N] with the last known one in the place of a missing one, and which are."""
+    missing = np.asarray(np.isnan(rows).any(axis=1), np.bool_)
+    known = np.flatnonzero(~missing)
+    if not len(known):  # a bone whose parent and child were never seen at once with it
+        return np.tile(np.eye(rows.shape[1])[-1], (len(rows), 1)), missing
+    last = np.maximum(np.searchsorted(known, np.arange(len(rows)), side="right") - 1, 0)
+    return rows[known[last]], missing

@@ -1,0 +1,50 @@
+"""What can be seen of a voxel map: its occupied voxels that have a neighbour which is not occupied."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.session.records import Float, Int64, Occupancy
+
+MOST_CUBES = 1_000_000
+_SLAB = 16  # layers that are looked at together
+
+
+@dataclass(frozen=True)
+class MapSurface:
+    """N cubes that stand for the surface."""
+
+    middle: Float  # [N, 3] m, world
+    cube_m: float  # their side
+    voxels: int  # of the map's surface
+
+
+def surface_of(occupancy: Occupancy, most: int = MOST_CUBES) -> MapSurface:
+    """The surface of a map, gathered in the smallest cubes of whole voxels of which at most `most` hold any.
+
+    Beyond the map's box nothing is occupied, and what is not known is not either.
+    """
+    layers = occupancy.probability.shape[0]
+    found: list[Int64] = []
+    for first in range(0, layers, _SLAB):
+        last = min(first + _SLAB, layers)
+        low, high = max(first - 1, 0), min(last + 1, layers)
+        with np.errstate(invalid="ignore"):
+            part = occupancy.probability[low:high] >= 0.5
+        padding = ((int(first == 0), int(last == layers)), (1, 1), (1, 1))
+        part = np.pad(part, padding)
+        inner = part[1:-1, 1:-1, 1:-1].copy()
+        for axis in range(3):
+            for side in (slice(None, -2), slice(2, None)):
+                inner &= part[tuple(side if a == axis else slice(1, -1) for a in range(3))]
+        here = np.argwhere(part[1:-1, 1:-1, 1:-1] & ~inner)
+        found.append(here.astype(np.int64) + np.array([first, 0, 0]))
+    voxels = np.concatenate(found)
+    gathered, cubes = 1, voxels
+    while len(cubes) > most:
+        gathered += 1
+        cubes = np.unique(voxels // gathered, axis=0)
+    cube_m = occupancy.resolution_m * gathered
+    return MapSurface(occupancy.origin + cube_m * (cubes + 0.5), cube_m, len(voxels))

@@ -1,0 +1,65 @@
+"""The cameras of a reconstructed session as their pictures are drawn on: frames, poses and keypoints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.reporting.overlays import FilmedCamera
+from pipelines.session.description import Description
+from pipelines.session.records import Trajectory
+from pipelines.session.stages import StageRecord
+from pipelines.session.storage import read_json
+from pipelines.session.tables import CAMERA_POSES, FRAMES, KEYPOINTS, POSES, read_table
+from pipelines.session.tabular import trajectory_from
+
+
+def origin_ns(description: Description) -> int:
+    """The first frame of a flight's cameras."""
+    return min(entry.frames.first_t_ns for entry in description.cameras.values())
+
+
+def refined_poses(folder: Path) -> dict[str, Trajectory]:
+    """The poses of the cameras that a session's reconstruction refined."""
+    path = folder / "reconstruct" / "cameras.parquet"
+    if not path.exists():
+        return {}
+    table = read_table(path, CAMERA_POSES)
+    return {str(name): trajectory_from(own.sort_values("t_ns")) for name, own in table.groupby("camera")}
+
+
+def read_filmed(
+    folder: Path, description: Description, record: StageRecord, cameras: Iterable[str]
+) -> dict[str, FilmedCamera]:
+    """Cameras as the reconstruction took them, or as it refined them; frames by the clock that it estimated.
+
+    Args:
+        folder: the session.
+        description: its session.json.
+        record: of its reconstruction: keypoints less sure than it used are left out.
+        cameras: which ones.
+    """
+    offsets_s = read_json(folder / "reconstruct" / "metrics.json").get("clock_offsets_s", {})
+    refined, bounds = refined_poses(folder), description.pose_interpolation
+    filmed = {}
+    for name in cameras:
+        entry = description.cameras[name]
+        stage = "cameras" if entry.keypoints is not None else "detect"
+        keypoints = read_table(folder / stage / name / "keypoints.parquet", KEYPOINTS)
+        frames = read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
+        logged = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
+        offset_ns = round((offsets_s.get(name) or 0.0) * 1e9)
+        filmed[name] = FilmedCamera(
+            name=name,
+            intrinsics=entry.intrinsics.intrinsics(),
+            frame=frames["frame"].to_numpy(np.int64),
+            frame_t_ns=frames["t_ns"].to_numpy(np.int64) + offset_ns,
+            keypoints=keypoints[keypoints["confidence"] >= record.settings["min_confidence"]],
+            track=refined.get(name, logged),
+            static=entry.poses.static,
+            max_gap_ns=round(bounds.max_gap_s * 1e9),
+            max_extrapolation_ns=round(bounds.max_extrapolation_s * 1e9),
+        )
+    return filmed

@@ -1,0 +1,134 @@
+"""`mocap export` as a command: every format at once, what may be replaced, C3D as truth."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from rosbags.highlevel import AnyReader
+
+from pipelines.export import export, load_recording
+from pipelines.formats import c3d
+from pipelines.formats.even_frames import at_even_times
+from pipelines.session.progress import Silent
+from pipelines.session.records import JointMotion
+from tests.commands.runner import refused, succeeds
+from tests.commands.test_overlay import filmed_flight, session_of
+from tests.synthetic.flights import START_NS, write_flight
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A reconstructed session of 12 frames with videos beside it."""
+    return session_of(filmed_flight(tmp_path_factory.mktemp("filmed")))
+
+
+def test_help_lists_every_format_with_one_line() -> None:
+    text = " ".join(succeeds("export", "--help").split())
+    for line in (
+        "bvh a rig of constant bones that follows the skeleton, for Blender; cm|m|mm|inch, y-up|z-up",
+        "trc markers for OpenSim and Pose2Sim; m|cm|mm, y-up|z-up",
+        "parquet the same tables",
+        "rerun a recording",
+        "tum trajectories",
+    ):
+        assert line in text
+
+
+def test_all_formats_at_once_with_a_record_of_what_they_are(filmed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    names = "bvh,c3d,csv,mcap,parquet,rerun,trc,tum"
+    result = json.loads(succeeds("export", filmed, "--to", names, "-o", out, "--pictures-hz", "5", "--json"))
+    written = {Path(path).name for path in result["written"]}
+    record = json.loads((out / "export.json").read_text(encoding="utf-8"))["files"]
+    assert set(record) == written == {path.name for path in out.iterdir()} - {"export.json"}
+    stated = {(facts["format"], facts["unit"], facts["axes"]) for facts in record.values()}
+    assert {
+        ("bvh", "cm", "y-up"),
+        ("c3d", "mm", "z-up"),
+        ("trc", "m", "y-up"),
+        ("mcap", "m", "z-up"),
+    } <= stated
+    assert any("turns of bones are held" in note for facts in record.values() for note in facts["notes"])
+    (log,) = out.glob("*.mcap")
+    with AnyReader([log]) as reader:
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+    # 0.4 s of video at 5 pictures per second.
+    assert counts["/drone1/image/compressed"] == counts["/drone1/camera_info"] == 2
+
+
+def test_pictures_lie_where_the_skeleton_does(filmed: Path) -> None:
+    recording = load_recording(filmed, pictures_hz=5.0)
+    plain, drawn = dict(recording.pictures("drone2")), dict(recording.overlays("drone2"))
+    # The first frame of every 0.2 s.
+    assert list(plain) == list(drawn) == [START_NS + ms * 1_000_000 for ms in (0, 217, 400)]
+    for stamp, picture in drawn.items():
+        changed = np.abs(picture.astype(int) - plain[stamp]).max(axis=2) > 40
+        assert 500 < changed.sum() < changed.size / 10  # bones, joints and the caption
+    assert not dict(load_recording(filmed).overlays("drone2")), "none unless they are asked for"
+
+
+def test_files_of_an_earlier_export_are_replaced_others_are_not(filmed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    first = export(filmed, ["trc", "csv"], out)
+    assert len(first.written) == 4
+    trc = next(path for path in first.written if path.suffix == ".trc")
+    assert "Units" in trc.read_text(encoding="utf-8")
+    again = json.loads(succeeds("export", filmed, "--to", "trc", "--unit", "mm", "-o", out, "--json"))
+    assert again["written"] == [str(trc)]
+    trc.write_text("changed by hand", encoding="utf-8")
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert "add --overwrite" in refused("export", filmed, "--to", "csv,c3d,trc", "-o", out)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before, "all of them, or none"
+    succeeds("export", filmed, "--to", "trc", "-o", out, "--overwrite")
+    record = json.loads((out / "export.json").read_text(encoding="utf-8"))["files"]
+    assert set(record) == {path.name for path in first.written}
+    (out / "export.json").write_text("{", encoding="utf-8")
+    assert "add --overwrite" in refused("export", filmed, "--to", "trc", "--unit", "cm", "-o", out)
+
+
+def test_units_and_axes_only_where_there_is_a_choice(filmed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert "csv, tum: are always in metres with z up" in refused(
+        "export", filmed, "--to", "csv,tum,trc", "--unit", "mm", "-o", out
+    )
+    assert "trc: has no unit inch; there are m, cm, mm" in refused(
+        "export", filmed, "--to", "trc", "--unit", "inch", "-o", out
+    )
+    assert "bvh: has no axes x-up; there are y-up, z-up" in refused(
+        "export", filmed, "--to", "bvh", "--axes", "x-up", "-o", out
+    )
+    assert not out.exists()
+
+
+def test_pictures_that_are_gone_cost_pictures_only(filmed: Path, tmp_path: Path) -> None:
+    shutil.copytree(filmed, tmp_path / "flight.session")  # without the videos beside it
+    result = export(tmp_path / "flight.session", ["mcap"], tmp_path / "out")
+    with AnyReader(result.written) as reader:
+        topics = {connection.topic for connection in reader.connections}
+    assert {"/skeleton", "/drone1/camera_info"} <= topics
+    assert "/drone1/image/compressed" not in topics
+
+
+def test_c3d_is_truth(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, seconds=0.5)
+    since_start = JointMotion(flight.t_ns - START_NS, flight.joints, flight.position[:, None])
+    even = at_even_times("x", since_start, Silent())
+    c3d.write_joints(tmp_path / "truth.c3d", even, 0, unit="cm", axes="y-up")
+    flight.settings["truth"] = {
+        "joints": {"path": "truth.c3d", "unit": "cm", "axes": "y-up", "offset_s": START_NS // 10**9}
+    }
+    flight.save()
+    succeeds("ingest", flight.manifest)
+    table = pd.read_parquet(tmp_path / "flight.session" / "truth.parquet")
+    nose = table[table["joint"] == "nose"]
+    assert np.abs(nose["t_ns"].to_numpy() - flight.t_ns).max() <= 1
+    truth = flight.position[:, flight.joints.index("nose")]
+    np.testing.assert_allclose(nose[["x", "y", "z"]], truth, rtol=2.0**-24)
+    said = succeeds("info", tmp_path / "truth.c3d")
+    assert "Biomechanics points (C3D)" in said
+    assert "POINT:UNITS" in said
