@@ -180,7 +180,9 @@ def test_session_of_another_flight_is_not_replaced_silently(flight: SyntheticFli
 
 def test_unknown_export_lists_those_there_are(flight: SyntheticFlight, tmp_path: Path) -> None:
     succeeds("ingest", flight.manifest)
-    assert "csv, trc, tum" in refused("export", tmp_path / "flight.session", "--to", "fbx")
+    assert "bvh, c3d, csv, mcap, parquet, rerun, trc, tum" in refused(
+        "export", tmp_path / "flight.session", "--to", "fbx"
+    )
     assert "reconstruct" in refused("export", tmp_path / "flight.session", "--to", "trc")
 
 
