@@ -49,7 +49,7 @@ from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.scenario import Scenario, read_scenario
 from pipelines.simulation.world.scene import World
 
-_REVISION = 4
+_REVISION = 5
 _MARK = "simulation.json"
 _OWN = ("drone*", "flight.yaml", "true_poses.yaml", "scenario.yaml", "site.*", "truth", _MARK)
 _BLOCK = 60  # pictures that are rendered and encoded together, and kept when the work is interrupted

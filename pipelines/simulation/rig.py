@@ -64,6 +64,11 @@ class Rig:
         """How high the pelvis's joint is above the ground in the neutral pose, m."""
         return float(self.offset[0, 2])
 
+    @property
+    def length_of_leg(self) -> float:
+        """How high the joints of the hips are above the ground in the neutral pose, m."""
+        return self.height_of_pelvis + float(self.offset[BONE["left_thigh"], 2])
+
 
 @dataclass(frozen=True)
 class BodyMotion:

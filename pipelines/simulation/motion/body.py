@@ -20,9 +20,10 @@ from pipelines.simulation.rig import BONE, BONES, SIDES, BodyMotion, Rig
 Float = NDArray[np.float64]
 Heights = Callable[[Float], Float]
 
-_STANDING_SOFTNESS_M, _STEPPING_SOFTNESS_M = 0.006, 0.026
+_WALKING_SOFTNESS_M, _RUNNING_SOFTNESS_M = 0.006, 0.026
 _SCRAPES_M = 0.02  # a kicking foot that comes as near to the ground is lifted
-_HEADROOM_M = 0.015  # what is wanted of the pelvis of somebody upright is more than the legs allow
+# What is wanted of the pelvis of somebody upright is more than the legs allow.
+_STANDING_HEADROOM_M, _WALKING_HEADROOM_M = 0.015, 0.004
 
 
 @dataclass(frozen=True)
@@ -71,8 +72,7 @@ def bodies(
 
     feet = [foot_over_time(rig, side, t_s, plan.feet[side], keys, ground) for side in (0, 1)]
     wanted = floor + _wanted_height(rig, plan, speed, run, stride) - keys.at("drop", t_s)
-    moving = np.tanh(speed / 0.5)
-    softness = _STANDING_SOFTNESS_M + moving * (_STEPPING_SOFTNESS_M - _STANDING_SOFTNESS_M)
+    softness = _WALKING_SOFTNESS_M + run * (_RUNNING_SOFTNESS_M - _WALKING_SOFTNESS_M)
     height = pelvis_height(rig, place, pelvis, feet, wanted, softness)
     root = np.concatenate([place, height[:, None]], axis=1)
     feet = [
@@ -130,7 +130,9 @@ def _idle(style: Style, t_s: Float, rate_hz: float, which: int) -> Float:
 
 def _wanted_height(rig: Rig, plan: Plan, speed: Float, run: Float, stride: Float) -> Float:
     """Of the pelvis above the ground: out of reach for walkers, a bounce for runners."""
-    upright = rig.height_of_pelvis + _HEADROOM_M
+    moving = np.tanh(speed / 0.5)
+    headroom = _STANDING_HEADROOM_M + moving * (_WALKING_HEADROOM_M - _STANDING_HEADROOM_M)
+    upright = rig.height_of_pelvis + headroom
     step_s = 1 / np.array([gait.cadence(v, 1.0, plan.leg_m) for v in speed])
     flight = np.array([gait.swing_steps(v, 1.0) for v in speed]) - 1
     runner = 0.962 * rig.height_of_pelvis + gait.bounce_m(stride, step_s, flight)

@@ -58,7 +58,7 @@ def foot_over_time(
         extra: curves beside the steps: `heel_deg` that both heels are raised by, `left_kick`, `right_kick`.
         ground: heights of places [N, 2].
     """
-    keys = _keys_of_steps(steps, leg_m=rig.height_of_pelvis)
+    keys = _keys_of_steps(steps, leg_m=rig.length_of_leg)
     curve = {name: keys.at(name, t_s) for name in ("x", "y", "yaw", "clear", "soft", "bent", "carries")}
     joint, heel, tip = _sole(rig, side)
     place = np.stack([curve["x"], curve["y"]], axis=1)
@@ -117,14 +117,16 @@ def _keys_of_steps(steps: Sequence[Footstep], leg_m: float) -> Keys:
                 keys.add(name, (lift_s, value), (lift_s + late_s, value))
         _stance(keys, step.strike_s, lift_s, rolled)
         if lift_s is not None:
-            _swing(keys, lift_s, steps[i + 1].strike_s, roll(runs[i], goes, goes))
+            swung = roll(runs[i], goes, goes)
+            _onward(keys, lift_s, step, steps[i + 1], swung)
+            _swing(keys, lift_s, steps[i + 1].strike_s, swung)
     return keys
 
 
 def _extent(before: Footstep, after: Footstep, leg_m: float) -> float:
-    """How long a swing is, by that of a full stride of walking, at most 1."""
+    """How long a swing is, by that of a full stride of walking."""
     moved = float(np.hypot(*(after.place - before.place))) + 0.15 * abs(after.yaw - before.yaw)
-    return float(np.sin(np.pi / 2 * min(moved * 0.93 / (leg_m * _FULL_SWING_M), 1.0)))
+    return moved * 0.93 / (leg_m * _FULL_SWING_M)
 
 
 def _stance(keys: Keys, strike_s: float, lift_s: float | None, rolled: Roll) -> None:
@@ -148,15 +150,26 @@ def _stance(keys: Keys, strike_s: float, lift_s: float | None, rolled: Roll) -> 
     keys.add("leaves", (lift_s - 0.5 * lasting, 0.0), (lift_s - 0.18 * lasting, 0.9), (lift_s, 1.0))
 
 
+def _onward(keys: Keys, lift_s: float, before: Footstep, after: Footstep, rolled: Roll) -> None:
+    """From one place on the ground to the next, without these two."""
+    for name, start, end in (
+        ("x", before.place[0], after.place[0]),
+        ("y", before.place[1], after.place[1]),
+        ("yaw", before.yaw, after.yaw),
+    ):
+        for share, there in rolled.onward:
+            keys.add(name, (lift_s + share * (after.strike_s - lift_s), float(start + there * (end - start))))
+
+
 def _swing(keys: Keys, lift_s: float, strike_s: float, rolled: Roll) -> None:
     """From the lift to the strike, without these two."""
     for name, curve in (
         ("pitch_deg", rolled.swing_deg),
         ("clear", rolled.clearance_m),
         ("soft", ((0.25, _SOFTNESS_M[1]), (0.75, _SOFTNESS_M[1]))),
-        ("bent", ((0.35, 0.0), (0.9, 0.0))),
+        ("bent", ((0.35, rolled.toes), (0.9, rolled.toes))),
         ("leaves", ((0.5, 0.0),)),
-        ("carries", ((0.2, 0.0), (0.6, 0.0), (0.9, 1.0))),
+        ("carries", ((0.2, 0.0), (0.6, 0.0), (rolled.carries, 1.0))),
     ):
         keys.add(name, *((lift_s + share * (strike_s - lift_s), value) for share, value in curve))
 

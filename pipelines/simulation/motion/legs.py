@@ -14,7 +14,7 @@ from pipelines.simulation.rig import BONE, SIDES, Rig
 
 Float = NDArray[np.float64]
 
-_HANGS_FREE_M = 0.03  # how much higher the pelvis may be than a leg reaches that does not carry
+_HANGS_FREE_M = 0.02  # how much higher the pelvis may be than a leg reaches that does not carry
 _STRETCHED_M = 0.002  # before a limb is straight, the last of its reach is softened
 
 

@@ -42,7 +42,7 @@ def perform(
     )
     start = np.asarray(start, dtype=np.float64)
     heading = float(np.radians(heading_deg))
-    plan = Plan(start, heading, rig.height_of_pelvis, ground, step_width=float(random.uniform(0.85, 1.15)))
+    plan = Plan(start, heading, rig.length_of_leg, ground, step_width=float(random.uniform(0.85, 1.15)))
     end_s = float(t_s[-1])
     while plan.t_s <= end_s:
         before = plan.t_s

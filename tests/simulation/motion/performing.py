@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.poses import conjugate, multiply
 from pipelines.simulation.motion.script import perform
-from pipelines.simulation.rig import BONE, BodyMotion, Rig, average_rig, sole_points
+from pipelines.simulation.rig import BONE, SIDES, BodyMotion, Rig, average_rig, joint_centres, sole_points
 from pipelines.simulation.scenario import Step
 
 Float = NDArray[np.float64]
@@ -63,6 +63,31 @@ def bent_deg(motion: BodyMotion, above: str, below: str) -> Float:
     angle = np.degrees(2 * np.arctan2(relative[:, 1], relative[:, 3]))
     wrapped: Float = (angle + 180.0) % 360.0 - 180.0
     return wrapped
+
+
+def leg_angles_deg(motion: BodyMotion, side: int, rig: Rig = RIG) -> dict[str, Float]:
+    """[T] flexion of hip and knee, dorsiflexion of the ankle of somebody who walks east.
+
+    Read off where joints, heel and ball are, in the vertical plane of the way; the hip against upright.
+    """
+    centres, soles = joint_centres(rig, motion), sole_points(rig, motion)[:, side]
+    hip, knee, ankle = (centres[:, BONE[f"{SIDES[side]}_{bone}"]] for bone in ("thigh", "shank", "foot"))
+    sole = soles[:, 1] - soles[:, 0]
+    return angles_of_leg_deg(hip, knee, ankle) | {
+        "ankle": np.degrees(np.arctan2(sole[:, 2], sole[:, 0])) - _forward_deg(ankle - knee)
+    }
+
+
+def angles_of_leg_deg(hip: Float, knee: Float, ankle: Float) -> dict[str, Float]:
+    """[T] flexion of hip and knee from where they are, [T, 3] m, of somebody who walks east."""
+    thigh = _forward_deg(knee - hip)
+    return {"hip": thigh, "knee": thigh - _forward_deg(ankle - knee)}
+
+
+def _forward_deg(down: Float) -> Float:
+    """[T] how far vectors [T, 3] that point down are turned forward."""
+    turned: Float = np.degrees(np.arctan2(down[:, 0], -down[:, 2]))
+    return turned
 
 
 def clearance_m(motion: BodyMotion, ground: Callable[[Float], Float] = flat, rig: Rig = RIG) -> Float:
