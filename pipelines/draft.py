@@ -11,6 +11,8 @@ from typing import Literal
 
 from pipelines.drafting.found import (
     Calibration,
+    Driver,
+    DroneLog,
     Edge,
     Findings,
     Found,
@@ -27,8 +29,11 @@ from pipelines.drafting.found import (
 )
 from pipelines.drafting.manifest_text import write_manifest
 from pipelines.drafting.matching import match
+from pipelines.formats.dji_srt import read_subtitles
 from pipelines.formats.frame_times import read_frame_times
 from pipelines.formats.log_messages import kind_of, samples
+from pipelines.formats.log_presets import namespaces, parts_of
+from pipelines.formats.summaries import median_step_ns
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
 from pipelines.session.progress import Progress, Silent
@@ -47,6 +52,7 @@ from pipelines.session.registries import (
     why_not,
 )
 from pipelines.session.storage import as_data_error
+from pipelines.session.telemetry import TelemetryChoice, TelemetryFormat
 
 _FRAME_TIMES = "frame_times"  # the one format that no protocol tells apart
 _TRANSFORMS_ASKED = 2000  # messages of a topic, for the names of its frames
@@ -206,6 +212,7 @@ class _Search:
             videos=[thing for thing in found if isinstance(thing, Video)],
             maps=[thing for thing in found if isinstance(thing, Map)],
             recordings=[thing for thing in found if isinstance(thing, Recording)],
+            drone_logs=[thing for thing in found if isinstance(thing, DroneLog)],
         )
 
     def _under(self, path: Path) -> Iterator[Thing]:
@@ -314,6 +321,7 @@ def _kind(format_: Format) -> type | None:
         LogFormat,
         VideoFormat,
         MapFormat,
+        TelemetryFormat,
     )
     return next((kind for kind in kinds if isinstance(format_, kind)), None)
 
@@ -331,6 +339,8 @@ def _described(head: Found, format_: Format, ambiguous: bool) -> Found | None:
         return Keypoints(*about, len(listed), int(listed[0]), int(listed[-1]), ambiguous)
     if isinstance(format_, TrajectoryFormat):
         return Poses(*about, _span(format_.read_trajectory(path).t_ns))
+    if isinstance(format_, TelemetryFormat):
+        return _drone_log(head, format_)
     if isinstance(format_, CalibrationFormat):
         cameras = format_.read_calibration(path)
         held = {name: Lens(c.intrinsics is not None, c.position is not None) for name, c in cameras.items()}
@@ -355,6 +365,49 @@ def _span(t_ns: Int64) -> Span:
     return Span(int(t_ns[0]), int(t_ns[-1]))
 
 
+# --- drones' own logs ------------------------------------------------------------------------------------
+
+
+def _drone_log(head: Found, format_: TelemetryFormat) -> DroneLog | None:
+    """What a drone's own log says of its poses, whether or not it says where the drone looked.
+
+    Raises:
+        DataError: it cannot be read, or holds no position.
+    """
+    has_height = True
+    try:
+        telemetry = format_.read_telemetry(head.path, TelemetryChoice())
+    except DataError as error:
+        if "height" not in error.problem:
+            raise
+        has_height = False
+        telemetry = format_.read_telemetry(head.path, TelemetryChoice(altitude=0.0))
+    track = telemetry.position
+    keys: tuple[Literal["dji"], Literal["ulog"], Literal["ardupilot"]] = ("dji", "ulog", "ardupilot")
+    key = next((key for key in keys if key == head.format), None)
+    if key is None:
+        return None
+    start_ns = None
+    if head.path.suffix.lower() == ".srt":
+        subtitles = read_subtitles(head.path)
+        start_ns = subtitles.start_ns() if subtitles.are_slow else None
+    return DroneLog(
+        head.path,
+        head.place,
+        head.format,
+        head.title,
+        key=key,
+        span=_span(track.t_ns),
+        positions=len(track.t_ns),
+        step_ns=int(median_step_ns(track.t_ns) or 0),
+        by_gps=track.on_earth or track.origin is not None,
+        body=telemetry.body is not None,
+        gimbal=telemetry.gimbal is not None,
+        has_height=has_height,
+        video_start_ns=start_ns,
+    )
+
+
 # --- logs ----------------------------------------------------------------------------------------------
 
 
@@ -367,6 +420,7 @@ def _recording(head: Found, format_: LogFormat) -> Recording:
             if kind and topic.name not in topics:
                 span = Span(topic.first_ns or 0, topic.last_ns or 0)
                 topics[topic.name] = TopicFound(topic.name, topic.type, kind, topic.count, span)
+        drivers = tuple(_drivers(log))
         edges: dict[Edge, None] = {}
         for name, known in topics.items():
             if known.kind == "poses":
@@ -378,7 +432,27 @@ def _recording(head: Found, format_: LogFormat) -> Recording:
                 for sample in _pose_samples(log, name, _TRANSFORMS_ASKED, head.path):
                     edges[Edge(name, sample.target, sample.source, still)] = None
     about = (head.path, head.place, head.format, head.title)
-    return Recording(*about, (head.path,), tuple(topics.values()), tuple(edges))
+    return Recording(*about, (head.path,), tuple(topics.values()), tuple(edges), drivers)
+
+
+def _drivers(log: Log) -> Iterator[Driver]:
+    """The drones whose drivers' usual topics are in a log."""
+    topics = {topic.name: topic for topic in log.topics if topic.count}
+    every = namespaces(list(topics))
+    for preset, namespace in every:
+        parts = parts_of(preset, namespace, list(topics))
+        spans = [topics[name] for name in parts.position]
+        yield Driver(
+            preset=preset,
+            namespace=None
+            if len([known for known, _ in every if known == preset]) == 1
+            else namespace or "/",
+            span=Span(min(t.first_ns or 0 for t in spans), max(t.last_ns or 0 for t in spans)),
+            count=max(topic.count for topic in spans),
+            body=bool(parts.attitude),
+            gimbal=bool(parts.gimbal),
+            by_gps=any("NavSatFix" in topics[name].type for name in parts.position),
+        )
 
 
 def _pose_samples(log: Log, topic: str, messages: int, source: Path) -> Iterator[PoseSample]:

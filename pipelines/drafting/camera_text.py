@@ -10,6 +10,7 @@ from pathlib import Path
 from pipelines.drafting.candidates import Candidate
 from pipelines.drafting.found import (
     Calibration,
+    DroneLog,
     Found,
     FrameTimes,
     Keypoints,
@@ -22,6 +23,7 @@ from pipelines.drafting.matching import CameraDraft, Draft
 from pipelines.drafting.yaml_text import entry, flow, scalar
 
 ASSUMED_FPS = 30
+_BRIDGED_NS = 500_000_000  # between two poses, unless ingest is told otherwise
 _MOST_OTHERS = 8  # candidates that are named beside the one taken
 
 
@@ -112,6 +114,8 @@ class CameraText:
             return self._said("frame_times", choice.all, told(choice.taken))
         if self._camera.videos and self._film is None:
             return []  # the log's own stamps
+        if coarse := self._coarse_start():
+            return coarse
         start, reason = self._start()
         if self._film:
             if start is None:
@@ -127,6 +131,16 @@ class CameraText:
         self._assume(f"frame_times: fps {ASSUMED_FPS}; start, when the first frame was taken")
         remark = f"assumed: {ASSUMED_FPS} frames a second, the first {reason}"
         return [entry("frame_times", {"start": start, **fps}, remark)]
+
+    def _coarse_start(self) -> list[str]:
+        """The video's start by subtitles that show whole seconds."""
+        found = self._camera.poses.taken.found if self._camera.poses else None
+        if not isinstance(found, DroneLog) or found.video_start_ns is None or not self._film:
+            return []
+        self._assume("frame_times: start by the subtitles' clock, to a second")
+        start = Decimal(found.video_start_ns) / 10**9
+        remark = "assumed: by the subtitles' clock, whole seconds of local time taken as UTC"
+        return [entry("frame_times", {"start": start.normalize()}, remark)]
 
     def _start(self) -> tuple[Decimal | None, str]:
         """When the first frame was taken, in seconds: as soon as poses and truth begin; None for 0."""
@@ -151,6 +165,9 @@ class CameraText:
     def _clock(self) -> list[str]:
         if self._camera.videos and self._film is None:
             return []
+        if self._coarse_start():
+            settings = {"offset_s": 0, "sigma_s": 1}
+            return [entry("clock", settings, "the subtitles' clock shows whole seconds")]
         return ["# clock: {offset_s: 0, sigma_s: 0.2}  # if its clock is off against the poses', or unsure"]
 
     # --- poses -----------------------------------------------------------------------------------------
@@ -159,10 +176,11 @@ class CameraText:
         choice = self._camera.poses
         if choice is None:
             self._miss("pose: nothing of that name has poses")
-            loose = self._loose(Poses, Recording, Calibration)
+            loose = self._loose(Poses, DroneLog, Recording, Calibration)
             return [
                 f"# pose: {{tum: {self._camera.name}.tum}}  # missing: nothing of that name has poses{loose}",
-                "#   or {csv: FILE}, {static: CALIBRATION}, {log: LOG, topic: TOPIC}, {log, parent, child}",
+                "#   or {csv: FILE}, {static: CALIBRATION}, {log: LOG, topic: TOPIC}, {log, parent, child},",
+                "#   {dji: SRT}, {ulog: FILE}, {ardupilot: FILE}, {log: LOG, preset: dji_osdk or mavros}",
             ]
         taken = choice.taken
         remarks = [told(taken)]
@@ -178,20 +196,47 @@ class CameraText:
             self._miss("pose: there are no poses of the time when it filmed")
         if isinstance(taken.found, Poses):
             remarks.append("if of the body, not the camera: add of: body, and a mount")
+        if isinstance(taken.found, DroneLog):
+            remarks += self._about_drone(taken.found)
         if taken.ned_hint:
             remarks.append(f"{scalar(taken.ned_hint)} sounds like north-east-down: then add axes: ned")
             self._assume("pose: axes enu, although a name sounds like ned")
         return self._said("pose", choice.all, "; ".join(remarks), self._pose_settings)
 
+    def _about_drone(self, found: DroneLog) -> list[str]:
+        """What a drone's own log leaves open."""
+        remarks = []
+        if not found.has_height:
+            self._miss("pose: altitude, for its log states no height")
+            remarks.append("missing: altitude: METRES above the take-off")
+        elif found.key == "dji":
+            self._assume("pose: heights above the take-off, which was level for all")
+            remarks.append("assumed: heights above the take-off (altitude: absolute takes the other)")
+        if found.step_ns > _BRIDGED_NS:
+            step_s = found.step_ns / 1e9
+            remarks.append(f"a position every {step_s:.3g} s: ingest with --max-pose-gap {1.5 * step_s:.3g}")
+        return remarks
+
     def _pose_settings(self, candidate: Candidate) -> object:
         if isinstance(candidate.found, Calibration):
             return {"static": self._of_calibration(candidate)}
-        if "log" in candidate.settings:
+        if "log" in candidate.settings and "preset" not in candidate.settings:
             return {**candidate.settings, "of": "body" if candidate.of_body else "camera"}
         return candidate.settings
 
     def _mount(self) -> list[str]:
-        if self._camera.poses is None or not self._camera.poses.taken.of_body:
+        if self._camera.poses is None:
+            return []
+        taken = self._camera.poses.taken
+        if taken.unturned and self._camera.gimbal is None:
+            self._miss("gimbal: how the camera was turned, for its log does not say it")
+            return [
+                "# gimbal: {fixed: {yaw_deg: 90, pitch_deg: -30}}  # missing: from north to east, and up; or"
+                " {log: LOG, topic: TOPIC, relative_to: world}"
+            ]
+        if not taken.of_body and (isinstance(taken.found, DroneLog) or "preset" in taken.settings):
+            return ["# mount: {looks: forward, translation: [0, 0, 0]}  # the lever arm to the gimbal, m"]
+        if not (taken.of_body or taken.unturned):
             return []
         choice = self._camera.gimbal
         if choice is None:
@@ -213,6 +258,12 @@ class CameraText:
     def _noise(self) -> list[str]:
         if self._camera.poses is None or self._camera.poses.taken.span is None:
             return []
+        if self._camera.poses.taken.by_gps:
+            return [
+                "# pose_noise: {gauss-markov: {position_m: 1.5, rotation_deg: 1, correlation_s: 100},"
+                " white: {position_m: 0.1, rotation_deg: 0.3}}",
+                "#   what GPS alone is good for: 1 to 2 m across, twice that in height, for minutes alike",
+            ]
         return ["# pose_noise: {white: {position_m: 0.1, rotation_deg: 0.5}}  # how good they are, if known"]
 
     # --- intrinsics ------------------------------------------------------------------------------------
@@ -301,6 +352,12 @@ def told(candidate: Candidate) -> str:
             return f"{found.rows} times" + (", local time taken as UTC" if found.key == "srt" else "")
         case Poses():
             return f"{found.title}, {spanned(found.span)}"
+        case DroneLog():
+            has = "with gimbal angles" if found.gimbal else "no gimbal angles"
+            return f"{found.title}, {found.positions} positions, {has}, {spanned(found.span)}"
+        case Recording() if "preset" in candidate.settings:
+            turned = "" if candidate.of_body or candidate.unturned else " with gimbal angles"
+            return f"usual topics{turned}" + (f", {spanned(candidate.span)}" if candidate.span else "")
         case Recording():
             return "transforms" + (f", {spanned(candidate.span)}" if candidate.span else "")
     return found.title

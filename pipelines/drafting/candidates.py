@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 from pipelines.drafting.found import (
     Calibration,
+    DroneLog,
     Findings,
     Found,
     Poses,
@@ -53,6 +54,8 @@ class Candidate:
     span: Span | None = None
     topic: TopicFound | None = None
     of_body: bool = False  # poses of the body; else of the camera
+    by_gps: bool = False  # poses whose position is that of a satellite receiver
+    unturned: bool = False  # positions alone: nothing says how the drone was turned
     is_true: bool = False  # called the truth
     ned_hint: str = ""  # a name that sounds like north-east-down
 
@@ -90,7 +93,8 @@ def moving_poses(findings: Findings, logs: Mapping[str, Recording]) -> list[Cand
         if candidate.topic
         and not (is_truth(candidate.topic) or is_actor(candidate.topic) or is_commanded(candidate.topic))
     ]
-    return [*(c for c in files if c), *topics, *_of_transforms(logs)]
+    drones = [_of_drone(found) for found in findings.drone_logs]
+    return [*(c for c in files if c), *drones, *_of_drivers(logs), *topics, *_of_transforms(logs)]
 
 
 def true_poses(findings: Findings) -> list[Candidate]:
@@ -146,7 +150,6 @@ def joints(findings: Findings) -> list[Candidate]:
 def frame_times(findings: Findings) -> list[Candidate]:
     """Files with the times of frames."""
     stamps = findings.frame_times
-    stamps = findings.frame_times
     return [replace(_of_file(found, {found.key: found.path}), span=found.span) for found in stamps]
 
 
@@ -170,6 +173,36 @@ def _trajectory(found: Poses) -> Candidate | None:
     if found.format not in PoseSource.one_of:
         return None
     return replace(_of_file(found, {found.format: found.path}), rank=(0, 0, found.place), span=found.span)
+
+
+def _of_drone(found: DroneLog) -> Candidate:
+    """A drone's own log; the poses of its camera where it has gimbal angles."""
+    return replace(
+        _of_file(found, {found.key: found.path}),
+        rank=(0, int(not found.gimbal), found.place),
+        span=found.span,
+        of_body=found.body and not found.gimbal,
+        by_gps=found.by_gps,
+        unturned=not (found.body or found.gimbal),
+    )
+
+
+def _of_drivers(logs: Mapping[str, Recording]) -> Iterator[Candidate]:
+    """What a driver's usual topics say together, which is more than any of them says alone."""
+    for log, recording in logs.items():
+        for driver in recording.drivers:
+            namespace = driver.namespace or ""
+            settings = {"log": log, "preset": driver.preset, "namespace": driver.namespace}
+            yield Candidate(
+                dict(settings),
+                (label_of_topic(recording, namespace),),
+                recording,
+                (1, 1 - int(driver.gimbal) + int(not driver.body), -1, -driver.count, namespace),
+                driver.span,
+                of_body=driver.body and not driver.gimbal,
+                by_gps=driver.by_gps,
+                unturned=not (driver.body or driver.gimbal),
+            )
 
 
 def _is_true(found: Found) -> bool:

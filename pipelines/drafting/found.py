@@ -109,6 +109,34 @@ class TopicFound:
 
 
 @dataclass(frozen=True)
+class DroneLog(Found):
+    """A log that a drone wrote itself: where it was, and perhaps how it and its gimbal were turned."""
+
+    key: Literal["dji", "ulog", "ardupilot"]  # what it is called in a manifest
+    span: Span
+    positions: int
+    step_ns: int  # between positions, usually
+    by_gps: bool
+    body: bool
+    gimbal: bool
+    has_height: bool = True
+    video_start_ns: int | None = None  # of the video beside it, where its own times are too coarse for frames
+
+
+@dataclass(frozen=True)
+class Driver:
+    """The topics of a drone's driver in a log, as a manifest's preset reads them."""
+
+    preset: str
+    namespace: str | None  # None where it is the only one
+    span: Span
+    count: int
+    body: bool
+    gimbal: bool
+    by_gps: bool
+
+
+@dataclass(frozen=True)
 class Edge:
     """A transform that a log states: the frame `child` in `parent`."""
 
@@ -125,6 +153,7 @@ class Recording(Found):
     parts: tuple[Path, ...]
     topics: tuple[TopicFound, ...]
     edges: tuple[Edge, ...] = ()
+    drivers: tuple[Driver, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -139,6 +168,7 @@ class Findings:
     videos: list[Video] = field(default_factory=list)
     maps: list[Map] = field(default_factory=list)
     recordings: list[Recording] = field(default_factory=list)
+    drone_logs: list[DroneLog] = field(default_factory=list)
 
     def all(self) -> list[Found]:
         """Every one of them, kind by kind."""
@@ -146,6 +176,7 @@ class Findings:
             *self.videos,
             *self.keypoints,
             *self.recordings,
+            *self.drone_logs,
             *self.poses,
             *self.calibrations,
             *self.frame_times,

@@ -50,6 +50,7 @@ def write_manifest(draft: Draft, name: str, relative: Callable[[Path], str]) -> 
         entry("schema", SCHEMA),
         entry("name", name),
         entry("world", {"frame": "enu"}, "assumed: the poses have z up (x east, y north); or ned"),
+        *_origin(draft),
         *_logs(draft, relative, remarks),
         *_cameras(draft, relative, remarks),
         *_actor(draft, relative, remarks),
@@ -67,6 +68,13 @@ def _in_short(remarks: Mapping[str, list[str]]) -> list[str]:
         shown = ", ".join(names[:_NAMES_TOLD]) + (", ..." if len(names) > _NAMES_TOLD else "")
         lines.append(f"{shown}: {what}" if shown else what)
     return lines
+
+
+def _origin(draft: Draft) -> list[str]:
+    """Where the world's origin lies, for positions on Earth."""
+    if not any(camera.poses and camera.poses.taken.by_gps for camera in draft.cameras):
+        return []
+    return ["#   origin: {latitude_deg: 0, longitude_deg: 0, altitude_m: 0}  # else the first position's"]
 
 
 def _logs(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) -> list[str]:

@@ -101,7 +101,7 @@ def match(findings: Findings) -> Draft:
             camera.true_poses = choose(truth)
         camera.intrinsics = choose(lenses, shared=True)
         camera.frame_times = choose(stamps) if "log" not in _video(camera) else None
-        if camera.poses and camera.poses.taken.of_body:
+        if camera.poses and (camera.poses.taken.of_body or camera.poses.taken.unturned):
             camera.gimbal = choose(gimbals)
 
     actors = of.actors(logs)

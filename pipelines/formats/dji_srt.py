@@ -238,18 +238,18 @@ def _said(text: str) -> dict[str, float]:
         for key, number in _PAIR.findall(bracket):
             name = key.lower()
             said[_HEIGHTS.get(name) or _NAMES.get(name, name)] = float(number)
-    if gps := _GPS.search(text):
+    if "GPS" in text and (gps := _GPS.search(text)):
         first, second, third = (float(part) for part in gps.groups()[:3])
         if gps[4]:  # a height: only those that write it begin with the latitude
             said |= {"latitude": first, "longitude": second, "absolute": third}
         else:
             said |= {"longitude": first, "latitude": second}
-    if above := _ABOVE_TAKE_OFF.search(text):
-        said.setdefault("relative", float(above[1]))
-    for part, pattern in _ANGLES.items():
-        if angles := pattern.search(text):
-            pitch, roll, yaw = (float(angle) for angle in angles.groups())
-            said |= {f"{part}_pitch": pitch, f"{part}_roll": roll, f"{part}_yaw": yaw}
+        if above := _ABOVE_TAKE_OFF.search(text):
+            said.setdefault("relative", float(above[1]))
+        for part, pattern in _ANGLES.items():
+            if angles := pattern.search(text):
+                pitch, roll, yaw = (float(angle) for angle in angles.groups())
+                said |= {f"{part}_pitch": pitch, f"{part}_roll": roll, f"{part}_yaw": yaw}
     if "latitude" not in said or "longitude" not in said:  # one of them broke off
         said.pop("latitude", None)
     return said

@@ -15,9 +15,9 @@ the nose.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -115,12 +115,24 @@ def namespaces(names: Sequence[str]) -> list[tuple[Preset, str]]:
     return sorted(set(found))
 
 
-def topics_of(preset: Preset, namespace: str, names: Sequence[str]) -> list[str]:
+class Parts(NamedTuple):
+    """The topics of one drone that a preset reads."""
+
+    position: list[str]
+    attitude: list[str]
+    gimbal: list[str]
+
+
+def parts_of(preset: Preset, namespace: str, names: Sequence[str]) -> Parts:
     """Those of some topics that a preset reads in a namespace."""
     driver = DRIVERS[preset]
-    parts = [*(p for ps in driver.positions.values() for p in ps), *driver.attitude, *driver.gimbal]
-    wanted = {f"{namespace}/{base}/{part}" for base in driver.names for part in parts}
-    return [name for name in names if name in wanted]
+
+    def among(parts: Iterable[str]) -> list[str]:
+        wanted = [f"{namespace}/{base}/{part}" for part in parts for base in driver.names]
+        return [name for name in wanted if name in names]
+
+    positions = (part for parts in driver.positions.values() for part in parts)
+    return Parts(among(positions), among(driver.attitude), among(driver.gimbal))
 
 
 def read_preset(

@@ -397,8 +397,8 @@ def _open(path: Path, wanted: Collection[str] | None) -> Any:
     core = need("pyulog", "drones")
     _refuse_bombs(path)
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints what it doubts
-            return core.ULog(str(path), None if wanted is None else sorted(wanted))
+        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):  # it prints its doubts
+            return core.ULog(file, None if wanted is None else sorted(wanted))
     except DataError:
         raise
     except OSError as error:

@@ -215,7 +215,11 @@ def test_times_by_place_in_the_video() -> None:
 
 
 def test_what_is_recognised(tmp_path: Path) -> None:
-    yes = {"a.csv": "frame,t_ns\n0,1\n", "b.txt": "timestamp\n1\n", "c.srt": subtitles(["x"])}
+    yes = {
+        "a.csv": "frame,t_ns\n0,1\n",
+        "b.txt": "timestamp\n1\n",
+        "c.srt": subtitles(["2022-08-07 13:40:40,774"]),
+    }
     no = {
         "d.csv": "t,x\n0,1\n",
         "e.csv": "t_ns,x,y,z,qx,qy,qz,qw\n",
