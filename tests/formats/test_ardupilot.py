@@ -51,7 +51,8 @@ def test_what_is_in_it(tmp_path: Path, truth: DroneTruth) -> None:
 def test_positions(tmp_path: Path, truth: DroneTruth, position: str, tolerance_m: float) -> None:
     telemetry = read(write_dataflash(tmp_path / "a.bin", truth), position=position)
     track = telemetry.position
-    values = track.values if not track.on_earth else enu_from_geodetic(*track.values.T, HOME)
+    latitude, longitude, height = track.values.T
+    values = enu_from_geodetic(latitude, longitude, height, HOME) if track.on_earth else track.values
     lost = len(truth.t_ns) - len(values)
     assert telemetry.dropped == ({"no 3D fix": 1} if position == "gps" else {})
     np.testing.assert_allclose(values, truth.enu[lost:], atol=tolerance_m)
