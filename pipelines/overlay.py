@@ -33,7 +33,7 @@ from pipelines.session.storage import canonical_json, read_json, write_json
 from pipelines.session.tables import FRAMES, SKELETON, read_table
 from pipelines.session.whole_folders import Making, is_made, whole_folder
 
-_REVISION = 3
+_REVISION = 4
 _MARK = "overlay.json"
 _BLOCK = 300  # pictures that are drawn and encoded together, and kept when the work is interrupted
 _TICK_NS = int(TICK_S * 10**9) + 1

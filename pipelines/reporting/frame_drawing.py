@@ -27,6 +27,10 @@ _PAPER: Colour = (255, 255, 255)
 _BONE = 1 / 700  # of the picture's diagonal: 2 px at 1280 x 720
 _TEXT = 1 / 2000  # of it, too: OpenCV's scale, 22 px high at 1
 _LEAST_TEXT = 0.3  # OpenCV's scale below which no letter can be read
+_SPARE, _CORNER = 0.1, 0.15  # of a person's box: to spare at each side, and how long its corners' arms are
+_WITH_ELLIPSE = {"nose", "head", "shoulder", "elbow", "wrist", "hip", "knee", "ankle"}  # others lie too close
+CHI2_95 = 5.991
+"""Of a Gaussian in two dimensions 95 % lie within {x : x' S^-1 x = 5.991} (chi-square)."""
 _SHIFT = 4  # OpenCV takes coordinates in sixteenths of a pixel
 _FURTHEST_PX = 1e6  # of a point just before the camera's plane; OpenCV counts in 32 bits
 
@@ -34,9 +38,11 @@ _FURTHEST_PX = 1e6  # of a point just before the camera's plane; OpenCV counts i
 def draw_frame(picture: Picture, view: View, caption: Sequence[str]) -> Picture:
     """A copy of a picture with a view's skeleton and keypoints, and lines of text at its upper left.
 
-    Bones and joints are coloured by the side of the body; what is NaN is not drawn. Rings are keypoints that
-    were found, crosses those of joints that were rejected (red) or not reconstructed (grey), small dots
-    the keypoints of other people.
+    Bones and joints are coloured by the side of the body; what is NaN is not drawn. Thin ellipses hold a
+    joint of the body with 95 %, as far as its own uncertainty goes. Rings are keypoints that were found,
+    crosses those of joints that were rejected (red) or not reconstructed (grey), small dots the keypoints of
+    other people. Four corners hold the keypoints that were found of a person of the skeleton, with a tenth
+    to spare.
 
     Args:
         picture: [height, width, 3]; of another size than the view's camera it is the same view at another
@@ -52,6 +58,10 @@ def draw_frame(picture: Picture, view: View, caption: Sequence[str]) -> Picture:
         (points + 0.5) * scale - 0.5 for points in (view.reprojected, view.found, view.others)
     )
     _dots(drawn, others.reshape(-1, 2), bone, UNMEASURED)
+    if view.spread is not None:
+        _ellipses(drawn, view.joints, reprojected, view.spread * np.outer(scale, scale), max(1, bone // 2))
+    for person in found:
+        _corners(drawn, person, max(1, bone // 2))
     _bones(drawn, view.joints, reprojected, bone)
     for k, joint in enumerate(view.joints):
         _dots(drawn, reprojected[:, k], 1.5 * bone, SIDES[side_of(joint)])
@@ -120,6 +130,43 @@ def _dots(picture: Picture, points: Float, radius: float, colour: Colour) -> Non
 
     for point in points[_drawable(points)]:
         cv2.circle(picture, _fixed(point), round(radius * 2**_SHIFT), colour, cv2.FILLED, cv2.LINE_AA, _SHIFT)
+
+
+def _ellipses(
+    picture: Picture, joints: tuple[str, ...], people: Float, spread: Float, thickness: int
+) -> None:
+    """95 % ellipses of the body's joints [P, K, 2] by their covariances [P, J, 2, 2], where these are known."""
+    import cv2
+
+    most = float(np.hypot(*picture.shape[:2]))
+    for body, own in zip(people, spread, strict=True):
+        for k in np.flatnonzero(np.isfinite(own).all(axis=(1, 2)) & _drawable(body[: len(own)])):
+            if joints[k].removeprefix("left_").removeprefix("right_") not in _WITH_ELLIPSE:
+                continue
+            squared, axes = np.linalg.eigh(own[k])
+            half = np.sqrt(CHI2_95 * np.maximum(squared, 0.0))
+            if half[1] < most:
+                angle = float(np.degrees(np.arctan2(axes[1, 1], axes[0, 1])))
+                size = _fixed(half[::-1])
+                colour = SIDES[side_of(joints[k])]
+                centre = _fixed(body[k])
+                cv2.ellipse(picture, centre, size, angle, 0, 360, colour, thickness, cv2.LINE_AA, _SHIFT)
+
+
+def _corners(picture: Picture, found: Float, thickness: int) -> None:
+    """The corners of a box about the points [J, 2] that are known; nothing for fewer than two."""
+    known = found[_drawable(found)]
+    if len(known) < 2:
+        return
+    low, high = known.min(axis=0), known.max(axis=0)
+    spare = _SPARE * float((high - low).max())
+    low, high = low - spare, high + spare
+    arm = _CORNER * float((high - low).min())
+    for x, inward in ((low[0], 1), (high[0], -1)):
+        for y, downward in ((low[1], 1), (high[1], -1)):
+            corner = np.array([x, y])
+            for across in (np.array([inward * arm, 0.0]), np.array([0.0, downward * arm])):
+                _line(picture, corner, corner + across, thickness, FOUND)
 
 
 def _rings(picture: Picture, points: Float, radius: float, thickness: int, colour: Colour) -> None:

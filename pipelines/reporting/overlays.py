@@ -34,6 +34,7 @@ ReadFrame = Callable[[str, int], Picture | None]
 
 MOMENTS = 6
 _LONGEST_STEP = 1.5  # usual steps: the skeleton is not interpolated between times further apart
+_STEP = 1e-4  # of a joint's depth: small against how lenses bend, large against rounding
 _SAME_PERSON = 0.5  # of a body's size in the picture: a detection further away is somebody else
 
 
@@ -53,6 +54,9 @@ class View:
     others: Float  # [D, J, 2] px: people who are not part of the skeleton
     has_pose: bool
     picture: Picture | None
+    spread: Float | None = (
+        None  # [P, J, 2, 2] px^2 covariance of reprojected joints; NaN where none is stated
+    )
 
     @property
     def residual_px(self) -> Float:
@@ -231,8 +235,15 @@ def status_at(motion: Motion, t_ns: Int64) -> NDArray[np.int8]:
     after = np.minimum(before + 1, len(motion.t_ns) - 1)
     step, since = motion.t_ns[after] - motion.t_ns[before], held - motion.t_ns[before]
     known = (held == t_ns) & ((since == 0) | (step <= _longest_step_ns(motion)))
-    nearest = np.where(2 * since > step, after, before)
-    return np.where(known[:, None, None], motion.status[nearest], np.int8(-1))
+    return np.where(known[:, None, None], motion.status[_nearest_row(motion, t_ns)], np.int8(-1))
+
+
+def _nearest_row(motion: Motion, t_ns: Int64) -> Int64:
+    """The skeleton's time nearest to each of [N] times; of two the earlier."""
+    after = np.clip(np.searchsorted(motion.t_ns, t_ns), min(1, len(motion.t_ns) - 1), len(motion.t_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    is_after = motion.t_ns[after] - t_ns < t_ns - motion.t_ns[before]
+    return np.where(is_after, after, before).astype(np.int64)
 
 
 def views_of(
@@ -253,7 +264,12 @@ def views_of(
     )
     joints, points = with_derived(motion.joints, skeleton)
     position, rotation = camera.poses_at(t_ns)
-    reprojected = project((points - position[:, None, None]) @ rotation[:, None], camera.intrinsics)
+    seen = (points - position[:, None, None]) @ rotation[:, None]
+    reprojected = project(seen, camera.intrinsics)
+    stated = np.where(motion.measured[..., None], motion.covariance, np.nan)[_nearest_row(motion, t_ns)]
+    spread = seen_spread(
+        seen[..., : len(motion.joints), :], stated, rotation[:, None, None], camera.intrinsics
+    )
     views = []
     for n, people in enumerate(camera.people_in(frame, motion.joints)):
         matches = match_people(reprojected[n, :, : len(motion.joints)], people)
@@ -275,9 +291,35 @@ def views_of(
                 others=people[[d for d in range(len(people)) if d not in matches]],
                 has_pose=bool(np.isfinite(position[n]).all()),
                 picture=None,
+                spread=spread[n],
             )
         )
     return views
+
+
+def seen_spread(points: Float, covariance: Float, world_from_camera: Float, lens: Intrinsics) -> Float:
+    """How the uncertainty of joints spreads in a picture, to first order: J R' S R J'.
+
+    It is that of the joints alone: where the camera was is taken for known.
+
+    Args:
+        points: [..., 3] m, in the camera.
+        covariance: [..., 6] m^2, in the world: xx, xy, xz, yy, yz, zz.
+        world_from_camera: [..., 3, 3] rotations.
+        lens: the camera's; J is its derivative there, by central differences.
+
+    Returns:
+        [..., 2, 2] px^2, NaN where a number is missing.
+    """
+    full = covariance[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*covariance.shape[:-1], 3, 3)
+    step = _STEP * np.abs(points[..., 2])[..., None]
+    columns = [
+        (project(points + step * axis, lens) - project(points - step * axis, lens)) / (2 * step)
+        for axis in np.eye(3)
+    ]
+    derivative = np.stack(columns, axis=-1) @ np.swapaxes(world_from_camera, -1, -2)
+    spread: Float = derivative @ full @ np.swapaxes(derivative, -1, -2)
+    return spread
 
 
 def _view(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.reporting.frame_drawing import (
+    CHI2_95,
     FOUND,
     GREY,
     REJECTED,
@@ -174,3 +175,37 @@ def test_padding_repeats_the_last_row_and_column(height: int, width: int) -> Non
     assert (padded[:height, :width] == picture).all()
     assert (padded[-1, :width] == picture[-1]).all()
     assert (padded[:height, -1] == picture[:, -1]).all()
+
+
+def test_ellipses_hold_95_percent(view: View) -> None:
+    covariance = np.array([[400.0, 150.0], [150.0, 100.0]])
+    spread = np.full((1, 4, 2, 2), np.nan)
+    spread[0, 0] = covariance  # of the left shoulder
+    alone = replace(view, reprojected=_only(0))
+    drawn = changed(draw_frame(GROUND, replace(alone, spread=spread), ()))
+    outline = drawn & ~changed(draw_frame(GROUND, alone, ()))
+    rows, columns = np.nonzero(outline)
+    offset = np.stack([columns, rows], axis=1) - BODY[0, 0]
+    squared = np.einsum("ni,ij,nj->n", offset, np.linalg.inv(covariance), offset)
+    # The pen is a pixel wide on either side; along the short axis (6.1 px of sigma) that is 0.16 of 2.45.
+    short = np.sqrt(np.linalg.eigvalsh(covariance)[0])
+    assert np.abs(np.sqrt(squared) - np.sqrt(CHI2_95)).max() < 1.5 / short
+    # It closes: some of it in each eighth of the turn.
+    assert set(np.floor(np.arctan2(offset[:, 1], offset[:, 0]) / (np.pi / 4))) >= set(range(-4, 4))
+    assert not changed(draw_frame(GROUND, replace(alone, spread=1e8 * spread), ()))[~drawn].any()
+
+
+def test_corners_hold_the_person_that_was_found(view: View) -> None:
+    found = BODY.copy()
+    found[0, 1] = np.nan
+    lost = np.ones((1, 4), np.bool_)
+    drawn = draw_frame(GROUND, replace(view, reprojected=MISSING, found=found), ())
+    low, high = np.nanmin(found[0], axis=0), np.nanmax(found[0], axis=0)
+    spare = 0.1 * (high - low).max()
+    rows, columns = np.nonzero(changed(drawn))
+    box = [columns.min(), rows.min(), columns.max(), rows.max()]
+    np.testing.assert_allclose(box, [*(low - spare), *(high + spare)], atol=1.5)  # the pen
+    middle = int(low[0] + high[0]) // 2
+    assert not changed(drawn)[: int(low[1]) - 10, middle].any(), "its sides are open"
+    nobody = replace(view, reprojected=MISSING, found=MISSING, unmeasured=lost)
+    assert not changed(draw_frame(GROUND, nobody, ())).any()
