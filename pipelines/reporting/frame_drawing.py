@@ -135,7 +135,7 @@ def _dots(picture: Picture, points: Float, radius: float, colour: Colour) -> Non
 def _ellipses(
     picture: Picture, joints: tuple[str, ...], people: Float, spread: Float, thickness: int
 ) -> None:
-    """95 % ellipses of the body's joints [P, K, 2] by their covariances [P, J, 2, 2], where these are known."""
+    """95 % ellipses of the body's joints [P, K, 2], whose covariances [P, J, 2, 2] are NaN if not known."""
     import cv2
 
     most = float(np.hypot(*picture.shape[:2]))
