@@ -38,7 +38,7 @@ from pipelines.formats.map_topics import (
     map_messages,
     nothing_usable,
 )
-from pipelines.formats.pictures import later_pictures, picture_samples, stamp_of
+from pipelines.formats.pictures import Stamped, later_pictures, picture_stamps, stamp_of
 from pipelines.formats.recordings import OpenLog
 from pipelines.geometry.poses import compose, matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.session.errors import DataError
@@ -50,7 +50,6 @@ from pipelines.session.records import (
     IntrinsicsSample,
     Message,
     Occupancy,
-    PictureSample,
     Topic,
     Trajectory,
 )
@@ -208,13 +207,11 @@ class FlightLogs:
             seen = 0
             t_ns = array("q")
 
-            def pictures() -> Iterator[PictureSample]:
+            def pictures() -> Iterator[Stamped]:
                 nonlocal seen
-                for sample in picture_samples(recording, name, source):
-                    if not isinstance(sample, PictureSample):
-                        raise DataError(source, f"{name} holds no pictures", "name another topic")
+                for picture in picture_stamps(recording, name, source):
                     seen += 1
-                    yield sample
+                    yield picture
 
             for picture in later_pictures(pictures(), stamps):
                 t_ns.append(stamp_of(picture, stamps))

@@ -7,6 +7,7 @@ writes it, that takes a fifth of the time of a decoding; wherever it is not, it 
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.message_decoders import Decoder, Schema, decoder, is_standard
+from pipelines.session.records import Int64
 
 _COMPRESSED = "sensor_msgs/msg/CompressedImage"
 _RAW = "sensor_msgs/msg/Image"
@@ -23,6 +25,7 @@ _BEGIN = struct.Struct(
     "<4siI"
 )  # head of CDR or number of ROS 1, then the stamp, signed as rosbags reads both
 _SIZE = struct.Struct("<II")
+_LATEST_NS = 2**62  # stamps beyond are no times, which is for others to say
 
 
 class PictureFields(NamedTuple):
@@ -36,6 +39,13 @@ class PictureFields(NamedTuple):
     data: NDArray[np.uint8]
 
 
+Heads = tuple[Int64, Int64, NDArray[np.uint8]]
+"""Stamps of receipt [n] of messages, how many bytes they have [n], and the first of these [n, length]."""
+
+HEAD_LENGTH = 256
+"""Bytes of a message of pictures that hold what comes before the picture, but for long names."""
+
+
 class _OtherLayoutError(Exception):
     """A message that is not laid out as usual."""
 
@@ -47,8 +57,7 @@ def picture_decoder(schema: Schema) -> Decoder:
         ValueError: why messages of this schema cannot be decoded.
     """
     general = decoder(schema)
-    known = schema.type in {_COMPRESSED, _RAW} and schema.encoding in {"cdr", "ros1"}
-    if not known or not is_standard(schema):
+    if not _is_known(schema):
         return general
 
     like: _Layout | None = None  # as the last picture was laid out, so is the next
@@ -58,12 +67,48 @@ def picture_decoder(schema: Schema) -> Decoder:
         if like is not None and (picture := like.picture(data)) is not None:
             return picture
         try:
-            like = _layout(schema, data)
+            like = _layout(schema, data, len(data))
         except (_OtherLayoutError, struct.error, UnicodeDecodeError):
             return general(data)
         return like.picture(data)
 
     return decode
+
+
+def read_stamps(schema: Schema, messages: Iterable[Heads]) -> tuple[Int64, Int64] | None:
+    """Stamps of the headers [N] and of receipt [N] of all pictures of a topic, in the order of receipt.
+
+    None where they are not all laid out alike and as usual, or a stamp of receipt is no time: then
+    messages must be decoded one by one.
+
+    Args:
+        schema: of the topic.
+        messages: in any order; those of equal stamps keep theirs. Read to the end, or to the first that
+            differs.
+    """
+    if not _is_known(schema):
+        return None
+    header_ns: list[Int64] = [np.zeros(0, np.int64)]
+    receive_ns: list[Int64] = [np.zeros(0, np.int64)]
+    layout: _Layout | None = None
+    for received, sizes, heads in messages:
+        try:
+            layout = layout or _layout(schema, heads[0].tobytes(), int(sizes[0]))
+        except (_OtherLayoutError, struct.error, UnicodeDecodeError):
+            return None
+        stamps = layout.stamps(heads, sizes)
+        if stamps is None or np.abs(received).max() >= _LATEST_NS:
+            return None
+        header_ns.append(stamps)
+        receive_ns.append(received)
+    every = np.concatenate(receive_ns)
+    order = np.argsort(every, kind="stable")
+    return np.concatenate(header_ns)[order], every[order]
+
+
+def _is_known(schema: Schema) -> bool:
+    known = schema.type in {_COMPRESSED, _RAW} and schema.encoding in {"cdr", "ros1"}
+    return known and is_standard(schema)
 
 
 @dataclass(frozen=True)
@@ -90,9 +135,35 @@ class _Layout:
         stamp_ns = seconds * 1_000_000_000 + nanoseconds
         return PictureFields(stamp_ns, self.format, self.width, self.height, self.step, pixels)
 
+    def stamps(self, heads: NDArray[np.uint8], sizes: Int64) -> Int64 | None:
+        """The stamps [n] of messages by their heads; None if one is laid out or states things otherwise."""
+        at = self.parts.size
+        if at > heads.shape[1]:
+            return None
+        between = np.frombuffer(self.between, np.uint8)
+        if (heads[:, _BEGIN.size : at - _U32.size] != between).any():
+            return None
+        if self.head is not None and (heads[:, :4] != np.frombuffer(self.head, np.uint8)).any():
+            return None
+        lengths = _column(heads, at - _U32.size, "<u4")
+        if (sizes <= at).any() or (at + lengths != sizes).any():
+            return None
+        return _column(heads, 4, "<i4") * 1_000_000_000 + _column(heads, 8, "<u4")
 
-def _layout(schema: Schema, data: memoryview | bytes) -> _Layout:
-    """Found field by field: CDR aligns numbers to four bytes and ends text with a zero, unlike ROS 1."""
+
+def _column(heads: NDArray[np.uint8], at: int, kind: str) -> Int64:
+    """The numbers of four bytes that stand at one place of every head."""
+    return heads[:, at : at + 4].copy().view(kind)[:, 0].astype(np.int64)
+
+
+def _layout(schema: Schema, data: memoryview | bytes, size: int) -> _Layout:
+    """Found field by field: CDR aligns numbers to four bytes and ends text with a zero, unlike ROS 1.
+
+    Args:
+        schema: of the message.
+        data: its bytes, or its first ones.
+        size: how many bytes it has.
+    """
     is_cdr = schema.encoding == "cdr"
     head = bytes(data[:4])
     if is_cdr and head != _CDR_LITTLE_ENDIAN:
@@ -111,7 +182,7 @@ def _layout(schema: Schema, data: memoryview | bytes) -> _Layout:
         stated, at = _text(data, at + (-at % 4 if is_cdr else 0), is_cdr)
         at += -at % 4 if is_cdr else 0
     (length,) = _U32.unpack_from(data, at)
-    if not length or at + 4 + length != len(data):
+    if not length or at + 4 + length != size:
         raise _OtherLayoutError
     between = bytes(data[_BEGIN.size : at])
     parts = struct.Struct(f"{_BEGIN.format}{len(between)}sI")

@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Protocol, Self
+from typing import NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.log_messages import all_samples
-from pipelines.formats.picture_layouts import picture_decoder
+from pipelines.formats.picture_layouts import HEAD_LENGTH, picture_decoder, read_stamps
 from pipelines.formats.recordings import OpenLog
 from pipelines.formats.video import VideoReader
 from pipelines.session.description import MediaEntry
-from pipelines.session.records import PictureSample, Sample
+from pipelines.session.errors import DataError
+from pipelines.session.records import Int64, PictureSample, Sample
 from pipelines.session.registries import Log, LogFormat, recognise
 
 Picture = NDArray[np.uint8]
@@ -36,6 +37,26 @@ class Pictures(Protocol):
 
     def __exit__(self, *exception: object) -> None:
         """Close the files."""
+
+
+class Stamped(Protocol):
+    """What is known of a picture without its pixels."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of its header; 0 without one."""
+
+    @property
+    def receive_ns(self) -> int:
+        """Of its receipt."""
+
+
+class _Stamps(NamedTuple):
+    stamp_ns: int
+    receive_ns: int
+
+
+_Stamped = TypeVar("_Stamped", bound=Stamped)
 
 
 def open_pictures(media: MediaEntry, session: Path) -> Pictures:
@@ -108,10 +129,38 @@ def picture_samples(recording: Log, topic: str, source: Path | str) -> Iterator[
     return all_samples(recording.messages([topic]), source)
 
 
-def later_pictures(pictures: Iterator[PictureSample], stamps: str) -> Iterator[PictureSample]:
+def picture_stamps(recording: Log, topic: str, source: Path | str) -> Iterator[Stamped]:
+    """When the pictures of a topic were taken and received, in the order of receipt.
+
+    Of the same pictures as `picture_samples` gives. Where their messages are laid out alike, only the
+    beginning of each is looked at.
+
+    Raises:
+        DataError: the topic holds something else.
+    """
+    if (at_once := _stamps_at_once(recording, topic)) is not None:
+        yield from map(_Stamps, *(stamps.tolist() for stamps in at_once))
+        return
+    for sample in picture_samples(recording, topic, source):
+        if not isinstance(sample, PictureSample):
+            raise DataError(source, f"{topic} holds no pictures", "name another topic")
+        yield sample
+
+
+def _stamps_at_once(recording: Log, topic: str) -> tuple[Int64, Int64] | None:
+    if not isinstance(recording, OpenLog):
+        return None
+    of_that_name = [known for known in recording.topics if known.name == topic]
+    schemas = {schema for known in of_that_name for schema in recording.schemas(known)}
+    if len(of_that_name) != 1 or len(schemas) != 1:
+        return None
+    return read_stamps(schemas.pop(), recording.heads(of_that_name[0], HEAD_LENGTH))
+
+
+def later_pictures(pictures: Iterator[_Stamped], stamps: str) -> Iterator[_Stamped]:
     """The pictures whose stamp is above all before: frame k of a topic is the k-th of these."""
-    newest: PictureSample | None = None
-    leapt: PictureSample | None = None
+    newest: _Stamped | None = None
+    leapt: _Stamped | None = None
     for picture in pictures:
         if newest is not None:
             if stamp_of(picture, stamps) <= stamp_of(newest, stamps):
@@ -127,14 +176,14 @@ def later_pictures(pictures: Iterator[PictureSample], stamps: str) -> Iterator[P
         yield picture
 
 
-def _leap_ns(before: PictureSample, after: PictureSample) -> int:
+def _leap_ns(before: Stamped, after: Stamped) -> int:
     """How much more the header's clock went on between two pictures than that of receipt."""
     if not before.stamp_ns or not after.stamp_ns:
         return 0
     return (after.stamp_ns - before.stamp_ns) - (after.receive_ns - before.receive_ns)
 
 
-def stamp_of(picture: PictureSample, stamps: str) -> int:
+def stamp_of(picture: Stamped, stamps: str) -> int:
     """The stamp that counts: that of the header where it has one and it is wanted."""
     return picture.stamp_ns if stamps == "header" and picture.stamp_ns else picture.receive_ns
 

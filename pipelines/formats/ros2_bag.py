@@ -32,6 +32,7 @@ from pipelines.formats.recordings import (
     OpenLog,
     UnlikeError,
     describe_log,
+    joined_heads,
     open_file,
     open_parts,
     require_content,
@@ -44,6 +45,7 @@ _INFORMATION = "rosbag2_bagfile_information"
 _METADATA_LIMIT = 16 << 20  # bytes of a metadata.yaml
 _LARGEST_ROWID = 1 << 48
 _BATCH = 4096  # rows at a time
+_LISTED = 1 << 14  # rows that are listed at a time
 _SMALLEST_ROW = 6  # bytes a row takes in a file at the least: its length, its number, a header of four
 _MOST_ATTEMPTS = 10_000  # to go on behind damage
 _SUFFIXES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
@@ -171,6 +173,28 @@ class _Sqlite3Part(LogPart):
         except sqlite3.Error as error:
             raise UnlikeError from error
 
+    def read_heads(self, rows: Int64, length: int) -> Iterator[tuple[Int64, Int64, NDArray[np.uint8]]]:
+        """By queries that name the rows; from the first damage on, one by one."""
+        # sqlite reads the messages to their ends all the same, so that damage behind a head shows.
+        query = (
+            "SELECT messages.rowid, length(data), substr(data, 1, ?) "
+            "FROM json_each(?) AS wanted CROSS JOIN messages ON messages.rowid = wanted.value"
+        )
+        done = 0
+        try:
+            while done < len(rows):
+                batch = rows[done : done + _BATCH]
+                places = self.table.place[batch].tolist()
+                found = self.database.execute(query, (length, json.dumps(places))).fetchall()
+                found_places, sizes, heads = zip(*found, strict=True) if found else ((), (), ())
+                if found_places != tuple(places) or set(map(type, heads)) != {bytes}:
+                    break
+                yield batch, np.array(sizes, np.int64), joined_heads(heads, length)
+                done += len(batch)
+        except sqlite3.Error:
+            pass
+        yield from super().read_heads(rows[done:], length)
+
     def _query(self, rows: Int64, places: Sequence[int]) -> sqlite3.Cursor:
         """The rows of the table from the first place to the last, of the topics of some messages."""
         query = (
@@ -221,15 +245,17 @@ class _Sqlite3Part(LogPart):
     def _list_messages(self) -> MessageTable:
         # A row without a stamp gets a topic that no bag has, and is counted with those of unknown topics.
         query = (
-            "SELECT rowid, CASE typeof(timestamp) WHEN 'integer' THEN ifnull(CAST(topic_id AS INTEGER), -1) "
-            "ELSE -1 END, ifnull(CAST(timestamp AS INTEGER), 0), ifnull(length(data), 0) "
+            "SELECT rowid AS place, CASE typeof(timestamp) WHEN 'integer' "
+            "THEN ifnull(CAST(topic_id AS INTEGER), -1) ELSE -1 END AS topic, "
+            "ifnull(CAST(timestamp AS INTEGER), 0) AS stamp, ifnull(length(data), 0) AS size "
             "FROM messages WHERE rowid > ? ORDER BY rowid"
         )
         numbers = array("q")
         # Pages of a damaged file can lead in circles and show rows without end.
         most = 4 * (self.file_size // _SMALLEST_ROW)
+        whole = self._take_joined(query, numbers, most)
         attempts = 0
-        last, step, whole = -1, 1, False
+        last, step = numbers[-4] if numbers else -1, 1
         while not whole and last < _LARGEST_ROWID and attempts < _MOST_ATTEMPTS:
             attempts += 1
             begin = len(numbers)
@@ -242,6 +268,32 @@ class _Sqlite3Part(LogPart):
                 last, step = last + step, 2 * step
         rows = np.array(numbers, np.int64).reshape(-1, 4)
         return MessageTable(rows[:, 1], rows[:, 2], np.zeros(len(rows), np.int64), rows[:, 0], rows[:, 3])
+
+    def _take_joined(self, query: str, numbers: array[int], most: int) -> bool:
+        """Append rows as `_take_rows` does, in half its time; up to the first damage. Whether that was all.
+
+        sqlite makes one text of each column of many rows, which is less work than an object for each number.
+        """
+        columns = (
+            "count(*), group_concat(place), group_concat(topic), group_concat(stamp), group_concat(size)"
+        )
+        joined = f"SELECT {columns} FROM ({query} LIMIT {_LISTED})"  # noqa: S608  # of constants
+        last = -1
+        while len(numbers) < most:
+            try:
+                count, *texts = self.database.execute(joined, (last,)).fetchone()
+            except sqlite3.Error:
+                return False
+            if not count:
+                return True
+            rows = np.stack([np.fromstring(text, np.int64, sep=",") for text in texts], axis=1)
+            if len(rows) != count or (np.diff(rows[:, 0], prepend=last) <= 0).any():
+                return False
+            numbers.frombytes(rows.tobytes())
+            if count < _LISTED:
+                return True
+            last = int(rows[-1, 0])
+        return False
 
     def _take_rows(self, query: str, last: int, numbers: array[int], most: int) -> bool:
         """Append rows of four numbers, the first of which must rise from `last` on; whether that was all."""

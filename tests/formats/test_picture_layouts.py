@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from pipelines.formats.log_messages import all_samples
 from pipelines.formats.message_decoders import Schema, decoder
-from pipelines.formats.picture_layouts import PictureFields, picture_decoder
-from pipelines.formats.pictures import picture_samples
+from pipelines.formats.picture_layouts import HEAD_LENGTH, PictureFields, picture_decoder, read_stamps
+from pipelines.formats.pictures import picture_samples, picture_stamps
 from pipelines.formats.recordings import OpenLog
 from pipelines.formats.ros_messages import build
+from pipelines.session.errors import DataError
 from pipelines.session.records import PictureSample
 from pipelines.session.registries import LogFormat, recognise
 from tests.synthetic.logs import CONTAINERS, ROS1, ROS2, Container, Entry, write_log
@@ -72,6 +76,70 @@ def test_the_same_as_decoded(tmp_path: Path, container: Container, type_: str) -
         for name in ("stamp_ns", "receive_ns", "encoding", "width", "height", "step"):
             assert getattr(one, name) == getattr(other, name)
         np.testing.assert_array_equal(one.data, other.data, strict=True)
+
+
+def alike(k: int, received_ns: int) -> Entry:
+    """A picture that differs from the others in its stamp and its pixels alone, as those of a camera do."""
+    stated = fields(0, header={"stamp": START_NS + k, "frame_id": "camera"})
+    return Entry(TOPIC, COMPRESSED, received_ns, stated)
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_stamps_at_once_are_those_of_the_pictures(tmp_path: Path, container: Container) -> None:
+    """Of two files that interleave, with equal stamps of receipt and some out of order."""
+    received = np.random.default_rng(3).integers(0, 30, 60).tolist()
+    entries = [alike(k, START_NS + r) for k, r in enumerate(received)]
+    paths = [
+        write_log(tmp_path, name, container, part)
+        for name, part in (("first", entries[:30]), ("second", entries[30:]))
+    ]
+    with recognise(paths[0], LogFormat, "log").open_log(paths) as log:
+        expected = [(s.stamp_ns, s.receive_ns) for s in picture_samples(log, TOPIC, "log")]
+        found = [(s.stamp_ns, s.receive_ns) for s in picture_stamps(log, TOPIC, "log")]
+        assert isinstance(log, OpenLog)
+        (topic,) = log.topics
+        (schema,) = log.schemas(topic)
+        at_once = read_stamps(schema, log.heads(topic, HEAD_LENGTH))
+    assert found == expected
+    assert len(expected) == 60
+    assert (at_once is not None) == (schema.encoding in {"cdr", "ros1"})
+
+
+@pytest.mark.parametrize("name", ["bag", "log.bag", "log.mcap"])
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damage_costs_both_ways_the_same(tmp_path: Path, name: str, data: st.DataObject) -> None:
+    container: Container = "ros2-sqlite3" if name == "bag" else "ros1" if name == "log.bag" else "mcap-cdr"
+    whole = tmp_path / name
+    if not whole.exists():
+        # Of 9 kB each, so that a database needs several pages for one.
+        wide = np.arange(9000, dtype=np.uint8)
+        write_log(
+            tmp_path,
+            name.partition(".")[0],
+            container,
+            [
+                replace(e, fields={**e.fields, "data": wide})
+                for e in (alike(k, START_NS + k) for k in range(20))
+            ],
+        )
+    content = bytearray((whole / "bag.db3" if whole.is_dir() else whole).read_bytes())
+    if data.draw(st.booleans()):
+        at = data.draw(st.integers(0, len(content) // 4096)) * 4096
+        content[at : at + 4096] = bytes(len(content[at : at + 4096]))
+    else:
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    hurt = tmp_path / f"hurt{'.db3' if whole.is_dir() else whole.suffix}"
+    hurt.write_bytes(content)
+    results = []
+    for read in (picture_stamps, picture_samples):
+        try:
+            with recognise(hurt, LogFormat, "log").open_log([hurt]) as log:
+                stamps = [(s.stamp_ns, s.receive_ns) for s in read(log, TOPIC, "log")]
+                results.append((stamps, log.dropped))
+        except DataError as error:
+            results.append(([], {str(error): 1}))
+    assert results[0] == results[1]
 
 
 @pytest.mark.parametrize("type_", [COMPRESSED, RAW])
