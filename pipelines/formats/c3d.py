@@ -11,6 +11,7 @@ text because its numbers are too short; other files begin at the time of their f
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -82,37 +83,79 @@ class C3dFormat:
 
 def _open(path: Path) -> Any:
     ezc3d = need("ezc3d", "c3d")
-    _check_size(path)
+    _check_layout(path)
     try:
         return ezc3d.c3d(str(path))
     except (OSError, ValueError, RuntimeError, IndexError, KeyError, MemoryError) as error:
         raise DataError(path, f"is no readable C3D ({str(error)[:120]})", _EXPORT_AGAIN) from error
 
 
-def _check_size(path: Path) -> None:
-    """Refuse a file that is shorter than its header says: ezc3d searches minutes for what is not there."""
+def _check_layout(path: Path) -> None:
+    """Refuse a file that is shorter than its header says, or whose parameters run into each other.
+
+    ezc3d searches minutes for what is not there, or dies of it.
+    """
     try:
         with path.open("rb") as file:
             head = file.read(_BLOCK)
-            parameters = (head[0] - 1) * _BLOCK if head else 0
-            file.seek(parameters)
-            processor = file.read(4)
+            file.seek(max(head[0] - 1, 0) * _BLOCK if head else 0)
+            section = file.read(_BLOCK)
+            # Some writers count no blocks; the data's own block, then, says where the section ends.
+            until_data = max(head[16 if section[3] != _MIPS else 17] - head[0], 0) if len(section) > 3 else 0
+            section += file.read(max(*section[2:3], until_data, 1) * _BLOCK - _BLOCK)
             size = file.seek(0, 2)
     except OSError as error:
         raise as_data_error(error, path) from error
-    if len(head) < _BLOCK or head[1] != _MAGIC or len(processor) < 4:
+    if len(head) < _BLOCK or head[1] != _MAGIC or len(section) < 4:
         raise DataError(path, "is no readable C3D (it ends in its header)", _EXPORT_AGAIN)
-    order = ">" if processor[3] == _MIPS else "<"
+    processor = section[3]
+    order = ">" if processor == _MIPS else "<"
     points, analogs, first, last = struct.unpack_from(f"{order}4H", head, 2)
     scale, start = struct.unpack_from(f"{order}fH", head, 12)
     # DEC stores the half with the sign first.
-    is_float = head[13] & 0x80 if processor[3] == _DEC else scale < 0
+    is_float = head[13] & 0x80 if processor == _DEC else scale < 0
     frames = max(last - first + 1, 0)
     needed = (start - 1) * _BLOCK + frames * (4 * points + analogs) * (4 if is_float else 2)
     if size < needed:
         raise DataError(
             path, f"is no readable C3D (it holds {size} of the {needed} bytes of its header)", _EXPORT_AGAIN
         )
+    if not _is_chain(section, order):
+        raise DataError(path, "is no readable C3D (its parameters are damaged)", _EXPORT_AGAIN)
+
+
+def _is_chain(section: bytes, order: str) -> bool:
+    """Whether the parameters follow each other within their section, each as long as it says.
+
+    A record is the length of its name (negative: locked), a group's number (negative: the group itself), the
+    name, how far it is to the next, then of a parameter its type, its dimensions and its values.
+    """
+    at, groups = 4, set()
+    asked: set[int] = set()
+    try:
+        while at < len(section) and section[at]:
+            name, group = struct.unpack_from("2b", section, at)
+            step = at + 2 + abs(name)
+            (further,) = struct.unpack_from(f"{order}H", section, step)
+            if group < 0:
+                groups.add(-group)
+                end = step + 3 + section[step + 2]
+            else:
+                asked.add(group)
+                kind, dimensions = struct.unpack_from("bB", section, step + 2)
+                sides = section[step + 4 : step + 4 + dimensions]
+                end = step + 4 + dimensions + abs(kind) * math.prod(sides)
+                end += 1 + section[end]
+                if kind not in {-1, 1, 2, 4} or dimensions > 7 or len(sides) < dimensions:
+                    return False
+            if end > len(section) or (further and step + further < end):
+                return False
+            if not further:
+                break
+            at = step + further
+    except (IndexError, struct.error):
+        return False
+    return asked <= groups
 
 
 def _motion(path: Path, contents: Any, *, unit: str | None, axes: str | None) -> JointMotion:

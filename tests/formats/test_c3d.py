@@ -139,6 +139,22 @@ def test_what_is_wrong_is_said(tmp_path: Path) -> None:
     assert not READER.recognises(tmp_path / "text.c3d")
 
 
+@pytest.mark.parametrize("name", [b"POINT", b"LABELS", b"RATE", b"FIRST_T_NS"])
+def test_damaged_parameters_are_refused_before_ezc3d_sees_them(tmp_path: Path, name: bytes) -> None:
+    """It searches minutes for what they promise, or takes the process along."""
+    damaged = bytearray(write(tmp_path / "a.c3d", walking(30)).read_bytes())
+    behind = damaged.index(name) + len(name)  # how far it is to the next, then type and dimensions
+    damaged[behind : behind + 4] = bytes([0x77]) * 4
+    (tmp_path / "a.c3d").write_bytes(damaged)
+    with pytest.raises(DataError, match="its parameters are damaged"):
+        read(tmp_path / "a.c3d")
+
+
+def test_the_same_motion_gives_the_same_bytes(tmp_path: Path) -> None:
+    first, second = (write(tmp_path / name, walking(30)).read_bytes() for name in ("a.c3d", "b.c3d"))
+    assert first == second
+
+
 def test_without_ezc3d_one_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "a.c3d", walking(2))
 
