@@ -20,7 +20,7 @@ from pipelines.formats.fixed_layouts import PoseArrays, read_poses
 from pipelines.formats.log_frames import frames_of_poses, place_of_frame, transforms_in
 from pipelines.formats.log_maps import read_maps
 from pipelines.formats.log_messages import Kind, all_samples, kind_of
-from pipelines.formats.log_presets import Preset, read_preset
+from pipelines.formats.log_presets import NAV_SAT_FIX, read_pair, read_positions, read_preset
 from pipelines.formats.log_trajectories import (
     Gathered,
     StampCheck,
@@ -29,6 +29,7 @@ from pipelines.formats.log_trajectories import (
     trajectory_of,
     trajectory_of_arrays,
 )
+from pipelines.formats.log_triggers import TRIGGER_TYPES, read_triggers
 from pipelines.formats.map_topics import (
     MAP_TYPES,
     OCCUPANCY_GRID,
@@ -42,7 +43,7 @@ from pipelines.formats.pictures import Stamped, later_pictures, picture_stamps, 
 from pipelines.formats.recordings import OpenLog
 from pipelines.geometry.poses import compose, matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Flight
+from pipelines.session.manifest import Flight, PoseSource
 from pipelines.session.manifest import Log as LogSource
 from pipelines.session.manifest import Map as MapSource
 from pipelines.session.records import (
@@ -54,7 +55,7 @@ from pipelines.session.records import (
     Trajectory,
 )
 from pipelines.session.registries import Log, LogFormat, recognise
-from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from pipelines.session.telemetry import PositionTrack, Telemetry, TelemetryChoice
 
 _MAY_DISAGREE_S = 0.5  # header and receive stamps: transport and decoding take less
 _KEPT_MESSAGES = 4_000_000  # of all logs that stay open: their tables have 160 MB
@@ -135,18 +136,46 @@ class FlightLogs:
             started_ns = _start_ns(recording)
         return self._at_world_times(log, source, gathered, lost, started_ns)
 
-    def telemetry(
-        self, log: str, preset: Preset, namespace: str | None, choice: TelemetryChoice
-    ) -> Telemetry:
-        """What a driver's usual topics say of a drone, at the log's own times.
+    def telemetry(self, pose: PoseSource, choice: TelemetryChoice) -> Telemetry:
+        """What a driver's usual topics, or two that are named, say of a drone, at the log's own times.
 
         Raises:
             DataError: no such topics, those of several drones, or nothing usable.
         """
+        log = pose.log or ""
+        settings = self.settings(log)
         with self._open(log) as (recording, source):
-            found = read_preset(recording, source, preset, namespace, choice, self.settings(log).stamps)
+            if pose.preset:
+                found = read_preset(recording, source, pose.preset, pose.namespace, choice, settings.stamps)
+            else:
+                axes = pose.axes or settings.axes or self._flight.world.frame
+                named = (pose.topic or "", pose.attitude or "")
+                found = read_pair(recording, source, *named, axes, settings.stamps)
             lost = Counter(recording.dropped)
         return replace(found, dropped=dict(Counter(found.dropped) + lost))
+
+    def triggers(self, log: str, topic: str | None) -> Frames | None:
+        """When a topic says that pictures were taken, at world times; None where it is none of triggers."""
+        with self._open(log) as (recording, source):
+            types = {known.name: known.type for known in recording.topics}
+            if topic is None or types.get(topic) not in TRIGGER_TYPES:
+                return None
+            t_ns, repeated = read_triggers(recording, source, topic)
+            lost = Counter(recording.dropped)
+            started_ns = _start_ns(recording)
+        if repeated:
+            lost["trigger without a later stamp"] += repeated
+        return Frames(topic, self._world_times(log, t_ns, started_ns), dict(lost))
+
+    def positions(self, log: str, topic: str | None) -> PositionTrack | None:
+        """Positions on Earth of a topic, at world times; None where it is no NavSatFix."""
+        with self._open(log) as (recording, source):
+            types = {known.name: known.type for known in recording.topics}
+            if topic is None or types.get(topic) != NAV_SAT_FIX:
+                return None
+            track = read_positions(recording, source, topic, self.settings(log).stamps)
+            started_ns = _start_ns(recording)
+        return replace(track, t_ns=self._world_times(log, track.t_ns, started_ns))
 
     def attitudes(
         self,
@@ -407,6 +436,12 @@ class FlightLogs:
             self._note(
                 f"{source}: header and receive stamps disagree by up to {check.largest_disagreement_s:.3g} s"
                 f" in {check.disagreeing} of {check.count} messages; {used}"
+            )
+        drift = check.drift
+        if drift is not None and drift.drift_ppm and not check.jumps:
+            self._note(
+                f"{source}: header stamps drift {drift.drift_ppm:.1f} ppm (+- {drift.drift_sigma_ppm:.1g})"
+                f" against those of receipt; {used}, not corrected (logs: clock: drift_ppm does)"
             )
         for jump in check.jumps[:5]:
             self._note(

@@ -182,7 +182,8 @@ class FlightSources:
         if times.csv or times.srt:
             return self._frames_of_file(self._base / (times.csv or times.srt or ""), pictures)
         if times.log is not None:
-            stamped = self._logs.frames(times.log, times.topic)
+            triggers = self._logs.triggers(times.log, times.topic)
+            stamped = triggers or self._logs.frames(times.log, times.topic)
             return self._frames_by_stamps(stamped.t_ns, stamped.dropped, pictures)
         if times.ulog or times.ardupilot:
             kind: Literal["ulog", "ardupilot"] = "ulog" if times.ulog else "ardupilot"
@@ -461,6 +462,8 @@ class FlightSources:
 
     def actor(self, log: str, topic: str | None) -> Trajectory:
         """Where the actor was, as logged; its rotation means nothing."""
+        if (track := self._logs.positions(log, topic)) is not None:
+            return self._telemetry.points("actor", log, track)
         settings = self._logs.settings(log)
         trajectory = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
         return in_world(_in_enu(trajectory, self._axes(settings.axes)), settings)

@@ -30,7 +30,9 @@ from pipelines.formats.telemetry_rows import (
     world_from_heading,
 )
 from pipelines.geometry.clocks import fit_clock
+from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
+from pipelines.session.manifest import Axes
 from pipelines.session.records import Float, Int64
 from pipelines.session.registries import Log
 from pipelines.session.telemetry import (
@@ -45,6 +47,7 @@ Preset = Literal["dji_osdk", "mavros"]
 Stamps = Literal["header", "receive"]
 Position = Literal["local", "global", "gps"]
 
+NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 _NO_FIX = -1  # NavSatFix.status.status
 
 
@@ -202,6 +205,52 @@ def read_preset(
     )
 
 
+def read_pair(
+    recording: Log, source: str, position: str, attitude: str, axes: Axes, stamps: Stamps
+) -> Telemetry:
+    """A topic of positions (NavSatFix, PointStamped) and one of attitudes (Imu, QuaternionStamped).
+
+    Args:
+        recording: the log.
+        source: its name, for messages.
+        position: the topic of the positions.
+        attitude: the topic of the attitudes, of the body in the world.
+        axes: of attitudes and of positions in metres.
+        stamps: which stamps of its messages count.
+
+    Raises:
+        DataError: no such topics, or nothing usable in them.
+    """
+    counts = {topic.name: topic.count for topic in recording.topics}
+    for name in (position, attitude):
+        if not counts.get(name):
+            raise DataError(source, f"has no topic {name}, or nothing in it", "name another")
+    dropped: dict[str, int] = {}
+    track = _position(recording, source, position, "ellipsoid", stamps, dropped)
+    rows = _read(recording, source, attitude, _quaternion_of)
+    turned = rows.values()
+    if axes == "ned":
+        turned = attitude_in_enu(turned, relative_to="world", axes="ned")
+        if not track.on_earth:
+            track = replace(track, values=track.values[:, [1, 0, 2]] * [1, 1, -1])
+    return Telemetry(
+        position=track,
+        body=attitude_track(attitude, rows.times(stamps), turned, dropped),
+        gimbal=None,
+        clock=f"{stamps} stamps",
+        dropped=dropped,
+    )
+
+
+def read_positions(recording: Log, source: str, topic: str, stamps: Stamps) -> PositionTrack:
+    """A topic of positions alone.
+
+    Raises:
+        DataError: nothing usable in it.
+    """
+    return _position(recording, source, topic, "ellipsoid", stamps, {})
+
+
 def _prefix(source: str, preset: Preset, namespace: str | None, counts: dict[str, int]) -> str:
     there = [before for known, before in namespaces(list(counts)) if known == preset]
     if namespace is not None:
@@ -240,7 +289,7 @@ def _position(
     dropped: dict[str, int],
 ) -> PositionTrack:
     type_ = next(known.type for known in recording.topics if known.name == topic)
-    if type_ != "sensor_msgs/msg/NavSatFix":
+    if type_ != NAV_SAT_FIX:
         rows = _read(recording, source, topic, _point_of)
         return position_track(source, topic, rows.times(stamps), rows.values(), dropped, on_earth=False)
     rows = _read(recording, source, topic, _fix_of)

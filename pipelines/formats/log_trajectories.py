@@ -16,6 +16,7 @@ import numpy as np
 
 from pipelines.formats.fixed_layouts import PoseArrays
 from pipelines.formats.pose_rows import clean_poses
+from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.mounting import attitude_from_angles
 from pipelines.geometry.pose_covariance import pose_covariance_in_body
 from pipelines.geometry.transform_tree import Link, chain, find_route
@@ -46,6 +47,7 @@ class StampCheck:
     disagreeing: int  # of the others, header and receipt further apart than they may
     largest_disagreement_s: float  # header - receipt, where that is largest in size
     jumps: tuple[ClockJump, ...]
+    drift: ClockFit | None = None  # from receipt to header, where both are stated
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,7 @@ class SampleRows:
         header, receive = self._stamps()
         (stamped,) = np.nonzero(header)
         lead_ns = (header - receive)[stamped]
+        drift = fit_clock(receive[stamped], header[stamped]) if lead_ns.any() else None
         jump_ns = np.diff(lead_ns)
         return StampCheck(
             count=len(header),
@@ -142,6 +145,7 @@ class SampleRows:
                 ClockJump(int(stamped[k + 1]), int(header[stamped[k + 1]]), float(jump_ns[k]) / 1e9)
                 for k in np.flatnonzero(np.abs(jump_ns) > may_jump_s * 1e9)
             ),
+            drift=drift,
         )
 
     def _stamps(self) -> tuple[Int64, Int64]:
@@ -347,6 +351,7 @@ def _together(checks: Sequence[StampCheck]) -> StampCheck:
         disagreeing=sum(check.disagreeing for check in checks),
         largest_disagreement_s=max((c.largest_disagreement_s for c in checks), key=abs, default=0.0),
         jumps=tuple(jump for check in checks for jump in check.jumps),
+        drift=next((check.drift for check in checks if check.drift), None),
     )
 
 

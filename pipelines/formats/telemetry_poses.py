@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.formats.flight_logs import FlightLogs
+from pipelines.formats.flight_logs import FlightLogs, in_world
 from pipelines.formats.gimbal_angles import attitudes_at, stated_angles
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place, enu_from_enu, enu_from_geodetic
@@ -82,7 +82,7 @@ class TelemetryPoses:
         self._max_gap_ns = max_gap_ns
         self._note = note
         self._origin: Origin | None = None
-        self._read: dict[tuple[str, TelemetryChoice, str | None, str | None], Telemetry] = {}
+        self._read: dict[str, Telemetry] = {}
 
     # --- what is read ----------------------------------------------------------------------------------
 
@@ -90,10 +90,10 @@ class TelemetryPoses:
         """What a drone's own log says, at its own times; read once."""
         stated = _stated(pose)
         choice = TelemetryChoice(pose.position, pose.instance, pose.time, pose.altitude)
-        key = (stated, choice, pose.preset, pose.namespace)
+        key = pose.model_dump_json(exclude={"of"})
         if key not in self._read:
-            if pose.preset:
-                self._read[key] = self._logs.telemetry(stated, pose.preset, pose.namespace, choice)
+            if pose.log:
+                self._read[key] = self._logs.telemetry(pose, choice)
             else:
                 reader = FORMATS.get(_kind(pose))
                 path = self._one_file(stated)
@@ -111,7 +111,8 @@ class TelemetryPoses:
         reader, path = FORMATS.get(kind), self._one_file(stated)
         if not isinstance(reader, TriggerFormat):
             raise DataError(path, f"the format {kind} reads no triggers")
-        return self._world_times(stated, reader.picture_times(path, TelemetryChoice()))
+        t_ns = reader.picture_times(path, TelemetryChoice())
+        return self._world_times(stated, t_ns, int(t_ns[0]))
 
     def _one_file(self, stated: str) -> Path:
         paths = self._logs.paths(stated)
@@ -119,9 +120,10 @@ class TelemetryPoses:
             raise DataError(self._manifest, f"logs.{stated}: a drone's own log is one file", "name one")
         return paths[0]
 
-    def _world_times(self, stated: str, t_ns: Int64) -> Int64:
+    def _world_times(self, stated: str, t_ns: Int64, since_ns: int) -> Int64:
+        """Times of a log with its stated clock; `since_ns` is what the drift counts from."""
         clock = self._logs.settings(stated).clock
-        drift_ns = np.round((t_ns - t_ns[:1]) * (clock.drift_ppm * 1e-6)).astype(np.int64)
+        drift_ns = np.round((t_ns - since_ns) * (clock.drift_ppm * 1e-6)).astype(np.int64)
         moved: Int64 = t_ns + drift_ns + round(clock.offset_s * 1e9)
         return moved
 
@@ -182,6 +184,22 @@ class TelemetryPoses:
             height = height + origin.place.altitude_m
         return enu_from_geodetic(latitude, longitude, height, origin.place), level
 
+    def points(self, name: str, log: str, track: PositionTrack) -> Trajectory:
+        """Where something without a direction was, in the world; its rotation means nothing.
+
+        Raises:
+            DataError: nothing says where on Earth the world lies.
+        """
+        if self.origin() is None:
+            raise DataError(
+                self._manifest,
+                f"{name}: {log} says where it was on Earth, and no camera does",
+                "write world: {origin: {latitude_deg: ..., longitude_deg: ..., altitude_m: ...}}",
+            )
+        values, _ = self._in_world(name, track)
+        still = np.tile([0.0, 0.0, 0.0, 1.0], (len(values), 1))
+        return in_world(Trajectory(track.t_ns, values, still), self._logs.settings(log))
+
     # --- poses of cameras ------------------------------------------------------------------------------
 
     def trajectory(self, name: str, camera: Camera, mounted: tuple[Float, Float]) -> Trajectory:
@@ -208,9 +226,11 @@ class TelemetryPoses:
         self._refuse_unturned(name, camera, telemetry, gimbal)
         stated = _stated(pose)
         settings = self._logs.settings(stated)
-        track = replace(telemetry.position, t_ns=self._world_times(stated, telemetry.position.t_ns))
+        track = telemetry.position
+        since_ns = int(track.t_ns[0])
+        track = replace(track, t_ns=self._world_times(stated, track.t_ns, since_ns))
         if body is not None:
-            body = replace(body, t_ns=self._world_times(stated, body.t_ns))
+            body = replace(body, t_ns=self._world_times(stated, body.t_ns, since_ns))
         values, turned = self._in_world(name, track)
         self._doubt(name, track)
 
@@ -240,7 +260,7 @@ class TelemetryPoses:
             if own is None or camera.pose.of == "body":
                 return None
             self._note(f"{name}: its camera is turned as {own.name} of {_stated(camera.pose)} say")
-            return self._at_world_times(camera.pose, own)
+            return self._at_world_times(camera.pose, telemetry, own)
         if gimbal.fixed is None and gimbal.log is None:
             if own is None:
                 raise DataError(
@@ -248,11 +268,13 @@ class TelemetryPoses:
                     f"cameras.{name}.gimbal: {_stated(camera.pose)} holds no gimbal angles",
                     "name the log and topic that do, or fixed angles",
                 )
-            return replace(self._at_world_times(camera.pose, own), relative_to=gimbal.relative_to or "world")
+            moved = self._at_world_times(camera.pose, telemetry, own)
+            return replace(moved, relative_to=gimbal.relative_to or "world")
         return stated_angles(gimbal, self._logs, self._flight.world.frame)
 
-    def _at_world_times(self, pose: PoseSource, track: AttitudeTrack) -> AttitudeTrack:
-        return replace(track, t_ns=self._world_times(_stated(pose), track.t_ns))
+    def _at_world_times(self, pose: PoseSource, telemetry: Telemetry, track: AttitudeTrack) -> AttitudeTrack:
+        since_ns = int(telemetry.position.t_ns[0])
+        return replace(track, t_ns=self._world_times(_stated(pose), track.t_ns, since_ns))
 
     def _refuse_unturned(
         self, name: str, camera: Camera, telemetry: Telemetry, gimbal: AttitudeTrack | None
@@ -300,10 +322,8 @@ class TelemetryPoses:
         ):
             if count:
                 dropped[cause] = int(count)
-        move = settings.world_from_log
-        yaw = quaternion_from_rotation_vector(np.array([0.0, 0.0, np.radians(move.yaw_deg)]))
-        moved = compose((np.array(move.translation), yaw), (position[known], quaternion[known]))
-        return Trajectory(t_ns[known], moved[0], moved[1], dropped=dropped)
+        poses = Trajectory(t_ns[known], position[known], quaternion[known], dropped=dropped)
+        return in_world(poses, settings)
 
     def _doubt(self, name: str, track: PositionTrack) -> None:
         if len(track.t_ns) < 2:

@@ -152,6 +152,7 @@ class PoseSource(Part):
     child: str | None = None
     preset: Literal["dji_osdk", "mavros"] | None = None  # the usual topics of a driver, in a log
     namespace: str | None = None  # of these topics, where a log holds several drones: /uav1
+    attitude: str | None = None  # a topic beside one of positions alone (NavSatFix, PointStamped)
     tum: str | None = None
     csv: str | None = None
     static: StaticPose | None = None
@@ -169,12 +170,15 @@ class PoseSource(Part):
     def _only_where_it_belongs(self) -> PoseSource:
         autopilot = self.ulog is not None or self.ardupilot is not None
         allowed = {
-            ("topic", "parent", "child", "preset"): (self.log is not None, "from a log"),
+            ("topic", "parent", "child", "preset", "attitude"): (self.log is not None, "from a log"),
             ("namespace",): (self.preset is not None, "by a preset"),
             ("position",): (autopilot or self.preset is not None, "by ulog, ardupilot or a preset"),
             ("instance", "time"): (autopilot, "by ulog or ardupilot"),
             ("altitude",): (self.dji is not None, "by dji"),
-            ("axes",): (not self.is_telemetry, "that is no drone's own log (those state theirs)"),
+            ("axes",): (
+                not self.is_telemetry or self.attitude is not None,
+                "that is no drone's own log (those state theirs)",
+            ),
         }
         for names, (may, whose) in allowed.items():
             stated = [name for name in names if getattr(self, name) is not None]
@@ -184,12 +188,17 @@ class PoseSource(Part):
             raise ValueError("needs both parent and child, or neither")
         if self.preset and (self.topic or self.parent):
             raise ValueError("has a preset and names topics or frames: leave one of them out")
+        if self.attitude and (self.topic is None or self.preset or self.parent):
+            raise ValueError(
+                "attitude: needs the topic of the positions beside it, and neither preset nor frames"
+            )
         return self
 
     @property
     def is_telemetry(self) -> bool:
         """Whether a drone's own log, or its driver's topics, say position and attitude apart."""
-        return any(part is not None for part in (self.dji, self.ulog, self.ardupilot, self.preset))
+        parts = (self.dji, self.ulog, self.ardupilot, self.preset, self.attitude)
+        return any(part is not None for part in parts)
 
 
 class RigidTransform(Part):

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipelines.geometry.geodesy import place_at
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
@@ -201,3 +202,101 @@ def test_a_camera_that_never_turned_has_fixed_angles(tmp_path: Path) -> None:
     turned = poses_of(flight, "drone1")[["qx", "qy", "qz", "qw"]].to_numpy()
     off = multiply(conjugate(flight.camera_quaternion[0][:1]), turned)
     assert np.abs(off[:, :3]).max() < 1e-7
+
+
+def test_fixes_and_attitudes_of_any_driver_an_actor_with_a_receiver_and_triggers(tmp_path: Path) -> None:
+    flight = with_poses(tmp_path, _any_driver, {"looks": "forward", "translation": LEVER_ARM.tolist()})
+    hip = flight.position[:, [flight.joints.index(f"{side}_hip") for side in ("left", "right")]].mean(axis=1)
+    places = [place_at(row, HOME) for row in hip]
+    entries = [
+        Entry(
+            "/tag",
+            "sensor_msgs/msg/NavSatFix",
+            int(t),
+            {
+                "header": header(int(t), ""),
+                "latitude": place.latitude_deg,
+                "longitude": place.longitude_deg,
+                "altitude": place.altitude_m,
+            },
+        )
+        for t, place in zip(flight.t_ns, places, strict=True)
+    ]
+    write_log(tmp_path, "tag", "ros1", entries)
+    flight.settings["actor"] = {"log": "tag.bag", "topic": "/tag"}
+    for k, name in enumerate(flight.cameras):
+        camera = flight.settings["cameras"][name]
+        yaw, pitch, roll = drone_of(flight, k).gimbal_ypr_deg[0].tolist()
+        camera["gimbal"] = {"fixed": {"yaw_deg": yaw, "pitch_deg": pitch, "roll_deg": roll}}
+        camera["frame_times"] = {"log": f"{name}.bag", "topic": "/trigger"}
+    flight.save()
+    ingest(flight.manifest)
+    for k, name in enumerate(flight.cameras):
+        poses = poses_of(flight, name)[["x", "y", "z"]].to_numpy()
+        np.testing.assert_allclose(poses, flight.camera_position[k], atol=1e-4)
+        session = flight.manifest.with_suffix(".session")
+        frames = pd.read_parquet(session / "cameras" / name / "frames.parquet")
+        np.testing.assert_array_equal(frames["t_ns"], flight.t_ns)
+    actor = pd.read_parquet(flight.manifest.with_suffix(".session") / "actor.parquet")
+    np.testing.assert_allclose(actor[["x", "y", "z"]].to_numpy(), hip, atol=1e-5)
+    # Without a place on Earth for the world nothing can be said of where the actor was.
+    del flight.settings["world"]["origin"]
+    for name in flight.cameras:
+        camera = flight.settings["cameras"][name]
+        del camera["mount"], camera["gimbal"]
+        camera["pose"] = {"tum": f"{name}.tum"}
+    flight.save()
+    with pytest.raises(DataError, match="says where it was on Earth, and no camera does"):
+        ingest(flight.manifest)
+
+
+def _any_driver(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+    entries: list[Entry] = []
+    for row, stamp_ns in enumerate(truth.t_ns.tolist()):
+        turned = dict(zip("xyzw", truth.body[row].tolist(), strict=True))
+        stamped = header(stamp_ns, "")
+        entries += [
+            Entry("/fix", "sensor_msgs/msg/NavSatFix", stamp_ns, _fix(truth, row)),
+            Entry("/imu", "sensor_msgs/msg/Imu", stamp_ns, {"header": stamped, "orientation": turned}),
+            Entry("/trigger", "sensor_msgs/msg/TimeReference", stamp_ns, {"header": stamped}),
+        ]
+    write_log(folder, name, "ros1", entries)
+    return {"log": f"{name}.bag", "topic": "/fix", "attitude": "/imu"}
+
+
+def test_frames_at_the_triggers_of_an_autopilot(tmp_path: Path) -> None:
+    flight = with_poses(tmp_path, _ulog, ON_GIMBAL)
+    for name in flight.cameras:
+        flight.settings["cameras"][name]["frame_times"] = {"ulog": f"{name}.ulg"}
+    flight.save()
+    ingest(flight.manifest)
+    for name in flight.cameras:
+        frames = pd.read_parquet(
+            flight.manifest.with_suffix(".session") / "cameras" / name / "frames.parquet"
+        )
+        assert (
+            np.abs(frames["t_ns"].to_numpy() - flight.t_ns).max() <= 2000
+        )  # two clocks of whole microseconds
+
+
+def test_a_recorder_whose_clock_drifts_is_noted(tmp_path: Path) -> None:
+    # 200 s at 10 Hz: header stamps gain 60 us a second on those of receipt, which come 4 ms late.
+    stamps = [1_700_000_000_000_000_000 + k * 100_000_000 for k in range(2000)]
+    turned = {"position": {"x": 1.0}, "orientation": {"w": 1.0}}
+    entries = [
+        Entry(
+            "/pose",
+            "geometry_msgs/msg/PoseStamped",
+            t + 4_000_000,
+            {"header": header(t + (t - stamps[0]) * 60 // 1_000_000, "map"), "pose": turned},
+        )
+        for t in stamps
+    ]
+    write_log(tmp_path, "drone1", "mcap-cdr", entries)
+    flight = write_flight(tmp_path, cameras=1, seconds=1.0, clean=True)
+    flight.settings["cameras"]["drone1"]["pose"] = {"log": "drone1.mcap", "topic": "/pose", "of": "camera"}
+    flight.save()
+    warnings = ingest(flight.manifest).description.warnings
+    (said,) = [line for line in warnings if "drift" in line]
+    assert "header stamps drift 60.0 ppm" in said
+    assert "not corrected" in said

@@ -26,6 +26,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ({"ulog": "a.ulg", "altitude": 3}, "altitude: only a pose by dji has that"),
         ({"ulog": "a.ulg", "instanc": 3}, "unknown key, did you mean 'instance'"),
         ({"ardupilot": "a.bin", "dji": "b"}, "needs exactly one of"),
+        ({"log": "a.bag", "attitude": "/imu"}, "attitude: needs the topic of the positions"),
         ({"dji": "a.SRT", "axes": "ned"}, "axes: only a pose that is no drone's own log"),
     ],
 )
