@@ -300,3 +300,24 @@ def test_a_recorder_whose_clock_drifts_is_noted(tmp_path: Path) -> None:
     (said,) = [line for line in warnings if "drift" in line]
     assert "header stamps drift 60.0 ppm" in said
     assert "not corrected" in said
+
+
+def test_a_video_begins_when_its_container_says(tmp_path: Path) -> None:
+    import av
+
+    flight = write_flight(tmp_path, cameras=1, seconds=1.0, clean=True)
+    with av.open(str(tmp_path / "drone1.mp4"), "w") as container:
+        container.metadata["creation_time"] = "2023-11-14T22:13:20.000000Z"  # 1700000000
+        stream = container.add_stream("mpeg4", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 1280, 720, "yuv420p"
+        picture = av.VideoFrame.from_ndarray(np.zeros((720, 1280, 3), np.uint8), format="rgb24")
+        for _ in range(3):
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    camera = flight.settings["cameras"]["drone1"]
+    camera |= {"video": "drone1.mp4", "frame_times": {"start": 0.25, "start_from": "container"}}
+    del camera["clock"]
+    flight.save()
+    described = ingest(flight.manifest).description
+    assert described.cameras["drone1"].frames.first_t_ns == int(flight.t_ns[0]) + 250_000_000
+    assert any("say clock: {sigma_s: 1}" in line for line in described.warnings)

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.formats import video
-from pipelines.formats.video import Picture, VideoReader, frames, index_video, read_frame
+from pipelines.formats.video import Picture, VideoReader, created_ns, frames, index_video, read_frame
 from pipelines.session.errors import DataError
 from pipelines.session.registries import FORMATS, VideoFormat
 from tests.real_data import real_data
@@ -405,3 +405,27 @@ def test_real_recordings_decode_as_ffmpeg_does(name: str) -> None:
             picture = reader.read(number)
             assert picture is not None
             assert np.array_equal(picture, decoded[number].to_ndarray(format="bgr24"))
+
+
+@pytest.mark.parametrize(
+    ("stated", "made_ns"),
+    [
+        ("2024-05-01T10:00:03.000000Z", 1_714_557_603_000_000_000),
+        ("1904-01-01T00:00:00.000000Z", None),  # the zero of MP4: its clock was never set
+        (None, None),
+    ],
+)
+def test_when_a_video_says_that_it_was_made(tmp_path: Path, stated: str | None, made_ns: int | None) -> None:
+    import av
+
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w", options={}) as container:
+        if stated is not None:
+            container.metadata["creation_time"] = stated
+        stream = container.add_stream("mpeg4", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 32, 32, "yuv420p"
+        for _ in range(3):
+            picture = av.VideoFrame.from_ndarray(np.zeros((32, 32, 3), np.uint8), format="rgb24")
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    assert created_ns(path) == made_ns

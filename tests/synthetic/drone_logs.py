@@ -87,7 +87,8 @@ def _angles(ahead: Float, right: Float) -> Float:
     level_right = np.stack([np.cos(yaw), -np.sin(yaw), np.zeros_like(yaw)], axis=1)
     level_down = np.cross(ahead, level_right)
     roll = np.arctan2(np.sum(right * level_down, axis=1), np.sum(right * level_right, axis=1))
-    return np.degrees(np.stack([yaw, pitch, roll], axis=1))
+    angles: Float = np.degrees(np.stack([yaw, pitch, roll], axis=1))
+    return angles
 
 
 # --- DJI's subtitles -----------------------------------------------------------------------------------
