@@ -153,6 +153,8 @@ def _is_chain(section: bytes, order: str) -> bool:
             if not further:
                 break
             at = step + further
+            if at > len(section):
+                return False
     except (IndexError, struct.error):
         return False
     return asked <= groups
