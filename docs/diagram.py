@@ -3,12 +3,11 @@
     python docs/diagram.py
 
 Rows are the layers that the import contracts of pyproject.toml keep. An arrow from a box to one below
-means that some module in it imports one there; each step of thickness stands for twice as many.
+means that some module in it imports one there.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 from xml.sax.saxutils import escape
 
@@ -24,15 +23,15 @@ _ROWS = [
 _WIDTH, _ROW, _HEIGHT, _GAP = 960, 104, 44, 14
 
 
-def arrows() -> Counter[tuple[str, str]]:
-    """Imports from one box to another, counted by modules."""
+def arrows() -> set[tuple[str, str]]:
+    """The pairs of boxes of which the first imports the second."""
     graph = grimp.build_graph("mocap_cli", "pipelines")
-    found: Counter[tuple[str, str]] = Counter()
+    found = set()
     for importer in graph.modules - {"pipelines"}:
         for imported in graph.find_modules_directly_imported_by(importer) - {"pipelines"}:
             pair = _box(importer), _box(imported)
             if pair[0] != pair[1]:
-                found[pair] += 1
+                found.add(pair)
     return found
 
 
@@ -52,12 +51,11 @@ def draw() -> str:
         for k, name in enumerate(row)
     }
     lines = []
-    for (above, below), count in sorted(arrows().items()):
+    for above, below in sorted(arrows()):
         (x0, y0), (x1, y1) = place[above], place[below]
-        width = 0.6 + 0.4 * count.bit_length()
         lines.append(
             f'<path d="M{x0:.0f} {y0 + _HEIGHT / 2:.0f} L{x1:.0f} {y1 - _HEIGHT / 2:.0f}" stroke="#8a94a6"'
-            f' stroke-opacity="0.55" stroke-width="{width:.1f}" fill="none">'
+            f' stroke-opacity="0.55" stroke-width="1.6" fill="none">'
             f"<title>{above} imports {below}</title></path>"
         )
     for row in _ROWS:
