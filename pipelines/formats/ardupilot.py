@@ -6,9 +6,10 @@ its world in NED and its body in FRD, and stamps in microseconds since boot (doc
 
 from __future__ import annotations
 
-import contextlib
 import io
-from collections.abc import Mapping, MutableMapping, Sequence
+import os
+from collections.abc import Iterator, Mapping, MutableMapping, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -79,7 +80,7 @@ class _Rows:
         return len(self.raw)
 
     def __contains__(self, field: str) -> bool:
-        return field in self.scales
+        return bool(self.scales.get(field))  # texts have none
 
     def integers(self, field: str) -> Int64:
         """[N] a field as it stands."""
@@ -180,9 +181,9 @@ class ArduPilotFormat:
         """
         log = _Log(path)
         for name in ("CAM", "TRIG"):
-            rows = log.rows(name)
-            if rows is not None and len(rows):
-                t_ns = np.unique(rows.of(choice.instance or 0, "I").t_ns())
+            rows = log.first([name], choice.instance or 0, "I")
+            if rows is not None:
+                t_ns = np.unique(rows.t_ns())
                 fit = on_gps_time(path, _gps_time(log), choice.time, [])
                 return t_ns if fit is None else np.unique(fit.other_ns(t_ns))
         raise DataError(path, "holds no CAM or TRIG message", "take the times of frames otherwise")
@@ -314,7 +315,7 @@ class _Log:
         """The messages of the first of some names that has any of an instance."""
         for name in names:
             rows = self.rows(name)
-            if rows is not None and len(found := rows.of(instance, *columns)):
+            if rows is not None and "TimeUS" in rows and len(found := rows.of(instance, *columns)):
                 return found
         return None
 
@@ -350,15 +351,30 @@ def _index(path: Path) -> Any:
     except OSError as error:
         raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
     reader = need("pymavlink.DFReader", "drones")
-    quiet = io.StringIO()
     try:
-        with contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet):  # it prints what it doubts
+        with _silence():
             return reader.DFReader_binary(str(path), zero_time_base=True)
     except OSError as error:
         raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
     except Exception as error:  # whatever damage makes of a parser that expects none
         problem = " ".join(str(error).split())[:100] or type(error).__name__
         raise DataError(path, f"is damaged ({problem})", "download it from the autopilot again") from error
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Keep what pymavlink prints of each damaged byte from the terminal; its compiled part prints too."""
+    quiet = io.StringIO()
+    stderr = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        with redirect_stdout(quiet), redirect_stderr(quiet):
+            yield
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(nowhere)
 
 
 FORMAT = ArduPilotFormat()

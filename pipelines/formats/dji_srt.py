@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.formats.pose_rows import longest_rising
 from pipelines.formats.stamps import Bool
 from pipelines.formats.summaries import describe_times
 from pipelines.formats.telemetry_rows import (
@@ -299,9 +300,13 @@ def _attitude(
         return None
     if missing := int(np.count_nonzero(~stated)):
         dropped[f"subtitles without {name}"] = missing
-    continuous = np.degrees(np.unwrap(np.radians(yaw_pitch_roll_deg[stated]), axis=0))
-    between, _ = between_repeats(t_ns[stated], continuous)
-    return attitude_track(name, t_ns[stated], turned_as_stated(between), dropped)
+    rows = np.flatnonzero(stated)
+    rows = rows[longest_rising(t_ns[rows])]
+    if late := int(np.count_nonzero(stated)) - len(rows):
+        dropped[f"{name} out of order"] = late
+    continuous = np.degrees(np.unwrap(np.radians(yaw_pitch_roll_deg[rows]), axis=0))
+    between, _ = between_repeats(t_ns[rows], continuous)
+    return attitude_track(name, t_ns[rows], turned_as_stated(between), dropped)
 
 
 def _clock_name(subtitles: Subtitles) -> str:

@@ -103,7 +103,7 @@ class UlogFormat:
         facts: dict[str, object] = {
             "hardware": str(log.msg_info_dict.get("ver_hw", "")),
             "messages": len(every),
-            "span_s": round(float(np.ptp(every[near])) / 1e9, 6) if len(every) else 0.0,
+            "span_s": round(float(np.ptp(every[near])) / 1e9, 6) if near.any() else 0.0,
         }
         if early := int(np.count_nonzero(~begun)):
             facts["messages_stamped_before_the_log_began"] = early

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -110,13 +111,14 @@ def test_a_clock_that_drifts_is_found(tmp_path: Path) -> None:
     assert np.abs(telemetry.position.t_ns - t_ns).max() < 1_500_000
 
 
-def test_damage(tmp_path: Path, truth: DroneTruth) -> None:
+def test_damage(tmp_path: Path, truth: DroneTruth, capfd: pytest.CaptureFixture[str]) -> None:
     path = write_dataflash(tmp_path / "a.bin", truth)
     whole = path.read_bytes()
     middle = len(whole) // 2
     path.write_bytes(whole[:middle] + b"\x00\xa3\x17garbage" + whole[middle:-5])
     telemetry = read(path)
     assert len(telemetry.position.t_ns) >= len(truth.t_ns) - 2
+    assert capfd.readouterr().err == ""  # pymavlink prints each byte that it does not understand
     path.write_bytes(whole[:700])
     with pytest.raises(DataError, match="has no POS, XKF1, NKF1 or GPS"):
         read(path)
@@ -133,3 +135,12 @@ def test_what_is_not_there(tmp_path: Path, truth: DroneTruth) -> None:
     with pytest.raises(DataError, match="holds no CAM or TRIG"):
         FORMAT.picture_times(path, TelemetryChoice())
     assert read(path).gimbal is None
+
+
+def test_without_pymavlink_it_is_said_what_to_install(
+    tmp_path: Path, truth: DroneTruth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_dataflash(tmp_path / "a.bin", truth)
+    monkeypatch.setitem(sys.modules, "pymavlink.DFReader", None)
+    with pytest.raises(DataError, match=r'pip install "mocap-pipeline\[drones\]"'):
+        read(path)

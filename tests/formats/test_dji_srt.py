@@ -139,6 +139,20 @@ def test_yaw_is_followed_across_north(tmp_path: Path) -> None:
     np.testing.assert_allclose(ahead[:, 1], -1, atol=2e-4)  # south throughout, never by way of north
 
 
+def test_angles_whose_clock_goes_back_are_dropped(tmp_path: Path) -> None:
+    text = "[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5] [gb_yaw: 1.0 gb_pitch: 0.0 gb_roll: 0.0]"
+    path = tmp_path / "a.srt"
+    blocks = "".join(
+        f"{n}\n00:00:00,{n * 40:03d} --> 00:00:00,{n * 40 + 40:03d}\n2024-05-01 {clock}\n{text}\n\n"
+        for n, clock in enumerate(("10:00:01.000", "09:00:00.000", "10:00:01.080"))
+    )
+    path.write_text(blocks)
+    telemetry = read(path)
+    assert telemetry.gimbal is not None
+    assert len(telemetry.gimbal.t_ns) == 2
+    assert telemetry.dropped == {"stamp out of order": 1, "its gimbal angles out of order": 1}
+
+
 def test_which_height(tmp_path: Path) -> None:
     text = "[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5 abs_alt: 480.0]"
     path = subtitles(tmp_path / "a.srt", text, text)
