@@ -9,6 +9,8 @@ import os
 
 from hypothesis import settings
 
+import pipelines  # noqa: F401  # before numpy, as commands do: linear algebra on one thread
+
 # A shared machine is sometimes slow: time is watched by the tests that are about time.
 settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.register_profile("explore", deadline=None, print_blob=True)

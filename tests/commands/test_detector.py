@@ -14,7 +14,7 @@ import pytest
 from pipelines.formats.trc import FORMAT as TRC
 from pipelines.session.registries import find_detector
 from pipelines.session.tabular import motion_from
-from tests.commands.runner import content, mocap, refused, succeeds
+from tests.commands.runner import content, mocap_process, refused, succeeds
 from tests.real_data import real_data
 
 EVERY = 10
@@ -24,7 +24,7 @@ EVERY = 10
 def flight(tmp_path: Path) -> Path:
     """Four videos, their calibration, and no keypoints."""
     if None in find_detector("blazepose").models().values():
-        fetched = mocap("models", "fetch", "blazepose", timeout=300)
+        fetched = mocap_process("models", "fetch", "blazepose", timeout=300)
         if fetched.returncode:
             pytest.skip(f"the detector's networks cannot be fetched here: {fetched.stderr.strip()}")
     recording = real_data("pose2sim_single")

@@ -140,6 +140,6 @@ def test_info_knows_what_it_wrote_and_what_it_reads(tmp_path: Path) -> None:
 
 def test_help_of_every_command() -> None:
     for command in ("init", "ingest", "reconstruct", "report", "export", "info"):
-        assert "Usage: mocap" in succeeds(command, "--help")
+        assert f"mocap {command} [OPTIONS]" in succeeds(command, "--help")
     assert mocap("ingest").returncode == 2
     assert mocap("reconstruct", "/nowhere", "--method", "magic").returncode == 2

@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from tests.commands.runner import content, mocap, refused, succeeds
+from tests.commands.runner import content, mocap, mocap_process, refusal, refused, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 
 
@@ -21,7 +21,7 @@ def test_unknown_key_names_the_nearest(flight: SyntheticFlight) -> None:
     flight.settings["cameras"]["drone2"]["keypoint"] = "d.json"
     flight.settings["wrold"] = {}
     flight.save()
-    line = refused("ingest", flight.manifest)
+    line = refusal(mocap_process("ingest", flight.manifest))  # as a shell sees it
     assert "cameras.drone2.keypoint: unknown key, did you mean 'keypoints'?" in line
     assert "wrold: unknown key, did you mean 'world'?" in line
 

@@ -7,6 +7,8 @@ import re
 from html import unescape
 from pathlib import Path
 
+import pytest
+
 from tests.commands.runner import succeeds
 
 SCENARIO = """
@@ -22,6 +24,7 @@ drones: {count: 2, formation: {yaw_deg: 45}}
 """
 
 
+@pytest.mark.slow
 def test_the_report_shows_the_comparison_of_the_session(tmp_path: Path) -> None:
     (tmp_path / "scenario.yaml").write_text(SCENARIO, encoding="utf-8")
     succeeds("simulate", tmp_path / "scenario.yaml", "-o", tmp_path / "flight", "--no-video")

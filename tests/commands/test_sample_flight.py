@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from pipelines.session.registries import find_detector
-from tests.commands.runner import mocap, succeeds
+from tests.commands.runner import mocap_process, succeeds
 
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "mound_walk"
 
@@ -19,7 +19,7 @@ SAMPLE = Path(__file__).parents[2] / "sample_data" / "mound_walk"
 def test_the_detector_and_true_poses_give_the_skeleton(tmp_path: Path) -> None:
     """At most 45 mm at 95 %: about half is what the detector means by hips and shoulders."""
     if None in find_detector("blazepose").models().values():
-        fetched = mocap("models", "fetch", "blazepose", timeout=300)
+        fetched = mocap_process("models", "fetch", "blazepose", timeout=300)
         if fetched.returncode:
             pytest.skip(f"the detector's networks cannot be fetched here: {fetched.stderr.strip()}")
     shutil.copytree(SAMPLE, tmp_path / "flight")
