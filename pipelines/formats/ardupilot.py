@@ -300,8 +300,6 @@ class _Log:
     def __init__(self, path: Path) -> None:
         self.path = path
         reader = _index(path)
-        reader.data_map.close()
-        reader.filehandle.close()
         self._bytes = np.memmap(path, dtype=np.uint8, mode="r")
         self._formats = {
             reader.id_to_name[k]: reader.formats[k] for k in reader.id_to_name if k in reader.formats
@@ -350,15 +348,26 @@ def _index(path: Path) -> Any:
                 raise DataError(path, "is no ArduPilot log", "give the .bin that the autopilot wrote")
     except OSError as error:
         raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
-    reader = need("pymavlink.DFReader", "drones")
+    kind = need("pymavlink.DFReader", "drones").DFReader_binary
+    reader = kind.__new__(kind)  # first without the file, which it leaves open where it fails
     try:
         with _silence():
-            return reader.DFReader_binary(str(path), zero_time_base=True)
+            reader.__init__(str(path), zero_time_base=True)
     except OSError as error:
+        _close(reader)
         raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
     except Exception as error:  # whatever damage makes of a parser that expects none
+        _close(reader)
         problem = " ".join(str(error).split())[:100] or type(error).__name__
         raise DataError(path, f"is damaged ({problem})", "download it from the autopilot again") from error
+    _close(reader)
+    return reader
+
+
+def _close(reader: Any) -> None:
+    """Close the file; the map of it goes with the last that looks at it."""
+    if file := getattr(reader, "filehandle", None):
+        file.close()
 
 
 @contextmanager
