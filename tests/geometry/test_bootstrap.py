@@ -1,0 +1,80 @@
+"""Intervals of means over time, against the variances that are known of the series they are drawn from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.geometry.bootstrap import RESAMPLES, STRETCH_S, intervals, stretch_samples
+
+Float = NDArray[np.float64]
+
+RATE = 30
+SAMPLES = 60 * RATE
+ONE = np.ones(SAMPLES)
+NORMAL_95 = 2 * 1.959964
+
+
+def stamps(count: int = SAMPLES) -> NDArray[np.int64]:
+    return 1_700_000_000_000_000_000 + np.arange(count, dtype=np.int64) * (1_000_000_000 // RATE)
+
+
+def mean_width(series: Float) -> float:
+    """The mean width of the intervals of many series [K, T]."""
+    widths = []
+    for k, values in enumerate(series):
+        found = intervals({"x": (values, ONE)}, stamps(), seed=k)["x"]
+        assert found is not None
+        widths.append(found[1] - found[0])
+    return float(np.mean(widths))
+
+
+def test_independent_errors_give_the_interval_of_the_textbook() -> None:
+    series = np.random.default_rng(1).normal(5, 2, (40, SAMPLES))
+    # 30 stretches: the variance of so few sums scatters by sqrt(2/30) = 26 % and a width by half of that;
+    # the ends of 1000 resamples by 1/sqrt(2 * 25) / 2.4 = 6 % of half a width; 40 series: 2.3 %, and the
+    # mean width of a chi with 30 degrees is 0.8 % short. Four times that.
+    expected = NORMAL_95 * 2 / np.sqrt(SAMPLES)
+    assert mean_width(series) == pytest.approx(expected, rel=0.1)
+
+
+def test_errors_that_last_widen_the_interval_by_what_their_memory_asks_for() -> None:
+    memory = RATE // 2
+    rng = np.random.default_rng(2)
+    noise = rng.normal(0, 1, (40, SAMPLES + memory - 1))
+    total = np.cumsum(np.pad(noise, ((0, 0), (1, 0))), axis=1)
+    series = (total[:, memory:] - total[:, :-memory]) / memory  # moving averages over half a second
+    # The variance of a mean is sum (1 - |h| / L) gamma(h) / T in stretches of L samples (Kuensch 1989), with
+    # gamma(h) = (1 - |h| / K) / K for the moving average over K.
+    length = stretch_samples(stamps())
+    lag = np.abs(np.arange(1 - memory, memory))
+    variance = float(np.sum((1 - lag / length) * (1 - lag / memory) / memory)) / SAMPLES
+    assert length == STRETCH_S * RATE
+    assert mean_width(series) == pytest.approx(NORMAL_95 * np.sqrt(variance), rel=0.1)
+    # Taken as independent, they would seem four times as sure (sqrt(15)).
+    assert mean_width(series) > 3 * NORMAL_95 * float(series.std()) / np.sqrt(SAMPLES)
+
+
+def test_a_figure_is_the_ratio_of_its_sums() -> None:
+    weights = np.random.default_rng(3).integers(1, 20, SAMPLES).astype(np.float64)
+    found = intervals({"constant": (3 * weights, weights)}, stamps())["constant"]
+    assert found == pytest.approx((3, 3), abs=1e-12)
+
+
+def test_nothing_to_draw_from_has_no_interval() -> None:
+    nothing = np.zeros(SAMPLES)
+    assert intervals({"a": (nothing, nothing)}, stamps()) == {"a": None}
+    assert intervals({"a": (ONE[:9], ONE[:9])}, stamps(9)) == {"a": None}
+    # One sample in a minute: some resampled minutes miss it.
+    rare = nothing.copy()
+    rare[40] = 1
+    assert intervals({"a": (rare, rare)}, stamps()) == {"a": None}
+
+
+def test_short_flights_are_cut_into_five_and_seeds_repeat() -> None:
+    assert stretch_samples(stamps(60)) == 12
+    values = np.random.default_rng(4).normal(size=SAMPLES)
+    first, again, other = (intervals({"x": (values, ONE)}, stamps(), seed=seed)["x"] for seed in (0, 0, 1))
+    assert first == again != other
+    assert RESAMPLES >= 1000
