@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -63,6 +64,43 @@ if TYPE_CHECKING:
     ' "white:position_m=0.3,rotation_deg=1 + drift:position_m_per_sqrt_s=0.05".',
 )
 @click.option(
+    "--refine-cameras",
+    type=click.Choice(["background"]),
+    help="Correct the attitudes of moving cameras first, by how the still background passes through their"
+    " pictures.",
+)
+@click.option(
+    "--disturb-poses",
+    metavar="MODEL",
+    help="Add such errors to every logged pose first, to see what they do. Methods are not told of them:"
+    " --pose-noise does that.",
+)
+@click.option(
+    "--trials",
+    type=click.IntRange(1, 1000),
+    default=1,
+    show_default=True,
+    metavar="N",
+    help="Draws of --disturb-poses. metrics.json has the figures of each, their mean, spread and interval;"
+    " the skeleton is that of the first.",
+)
+@click.option(
+    "--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help="Of --disturb-poses."
+)
+@click.option(
+    "--fill",
+    type=FiniteRange(0, min_open=True),
+    metavar="SECONDS",
+    help="Interpolate a joint across gaps of at most this length; their status is `filled`. Without it gaps"
+    " stay open.",
+)
+@click.option(
+    "--smooth",
+    metavar="FILTER",
+    help='"butterworth:cutoff_hz=6,order=4" (forwards and backwards, no lag) or "rts" (Kalman smoother that'
+    ' weighs covariances; "rts:model=jerk"). Never across gaps.',
+)
+@click.option(
     "--detector",
     default="blazepose",
     show_default=True,
@@ -106,6 +144,12 @@ def reconstruct_command(
     min_confidence: float,
     pixel_noise: float,
     pose_noise: str | None,
+    refine_cameras: Literal["background"] | None,
+    disturb_poses: str | None,
+    trials: int,
+    seed: int,
+    fill: float | None,
+    smooth: str | None,
     detector: str,
     every: int,
     start: float | None,
@@ -134,6 +178,12 @@ def reconstruct_command(
         every=every,
         start_s=start,
         end_s=end,
+        fill_s=fill,
+        smooth=smooth,
+        refine_cameras=refine_cameras,
+        disturb_poses=disturb_poses,
+        trials=trials,
+        seed=seed,
     )
     with watching(level(quiet, verbose)) as progress:
         result = reconstruct(session, settings, workers=workers, force=force, progress=progress)
@@ -145,18 +195,90 @@ def reconstruct_command(
         print_json(result.metrics)
         return
     if not quiet:
-        _print(result)
+        _print(result, every_joint=verbose > 0)
     click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'reconstruct'}")
     for video in videos:
         click.echo(f"written: {video}")
 
 
-def _print(result: Reconstructed) -> None:
+def _print(result: Reconstructed, *, every_joint: bool) -> None:
     metrics: dict[str, Any] = result.metrics
-    click.echo(
-        f"{metrics['method']}: {metrics['status_counts']['ok']} of {metrics['status_counts']['all']}"
-        f" joint-frames reconstructed"
-    )
+    counts = metrics["status_counts"]
+    filled = f", {counts['filled']} filled" if counts.get("filled") else ""
+    click.echo(f"{metrics['method']}: {counts['ok']} of {counts['all']} joint-frames reconstructed{filled}")
+    if metrics.get("smoothing"):
+        done = metrics["smoothing"]
+        cutoff = done["cutoff_hz"]
+        click.echo(f"smoothed: {done['filter']}" + (f", cutoff {cutoff:.2g} Hz" if cutoff else ""))
+    _print_summary(metrics)
+    if every_joint:
+        click.echo()
+        _print_joints(metrics)
+
+
+_ERRORS = {
+    "mpjpe_mm": ("MPJPE mm", 1),
+    "root_mpjpe_mm": ("root-relative MPJPE mm", 1),
+    "pa_mpjpe_mm": ("PA-MPJPE mm", 1),
+    "pck150": ("PCK@150 mm %", 100),
+    "pck150_auc": ("its AUC %", 100),
+    "acceleration_error_mm_s2": ("acceleration error mm/s2", 1),
+}
+
+
+def _print_summary(metrics: dict[str, Any]) -> None:
+    """The figures that matter most: those against the truth where there is one, and those without."""
+    reprojection, shape = metrics["reprojection_px"], metrics["shape"]
+    shown = {"reconstructed_share": ("reconstructed %", 100)}
+    if metrics["mpjpe_mm"] is not None:
+        shown |= _ERRORS
+    rows = [
+        [title, _times(metrics[name], scale), _ends(metrics["intervals"][name], scale)]
+        for name, (title, scale) in shown.items()
+    ]
+    trials = metrics.get("trials")
+    header = ["figure", "value", "95 % interval"]
+    if trials is not None:
+        header += [f"mean of {trials['count']} trials", "std"]
+        for row, (name, (_, scale)) in zip(rows, shown.items(), strict=True):
+            row += [_times(trials["mean"][name], scale), _times(trials["std"][name], scale)]
+    rows += [
+        [title, value, interval, None, None][: len(header)]
+        for title, value, interval in [
+            (
+                "reprojection px, mean",
+                reprojection["mean"],
+                _ends(metrics["intervals"]["reprojection_px_mean"]),
+            ),
+            ("reprojection px, median", reprojection["median"], None),
+            ("leave-one-camera-out px, median", _mean_median(metrics["leave_one_camera_out_px"]), None),
+            ("bone length spread mm", shape["bone_spread_mm"], None),
+            ("left/right asymmetry mm", _mean(shape["asymmetry_mm"].values()), None),
+            ("jerk m/s3, median", shape["jerk_m_s3"], None),
+        ]
+    ]
+    print_table(header, rows)
+
+
+def _times(value: float | None, scale: int) -> float | None:
+    return None if value is None else scale * value
+
+
+def _ends(interval: list[float] | None, scale: int = 1) -> str:
+    return "" if interval is None else f"{scale * interval[0]:.1f} .. {scale * interval[1]:.1f}"
+
+
+def _mean_median(figures: dict[str, Any] | None) -> float | None:
+    """The mean over the cameras; None with fewer than three."""
+    return None if figures is None else _mean(figure["median"] for figure in figures.values())
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    there = [value for value in values if value is not None]
+    return sum(there) / len(there) if there else None
+
+
+def _print_joints(metrics: dict[str, Any]) -> None:
     has_truth = metrics["mpjpe_mm"] is not None
     header = ["joint", "ok %", "reproj px"] + (["MPJPE mm", "root mm", "PA mm"] if has_truth else [])
     rows = []

@@ -19,9 +19,11 @@ from typing import Any
 import numpy as np
 
 from pipelines.geometry.metrics import PCK_THRESHOLD_M, common, measure
-from pipelines.geometry.triangulation import Method, Views, estimate_noise, locate
+from pipelines.geometry.noise import NoiseModel
+from pipelines.geometry.triangulation import Views, estimate_noise, locate
 from pipelines.keypoints.hints import project_actor
 from pipelines.keypoints.tracking import PeopleTracker
+from pipelines.reconstruction.refining_views import refined_points
 from pipelines.reporting.ablation import Row, draw, estimates, results_csv
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
@@ -42,10 +44,10 @@ from pipelines.simulation.study.filming import (
     views_of,
     walk,
 )
-from pipelines.simulation.study.settings import Noise, Settings
+from pipelines.simulation.study.settings import Noise, Settings, StudyMethod
 from pipelines.simulation.world.scene import build_world
 
-_REVISION = 1
+_REVISION = 2
 _MARK = "summary.json"
 _PER_JOINT = ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm")
 _HINT_SIGMA_M = 0.1  # of what the detector is told of the person's place: the camera looks straight there
@@ -202,9 +204,13 @@ def _measure_cell(
         else:
             sightings = exact
         views = views_of(filmed, cameras, sightings, models, seed=settings.seed, trial=trial)
-        points = {method: reconstructed(method, views) for method in settings.methods}
+        points, fell_back = {}, dict.fromkeys(settings.methods, 0.0)
+        for method in settings.methods:
+            points[method], doubt = reconstructed(method, views, filmed, models)
+            fell_back[method] = float(doubt is not None)
         for method, errors in compared(points, filmed).items():
-            rows.append({**_condition(cell), "trial": trial, "method": method, **errors})
+            told = {"trial": trial, "method": method, **errors, "fell_back": fell_back[method]}
+            rows.append({**_condition(cell), **told})
         progress.advance()
     write_json(folder / "rows.json", {"rows": rows})
 
@@ -218,14 +224,23 @@ def _condition(cell: Cell) -> Row:
     }
 
 
-def reconstructed(method: Method, views: Views) -> Float:
-    """The points [N, 3] m that a method makes of views, NaN for none; noise is estimated for `robust`."""
+def reconstructed(
+    method: StudyMethod, views: Views, filmed: Walk, models: Sequence[NoiseModel]
+) -> tuple[Float, str | None]:
+    """The points [N, 3] m that a method makes of views, NaN for none, and why it fell back if it did.
+
+    All are told how far poses err; `robust` and `refined` estimate what keypoints add, and `refined` is told
+    how long pose errors last.
+    """
+    if method == "refined":
+        elapsed_s = (filmed.t_ns - filmed.t_ns[0]) / 1e9
+        return refined_points(views, elapsed_s, tuple(filmed.person.joints), models)
     if method == "robust":
         views = replace(views, pixel_sigma=estimate_noise(views))
-    return locate(views, method=method).points
+    return locate(views, method=method).points, None
 
 
-def compared(points: Mapping[Method, Float], filmed: Walk) -> dict[Method, Row]:
+def compared(points: Mapping[StudyMethod, Float], filmed: Walk) -> dict[StudyMethod, Row]:
     """Errors of several methods on one walk.
 
     Args:
@@ -240,7 +255,7 @@ def compared(points: Mapping[Method, Float], filmed: Walk) -> dict[Method, Row]:
     truth = filmed.joints[:, None]
     estimates = {method: own.reshape(truth.shape) for method, own in points.items()}
     shared = common(*estimates.values())
-    rows: dict[Method, Row] = {}
+    rows: dict[StudyMethod, Row] = {}
     for method, own in estimates.items():
         errors = measure(np.where(shared[..., None], own, np.nan), truth, filmed.person.joints, filmed.t_ns)
         distance = np.linalg.norm(own - truth, axis=-1)

@@ -1,14 +1,14 @@
 """Stage `reconstruct`: from keypoints in moving cameras to a skeleton, its status and its errors.
 
 Load the session's tables; find out who is who; bring every camera to common times; triangulate all
-joints at once; measure; store. Nothing is filled: a joint that could not be measured is NaN with a
-status that says why.
+joints at once; measure; store. Nothing is filled or smoothed unless it is asked for: a joint that could not
+be measured is NaN with a status that says why.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.detect import detect
+from pipelines.formats.pictures import Picture, open_pictures
+from pipelines.geometry.poses import interpolate_poses
 from pipelines.geometry.triangulation import (
     STATUS,
     Method,
@@ -30,6 +32,9 @@ from pipelines.keypoints.association import Association, associate
 from pipelines.keypoints.calibration import measured_for, read_calibration
 from pipelines.keypoints.swaps import undo_swaps_of_tracks
 from pipelines.keypoints.swaps_across_views import swaps_across_views
+from pipelines.reconstruction.background import Followed, prior_of, refine_cameras, rows_to_follow
+from pipelines.reconstruction.background_tracks import follow, people_boxes
+from pipelines.reconstruction.finishing import finish
 from pipelines.reconstruction.loading import (
     load_actor,
     load_cameras,
@@ -46,21 +51,26 @@ from pipelines.reconstruction.observations import (
     on_sides,
     time_base,
 )
+from pipelines.reconstruction.pose_weighting import triangulate_weighted
 from pipelines.reconstruction.quality import assess
 from pipelines.reconstruction.refining import RefinedFlight, refine_flight
 from pipelines.reconstruction.reweighting import triangulate_heavy_tailed
+from pipelines.reconstruction.smoothing import smoother
+from pipelines.reconstruction.trials import disturbances, disturbed, told_together
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Float, Int64
 from pipelines.session.stages import Stage, StageRecord, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
-from pipelines.session.tables import CAMERA_POSES, SKELETON, write_table
+from pipelines.session.tables import CAMERA_POSES, FRAMES, SKELETON, read_table, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
 
-RECONSTRUCT = Stage("reconstruct", revision=5)
+RECONSTRUCT = Stage("reconstruct", revision=6)
+
+_LONGEST_FILL_S = 10.0
 
 _UNKNOWN_SIGMA = (0.3, np.radians(1.0))
 """Camera pose noise (m, rad) taken for telling people apart where nobody states it: METHODS' medium level."""
@@ -80,6 +90,12 @@ class Settings:
     every: int = 1  # of their pictures
     start_s: float | None = None  # since the flight's first picture: what the detector looks at
     end_s: float | None = None
+    fill_s: float | None = None  # the longest gap that is closed
+    smooth: str | None = None  # as `smoothing.smoother` reads it
+    refine_cameras: Literal["background"] | None = None  # by what, before the skeleton
+    disturb_poses: str | None = None  # errors added to the logged poses, as `--pose-noise` states them
+    trials: int = 1  # draws of these
+    seed: int = 0  # where they come from
 
 
 @dataclass(frozen=True)
@@ -116,6 +132,9 @@ def reconstruct(
     """
     settings = settings or Settings()
     progress = progress or Silent()
+    errors = disturbances(settings.disturb_poses, settings.trials)
+    smoother(settings.smooth)
+    _check_fill(settings.fill_s)
     with locked(folder) as session:
         ingested = session.record("ingest")
         if ingested is None:
@@ -147,7 +166,7 @@ def reconstruct(
             return Reconstructed(folder, run.record, metrics, skipped=True)
 
         description = read_description(folder)
-        progress.start("Reconstructing", 5)
+        progress.start("Reconstructing", 1 + 3 * settings.trials)
         cameras, warnings = load_cameras(
             folder,
             description,
@@ -158,66 +177,138 @@ def reconstruct(
         )
         cameras, swaps = _without_swaps(cameras)
         progress.advance()
-        found, observations, association, seen = _observe(folder, cameras, description, settings)
-        sigma = _ray_sigma(cameras, observations.t_ns, observations.position, settings)
-        sides, between_views = _agreeing_sides(observations, sigma)
-        xy, confidence = on_sides(observations.xy, observations.confidence, sides)
-        observations = replace(observations, xy=xy, confidence=confidence)
-        progress.advance()
-        views = _views(cameras, observations, settings, workers)
-        solve = _solver(cameras, observations, settings, workers)
-        result = _refused_people(solve(views), observations, seen)
-        _refuse_nothing(folder, views, result, association)
-        progress.advance()
-        refined = None
-        if settings.method == "refined":
-            refined = _refine(
-                cameras,
-                found,
-                association,
-                observations,
-                sides,
-                views,
-                result,
+        followed = {}
+        if settings.refine_cameras == "background":
+            followed = _follow_backgrounds(folder, description, cameras, progress)
+        attempts = (
+            _attempt(
+                folder,
                 description,
+                disturbed(cameras, errors, settings.seed, trial) if errors else cameras,
+                followed,
                 settings,
                 workers,
+                progress,
             )
-            observations, views = refined.observations, refined.views
-            result = _refused_people(refined.result, observations, seen)
-            warnings = [*warnings, *refined.warnings]
-        progress.advance()
-        metrics = jsonable(
-            assess(
-                observations,
-                views,
-                result,
-                cameras=[camera.name for camera in cameras],
-                method=settings.method,
-                truth=load_truth(folder, description, observations.joints, observations.t_ns),
-                solve=solve,
-            )
-            | (refined.metrics if refined else {})
+            for trial in range(settings.trials)
         )
-        write_table(run.folder / "skeleton.parquet", _skeleton_table(observations, result), SKELETON)
-        if refined is not None and refined.cameras is not None:
-            write_table(run.folder / "cameras.parquet", refined.cameras, CAMERA_POSES)
+        stored = next(attempts)
+        _refuse_nothing(folder, stored)
+        metrics = stored.metrics
+        if settings.disturb_poses is not None:
+            every = [metrics, *(attempt.metrics for attempt in attempts)]
+            metrics = metrics | {"trials": told_together(every, settings.disturb_poses, settings.seed)}
+            warnings.append(_said_disturbance(settings))
+        metrics = jsonable(metrics)
+        skeleton = _skeleton_table(stored.observations, stored.result)
+        write_table(run.folder / "skeleton.parquet", skeleton, SKELETON)
+        if stored.poses is not None:
+            write_table(run.folder / "cameras.parquet", stored.poses, CAMERA_POSES)
         write_json(run.folder / "metrics.json", metrics)
         record = run.publish(
             counts={
                 **metrics["status_counts"],
-                "association": _association_counts(association),
-                "left_right_swaps": {"undone_over_time": swaps, "between_views": between_views},
+                "association": _association_counts(stored.association),
+                "left_right_swaps": {"undone_over_time": swaps, "between_views": stored.between_views},
+                "filled": metrics["filled"],
+                "smoothing": metrics["smoothing"],
             },
-            warnings=[*warnings, *association.reasons, *_unused(cameras, result)],
+            warnings=[*warnings, *stored.warnings, *_unused(cameras, stored.result)],
         )
-        progress.advance()
         for name, (before, now) in run.replaces.items():
             progress.note(f"replaced the reconstruction made with {name} = {before} (now {now})")
     return Reconstructed(folder, record, metrics, skipped=False)
 
 
+def _check_fill(fill_s: float | None) -> None:
+    if fill_s is not None and not 0 < fill_s <= _LONGEST_FILL_S:
+        raise DataError(
+            "--fill",
+            f"{fill_s:g} s is not between 0 and {_LONGEST_FILL_S:g} s",
+            "a longer gap is no measurement: leave it open",
+        )
+
+
+def _said_disturbance(settings: Settings) -> str:
+    draws = "a single draw" if settings.trials == 1 else f"trial 0 of {settings.trials}"
+    return (
+        f"the poses were disturbed by {settings.disturb_poses}: the skeleton and the figures without `trials`"
+        f" are those of {draws} (seed {settings.seed}), not the flight's"
+    )
+
+
 # --- the work ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """One reconstruction of the flight, from its cameras to its figures."""
+
+    observations: Observations
+    views: Views
+    result: Triangulation
+    association: Association
+    between_views: dict[str, int]  # left and right, see `swaps_across_views`
+    metrics: dict[str, Any]
+    poses: pd.DataFrame | None  # of every picture, where they are not the log's
+    warnings: list[str]
+
+
+def _attempt(
+    folder: Path,
+    description: Description,
+    cameras: list[Camera],
+    followed: Mapping[str, Followed | str],
+    settings: Settings,
+    workers: int,
+    progress: Progress,
+) -> _Attempt:
+    background: dict[str, Any] = {"background": None}
+    warnings: list[str] = []
+    if followed:
+        cameras, background["background"], warnings = _refine_cameras(
+            cameras, followed, description, settings
+        )
+    found, observations, association, seen = _observe(folder, cameras, description, settings)
+    sigma = _ray_sigma(cameras, observations.t_ns, observations.position, settings)
+    sides, between_views = _agreeing_sides(observations, sigma)
+    xy, confidence = on_sides(observations.xy, observations.confidence, sides)
+    observations = replace(observations, xy=xy, confidence=confidence)
+    progress.advance()
+    views = _views(cameras, observations, settings, workers)
+    solve = _solver(cameras, observations, settings, workers)
+    result = _refused_people(solve(views), observations, seen)
+    progress.advance()
+    refined = None
+    if settings.method == "refined":
+        refined = _refine(
+            cameras, found, association, observations, sides, views, result, description, settings, workers
+        )
+        observations, views = refined.observations, refined.views
+        result = _refused_people(refined.result, observations, seen)
+    result, finished = finish(
+        observations, views, result, fill_s=settings.fill_s, smoother=smoother(settings.smooth)
+    )
+    metrics = assess(
+        observations,
+        views,
+        result,
+        cameras=[camera.name for camera in cameras],
+        method=settings.method,
+        truth=load_truth(folder, description, observations.joints, observations.t_ns),
+        solve=solve,
+    )
+    progress.advance()
+    return _Attempt(
+        observations,
+        views,
+        result,
+        association,
+        between_views,
+        metrics | finished | background | (refined.metrics if refined else {}),
+        _poses_used(cameras, refined, background["background"]),
+        [*warnings, *(refined.warnings if refined else []), *association.reasons],
+    )
 
 
 def _observe(
@@ -246,6 +337,94 @@ def _observe(
     nearest = np.clip(np.searchsorted(found.t_ns, observations.t_ns), 0, len(found.t_ns) - 1)
     seen = np.asarray((found.confidence > 0).any(axis=(1, 2, 3)), dtype=np.bool_)[nearest]
     return found, observations, association, seen
+
+
+def _follow_backgrounds(
+    folder: Path, description: Description, cameras: list[Camera], progress: Progress
+) -> dict[str, Followed | str]:
+    """The background of every moving camera with pictures; of the others why it is not there."""
+    followed: dict[str, Followed | str] = {}
+    for camera in cameras:
+        media = description.cameras[camera.name].media
+        if camera.static:
+            followed[camera.name] = "it stands still"
+        elif media is None:
+            followed[camera.name] = "it came without pictures"
+        else:
+            rows = rows_to_follow(camera)
+            frames = read_table(folder / "cameras" / camera.name / "frames.parquet", FRAMES)
+            at = np.searchsorted(frames["t_ns"].to_numpy(np.int64), camera.frame_t_ns[rows])
+            numbers = frames["frame"].to_numpy(np.int64)[at].tolist()
+            progress.start(f"Following the background of {camera.name}", len(rows))
+            with open_pictures(media, folder) as pictures:
+                grey = (_grey(pictures.read(number), progress) for number in numbers)
+                tracks = follow(grey, people_boxes(camera)[rows])
+            followed[camera.name] = Followed(rows, tracks)
+    if not any(isinstance(each, Followed) for each in followed.values()):
+        raise DataError(
+            "--refine-cameras",
+            "no moving camera has pictures to look at",
+            "state their `video`, or leave it out",
+        )
+    return followed
+
+
+def _grey(picture: Picture | None, progress: Progress) -> Picture | None:
+    import cv2
+
+    progress.advance()
+    return None if picture is None else np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+
+
+def _refine_cameras(
+    cameras: list[Camera],
+    followed: Mapping[str, Followed | str],
+    description: Description,
+    settings: Settings,
+) -> tuple[list[Camera], dict[str, Any], list[str]]:
+    stated = load_pose_errors(description, cameras, settings.pose_noise)
+    levels = [
+        np.array(_UNKNOWN_SIGMA) if camera.sigma is None else np.median(camera.sigma, axis=0)
+        for camera in cameras
+    ]
+    each = [None] * len(cameras) if stated is None else stated
+    return refine_cameras(
+        cameras,
+        followed,
+        [prior_of(errors, level) for errors, level in zip(each, levels, strict=True)],
+        stated=stated is not None,
+        **_pose_limits(description),
+    )
+
+
+def _poses_used(
+    cameras: list[Camera], refined: RefinedFlight | None, background: Mapping[str, Any] | None
+) -> pd.DataFrame | None:
+    """The pose of every picture that has one, where anything but the log decided."""
+    import pandas as pd
+
+    if refined is not None and refined.cameras is not None:
+        return refined.cameras
+    if background is None or not any(told["used"] for told in background.values()):
+        return None
+    parts = []
+    for camera in cameras:
+        log = camera.trajectory
+        position, quaternion = log.position, log.quaternion_xyzw
+        if camera.static:
+            t_ns = camera.frame_t_ns
+            position, quaternion = (np.repeat(part, len(t_ns), axis=0) for part in (position, quaternion))
+        else:
+            t_ns = camera.frame_t_ns[(camera.frame_t_ns >= log.t_ns[0]) & (camera.frame_t_ns <= log.t_ns[-1])]
+            longest = int(np.diff(log.t_ns).max(initial=0))
+            position, quaternion = interpolate_poses(
+                log.t_ns, position, quaternion, t_ns, max_gap_ns=longest, max_extrapolation_ns=0
+            )
+        table = pd.DataFrame({"t_ns": t_ns, "camera": camera.name})
+        table[["x", "y", "z"]] = position
+        table[["qx", "qy", "qz", "qw"]] = quaternion
+        parts.append(table)
+    return pd.concat(parts, ignore_index=True)
 
 
 def _without_swaps(cameras: list[Camera]) -> tuple[list[Camera], dict[str, dict[str, int]]]:
@@ -356,11 +535,13 @@ def _views(cameras: list[Camera], observations: Observations, settings: Settings
 def _solver(
     cameras: list[Camera], observations: Observations, settings: Settings, workers: int
 ) -> Callable[[Views], Triangulation]:
-    """How views become points; robust has a loss for calibrated cameras and one for logged poses."""
+    """How views become points; robust has a loss for calibrated cameras, weights for logged covariances."""
     calibrated = observations.pose_sigma is None and all(camera.static for camera in cameras)
     if settings.method == "robust" and calibrated:
         return partial(triangulate_heavy_tailed, threads=workers)
     method = "robust" if settings.method == "refined" else settings.method
+    if method == "robust" and observations.pose_covariance is not None:
+        return partial(triangulate_weighted, pose_covariance=observations.pose_covariance, threads=workers)
     return partial(triangulate, method=method, threads=workers)
 
 
@@ -384,16 +565,17 @@ def _said_noise(views: Views) -> str:
     return f"noise taken for poses {position_m:.3g} m and {rotation_deg:.3g} deg, pixels {pixels:.3g}"
 
 
-def _refuse_nothing(folder: Path, views: Views, result: Triangulation, association: Association) -> None:
+def _refuse_nothing(folder: Path, attempt: _Attempt) -> None:
     """Where not a single joint came out, say which gate stopped them."""
-    if (result.status == STATUS.index("ok")).any():
+    status = attempt.result.status
+    if (status == STATUS.index("ok")).any():
         return
-    codes, counts = np.unique(result.status, return_counts=True)
+    codes, counts = np.unique(status, return_counts=True)
     gates = ", ".join(f"{STATUS[code]} {count}" for code, count in zip(codes, counts, strict=True))
-    reasons = "; ".join(association.reasons)
+    reasons = "; ".join(attempt.association.reasons)
     raise DataError(
         folder,
-        f"no joint could be reconstructed ({gates}; {_said_noise(views)})"
+        f"no joint could be reconstructed ({gates}; {_said_noise(attempt.views)})"
         + (f"; {reasons}" if reasons else ""),
         "check calibration, clocks and poses, or state another pose noise with --pose-noise",
     )

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.alignment import align_each
+from pipelines.geometry.bootstrap import Series
 
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -78,14 +79,7 @@ def measure(estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64) -
     Raises:
         ValueError: the shapes disagree, or the stamps do not increase strictly.
     """
-    _check_shapes(estimate, truth, joints, t_ns)
-    distances = _Distances(
-        has_truth=common(truth),
-        absolute=_length(estimate - truth),
-        root=root_relative_distances(estimate, truth, joints),
-        aligned=aligned_distances(estimate, truth),
-        acceleration=_length(_derivative(estimate - truth, t_ns, 2)),
-    )
+    distances = _distances(estimate, truth, joints, t_ns)
     shared = np.isfinite(distances.absolute).any(axis=-1)
     rooted = np.isfinite(_root(estimate, joints) - _root(truth, joints)).all(axis=-1)
     aligned = np.isfinite(distances.aligned).any(axis=-1)
@@ -95,6 +89,22 @@ def measure(estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64) -
         "pa_frames_left_out": int((shared & ~aligned).sum()),
         "per_joint": {name: _jsonable(asdict(distances.errors(index))) for index, name in enumerate(joints)},
     }
+
+
+def error_series(
+    estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64
+) -> tuple[dict[str, Series], dict[str, dict[str, Series]]]:
+    """The errors of `measure` moment by moment, for their intervals (`bootstrap.intervals`).
+
+    Returns:
+        By the names of `JointErrors`, over all joints; and the same per joint.
+
+    Raises:
+        ValueError: as `measure`.
+    """
+    distances = _distances(estimate, truth, joints, t_ns)
+    per_joint = {name: distances.series(slice(j, j + 1)) for j, name in enumerate(joints)}
+    return distances.series(slice(None)), per_joint
 
 
 def root_relative_distances(estimate: Float, truth: Float, joints: Sequence[str]) -> Float:
@@ -193,6 +203,17 @@ def _mirrored(bones: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
 # --- shared steps --------------------------------------------------------------------------------------
 
 
+def _distances(estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64) -> _Distances:
+    _check_shapes(estimate, truth, joints, t_ns)
+    return _Distances(
+        has_truth=common(truth),
+        absolute=_length(estimate - truth),
+        root=root_relative_distances(estimate, truth, joints),
+        aligned=aligned_distances(estimate, truth),
+        acceleration=_length(_derivative(estimate - truth, t_ns, 2)),
+    )
+
+
 @dataclass(frozen=True)
 class _Distances:
     """Distances between estimate and truth in m (and m/s^2), [T, P, J], NaN where one is missing."""
@@ -224,6 +245,36 @@ class _Distances:
             pck150_auc=_ratio(area, judged),
             acceleration_error_mm_s2=1e3 * _mean(self.acceleration[:, :, joints]),
         )
+
+    def series(self, joints: slice) -> dict[str, Series]:
+        """The same moment by moment; an acceleration stands at the middle of its three samples."""
+        absolute = self.absolute[:, :, joints]
+        present = np.isfinite(absolute)
+        judged = self.has_truth[:, :, joints].sum(axis=(1, 2), dtype=np.float64)
+        count = present.sum(axis=(1, 2), dtype=np.float64)
+        distance = np.where(present, absolute, 0.0)
+        squared = (distance**2).sum(axis=(1, 2))
+        near = np.where(present, np.maximum(0.0, 1 - distance / PCK_THRESHOLD_M), 0.0).sum(axis=(1, 2))
+        within = (present & (distance <= PCK_THRESHOLD_M)).sum(axis=(1, 2), dtype=np.float64)
+        acceleration = np.full((len(absolute), *absolute.shape[1:]), np.nan)
+        acceleration[1:-1] = self.acceleration[:, :, joints]
+        return {
+            "reconstructed_share": (count, judged),
+            "mpjpe_mm": _summed(absolute),
+            "root_mpjpe_mm": _summed(self.root[:, :, joints]),
+            "pa_mpjpe_mm": _summed(self.aligned[:, :, joints]),
+            "e_recon_m2": (squared, np.full(len(squared), 1 / max(len(squared), 1))),
+            "e_recon_per_joint_frame_m2": (squared, count),
+            "pck150": (within, judged),
+            "pck150_auc": (near, judged),
+            "acceleration_error_mm_s2": _summed(acceleration),
+        }
+
+
+def _summed(distance_m: Float) -> Series:
+    """Sums [T] in mm and counts [T] of what is there."""
+    there = np.isfinite(distance_m)
+    return 1e3 * np.where(there, distance_m, 0.0).sum(axis=(1, 2)), there.sum(axis=(1, 2), dtype=np.float64)
 
 
 def _root(position: Float, joints: Sequence[str]) -> Float:

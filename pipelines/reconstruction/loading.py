@@ -25,7 +25,7 @@ _TRUTH_GAP = 1.5  # median steps: truth is never bridged across a missing sample
 _ACTOR_GAP_NS = 2_000_000_000
 _MOST_PEOPLE = 12  # in one picture; more are mistakes of a detector, and memory goes with their number
 _SANE_VARIANCE = (100.0, np.pi**2)  # m^2, rad^2: what ROS means by 1e6 is "unknown"
-
+_ROUNDED = 1e-6  # of an eigenvalue of correlations that logs have rounded
 
 Calibrated = Callable[[Float, NDArray[np.str_]], Float]
 
@@ -90,7 +90,8 @@ def load_cameras(
         entry = description.cameras[name]
         camera = _load_camera(folder, name, entry, source, joints, min_confidence, calibrated, warnings)
         sigma = stated_sigma(name, entry, camera.trajectory, pose_noise)
-        cameras.append(replace(camera, sigma=sigma))
+        covariance = None if pose_noise or entry.pose_noise else logged_covariance(camera.trajectory)
+        cameras.append(replace(camera, sigma=sigma, covariance=covariance))
     return cameras, warnings
 
 
@@ -181,7 +182,9 @@ def load_pose_errors(
     stated: list[PoseErrors | None] = []
     for camera in cameras:
         entry = description.cameras[camera.name]
-        if pose_noise:
+        if camera.errors is not None:
+            stated.append(camera.errors)
+        elif pose_noise:
             stated.append(pose_errors(parsed_noise_models("--pose-noise", pose_noise)))
         elif entry.pose_noise:
             stated.append(pose_errors(noise_models(f"pose_noise of {camera.name}", entry.pose_noise)))
@@ -201,15 +204,18 @@ def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> Flo
     )
 
 
-def _logged_sigma(trajectory: Trajectory) -> Float | None:
-    """Standard deviation [N, 2] of the logged covariances: the mean over the axes that say something.
+def logged_covariance(trajectory: Trajectory) -> Float | None:
+    """The logged covariances [N, 6, 6] as they are, where they say something of positions and of rotations.
 
-    Zero, negative, NaN and absurdly large variances are what logs write for "unknown". A pose none of whose
-    axes is known has the median of the others; None where there is no other.
+    Zero, negative, NaN and absurdly large variances are what logs write for "unknown". An axis that is
+    unknown has the mean of the known ones of its kind, and goes with no other; a pose with none known has the
+    median of the other poses. None where there is no other. A matrix that is none of a covariance (its
+    correlations contradict each other) keeps its variances alone.
     """
     if trajectory.covariance is None:
         return None
-    variances = np.diagonal(trajectory.covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
+    logged = trajectory.covariance
+    variances = np.diagonal(logged, axis1=1, axis2=2).reshape(-1, 2, 3)
     known = (variances > 0) & (variances < np.array(_SANE_VARIANCE)[:, None])
     count = known.sum(axis=2)
     mean = np.where(known, variances, 0.0).sum(axis=2) / np.maximum(count, 1)
@@ -218,7 +224,24 @@ def _logged_sigma(trajectory: Trajectory) -> Float | None:
     for block in range(2):
         unknown = count[:, block] == 0
         mean[unknown, block] = np.median(mean[~unknown, block])
-    sigma: Float = np.sqrt(mean)
+    axes = np.where(known, variances, mean[..., None]).reshape(-1, 6)
+    both = known.reshape(-1, 6)[:, :, None] & known.reshape(-1, 6)[:, None, :]
+    covariance = np.where(both & np.isfinite(logged), logged, 0.0)
+    covariance[:, np.arange(6), np.arange(6)] = axes
+    scale = np.sqrt(axes)
+    correlation = covariance / (scale[:, :, None] * scale[:, None, :])
+    contradictory = np.linalg.eigvalsh(correlation)[:, 0] < -_ROUNDED
+    covariance[contradictory] = axes[contradictory, :, None] * np.eye(6)
+    return covariance
+
+
+def _logged_sigma(trajectory: Trajectory) -> Float | None:
+    """Standard deviation per axis [N, 2] of position and rotation: the root of the mean logged variance."""
+    covariance = logged_covariance(trajectory)
+    if covariance is None:
+        return None
+    variances = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
+    sigma: Float = np.sqrt(variances.mean(axis=2))
     return sigma
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics, undistort
 from pipelines.geometry.poses import interpolate_points, interpolate_poses, matrix_from_quaternion
+from pipelines.reconstruction.refinement.problem import PoseErrors
 from pipelines.session.records import Detections, Float, Int64, Trajectory
 
 _FRAME_GAP_NS = 500_000_000  # consecutive frames further apart than this, and than usual, are not bridged
@@ -25,7 +26,8 @@ class Camera:
     """One camera of a session.
 
     `sigma` is the standard deviation per axis of position (m) and rotation (rad) at each pose of the
-    trajectory, as a prior or the log's covariance states it; None when nobody does. Detections count
+    trajectory, as a prior or the log's covariance states it; None when nobody does. `covariance` is the
+    log's own where `sigma` is its level: position in world, rotation vector in camera. Detections count
     frames by their row in `frame_t_ns`; where `follows` is False, pictures are missing before that row.
     """
 
@@ -37,6 +39,8 @@ class Camera:
     static: bool
     sigma: Float | None  # [N, 2]
     detections: Detections
+    covariance: Float | None = None  # [N, 6, 6]
+    errors: PoseErrors | None = None  # what is left of its poses' errors, where they were refined beforehand
 
     @cached_property
     def focal_px(self) -> float:
@@ -88,10 +92,15 @@ class Camera:
 
     def sigma_at(self, t_ns: Int64) -> Float | None:
         """The stated pose noise [T, 2] at given times, of the logged pose before each."""
-        if self.sigma is None:
-            return None
+        return None if self.sigma is None else self.sigma[self._pose_before(t_ns)]
+
+    def covariance_at(self, t_ns: Int64) -> Float | None:
+        """The logged pose covariance [T, 6, 6] at given times, of the logged pose before each."""
+        return None if self.covariance is None else self.covariance[self._pose_before(t_ns)]
+
+    def _pose_before(self, t_ns: Int64) -> NDArray[np.intp]:
         before = np.searchsorted(self.trajectory.t_ns, t_ns, side="right") - 1
-        return self.sigma[np.clip(before, 0, len(self.sigma) - 1)]
+        return np.clip(before, 0, len(self.trajectory.t_ns) - 1)
 
 
 @dataclass(frozen=True)
@@ -117,6 +126,7 @@ class Observations:
     position: Float  # [T, C, 3]
     rotation: Float  # [T, C, 3, 3]
     pose_sigma: Float | None  # [T, C, 2]; None when nobody stated the pose noise of any camera
+    pose_covariance: Float | None = None  # [T, C, 6, 6]; None unless the log of any camera states its own
 
 
 def time_base(cameras: list[Camera], rate_hz: float | None) -> Int64:
@@ -179,6 +189,7 @@ def observe(
         sigmas.append(camera.sigma_at(t_ns))
     position, rotation = (np.stack(part, axis=1) for part in zip(*poses, strict=True))
     stated = [sigma for sigma in sigmas if sigma is not None]
+    pose_sigma = _all_sigmas(cameras, sigmas) if stated else None
     return Observations(
         t_ns=t_ns,
         joints=cameras[0].detections.joints,
@@ -186,7 +197,8 @@ def observe(
         confidence=np.nan_to_num(np.stack(weights, axis=3)),
         position=position,
         rotation=rotation,
-        pose_sigma=_all_sigmas(cameras, sigmas) if stated else None,
+        pose_sigma=pose_sigma,
+        pose_covariance=_all_covariances(cameras, pose_sigma, t_ns),
     )
 
 
@@ -221,6 +233,18 @@ def _all_sigmas(cameras: list[Camera], sigmas: list[Float | None]) -> Float:
         ],
         axis=1,
     )
+
+
+def _all_covariances(cameras: list[Camera], sigma: Float | None, t_ns: Int64) -> Float | None:
+    """The pose covariances [T, C, 6, 6] where a log states any; of other cameras, what `sigma` says."""
+    if sigma is None or all(camera.covariance is None for camera in cameras):
+        return None
+    every = np.repeat(sigma**2, 3, axis=2)[..., None] * np.eye(6)
+    for c, camera in enumerate(cameras):
+        own = camera.covariance_at(t_ns)
+        if own is not None:
+            every[:, c] = own
+    return every
 
 
 def _timeline(cameras: list[Camera]) -> Int64:

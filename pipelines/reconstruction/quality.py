@@ -13,13 +13,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.metrics import JointErrors, measure, measure_shape
+from pipelines.geometry.bootstrap import LEVEL, RESAMPLES, Series, intervals, stretch_samples
+from pipelines.geometry.metrics import JointErrors, error_series, measure, measure_shape
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views
 from pipelines.reconstruction.observations import Observations
 from pipelines.reconstruction.reweighting import reprojection_px
-from pipelines.session.records import Float
+from pipelines.session.records import Float, Int64
 from pipelines.session.skeletons import bones_of
 
+_OK, _FILLED = STATUS.index("ok"), STATUS.index("filled")
+_PER_JOINT = (
+    "mpjpe_mm",
+    "root_mpjpe_mm",
+    "pa_mpjpe_mm",
+    "pck150",
+    "reconstructed_share",
+    "reprojection_px_mean",
+)
 _UNMEASURED = dict.fromkeys(
     [*(field.name for field in fields(JointErrors)), "root_frames_left_out", "pa_frames_left_out"]
 )
@@ -46,17 +56,24 @@ def assess(
         method: how it was triangulated.
         truth: [T, P', J, 3] the true joints at the same times, in any order of people.
         solve: the same way again, for the triangulations that leave one camera out.
+
+    Returns:
+        Errors, shape and shares are those of measured joints; what was filled is judged apart, in
+        `filled_mpjpe_mm`.
     """
     shape = observations.confidence.shape[:3]
-    position = result.points.reshape(*shape, 3)
     status = result.status.reshape(shape)
+    everything = result.points.reshape(*shape, 3)
+    position = np.where((status == _OK)[..., None], everything, np.nan)
     residual = result.residual_px.reshape(*shape, -1)
     per_joint = {
         name: _figures(status[:, :, j], residual[:, :, j]) for j, name in enumerate(observations.joints)
     }
     errors: dict[str, Any] = {**_UNMEASURED, "per_joint": {}}
+    own = None
     if truth is not None:
-        errors |= measure(position, _own_truth(position, truth), observations.joints, observations.t_ns)
+        own = _own_truth(position, truth)
+        errors |= measure(position, own, observations.joints, observations.t_ns)
     for name, figures in errors.pop("per_joint").items():
         per_joint[name] |= _of_truth(figures)
     overall = _figures(status, residual)
@@ -69,10 +86,65 @@ def assess(
         "shape": measure_shape(
             position, observations.joints, bones_of(observations.joints), observations.t_ns
         ),
+        "filled_mpjpe_mm": None
+        if own is None
+        else _mean_mm(everything[status == _FILLED] - own[status == _FILLED]),
         "clock_offsets_s": {},
-        "intervals": {},
+        "intervals": _intervals(position, own, status, residual, observations.joints, observations.t_ns),
         "per_joint": per_joint,
     }
+
+
+def _intervals(
+    position: Float,
+    own: Float | None,
+    status: NDArray[np.int8],
+    residual: Float,
+    joints: tuple[str, ...],
+    t_ns: Int64,
+) -> dict[str, Any]:
+    """How sure the means over the flight are, from resampled stretches of it (`geometry.bootstrap`)."""
+    whole: dict[str, Series] = {}
+    per_joint: dict[str, dict[str, Series]] = {name: {} for name in joints}
+    if own is not None:
+        whole, per_joint = error_series(position, own, joints, t_ns)
+        whole["reconstructed_share_of_truth"] = whole.pop("reconstructed_share")
+    whole["reconstructed_share"] = _share(status)
+    whole["reprojection_px_mean"] = _summed(residual)
+    for j, series in enumerate(per_joint.values()):
+        series["reconstructed_share"] = _share(status[:, :, [j]])
+        series["reprojection_px_mean"] = _summed(residual[:, :, [j]])
+    step_s = float(np.median(np.diff(t_ns))) / 1e9 if len(t_ns) > 1 else 0.0
+    return {
+        "level": LEVEL,
+        "method": "circular block bootstrap over time",
+        "stretch_s": stretch_samples(t_ns) * step_s if len(t_ns) > 1 else None,
+        "resamples": RESAMPLES,
+        "seed": 0,
+        **intervals(whole, t_ns),
+        "per_joint": {
+            name: intervals({key: series[key] for key in _PER_JOINT if key in series}, t_ns)
+            for name, series in per_joint.items()
+        },
+    }
+
+
+def _share(status: NDArray[np.int8]) -> Series:
+    """Measured joint-frames and all of them, moment by moment."""
+    measured = (status == _OK).sum(axis=(1, 2), dtype=np.float64)
+    return measured, np.full(len(status), float(status[0].size))
+
+
+def _summed(residual: Float) -> Series:
+    there = np.isfinite(residual)
+    axes = tuple(range(1, residual.ndim))
+    return np.where(there, residual, 0.0).sum(axis=axes), there.sum(axis=axes, dtype=np.float64)
+
+
+def _mean_mm(error_m: Float) -> float | None:
+    distance = np.linalg.norm(error_m, axis=-1)
+    there = distance[np.isfinite(distance)]
+    return 1e3 * float(there.mean()) if there.size else None
 
 
 def _figures(status: NDArray[np.int8], residual: Float) -> dict[str, Any]:

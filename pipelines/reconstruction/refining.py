@@ -89,7 +89,7 @@ def refine_flight(
         for c, camera in enumerate(cameras)
     ]
     start = result.points.reshape(times, people * joints, 3)
-    bones = _rigid_pairs(observations.joints, people)
+    bones = rigid_pairs(observations.joints, people)
     refined = refine(t_s, sightings, start, bones, prior, clock_sigma_s)
     metrics = _metrics(refined, cameras)
     if refined.fallback is not None:
@@ -167,7 +167,7 @@ def _sighting(
     )
 
 
-def _rigid_pairs(joints: tuple[str, ...], people: int) -> Int64:
+def rigid_pairs(joints: tuple[str, ...], people: int) -> Int64:
     """Pairs of joints [B, 2] whose distance hardly changes: bones, and the points of the head."""
     number = {name: index for index, name in enumerate(joints)}
     head = [number[name] for name in _HEAD if name in number]

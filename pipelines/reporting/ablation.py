@@ -26,10 +26,11 @@ METRICS = {
     "own_mpjpe_mm": "MPJPE of everything that the method itself reconstructed, mm",
     "pck150": "PCK@150 mm, missing joints counted as wrong, %",
     "reconstructed_share": "Reconstructed, %",
+    "fell_back": "Trials in which refined fell back to robust, %",
 }
 """What tables show of what is measured; the first three on the joint-frames that every method has."""
 
-_SHARES = {"pck150", "reconstructed_share"}  # in percent there
+_SHARES = {"pck150", "reconstructed_share", "fell_back"}  # in percent there
 _DRAWN = ("mpjpe_mm", "root_mpjpe_mm")
 _CONDITION = ("tilt_deg", "drones", "noise", "noise_model", "method")
 _VARIED = {"tilt": "tilt_deg", "robots": "drones"}
@@ -155,7 +156,12 @@ def tables(summary: Mapping[str, Any]) -> list[Table]:
     first = summary["settings"]["methods"][0] if summary["study"] == "noise" else columns[0]
     told = []
     for name, title in [*METRICS.items(), ("ratio", f"MPJPE relative to {first}, on common joint-frames")]:
-        rows = [[*label, *(_text(cell, name) for cell in cells)] for label, cells in _lines(summary)]
+        lines = _lines(summary)
+        if name == "fell_back":  # of the others there is nothing to say
+            lines = [(label, cells) for label, cells in lines if label[-1] == "refined"]
+            if not lines:
+                continue
+        rows = [[*label, *(_text(cell, name) for cell in cells)] for label, cells in lines]
         told.append(Table(title, [*head, *columns], rows))
     return told
 

@@ -22,7 +22,8 @@ from pipelines.simulation.study import settings
 from pipelines.simulation.study.filming import RANGE_M, exact_keypoints, formation, views_of, walk
 from tests.commands.runner import content
 
-SMALL = ("--seconds", "8", "--rate", "5", "--trials", "2", "--workers", "1")
+TRUSTING = ("--methods", "dlt,midpoint,robust")  # refined takes longer than all of them
+SMALL = ("--seconds", "8", "--rate", "5", "--trials", "2", "--workers", "1", *TRUSTING)
 
 
 def run(*arguments: str | Path) -> Any:
@@ -76,8 +77,8 @@ def test_errors_of_poses_have_the_size_and_shape_of_the_geometry(tmp_path: Path,
     """
     noise = "white:position_m=0.02,rotation_deg=0.1"
     cells = study(
-        what, "--seconds", "8", "--rate", "25", "--trials", "4", "--keypoints", "exact", "--noise", noise,
-        "-o", tmp_path / "out",
+        what, *TRUSTING, "--seconds", "8", "--rate", "25", "--trials", "4", "--keypoints", "exact",
+        "--noise", noise, "-o", tmp_path / "out",
     )  # fmt: skip
     ray_m = np.hypot(0.02, RANGE_M * np.radians(0.1))
     assert len(cells) == 3 * (5 if what == "tilt" else 4)
@@ -91,7 +92,7 @@ def test_the_studies_of_the_paper_have_its_shapes(tmp_path: Path) -> None:
     Trials have the same chance behind them everywhere, but rays differ: 8 s x 15 Hz x 3 trials = 360 draws
     scatter by 2.6 % in a mean, 3.7 % in a ratio; the bounds are 2.5 of those away and more.
     """
-    options = ("--seconds", "8", "--rate", "15", "--trials", "3", "--levels", "high")
+    options = ("--seconds", "8", "--rate", "15", "--trials", "3", "--levels", "high", *TRUSTING)
     tilted = study("tilt", *options, "--tilts", "0,30,60", "-o", tmp_path / "tilt")
     crowded = study("robots", *options, "-o", tmp_path / "robots")
     for method in ("dlt", "midpoint", "robust"):
@@ -106,7 +107,7 @@ def test_the_studies_of_the_paper_have_its_shapes(tmp_path: Path) -> None:
 
 def test_modelled_keypoints_and_exact_poses_stay_below_60_mm(tmp_path: Path) -> None:
     cells = study(
-        "tilt", "--seconds", "20", "--rate", "10", "--trials", "2", "--tilts", "0,15,30,60",
+        "tilt", *TRUSTING, "--seconds", "20", "--rate", "10", "--trials", "2", "--tilts", "0,15,30,60",
         "--levels", "none", "-o", tmp_path / "out",
     )  # fmt: skip
     for (tilt, *_), cell in cells.items():
@@ -167,7 +168,13 @@ def test_a_detector_looks_at_rendered_pictures(tmp_path: Path, monkeypatch: pyte
         monkeypatch.setattr(module, "find_detector", lambda _: _Pointing())
     monkeypatch.setattr(stage, "PeopleTracker", _Follower)
     asked = settings.settings_for(
-        "tilt", tilts_deg=[0.0], levels=["none"], detector="pointing", seconds=2.0, trials=1
+        "tilt",
+        tilts_deg=[0.0],
+        levels=["none"],
+        methods=["dlt", "midpoint", "robust"],
+        detector="pointing",
+        seconds=2.0,
+        trials=1,
     )
     (cell, *_) = stage.ablate(asked, tmp_path / "out").summary["cells"]
     of = walk(2.0, 1.0, 0)
@@ -212,10 +219,30 @@ def test_methods_are_compared_where_all_of_them_have_a_point(tmp_path: Path) -> 
     assert told == pytest.approx(robust["mpjpe_mm"]["mean"])
 
 
+def test_refined_is_one_of_the_methods_and_says_where_it_fell_back(tmp_path: Path) -> None:
+    """White errors are new in every picture: of n that a smooth walk ties together 1/sqrt(n) is left.
+
+    Steps of a walk last half a second, 8 pictures at 15 Hz: a third would be left, and a half is allowed.
+    """
+    noise = "white:position_m=0.3,rotation_deg=1"
+    options = ("--seconds", "4", "--rate", "15", "--trials", "1", "--methods", "midpoint,robust,refined")
+    output = tmp_path / "out"
+    cells = study("robots", *options, "--robots", "3", "--noise", noise, "-o", output)
+    robust, refined = (cells[15, 3, noise, method]["metrics"] for method in ("robust", "refined"))
+    assert refined["fell_back"]["mean"] == 0
+    assert refined["mpjpe_mm"]["mean"] < 0.5 * robust["mpjpe_mm"]["mean"]
+    assert refined["reconstructed_share"]["mean"] > 0.95
+    with (output / "results.csv").open(newline="") as file:
+        assert [row["fell_back"] for row in csv.DictReader(file)] == ["0.0"] * 3
+    text = succeeds("robots", *options, "--robots", "3", "--noise", noise, "-o", output)
+    table = text[text.index("Trials in which refined fell back") :].split("\n\n")[0]
+    assert table.splitlines()[2].split() == [noise, "refined", "0.0"]
+
+
 def test_workers_do_not_matter_and_a_study_that_is_there_is_not_made_again(tmp_path: Path) -> None:
     made = []
     for workers in ("1", "2"):
-        options = ("--seconds", "4", "--rate", "5", "--trials", "2", "--workers", workers)
+        options = ("--seconds", "4", "--rate", "5", "--trials", "2", "--workers", workers, *TRUSTING)
         text = succeeds("robots", *options, "-o", tmp_path / workers, "--levels", "none,low")
         assert text.startswith("Simulated: ")
         made.append((text.replace(str(tmp_path / workers), ""), content(tmp_path / workers)))
@@ -262,6 +289,7 @@ HOSTILE = {
     "noise that there is not": (("noise", "--noise", "pink:position_m=1"), "pink"),
     "noise and levels": (("noise", "--noise", "white:position_m=1", "--levels", "low"), "--levels"),
     "a single picture": (("tilt", "--seconds", "0.1", "--rate", "1"), "two pictures"),
+    "too short for refined": (("tilt", "--seconds", "1", "--rate", "15"), "too few pictures for refined"),
     "no such detector": (("tilt", "--detector", "oracle"), "oracle"),
     "detector and exact": (("tilt", "--detector", "blazepose", "--keypoints", "exact"), "--keypoints"),
 }

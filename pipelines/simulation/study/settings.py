@@ -19,9 +19,11 @@ Keypoints = Literal["model", "exact"]
 LEVELS = {"none": (0.0, 0.0), "low": (0.1, 0.5), "medium": (0.3, 1.0), "high": (0.5, 2.0)}
 """Pose noise per axis, m and degrees."""
 
-METHODS: tuple[Method, ...] = get_args(Method)
+StudyMethod = Method | Literal["refined"]
+METHODS: tuple[StudyMethod, ...] = (*get_args(Method), "refined")
 
 _CORRELATION_S = 10.0  # of gauss-markov
+_FEWEST_REFINED = 20  # pictures: below, it would always be robust
 _DRONES, _TILT_DEG, _STEEPEST_DEG = (2, 8), 15.0, 85.0
 
 
@@ -49,7 +51,7 @@ class Settings:
     tilts_deg: tuple[float, ...]
     drones: tuple[int, ...]
     noise: tuple[Noise, ...]
-    methods: tuple[Method, ...]
+    methods: tuple[StudyMethod, ...]
     keypoints: Keypoints
     detector: str | None  # looks at rendered pictures in place of `keypoints`
     seconds: float
@@ -115,10 +117,16 @@ def settings_for(
         _check_once(name, values)
     if seconds * rate_hz < 2:
         raise DataError("--seconds", f"{seconds:g} s at {rate_hz:g} Hz are not two pictures", "film longer")
+    if "refined" in methods and seconds * rate_hz < _FEWEST_REFINED:
+        raise DataError(
+            "--seconds",
+            f"{seconds:g} s at {rate_hz:g} Hz are too few pictures for refined ({_FEWEST_REFINED})",
+            "film longer, or leave it out of --methods",
+        )
     asked = [Noise(text, text) for text in noise] or _levels(study, levels, seconds)
     for each in asked:
         each.models()
-    chosen: tuple[Method, ...] = tuple(name for name in METHODS if name in methods)
+    chosen: tuple[StudyMethod, ...] = tuple(name for name in METHODS if name in methods)
     return Settings(
         study,
         tuple(float(tilt) for tilt in tilts_deg),

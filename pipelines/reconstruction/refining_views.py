@@ -1,0 +1,67 @@
+"""Method `refined` for cameras that share their times: what studies make of their views.
+
+As `refining` does for a flight: the estimate starts from `robust` and ends with it. Which joint-frames may be
+called reconstructed is what `robust` says with the corrected poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipelines.geometry.noise import NoiseModel
+from pipelines.geometry.triangulation import STATUS, Views, estimate_noise, triangulate
+from pipelines.reconstruction.refinement.building import Sighting
+from pipelines.reconstruction.refinement.problem import pose_errors
+from pipelines.reconstruction.refinement.refine import corrected, refine
+from pipelines.reconstruction.refining import rigid_pairs
+from pipelines.session.records import Float
+
+
+def refined_points(
+    views: Views, t_s: Float, joints: tuple[str, ...], models: Sequence[NoiseModel]
+) -> tuple[Float, str | None]:
+    """The points that `refined` makes of one person's views, and why it fell back to `robust` if it did.
+
+    Args:
+        views: N = T * J joint-frames, joints fastest; one row of poses for each of the T times. The pose
+            noise in them is for `robust`.
+        t_s: [T] strictly increasing.
+        joints: the J names.
+        models: what is known of the pose errors of every camera; none for exact poses.
+
+    Returns:
+        [N, 3] m, NaN for none.
+    """
+    times, cameras = views.position.shape[:2]
+    told = replace(views, pixel_sigma=estimate_noise(views))
+    start = triangulate(told, method="robust").points
+    sightings = [
+        Sighting(
+            t_s=t_s,
+            xy=views.xy[:, c].reshape(times, -1, 2),
+            confidence=views.weight[:, c].reshape(times, -1),
+            position=views.position[:, c],
+            rotation=views.rotation[:, c],
+            focal_px=float(views.focal[c]),
+            pixel_sigma=float(views.pixel_sigma[c]),
+        )
+        for c in range(cameras)
+    ]
+    prior = [pose_errors(models)] * cameras
+    shape = (times, len(joints), 3)
+    found = refine(t_s, sightings, start.reshape(shape), rigid_pairs(joints, 1), prior, np.zeros(cameras))
+    if found.fallback is not None:
+        return start, found.fallback
+    position, rotation = views.position.copy(), views.rotation.copy()
+    for c, (when_s, numbers) in enumerate(found.corrections):
+        if len(when_s):
+            there = np.stack([np.interp(t_s, when_s, column) for column in numbers.T], axis=1)
+            position[:, c], rotation[:, c] = corrected(position[:, c], rotation[:, c], there)
+    moved = replace(views, position=position, rotation=rotation, pose_sigma=np.zeros_like(views.pose_sigma))
+    gated = triangulate(replace(moved, pixel_sigma=estimate_noise(moved)), method="robust")
+    refined = found.position.reshape(-1, 3)
+    ok = (gated.status == STATUS.index("ok")) & np.isfinite(refined[:, 0])
+    return np.where(ok[:, None], refined, gated.points), None

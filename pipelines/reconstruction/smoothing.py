@@ -1,0 +1,268 @@
+"""Smoothing of a skeleton, where the user asks for it: a zero-phase Butterworth filter, or an RTS smoother.
+
+Both work on contiguous runs of a joint's samples and never across a gap. `filled` samples belong to runs.
+
+- `butterworth`: what biomechanists expect. A pass of order n/2 forwards and one backwards (so nothing lags);
+  the cutoff of a pass is raised so that both together have -3 dB at `cutoff_hz` (Robertson & Dowling 2003;
+  Winter 2009, 3.4.4.2), exactly, for the digital filter.
+- `rts`: a Kalman filter and the smoother of Rauch, Tung & Striebel (1965) on a model of constant acceleration
+  (driven by white jerk) or constant jerk (driven by white snap), weighing each sample by its covariance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.noise import parse
+from pipelines.reconstruction.rauch_tung_striebel import STATES, find_density, smooth_positions
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float, Int64
+
+Bool = NDArray[np.bool_]
+
+_PLACE = "--smooth"
+_USUAL_STEP = 1.5  # times the median step: a longer one is a gap
+_UNEVEN = 0.25  # of the step: a filter of fixed rate is wrong for stamps that stray further
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """A skeleton after smoothing, and what was done to it."""
+
+    position: Float  # [T, P, J, 3] m
+    covariance: Float  # [T, P, J, 3, 3] m^2
+    told: dict[str, Any]  # JSON-able: the filter, its effective cutoff or density, what was too short
+
+
+@dataclass(frozen=True)
+class Butterworth:
+    """A zero-phase low-pass filter, as users write it."""
+
+    cutoff_hz: float = 6.0
+    order: float = 4
+
+    def __post_init__(self) -> None:
+        if not 0 < self.cutoff_hz < math.inf:
+            raise ValueError(f"cutoff_hz is {self.cutoff_hz:g}; it must be above 0")
+        if self.order not in (2, 4, 6, 8):
+            raise ValueError(f"order is {self.order:g}; both passes together have 2, 4, 6 or 8")
+
+    def apply(self, t_ns: Int64, position: Float, covariance: Float) -> Smoothed:
+        """Filter every run; covariances stay: what a filter takes away of errors that last is not known."""
+        from scipy.signal import butter, sosfiltfilt
+
+        step_s, rate_hz = _even_rate(t_ns)
+        if self.cutoff_hz >= rate_hz / 2:
+            raise DataError(
+                _PLACE,
+                f"cutoff_hz={self.cutoff_hz:g} is not below half the skeleton's rate ({rate_hz / 2:.4g} Hz)",
+                "state a lower cutoff",
+            )
+        passes = int(self.order) // 2
+        design_hz = self._design_hz(rate_hz)
+        sections = butter(passes, design_hz, fs=rate_hz, output="sos")
+        # Ends are mirrored in their last sample, for as long as the filter remembers.
+        padding = max(3 * (2 * len(sections) + 1), round(rate_hz / self.cutoff_hz))
+        smooth = position.copy()
+        runs = _runs(t_ns, position, step_s)
+        short = 0
+        for person, joint, first, stop in runs:
+            if stop - first <= padding:
+                short += stop - first
+                continue
+            own = position[first:stop, person, joint]
+            smooth[first:stop, person, joint] = (
+                sosfiltfilt(sections, own - own[0], axis=0, padlen=padding) + own[0]
+            )  # far from the origin digits are lost
+        told = {
+            "filter": "butterworth",
+            "passes": "one forwards, one backwards: no lag",
+            "order": int(self.order),
+            "order_of_a_pass": passes,
+            "cutoff_hz": self.cutoff_hz,
+            "cutoff_of_a_pass_hz": design_hz,
+            "rate_hz": rate_hz,
+            "runs": len(runs),
+            "joint_frames_in_runs_too_short": short,
+            "covariances": "as before smoothing",
+        }
+        return Smoothed(smooth, covariance, told)
+
+    def _design_hz(self, rate_hz: float) -> float:
+        """The -3 dB frequency of one pass with which two have theirs at `cutoff_hz`.
+
+        A digital pass has the gain 1 / (1 + (tan(pi f / rate) / tan(pi d / rate))^2m) (bilinear transform),
+        two have its square; that is 1/2 where the ratio to the power of 2m is sqrt(2) - 1.
+        """
+        passes = int(self.order) // 2
+        tangent = math.tan(math.pi * self.cutoff_hz / rate_hz) / (math.sqrt(2) - 1) ** (1 / (2 * passes))
+        return math.atan(tangent) * rate_hz / math.pi
+
+
+@dataclass(frozen=True)
+class RauchTungStriebel:
+    """The smoother, as users write it; without a density the data tell it."""
+
+    model: Literal["acceleration", "jerk"] = "acceleration"
+    density: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.model not in STATES:
+            raise ValueError(f"model is {self.model!r} instead of {' or '.join(STATES)}")
+        if self.density is not None and not 0 < self.density < math.inf:
+            raise ValueError(f"density is {self.density}; it must be a number above 0")
+
+    def apply(self, t_ns: Int64, position: Float, covariance: Float) -> Smoothed:
+        """Smooth every run.
+
+        With a stated density covariances are taken at their word: errors that are new at every sample. Found
+        from the data, a factor on them comes out as well: the share of the variance that is new at every
+        sample. Only that share is smoothed away; the rest, which lasts, stays in the covariance.
+        """
+        step_s = float(np.median(np.diff(t_ns))) / 1e9 if len(t_ns) > 1 else 0.0
+        states = STATES[self.model]
+        runs = _runs(t_ns, position, step_s)
+        begins, used = _marks(position.shape[:3], [run for run in runs if run[3] - run[2] > states])
+        columns = used.any(axis=0)
+        shape = (len(t_ns), int(columns.sum()))
+        t_s = (t_ns - t_ns[0]) / 1e9
+        measured, known = position[:, columns], covariance[:, columns]
+        density, share = self.density, np.ones(shape[1])
+        densities = np.full(shape[1], density or 0.0)
+        if density is None and shape[1]:
+            densities, share = find_density(
+                t_s, measured, known, used[:, columns], begins[:, columns], states
+            )
+        smooth, uncertain = smooth_positions(
+            t_s,
+            measured,
+            share[:, None, None] * known,
+            used[:, columns],
+            begins[:, columns],
+            densities,
+            states,
+        )
+        lasting = np.maximum(1 - share, 0.0)[:, None, None] * known
+        own = used[:, columns]
+        new_position, new_covariance = position.copy(), covariance.copy()
+        new_position[:, columns] = np.where(own[..., None], smooth, measured)
+        new_covariance[:, columns] = np.where(own[..., None, None], uncertain + lasting, known)
+        median = float(np.median(densities)) if shape[1] else None
+        told = {
+            "filter": "rts",
+            "model": f"constant {self.model}",
+            "density": density if density is not None else median,
+            "density_unit": "m/s^3 per sqrt(Hz)" if self.model == "acceleration" else "m/s^4 per sqrt(Hz)",
+            "density_from": "stated" if density is not None else "the data, joint by joint (median)",
+            "new_share_of_variance": float(np.median(share)) if shape[1] else None,
+            "cutoff_hz": _cutoff_hz(densities, share, known, own, step_s, states),
+            "runs": len(runs),
+            "joint_frames_in_runs_too_short": int((np.isfinite(position[..., 0]) & ~used).sum()),
+            "covariances": "of the smoother",
+        }
+        return Smoothed(new_position, new_covariance, told)
+
+
+Smoother = Butterworth | RauchTungStriebel
+_SMOOTHERS: Mapping[str, Callable[..., Smoother]] = {"butterworth": Butterworth, "rts": RauchTungStriebel}
+
+
+def smoother(text: str | None) -> Smoother | None:
+    """The smoother of a text like `butterworth:cutoff_hz=6,order=4` or `rts`; None of none.
+
+    Raises:
+        DataError: the text does not read so, or names what there is not.
+    """
+    if text is None:
+        return None
+    remedy = "write butterworth:cutoff_hz=6,order=4 or rts:model=acceleration"
+    try:
+        parts = [(text.strip(), {})] if text.strip() in _SMOOTHERS else parse(text)
+    except ValueError as error:
+        raise DataError(_PLACE, str(error), remedy) from None
+    if len(parts) != 1:
+        raise DataError(_PLACE, f"{text!r} names {len(parts)} filters", "choose one")
+    name, parameters = parts[0]
+    if name not in _SMOOTHERS:
+        raise DataError(_PLACE, f"no such filter: {name}", remedy)
+    known = [field.name for field in fields(_SMOOTHERS[name])]  # type: ignore[arg-type]
+    unknown = sorted(set(parameters) - set(known))
+    if unknown:
+        raise DataError(_PLACE, f"{name} has no {', '.join(unknown)}", f"it has {', '.join(known)}")
+    for key, value in parameters.items():
+        if key != "model" and not isinstance(value, float):
+            raise DataError(_PLACE, f"{key} is {value!r} instead of a number", remedy)
+    try:
+        return _SMOOTHERS[name](**parameters)
+    except ValueError as error:
+        raise DataError(_PLACE, f"{name}: {error}", remedy) from None
+
+
+def _even_rate(t_ns: Int64) -> tuple[float, float]:
+    """The skeleton's step in s and rate in Hz."""
+    if len(t_ns) < 2:
+        raise DataError(_PLACE, "a single sample has no rate to filter at", "leave it out")
+    steps = np.diff(t_ns)
+    step = float(np.median(steps))
+    near = steps <= _USUAL_STEP * step
+    if np.mean(np.abs(steps[near] - step) > _UNEVEN * step) > _UNEVEN:
+        raise DataError(
+            _PLACE,
+            f"the skeleton's times are uneven ({steps.min() / 1e6:.1f} ms apart and more)",
+            "state --rate as well, or smooth with rts",
+        )
+    # The mean, not the median: stamps in whole ns or jitter make no bias.
+    mean_s = float(steps[near].mean()) / 1e9
+    return mean_s, 1 / mean_s
+
+
+def _runs(t_ns: Int64, position: Float, step_s: float) -> list[tuple[int, int, int, int]]:
+    """Person, joint, first sample and the one after the last of every stretch without a gap."""
+    runs = []
+    gap = np.append(np.diff(t_ns) > _USUAL_STEP * step_s * 1e9, True)
+    there = np.isfinite(position[..., 0])
+    for person, joint in np.ndindex(there.shape[1:]):
+        own = there[:, person, joint]
+        (first,) = np.nonzero(own & ~np.append(False, own[:-1] & ~gap[:-1]))
+        (last,) = np.nonzero(own & (gap | ~np.append(own[1:], False)))
+        runs += [(person, joint, int(a), int(b) + 1) for a, b in zip(first, last, strict=True)]
+    return runs
+
+
+def _marks(shape: tuple[int, ...], runs: list[tuple[int, int, int, int]]) -> tuple[Bool, Bool]:
+    """Where runs begin, and which samples belong to one [T, P, J]."""
+    begins, used = np.zeros(shape, dtype=np.bool_), np.zeros(shape, dtype=np.bool_)
+    for person, joint, first, stop in runs:
+        begins[first, person, joint] = True
+        used[first:stop, person, joint] = True
+    return begins, used
+
+
+def _cutoff_hz(
+    density: Float, share: Float, covariance: Float, used: Bool, step_s: float, states: int
+) -> float | None:
+    """Where the smoother's gain is 1/sqrt(2) (-3 dB): median over the joints.
+
+    Far from the ends the smoother of n states has the gain 1 / (1 + (w / w0)^2n) with w0^2n = density^2 /
+    (variance x step), for steps that are short beside it (Wiener); -3 dB lie at w0 (sqrt(2) - 1)^(1/2n).
+    """
+    variance = np.trace(covariance, axis1=-2, axis2=-1) / 3
+    typical = np.array(
+        [
+            np.median(own[there]) if there.any() else np.nan
+            for own, there in zip(variance.T, used.T, strict=True)
+        ]
+    )
+    noise = share * typical * step_s
+    known = np.isfinite(noise) & (noise > 0) & (density > 0)
+    if not known.any():
+        return None
+    corner = (density[known] ** 2 / noise[known]) ** (1 / (2 * states))
+    lower = (math.sqrt(2) - 1) ** (1 / (2 * states))
+    return float(np.median(corner) * lower / (2 * math.pi))

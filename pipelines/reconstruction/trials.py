@@ -1,0 +1,115 @@
+"""Reconstructing again with poses that err more than they do: the draws, and what they say together.
+
+Chance of trial k and camera i is the same whatever else is asked, so that two models of noise, or two
+methods, are compared on like draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
+from pipelines.reconstruction.observations import Camera
+from pipelines.session.errors import DataError
+from pipelines.session.registries import parsed_noise_models
+
+STORED = 0
+"""The trial whose skeleton is stored."""
+
+_FIGURES = (
+    "mpjpe_mm",
+    "root_mpjpe_mm",
+    "pa_mpjpe_mm",
+    "e_recon_m2",
+    "e_recon_terms",
+    "e_recon_per_joint_frame_m2",
+    "pck150",
+    "pck150_auc",
+    "acceleration_error_mm_s2",
+    "reconstructed_share",
+)
+_RESAMPLES = 2000
+_TAIL_PERCENT = 2.5
+
+
+def disturbances(text: str | None, trials: int) -> list[NoiseModel] | None:
+    """The errors that are asked for, None for none.
+
+    Raises:
+        DataError: they do not read, err by nothing, or there are trials of nothing.
+    """
+    place = "--disturb-poses"
+    if text is None:
+        if trials != 1:
+            raise DataError("--trials", "are draws of --disturb-poses, which is not there", "state it too")
+        return None
+    models = parsed_noise_models(place, text)
+    one = np.ones(1)  # any elapsed time, speed and turn rate
+    if not sum_sigma(models, one, one, one).any():
+        raise DataError(place, f"{text!r} disturbs nothing", "state at least one size above 0")
+    if trials < 1:
+        raise DataError("--trials", f"{trials} is no number of trials", "state 1 or more")
+    return models
+
+
+def disturbed(cameras: Sequence[Camera], models: Sequence[NoiseModel], seed: int, trial: int) -> list[Camera]:
+    """The cameras with errors added to every pose of their logs; what is known of the logs stays the same."""
+    moved = []
+    for c, camera in enumerate(cameras):
+        log = camera.trajectory
+        rng = np.random.default_rng([seed, trial, c])
+        position, quaternion = disturb(models, log.t_ns, log.position, log.quaternion_xyzw, rng)
+        moved.append(replace(camera, trajectory=replace(log, position=position, quaternion_xyzw=quaternion)))
+    return moved
+
+
+def told_together(metrics: Sequence[Mapping[str, Any]], text: str, seed: int) -> dict[str, Any]:
+    """What metrics.json says of all trials.
+
+    Args:
+        metrics: of every trial.
+        text: the errors, as users write them.
+        seed: of the draws, and of the resampling of trials.
+
+    Returns:
+        JSON-able, null for what could not be measured: `each` trial's figures, their `mean`, their `std`
+        (about the mean, n - 1) and the `intervals` that hold 95 % of the means of resampled trials (Efron &
+        Tibshirani 1993, 13.3); both null for less than two trials.
+    """
+    each = [_figures(told) for told in metrics]
+    mean: dict[str, float | None] = {}
+    std: dict[str, float | None] = {}
+    intervals: dict[str, list[float] | None] = {}
+    for name in each[0]:
+        values = np.array([told[name] for told in each if told[name] is not None], dtype=np.float64)
+        mean[name] = float(values.mean()) if values.size else None
+        std[name] = intervals[name] = None
+        if values.size > 1:
+            std[name] = float(values.std(ddof=1))
+            rows = np.random.default_rng([seed, values.size]).integers(
+                values.size, size=(_RESAMPLES, values.size)
+            )
+            ends = np.percentile(values[rows].mean(axis=1), [_TAIL_PERCENT, 100 - _TAIL_PERCENT])
+            intervals[name] = [float(end) for end in ends]
+    return {
+        "disturb_poses": text,
+        "seed": seed,
+        "count": len(each),
+        "stored": STORED,
+        "mean": mean,
+        "std": std,
+        "intervals": intervals,
+        "each": each,
+    }
+
+
+def _figures(told: Mapping[str, Any]) -> dict[str, float | None]:
+    figures: dict[str, float | None] = {name: told[name] for name in _FIGURES}
+    figures["reprojection_px_median"] = told["reprojection_px"]["median"]
+    if "refinement" in told:
+        figures["fell_back"] = float(told["refinement"]["fallback"] is not None)
+    return figures

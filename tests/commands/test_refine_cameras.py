@@ -1,0 +1,92 @@
+"""`--refine-cameras background`: on the rendered pictures of the sample flight, and where there are none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipelines.formats.video import VideoReader
+from pipelines.geometry.cameras import Intrinsics, undistort
+from pipelines.geometry.poses import (
+    conjugate,
+    interpolate_poses,
+    matrix_from_quaternion,
+    multiply,
+    quaternion_from_matrix,
+    rotation_vector_from_quaternion,
+)
+from pipelines.reconstruction.background import prior_of
+from pipelines.reconstruction.background_poses import adjust
+from pipelines.reconstruction.background_tracks import follow
+from pipelines.reconstruction.refinement.problem import pose_errors
+from pipelines.session.description import read_description
+from pipelines.session.registries import noise_models
+from tests.commands.runner import refused, succeeds
+from tests.synthetic.flights import write_flight
+
+SAMPLE = Path(__file__).parents[2] / "sample_data" / "mound_walk"
+PERSON = np.array([[440.0, 140.0, 840.0, 580.0]])  # the cameras aim at the person, who is in the middle
+SPAN_S = (6.0, 10.0)
+
+
+def test_without_pictures_it_is_refused_in_a_line(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, seconds=0.5)
+    session = tmp_path / "flight.session"
+    succeeds("ingest", flight.manifest, "-o", session)
+    assert "no moving camera has pictures" in refused(
+        "reconstruct", session, "--refine-cameras", "background"
+    )
+
+
+@pytest.mark.slow
+def test_the_background_of_the_sample_flight_halves_the_errors_of_attitudes(tmp_path: Path) -> None:
+    """Rendered pictures, known poses, 4 s in the arc; 12 s of both cameras are in docs/decisions."""
+    session = tmp_path / "sample.session"
+    succeeds("ingest", SAMPLE / "flight.yaml", "-o", session)
+    entry = read_description(session).cameras["drone2"]
+    frames = pd.read_parquet(session / "cameras" / "drone2" / "frames.parquet")
+    since_s = (frames["t_ns"] - frames["t_ns"].iloc[0]) / 1e9
+    chosen = frames[(since_s >= SPAN_S[0]) & (since_s < SPAN_S[1])].iloc[::2]
+    with VideoReader(SAMPLE / "drone2.mp4") as video:
+        pictures = [cv2.cvtColor(video.read(int(k)), cv2.COLOR_BGR2GRAY) for k in chosen["frame"]]
+    tracks = follow(
+        [np.asarray(picture, dtype=np.uint8) for picture in pictures], np.tile(PERSON, (len(chosen), 1, 1))
+    )
+    t_ns = chosen["t_ns"].to_numpy(np.int64)
+    truth = pd.read_parquet(session / "truth_poses.parquet")
+    poses = {
+        "log": pd.read_parquet(session / "cameras" / "drone2" / "poses.parquet"),
+        "truth": truth[truth["camera"] == "drone2"],
+    }
+    (at, turned), (_, true) = (
+        interpolate_poses(
+            table["t_ns"].to_numpy(np.int64),
+            table[["x", "y", "z"]].to_numpy(),
+            table[["qx", "qy", "qz", "qw"]].to_numpy(),
+            t_ns,
+            max_gap_ns=10**9,
+            max_extrapolation_ns=10**8,
+        )
+        for table in poses.values()
+    )
+    lens: Intrinsics = entry.intrinsics.intrinsics()
+    prior = prior_of(pose_errors(noise_models("the flight", entry.pose_noise or {})), np.zeros(2))
+    found = adjust(
+        tracks.picture,
+        tracks.point,
+        undistort(tracks.xy, lens),
+        lens.fx,
+        at,
+        matrix_from_quaternion(turned),
+        prior,
+    )
+    assert found.refused is None
+    logged_rad, left_rad = (
+        float(np.sqrt(np.mean(rotation_vector_from_quaternion(multiply(conjugate(true), other)) ** 2)))
+        for other in (turned, quaternion_from_matrix(found.rotation))
+    )
+    assert left_rad < 0.5 * logged_rad

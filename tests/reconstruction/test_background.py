@@ -1,0 +1,191 @@
+"""Attitudes from a still background: against true poses, where it says nothing, with people in the way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.geometry.poses import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    quaternion_from_rotation_vector,
+    rotation_vector_from_quaternion,
+)
+from pipelines.reconstruction.background import prior_of
+from pipelines.reconstruction.background_poses import Adjusted, PosePrior, adjust
+from pipelines.reconstruction.background_tracks import follow
+from pipelines.reconstruction.refinement.problem import ROTATION, SHIFT_IN_WORLD, PoseErrors, Process
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+FOCAL = 760.0
+PRIOR = PosePrior((0.02, np.radians(0.2)), (0.05, np.radians(0.3)))
+
+
+def flown(pictures: int, way_m: float, turn_deg: float = 90.0) -> tuple[Float, Float]:
+    """A camera that looks 15 deg down and 90 deg left of its way, an arc 3 m above the ground."""
+    angle = np.radians(turn_deg) * np.linspace(0, 1, pictures)
+    step = way_m / pictures * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    position = np.cumsum(step, axis=0) + np.array([0.0, 0.0, 3.0])
+    tilt = np.radians(15)
+    left = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
+    forward = np.cos(tilt) * left - np.array([0.0, 0.0, np.sin(tilt)])
+    right = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    return position, np.stack([right, np.cross(forward, right), forward], axis=2)
+
+
+def sighted(position: Float, rotation: Float, rng: np.random.Generator) -> tuple[Int64, Int64, Float]:
+    """Points of the ground and of trees, wherever they fall into the picture, with 0.3 px of noise."""
+    points = rng.uniform([-40, -20, 0], [30, 40, 0.2], (900, 3))
+    points[::4, 2] = rng.uniform(0, 5, len(points[::4]))
+    away = np.einsum("tji,tnj->tni", rotation, points[None] - position[:, None])
+    xy = away[..., :2] / away[..., 2:]
+    inside = (away[..., 2] > 1) & (np.abs(xy) < [0.84, 0.47]).all(axis=-1)
+    picture, point = np.nonzero(inside)
+    return picture, point, xy[inside] + rng.normal(0, 0.3 / FOCAL, (len(point), 2))
+
+
+def logged(position: Float, rotation: Float, rng: np.random.Generator) -> tuple[Float, Float]:
+    """Poses with errors of the prior."""
+    lasting = rng.normal(0, 1, 6) * np.repeat(PRIOR.lasting, 3)
+    error = lasting + rng.normal(0, 1, (len(position), 6)) * np.repeat(PRIOR.fresh, 3)
+    turned = matrix_from_quaternion(quaternion_from_rotation_vector(error[:, 3:]))
+    return position + error[:, :3], rotation @ turned
+
+
+def turns_deg(one: Float, other: Float) -> Float:
+    """Angles [T] between rotations."""
+    trace = np.einsum("tij,tij->t", one, other)
+    angle: Float = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+    return angle
+
+
+def refined(way_m: float, seed: int, lost: float = 0.0) -> tuple[Adjusted, Float, Float, Float, Float]:
+    """What comes out; the true attitudes; the logged ones; true and logged positions."""
+    rng = np.random.default_rng(seed)
+    position, rotation = flown(40, way_m)
+    picture, point, xy = sighted(position, rotation, rng)
+    wrong = rng.random(len(xy)) < lost
+    xy[wrong] += rng.normal(0, 20 / FOCAL, (int(wrong.sum()), 2))
+    at, turned = logged(position, rotation, rng)
+    return adjust(picture, point, xy, FOCAL, at, turned, PRIOR), rotation, turned, position, at
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.1])
+def test_attitudes_come_out_of_the_background(lost: float) -> None:
+    """12 m of way, of which a stretch of half is off by 0.02 m / sqrt(10) at each end, tells its course
+    to 0.1 deg: a third of the log's 0.6 deg is twice that; points lost on the way change little.
+    """
+    found, truth, before, _, _ = refined(12.0, 1, lost)
+    assert found.refused is None
+    assert found.reprojection_px < 0.6
+    logged_deg, left_deg = (np.sqrt(np.mean(turns_deg(of, truth) ** 2)) for of in (before, found.rotation))
+    assert left_deg < logged_deg / 3
+
+
+def test_the_stated_covariance_of_attitudes_is_what_they_have() -> None:
+    """e' C^-1 e has the mean 3; a flight's attitudes are nearly one draw, whose variance is 6."""
+    squared = []
+    flights = 5
+    for seed in range(flights):
+        found, truth, _, _, at = refined(12.0, seed)
+        turned = quaternion_from_matrix(np.swapaxes(truth, 1, 2) @ found.rotation)
+        error = rotation_vector_from_quaternion(turned)
+        whitened = np.linalg.solve(found.covariance[:, 3:, 3:], error[..., None])[..., 0]
+        squared.append(float(np.einsum("ti,ti->t", error, whitened).mean()))
+        # Paths are not moved: what lasts of the positions' errors stays.
+        moved = (found.position - at).mean(axis=0)
+        np.testing.assert_allclose(moved, 0, atol=0.02)
+        assert (found.covariance[:, range(3), range(3)] >= PRIOR.lasting[0] ** 2).all()
+    # Points are stated worse (0.5 px) than they are (0.3), and the loss keeps a tenth less of them.
+    assert 0.5 < np.mean(squared) < 3 + 2 * np.sqrt(6 / flights)
+
+
+def test_a_straight_way_tells_nothing_of_a_turn_about_itself() -> None:
+    """Here the way is the camera's x axis: what the log says of that axis stays, the other two are found."""
+    rng = np.random.default_rng(7)
+    position, rotation = flown(40, 12.0, turn_deg=0.0)
+    picture, point, xy = sighted(position, rotation, rng)
+    at, turned = logged(position, rotation, rng)
+    found = adjust(picture, point, xy, FOCAL, at, turned, PRIOR)
+    assert found.refused is None
+    sigma = np.sqrt(np.diagonal(found.covariance[:, 3:, 3:], axis1=1, axis2=2).mean(axis=0))
+    # Of 40 poses the new part averages out (0.2 deg / sqrt(40)), what lasts does not.
+    assert np.degrees(sigma[0]) == pytest.approx(0.3, rel=0.1)
+    assert np.degrees(sigma[1:]).max() < 0.15
+
+
+def test_a_camera_that_hovers_keeps_its_logged_poses() -> None:
+    found, _, before, _, at = refined(0.0, 3)
+    assert found.refused is not None
+    assert "parallax" in found.refused
+    np.testing.assert_array_equal(found.rotation, before)
+    np.testing.assert_array_equal(found.position, at)
+    np.testing.assert_allclose(found.covariance, PRIOR.covariance(40))
+
+
+def test_a_log_that_the_pictures_contradict_is_kept_and_named() -> None:
+    rng = np.random.default_rng(4)
+    position, rotation = flown(40, 12.0)
+    picture, point, xy = sighted(position, rotation, rng)
+    askew = matrix_from_quaternion(quaternion_from_rotation_vector(np.radians([[0.0, 5.0, 0.0]])))
+    found = adjust(picture, point, xy, FOCAL, position, rotation @ askew, PRIOR)
+    assert found.refused is not None
+    assert "standard deviations from the log" in found.refused
+
+
+def test_pictures_without_a_pose_stay_without() -> None:
+    rng = np.random.default_rng(5)
+    position, rotation = flown(40, 12.0)
+    picture, point, xy = sighted(position, rotation, rng)
+    at, turned = logged(position, rotation, rng)
+    at[10], turned[10] = np.nan, np.nan
+    found = adjust(picture, point, xy, FOCAL, at, turned, PRIOR)
+    assert found.refused is None
+    assert np.isnan(found.position[10]).all()
+    assert np.isfinite(np.delete(found.position, 10, axis=0)).all()
+
+
+def test_points_are_followed_and_people_left_out() -> None:
+    """A textured plane that moves by (3, 1) px a picture; a person's box in which nothing may be followed."""
+    rng = np.random.default_rng(6)
+    texture = cv2.GaussianBlur(rng.integers(0, 256, (400, 500), dtype=np.uint8), (0, 0), 2)
+    texture = cv2.normalize(texture, np.empty_like(texture), 0, 255, cv2.NORM_MINMAX)
+    pictures: list[NDArray[np.uint8] | None] = [
+        np.ascontiguousarray(texture[40 - k : 280 - k, 60 - 3 * k : 380 - 3 * k]) for k in range(8)
+    ]
+    pictures[4] = None
+    box = np.array([100.0, 60.0, 180.0, 200.0])
+    tracks = follow(pictures, np.tile(box, (8, 1, 1)))
+    assert len(np.unique(tracks.point)) > 50
+    assert set(tracks.picture.tolist()) == {0, 1, 2, 3, 5, 6, 7}
+    assert not ((tracks.xy > box[:2]) & (tracks.xy < box[2:])).all(axis=1).any()
+    first = {point: (row, xy) for row, point, xy in zip(*_reversed(tracks), strict=True)}
+    moved = [
+        (row - first[point][0], xy - first[point][1])
+        for row, point, xy in zip(tracks.picture.tolist(), tracks.point.tolist(), tracks.xy, strict=True)
+    ]
+    # Flow is good to a tenth of a pixel; 3 pictures in a row at most before one is missing.
+    for steps, by in moved:
+        np.testing.assert_allclose(by, [3.0 * steps, 1.0 * steps], atol=0.3)
+    # Nothing is followed over a picture that is missing.
+    assert all((steps <= 3) for steps, _ in moved)
+
+
+def _reversed(tracks: object) -> tuple[list[int], list[int], Float]:
+    picture, point, xy = (getattr(tracks, name)[::-1] for name in ("picture", "point", "xy"))
+    return picture.tolist(), point.tolist(), xy
+
+
+def test_stated_models_say_what_is_new_and_what_lasts() -> None:
+    errors = PoseErrors((0.02, 0.003), (Process(SHIFT_IN_WORLD, 0.3), Process(ROTATION, 0.04, rate=0.01)))
+    prior = prior_of(errors, np.zeros(2))
+    assert prior.fresh == (0.02, 0.003)
+    assert prior.lasting == pytest.approx((0.3, np.sqrt(0.04**2 + 0.01**2 * 10)))
+    np.testing.assert_allclose(prior_of(None, np.array([0.3, 0.02])).level, [0.3, 0.02])
+    assert replace(prior, fresh=(0.0, 0.0)).level == pytest.approx(prior.lasting)

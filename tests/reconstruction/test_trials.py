@@ -1,0 +1,89 @@
+"""Disturbed poses: whose chance is whose, what is refused, and what several trials say together."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.geometry.cameras import Intrinsics
+from pipelines.reconstruction.observations import Camera
+from pipelines.reconstruction.trials import disturbances, disturbed, told_together
+from pipelines.session.errors import DataError
+from pipelines.session.records import Detections, Trajectory
+
+
+def camera(name: str) -> Camera:
+    nothing = np.empty(0, dtype=np.int64)
+    log = Trajectory(np.arange(5, dtype=np.int64) * 10**8, np.zeros((5, 3)), np.tile([0.0, 0, 0, 1], (5, 1)))
+    return Camera(
+        name=name,
+        intrinsics=Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0, "none", ()),
+        frame_t_ns=log.t_ns,
+        follows=np.ones(5, dtype=np.bool_),
+        trajectory=log,
+        static=False,
+        sigma=np.full((5, 2), 0.1),
+        detections=Detections(("nose",), nothing, nothing, np.empty((0, 1, 2)), np.empty((0, 1)), nothing),
+    )
+
+
+def moved(models: str, *, seed: int = 0, trial: int = 0, count: int = 2) -> Any:
+    cameras = [camera(f"drone{k}") for k in range(count)]
+    errors = disturbances(models, 1)
+    assert errors is not None
+    after = disturbed(cameras, errors, seed, trial)
+    assert all((a.sigma == b.sigma).all() for a, b in zip(after, cameras, strict=True) if a.sigma is not None)
+    return np.stack([each.trajectory.position for each in after])
+
+
+def test_each_camera_and_trial_has_its_own_chance_whatever_else_is_asked() -> None:
+    two, three = moved("white:position_m=0.1"), moved("white:position_m=0.1", count=3)
+    np.testing.assert_array_equal(two, three[:2])
+    np.testing.assert_allclose(moved("white:position_m=0.2"), 2 * two)
+    assert not np.allclose(two[0], two[1])
+    assert not np.allclose(two, moved("white:position_m=0.1", trial=1))
+    assert not np.allclose(two, moved("white:position_m=0.1", seed=1))
+    # Latency moves nobody who stands still.
+    assert not moved("latency:latency_ms=50").any()
+
+
+@pytest.mark.parametrize(
+    ("text", "trials", "said"),
+    [
+        (None, 5, "--trials: are draws of --disturb-poses"),
+        ("loud", 1, "does not read"),
+        ("pink:position_m=1", 1, "pink is none of"),
+        ("white:position_m=-1", 1, "position_m is -1"),
+        ("white:position_m=0 + bias:rotation_deg=0", 3, "disturbs nothing"),
+        ("white:position_m=1", 0, "0 is no number of trials"),
+    ],
+)
+def test_nonsense_is_refused_in_a_line(text: str | None, trials: int, said: str) -> None:
+    with pytest.raises(DataError, match=said) as refused:
+        disturbances(text, trials)
+    assert "\n" not in str(refused.value)
+
+
+def told(mpjpe_mm: float | None) -> dict[str, Any]:
+    names = (
+        "mpjpe_mm root_mpjpe_mm pa_mpjpe_mm e_recon_m2 e_recon_terms e_recon_per_joint_frame_m2 pck150"
+        " pck150_auc acceleration_error_mm_s2 reconstructed_share"
+    )
+    return {**dict.fromkeys(names.split()), "mpjpe_mm": mpjpe_mm, "reprojection_px": {"median": 2.0}}
+
+
+def test_trials_together() -> None:
+    said = told_together([told(100.0), told(None), told(140.0)], "white:position_m=1", 0)
+    assert (said["count"], said["stored"], said["seed"]) == (3, 0, 0)
+    assert [each["mpjpe_mm"] for each in said["each"]] == [100.0, None, 140.0]
+    assert said["mean"]["mpjpe_mm"] == 120
+    assert said["std"]["mpjpe_mm"] == pytest.approx(20 * np.sqrt(2))
+    # Of two values every resample's mean is one of them or their middle: the ends are both of them.
+    assert said["intervals"]["mpjpe_mm"] == [100, 140]
+    assert said["mean"]["pa_mpjpe_mm"] is None
+    assert said["std"]["reprojection_px_median"] == 0
+    alone = told_together([told(100.0)], "white:position_m=1", 0)
+    assert alone["mean"]["mpjpe_mm"] == 100
+    assert alone["std"]["mpjpe_mm"] is alone["intervals"]["mpjpe_mm"] is None
