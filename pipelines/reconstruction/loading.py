@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from pipelines.geometry.noise import sum_sigma
 from pipelines.geometry.poses import interpolate_points, rates
 from pipelines.reconstruction.observations import Camera
-from pipelines.reconstruction.refinement.problem import PoseErrors, pose_errors
+from pipelines.reconstruction.refinement.problem import (
+    ROTATION,
+    SHIFT_IN_WORLD,
+    PoseErrors,
+    Process,
+    pose_errors,
+)
 from pipelines.session.description import CameraEntry, Description
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Int64, Trajectory
@@ -176,8 +182,8 @@ def load_pose_errors(
 ) -> list[PoseErrors] | None:
     """What is known of each camera's pose errors over time; None where nobody stated it for all that move.
 
-    A logged covariance says how large errors are, not how long they last: it is no such statement. A still
-    camera of which nothing is said was calibrated, and counts as exact beside others that are stated.
+    A logged covariance says how large errors are, not how long they last (`errors_of_level`). A still camera
+    of which nothing is said was calibrated, and counts as exact beside others that are stated.
     """
     stated: list[PoseErrors | None] = []
     for camera in cameras:
@@ -188,10 +194,18 @@ def load_pose_errors(
             stated.append(pose_errors(parsed_noise_models("--pose-noise", pose_noise)))
         elif entry.pose_noise:
             stated.append(pose_errors(noise_models(f"pose_noise of {camera.name}", entry.pose_noise)))
+        elif camera.covariance is not None and camera.sigma is not None:
+            stated.append(errors_of_level(np.median(camera.sigma, axis=0)))
         else:
             stated.append(PoseErrors((0.0, 0.0), ()) if camera.static else None)
     known = [errors for errors in stated if errors is not None]
     return known if len(known) == len(stated) else None
+
+
+def errors_of_level(level: Float) -> PoseErrors:
+    """Pose errors of which only the level [2] (m, rad) is known: half of the variance new, half lasting."""
+    shift, turn = (float(sigma) for sigma in level / np.sqrt(2))
+    return PoseErrors((shift, turn), (Process(SHIFT_IN_WORLD, shift), Process(ROTATION, turn)))
 
 
 def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> Float:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.geometry.triangulation import STATUS, Views, triangulate
-from pipelines.reconstruction.loading import logged_covariance
+from pipelines.reconstruction.loading import errors_of_level, logged_covariance
 from pipelines.reconstruction.pose_weighting import triangulate_weighted
+from pipelines.reconstruction.refinement.problem import ROTATION
 from pipelines.session.records import Trajectory
 from tests.geometry.rings import ring, turned, with_pixel_noise
 
@@ -89,6 +90,15 @@ def logged(covariance: Float) -> Trajectory:
     count = len(covariance)
     still = quaternion_from_matrix(np.tile(np.eye(3), (count, 1, 1)))
     return Trajectory(np.arange(count, dtype=np.int64), np.zeros((count, 3)), still, covariance)
+
+
+def test_a_level_alone_becomes_half_new_and_half_lasting_errors() -> None:
+    errors = errors_of_level(np.array([0.3, 0.02]))
+    found = np.square(errors.white)
+    for process in errors.processes:
+        assert process.constant
+        found[1 if process.number == ROTATION else 0] += process.sigma0**2
+    np.testing.assert_allclose(np.sqrt(found), [0.3, 0.02])
 
 
 def test_what_logs_write_for_unknown_is_not_taken_at_its_word() -> None:
