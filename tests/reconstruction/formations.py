@@ -48,6 +48,8 @@ def formation(
     seed: int,
     *,
     pixel_px: float = 2.0,
+    memory: float = 0.0,
+    constant_px: float = 0.0,
     bad_share: float = 0.0,
     still: bool = False,
     variation: float = 1.0,
@@ -62,6 +64,8 @@ def formation(
         models: what is wrong with their logs; nobody tells `robust`.
         seed: of all chance.
         pixel_px: noise of the keypoints, at f = 1500 px.
+        memory: autocorrelation of that noise from one frame to the next.
+        constant_px: how far each joint is off in each camera, all along.
         bad_share: of the keypoints are 100 to 300 px off, and as many are missing.
         still: the cameras hover around the walk instead of following it.
         variation: how far moving cameras leave the rigid ring.
@@ -93,7 +97,12 @@ def formation(
         rotation = matrix_from_quaternion(quaternion)
         seen = np.einsum("tij,tki->tkj", rotation, joints - position[:, None])
         xy = seen[..., :2] / seen[..., 2:]
-        xy = xy + rng.normal(0, pixel_px / FOCAL_PX, xy.shape)
+        noise = rng.normal(0, pixel_px / FOCAL_PX, xy.shape)
+        for k in range(1, len(noise) if memory else 0):
+            noise[k] = memory * noise[k - 1] + np.sqrt(1 - memory**2) * noise[k]
+        if constant_px:
+            noise += rng.normal(0, constant_px / FOCAL_PX, noise.shape[1:])
+        xy = xy + noise
         bad, missing = rng.random(xy.shape[:2]) < bad_share, rng.random(xy.shape[:2]) < bad_share
         off = rng.uniform(100, 300, xy.shape) * rng.choice([-1, 1], xy.shape) / FOCAL_PX
         xy = np.where(bad[..., None], xy + off, xy)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from pipelines.geometry.noise import Bias, Drift, NoiseModel, White
 from pipelines.reconstruction.refinement import kernels
 from pipelines.reconstruction.refinement.building import build
-from pipelines.reconstruction.refinement.elimination import System, misfit, prior_cost
-from pipelines.reconstruction.refinement.estimate import covariances, initial_state, solve
+from pipelines.reconstruction.refinement.elimination import System, covariances, eliminate, misfit, prior_cost
+from pipelines.reconstruction.refinement.estimate import initial_state, solve
 from pipelines.reconstruction.refinement.problem import (
     ROTATION,
     SHIFT_IN_CAMERA,
@@ -157,7 +157,7 @@ def test_covariances_are_those_of_the_whole_inverse() -> None:
     times, joints = still.shape[:2]
     own = inverse[: 3 * times * joints, : 3 * times * joints].reshape(times, joints, 3, times, joints, 3)
     expected = np.einsum("tjatjb->tjab", own)
-    found = covariances(system, state)
+    found = covariances(system, eliminate(system, state))
     # Second differences of costs of size 1 with steps of 1e-4 are good to 1e-8 of a curvature of 1e4.
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
 

@@ -18,52 +18,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.reconstruction.refinement import kernels
+from pipelines.reconstruction.refinement import kernels, sweeps
 from pipelines.reconstruction.refinement.problem import Knowledge, Layout, Problem, State
 
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 # Their arguments are assembled from tuples, whose lengths types do not know.
-_assemble: Callable[..., None] = kernels.assemble
+_forwards: Callable[..., tuple[int, float]] = sweeps.forwards
+_visit: Callable[..., tuple[Float, int]] = sweeps.visit
 _whiten: Callable[..., None] = kernels.whiten
 _misfit: Callable[..., float] = kernels.misfit
 
 _SEGMENT = 256  # times of the skeleton
 _KEPT_BYTES = 600e6  # of factors, before segments are factorised twice
+_HELD = 1e10  # 1 / m^2, of a bone length
 _ANYWHERE_M = 100.0  # a joint that nobody saw lies within this of where the search began
-
-
-@dataclass
-class Factor:
-    """One elimination: its unknowns x follow the rest of the front z as x = L^-T (y - W' z)."""
-
-    time: int  # of the joints that were eliminated, or the knot
-    knot: bool
-    lower: Float  # [n, n]
-    across: Float  # [m, n], W'
-    solved: Float  # [n], y
-
-
-@dataclass
-class _Front:
-    """Normal equations of what is alive: joints at three times, knots around them, what all share."""
-
-    matrix: Float  # [N, N] Fortran order, lower triangle
-    gradient: Float  # [N]
-    interval: int
-
-    def copy(self) -> _Front:
-        return _Front(self.matrix.copy(order="F"), self.gradient.copy(), self.interval)
-
-
-@dataclass(frozen=True)
-class Visit:
-    """What the way back sees of one time: the covariance of its whole front, and where things stand."""
-
-    time: int
-    covariance: Float  # [N, N]: three times, knot before, knot after, shared
-    interval: int
 
 
 @dataclass(frozen=True)
@@ -74,6 +44,7 @@ class System:
     knowledge: Knowledge
     layout: Layout
     bound2: float  # of the robust loss
+    held: bool = False  # bone lengths stay as they are
     sharpness: Float = field(init=False)
     white_precision: Float = field(init=False)  # [C, 6], inf without
     inverse_acceleration: Float = field(init=False)  # [J, J]
@@ -81,6 +52,10 @@ class System:
     fraction: Float = field(init=False)  # [G]
     starts: Int64 = field(init=False)  # [T - 1] where the pictures of each time begin
     usual_step_s: float = field(init=False)
+    curvature: Float = field(init=False)  # [T - 2, 3] weights that make an acceleration of three positions
+    spread: Float = field(init=False)  # [T - 2] its variance against the usual
+    tie_kept: Float = field(init=False)  # [K - 1, c] share of a slow error that is left at the next knot
+    tie_variance: Float = field(init=False)  # [K - 1, c] what comes in addition
 
     def __post_init__(self) -> None:
         """Derive what every linearisation needs."""
@@ -88,14 +63,24 @@ class System:
         of_time, fraction = problem.intervals()
         knot_s = float(problem.knot_t_s[1] - problem.knot_t_s[0])
         white = np.array([np.repeat(errors.white_with_stray(knot_s), 3) for errors in known.poses])
+        before, after = np.diff(problem.t_s)[:-1], np.diff(problem.t_s)[1:]
+        usual = float(np.median(np.diff(problem.t_s)))
+        kept, variance = _ties(self.layout)
         derived = {
-            "sharpness": problem.pictures.sharpness / known.pixel_scale,
+            "sharpness": problem.pictures.sharpness / (known.pixel_scale * np.sqrt(known.memory)),
             "white_precision": np.where(white > 0, 1 / np.where(white > 0, white, 1.0) ** 2, np.inf),
             "inverse_acceleration": np.linalg.inv(known.acceleration),
             "of_time": of_time,
             "fraction": fraction,
             "starts": np.searchsorted(problem.pictures.first, np.arange(len(problem.t_s) - 1)),
-            "usual_step_s": float(np.median(np.diff(problem.t_s))),
+            "usual_step_s": usual,
+            "curvature": np.stack(
+                [2 / (before * (before + after)), -2 / (before * after), 2 / (after * (before + after))],
+                axis=1,
+            ),
+            "spread": usual / (0.5 * (before + after)),
+            "tie_kept": kept,
+            "tie_variance": variance,
         }
         for name, value in derived.items():
             object.__setattr__(self, name, value)
@@ -134,41 +119,124 @@ class System:
         lengths = state.shared[self.layout.bone_column :]
         return float(lengths.mean() / self.knowledge.size_m) if len(lengths) else 1.0
 
-    def curvature(self, time: int) -> tuple[Float, float]:
-        """Weights [3] that make an acceleration of three positions, and its variance against the usual."""
-        before, after = np.diff(self.problem.t_s[time : time + 3])
-        weights = 2 / (before + after) * np.array([1 / before, -1 / before - 1 / after, 1 / after])
-        return weights, self.usual_step_s / (0.5 * (before + after))
+    def arguments(self, state: State) -> tuple[Any, ...]:
+        """What the sweeps need to know of the problem and of where it is linearised."""
+        pictures = self.problem.pictures
+        return (
+            self.problem.t_s,
+            state.position,
+            state.knots,
+            state.shared,
+            state.white,
+            self.starts,
+            pictures.camera,
+            pictures.when_s,
+            self.fraction,
+            self.of_time,
+            *self.picture_arguments(),
+            self.bound2,
+            self.white_precision,
+            *self.entries(),
+            self.layout.knot_count,
+            self.curvature,
+            self.spread,
+        )
 
 
-def step(system: System, state: State) -> tuple[State, float]:
-    """The Gauss-Newton step from a state, and half the logarithm of the determinant of its equations."""
-    factors, rest, log_determinant = _eliminate_all(system, state)
-    return _solve_back(system, state, factors, rest), log_determinant
+def _ties(layout: Layout) -> tuple[Float, Float]:
+    """How every unknown of a knot [K - 1, c] goes on to the next."""
+    elapsed_s = np.diff(layout.knot_t_s)
+    kept, variance = (
+        np.ones((len(elapsed_s), layout.knot_count)),
+        np.ones((len(elapsed_s), layout.knot_count)),
+    )
+    for (_, process), (at_knots, column) in zip(layout.processes, layout.place, strict=True):
+        if at_knots:
+            steps = np.array([process.step(float(span)) for span in elapsed_s])
+            kept[:, column : column + 3] = steps[:, :1]
+            variance[:, column : column + 3] = steps[:, 1:]
+    return kept, variance
 
 
-def posterior(
-    system: System,
-    state: State,
-    see_time: Callable[[Visit], None],
-    see_knots: Callable[[int, Float], None] | None = None,
-) -> None:
-    """Visit the posterior covariances of every front, from the last time to the first.
+@dataclass(frozen=True)
+class Moments:
+    """Posterior mean squares of what the levels are the deviations of, and posterior variances."""
 
-    Args:
-        system: the problem and its prior.
-        state: where it is linearised.
-        see_time: called with every time but the last two, which the one before them holds.
-        see_knots: called with every interval between two knots, and their joint covariance.
+    acceleration: Float  # [2, J, J] sums of mean squares and of variances over the times
+    bones: Float  # [B] sums of mean squares
+    image: Float  # [J, 2] weighted squares of residuals, and how many of them the fit leaves
+    white: Float  # [2, 4] of position, rotation: sum of mean squares, count, sum of told shares and squares
+    walked: Float  # [c, 4] of the changes between knots per s: mean squares, count, variances and squares
+    starting: Float  # [c + shared, 2] mean squares and variances at the first time
+    times: int
+
+
+@dataclass
+class Eliminated:
+    """A state's equations after the elimination of all that does not live to the end."""
+
+    state: State
+    kept: _Kept
+    rest: _Front
+    lower: Float  # Cholesky factor of what is left at the end
+    log_determinant: float  # half of it, of all equations, white errors too
+
+
+def eliminate(system: System, state: State) -> Eliminated:
+    """Linearise at a state and eliminate.
+
+    Raises:
+        LinAlgError: the equations are singular.
     """
-    kept, rest, _ = _eliminate_all(system, state)
-    _visit_back(system, state, kept, rest, see_time, see_knots or (lambda _interval, _covariance: None))
+    kept, rest, half = _eliminate_all(system, state)
+    lower = _last_factor(system, rest)
+    return Eliminated(state, kept, rest, lower, half + float(np.log(np.diagonal(lower)).sum()))
+
+
+def step(system: System, at: Eliminated) -> State:
+    """The Gauss-Newton step."""
+    from scipy.linalg.lapack import dpotrs
+
+    last = dpotrs(at.lower, -at.rest.gradient[_alive(system)], lower=1)[0]
+    return _solve_back(system, at, last)
+
+
+def covariances(system: System, at: Eliminated) -> Float:
+    """Posterior covariance [T, J, 3, 3] of every joint at every time."""
+    joints = system.problem.joints
+    covariance = np.zeros((len(system.problem.t_s), joints, 3, 3))
+    _visit_back(system, at.state, at, covariance, 0)
+    return covariance
+
+
+def moments(system: System, state: State, at: Eliminated, *, every: int) -> Moments:
+    """What the levels are estimated from, pictures from one in so many times.
+
+    Covariances are those of the state that was eliminated, squares those of `state`, a step further.
+    """
+    return _visit_back(system, state, at, np.zeros((0, 1, 3, 3)), every)
+
+
+def shared_covariance(system: System, at: Eliminated) -> Float:
+    """Posterior covariance of what all times share."""
+    whole = _last_covariance(at)
+    begins = len(whole) - system.layout.shared_count
+    return whole[begins:, begins:]
+
+
+def samples(system: System, at: Eliminated, count: int, rng: np.random.Generator) -> Iterator[Float]:
+    """Draws [T, J, 3] from the posterior of the joints about 0: the errors that it expects."""
+    from scipy.linalg.lapack import dtrtrs
+
+    for _ in range(count):
+        last = dtrtrs(at.lower, rng.standard_normal(len(at.lower)), lower=1, trans=1)[0]
+        yield _solve_back(system, at, last, rng).position
 
 
 def misfit(system: System, state: State) -> tuple[float, Float, Float]:
-    """Loss of the pictures, whitened squared residuals [G, J], the ten numbers of each picture [G, 10]."""
+    """Loss of the pictures, whitened residuals [G, J, 2], NaN unseen, the ten numbers of each picture."""
     pictures = system.problem.pictures
-    squared = np.empty(pictures.xy.shape[:2])
+    residual = np.empty(pictures.xy.shape)
     numbers = np.empty((len(pictures.first), kernels.NUMBERS))
     total: float = _misfit(
         system.problem.t_s,
@@ -184,10 +252,10 @@ def misfit(system: System, state: State) -> tuple[float, Float, Float]:
         *system.picture_arguments(),
         system.bound2,
         *system.entries(),
-        squared,
+        residual,
         numbers,
     )
-    return total, squared, numbers
+    return total, residual, numbers
 
 
 def prior_cost(system: System, state: State) -> float:
@@ -229,11 +297,36 @@ def _bone_lengths(problem: Problem, position: Float) -> Float:
 
 
 @dataclass
+class _Front:
+    """Normal equations of what is alive: joints at three times, knots around them, what all share."""
+
+    matrix: Float  # [N, N] lower triangle
+    gradient: Float  # [N]
+    interval: int
+
+    def copy(self) -> _Front:
+        return _Front(self.matrix.copy(), self.gradient.copy(), self.interval)
+
+
+@dataclass
+class _Factors:
+    """What a segment's elimination leaves; see `sweeps.forwards`."""
+
+    first_interval: int
+    inverse: Float
+    across: Float
+    solved: Float
+    knot_inverse: Float
+    knot_across: Float
+    knot_solved: Float
+
+
+@dataclass
 class _Kept:
-    """Factors of segments: all of them, or the fronts from which they are made again."""
+    """Factors of segments, or the fronts from which they are made again."""
 
     fronts: list[_Front]
-    factors: dict[int, list[Factor]]
+    factors: dict[int, _Factors]
 
 
 def _segments(system: System) -> list[tuple[int, int]]:
@@ -248,8 +341,8 @@ def _eliminate_all(system: System, state: State) -> tuple[_Kept, _Front, float]:
     bytes_per_time = 8 * 3 * system.problem.joints * system.size
     for index, (first, last) in enumerate(_segments(system)):
         kept.fronts.append(front.copy())
-        factors = list(_eliminate(system, state, front, first, last))
-        log_determinant += sum(float(np.log(np.diagonal(factor.lower)).sum()) for factor in factors)
+        factors, part = _eliminate(system, state, front, first, last)
+        log_determinant += part
         if bytes_per_time * last < _KEPT_BYTES or last == len(system.problem.t_s) - 2:
             kept.factors[index] = factors
     return kept, front, log_determinant
@@ -258,7 +351,7 @@ def _eliminate_all(system: System, state: State) -> tuple[_Kept, _Front, float]:
 def _begin(system: System, state: State) -> _Front:
     """The priors of what is there from the start."""
     layout, n3 = system.layout, 9 * system.problem.joints
-    front = _Front(np.zeros((system.size, system.size), order="F"), np.zeros(system.size), 0)
+    front = _Front(np.zeros((system.size, system.size)), np.zeros(system.size), 0)
     for (_, process), (at_knots, column) in zip(layout.processes, layout.place, strict=True):
         value = state.knots[0] if at_knots else state.shared
         offset = n3 if at_knots else n3 + 2 * layout.knot_count
@@ -271,193 +364,135 @@ def _begin(system: System, state: State) -> _Front:
             front.matrix[place, place] += 1 / sigma**2
             front.gradient[place] += state.shared[column] / sigma**2
     for place in range(n3 + 2 * layout.knot_count + layout.bone_column, system.size):
-        front.matrix[place, place] += 1e-6  # a length that nothing speaks of stays where it is
-    _tie_knots(system, state, front)
+        # A length that nothing speaks of stays where it is.
+        front.matrix[place, place] += _HELD if system.held else 1e-6
+    if layout.knot_count:
+        sweeps.begin(
+            front.matrix,
+            front.gradient,
+            3 * system.problem.joints,
+            layout.knot_count,
+            state.knots,
+            system.tie_kept,
+            system.tie_variance,
+        )
     return front
 
 
-def _tie_knots(system: System, state: State, front: _Front) -> None:
-    """The random walk from the knot before to the knot after."""
-    layout, before = system.layout, 9 * system.problem.joints
-    if layout.knot_count == 0:
-        return
-    after, k = before + layout.knot_count, front.interval
-    elapsed_s = layout.knot_t_s[k + 1] - layout.knot_t_s[k]
-    for (_, process), (at_knots, column) in zip(layout.processes, layout.place, strict=True):
-        if not at_knots:
-            continue
-        kept, variance = process.step(elapsed_s)
-        for i in range(column, column + 3):
-            change = state.knots[k + 1, i] - kept * state.knots[k, i]
-            front.matrix[before + i, before + i] += kept**2 / variance
-            front.matrix[after + i, after + i] += 1 / variance
-            front.matrix[after + i, before + i] -= kept / variance
-            front.gradient[before + i] -= kept * change / variance
-            front.gradient[after + i] += change / variance
-
-
-def _eliminate(system: System, state: State, front: _Front, first: int, last: int) -> Iterator[Factor]:
+def _eliminate(system: System, state: State, front: _Front, first: int, last: int) -> tuple[_Factors, float]:
     """Eliminate the knots and joints of some times; the front is changed in place."""
-    for time in range(first, last):
-        while system.layout.knot_count and front.interval < system.of_time[time]:
-            yield _eliminate_knot(system, state, front)
-        _add_time(system, state, front, time)
-        yield _eliminate_joints(system, front, time)
-
-
-def _add_time(system: System, state: State, front: _Front, time: int) -> None:
-    problem, layout, pictures = system.problem, system.layout, system.problem.pictures
-    _assemble(
-        system.starts[time],
-        system.starts[time + 1],
-        time,
-        problem.t_s,
-        state.position,
-        state.knots,
-        state.shared,
-        state.white,
-        pictures.camera,
-        pictures.when_s,
-        system.fraction,
+    n, c = 3 * system.problem.joints, system.layout.knot_count
+    times, size = last - first, system.size
+    knots = int(system.of_time[last - 1]) - front.interval if c else 0
+    factors = _Factors(
         front.interval,
-        *system.picture_arguments(),
-        system.bound2,
-        system.white_precision,
-        *system.entries(),
-        layout.knot_count,
-        front.matrix,
-        front.gradient,
+        np.zeros((times, n, n)),
+        np.zeros((times, size - n, n)),
+        np.zeros((times, n)),
+        np.zeros((knots, c, c)),
+        np.zeros((knots, size - n - c, c)),
+        np.zeros((knots, c)),
     )
-    weights, spread = system.curvature(time)
-    lengths = state.shared[layout.bone_column :]
     grown = system.grown(state)
-    length_offset = 9 * problem.joints + 2 * layout.knot_count + layout.bone_column
-    # All bones of a time at once with the first of its three; the last two times have their own.
-    times = range(1) if time < len(problem.t_s) - 3 else range(3)
-    kernels.add_motion(
-        state.position[time : time + 3],
-        weights,
-        system.inverse_acceleration / (spread * grown**2),
-        1 / _ANYWHERE_M**2,
-        lengths,
-        length_offset,
-        front.matrix,
-        front.gradient,
-    )
-    for offset in times:
-        kernels.add_bones(
-            state.position[time + offset],
-            problem.bones,
-            lengths,
-            system.knowledge.bone_sigma_m * grown,
-            3 * problem.joints * offset,
-            length_offset,
+    try:
+        front.interval, log_determinant = _forwards(
+            first,
+            last,
+            *system.arguments(state),
+            system.inverse_acceleration,
+            1 / _ANYWHERE_M**2,
+            system.problem.bones,
+            system.knowledge.bone_sigma_m,
+            grown,
+            system.tie_kept,
+            system.tie_variance,
             front.matrix,
             front.gradient,
+            front.interval,
+            factors.inverse,
+            factors.across,
+            factors.solved,
+            factors.knot_inverse,
+            factors.knot_across,
+            factors.knot_solved,
         )
-
-
-def _eliminate_joints(system: System, front: _Front, time: int) -> Factor:
-    n = 3 * system.problem.joints
-    factor, rest, gradient = _partial(front.matrix, front.gradient, n, time, knot=False)
-    # The joints at the next two times move up, and those of a third come in, of which nothing is known yet.
-    size = system.size
-    matrix = front.matrix
-    matrix[: 2 * n, : 2 * n] = rest[: 2 * n, : 2 * n]
-    matrix[2 * n : 3 * n] = 0.0
-    matrix[2 * n :, 2 * n : 3 * n] = 0.0
-    matrix[3 * n :, : 2 * n] = rest[2 * n :, : 2 * n]
-    matrix[3 * n :, 3 * n :] = rest[2 * n :, 2 * n :]
-    front.gradient = np.concatenate([gradient[: 2 * n], np.zeros(n), gradient[2 * n : size - n]])
-    return factor
-
-
-def _eliminate_knot(system: System, state: State, front: _Front) -> Factor:
-    n3, count = 9 * system.problem.joints, system.layout.knot_count
-    order = np.concatenate([np.arange(n3, n3 + count), np.arange(n3), np.arange(n3 + count, system.size)])
-    whole = front.matrix + np.tril(front.matrix, -1).T
-    # The joints of the third time are not in yet: a one on their diagonal keeps them apart.
-    factor, rest, gradient = _partial(
-        np.asfortranarray(np.tril(whole[np.ix_(order, order)])), front.gradient[order], count,
-        front.interval, knot=True,
-    )  # fmt: skip
-    kept = np.concatenate([np.arange(n3), np.arange(n3, n3 + count), np.arange(n3 + 2 * count, system.size)])
-    matrix = np.zeros_like(front.matrix)
-    matrix[np.ix_(kept, kept)] = np.tril(rest)
-    front.matrix = np.asfortranarray(matrix)
-    front.gradient = np.zeros_like(front.gradient)
-    front.gradient[kept] = gradient
-    front.interval += 1
-    _tie_knots(system, state, front)
-    return factor
-
-
-def _partial(matrix: Float, gradient: Float, n: int, time: int, *, knot: bool) -> tuple[Factor, Float, Float]:
-    """Eliminate the first n unknowns; the Schur complement (lower) and gradient of the others."""
-    from scipy.linalg.blas import dsyrk, dtrsm
-    from scipy.linalg.lapack import dpotrf, dtrtrs
-
-    lower, failed = dpotrf(matrix[:n, :n], lower=1, clean=1)
-    if failed:
-        raise np.linalg.LinAlgError(f"the equations at {'knot' if knot else 'time'} {time} are singular")
-    across = dtrsm(1.0, lower, matrix[n:, :n], side=1, lower=1, trans_a=1)
-    rest = dsyrk(-1.0, across, beta=1.0, c=matrix[n:, n:], lower=1)
-    solved = dtrtrs(lower, -gradient[:n], lower=1)[0]
-    return Factor(time, knot, lower, across, solved), rest, gradient[n:] + across @ solved
+    except np.linalg.LinAlgError as error:
+        raise np.linalg.LinAlgError("the equations of the refinement are singular") from error
+    return factors, log_determinant
 
 
 # --- backwards -----------------------------------------------------------------------------------------
 
 
-def _last_front(system: System, rest: _Front) -> tuple[Float, Float]:
-    """Factor and solution of what is left at the end: two times, two knots, what all share."""
-    from scipy.linalg.lapack import dpotrf, dpotrs
-
+def _alive(system: System) -> Int64:
+    """What of a front is left at the end: two times, two knots, what all share."""
     n = 3 * system.problem.joints
-    alive = np.concatenate([np.arange(2 * n), np.arange(3 * n, system.size)])
+    return np.concatenate([np.arange(2 * n), np.arange(3 * n, system.size)])
+
+
+def _last_factor(system: System, rest: _Front) -> Float:
+    from scipy.linalg.lapack import dpotrf
+
+    alive = _alive(system)
+    lower: Float
     lower, failed = dpotrf(rest.matrix[np.ix_(alive, alive)], lower=1, clean=1)
     if failed:
         raise np.linalg.LinAlgError("the equations of what all times share are singular")
-    return lower, dpotrs(lower, -rest.gradient[alive], lower=1)[0]
+    return lower
 
 
-def _factors_backwards(system: System, state: State, kept: _Kept) -> Iterator[Factor]:
+def _last_covariance(at: Eliminated) -> Float:
+    from scipy.linalg.lapack import dpotri
+
+    inverse, _ = dpotri(at.lower, lower=1)
+    return np.ascontiguousarray(np.tril(inverse) + np.tril(inverse, -1).T)
+
+
+def _factors_backwards(system: System, at: Eliminated) -> Iterator[tuple[int, int, _Factors]]:
     segments = _segments(system)
     for index in range(len(segments) - 1, -1, -1):
-        factors = kept.factors.pop(index, None)
+        factors = at.kept.factors.get(index)
         if factors is None:
-            factors = list(_eliminate(system, state, kept.fronts[index].copy(), *segments[index]))
-        yield from reversed(factors)
+            factors, _ = _eliminate(system, at.state, at.kept.fronts[index].copy(), *segments[index])
+        yield *segments[index], factors
 
 
-def _solve_back(system: System, state: State, kept: _Kept, rest: _Front) -> State:
-    from scipy.linalg.lapack import dtrtrs
-
-    problem, layout = system.problem, system.layout
+def _solve_back(
+    system: System, at: Eliminated, last_solution: Float, rng: np.random.Generator | None = None
+) -> State:
+    """The unknowns of all times from those of the last; a draw about 0 where `rng` says so."""
+    problem, layout, state = system.problem, system.layout, at.state
     n, count = 3 * problem.joints, layout.knot_count
-    _, solution = _last_front(system, rest)
     times = len(problem.t_s)
     position, knots = np.zeros((times, n)), np.zeros_like(state.knots)
-    position[-2:] = solution[: 2 * n].reshape(2, n)
-    shared = solution[2 * n + 2 * count :]
-    k = rest.interval
+    position[-2:] = last_solution[: 2 * n].reshape(2, n)
+    shared = np.ascontiguousarray(last_solution[2 * n + 2 * count :])
+    interval = at.rest.interval
     if count:
-        knots[k : k + 2] = solution[2 * n : 2 * n + 2 * count].reshape(2, count)
-    time = times - 2
-    for factor in _factors_backwards(system, state, kept):
-        if factor.knot:
-            k = factor.time
-            others = np.concatenate([position[time : time + 2].ravel(), np.zeros(n), knots[k + 1], shared])
-        else:
-            time = factor.time
-            beside = knots[k : k + 2].ravel() if count else np.zeros(0)
-            others = np.concatenate([position[time + 1 : time + 3].ravel(), beside, shared])
-        found = dtrtrs(factor.lower, factor.solved - factor.across.T @ others, lower=1, trans=1)[0]
-        if factor.knot:
-            knots[k] = found
-        else:
-            position[time] = found
+        knots[interval : interval + 2] = last_solution[2 * n : 2 * n + 2 * count].reshape(2, count)
+    for first, last, factors in _factors_backwards(system, at):
+        solved, knot_solved = factors.solved, factors.knot_solved
+        if rng is not None:
+            solved, knot_solved = rng.standard_normal(solved.shape), rng.standard_normal(knot_solved.shape)
+        interval = sweeps.backwards(
+            first,
+            last,
+            system.of_time,
+            interval,
+            factors.first_interval,
+            factors.inverse,
+            factors.across,
+            solved,
+            factors.knot_inverse,
+            factors.knot_across,
+            knot_solved,
+            position,
+            knots,
+            shared,
+        )
     moved = State(position.reshape(state.position.shape), knots, shared, np.zeros_like(state.white))
+    if rng is not None:
+        return moved
     pictures = problem.pictures
     _whiten(
         problem.t_s,
@@ -482,59 +517,45 @@ def _solve_back(system: System, state: State, kept: _Kept, rest: _Front) -> Stat
     return moved
 
 
-def _visit_back(
-    system: System,
-    state: State,
-    kept: _Kept,
-    rest: _Front,
-    see_time: Callable[[Visit], None],
-    see_knots: Callable[[int, Float], None],
-) -> None:
-    from scipy.linalg.lapack import dpotri, dtrtri
-
-    n, count = 3 * system.problem.joints, system.layout.knot_count
-    lower, _ = _last_front(system, rest)
-    inverse, _ = dpotri(lower, lower=1)
-    others = np.tril(inverse) + np.tril(inverse, -1).T
-    interval = rest.interval
-    both = slice(2 * n, 2 * n + 2 * count)
-    if count:
-        see_knots(interval, others[both, both])
-    for factor in _factors_backwards(system, state, kept):
-        inverse_lower, _ = dtrtri(factor.lower, lower=1)
-        if factor.knot:
-            # Alive beside it: two times, a third that is not in yet, the knot after, what all share.
-            interval = factor.time
-            there = np.concatenate([np.arange(2 * n), np.arange(3 * n, system.size - count)])
-            across = factor.across[there]
-            alive = np.concatenate([np.arange(2 * n + count), np.arange(2 * n + 2 * count, len(others))])
-            beside = others[np.ix_(alive, alive)]
-            own, cross = _join(inverse_lower, across, beside)
-            joined = np.empty_like(others)
-            knot = np.arange(2 * n, 2 * n + count)
-            place = np.concatenate([np.arange(2 * n), np.arange(2 * n + count, len(others))])
-            joined[np.ix_(place, place)] = beside
-            joined[np.ix_(knot, knot)] = own
-            joined[np.ix_(knot, place)] = cross
-            joined[np.ix_(place, knot)] = cross.T
-            others = joined
-            see_knots(interval, others[both, both])
-            continue
-        own, cross = _join(inverse_lower, factor.across, others)
-        whole = np.empty((system.size, system.size))
-        whole[:n, :n] = own
-        whole[:n, n:] = cross
-        whole[n:, :n] = cross.T
-        whole[n:, n:] = others
-        see_time(Visit(factor.time, whole, interval))
-        alive = np.concatenate([np.arange(2 * n), np.arange(3 * n, system.size)])
-        others = np.ascontiguousarray(whole[np.ix_(alive, alive)])
-
-
-def _join(inverse_lower: Float, across: Float, others: Float) -> tuple[Float, Float]:
-    """Covariance of what was eliminated, and with the others, given that of the others."""
-    gain = -(across @ inverse_lower).T  # [n, m]
-    cross = gain @ others
-    own = inverse_lower.T @ inverse_lower + cross @ gain.T
-    # Rounding must not grow from step to step: what is not symmetric would.
-    return (own + own.T) / 2, cross
+def _visit_back(system: System, state: State, at: Eliminated, covariance: Float, every: int) -> Moments:
+    problem, layout = system.problem, system.layout
+    joints = problem.joints
+    others = _last_covariance(at)
+    found = Moments(
+        np.zeros((2, joints, joints)),
+        np.zeros(len(problem.bones)),
+        np.zeros((joints, 2)),
+        np.zeros((2, 4)),
+        np.zeros((layout.knot_count, 4)),
+        np.zeros((layout.knot_count + layout.shared_count, 2)),
+        len(problem.t_s) - 2,
+    )
+    interval = at.rest.interval
+    if layout.knot_count and every:
+        sweeps.last_walk(
+            others, 3 * joints, layout.knot_count, state.knots, layout.knot_t_s, interval, found.walked
+        )
+    for first, last, factors in _factors_backwards(system, at):
+        others, interval = _visit(
+            first,
+            last,
+            *system.arguments(state),
+            problem.bones,
+            layout.knot_t_s,
+            others,
+            interval,
+            factors.first_interval,
+            factors.inverse,
+            factors.across,
+            factors.knot_inverse,
+            factors.knot_across,
+            every,
+            covariance,
+            found.acceleration,
+            found.bones,
+            found.image,
+            found.white,
+            found.walked,
+            found.starting,
+        )
+    return found

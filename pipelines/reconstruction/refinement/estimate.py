@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.reconstruction.refinement.elimination import (
+    Eliminated,
     System,
-    Visit,
+    eliminate,
     misfit,
-    posterior,
     prior_cost,
     step,
 )
 from pipelines.reconstruction.refinement.levels import reestimated
+from pipelines.reconstruction.refinement.memory import memory_of
 from pipelines.reconstruction.refinement.problem import (
     Knowledge,
     Problem,
@@ -26,65 +29,97 @@ Float = NDArray[np.float64]
 BOUND = 3.5
 """Standard deviations of an image point beyond which its weight falls: one good view in 450."""
 
+REMEMBERED = 1.5
+"""Memory of keypoint errors above which it matters."""
+
 _CONVERGED_M = 2e-4
 _BOUNDS = (20.0, 8.0, BOUND)
+_SETTLED = 3  # rounds after which an estimate is one of its prior
 _WIDE = 4.0  # times the usual residual of the start: poses are not corrected yet
 
 
 def solve(
     problem: Problem, known: Knowledge, state: State, *, rounds: int, bounds: tuple[float, ...] = _BOUNDS
-) -> tuple[System, State, int]:
-    """Gauss-Newton with halved steps where the cost would rise; the robust bound tightens as it goes."""
+) -> tuple[System, State, Eliminated]:
+    """Gauss-Newton with halved steps where the cost would rise; the robust bound tightens as it goes.
+
+    The equations returned are those of the last step, within a step of the state.
+    """
     layout = lay_out(known.poses, known.clock_sigma_s, len(problem.bones), problem.knot_t_s)
-    done = 0
     for done in range(1, rounds + 1):
         bound = bounds[min(done, len(bounds)) - 1]
         if done < len(bounds):
-            _, squared, _ = misfit(System(problem, known, layout, bound**2), state)
-            bound = max(bound, _WIDE * float(np.sqrt(np.nanmedian(squared))))
-        system = System(problem, known, layout, bound**2)
-        direction, _ = step(system, state)
-        cost = _cost(system, state)
+            _, residual, _ = misfit(System(problem, known, layout, bound**2), state)
+            bound = max(bound, _WIDE * float(np.sqrt(np.nanmedian((residual**2).sum(axis=-1)))))
+        # Where poses are noisy the start jumps from picture to picture, which a giant would do more easily.
+        system = System(problem, known, layout, bound**2, held=done < len(bounds))
+        at = eliminate(system, state)
+        direction = step(system, at)
+        before = cost(system, state)
         share = 1.0
-        while share > 0.01 and not _cost(system, state.moved(direction, share)) <= cost * (1 + 1e-9):
+        while share > 0.01 and not cost(system, state.moved(direction, share)) <= before * (1 + 1e-9):
             share /= 2
         state = state.moved(direction, share)
         moved = float(np.sqrt(np.mean((share * direction.position) ** 2)))
         if moved < _CONVERGED_M and done >= len(bounds):
             break
-    return System(problem, known, layout, bounds[-1] ** 2), state, done
+    return system, state, at
 
 
-def _cost(system: System, state: State) -> float:
+def cost(system: System, state: State) -> float:
+    """Minus twice the logarithm of the posterior, up to a constant."""
     return misfit(system, state)[0] + prior_cost(system, state)
-
-
-def covariances(system: System, state: State) -> Float:
-    """Posterior covariance [T, J, 3, 3] of every joint at every time."""
-    joints = system.problem.joints
-    n = 3 * joints
-    result = np.empty((len(system.problem.t_s), joints, 3, 3))
-    last = len(result) - 3
-    pick = 3 * np.arange(joints)[:, None] + np.arange(3)
-
-    def see(visit: Visit) -> None:
-        for offset in range(3) if visit.time == last else (0,):
-            place = pick + offset * n
-            result[visit.time + offset] = visit.covariance[place[:, :, None], place[:, None, :]]
-
-    posterior(system, state, see)
-    return result
 
 
 def learn(
     problem: Problem, known: Knowledge, state: State, *, poses: bool, rounds: int
 ) -> tuple[Knowledge, State]:
-    """Alternate Gauss-Newton steps and reestimates of the prior's parameters."""
+    """Alternate Gauss-Newton steps and reestimates of the prior's parameters.
+
+    Halfway, when residuals hold few pose errors any more, the memory of keypoint errors is estimated. From
+    there on slow pose errors are held against keypoints that say accordingly less, and motion and image
+    noise, which are quick, stay as they are if that is much less.
+
+    Args:
+        problem: stretches of the flight.
+        known: where to begin.
+        state: where to begin.
+        poses: whether levels of pose errors are among the parameters.
+        rounds: how often.
+    """
     for index in range(rounds):
         bounds = _BOUNDS if index == 0 else (BOUND,)
-        system, state, _ = solve(problem, known, state, rounds=3 if index == 0 else 1, bounds=bounds)
-        known = reestimated(system, state, poses=poses)
+        system, state, at = solve(problem, known, state, rounds=3 if index == 0 else 1, bounds=bounds)
+        known = reestimated(system, state, at, poses=poses, motion=known.memory < REMEMBERED)
+        if poses and index == rounds // 2:
+            known = replace(known, memory=memory_of(system, state))
     return known, state
+
+
+def evidence(problem: Problem, known: Knowledge, state: State) -> float:
+    """Logarithm of how likely the pictures are under a prior, up to a constant of the pictures.
+
+    Laplace's approximation about the estimate that belongs to the prior, two Gauss-Newton steps from
+    `state`. The pictures count as if only one in `known.memory` were there.
+    """
+    system, state, _ = solve(problem, known, state, rounds=_SETTLED, bounds=(BOUND,))
+    at = eliminate(system, state)
+    grown = system.grown(state)
+    times = len(problem.t_s)
+    value = -0.5 * cost(system, state) - at.log_determinant
+    value -= 2 * float(problem.pictures.trust.sum()) / known.memory * np.log(known.pixel_scale)
+    # Motion and bones in units of the body, whose size beforehand is as likely to be any.
+    _, log_determinant = np.linalg.slogdet(known.acceleration / known.size_m**2)
+    value -= 1.5 * (times - 2) * float(log_determinant)
+    value -= times * float(np.log(known.bone_sigma_m / known.size_m).sum())
+    value -= (state.position.size + len(problem.bones)) * float(np.log(known.size_m * grown))
+    white = system.white_precision[problem.pictures.camera]
+    value += 0.5 * float(np.log(white[np.isfinite(white)]).sum())
+    for (_, process), (at_knots, column) in zip(system.layout.processes, system.layout.place, strict=True):
+        value -= 3 * float(np.log(process.sigma0))
+        if at_knots:
+            value -= 0.5 * float(np.log(system.tie_variance[:, column : column + 3]).sum())
+    return float(value)
 
 
 def initial_state(problem: Problem, known: Knowledge, position: Float) -> State:

@@ -283,7 +283,7 @@ def numbers_of(
         out[i] += white[i]
 
 
-@cached
+@helper
 def assemble(
     first_picture: int,
     last_picture: int,
@@ -314,8 +314,10 @@ def assemble(
     knot_count: int,
     front: Float,
     gradient: Float,
-) -> None:
+) -> float:
     """Add the pictures whose three times begin at `first` to the front.
+
+    Returns half the logarithm of the determinant of the white errors' equations, which are eliminated.
 
     The front's unknowns are the joints at three times, the knots on both sides of the interval, what all
     share; only its lower triangle is kept. A `white_precision` [C, 6] of inf means no white part.
@@ -332,6 +334,7 @@ def assemble(
     factor, by_white, z = np.empty((WHITE, WHITE)), np.empty((n + NUMBERS, WHITE)), np.empty(WHITE)
     most = 2 * (entry_column.size + 1)
     column, of_number, share = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
+    half = 0.0
     for g in range(first_picture, last_picture):
         c = camera[g]
         moved = when[g] + (shared[clock_column[c]] if clock_column[c] >= 0 else 0.0)
@@ -359,6 +362,8 @@ def assemble(
                 factor[a, a] += white_precision[c, a]
                 z[a] = number_gradient[a] + white_precision[c, a] * white[g, a]
             factorise(factor)
+            for a in range(WHITE):
+                half += np.log(factor[a, a])
             forward(factor, z)
             for joint in range(J):
                 for i in range(3):
@@ -403,8 +408,8 @@ def assemble(
                                 both * of_joints[joint, i, j]
                             )
                 if eliminated:
-                    for q in range(n):
-                        for p in range(q if k == m else 0, n):
+                    for p in range(n):
+                        for q in range(p + 1 if k == m else n):
                             total = 0.0
                             for a in range(WHITE):
                                 total += by_white[p, a] * by_white[q, a]
@@ -434,6 +439,7 @@ def assemble(
                     for i in range(WHITE):
                         total -= by_white[n + a, i] * by_white[n + b, i]
                     front[column[e], column[f]] += share[e] * share[f] * total
+    return half
 
 
 @cached
@@ -543,10 +549,10 @@ def misfit(
     entry_knot: Int64,
     entry_column: Int64,
     clock_column: Int64,
-    squared: Float,
+    residuals: Float,
     numbers: Float,
 ) -> float:
-    """The loss of all pictures; whitened squared residuals [G, J] (NaN unseen) and numbers [G, 10] beside."""
+    """The loss of all pictures; whitened residuals [G, J, 2] (NaN unseen) and numbers [G, 10] beside."""
     J = position.shape[1]
     out, rate = np.empty((J, 3)), np.empty((J, 3))
     weight, slope = np.empty(3), np.empty(3)
@@ -566,13 +572,13 @@ def misfit(
         )  # fmt: skip
         for joint in range(J):
             value = residual[joint, 0] ** 2 + residual[joint, 1] ** 2
-            squared[g, joint] = value
+            residuals[g, joint] = residual[joint]
             if not np.isnan(value):
                 total += trust[g, joint] * loss_of(value, bound2)
     return total
 
 
-@cached
+@helper
 def rows_of_picture(
     g: int,
     first: int,
@@ -701,11 +707,12 @@ def rows_of_picture(
                     own[2 * joint + axis] += z[b] * z[b]
 
 
-@cached
+@helper
 def add_motion(
     position: Float,
     weights: Float,
     precision: Float,
+    scale: float,
     hold: float,
     lengths: Float,
     length_offset: int,
@@ -715,8 +722,9 @@ def add_motion(
     """Add how unlikely the acceleration between three times is, in units of the body's size.
 
     The size is the mean of the bone lengths. Without it the estimate would shrink: smaller bodies
-    accelerate less, and pictures do not tell the scale. `precision` [J, J] is for every axis at the size
-    that the lengths have now; `hold` is added to the diagonal of the first time, and pulls at nothing.
+    accelerate less, and pictures do not tell the scale. `precision` [J, J] times `scale` is for every axis
+    at the size that the lengths have now; `hold` is added to the diagonal of the first time, and pulls
+    at nothing.
     """
     J, B = position.shape[1], len(lengths)
     n = 3 * J
@@ -731,7 +739,7 @@ def add_motion(
         for a in range(J):
             pull[a] = 0.0
             for b in range(J):
-                pull[a] += precision[a, b] * acceleration[b]
+                pull[a] += scale * precision[a, b] * acceleration[b]
             cost += pull[a] * acceleration[a]
         for k in range(3):
             for a in range(J):
@@ -744,21 +752,22 @@ def add_motion(
             front[length_offset + b, length_offset + d] += cost * shrinking * shrinking
     for k in range(3):
         for m in range(k + 1):
-            both = weights[k] * weights[m]
-            for b in range(J):
-                for a in range(b if k == m else 0, J):
+            both = scale * weights[k] * weights[m]
+            for a in range(J):
+                for b in range(a + 1 if k == m else J):
                     for axis in range(3):
                         front[k * n + 3 * a + axis, m * n + 3 * b + axis] += both * precision[a, b]
     for i in range(n):
         front[i, i] += hold
 
 
-@cached
+@helper
 def add_bones(
     position: Float,
     bones: Int64,
     lengths: Float,
     sigma: Float,
+    grown: float,
     offset: int,
     length_offset: int,
     front: Float,
@@ -776,7 +785,7 @@ def add_bones(
         length = np.sqrt(length)
         if length < 1e-6:
             continue
-        weight = 1 / sigma[b] ** 2
+        weight = 1 / (sigma[b] * grown) ** 2
         residual = length - lengths[b]
         for axis in range(3):
             direction[axis] /= length

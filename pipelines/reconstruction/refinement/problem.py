@@ -218,6 +218,8 @@ class Knowledge:
     bone_sigma_m: Float  # [B] how far a bone's length varies
     size_m: float  # mean bone length of the body for which these two hold; they go with it
     pixel_scale: float  # what the stated standard deviations of image points are to be multiplied by
+    memory: float = 1.0
+    """So many neighbouring image points of a joint in a camera say as much as one independent point."""
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.reconstruction.refinement.building import Sighting, build
-from pipelines.reconstruction.refinement.elimination import System, misfit
-from pipelines.reconstruction.refinement.estimate import covariances, initial_state, learn, solve
+from pipelines.reconstruction.refinement.elimination import (
+    Eliminated,
+    System,
+    covariances,
+    misfit,
+    shared_covariance,
+)
+from pipelines.reconstruction.refinement.estimate import (
+    BOUND,
+    REMEMBERED,
+    evidence,
+    initial_state,
+    learn,
+    solve,
+)
 from pipelines.reconstruction.refinement.kernels import exponential
 from pipelines.reconstruction.refinement.problem import (
     ROTATION,
@@ -27,13 +40,17 @@ Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 _WINDOWS, _WINDOW = 3, 100  # stretches of the flight, in times, from which the prior is found
-_LEARNING_ROUNDS = 8
+_LEARNING_ROUNDS, _FEWER_ROUNDS = 8, 3
 _ROUNDS = 8
 _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2 where the search begins: a walking body, its limbs
 _BONE_SIGMA_M = 0.02
 _FEWEST_TIMES = 20
 _UNEXPLAINED = 1.15  # times the image noise that the pictures show between neighbours: the prior is wrong
 _SIGMAS = 4.0
+_STATED = 10.0  # by how much its evidence, a logarithm, is raised
+_SMALL_SCALE = 0.01  # standard deviation of the constellation's scale that is no matter
+_UNSEEN_SCALE = 0.85  # share of it that is left once the pictures were seen, from which they did not tell it
+_SLOW_SHARE = 0.2  # of the disagreement of views: slow errors where the search begins, at least
 _MEDIAN_OF_TWO = 2 * np.log(2)  # of the chi-square distribution with two degrees of freedom
 _FARTHEST = 1.8
 """Times what the disagreement of the views lets expect; good estimates moved by up to 1.6 of it."""
@@ -82,13 +99,16 @@ def refine(
         known, learned, warnings, expected_m = _find_prior(t_s, sightings, begun, bones, prior, clock_sigma_s)
         problem = build(t_s, sightings, bones)
         state = initial_state(problem, known, begun)
-        system, state, _ = solve(problem, known, state, rounds=_ROUNDS)
-        covariance = covariances(system, state)
+        system, state, at = solve(problem, known, state, rounds=_ROUNDS)
+        covariance = covariances(system, at)
+        quick = state.position
+        if known.memory > REMEMBERED:
+            quick = _quickly(system, state)
     except np.linalg.LinAlgError as error:
         return _none(sightings, start, str(error))
-    fallback = _doubts(system, state, learned=learned) or _too_far(state, begun, expected_m)
+    fallback = _doubts(system, state, at, learned=learned) or _too_far(quick, begun, expected_m)
     position = np.full_like(start, np.nan)
-    position[:, part] = state.position
+    position[:, part] = quick
     whole = np.full((*start.shape, 3), np.nan)
     whole[:, part] = covariance
     return Refined(
@@ -102,6 +122,29 @@ def refine(
         warnings=tuple(warnings),
         fallback=fallback,
     )
+
+
+def _quickly(system: System, state: State) -> Float:
+    """The joints [T, J, 3] once slow pose errors are taken away, every keypoint counting in full.
+
+    Keypoints that err for long were made to count less, which is right for slow pose errors and wrong for
+    limbs: those would be smoothed away.
+    """
+    pictures, known = system.problem.pictures, system.knowledge
+    slow = replace(state, white=np.zeros_like(state.white))
+    _, _, numbers = misfit(system, slow)
+    position, rotation = corrected(pictures.position, pictures.rotation, numbers)
+    # Clocks and what goes with them stay unknowns.
+    problem = replace(system.problem, pictures=replace(pictures, position=position, rotation=rotation))
+    knot_s = float(problem.knot_t_s[1] - problem.knot_t_s[0])
+    poses = []
+    for errors in known.poses:
+        white = errors.white_with_stray(knot_s)
+        poses.append(PoseErrors((float(white[0]), float(white[1])), ()))
+    known = replace(known, poses=tuple(poses), memory=1.0)
+    begun = initial_state(problem, known, state.position)
+    _, found, _ = solve(problem, known, begun, rounds=4, bounds=(BOUND,))
+    return found.position
 
 
 def corrected(position: Float, rotation: Float, numbers: Float) -> tuple[Float, Float]:
@@ -167,7 +210,11 @@ def _find_prior(
 ) -> tuple[Knowledge, bool, list[str], float]:
     """The parameters of the prior from stretches of the flight; whether pose errors are among them.
 
-    At the end, by how many metres the views disagree at the actor.
+    Pose errors of estimated levels, none at all, and what was stated compete by their evidence. At the end,
+    by how many metres the skeleton may move.
+
+    Raises:
+        LinAlgError: none of them explains the pictures.
     """
     chosen = _stretches(len(t_s))
     problem = build(t_s[chosen], sightings, bones)
@@ -175,18 +222,32 @@ def _find_prior(
     # n rays from all around, each off by s on two axes, leave a point off by s sqrt(9 / 2n) in space.
     stated_m = 0.0 if prior is None else float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
     spread = _FARTHEST * float(np.sqrt(4.5 / len(sightings)))
-    warnings: list[str] = []
-    if prior is not None:
-        known = _learned(problem, start[chosen], tuple(prior), clock_sigma_s, poses=False)
-        if known is not None and known.pixel_scale < _UNEXPLAINED * image:
-            return known, False, warnings, spread * max(disagreement_m, stated_m)
-        warnings.append(
-            "refined: the stated pose noise does not explain the pictures; its levels were estimated instead"
-        )
-    known = _learned(problem, start[chosen], (guess,) * len(sightings), clock_sigma_s, poses=True)
-    if known is None:
+    begun = _unlearned(problem, start[chosen], (guess,) * len(sightings), clock_sigma_s)
+    state = initial_state(problem, begun, start[chosen])
+    free, state = learn(problem, begun, state, poses=True, rounds=_LEARNING_ROUNDS)
+    candidates = {"estimated": (free, state)}
+    others = {} if prior is None else {"stated": tuple(prior)}
+    others["exact"] = (PoseErrors((0.0, 0.0), ()),) * len(sightings)
+    for name, poses in others.items():
+        known = replace(free, poses=poses)
+        state = initial_state(problem, known, start[chosen])
+        try:
+            candidates[name] = learn(problem, known, state, poses=False, rounds=_FEWER_ROUNDS)
+        except np.linalg.LinAlgError:
+            continue
+    found = {name: evidence(problem, *candidate) for name, candidate in candidates.items()}
+    # What somebody knows is given up for a reason alone.
+    best = max(found, key=lambda name: found[name] + (_STATED if name == "stated" else 0.0))
+    known = candidates[best][0]
+    if known.memory < REMEMBERED and known.pixel_scale > _UNEXPLAINED * image:
         raise np.linalg.LinAlgError("no level of pose noise explains the pictures")
-    return known, True, warnings, spread * disagreement_m
+    warnings: list[str] = []
+    if prior is not None and best != "stated":
+        warnings.append(
+            "refined: the stated pose noise does not explain the pictures; it was estimated instead"
+        )
+    expected_m = spread * max(disagreement_m, stated_m if best == "stated" else 0.0)
+    return known, best != "stated", warnings, expected_m
 
 
 def _stretches(times: int) -> Int64:
@@ -197,20 +258,15 @@ def _stretches(times: int) -> Int64:
     return (begins[:, None] + np.arange(_WINDOW)).ravel()
 
 
-def _learned(
-    problem: Problem, start: Float, errors: tuple[PoseErrors, ...], clock_sigma_s: Float, *, poses: bool
-) -> Knowledge | None:
+def _unlearned(
+    problem: Problem, start: Float, errors: tuple[PoseErrors, ...], clock_sigma_s: Float
+) -> Knowledge:
     joints, bones = problem.joints, len(problem.bones)
     acceleration = np.full((joints, joints), _ROOT_ACCELERATION**2)
     acceleration[np.diag_indices(joints)] += _OWN_ACCELERATION**2
     known = Knowledge(errors, clock_sigma_s, acceleration, np.full(bones, _BONE_SIGMA_M), 1.0, 1.0)
     state = initial_state(problem, known, start)
-    known = replace(known, size_m=float(state.shared[-bones:].mean()))
-    try:
-        known, _ = learn(problem, known, state, poses=poses, rounds=_LEARNING_ROUNDS)
-    except np.linalg.LinAlgError:
-        return None
-    return known if np.isfinite(known.pixel_scale) else None
+    return replace(known, size_m=float(state.shared[-bones:].mean()))
 
 
 def _first_guess(problem: Problem, start: Float) -> tuple[PoseErrors, float, float, float]:
@@ -234,7 +290,9 @@ def _first_guess(problem: Problem, start: Float) -> tuple[PoseErrors, float, flo
         image.append(_spread(np.diff(own[mine], axis=0)) / np.sqrt(2))
     # Of 2 n residuals of a joint three are lost to its position.
     lost = np.sqrt(2 * cameras / (2 * cameras - 3))
-    quick, slow = 1.2 * lost * float(np.median(white)), 1.5 * lost * float(np.median(total))
+    quick, all_of_it = lost * float(np.median(white)), lost * float(np.median(total))
+    slow = 1.5 * float(np.sqrt(max(all_of_it**2 - quick**2, (_SLOW_SHARE * all_of_it) ** 2)))
+    quick *= 1.2
     range_m = float(np.nanmedian(distance))
     guess = PoseErrors(
         (max(0.8 * quick * range_m, 0.01), max(0.6 * quick, 1e-3)),
@@ -285,7 +343,7 @@ def _residuals(problem: Problem, position: Float) -> tuple[Float, Float]:
 # --- what came out -------------------------------------------------------------------------------------
 
 
-def _doubts(system: System, state: State, *, learned: bool) -> str | None:
+def _doubts(system: System, state: State, at: Eliminated, *, learned: bool) -> str | None:
     """Why the estimate must not be believed."""
     if not np.isfinite(state.position).all():
         return "the estimate did not converge"
@@ -303,6 +361,15 @@ def _doubts(system: System, state: State, *, learned: bool) -> str | None:
     if abs(grown) > max(_SIGMAS * sigma, 0.05 if learned else 0.02):
         side = "wider" if grown > 0 else "closer"
         return f"the cameras would stand {100 * abs(grown):.0f} % {side} than logged"
+    if learned and sigma > _SMALL_SCALE:
+        lengths = state.shared[system.layout.bone_column :]
+        told = shared_covariance(system, at)[system.layout.bone_column :, system.layout.bone_column :]
+        scale_sigma = float(np.sqrt(told.sum())) / float(lengths.sum())
+        if scale_sigma > _UNSEEN_SCALE * sigma:
+            return (
+                "the formation hardly changes, so pictures tell neither its scale nor how far off poses are "
+                "all along, and nobody stated it: state the pose noise"
+            )
     for (camera, process), (at_knots, column) in zip(
         system.layout.processes, system.layout.place, strict=True
     ):
@@ -313,9 +380,9 @@ def _doubts(system: System, state: State, *, learned: bool) -> str | None:
     return None
 
 
-def _too_far(state: State, begun: Float, expected_m: float) -> str | None:
+def _too_far(position: Float, begun: Float, expected_m: float) -> str | None:
     """Whether the skeleton was moved further than its views disagree."""
-    moved_m = float(np.median(np.linalg.norm(state.position - begun, axis=-1)))
+    moved_m = float(np.median(np.linalg.norm(position - begun, axis=-1)))
     if moved_m > expected_m:
         return f"the skeleton would move by {moved_m:.2f} m where the views let expect {expected_m:.2f} m"
     return None

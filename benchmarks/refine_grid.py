@@ -1,0 +1,197 @@
+"""Is `refined` ever worse than `robust`? Every noise model, told, told wrongly and not told.
+
+python -m benchmarks.refine_grid [--seeds N] [--times T] [--cameras N ...] [--tilts DEG ...] [--csv FILE]
+
+Simulated: the walk and the formations of `benchmarks.refine`, 0.3 m / 1 deg, 2 px. A cell is a noise model, a
+number of cameras, hovering or moving, a tilt and what was told; its ratio is that of the mean errors over the
+seeds, what fell back counting as `robust`. Two processes; set OPENBLAS_NUM_THREADS=1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import product
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.refine import MODELS, mean_nees, rooted
+from pipelines.geometry.noise import Bias, NoiseModel, White
+from pipelines.reconstruction.refinement.problem import pose_errors
+from pipelines.reconstruction.refinement.refine import refine
+from tests.reconstruction.formations import BONES, formation, mean_mm
+
+_BIAS = (Bias(position_m=0.3, rotation_deg=1.0),)
+_WRONG: Mapping[str, Sequence[NoiseModel]] = {
+    "exact": _BIAS,
+    "white": _BIAS,
+    "bias, world": (White(position_m=0.3, rotation_deg=1.0),),
+    "bias, body": _BIAS,
+    "bias + drift": _BIAS,
+    "Gauss-Markov 20 s": _BIAS,
+}
+"""What was told although something else was true."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One flight of one cell."""
+
+    noise: str
+    cameras: int
+    hovering: bool
+    tilt_deg: float
+    told: str  # right, wrong, nothing
+    keypoints: str  # white; correlated: as a detector's, see `KEYPOINTS`
+    times: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of it; mm, of the returned skeleton (after a fallback: that of `robust`)."""
+
+    robust_mm: float
+    robust_root_mm: float
+    refined_mm: float
+    refined_root_mm: float
+    nees: float  # NaN after a fallback
+    cpu_s: float
+    fallback: str
+
+
+KEYPOINTS: Mapping[str, tuple[float, float, float]] = {
+    "white": (2.0, 0.0, 0.0),
+    "correlated": (4.0, 0.9, 2.0),
+}
+"""Noise in px, how much of it stays from frame to frame, how far every joint is off all along in px."""
+
+
+def main() -> None:
+    """Print a row for each cell, then which cells miss the mark."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--times", type=int, default=150)
+    parser.add_argument("--cameras", type=int, nargs="*", default=[2, 3, 4, 5])
+    parser.add_argument("--tilts", type=float, nargs="*", default=[15.0, 45.0])
+    parser.add_argument("--noise", nargs="*", default=list(MODELS), choices=list(MODELS))
+    parser.add_argument("--told", nargs="*", default=["right", "wrong", "nothing"])
+    parser.add_argument("--formation", nargs="*", default=["moving", "hovering"])
+    parser.add_argument("--keypoints", nargs="*", default=["white"], choices=list(KEYPOINTS))
+    parser.add_argument("--csv", type=Path, help="one row for each flight")
+    arguments = parser.parse_args()
+    cells = list(
+        product(
+            arguments.noise,
+            arguments.cameras,
+            [name == "hovering" for name in arguments.formation],
+            arguments.tilts,
+            arguments.told,
+            arguments.keypoints,
+        )
+    )
+    cases = [Case(*cell, arguments.times, seed) for cell in cells for seed in range(arguments.seeds)]
+    rows = []
+    print(
+        "| noise | n | formation | tilt | told | keypoints | robust mm | refined mm | ratio (worst) | NEES"
+        " | fell back | CPU s |"
+    )
+    print("|" + " --- |" * 12)
+    misses = []
+    for found in _by_cell(run_all(cases), arguments.seeds):
+        rows += found
+        line, ratio = summary(found)
+        print(line, flush=True)
+        if ratio > 1.05:
+            misses.append(line)
+    print(f"\n{len(misses)} of {len(cells)} cells above 1.05")
+    for line in misses:
+        print(line)
+    if arguments.csv:
+        with arguments.csv.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(asdict(rows[0][0]) | asdict(rows[0][1])))
+            writer.writeheader()
+            writer.writerows(asdict(case) | asdict(outcome) for case, outcome in rows)
+
+
+def run_all(cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
+    """Every flight, in order, two at a time."""
+    with get_context("spawn").Pool(2) as pool:
+        yield from zip(cases, pool.imap(outcome_of, cases), strict=True)
+
+
+def outcome_of(case: Case) -> Outcome:
+    """Fly it, refine it, compare it."""
+    models = MODELS[case.noise]
+    pixel_px, memory, constant_px = KEYPOINTS[case.keypoints]
+    flight = formation(
+        case.times,
+        case.cameras,
+        models,
+        case.seed,
+        still=case.hovering,
+        tilt_deg=case.tilt_deg,
+        pixel_px=pixel_px,
+        memory=memory,
+        constant_px=constant_px,
+    )
+    told = {"right": models, "wrong": _WRONG[case.noise], "nothing": None}[case.told]
+    prior = None if told is None else [pose_errors(told)] * case.cameras
+    began = time.process_time()
+    result = refine(flight.t_s, flight.sightings, flight.start, BONES, prior, np.zeros(case.cameras))
+    took = time.process_time() - began
+    fell = result.fallback is not None
+    position = flight.start if fell else result.position
+    both = np.where(np.isnan(flight.start), np.nan, position)
+    return Outcome(
+        mean_mm(flight.start, flight.truth),
+        mean_mm(rooted(flight.start), rooted(flight.truth)),
+        mean_mm(both, flight.truth),
+        mean_mm(rooted(both), rooted(flight.truth)),
+        np.nan if fell else mean_nees(result, flight.truth),
+        took,
+        result.fallback or "",
+    )
+
+
+def summary(found: Sequence[tuple[Case, Outcome]]) -> tuple[str, float]:
+    """A cell as a row of the table, and its ratio."""
+    case = found[0][0]
+    robust = np.array([o.robust_mm for _, o in found])
+    refined = np.array([o.refined_mm for _, o in found])
+    roots = [np.mean([getattr(o, name) for _, o in found]) for name in ("robust_root_mm", "refined_root_mm")]
+    nees = [o.nees for _, o in found if not o.fallback]
+    ratio = float(refined.mean() / robust.mean())
+    cells = [
+        case.noise,
+        str(case.cameras),
+        "hovering" if case.hovering else "moving",
+        f"{case.tilt_deg:.0f}",
+        case.told,
+        case.keypoints,
+        f"{robust.mean():.0f} / {roots[0]:.0f}",
+        f"{refined.mean():.1f} / {roots[1]:.1f}",
+        f"{ratio:.2f} ({(refined / robust).max():.2f})",
+        f"{np.mean(nees):.2f}" if nees else "",
+        str(sum(bool(o.fallback) for _, o in found)),
+        f"{np.mean([o.cpu_s for _, o in found]):.1f}",
+    ]
+    return "| " + " | ".join(cells) + " |", ratio
+
+
+def _by_cell(results: Iterable[tuple[Case, Outcome]], seeds: int) -> Iterator[list[tuple[Case, Outcome]]]:
+    found: list[tuple[Case, Outcome]] = []
+    for result in results:
+        found.append(result)
+        if len(found) == seeds:
+            yield found
+            found = []
+
+
+if __name__ == "__main__":
+    main()

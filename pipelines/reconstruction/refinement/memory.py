@@ -1,0 +1,64 @@
+"""How long errors of a keypoint last.
+
+A detector is wrong for the same reasons in neighbouring pictures, so many of them do not say as much as
+independent ones would: the mean of a stationary error falls as if only one in tau = 1 + 2 sum of its
+autocorrelations had been taken. An estimate that does not know this takes keypoint errors for slow pose
+errors. What tells them apart: a pose error moves all joints of a camera together, so it is looked for in
+what each joint does beside the others.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.reconstruction.refinement.elimination import System, misfit
+from pipelines.reconstruction.refinement.problem import State
+
+Float = NDArray[np.float64]
+
+_LONGEST_S = 2.0  # lags up to here
+_STOPS = 0.02  # an autocorrelation below this is chance, and what follows too
+_MOST = 30.0
+
+
+def memory_of(system: System, state: State) -> float:
+    """How many neighbouring residuals at an estimate say as much as one: tau, at least 1."""
+    problem = system.problem
+    pictures = problem.pictures
+    _, residual, _ = misfit(system, state)
+    far = (residual**2).sum(axis=-1) > system.bound2
+    residual = np.where(far[..., None], np.nan, residual)
+    cameras = np.unique(pictures.camera)
+    with np.errstate(invalid="ignore"):
+        own = residual - np.nanmean(residual, axis=1, keepdims=True)
+    lags = max(int(_LONGEST_S / system.usual_step_s), 1)
+    products, counts = np.zeros(lags + 1), np.zeros(lags + 1)
+    for camera in cameras:
+        (mine,) = np.nonzero(pictures.camera == camera)
+        order = mine[np.argsort(pictures.when_s[mine], kind="stable")]
+        step_s = float(np.median(np.diff(pictures.when_s[order]))) if len(order) > 1 else 1.0
+        values = _evenly(pictures.when_s[order], own[order], step_s)
+        for lag in range(min(lags, len(values) - 1) + 1):
+            product = values[: len(values) - lag] * values[lag:]
+            products[lag] += np.nansum(product)
+            counts[lag] += np.isfinite(product).sum()
+    if counts[0] == 0:
+        return 1.0
+    # Of the 2 C numbers that C cameras see of a slow error, the joint's position takes three.
+    shown = (2 * len(cameras) - 3) / (2 * len(cameras))
+    correlation = products / np.maximum(counts, 1) / (products[0] / counts[0])
+    tau = 1.0
+    for value in correlation[1:]:
+        if value < _STOPS:
+            break
+        tau += 2 * float(value) / shown
+    return min(tau, _MOST)
+
+
+def _evenly(when_s: Float, values: Float, step_s: float) -> Float:
+    """Values [F, ...] at their places in an even sequence; NaN where there is none."""
+    place = np.round((when_s - when_s[0]) / step_s).astype(np.int64)
+    even = np.full((int(place[-1]) + 1, *values.shape[1:]), np.nan)
+    even[place] = values
+    return even

@@ -1,0 +1,634 @@
+"""The elimination of a stretch of time, forwards and backwards, compiled.
+
+A front [N, N] holds the normal equations of what is alive, lower triangle: joints at three times (3 n), knots
+before and after (2 c), what all times share. Eliminated unknowns x follow the rest z of the front as
+x = R' (y - W' z), with R the inverse of the Cholesky factor of their own block and W = B R'.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.compilation import cached, helper
+from pipelines.reconstruction.refinement.kernels import (
+    WHITE,
+    add_bones,
+    add_motion,
+    assemble,
+    rows_of_picture,
+)
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+
+@helper
+def eliminate(own: Float, across: Float, gradient: Float, inverse: Float, y: Float) -> tuple[Float, float]:
+    """W = B L^-T; in place R = L^-1 and y = -R g; half the logarithm of the determinant of `own`."""
+    n = len(own)
+    lower = np.linalg.cholesky(own)
+    half = 0.0
+    for i in range(n):
+        half += np.log(lower[i, i])
+        for j in range(i + 1):
+            inverse[i, j] = 0.0
+        for j in range(i + 1, n):
+            inverse[i, j] = 0.0
+        for k in range(i):
+            scale = lower[i, k]
+            for j in range(k + 1):
+                inverse[i, j] -= scale * inverse[k, j]
+        for j in range(i):
+            inverse[i, j] /= lower[i, i]
+        inverse[i, i] = 1.0 / lower[i, i]
+    for i in range(n):
+        total = 0.0
+        for j in range(i + 1):
+            total -= inverse[i, j] * gradient[j]
+        y[i] = total
+    return np.dot(across, inverse.T), half
+
+
+@cached
+def forwards(
+    first: int,
+    last: int,
+    t_s: Float,
+    position: Float,
+    knots: Float,
+    shared: Float,
+    white: Float,
+    starts: Int64,
+    camera: Int64,
+    when: Float,
+    fraction: Float,
+    of_time: Int64,
+    xy: Float,
+    sharpness: Float,
+    pose_position: Float,
+    pose_rotation: Float,
+    speed: Float,
+    turn: Float,
+    trust: Float,
+    bound2: float,
+    white_precision: Float,
+    entry_start: Int64,
+    entry_number: Int64,
+    entry_knot: Int64,
+    entry_column: Int64,
+    clock_column: Int64,
+    knot_count: int,
+    curvature: Float,
+    spread: Float,
+    precision: Float,
+    hold: float,
+    bones: Int64,
+    bone_sigma: Float,
+    grown: float,
+    tie_kept: Float,
+    tie_variance: Float,
+    front: Float,
+    gradient: Float,
+    interval: int,
+    inverse: Float,
+    across: Float,
+    solved: Float,
+    knot_inverse: Float,
+    knot_across: Float,
+    knot_solved: Float,
+) -> tuple[int, float]:
+    """Eliminate joints and knots of the times from `first` to before `last`; the front changes in place.
+
+    Factors go to row `time - first` of `inverse` [., n, n], `across` [., m, n] and `solved` [., n], and
+    those of knots to row `k - interval` of the others. Returns the interval in which the front ends, and
+    half the logarithm of the determinant of all that was eliminated, white errors too.
+    """
+    J = position.shape[1]
+    n, c = 3 * J, knot_count
+    size = len(gradient)
+    s = size - 3 * n - 2 * c
+    lengths = shared[len(shared) - len(bones) :]
+    length_offset = size - len(bones)
+    half = 0.0
+    first_interval = interval
+    own, beside = np.empty((n, n)), np.empty((size - n, n))
+    knot_own, knot_beside = np.empty((c, c)), np.empty((2 * n + c + s, c))
+    for time in range(first, last):
+        while c and interval < of_time[time]:
+            k = interval - first_interval
+            half += eliminate_knot(
+                front, gradient, n, c, knot_own, knot_beside, knot_inverse[k], knot_across[k], knot_solved[k]
+            )
+            interval += 1
+            tie_knots(front, gradient, n, c, knots, interval, tie_kept, tie_variance)
+        half += assemble(
+            starts[time], starts[time + 1], time, t_s, position, knots, shared, white, camera, when, fraction,
+            interval, xy, sharpness, pose_position, pose_rotation, speed, turn, trust, bound2,
+            white_precision, entry_start, entry_number, entry_knot, entry_column, clock_column, knot_count,
+            front, gradient,
+        )  # fmt: skip
+        add_motion(
+            position[time : time + 3], curvature[time], precision, 1.0 / (spread[time] * grown**2), hold,
+            lengths, length_offset, front, gradient,
+        )  # fmt: skip
+        # All bones of a time at once with the first of its three; the last two times have their own.
+        for offset in range(1 if time < len(t_s) - 3 else 3):
+            add_bones(
+                position[time + offset], bones, lengths, bone_sigma, grown, n * offset, length_offset, front,
+                gradient,
+            )  # fmt: skip
+        own[:] = front[:n, :n]
+        beside[:] = front[n:, :n]
+        row = time - first
+        w, part = eliminate(own, beside, gradient[:n], inverse[row], solved[row])
+        half += part
+        across[row] = w
+        less = np.dot(w, w.T)
+        # The joints at the next two times move up; those of a third come in, of which nothing is known yet.
+        for i in range(2 * n):
+            down = 0.0
+            for a in range(n):
+                down += w[i, a] * solved[row, a]
+            gradient[i] = gradient[n + i] + down
+            for j in range(i + 1):
+                front[i, j] = front[n + i, n + j] - less[i, j]
+        for i in range(2 * n, 3 * n):
+            gradient[i] = 0.0
+            for j in range(i + 1):
+                front[i, j] = 0.0
+        for i in range(3 * n, size):
+            down = 0.0
+            for a in range(n):
+                down += w[i - n, a] * solved[row, a]
+            gradient[i] += down
+            for j in range(2 * n):
+                front[i, j] = front[i, n + j] - less[i - n, j]
+            for j in range(2 * n, 3 * n):
+                front[i, j] = 0.0
+            for j in range(3 * n, i + 1):
+                front[i, j] -= less[i - n, j - n]
+    return interval, half
+
+
+@helper
+def eliminate_knot(
+    front: Float,
+    gradient: Float,
+    n: int,
+    c: int,
+    own: Float,
+    beside: Float,
+    inverse: Float,
+    across: Float,
+    solved: Float,
+) -> float:
+    """Eliminate the knot before; the knot after takes its place, of the next nothing is known yet."""
+    size = len(gradient)
+    before, after = 3 * n, 3 * n + c
+    own[:] = front[before:after, before:after]
+    for i in range(c):
+        for j in range(2 * n):
+            beside[j, i] = front[before + i, j]
+        for j in range(after, size):
+            beside[2 * n + j - after, i] = front[j, before + i]
+    w, half = eliminate(own, beside, gradient[before:after], inverse, solved)
+    across[:] = w
+    less = np.dot(w, w.T)
+    for i in range(2 * n):
+        for a in range(c):
+            gradient[i] += w[i, a] * solved[a]
+        for j in range(i + 1):
+            front[i, j] -= less[i, j]
+    for i in range(after, size):
+        row = 2 * n + i - after
+        down = 0.0
+        for a in range(c):
+            down += w[row, a] * solved[a]
+        gradient[i] += down
+        for j in range(2 * n):
+            front[i, j] -= less[row, j]
+        for j in range(after, i + 1):
+            front[i, j] -= less[row, 2 * n + j - after]
+    for i in range(c):
+        gradient[before + i] = gradient[after + i]
+        gradient[after + i] = 0.0
+        for j in range(3 * n):
+            front[before + i, j] = front[after + i, j]
+            front[after + i, j] = 0.0
+        for j in range(i + 1):
+            front[before + i, before + j] = front[after + i, after + j]
+        for j in range(c):
+            front[after + i, before + j] = 0.0
+        for j in range(i + 1):
+            front[after + i, after + j] = 0.0
+    for i in range(after + c, size):
+        for j in range(c):
+            front[i, before + j] = front[i, after + j]
+            front[i, after + j] = 0.0
+    return half
+
+
+@helper
+def tie_knots(
+    front: Float,
+    gradient: Float,
+    n: int,
+    c: int,
+    knots: Float,
+    interval: int,
+    kept: Float,
+    variance: Float,
+) -> None:
+    """The random walk from the knot before to the knot after."""
+    before, after = 3 * n, 3 * n + c
+    for i in range(c):
+        p, q = kept[interval, i], variance[interval, i]
+        change = knots[interval + 1, i] - p * knots[interval, i]
+        front[before + i, before + i] += p * p / q
+        front[after + i, after + i] += 1 / q
+        front[after + i, before + i] -= p / q
+        gradient[before + i] -= p * change / q
+        gradient[after + i] += change / q
+
+
+@cached
+def begin(front: Float, gradient: Float, n: int, c: int, knots: Float, kept: Float, variance: Float) -> None:
+    """Tie the first two knots."""
+    tie_knots(front, gradient, n, c, knots, 0, kept, variance)
+
+
+@cached
+def backwards(
+    first: int,
+    last: int,
+    of_time: Int64,
+    interval: int,
+    first_interval: int,
+    inverse: Float,
+    across: Float,
+    solved: Float,
+    knot_inverse: Float,
+    knot_across: Float,
+    knot_solved: Float,
+    position: Float,
+    knots: Float,
+    shared: Float,
+) -> int:
+    """Solve for joints [T, n] and knots [K, c] of a stretch from its end, in place; the interval reached."""
+    n, c = position.shape[1], knots.shape[1]
+    s = len(shared)
+    z, zk = np.empty(2 * n + 2 * c + s), np.empty(2 * n + c + s)
+    z[2 * n + 2 * c :] = shared
+    zk[2 * n + c :] = shared
+    rest_n, rest_c = np.empty(n), np.empty(c)
+    for time in range(last - 1, first - 1, -1):
+        # Which knots were alive when this time was eliminated.
+        while c and interval > of_time[time]:
+            interval -= 1
+            follow_knot(
+                interval - first_interval, time, interval, n, c, zk, rest_c, knot_inverse, knot_across,
+                knot_solved, position, knots,
+            )  # fmt: skip
+        z[:n] = position[time + 1]
+        z[n : 2 * n] = position[time + 2]
+        for i in range(c):
+            z[2 * n + i] = knots[interval, i]
+            z[2 * n + c + i] = knots[interval + 1, i]
+        row = time - first
+        rest_n[:] = solved[row]
+        for j in range(len(z)):
+            for i in range(n):
+                rest_n[i] -= across[row, j, i] * z[j]
+        for i in range(n):
+            position[time, i] = 0.0
+        for j in range(n):
+            for i in range(j + 1):
+                position[time, i] += inverse[row, j, i] * rest_n[j]
+    while c and interval > first_interval:
+        interval -= 1
+        follow_knot(
+            interval - first_interval, first - 1, interval, n, c, zk, rest_c, knot_inverse, knot_across,
+            knot_solved, position, knots,
+        )  # fmt: skip
+    return interval
+
+
+@helper
+def follow_knot(
+    row: int,
+    time: int,
+    interval: int,
+    n: int,
+    c: int,
+    z: Float,
+    rest: Float,
+    inverse: Float,
+    across: Float,
+    solved: Float,
+    position: Float,
+    knots: Float,
+) -> None:
+    """A knot, once the two times after it was eliminated, `time` + 1 and + 2, and the next knot are known."""
+    z[:n] = position[time + 1]
+    z[n : 2 * n] = position[time + 2]
+    z[2 * n : 2 * n + c] = knots[interval + 1]
+    rest[:] = solved[row]
+    for j in range(len(z)):
+        for i in range(c):
+            rest[i] -= across[row, j, i] * z[j]
+    for i in range(c):
+        knots[interval, i] = 0.0
+    for j in range(c):
+        for i in range(j + 1):
+            knots[interval, i] += inverse[row, j, i] * rest[j]
+
+
+# --- covariances ---------------------------------------------------------------------------------------
+
+
+@helper
+def join(inverse: Float, across: Float, others: Float) -> tuple[Float, Float]:
+    """Covariance of what was eliminated, and with the others, given that of the others."""
+    gain = np.dot(across, inverse)  # [m, n]; x follows the others by its negative, transposed
+    cross = np.dot(others, gain)  # [m, n], negative
+    own = np.dot(inverse.T, inverse) + np.dot(gain.T, cross)
+    # Rounding must not grow from step to step: what is not symmetric would.
+    return (own + own.T) / 2, cross
+
+
+@cached
+def visit(
+    first: int,
+    last: int,
+    t_s: Float,
+    position: Float,
+    knots: Float,
+    shared: Float,
+    white: Float,
+    starts: Int64,
+    camera: Int64,
+    when: Float,
+    fraction: Float,
+    of_time: Int64,
+    xy: Float,
+    sharpness: Float,
+    pose_position: Float,
+    pose_rotation: Float,
+    speed: Float,
+    turn: Float,
+    trust: Float,
+    bound2: float,
+    white_precision: Float,
+    entry_start: Int64,
+    entry_number: Int64,
+    entry_knot: Int64,
+    entry_column: Int64,
+    clock_column: Int64,
+    knot_count: int,
+    curvature: Float,
+    spread: Float,
+    bones: Int64,
+    knot_t_s: Float,
+    others: Float,
+    interval: int,
+    first_interval: int,
+    inverse: Float,
+    across: Float,
+    knot_inverse: Float,
+    knot_across: Float,
+    every: int,
+    covariance: Float,
+    acceleration: Float,
+    bone_sums: Float,
+    image: Float,
+    white_sums: Float,
+    walked: Float,
+    starting: Float,
+) -> tuple[Float, int]:
+    """Covariances of a stretch from its end, given those [m, m] of what was alive there; sums for the levels.
+
+    `covariance` [T, J, 3, 3] is filled where it has a length. Sums are made where `every` is not 0, over
+    the pictures of every so many times: `acceleration` [2, J, J] posterior mean squares and variances;
+    `bone_sums` [B]; `image` [J, 2] weighted squares, and how many of them the fit leaves;
+    `white_sums` [2, 4] of position and rotation:
+    mean squares, count, sums of what the pictures tell (1 - posterior / prior variance) and its square;
+    `walked` [c, 4] the same of every knot's change per s; `starting` [c + shared, 2] at time 0: mean square,
+    variance. Returns the covariance of what is alive at the beginning, and the interval there.
+    """
+    J = position.shape[1]
+    n, c = 3 * J, knot_count
+    m = len(others)
+    size = m + n
+    whole = np.empty((size, size))
+    alive = others.copy()
+    believed, residual = np.empty(J), np.empty((J, 2))
+    rows, added = np.empty((2 * J + WHITE, size)), np.empty(2 * J + WHITE)
+    joints_time = len(t_s) - 3
+    for time in range(last - 1, first - 1, -1):
+        while c and interval > of_time[time]:
+            interval -= 1
+            row = interval - first_interval
+            alive = before_knot(alive, n, c, knot_inverse[row], knot_across[row])
+            if every:
+                walk_of(alive, n, c, knots, knot_t_s, interval, walked)
+        row = time - first
+        own, cross = join(inverse[row], across[row], alive)
+        whole[:n, :n] = own
+        for i in range(m):
+            for j in range(n):
+                whole[n + i, j] = -cross[i, j]
+            for j in range(m):
+                whole[n + i, n + j] = alive[i, j]
+        for j in range(n):
+            for i in range(m):
+                whole[j, n + i] = -cross[i, j]
+        if len(covariance):
+            for k in range(3 if time == joints_time else 1):
+                for joint in range(J):
+                    p = k * n + 3 * joint
+                    for a in range(3):
+                        for b in range(3):
+                            covariance[time + k, joint, a, b] = whole[
+                                k * n + 3 * joint + a, k * n + 3 * joint + b
+                            ]
+        if every:
+            acceleration_of(whole, position, curvature, spread, time, acceleration)
+            bones_of(whole, position, shared, bones, time, bone_sums)
+            if time % every == 0:
+                for g in range(starts[time], starts[time + 1]):
+                    rows_of_picture(
+                        g, time, t_s, position, knots, shared, white, camera, when, fraction, interval, xy,
+                        sharpness, pose_position, pose_rotation, speed, turn, trust, bound2, white_precision,
+                        entry_start, entry_number, entry_knot, entry_column, clock_column, knot_count,
+                        believed, residual, rows, added,
+                    )  # fmt: skip
+                    picture_of(rows, np.dot(rows, whole), added, believed, residual, white[g],
+                               white_precision[camera[g]], image, white_sums)  # fmt: skip
+            if time == 0:
+                for i in range(c):
+                    starting[i, 0] = knots[0, i] ** 2 + whole[3 * n + i, 3 * n + i]
+                    starting[i, 1] = whole[3 * n + i, 3 * n + i]
+                for i in range(len(shared)):
+                    p = 3 * n + 2 * c + i
+                    starting[c + i, 0] = shared[i] ** 2 + whole[p, p]
+                    starting[c + i, 1] = whole[p, p]
+        for i in range(2 * n):
+            for j in range(2 * n):
+                alive[i, j] = whole[i, j]
+            for j in range(3 * n, size):
+                alive[i, j - n] = whole[i, j]
+        for i in range(3 * n, size):
+            for j in range(2 * n):
+                alive[i - n, j] = whole[i, j]
+            for j in range(3 * n, size):
+                alive[i - n, j - n] = whole[i, j]
+    while c and interval > first_interval:
+        interval -= 1
+        row = interval - first_interval
+        alive = before_knot(alive, n, c, knot_inverse[row], knot_across[row])
+        if every:
+            walk_of(alive, n, c, knots, knot_t_s, interval, walked)
+    return alive, interval
+
+
+@helper
+def before_knot(alive: Float, n: int, c: int, inverse: Float, across: Float) -> Float:
+    """The covariance of what is alive while the knot that was eliminated still is, and the next after it."""
+    m = len(alive)
+    place = np.empty(m - c, np.int64)  # what of it was alive then: all but the knot after the next
+    for i in range(2 * n + c):
+        place[i] = i
+    for i in range(2 * n + 2 * c, m):
+        place[i - c] = i
+    beside = np.empty((m - c, m - c))
+    for i in range(m - c):
+        for j in range(m - c):
+            beside[i, j] = alive[place[i], place[j]]
+    own, cross = join(inverse, across, beside)
+    for i in range(2 * n, 2 * n + c):  # what was the knot before is the knot after
+        place[i] += c
+    joined = np.empty((m, m))
+    for i in range(m - c):
+        for j in range(m - c):
+            joined[place[i], place[j]] = beside[i, j]
+        for j in range(c):
+            joined[place[i], 2 * n + j] = -cross[i, j]
+            joined[2 * n + j, place[i]] = -cross[i, j]
+    joined[2 * n : 2 * n + c, 2 * n : 2 * n + c] = own
+    return joined
+
+
+@helper
+def walk_of(
+    alive: Float, n: int, c: int, knots: Float, knot_t_s: Float, interval: int, walked: Float
+) -> None:
+    """Add how much the slow errors changed between two knots, per second."""
+    elapsed = knot_t_s[interval + 1] - knot_t_s[interval]
+    for i in range(c):
+        p, q = 2 * n + i, 2 * n + c + i
+        variance = (alive[p, p] + alive[q, q] - 2 * alive[p, q]) / elapsed
+        change = knots[interval + 1, i] - knots[interval, i]
+        walked[i, 0] += change**2 / elapsed + variance
+        walked[i, 1] += 1
+        walked[i, 2] += variance
+        walked[i, 3] += variance**2
+
+
+@cached
+def last_walk(
+    alive: Float, n: int, c: int, knots: Float, knot_t_s: Float, interval: int, walked: Float
+) -> None:
+    """Add the last interval's change of the slow errors."""
+    walk_of(alive, n, c, knots, knot_t_s, interval, walked)
+
+
+@helper
+def acceleration_of(
+    whole: Float, position: Float, curvature: Float, spread: Float, time: int, sums: Float
+) -> None:
+    """Add posterior mean squares, and variances, of the accelerations between three times [2, J, J]."""
+    J = position.shape[1]
+    n = 3 * J
+    at = np.empty((J, 3))
+    for joint in range(J):
+        for a in range(3):
+            at[joint, a] = 0.0
+            for k in range(3):
+                at[joint, a] += curvature[time, k] * position[time + k, joint, a]
+    scale = 1.0 / (3 * spread[time])
+    for i in range(J):
+        for j in range(J):
+            total, variance = 0.0, 0.0
+            for a in range(3):
+                total += at[i, a] * at[j, a]
+            for k in range(3):
+                for m in range(3):
+                    both = curvature[time, k] * curvature[time, m]
+                    for a in range(3):
+                        variance += both * whole[k * n + 3 * i + a, m * n + 3 * j + a]
+            sums[0, i, j] += scale * (total + variance)
+            sums[1, i, j] += scale * variance
+
+
+@helper
+def bones_of(whole: Float, position: Float, shared: Float, bones: Int64, time: int, sums: Float) -> None:
+    """Add posterior mean squares [B] of how far the bones of a time are from their lengths."""
+    B, size = len(bones), len(whole)
+    column, by = np.empty(7, np.int64), np.empty(7)
+    for b in range(B):
+        i, j = bones[b]
+        length = 0.0
+        for a in range(3):
+            by[3 + a] = position[time, j, a] - position[time, i, a]
+            length += by[3 + a] ** 2
+        length = np.sqrt(length)
+        for a in range(3):
+            by[3 + a] /= max(length, 1e-6)
+            by[a] = -by[3 + a]
+            column[a], column[3 + a] = 3 * i + a, 3 * j + a
+        by[6], column[6] = -1.0, size - B + b
+        total = (length - shared[len(shared) - B + b]) ** 2
+        for p in range(7):
+            for q in range(7):
+                total += by[p] * by[q] * whole[column[p], column[q]]
+        sums[b] += total
+
+
+@helper
+def picture_of(
+    rows: Float,
+    followed: Float,
+    added: Float,
+    believed: Float,
+    residual: Float,
+    white: Float,
+    precision: Float,
+    image: Float,
+    sums: Float,
+) -> None:
+    """Add what a picture says of image noise and of white errors."""
+    J = len(believed)
+    for joint in range(J):
+        if believed[joint] == 0.0:
+            continue
+        for axis in range(2):
+            r = 2 * joint + axis
+            variance = added[r]
+            for k in range(rows.shape[1]):
+                variance += rows[r, k] * followed[r, k]
+            image[joint, 0] += believed[joint] * residual[joint, axis] ** 2
+            image[joint, 1] += believed[joint] * (1 - variance)
+    for i in range(WHITE):
+        if not np.isfinite(precision[i]):
+            continue
+        r = 2 * J + i
+        variance = added[r]
+        for k in range(rows.shape[1]):
+            variance += rows[r, k] * followed[r, k]
+        told = 1 - variance * precision[i]
+        part = i // 3
+        sums[part, 0] += white[i] ** 2 + variance
+        sums[part, 1] += 1
+        sums[part, 2] += told
+        sums[part, 3] += told**2
