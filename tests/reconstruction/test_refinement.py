@@ -233,3 +233,21 @@ def test_a_wrong_prior_is_noticed() -> None:
     position, _, fallback = refined(flight, [BIAS])
     if fallback is None:
         assert mean_mm(position, flight.truth) < 1.05 * mean_mm(flight.start, flight.truth)
+
+
+@pytest.mark.parametrize("told", ["nothing", "wrong"])
+def test_exact_poses_are_recognised(told: str) -> None:
+    # Two views and no word of their poses: every level must come down from its guess, or evidence say so.
+    flight = formation(90, 2, [], 0)
+    position, _, fallback = refined(flight, [BIAS] if told == "wrong" else None)
+    assert fallback is None
+    # Time and bones take at least a third off errors of 2 px.
+    assert mean_mm(position, flight.truth) < 0.67 * mean_mm(flight.start, flight.truth)
+
+
+def test_keypoint_errors_that_last_are_not_taken_for_pose_errors() -> None:
+    # With 0.9 kept from frame to frame 19 neighbours say as much as one: tau = (1 + 0.9) / (1 - 0.9).
+    flight = formation(150, 3, [], 0, pixel_px=4.0, memory=0.9)
+    position, _, fallback = refined(flight, None)
+    assert fallback is None
+    assert mean_mm(position, flight.truth) < mean_mm(flight.start, flight.truth)
