@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.session.records import Float, Int64
@@ -216,7 +215,7 @@ class _Stretch:
                 break
         position, rotation = self._poses(errors)
         inverse = np.linalg.inv(normal)[:-6, :-6].reshape(times, 6, times, 6)
-        covariance = inverse[np.arange(times), :, np.arange(times)]
+        covariance: Float = np.asarray(inverse, dtype=np.float64)[np.arange(times), :, np.arange(times)]
         if not (np.linalg.eigvalsh(covariance) > 0).all():
             return None
         covariance[:, range(3), range(3)] += self.prior.lasting[0] ** 2
@@ -286,8 +285,8 @@ class _Stretch:
         apart = (errors - lasting) / fresh**2
         force[:size] -= apart.ravel()
         force[size:] = apart.sum(axis=0) - lasting / steady**2
-        step = np.linalg.solve(normal, force)
-        back = right - (across.T @ step[:size]).reshape(points, 3)
+        step = np.asarray(np.linalg.solve(normal, force), dtype=np.float64)
+        back = right - np.asarray(across.T @ step[:size]).reshape(points, 3)
         return normal, step, np.einsum("nij,nj->ni", inverse, back)
 
 
@@ -295,5 +294,4 @@ def _sum_by(values: Float, number: Int64, count: int) -> Float:
     """Sums of the values [K, ...] of each number: [count, ...]."""
     flat = values.reshape(len(values), -1)
     sums = np.stack([np.bincount(number, weights=column, minlength=count) for column in flat.T], axis=-1)
-    summed: NDArray[np.float64] = sums.reshape(count, *values.shape[1:])
-    return summed
+    return np.asarray(sums, dtype=np.float64).reshape(count, *values.shape[1:])
