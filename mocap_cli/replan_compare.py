@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from mocap_cli.filming import Rendering, film_arms, print_filmed, render_options
 from mocap_cli.options import (
     FiniteRange,
     any_path,
@@ -70,6 +71,7 @@ if TYPE_CHECKING:
     help="Errors of the cameras' poses, instead of what the session says; for example"
     ' "white:position_m=0.3,rotation_deg=1".',
 )
+@render_options
 @force_option
 @json_option
 @verbosity_options
@@ -87,6 +89,7 @@ def replan_compare_command(
     trials: int,
     seed: int,
     pose_noise: str | None,
+    rendering: Rendering | None,
     force: bool,
     as_json: bool,
     quiet: bool,
@@ -114,12 +117,17 @@ def replan_compare_command(
     )
     with watching(level(quiet, verbose)) as progress:
         result = replan(session, settings, force=force, progress=progress)
+        filmed = None
+        if rendering is not None:
+            filmed = film_arms(session, rendering, force=force, progress=progress)
     say_warnings(result.record.warnings, quiet)
     if as_json:
-        print_json(result.metrics)
+        print_json(result.metrics if filmed is None else result.metrics | {"filmed": filmed})
         return
     if not quiet:
         _print(result.metrics)
+        if filmed is not None:
+            print_filmed(filmed)
     click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'replan'}")
 
 

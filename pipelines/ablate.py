@@ -21,8 +21,8 @@ import numpy as np
 from pipelines.geometry.metrics import PCK_THRESHOLD_M, common, measure
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.triangulation import Views, estimate_noise, locate
+from pipelines.keypoints.alone import FollowedAlone
 from pipelines.keypoints.hints import project_actor
-from pipelines.keypoints.tracking import PeopleTracker
 from pipelines.reconstruction.refining_views import refined_points
 from pipelines.reporting.ablation import Row, draw, estimates, results_csv
 from pipelines.session.errors import DataError
@@ -322,26 +322,18 @@ def _film(
     folder: Path,
 ) -> None:
     """Write what a detector finds in the pictures of one camera: xy [T, J, 2] and confidence [T, J]."""
-    networks = detector.load(threads=1)
-    tracker = PeopleTracker(networks)
     names = filmed.person.joints
-    column = [networks.joints.index(name) if name in networks.joints else None for name in names]
-    xy = np.full((len(filmed.t_ns), len(names), 2), np.nan)
-    confidence = np.zeros(xy.shape[:-1])
+    follower = FollowedAlone(detector.load(threads=1), names)
+    xy = np.empty((len(filmed.t_ns), len(names), 2))
+    confidence = np.empty(xy.shape[:-1])
     for frame in range(len(filmed.t_ns)):
         _go_on(stopped)
         pose = seen_by.position[camera, frame], seen_by.quaternion_xyzw[camera, frame]
         surface = filmed.person.surface(filmed.motion.root[frame], filmed.motion.rotation[frame])
         picture = renderer.picture(*pose, [surface], frame)
         hint = project_actor(filmed.aim[frame], pose, seen_by.lens, sigma_m=_HINT_SIGMA_M, sigma_rad=0.0)
-        people = tracker.step(picture, hint=hint)
-        if people:  # there is only one to be seen
-            person = max(people, key=lambda seen: seen.person.presence).person
-            for j, k in enumerate(column):
-                if k is not None:
-                    xy[frame, j], confidence[frame, j] = person.xy[k], person.confidence[k]
+        xy[frame], confidence[frame] = follower.step(picture, hint=hint)
         progress.advance()
-    confidence[np.isnan(xy).any(axis=-1)] = 0.0
     np.savez(folder / "keypoints.npz", xy=xy, confidence=confidence)
 
 

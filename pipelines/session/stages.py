@@ -50,7 +50,7 @@ _AT_ROOT = {
 }
 """What a stage publishes beside its own folder instead of inside it; these names are its own."""
 
-_STAGES = ("ingest", "detect", "reconstruct", "replan", "report")
+_STAGES = ("ingest", "detect", "reconstruct", "replan", "film", "report")
 
 _LEFT_BY_KILLED_INGEST = {".lock", ".lock.pid", ".partial", "ingest.new", "run.json.new"}
 

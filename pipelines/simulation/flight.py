@@ -78,6 +78,27 @@ class SimulatedFlight:
         return rows
 
 
+@dataclass(frozen=True)
+class Set:
+    """Who is filmed, and where: all of a scenario but its drones."""
+
+    world: World
+    person: Person
+    moving: Moving  # the person's motion at seconds since the flight's start
+
+
+def build_set(scenario: Scenario, *, bvh: SkeletalMotion | None = None) -> Set:
+    """Build a scenario's world and let its actor move there.
+
+    Raises:
+        DataError: the world cannot be built, or the motion is not that of a person.
+    """
+    person = make_body(scenario.actor.body)
+    moving = _moving(scenario.actor, person, scenario, bvh)
+    way = moving(np.arange(*_span_s(scenario), _WAY_S)).root[:, :2]
+    return Set(build_world(scenario.world, scenario.seed, keep_clear=way), person, moving)
+
+
 def fly_scenario(
     scenario: Scenario,
     noise: Sequence[NoiseModel],
@@ -99,11 +120,9 @@ def fly_scenario(
             before a drone takes its first picture.
     """
     seed = scenario.seed
-    person = make_body(scenario.actor.body)
-    moving = _moving(scenario.actor, person, scenario, bvh)
-    span_s = (-LEAD_S, scenario.duration_s + LEAD_S)
-    way = moving(np.arange(*span_s, _WAY_S)).root[:, :2]
-    world = build_world(scenario.world, seed, keep_clear=way)
+    set_up = build_set(scenario, bvh=bvh)
+    world, person, moving = set_up.world, set_up.person, set_up.moving
+    span_s = _span_s(scenario)
 
     t_s = moments(*span_s)
     hip = moving(t_s).root
@@ -169,6 +188,11 @@ def intrinsics_of(lens: Lens) -> Intrinsics:
     """A pinhole that looks straight ahead: the picture's middle is half a pixel inside of its pixels."""
     focal = lens.width / 2 / float(np.tan(np.radians(lens.hfov_deg / 2)))
     return Intrinsics(lens.width, lens.height, focal, focal, (lens.width - 1) / 2, (lens.height - 1) / 2)
+
+
+def _span_s(scenario: Scenario) -> tuple[float, float]:
+    """When the logs begin and end."""
+    return -LEAD_S, scenario.duration_s + LEAD_S
 
 
 def _moving(actor: Actor, person: Person, scenario: Scenario, bvh: SkeletalMotion | None) -> Moving:

@@ -166,7 +166,7 @@ def test_a_detector_looks_at_rendered_pictures(tmp_path: Path, monkeypatch: pyte
     """Joint k is k pixels right of the middle in two views at right angles: as far off in the world."""
     for module in (stage, settings):
         monkeypatch.setattr(module, "find_detector", lambda _: _Pointing())
-    monkeypatch.setattr(stage, "PeopleTracker", _Follower)
+    monkeypatch.setattr("pipelines.keypoints.alone.PeopleTracker", _Follower)
     asked = settings.settings_for(
         "tilt",
         tilts_deg=[0.0],

@@ -1,0 +1,446 @@
+"""Stage `film`: the arms of a comparison filmed, and a real detector on the pictures.
+
+Build the scenario's world and actor again; render what every camera of an arm would have seen; run the
+detector; reconstruct, and measure against the truth; draw the skeleton over the pictures. The pictures are
+simulated, the detector is the real one. `replan` is read and left as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.formats.bvh import read_motion
+from pipelines.formats.video import VideoReader
+from pipelines.formats.video_writing import Picture, write_h264
+from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.geometry.metrics import common, measure
+from pipelines.geometry.noise import NoiseModel
+from pipelines.geometry.poses import invert, transform
+from pipelines.geometry.triangulation import Views, estimate_noise, locate
+from pipelines.keypoints.alone import FollowedAlone
+from pipelines.keypoints.hints import project_actor
+from pipelines.planning.formation import TILT, slot_of
+from pipelines.planning.loading import LoggedFlight, load_flight
+from pipelines.reconstruction.loading import load_actor
+from pipelines.reporting.frame_drawing import draw_frame
+from pipelines.reporting.overlays import View
+from pipelines.session.description import Description, read_description
+from pipelines.session.errors import DataError
+from pipelines.session.progress import Progress, Silent
+from pipelines.session.records import Float, Int64, JointMotion
+from pipelines.session.registries import Detector, find_detector
+from pipelines.session.stages import Stage, StageRecord, locked
+from pipelines.session.storage import canonical_json, jsonable, read_json, sha256_of, write_json
+from pipelines.session.tables import REPLAN, TRUTH, read_table, write_table
+from pipelines.session.tabular import motion_table
+from pipelines.simulation.flight import Set, build_set
+from pipelines.simulation.rendering.renderer import Renderer
+from pipelines.simulation.scenario import Scenario, read_scenario
+from pipelines.simulation.study.filming import Formation, Sightings, Walk, views_of
+
+Bool = NDArray[np.bool_]
+
+FILM = Stage("film", revision=1)
+
+NEAR_SHARE = 0.1
+"""A keypoint is right within this share of the height in pixels of somebody who stands where the actor is."""
+
+_ACTOR_SIGMA_M, _HINT_SIGMA_RAD = 1.0, float(np.radians(1.0))  # as stage `detect` takes the actor's log
+_SAME_M = 0.05  # between the scenario's hips and the session's truth, which is interpolated
+_HIPS = ("left_hip", "right_hip")
+_QUALITY = 20  # of the videos that are drawn on
+_INLET_HEIGHTS, _INLET_SHARE = 1.3, 0.42  # of the person, and of the picture's height
+_ERRORS = ("reconstructed_share", "mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm", "pck150")
+
+
+@dataclass(frozen=True)
+class Shooting:
+    """What is filmed, and who looks at it."""
+
+    rate_hz: float = 5.0
+    start_s: float | None = None  # since the replay's first moment; from there by default
+    end_s: float | None = None  # to the last by default
+    detector: str = "blazepose"
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """What filming left behind."""
+
+    folder: Path
+    record: StageRecord
+    metrics: dict[str, Any]
+    skipped: bool  # nothing had changed
+
+
+def film(
+    folder: Path,
+    shooting: Shooting | None = None,
+    *,
+    scenario: Path | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Filmed:
+    """Film every arm of a session's comparison.
+
+    Args:
+        folder: the session; `replan` has run.
+        shooting: what decides the result.
+        scenario: of the simulated flight; looked for beside its pictures and the session by default.
+        force: do it again although nothing changed.
+        progress: who watches.
+
+    Raises:
+        DataError: nothing was compared yet, the flight was not simulated, its scenario is not there or
+            another flight's, the span holds no two pictures, or the detector's files are missing.
+        BusyError: another process writes the session.
+    """
+    shooting = shooting or Shooting()
+    progress = progress or Silent()
+    with locked(folder) as session:
+        compared = session.record("replan")
+        if compared is None:
+            raise DataError(folder, "holds no comparison to film", "run `mocap replan-compare` first")
+        description = read_description(folder)
+        if not description.simulated:
+            raise DataError(folder, "was really flown: only simulated flights can be filmed again")
+        path = scenario or _scenario_of(folder, description)
+        detector = find_detector(shooting.detector)
+        detector.load(threads=1)  # says at once what is missing
+        plan = read_scenario(path)
+        inputs = {"replan": compared.key, "scenario": _hash_of(plan.model_dump(mode="json"))}
+        models = {name: model for name, model in detector.models().items() if model is not None}
+        inputs |= {f"model {name}": sha256_of(model) for name, model in models.items()}
+        run = session.begin(FILM, settings=asdict(shooting), inputs=inputs, force=force)
+        if run.finished:
+            return Filmed(folder, run.record, read_json(folder / "film" / "metrics.json"), skipped=True)
+
+        flight = load_flight(folder, description, None, pose_noise=compared.settings["pose_noise"])
+        setting = _set(plan, path, flight)
+        arms = {
+            arm: _arm(folder, description, flight, plan, setting, arm, shooting)
+            for arm in read_json(folder / "replan" / "metrics.json")["arms"]
+        }
+        progress.start(
+            "Filming", sum(arm.seen_by.position.shape[0] * len(arm.of.t_ns) for arm in arms.values())
+        )
+        renderer = Renderer(
+            setting.world.surfaces(),
+            flight.cameras[0].intrinsics,
+            sun=np.array(plan.world.sun),
+            seed=plan.seed,
+        )
+        reconstructed, metrics = {}, {}
+        for name, arm in arms.items():
+            parts = [
+                run.chunk(f"{name}-{camera}", partial(_shoot, arm, k, renderer, detector, progress))
+                for k, camera in enumerate(arm.names)
+            ]
+            sightings = _read_sightings(parts)
+            views = _views(arm, sightings, compared.settings["seed"])
+            points = locate(views, method="robust").points.reshape(arm.of.joints.shape)
+            reconstructed[name] = points
+            desired = float(compared.settings["planner.tilt_deg"])
+            metrics[name] = _measured(arm, sightings, views, points, desired_tilt_deg=desired)
+            (run.folder / name).mkdir()
+            motion = JointMotion(arm.of.t_ns, arm.of.person.joints, points[:, None])
+            write_table(run.folder / name / "skeleton.parquet", motion_table(motion), TRUTH)
+            for k, part in enumerate(parts):
+                _draw(arm, k, sightings, points, part / "pictures.mp4", run.folder / name)
+        _compare(metrics, reconstructed, arms)
+        told = jsonable(
+            {
+                "schema": 1,
+                "simulated": True,
+                "detector": detector.title,
+                "rate_hz": shooting.rate_hz,
+                "arms": metrics,
+            }
+        )
+        write_json(run.folder / "metrics.json", told)
+        counts = {name: len(arm.of.t_ns) for name, arm in arms.items()}
+        record = run.publish(counts={"moments": counts, "detector": detector.title})
+    return Filmed(folder, record, told, skipped=False)
+
+
+# --- what is filmed ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Arm:
+    """The cameras N of an arm at the moments T of its pictures, and whom they film."""
+
+    names: tuple[str, ...]
+    of: Walk
+    seen_by: Formation
+    actor: Float | None  # [T, 3] m, where the log has the actor
+    noise: tuple[NoiseModel, ...]
+
+
+def _scenario_of(folder: Path, description: Description) -> Path:
+    """The scenario that `mocap simulate` left beside the flight."""
+    beside = [folder.parent, folder.with_suffix("")]
+    for entry in description.cameras.values():
+        if entry.media is not None:
+            beside += [(folder / path).parent for path in entry.media.paths]
+    for place in beside:
+        if (place / "simulation.json").is_file() and (place / "scenario.yaml").is_file():
+            return place / "scenario.yaml"
+    raise DataError(
+        folder,
+        "has no scenario.yaml of a simulated flight beside it",
+        "name it with --scenario SCENARIO.yaml",
+    )
+
+
+def _set(plan: Scenario, path: Path, flight: LoggedFlight) -> Set:
+    """World and actor of a scenario, if it is this flight's."""
+    motion = plan.actor.motion
+    bvh = (
+        None
+        if motion.bvh is None
+        else read_motion(path.parent / motion.bvh, unit=motion.unit, axes=motion.axes)
+    )
+    setting = build_set(plan, bvh=bvh)
+    if flight.hips is None:
+        raise DataError(path, "cannot be told to be this flight's", "ingest the flight with its truth")
+    moved = setting.moving((flight.hips.t_ns - plan.start_ns) / 1e9)
+    joints = setting.person.keypoints(moved)
+    hips = joints[:, [setting.person.joints.index(name) for name in _HIPS]].mean(axis=1)
+    off_m = float(np.nanmax(np.linalg.norm(hips - flight.hips.position[:, 0, 0], axis=-1)))
+    if not off_m <= _SAME_M:
+        raise DataError(
+            path,
+            f"is not this flight's: its actor is {off_m:.2f} m from the session's truth",
+            "name the flight's own with --scenario",
+        )
+    return setting
+
+
+def _arm(
+    folder: Path,
+    description: Description,
+    flight: LoggedFlight,
+    plan: Scenario,
+    setting: Set,
+    name: str,
+    shooting: Shooting,
+) -> _Arm:
+    table = read_table(folder / "replan" / name / "trajectories.parquet", REPLAN)
+    cameras = tuple(dict.fromkeys(table["camera"]))
+    t_ns = table["t_ns"].to_numpy(np.int64)[:: len(cameras)]
+    rows = _rows(t_ns, shooting)
+    if len(rows) < 2:
+        raise DataError(folder, f"{len(rows)} pictures lie in the span that is to be filmed", "widen it")
+
+    def dense(*columns: str) -> Float:
+        values = table[list(columns)].to_numpy(np.float64).reshape(len(t_ns), len(cameras), len(columns))
+        return np.ascontiguousarray(values[rows].swapaxes(0, 1))
+
+    moments = t_ns[rows]
+    motion = setting.moving((moments - plan.start_ns) / 1e9)
+    person = setting.person
+    joints = person.keypoints(motion)
+    walked = Walk(moments, person, plan.actor.body.height_m, motion, joints, motion.root)
+    seen_by = Formation(dense("x", "y", "z"), dense("qx", "qy", "qz", "qw"), flight.cameras[0].intrinsics)
+    actor = load_actor(folder, description, moments)
+    return _Arm(cameras, walked, seen_by, actor, flight.cameras[0].noise)
+
+
+def _rows(t_ns: Int64, shooting: Shooting) -> Int64:
+    """The moments [T] nearest to even ones at the wanted rate, each once."""
+    since_s = (t_ns - t_ns[0]) / 1e9
+    first = shooting.start_s or 0.0
+    behind = since_s[-1] + 1e-9 if shooting.end_s is None else shooting.end_s
+    wanted = np.arange(first, min(behind, since_s[-1] + 1e-9), 1 / shooting.rate_hz)
+    return np.unique(
+        np.clip(np.rint(np.interp(wanted, since_s, np.arange(len(t_ns)))), 0, None).astype(np.int64)
+    )
+
+
+def _hash_of(value: object) -> str:
+    return sha256(canonical_json(value).encode()).hexdigest()
+
+
+# --- pictures ------------------------------------------------------------------------------------------
+
+
+def _shoot(
+    arm: _Arm, camera: int, renderer: Renderer, detector: Detector, progress: Progress, folder: Path
+) -> None:
+    """Write one camera's pictures, and what the detector finds in them: xy [T, J, 2], confidence [T, J]."""
+    of, lens = arm.of, arm.seen_by.lens
+    follower = FollowedAlone(detector.load(threads=1), of.person.joints)
+    found: list[tuple[Float, Float]] = []
+
+    def pictures() -> Iterator[Picture]:
+        for k in range(len(of.t_ns)):
+            pose = arm.seen_by.position[camera, k], arm.seen_by.quaternion_xyzw[camera, k]
+            surface = of.person.surface(of.motion.root[k], of.motion.rotation[k])
+            picture = renderer.picture(*pose, [surface], k)
+            hint = None
+            if arm.actor is not None and np.isfinite(arm.actor[k]).all():
+                hint = project_actor(
+                    arm.actor[k], pose, lens, sigma_m=_ACTOR_SIGMA_M, sigma_rad=_HINT_SIGMA_RAD
+                )
+            found.append(follower.step(picture, hint=hint))
+            yield picture
+            progress.advance()
+
+    _write_video(folder / "pictures.mp4", pictures(), of.t_ns, lens)
+    xy, confidence = (np.stack(part) for part in zip(*found, strict=True))
+    np.savez(folder / "keypoints.npz", xy=xy, confidence=confidence)
+
+
+def _write_video(path: Path, pictures: Iterator[Picture], t_ns: Int64, lens: Intrinsics) -> None:
+    write_h264(path, pictures, t_ns - t_ns[0], width=lens.width, height=lens.height, quality=_QUALITY)
+
+
+def _read_sightings(parts: Sequence[Path]) -> Sightings:
+    xy, confidence = [], []
+    for part in parts:
+        with np.load(part / "keypoints.npz") as stored:
+            xy.append(stored["xy"])
+            confidence.append(stored["confidence"])
+    return Sightings(np.stack(xy), np.stack(confidence))
+
+
+# --- measuring -----------------------------------------------------------------------------------------
+
+
+def _views(arm: _Arm, sightings: Sightings, seed: int) -> Views:
+    """What triangulation is given: poses err as the comparison's do, once."""
+    views = views_of(arm.of, arm.seen_by, sightings, arm.noise, seed=seed, trial=0)
+    return replace(views, pixel_sigma=estimate_noise(views))
+
+
+def _measured(
+    arm: _Arm, sightings: Sightings, views: Views, points: Float, *, desired_tilt_deg: float
+) -> dict[str, Any]:
+    """One arm's figures; shares are of pictures, of joints in them, and of moments."""
+    of, seen_by = arm.of, arm.seen_by
+    exact = np.stack([_pixels(seen_by, k, of.joints) for k in range(len(arm.names))])
+    inside = np.isfinite(exact[..., 0])
+    slots = slot_of(seen_by.position - of.motion.root)
+    tilt_deg, range_m = np.degrees(slots[..., TILT]), slots[..., 2]
+    off_px = np.linalg.norm(sightings.xy - exact, axis=-1)
+    near = off_px <= NEAR_SHARE * (seen_by.lens.fx * of.height_m / range_m)[..., None]
+    measured = off_px[np.isfinite(off_px)]
+    errors = measure(points[:, None], of.joints[:, None], of.person.joints, of.t_ns)
+    return {
+        "pictures": int(np.prod(inside.shape[:2])),
+        "in_view_share": float(inside.all(axis=-1).mean()),
+        "tilt_deg": {
+            "mean": float(tilt_deg.mean()),
+            "max": float(tilt_deg.max()),
+            "within_5_share": float((np.abs(tilt_deg - desired_tilt_deg) <= 5.0).mean()),
+        },
+        "detected_share": float((sightings.confidence > 0).any(axis=-1).mean()),
+        "keypoint_pck": float(near[inside].mean()) if inside.any() else None,
+        "keypoint_median_px": float(np.median(measured)) if measured.size else None,
+        "reprojection_px": _reprojection_px(views, points),
+        **{name: errors[name] for name in _ERRORS},
+    }
+
+
+def _pixels(seen_by: Formation, camera: int, points: Float) -> Float:
+    """Pixels [T, J, 2] of points [T, J, 3] in one camera; NaN outside its pictures."""
+    lens = seen_by.lens
+    camera_from_world = invert(seen_by.position[camera, :, None], seen_by.quaternion_xyzw[camera, :, None])
+    pixels = project(transform(camera_from_world, points), lens)
+    inside = (pixels >= -0.5) & (pixels <= np.array([lens.width, lens.height]) - 0.5)
+    return np.where(inside.all(axis=-1, keepdims=True), pixels, np.nan)
+
+
+def _reprojection_px(views: Views, points: Float) -> dict[str, float] | None:
+    """Between the keypoints that were used and the skeleton, by the poses that the log would state."""
+    rows = views.pose_index
+    offset = points.reshape(-1, 1, 3) - views.position[rows]
+    seen = np.einsum("ncji,ncj->nci", views.rotation[rows], offset)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        off_px = np.linalg.norm(seen[..., :2] / seen[..., 2:] - views.xy, axis=-1) * views.focal
+    used = off_px[(views.weight > 0) & np.isfinite(off_px)]
+    return {"mean": float(used.mean()), "median": float(np.median(used))} if used.size else None
+
+
+def _compare(
+    metrics: Mapping[str, dict[str, Any]], points: Mapping[str, Float], arms: Mapping[str, _Arm]
+) -> None:
+    """Add each arm's MPJPE on the joint-frames that all arms reconstructed."""
+    shared = common(*(own[:, None] for own in points.values()))[:, 0]
+    for name, own in points.items():
+        error_m = np.linalg.norm(own - arms[name].of.joints, axis=-1)[shared]
+        metrics[name]["common_mpjpe_mm"] = 1e3 * float(error_m.mean()) if error_m.size else None
+
+
+# --- drawing -------------------------------------------------------------------------------------------
+
+
+def _draw(arm: _Arm, camera: int, sightings: Sightings, points: Float, pictures: Path, folder: Path) -> None:
+    """Write <camera>.mp4: the skeleton over the pictures, and the person enlarged in a corner."""
+    of, lens, name = arm.of, arm.seen_by.lens, arm.names[camera]
+    drawn_px = _pixels(arm.seen_by, camera, points)
+    middle_px = _pixels(arm.seen_by, camera, of.motion.root[:, None])[:, 0]
+    slots = slot_of(arm.seen_by.position[camera] - of.motion.root)
+
+    def drawn() -> Iterator[Picture]:
+        with VideoReader(pictures) as video:
+            for k, t_ns in enumerate(of.t_ns.tolist()):
+                picture = video.read(k)
+                if picture is None:
+                    raise ValueError(f"{pictures}: picture {k} cannot be decoded")
+                found = sightings.xy[camera, k]
+                known, seen = np.isfinite(points[k, :, 0]), np.isfinite(found[:, 0])
+                view = View(
+                    camera=name,
+                    intrinsics=lens,
+                    joints=of.person.joints,
+                    frame=k,
+                    t_s=(t_ns - int(of.t_ns[0])) / 1e9,
+                    found=found[None],
+                    reprojected=drawn_px[k][None],
+                    rejected=np.zeros((1, len(known)), np.bool_),
+                    unmeasured=(seen & ~known)[None],
+                    others=np.empty((0, len(known), 2)),
+                    has_pose=True,
+                    picture=None,
+                )
+                error = np.linalg.norm(points[k] - of.joints[k], axis=-1)
+                said = f"{1e3 * np.nanmean(error):.0f} mm off" if known.any() else "nothing reconstructed"
+                caption = (
+                    f"{name}   {view.t_s:.2f} s   tilt {np.degrees(slots[k, TILT]):.0f} deg",
+                    f"{int(seen.sum())} joints found, {int(known.sum())} reconstructed, {said}",
+                )
+                side_px = _INLET_HEIGHTS * lens.fx * of.height_m / float(slots[k, 2])
+                yield _with_inlet(draw_frame(picture, view, caption), middle_px[k], side_px)
+
+    _write_video(folder / f"{name}.mp4", drawn(), of.t_ns, lens)
+
+
+def _with_inlet(picture: Picture, middle_px: Float, side_px: float) -> Picture:
+    """The square about the middle once more, enlarged, at the lower right; the same without a middle."""
+    import cv2
+
+    height, width = picture.shape[:2]
+    side = int(min(side_px, height, width))
+    if side < 2 or not np.isfinite(middle_px).all():
+        return picture
+    left, upper = (
+        int(np.clip(round(float(centre)) - side // 2, 0, most - side))
+        for centre, most in zip(middle_px, (width, height), strict=True)
+    )
+    edge = round(_INLET_SHARE * min(height, width))
+    part = cv2.resize(
+        picture[upper : upper + side, left : left + side], (edge, edge), interpolation=cv2.INTER_CUBIC
+    )
+    picture[-edge:, -edge:] = part
+    cv2.rectangle(picture, (width - edge, height - edge), (width - 1, height - 1), (255, 255, 255), 1)
+    return picture

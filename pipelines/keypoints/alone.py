@@ -1,0 +1,48 @@
+"""The keypoints of somebody who is alone in the pictures: what studies and replays look at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.keypoints.hints import Hint
+from pipelines.keypoints.tiles import Picture
+from pipelines.keypoints.tracking import PeopleTracker
+from pipelines.session.registries import KeypointNetworks
+
+Float = NDArray[np.float64]
+
+
+class FollowedAlone:
+    """Follows the only person in the pictures of one camera, as `PeopleTracker` does everybody.
+
+    Args:
+        networks: the detector, loaded.
+        joints: the J whose keypoints are wanted; those that the detector does not have are never found.
+    """
+
+    def __init__(self, networks: KeypointNetworks, joints: Sequence[str]) -> None:
+        self._tracker = PeopleTracker(networks)
+        self._column = [networks.joints.index(name) if name in networks.joints else None for name in joints]
+
+    def step(self, picture: Picture, *, hint: Hint | None) -> tuple[Float, Float]:
+        """The keypoints in the next picture, of whoever is most surely there.
+
+        Args:
+            picture: [H, W, 3] BGR.
+            hint: where the log says that the person is, if it does.
+
+        Returns:
+            [J, 2] px, NaN for what was not found, and confidences [J], 0 for that.
+        """
+        xy, confidence = np.full((len(self._column), 2), np.nan), np.zeros(len(self._column))
+        people = self._tracker.step(picture, hint=hint)
+        if people:
+            person = max(people, key=lambda seen: seen.person.presence).person
+            for j, k in enumerate(self._column):
+                if k is not None:
+                    xy[j], confidence[j] = person.xy[k], person.confidence[k]
+        confidence[np.isnan(xy).any(axis=-1)] = 0.0
+        return xy, confidence

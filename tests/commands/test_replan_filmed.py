@@ -1,0 +1,70 @@
+"""`mocap replan-compare --render`: a short flight filmed again, in small pictures, by the real detector."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pipelines.filming import Shooting, film
+from pipelines.formats.video import index_video
+from pipelines.ingest import ingest
+from pipelines.reconstruct import reconstruct
+from pipelines.session.errors import DataError
+from pipelines.session.storage import read_json
+from tests.commands.test_replan import compare, refused, session_of
+from tests.synthetic.flights import write_flight
+
+SHORT = """
+schema: 1
+name: Short
+duration_s: 2
+actor: {motion: [walk: {distance_m: 5}], estimate_sigma_m: 0.02}
+world: {ground: {size_m: 40}, map: {resolution_m: 0.5, height_m: 4}}
+drones:
+  count: 2
+  camera: {rate_hz: 5, width: 640, height: 360}
+"""
+SMALL = ("--arms", "fixed", "--trials", "1", "--render", "--render-hz", "4", "--render-end", "1")
+FIRST_MM = 150.0
+"""People of 67 px: keypoints of BlazePose are off by some 3 px of 26 mm, points of two views by more."""
+
+
+@pytest.mark.slow
+def test_arms_are_filmed_and_a_detector_looks_at_them(tmp_path: Path) -> None:
+    session = session_of(tmp_path, SHORT)
+    done = compare(session, *SMALL, "--json")
+    assert done.exit_code == 0, done.stderr
+    filmed = json.loads(done.stdout)["filmed"]["arms"]["fixed"]
+    assert filmed["pictures"] == 8  # at 0, 0.25, 0.5 and 0.75 s, by two cameras
+    assert filmed["in_view_share"] == filmed["detected_share"] == 1.0
+    assert filmed["tilt_deg"]["mean"] == pytest.approx(15, abs=1)
+    assert filmed["keypoint_pck"] > 0.9
+    assert filmed["mpjpe_mm"] == filmed["common_mpjpe_mm"] < FIRST_MM
+    folder = session / "film" / "fixed"
+    assert len(index_video(folder / "drone1.mp4").pts_ns) == 4
+    assert (folder / "skeleton.parquet").is_file()
+
+    replanned = read_json(session / "replan" / "stage.json")
+    again = compare(session, *SMALL)
+    assert again.exit_code == 0, again.stderr
+    assert "filmed (simulated) at 4 Hz, keypoints by " in again.stdout
+    assert "unchanged: " in again.stdout
+    assert read_json(session / "replan" / "stage.json") == replanned
+    assert film(session, Shooting(rate_hz=4.0, end_s=1.0)).skipped
+
+    other = tmp_path / "other.yaml"
+    other.write_text(SHORT.replace("distance_m: 5", "distance_m: 5, turn_deg: 90"), encoding="utf-8")
+    assert "is not this flight's" in refused(session, *SMALL, "--scenario", other)
+    assert "lie in the span" in refused(session, *SMALL, "--render-start", "0.9")
+
+
+def test_only_simulated_flights_are_filmed_again(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path / "flown", seconds=1.5, clean=True)
+    session = tmp_path / "flown.session"
+    ingest(flight.manifest, session=session)
+    with pytest.raises(DataError, match="holds no comparison to film"):
+        film(session)
+    reconstruct(session)
+    assert "only simulated flights can be filmed again" in refused(session, *SMALL, "-q")
