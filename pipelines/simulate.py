@@ -174,6 +174,12 @@ def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | Non
         known = ", ".join([_RING, *PLANNER_ARMS.names()])
         place = f"{path}: drones.formation.planner"
         raise DataError(place, f"no such planner {formation.planner!r}", f"there are {known}")
+    if formation.yaw_rate_deg_per_s or formation.variation:
+        raise DataError(
+            f"{path}: drones.formation",
+            f"yaw_rate_deg_per_s and variation are the ring's, {formation.planner} turns as it decides",
+            "leave them out, or take planner: ring",
+        )
     arm = PLANNER_ARMS.get(formation.planner)
     try:
         config = PlannerConfig(

@@ -113,9 +113,14 @@ class _Formation:
     def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float, *, predicts_error: bool) -> None:
         tilts = np.radians(config.tilts_deg) if predicts_error else np.array([config.tilt_rad])
         ranges = np.array(config.ranges_m) if predicts_error else np.array([config.radius_m])
-        states = _all_states(yaw_set(config.yaws, yaw_rad), tilts, ranges)
+        yaws = config.lattice_yaws if predicts_error else config.yaws
+        self._every = config.lattice_knots if predicts_error else 1
+        states = _all_states(yaw_set(yaws, yaw_rad), tilts, ranges)
         self._lattice = lattice(
-            states, rates=np.array(config.slot_rates), knot_s=config.knot_s, w_turn=config.w_turn
+            states,
+            rates=np.array(config.slot_rates),
+            knot_s=self._every * config.knot_s,
+            w_turn=config.w_turn,
         )
         first = formation_slots(np.zeros(len(states)), drones, tilt_rad=0.0, range_m=0.0)
         self._slots = states[:, None] + first  # [S, n, 3]
@@ -123,12 +128,12 @@ class _Formation:
         self._config, self._predicts_error = config, predicts_error
 
     def plan(self, t_s: float, commanded: Float, actor: Float, field: DistanceField) -> FormationPath:
-        costs = costs_of_slots(field, actor, self._offsets, self._config)
+        costs = costs_of_slots(field, _each(actor, self._every), self._offsets, self._config)
         cost = cost_map(costs, self._config)
         if self._predicts_error:
             cost += self._config.w_error * error_map(costs, self._offsets, self._config)
         sequence, _ = best_sequence(cost, self._lattice, commanded[0])
-        return _path(t_s, commanded, self._slots[sequence], self._config)
+        return _path(t_s, commanded, self._slots[sequence], self._lattice.knot_s, self._config)
 
 
 class _Greedy:
@@ -143,9 +148,9 @@ class _Greedy:
         tilts, ranges = np.radians(config.tilts_deg), np.array(config.ranges_m)
         self._lattices = [
             lattice(
-                _all_states(yaw_set(config.yaws, slot[YAW]), tilts, ranges),
+                _all_states(yaw_set(config.lattice_yaws, slot[YAW]), tilts, ranges),
                 rates=np.array(config.slot_rates),
-                knot_s=config.knot_s,
+                knot_s=config.lattice_knots * config.knot_s,
                 w_turn=config.w_turn,
             )
             for slot in start
@@ -156,6 +161,7 @@ class _Greedy:
 
     def plan(self, t_s: float, commanded: Float, actor: Float, field: DistanceField) -> FormationPath:
         config = self._config
+        actor = _each(actor, config.lattice_knots)
         known = np.zeros((len(actor), 1, 3, 3)) + np.eye(3) / config.prior_sigma_m**2
         taken: list[Float] = []
         slots = np.empty((len(actor), len(self._lattices), 3))
@@ -175,7 +181,7 @@ class _Greedy:
             known = known + gained[at, sequence][:, None]
             taken.append(offsets[sequence])
             slots[:, i] = grid.states[sequence]
-        return _path(t_s, commanded, slots, config)
+        return _path(t_s, commanded, slots, self._lattices[0].knot_s, config)
 
 
 def _all_states(yaws: Float, tilts: Float, ranges: Float) -> Float:
@@ -183,10 +189,15 @@ def _all_states(yaws: Float, tilts: Float, ranges: Float) -> Float:
     return np.stack(np.meshgrid(yaws, tilts, ranges, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def _path(t_s: float, commanded: Float, slots: Float, config: PlannerConfig) -> FormationPath:
+def _each(actor: Float, every: int) -> Float:
+    """Every so many knots of a forecast, at least the last one."""
+    return actor[every - 1 :: every] if len(actor) >= every else actor[-1:]
+
+
+def _path(t_s: float, commanded: Float, slots: Float, knot_s: float, config: PlannerConfig) -> FormationPath:
     """From the commanded slots [n, 3] through slots [T, n, 3], each turn the shorter way round."""
     through = np.concatenate([commanded[None], slots])
     yaw = through[..., YAW]
     yaw[1:] = commanded[:, YAW] + np.cumsum(wrapped(yaw[1:] - yaw[:-1]), axis=0)
-    knots = t_s + config.knot_s * np.arange(len(through), dtype=np.float64)
+    knots = t_s + knot_s * np.arange(len(through), dtype=np.float64)
     return FormationPath(knots, through, np.array(config.slot_rates))

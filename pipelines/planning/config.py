@@ -18,7 +18,14 @@ _MAY_BE_ZERO = (
     *("speed_floor_mps", "sight_start_m", "k_integral", "actor_noise_m"),
     *("position_sigma_m", "rotation_sigma_deg"),
 )
-_MOST = {"yaws": 360, "horizon_knots": 60, "waypoints": 200, "iterations": 10_000}
+_MOST = {
+    "yaws": 360,
+    "lattice_yaws": 360,
+    "lattice_knots": 60,
+    "horizon_knots": 60,
+    "waypoints": 200,
+    "iterations": 10_000,
+}
 
 
 @dataclass(frozen=True)
@@ -32,14 +39,16 @@ class PlannerConfig:
     # The formation.
     radius_m: float = 10.0
     tilt_deg: float = 15.0
-    yaws: int = 8  # D: over a full turn, the first at the yaw of the start
-    knot_s: float = 2.0
-    horizon_knots: int = 5  # T
+    yaws: int = 32  # D: over a full turn, one of them the yaw of the start
+    knot_s: float = 1.0
+    horizon_knots: int = 10  # T
     yaw_rate_deg_per_s: float = 22.5
     tilt_rate_deg_per_s: float = 5.0  # tilt and range are searched by `covariance` and `greedy` alone
     range_rate_mps: float = 1.0
     tilts_deg: tuple[float, ...] = (5.0, 15.0, 25.0, 35.0)
     ranges_m: tuple[float, ...] = (8.0, 10.0, 12.0)
+    lattice_yaws: int = 8  # of these two, likewise: their lattice has more dimensions
+    lattice_knots: int = 2  # knots from one of their decisions to the next
 
     # What its search weighs.
     w_obs: float = 1.0
@@ -49,8 +58,8 @@ class PlannerConfig:
 
     # What the local planner weighs.
     l_obs: float = 50.0
-    l_occ: float = 2.0
-    l_form: float = 1.0
+    l_occ: float = 5.0
+    l_form: float = 3.0
     l_sep: float = 50.0
     a_velocity: float = 1.0
     a_acceleration: float = 1.0

@@ -47,15 +47,15 @@ class Entrant:
 def compare(scene: Scene, entrants: Mapping[str, Entrant]) -> dict[str, Any]:
     """Score every arm and the differences to the reference.
 
-    Errors are compared on common joint-frames: `mpjpe_mm` on those that all arms measured in a trial, a
-    difference on those that both did. `coverage` is the share that the arm itself measured.
+    Errors are compared on common joint-frames: those that all arms measured in a trial, for `mpjpe_mm` and
+    for the differences alike. `coverage` is the share that the arm itself measured.
     """
     errors = {name: entrant.error_m for name, entrant in entrants.items() if entrant.error_m is not None}
     shared = common_frames(errors) if errors else None
     arms = {name: _scores(scene, name, entrant, shared) for name, entrant in entrants.items()}
     reference = REFERENCE if REFERENCE in entrants else next(iter(entrants))
     differences = [
-        {"arm": name, "against": reference, **_difference(scene, entrant, entrants[reference])}
+        {"arm": name, "against": reference, **_difference(scene, entrant, entrants[reference], shared)}
         for name, entrant in entrants.items()
         if name != reference
     ]
@@ -117,8 +117,8 @@ def _errors(
     return own, common, mean_of_trials(coverage(error, entrant.joint_frames), seed)
 
 
-def _difference(scene: Scene, one: Entrant, other: Entrant) -> dict[str, Any]:
-    """One minus the other, with intervals: same seeds, same moments."""
+def _difference(scene: Scene, one: Entrant, other: Entrant, shared: Bool | None) -> dict[str, Any]:
+    """One minus the other, with intervals: same seeds, same moments, same joint-frames as in the table."""
     tilt_deg, hidden = (
         [np.atleast_2d(of(scene, entrant.flown)).mean(axis=0) for entrant in (one, other)]
         for of in (_tilt_deg, _hidden)
@@ -126,8 +126,8 @@ def _difference(scene: Scene, one: Entrant, other: Entrant) -> dict[str, Any]:
     always = np.ones(len(scene.t_ns), dtype=np.bool_)
     seed = scene.rules.seed
     error = cover = None
-    if one.error_m is not None and other.error_m is not None:
-        both = np.isfinite(one.error_m) & np.isfinite(other.error_m)
+    if one.error_m is not None and other.error_m is not None and shared is not None:
+        both = shared & np.isfinite(one.error_m) & np.isfinite(other.error_m)  # none may have measured any
         error = mean_of_trials(mpjpe_mm(one.error_m, both) - mpjpe_mm(other.error_m, both), seed)
         cover = mean_of_trials(
             coverage(one.error_m, one.joint_frames) - coverage(other.error_m, other.joint_frames), seed

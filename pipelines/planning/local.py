@@ -31,6 +31,7 @@ from pipelines.planning.tracking import Plan
 Float = NDArray[np.float64]
 
 TERMS = ("smooth", "form", "obs", "occ", "sep")
+_ASTRAY_M = 3.0  # who plans to be farther off the slot in the end may be caught in a local minimum
 _ROUNDS = 10  # of pushing apart, each a little farther than the one before
 _MARGIN_M = 0.1  # projected waypoints keep this much more than the least distance
 
@@ -90,11 +91,34 @@ class LocalPlanner:
         times = t_s + config.waypoint_s * np.arange(1, config.waypoints + 1, dtype=np.float64)
         waypoints = np.stack([p.at(np.append(t_s, times))[0] for p in others]) if others else _nobody(times)
         guess = slots if previous is None else previous.at(times)[0]
-        path, cost, evaluations = descend(
+        path, cost, evaluations = self._descended(position, velocity, guess, slots, actor, waypoints, field)
+        if previous is not None and np.linalg.norm(path[-1] - slots[-1]) > _ASTRAY_M:
+            # Caught behind something: begin once more where the drone should be, and take what is better.
+            other = self._descended(position, velocity, slots, slots, actor, waypoints, field)
+            evaluations += other[2]
+            if other[1] < cost:
+                path, cost = other[:2]
+        old = None if previous is None else np.concatenate([position[None], guess])
+        kept, separation = _keep_apart(path[2:], waypoints, old, field, config.separation_m)
+        return LocalPlan(Plan(t_s, kept, velocity.copy(), config.waypoint_s), cost, evaluations, separation)
+
+    def _descended(
+        self,
+        position: Float,
+        velocity: Float,
+        guess: Float,
+        slots: Float,
+        actor: Float,
+        others: Float,
+        field: DistanceField,
+    ) -> tuple[Float, float, int]:
+        """What becomes of a guess [N, 3]: path [N + 3, 3], cost, evaluations. `others` [M, N + 1, 3]."""
+        config = self._config
+        return descend(
             _with_start(position, velocity, guess, config.waypoint_s),
             np.ascontiguousarray(slots),
             np.ascontiguousarray(actor),
-            np.ascontiguousarray(waypoints[:, 1:]),
+            np.ascontiguousarray(others[:, 1:]),
             field.grid,
             self._weights_for(field),
             self._factor,
@@ -102,9 +126,6 @@ class LocalPlanner:
             config.tolerance,
             config.step_cap_m,
         )
-        old = None if previous is None else np.concatenate([position[None], guess])
-        kept, separation = _keep_apart(path[2:], waypoints, old, field, config.separation_m)
-        return LocalPlan(Plan(t_s, kept, velocity.copy(), config.waypoint_s), cost, evaluations, separation)
 
     def cost(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -52,15 +53,24 @@ class Pilot:
         config: weights and rates.
         drones: how many, 1 to 16.
         yaw_rad: of the first camera at the start, counterclockwise from east.
+        clock: seconds, for `times`.
 
     Raises:
         ValueError: an impossible number of drones.
     """
 
-    def __init__(self, arm: Arm, config: PlannerConfig, *, drones: int, yaw_rad: float) -> None:
+    def __init__(
+        self,
+        arm: Arm,
+        config: PlannerConfig,
+        *,
+        drones: int,
+        yaw_rad: float,
+        clock: Callable[[], float] = perf_counter,
+    ) -> None:
         if not 1 <= drones <= MOST_DRONES:
             raise ValueError(f"{drones} drones: 1 to {MOST_DRONES} can be planned for")
-        self._config = config
+        self._config, self._clock = config, clock
         self._formation_planner = arm.start(config, drones=drones, yaw_rad=yaw_rad)
         self._local_planner = LocalPlanner(config)
         self._filter = ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m)
@@ -109,12 +119,12 @@ class Pilot:
 
     def _plan_formation(self, t_s: float, field: DistanceField) -> None:
         config = self._config
-        started = perf_counter()
+        started = self._clock()
         knots = t_s + config.knot_s * np.arange(1, config.horizon_knots + 1, dtype=np.float64)
         commanded = self._formation.at(np.array([t_s]))[0]
         actor = self._filter.forecast(knots)
         self._formation = self._formation_planner.plan(t_s, commanded, actor, field)
-        self.times.central_s.append(perf_counter() - started)
+        self.times.central_s.append(self._clock() - started)
 
     def _plan_locally(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
         config = self._config
@@ -122,7 +132,7 @@ class Pilot:
         actor = self._filter.forecast(times)
         slots = actor[:, None] + slot_offsets(self._formation.at(times))
         for i in range(len(self._plans)):
-            started = perf_counter()
+            started = self._clock()
             made = self._local_planner.plan(
                 t_s,
                 position[i],
@@ -133,6 +143,6 @@ class Pilot:
                 field=field,
                 previous=self._plans[i],
             )
-            self.times.local_s.append(perf_counter() - started)
+            self.times.local_s.append(self._clock() - started)
             self._plans[i] = made.plan
             self.separation[made.separation] += 1

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from time import perf_counter
 from typing import Literal
 
 import numpy as np
@@ -64,6 +65,7 @@ def replay(
     yaw_rad: float = 0.0,
     mode: Mode = "closed-loop",
     seed: int = 0,
+    clock: Callable[[], float] = perf_counter,
 ) -> ReplayResult:
     """Fly an arm against a log; equal arguments give equal results, but for the measured times.
 
@@ -81,6 +83,7 @@ def replay(
         mode: `closed-loop` flies point masses with limited acceleration; `plan-only` puts the drones
             exactly where their local plans want them.
         seed: of the noise.
+        clock: seconds, for how long planning takes.
 
     Raises:
         ValueError: times that do not ascend, or fewer than two measurements.
@@ -95,7 +98,7 @@ def replay(
     known = [open_space(), *maps]
     taken_in = np.searchsorted(t_ns, replay_ns, side="right")
 
-    pilot = Pilot(arm, config, drones=drones, yaw_rad=yaw_rad)
+    pilot = Pilot(arm, config, drones=drones, yaw_rad=yaw_rad, clock=clock)
     pilot.measure(0.0, noisy[0])
     start = pilot.slots_now(0.0)[1]
     tracker = Tracker(start, np.zeros_like(start), config)

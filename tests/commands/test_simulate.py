@@ -290,9 +290,9 @@ def test_a_planner_flies_around_what_the_ring_flies_into(tmp_path: Path) -> None
         .replace("duration_s: 4", "duration_s: 8")
     )
     nearest = {}
-    for planner in ("ring", "adaptive"):
+    for planner, turning in (("ring", ", yaw_rate_deg_per_s: -6"), ("adaptive", "")):
         (tmp_path / planner).mkdir()
-        formation = f"count: 2\n  formation: {{planner: {planner}, yaw_deg: 30, yaw_rate_deg_per_s: -6}}"
+        formation = f"count: 2\n  formation: {{planner: {planner}, yaw_deg: 30{turning}}}"
         flight = simulated(tmp_path / planner, text.replace("count: 2", formation), "--no-video")
         distances = []
         for name in ("drone1", "drone2"):
@@ -328,6 +328,11 @@ HOSTILE = {
     "two things at once": ("{distance_m: 5}", "{distance_m: 5, to: [1, 2]}", "exactly one"),
     "unknown noise": ("white:", "pink:", "pink"),
     "noise below zero": ("position_m: 0.1", "position_m: -0.1", "position_m"),
+    "a planner told to turn": (
+        "count: 2",
+        "count: 2\n  formation: {planner: adaptive, yaw_rate_deg_per_s: 4}",
+        "are the ring's",
+    ),
     "unknown planner": ("count: 2", "count: 2\n  formation: {planner: magic}", "magic"),
     "a wood too dense": ("walls:", "wood: {count: 2000, radius_m: 3}\n  walls:", "wood"),
     "a sun below the horizon": ("walls:", "sun: [1, 0, -1]\n  walls:", "sun"),

@@ -174,7 +174,7 @@ def test_terms_of_a_steady_flight_in_closed_form() -> None:
     )
     assert terms["obs"] == pytest.approx((0.3 - 1.5) ** 2 / 3 * speed * 10, rel=1e-5)
     assert terms["occ"] == pytest.approx((0.3 - 0.5) ** 2 / 1 * 8.5 * speed * 10, rel=1e-5)
-    assert total == pytest.approx(2.0 + 1.125 + CONFIG.l_sep * 0.125)
+    assert total == pytest.approx(2.0 + CONFIG.l_form * 1.125 + CONFIG.l_sep * 0.125)
 
 
 def test_descent_never_ends_higher_than_it_began() -> None:
@@ -268,3 +268,29 @@ def test_where_pushing_does_not_help_the_plan_before_goes_on() -> None:
     assert made.separation is Separation.REJECTED
     assert closest_approach(made.plan.path, beside[None]) >= config.separation_m
     assert field.sample(made.plan.path)[0].min() > 0
+
+
+def test_who_is_astray_begins_once_more_and_takes_the_cheaper_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From a plan that stays where it is, 8 m off its slots among boulders: never worse, at times better."""
+    field, costs = boulders(), []
+    for astray_m in (np.inf, 3.0):
+        monkeypatch.setattr("pipelines.planning.local._ASTRAY_M", astray_m)
+        planner, found = LocalPlanner(CONFIG), []
+        for seed in range(12):
+            here = np.append(np.random.default_rng(seed).uniform(-5, 5, 2), 1.0)
+            slots = np.tile(np.array([-here[0], -here[1], 1.3]), (20, 1))
+            made = planner.plan(
+                0.0,
+                here,
+                np.zeros(3),
+                slots=slots,
+                actor=slots + np.array([0, 9, 0]),
+                others=[],
+                field=field,
+                previous=Plan(-0.2, np.tile(here, (21, 1)), np.zeros(3), 0.5),
+            )
+            found.append(made.cost)
+        costs.append(found)
+    once, twice = np.array(costs)
+    assert (twice <= once).all()
+    assert (twice < 0.9 * once).any()

@@ -16,7 +16,7 @@ from pipelines.planning.formation import FormationPath
 from pipelines.planning.pilot import Pilot
 from pipelines.planning.replay import ReplayResult, replay
 from pipelines.planning.scores import near_obstacle, score
-from tests.planning.worlds import bare_ground, mound, trees, walker, wall
+from tests.planning.worlds import bare_ground, high_wall, mound, trees, walker, wall
 
 Float = NDArray[np.float64]
 CONFIG = PlannerConfig()
@@ -76,6 +76,24 @@ def test_a_higher_mound_lifts_the_fixed_formation_further() -> None:
     ]
     assert highest[1] > highest[0] > 30
     assert highest[2] < 20
+
+
+def test_a_wall_blinds_the_fixed_formation_and_not_the_adaptive_one() -> None:
+    """1 m thick, 12 m high, 5 m beside the way: too high to look over, and the slots are behind it."""
+    field = high_wall()
+    fixed, adaptive = fly(FIXED, field, seconds=25.0), fly(ADAPTIVE, field, seconds=25.0)
+    assert 1 - fixed.visible.mean() > 0.1
+    assert adaptive.visible.all()
+    assert tilt_deg(adaptive).max() < 20
+    for result in (fixed, adaptive):
+        assert field.sample(result.position)[0].min() > 1
+
+
+def test_between_trees_the_adaptive_formation_stays_low_and_with_the_actor() -> None:
+    """With cells of 45 deg and 2 s it swept through trees and reached 40 deg."""
+    result = fly(ADAPTIVE, trees(), seconds=30.0)
+    assert tilt_deg(result).max() < 20
+    assert np.linalg.norm(result.position - result.actor, axis=-1).max() < 15
 
 
 @pytest.mark.parametrize("arm", [FIXED, ADAPTIVE], ids=lambda arm: arm.name)

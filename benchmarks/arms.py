@@ -1,0 +1,143 @@
+"""The arms past a mound, a wall and trees: `python -m benchmarks.arms [--weights]`.
+
+Each scenario of sample_data/planning is simulated without video, ingested, and flown again by the fixed and
+the adaptive formation with the weights of its planner.yaml, as `mocap replan-compare` does. All simulated.
+`--weights` flies them with other weights and resolutions too, and counts what each makes of the arms.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.ingest import ingest
+from pipelines.planning.arm_flights import fly_arm
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.loading import load_flight
+from pipelines.planning.scene import Rules, Scene, build_scene
+from pipelines.planning.scores import score
+from pipelines.replan import Settings, planner_settings, replan
+from pipelines.session.description import read_description
+from pipelines.session.maps import load_maps
+from pipelines.session.registries import PLANNER_ARMS
+from pipelines.simulate import simulate
+
+SCENARIOS = Path(__file__).parents[1] / "sample_data" / "planning"
+NAMES = ("mound", "wall", "trees")
+ARMS = ("adaptive", "fixed")
+
+VARIANTS: tuple[Mapping[str, float], ...] = (
+    {},
+    {"yaws": 8, "knot_s": 2, "horizon_knots": 5},
+    {"yaws": 16},
+    {"l_form": 1},
+    {"l_occ": 2},
+    {"l_form": 1, "l_occ": 2, "yaws": 8, "knot_s": 2, "horizon_knots": 5},
+)
+"""What is changed of the defaults; the last was flown before they were measured here."""
+
+
+def main() -> None:
+    """Print the tables of docs/planner.md."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--trials", type=int, default=20, help="draws of noise (default 20)")
+    parser.add_argument("--weights", action="store_true", help="other weights instead (minutes)")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        sessions = {name: _session(name, Path(temporary)) for name in NAMES}
+        if arguments.weights:
+            _print_weights({name: _scene(session) for name, session in sessions.items()})
+        else:
+            _print_comparisons(sessions, arguments.trials)
+
+
+def _session(name: str, folder: Path) -> Path:
+    session = folder / f"{name}.session"
+    simulate(SCENARIOS / f"{name}.yaml", folder / name, video=False)
+    ingest(folder / name / "flight.yaml", session=session)
+    return session
+
+
+def _print_comparisons(sessions: Mapping[str, Path], trials: int) -> None:
+    header = (
+        "scenario",
+        "arm",
+        "tilt mean deg",
+        "max",
+        "near obstacle",
+        "hidden %",
+        "MPJPE mm",
+        "measured %",
+    )
+    print("|".join(["", *(f" {name} " for name in header), ""]))
+    print("|" + " --- |" * len(header))
+    settings = Settings(arms=ARMS, trials=trials, planner=planner_settings(SCENARIOS / "planner.yaml", {}))
+    found = {name: replan(session, settings).metrics for name, session in sessions.items()}
+    for name, metrics in found.items():
+        for arm in ARMS:
+            scores = metrics["arms"][arm]
+            tilt, error = scores["tilt_deg"], scores["reconstruction_error"]
+            print(
+                f"| {name} | {arm} | {tilt['mean']:.1f} | {tilt['max']:.1f} | {tilt['near_obstacle']:.1f} |"
+                f" {100 * scores['occluded_share']:.1f} | {scores['mpjpe_mm']:.1f} |"
+                f" {100 * error['coverage']['mean']:.1f} |"
+            )
+    print("\n| adaptive minus fixed | tilt deg | near obstacle | hidden, points of % | MPJPE mm |")
+    print("|" + " --- |" * 5)
+    for name, metrics in found.items():
+        (difference,) = metrics["differences"]
+        figures = [
+            _with_interval(difference["tilt_deg"], 1),
+            _with_interval(difference["tilt_near_obstacle_deg"], 1),
+            _with_interval(difference["occluded_share"], 100),
+            _with_interval(difference["mpjpe_mm"], 1),
+        ]
+        print(f"| {name} | {' | '.join(figures)} |")
+
+
+def _with_interval(estimate: Mapping[str, Any], scale: float) -> str:
+    low, high = estimate["interval"]
+    return f"{scale * estimate['mean']:+.1f} [{scale * low:+.1f}, {scale * high:+.1f}]"
+
+
+def _scene(session: Path) -> Scene:
+    description = read_description(session)
+    flight = load_flight(session, description, None, pose_noise=None)
+    return build_scene(flight, load_maps(session), description, Rules(PlannerConfig()))
+
+
+def _print_weights(scenes: Mapping[str, Scene]) -> None:
+    print("| changed | " + " | ".join(f"{name}: {arm}" for name in scenes for arm in ARMS) + " |")
+    print("|" + " --- |" * (1 + len(scenes) * len(ARMS)))
+    for changed in VARIANTS:
+        config = replace(PlannerConfig(), **changed)  # type: ignore[arg-type]  # ints and floats by name
+        cells = [
+            _figures(replace(scene, rules=replace(scene.rules, config=config)), arm)
+            for scene in scenes.values()
+            for arm in ARMS
+        ]
+        said = ", ".join(f"{key} {value:g}" for key, value in changed.items()) or "nothing"
+        print(f"| {said} | {' | '.join(cells)} |", flush=True)
+
+
+def _figures(scene: Scene, arm: str) -> str:
+    """Tilt mean/max in deg, and how much of the time nothing is seen."""
+    flown = fly_arm(scene, PLANNER_ARMS.get(arm))
+    scores = score(scene.t_s, flown.position, scene.actor, scene.field, scene.config)
+    tilt = np.degrees(
+        np.arctan2(
+            flown.position[..., 2] - scene.actor[:, 2],
+            np.linalg.norm(flown.position[..., :2] - scene.actor[:, :2], axis=-1),
+        )
+    )
+    return f"{tilt.mean():.1f}/{tilt.max():.1f}, {100 * float(str(scores['occluded_share'])):.1f} %"
+
+
+if __name__ == "__main__":
+    main()
