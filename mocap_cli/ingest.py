@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     metavar="SECONDS",
     help="Frames further than this before or after all logged poses have none.",
 )
+@click.option("--strict", is_flag=True, help="Refuse a flight of which anything is lost or damaged.")
 @overwrite_option
 @force_option
 @json_option
@@ -52,6 +53,7 @@ def ingest_command(
     output: Path | None,
     max_pose_gap: float,
     max_extrapolation: float,
+    strict: bool,
     overwrite: bool,
     force: bool,
     as_json: bool,
@@ -67,6 +69,7 @@ def ingest_command(
             output,
             max_pose_gap_s=max_pose_gap,
             max_extrapolation_s=max_extrapolation,
+            strict=strict,
             overwrite=overwrite,
             force=force,
             progress=progress,

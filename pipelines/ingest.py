@@ -65,6 +65,7 @@ _SHORTER_S = 1.0
 _HASHERS = 4
 _AHEAD_ROWS = 200_000  # of cameras read while their sources are hashed: some 70 MB
 _FASTEST_MPS = 100.0  # no camera that films a person flies faster
+_FROZEN_S, _FROZEN_POSES = 1.0, 10  # a pose that stays the same for longer, and for as many messages
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,7 @@ def ingest(
     *,
     max_pose_gap_s: float = 0.5,
     max_extrapolation_s: float = 0.1,
+    strict: bool = False,
     overwrite: bool = False,
     force: bool = False,
     progress: Progress | None = None,
@@ -94,6 +96,7 @@ def ingest(
         session: where to; by default `<name of the manifest>.session` beside it.
         max_pose_gap_s: frames between two logged poses further apart than this have no pose.
         max_extrapolation_s: frames further than this before or after all logged poses have none.
+        strict: refuse a flight of which anything could not be read or used.
         overwrite: take a target that holds something else.
         force: read everything again although nothing changed.
         progress: who watches.
@@ -122,7 +125,10 @@ def ingest(
         with locked(target, create=True, overwrite=overwrite) as writable:
             run = writable.begin(INGEST, settings=settings, inputs=sources, force=force)
             if run.finished:
-                return Ingested(target, run.record, _stored_description(target), skipped=True)
+                stored_description = _stored_description(target)
+                if strict:
+                    _refuse_losses(flight_path, stored_description)
+                return Ingested(target, run.record, stored_description, skipped=True)
 
             progress.start("Reading cameras", len(flight.cameras))
             entries: dict[str, CameraEntry] = {}
@@ -155,6 +161,8 @@ def ingest(
                 sources=sources,
                 warnings=warnings,
             )
+            if strict:
+                _refuse_losses(flight_path, description)
             write_json(run.folder / "session.json", description.model_dump(mode="json", by_alias=True))
             record = run.publish(counts=_counts(entries), warnings=warnings)
     return Ingested(target, record, description, skipped=False)
@@ -162,6 +170,28 @@ def ingest(
 
 def _stored_description(folder: Path) -> Description:
     return Description.model_validate(read_json(folder / "session.json"))
+
+
+def _refuse_losses(flight_path: Path, description: Description) -> None:
+    """Refuse, in one line, a flight of which something was dropped: all of it, by part and cause."""
+    parts = {
+        f"{name}: {what}": dropped
+        for name, camera in description.cameras.items()
+        for what, dropped in (
+            ("frames", camera.frames.dropped),
+            ("poses", camera.poses.dropped),
+            ("keypoints", camera.keypoints.dropped if camera.keypoints else {}),
+        )
+    }
+    parts["actor"] = description.actor.dropped if description.actor else {}
+    parts["map"] = description.map.dropped if description.map else {}
+    lost = [f"{part}: {losses(dropped)}" for part, dropped in parts.items() if dropped]
+    if lost:
+        raise DataError(
+            flight_path,
+            f"is not whole, and --strict was given ({'; '.join(lost)})",
+            "copy what is damaged again, or ingest without --strict",
+        )
 
 
 def _refuse_unread_parts(flight: Flight, path: Path) -> None:
@@ -531,6 +561,7 @@ class _Reader:
         if not static:
             without_pose = self._frames_without_pose(name, camera, trajectory, frames_t_ns)
             self._doubt_speed(name, trajectory)
+            self._notes += [f"{name}: {doubt}" for doubt in doubts_of_stillness(trajectory)]
             span, covered = int(np.ptp(poses_t_ns)) / 1e9, int(np.ptp(frames_t_ns)) / 1e9
             if covered < _MUCH_SHORTER * span and span - covered > _SHORTER_S:
                 self._notes.append(f"{name}: its pictures cover {covered:.1f} s of {span:.1f} s of poses")
@@ -593,6 +624,27 @@ class _Reader:
                 f"spans {_span(t_ns[0], t_ns[-1])}, the pictures {_span(first, last)}",
                 "check its time base: stamps are world times",
             )
+
+
+def doubts_of_stillness(trajectory: Trajectory) -> list[str]:
+    """Where poses that otherwise change are the same to the last bit for over a second, in one line or none.
+
+    No drone is so still, but the estimator may have frozen. The poses stay in use: nothing but their
+    sameness is against them, and a camera on the ground is as still in a log without noise.
+    """
+    pose = np.concatenate([trajectory.position, trajectory.quaternion_xyzw], axis=1)
+    changes = np.flatnonzero((np.diff(pose, axis=0) != 0).any(axis=1))
+    first, last = np.append(0, changes + 1), np.append(changes, len(pose) - 1)
+    lasts_s = (trajectory.t_ns[last] - trajectory.t_ns[first]) / 1e9
+    count = last - first + 1
+    frozen = (lasts_s > _FROZEN_S) & (count >= _FROZEN_POSES)
+    if not frozen.any() or len(first) == 1:
+        return []
+    after_s = int(trajectory.t_ns[first[np.argmax(frozen)]] - trajectory.t_ns[0]) / 1e9
+    return [
+        f"its poses stand still {frozen.sum()} times, for up to {lasts_s.max():.3g} s ({count[frozen].sum()}"
+        f" poses in all, first after {after_s:.2f} s): was its estimator frozen?"
+    ]
 
 
 def _keypoints_entry(

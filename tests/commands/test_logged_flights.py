@@ -75,6 +75,21 @@ def test_a_topic_that_is_left_out_is_chosen_and_said(tmp_path: Path) -> None:
     assert "poses are timed by the header stamps of their logs: drone1, drone2" in done.stdout
 
 
+def test_strict_refuses_what_is_salvaged_otherwise(tmp_path: Path) -> None:
+    flight = write_logged_flight(tmp_path, "ros1")
+    succeeds("ingest", flight.manifest, "--strict")
+    log = tmp_path / flight.settings["cameras"]["drone1"]["pose"]["log"]
+    log.write_bytes(log.read_bytes()[:-2000])
+    line = refused("ingest", flight.manifest, "--strict")
+    assert "flight.yaml: is not whole, and --strict was given (drone1: " in line
+    assert "1 file truncated" in line
+    kept = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
+    assert kept["cameras"]["drone1"]["poses"]["dropped"] == {}  # the session is the one from before
+    _, description = ingested(tmp_path)
+    assert description["cameras"]["drone1"]["poses"]["dropped"]
+    assert line == refused("ingest", flight.manifest, "--strict")  # though there is nothing left to do
+
+
 def test_missing_topic_lists_the_candidates(tmp_path: Path) -> None:
     flight = write_logged_flight(tmp_path, "ros2-mcap")
     flight.settings["cameras"]["drone1"]["pose"]["topic"] = "/drone1/odom"

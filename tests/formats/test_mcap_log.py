@@ -212,6 +212,28 @@ def test_a_wrong_checksum_costs_its_chunk(tmp_path: Path) -> None:
     assert dropped == {"messages in damaged blocks": 100 - len(pose)}
 
 
+def test_checksums_count_without_an_index_too(tmp_path: Path) -> None:
+    """The library's reader for files without an index would hand out the damaged chunk as it is."""
+    path = write_mcap(tmp_path / "a.mcap", FLIGHT, compression="none", chunk_size=9_000)
+    content = path.read_bytes()
+    found = records(content)
+    # The chunks alone, the third of them damaged, behind the schemas and channels.
+    begins = sorted(at for places in found.values() for at in places)
+    ends = dict(zip(begins, [*begins[1:], len(content)], strict=True))
+    kept = [at for kind in (0x01, 0x03, 0x04, _CHUNK) for at in found.get(kind, [])]
+    bare = bytearray(content[:8])
+    for at in sorted(kept):
+        if at == found[_CHUNK][2]:
+            damaged_at = len(bare) + 2_000
+        bare += content[at : ends[at]]
+    bare[damaged_at] ^= 1
+    path.write_bytes(bare)
+    left, dropped = everything(path)
+    assert dropped == {"damaged blocks without an index": 1, "recording not closed": 1}
+    assert 0 < len(ALL) - len(left) < 20
+    assert left == [message for message in ALL if message in set(left)]
+
+
 def test_an_index_that_points_nowhere_costs_its_messages(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", FLIGHT, chunk_size=9_000)
     content = bytearray(path.read_bytes())
