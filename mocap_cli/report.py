@@ -1,4 +1,4 @@
-"""`mocap report`: a page about a session."""
+"""`mocap report`: a page about a session, and one about several."""
 
 from __future__ import annotations
 
@@ -6,29 +6,68 @@ from pathlib import Path
 
 import click
 
-from mocap_cli.options import any_path, force_option, json_option, level, verbosity_options
+from mocap_cli.options import (
+    any_path,
+    force_option,
+    json_option,
+    level,
+    overwrite_option,
+    verbosity_options,
+)
 from mocap_cli.terminal import print_json, say_warnings, watching
 
 
-@click.command("report", short_help="Write a page about each session.")
+@click.command("report", short_help="Write a page about each session, and one that compares them.")
 @click.argument("sessions", nargs=-1, required=True, type=any_path, metavar="SESSION...")
+@click.option(
+    "-o",
+    "--output",
+    type=any_path,
+    help="Page that compares the sessions [default: comparison/index.html beside the first].",
+)
 @force_option
+@overwrite_option
 @json_option
 @verbosity_options
-def report_command(sessions: tuple[Path, ...], force: bool, as_json: bool, quiet: bool, verbose: int) -> None:
-    """Write one self-contained HTML page for each session: how good, how sure, what is doubtful."""
-    from pipelines.report import report
+def report_command(
+    sessions: tuple[Path, ...],
+    output: Path | None,
+    force: bool,
+    overwrite: bool,
+    as_json: bool,
+    quiet: bool,
+    verbose: int,
+) -> None:
+    """Write one self-contained HTML page for each session: how good, how sure, what is doubtful.
 
+    Two or more sessions are compared side by side as well, every one against the first: which skeleton is
+    better, by how much, and whether that is more than noise.
+    """
+    from pipelines.report import compare_sessions, report
+
+    if output is not None and len(sessions) < 2:
+        raise click.UsageError("--output is the page that compares sessions: state two or more.")
+    compared = None
     results = []
     with watching(level(quiet, verbose)) as progress:
-        progress.start("Writing pages", len(sessions))
+        progress.start("Writing pages", len(sessions) + (len(sessions) > 1))
         for session in sessions:
             results.append(report(session, force=force))
+            progress.advance()
+        if len(sessions) > 1:
+            compared = compare_sessions(sessions, output, overwrite=overwrite)
             progress.advance()
     for result in results:
         say_warnings(result.record.warnings, quiet)
     if as_json:
-        print_json({"pages": [str(result.page) for result in results]})
+        print_json(
+            {
+                "pages": [str(result.page) for result in results],
+                "comparison": None if compared is None else str(compared.page),
+            }
+        )
         return
-    for result in results:
-        click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.page}")
+    pages = [(one.skipped, one.page) for one in results]
+    pages += [] if compared is None else [(compared.skipped, compared.page)]
+    for skipped, page in pages:
+        click.echo(f"{'unchanged' if skipped else 'written'}: {page}")

@@ -1,22 +1,34 @@
-"""Stage `report`: one self-contained page about a session."""
+"""Stage `report`: one self-contained page about a session, and one that sets sessions side by side."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipelines.formats.pictures import Picture, Pictures, open_pictures
+from pipelines.reporting.comparison import labels_of
+from pipelines.reporting.comparison_page import GENERATOR, render_comparison
 from pipelines.reporting.content import ReplanContent, SessionContent, section
 from pipelines.reporting.page import render_page
 from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
-from pipelines.session.stages import Stage, StageRecord, WritableSession, locked, session_name
-from pipelines.session.storage import read_json
+from pipelines.session.stages import (
+    Session,
+    Stage,
+    StageRecord,
+    locked,
+    open_session,
+    session_name,
+)
+from pipelines.session.storage import as_data_error, read_json
 from pipelines.session.tables import (
     ACTOR,
+    CAMERA_POSES,
     COST_MAP,
     FRAMES,
     KEYPOINTS,
@@ -27,7 +39,10 @@ from pipelines.session.tables import (
     read_table,
 )
 
-REPORT = Stage("report", revision=3)
+if TYPE_CHECKING:
+    import pandas as pd
+
+REPORT = Stage("report", revision=4)
 
 
 @dataclass(frozen=True)
@@ -69,7 +84,76 @@ def report(folder: Path, *, force: bool = False) -> Reported:
     return Reported(page, record, skipped=False)
 
 
-def _finished_stages(session: WritableSession) -> dict[str, StageRecord]:
+@dataclass(frozen=True)
+class Compared:
+    """Where the page about several sessions is."""
+
+    page: Path
+    skipped: bool  # the same bytes were there already
+
+
+def compare_sessions(
+    folders: Sequence[Path], output: Path | None = None, *, overwrite: bool = False
+) -> Compared:
+    """Write the page that sets sessions side by side, every one against the first.
+
+    Args:
+        folders: the sessions, two at least.
+        output: the file; by default comparison/index.html beside the first session. A page of an earlier
+            comparison is written anew.
+        overwrite: write also where something else lies.
+
+    Raises:
+        DataError: not a session, damaged, stated twice, or something else lies where the page goes.
+    """
+    resolved = [folder.resolve() for folder in folders]
+    for folder, place in zip(folders, resolved, strict=True):
+        if resolved.count(place) > 1:
+            raise DataError(folder, "is stated twice", "state every session once")
+    labels = labels_of([(*place.parts[1:-1], session_name(place)) for place in resolved])
+    contents = {}
+    for label, folder in zip(labels, folders, strict=True):
+        contents[label] = _load(folder, _finished_stages(open_session(folder)))
+    page = output or resolved[0].parent / "comparison" / "index.html"
+    html, _ = render_comparison(contents)
+    try:
+        if not overwrite:
+            _refuse_foreign(page)
+        if page.is_file() and page.read_bytes() == html.encode():
+            return Compared(page, skipped=True)
+        page.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(page, html.encode())
+    except OSError as error:
+        raise as_data_error(error, page) from error
+    return Compared(page, skipped=False)
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file so that it is there whole or as it was before."""
+    new = path.with_name(f".{path.name}.new")
+    try:
+        new.write_bytes(content)
+        new.replace(path)
+    finally:
+        new.unlink(missing_ok=True)
+
+
+def _refuse_foreign(page: Path) -> None:
+    """A page of ours says so near its beginning."""
+    if page.is_dir():
+        raise DataError(page, "is a folder", "name a file with --output")
+    if not page.exists():
+        return
+    with page.open("rb") as file:
+        if GENERATOR.encode() not in file.read(2048):
+            raise DataError(
+                page,
+                "is there and is no earlier comparison",
+                "choose another place with --output, or write over it with --overwrite",
+            )
+
+
+def _finished_stages(session: Session) -> dict[str, StageRecord]:
     records = {name: session.record(name) for name in ("ingest", "detect", "reconstruct", "replan")}
     if records["ingest"] is None:
         raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
@@ -132,7 +216,16 @@ def _load(folder: Path, records: dict[str, StageRecord]) -> SessionContent:
         keypoints=keypoints,
         stages={name: asdict(record) for name, record in records.items()},
         replan=_load_replan(folder, records["replan"]) if "replan" in records else None,
+        refined=_load_refined(folder) if reconstructed else {},
     )
+
+
+def _load_refined(folder: Path) -> dict[str, pd.DataFrame]:
+    path = folder / "reconstruct" / "cameras.parquet"
+    if not path.exists():
+        return {}
+    table = read_table(path, CAMERA_POSES).sort_values(["camera", "t_ns"])
+    return {str(name): own[POSES.names].reset_index(drop=True) for name, own in table.groupby("camera")}
 
 
 def _load_replan(folder: Path, record: StageRecord) -> ReplanContent:

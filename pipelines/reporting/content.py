@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from pipelines.session.records import Occupancy
@@ -37,6 +37,7 @@ class SessionContent:
     keypoints: dict[str, pd.DataFrame]  # camera: tables.KEYPOINTS, of cameras that have any
     stages: dict[str, dict[str, object]]  # stage: its stage.json
     replan: ReplanContent | None = None
+    refined: dict[str, pd.DataFrame] = field(default_factory=dict)  # camera: tables.POSES, where refined
 
 
 def section(mapping: Mapping[str, object], key: str) -> dict[str, object]:

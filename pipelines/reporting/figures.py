@@ -231,9 +231,9 @@ def _over_time(summary: Summary, motion: Motion) -> Plate:
     values = motion.reprojection_px if summary.errors_mm is None else summary.errors_mm
     unit = "px" if summary.errors_mm is None else "mm"
     what = "reprojection error" if summary.errors_mm is None else "distance from truth"
-    bins = _time_bins(seconds)
+    bins = time_bins(seconds)
     centres, shares = _status_shares(seconds, motion, bins)
-    middle, low, high = _percentiles(np.where(motion.measured, values, np.nan), seconds, bins)
+    middle, low, high = percentiles(np.where(motion.measured, values, np.nan), seconds, bins)
     with page_style():
         figure = Figure((WIDTH_IN, 3.5), layout="constrained")
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
@@ -274,15 +274,15 @@ def _over_time(summary: Summary, motion: Motion) -> Plate:
     return Plate("time", title, caption, svg)
 
 
-def _time_bins(seconds: Float) -> Float:
-    """Edges of at most `MOST_BINS` bins; one per stamp if there are fewer stamps."""
-    count = min(len(seconds), MOST_BINS)
+def time_bins(seconds: Float, most: int = MOST_BINS) -> Float:
+    """Edges of at most so many bins; one per stamp if there are fewer stamps."""
+    count = min(len(seconds), most)
     step = (seconds[-1] - seconds[0]) / max(len(seconds) - 1, 1) or 1.0
     edges: Float = np.linspace(seconds[0] - step / 2, seconds[-1] + step / 2, count + 1)
     return edges
 
 
-def _percentiles(values: Float, seconds: Float, bins: Float) -> tuple[Float, Float, Float]:
+def percentiles(values: Float, seconds: Float, bins: Float) -> tuple[Float, Float, Float]:
     """Median, 10th and 90th percentile of the finite values in each bin; NaN in an empty one."""
     edges = np.searchsorted(seconds, bins)
     result = np.full((3, len(bins) - 1), np.nan)

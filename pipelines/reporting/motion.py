@@ -33,6 +33,7 @@ class Motion:
     covariance: Float  # [T, P, J, 6] m^2, upper triangle as in COVARIANCE
     reprojection_px: Float  # [T, P, J]
     status: NDArray[np.int8]  # [T, P, J] index into tables.STATUS, -1 where the table has no row
+    views: Int64  # [T, P, J] how many cameras the joint was taken from
 
     @property
     def measured(self) -> NDArray[np.bool_]:
@@ -76,6 +77,7 @@ def motion_from_skeleton(table: pd.DataFrame) -> Motion:
         covariance=dense(*COVARIANCE),
         reprojection_px=dense("reprojection_px")[..., 0],
         status=status,
+        views=np.nan_to_num(dense("views")[..., 0]).astype(np.int64),
     )
 
 

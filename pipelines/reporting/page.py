@@ -16,8 +16,10 @@ from pipelines.reporting.content import SessionContent, number, section, text
 from pipelines.reporting.figures import draw_all
 from pipelines.reporting.overlays import Moment, ReadFrame, collect_moments
 from pipelines.reporting.panels import draw_panel, picture_width
+from pipelines.reporting.placing import as_reconstructed
 from pipelines.reporting.replanned import summarise_replan
 from pipelines.reporting.summary import Summary, errors_per_camera, give_verdict, measures, summarise
+from pipelines.reporting.templating import environment
 from pipelines.reporting.viewer import make_scene
 from pipelines.session.tables import STATUS
 
@@ -52,6 +54,7 @@ class Overlays:
     rejected: bool  # whether any joint is marked so
     unmeasured: bool
     others: bool  # whether anybody beside the skeleton's people is drawn
+    refined: bool  # whether the cameras stand where the reconstruction found them, not where the log says
 
 
 def render_page(content: SessionContent, read_frame: ReadFrame | None = None) -> str:
@@ -65,23 +68,7 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
         content: what the session holds.
         read_frame: gives the pictures behind the overlays; without it they are drawn on plain ground.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     summary = summarise(content)
-    environment = Environment(
-        loader=PackageLoader("pipelines.reporting"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters.update(
-        fixed=wording.fixed,
-        whole=wording.whole,
-        percent=wording.percent,
-        joint=wording.joint_label,
-    )
     replan = (
         None
         if content.replan is None
@@ -89,31 +76,35 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
     )
     plates = draw_all(summary, content.poses) | (draw_arms(replan) if replan is not None else {})
     script = (files("pipelines.reporting") / "templates" / "viewer.js").read_text(encoding="utf-8")
-    overlays = _overlays(content, summary, read_frame)
-    return environment.get_template("page.html.j2").render(
-        name=content.name,
-        title=summary.description.flight or content.name,
-        summary=summary,
-        detected=set(content.keypoints),
-        description=summary.description,
-        started=wording.moment(summary.origin_ns),
-        method=text(summary.metrics, "method"),
-        verdict=give_verdict(content, summary),
-        key_figures=_key_figures(summary),
-        measures=measures(summary),
-        errors_per_camera=errors_per_camera(summary),
-        plates=plates,
-        replan=replan,
-        scene=make_scene(summary, content.poses, replan),
-        viewer_script=Markup(script),  # noqa: S704 - our own file
-        policy=_policy(script, pictures=overlays is not None and overlays.pictures > 0),
-        overlays=overlays,
-        # Our own drawing, in which every name was escaped when it was written.
-        drawings={key: Markup(plate.svg) for key, plate in plates.items()},  # noqa: S704
-        statuses=[word for word in STATUS if summary.counts.get(word)],
-        status_labels=wording.STATUS_LABELS,
-        status_reasons=wording.STATUS_REASONS,
-        stages=[_stage_note(stage, record) for stage, record in content.stages.items()],
+    overlays = _overlays(as_reconstructed(content), summary, read_frame)
+    return (
+        environment()
+        .get_template("page.html.j2")
+        .render(
+            name=content.name,
+            title=summary.description.flight or content.name,
+            summary=summary,
+            detected=set(content.keypoints),
+            description=summary.description,
+            started=wording.moment(summary.origin_ns),
+            method=text(summary.metrics, "method"),
+            verdict=give_verdict(content, summary),
+            key_figures=_key_figures(summary),
+            measures=measures(summary),
+            errors_per_camera=errors_per_camera(summary),
+            plates=plates,
+            replan=replan,
+            scene=make_scene(summary, content.poses, replan),
+            viewer_script=Markup(script),  # noqa: S704 - our own file
+            policy=_policy(script, pictures=overlays is not None and overlays.pictures > 0),
+            overlays=overlays,
+            # Our own drawing, in which every name was escaped when it was written.
+            drawings={key: Markup(plate.svg) for key, plate in plates.items()},  # noqa: S704
+            statuses=[word for word in STATUS if summary.counts.get(word)],
+            status_labels=wording.STATUS_LABELS,
+            status_reasons=wording.STATUS_REASONS,
+            stages=[_stage_note(stage, record) for stage, record in content.stages.items()],
+        )
     )
 
 
@@ -138,6 +129,7 @@ def _overlays(content: SessionContent, summary: Summary, read_frame: ReadFrame |
         rejected=any(view.rejected.any() for view in views.values()),
         unmeasured=any(view.unmeasured.any() for view in views.values()),
         others=any(len(view.others) for view in views.values()),
+        refined=bool(content.refined),
     )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape
@@ -110,9 +110,12 @@ def inline_svg(figure: Figure, key: str, title: str, description: str) -> str:
         raise ValueError("matplotlib wrote an SVG without a viewBox")
     body = drawing[drawing.index("</metadata>") + len("</metadata>") :]
     body = re.sub(r"<defs>\s*<style[^>]*>[^<]*</style>\s*</defs>", "", body, count=1)
-    referenced = set(re.findall(r'(?:url\(#|href="#)([^")]+)', body))
+    # Matplotlib's own ids are hashes of coordinates whose last bits the layout's solver leaves open.
+    tags = "".join(re.findall(r"<[^<>]+>", body))
+    found = dict.fromkeys(re.findall(r'(?:url\(#|href="#)([^")]+)', tags))
+    referenced = {name: f"{key}-{k}" for k, name in enumerate(found)}
     # Names stand between tags and are escaped there, so that a tag is whatever lies between < and >.
-    body = re.sub(r"<[^<>]+>", lambda tag: _page_tag(tag.group(), key, referenced), body)
+    body = re.sub(r"<[^<>]+>", lambda tag: _page_tag(tag.group(), referenced), body)
     body = re.sub(r">\s+<", "><", body)
     return (
         f'<svg viewBox="{view.group(1)}" role="img" aria-labelledby="{key}-title" '
@@ -121,11 +124,12 @@ def inline_svg(figure: Figure, key: str, title: str, description: str) -> str:
     )
 
 
-def _page_tag(tag: str, key: str, referenced: set[str]) -> str:
+def _page_tag(tag: str, referenced: Mapping[str, str]) -> str:
     tag = re.sub(
-        r' id="([^"]+)"', lambda m: f' id="{key}-{m.group(1)}"' if m.group(1) in referenced else "", tag
+        r' id="([^"]+)"', lambda m: f' id="{referenced[m.group(1)]}"' if m.group(1) in referenced else "", tag
     )
-    tag = tag.replace("url(#", f"url(#{key}-").replace('xlink:href="#', f'href="#{key}-')
+    tag = re.sub(r'(url\(#|href="#)([^")]+)', lambda m: m.group(1) + referenced[m.group(2)], tag)
+    tag = tag.replace("xlink:href=", "href=")
     tag = re.sub(r" font-family: [^;\"]+;?", "", tag)
     tag = re.sub(r' transform="rotate\(-0 [^"]*"', "", tag)
     tag = re.sub(r"\d+\.\d{3,}", lambda m: f"{float(m.group()):.2f}".rstrip("0").rstrip("."), tag)

@@ -14,7 +14,7 @@ from .conftest import FRAMES, JOINTS, RATE_HZ, make_skeleton, statuses, true_pos
 def test_bins_hold_each_time_once() -> None:
     for count in (1, 2, 299, 300, 301, 5000):
         seconds = np.arange(count) / RATE_HZ + 3.0
-        bins = figures._time_bins(seconds)
+        bins = figures.time_bins(seconds)
         assert len(bins) - 1 == min(count, figures.MOST_BINS)
         assert np.histogram(seconds, bins)[0].sum() == count
 
@@ -25,8 +25,8 @@ def test_percentiles_are_those_of_each_bin() -> None:
     values = rng.random((1200, 2, 17))
     values[rng.random(values.shape) < 0.3] = np.nan
     values[400:420] = np.nan
-    bins = figures._time_bins(seconds)
-    middle, low, high = figures._percentiles(values, seconds, bins)
+    bins = figures.time_bins(seconds)
+    middle, low, high = figures.percentiles(values, seconds, bins)
     # 300 bins of 4 times each.
     expected = [
         np.nanpercentile(values[4 * k : 4 * k + 4], [50, 10, 90]) for k in range(300) if not 100 <= k < 105
@@ -40,7 +40,7 @@ def test_percentiles_are_those_of_each_bin() -> None:
 def test_status_shares_are_those_of_each_bin() -> None:
     motion = motion_from_skeleton(make_skeleton())
     seconds = np.arange(FRAMES) / RATE_HZ
-    _, shares = figures._status_shares(seconds, motion, figures._time_bins(seconds))
+    _, shares = figures._status_shares(seconds, motion, figures.time_bins(seconds))
     np.testing.assert_allclose(shares.sum(axis=0), 1.0)
     # 600 times in 300 bins of two: the share over all times is the mean over the bins.
     for code, word in enumerate(STATUS):

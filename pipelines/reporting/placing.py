@@ -1,0 +1,51 @@
+"""Where the cameras of a session were: as refined where a reconstruction did, else as logged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipelines.geometry.poses import interpolate_poses
+from pipelines.reporting.content import SessionContent, number, section
+from pipelines.reporting.summary import Summary
+from pipelines.session.records import Float, Int64
+from pipelines.session.tabular import trajectory_from
+
+
+def as_reconstructed(content: SessionContent) -> SessionContent:
+    """The session with the poses and the clocks that its skeleton was measured with.
+
+    Refined poses take the place of the logged ones, and frames come at the times of the clocks that were
+    estimated: only so are residuals those of the reconstruction.
+    """
+    offsets = section(content.metrics or {}, "clock_offsets_s")
+    frames = {
+        name: table.assign(t_ns=table["t_ns"] + round((number(offsets, name) or 0.0) * 1e9))
+        for name, table in content.frames.items()
+    }
+    return replace(content, poses=content.poses | content.refined, frames=frames)
+
+
+def camera_positions(content: SessionContent, summary: Summary, t_ns: Int64) -> Float:
+    """[C, T, 3] m of the cameras that have poses; NaN at times without one."""
+    between = summary.description.pose_interpolation
+    poses = content.poses | content.refined
+    positions = []
+    for camera in summary.cameras:
+        if camera.name not in poses:
+            continue
+        track = trajectory_from(poses[camera.name])
+        if camera.entry.poses.static:
+            positions.append(np.repeat(track.position[:1], len(t_ns), axis=0))
+            continue
+        position, _ = interpolate_poses(
+            track.t_ns,
+            track.position,
+            track.quaternion_xyzw,
+            t_ns,
+            max_gap_ns=round(between.max_gap_s * 1e9),
+            max_extrapolation_ns=round(between.max_extrapolation_s * 1e9),
+        )
+        positions.append(position)
+    return np.stack(positions) if positions else np.full((1, len(t_ns), 3), np.nan)

@@ -1,0 +1,259 @@
+"""Sessions side by side: differences that are known in closed form, and the page that tells them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipelines.geometry.bootstrap import RESAMPLES, STRETCH_S
+from pipelines.reporting.comparison import compare, labels_of
+from pipelines.reporting.comparison_page import GENERATOR, render_comparison
+from pipelines.reporting.comparison_verdict import judge
+from pipelines.reporting.content import SessionContent
+from pipelines.reporting.wording import THIN
+
+from .conftest import JOINTS, OFFSET_M, make_skeleton, make_truth
+from .test_page import HOSTILE, _named, _Outline
+
+OFF_MM = 1000 * float(np.linalg.norm(OFFSET_M))
+NORMAL_95 = 1.959964
+
+
+def _moved(content: SessionContent, times: float) -> SessionContent:
+    """The skeleton at so many times its distance from truth."""
+    assert content.skeleton is not None
+    extra = dict(zip("xyz", (times - 1) * OFFSET_M, strict=True))
+    return replace(
+        content,
+        skeleton=content.skeleton.assign(**{axis: content.skeleton[axis] + d for axis, d in extra.items()}),
+    )
+
+
+def _later(content: SessionContent, seconds: int) -> SessionContent:
+    """The same at another time: another flight, as far as the stamps tell."""
+
+    def later(table: pd.DataFrame | None) -> pd.DataFrame | None:
+        return None if table is None else table.assign(t_ns=table["t_ns"] + seconds * 1_000_000_000)
+
+    return replace(content, skeleton=later(content.skeleton), truth=later(content.truth))
+
+
+def _wandering(content: SessionContent, distance_mm: np.ndarray) -> SessionContent:
+    """One sample a second, all joints as far east of the truth as is stated for each."""
+    frames = len(distance_mm)
+    skeleton, truth = make_skeleton(frames, 1.0), make_truth(frames, 1.0)
+    skeleton["status"] = "ok"
+    skeleton[["x", "y", "z"]] = truth[["x", "y", "z"]].to_numpy()
+    skeleton["x"] += np.repeat(distance_mm, len(JOINTS)) / 1000
+    return replace(content, skeleton=skeleton, truth=truth, metrics={"method": "robust"})
+
+
+def _told(contents: dict[str, SessionContent]) -> str:
+    """Every sentence of the verdict."""
+    found = judge(compare(contents))
+    sentences = [found.lead, *found.quality, *found.certainty, *found.doubts]
+    return " ".join(sentences).replace(THIN, " ")
+
+
+def test_the_same_motion_is_compared_moment_by_moment(content: SessionContent) -> None:
+    (pair,) = compare({"a": content, "b": _moved(content, 2)}).pairs
+    found = pair.differences["mpjpe"]
+    assert pair.by_time
+    # Every joint-frame of b is as far again from the truth as that of a: there is nothing to be unsure of.
+    assert found.estimate.value == pytest.approx(OFF_MM, abs=1e-6)
+    assert found.estimate.interval == pytest.approx((OFF_MM, OFF_MM), abs=1e-6)
+    assert found.estimate.is_clear
+    assert (found.first, found.other) == pytest.approx((OFF_MM, 2 * OFF_MM))
+    assert content.skeleton is not None
+    assert found.pairs == int((content.skeleton["status"] == "ok").sum())
+    assert (found.lower, found.joints) == (0, len(JOINTS))
+    # What does not see where the skeleton is does not differ.
+    for key in ("root_mpjpe", "pa_mpjpe", "share", "bones", "predicted", "reprojection"):
+        assert abs(pair.differences[key].estimate.value) < 1e-6, key
+
+
+def test_pairs_are_what_both_measured(content: SessionContent) -> None:
+    """The second lacks a joint that errs as the others do not: its mean is lower, the paired difference 0."""
+    assert content.skeleton is not None
+    nose = content.skeleton["joint"] == "nose"
+    worse = content.skeleton.assign(x=content.skeleton["x"] + np.where(nose, 1.0, 0.0))
+    without = worse.copy()
+    without.loc[nose, "status"] = "rejected"
+    a, b = replace(content, skeleton=worse), replace(content, skeleton=without)
+    comparison = compare({"a": a, "b": b})
+    first, second = (one.estimates["mpjpe"].value for one in comparison.sessions)
+    assert first > second + 40  # a metre at one of 17 joints is 59 mm, less what it was off before
+    found = comparison.pairs[0].differences["mpjpe"]
+    assert abs(found.estimate.value) < 1e-9
+    assert not found.estimate.is_clear
+    assert comparison.pairs[0].differences["share"].estimate.is_clear
+
+
+def test_other_times_are_compared_joint_by_joint(content: SessionContent) -> None:
+    other = _later(_moved(content, 2), 3600)
+    (pair,) = compare({"a": content, "b": other}).pairs
+    assert not pair.by_time
+    found = pair.differences["mpjpe"]
+    assert found.estimate.value == pytest.approx(OFF_MM, abs=1e-6)
+    assert (found.pairs, found.lower) == (len(JOINTS), 0)
+    assert (
+        f"each joint’s mean in one with its mean in the other; “b” has the smaller one for 0 of {len(JOINTS)}"
+        in (_told({"a": content, "b": other}))
+    )
+
+
+def test_another_motion_at_the_same_times_is_compared_joint_by_joint(content: SessionContent) -> None:
+    assert content.skeleton is not None
+    assert content.truth is not None
+    elsewhere = replace(
+        content,
+        skeleton=content.skeleton.assign(y=content.skeleton["y"] + 3),
+        truth=content.truth.assign(y=content.truth["y"] + 3),
+    )
+    assert not compare({"a": content, "b": elsewhere}).pairs[0].by_time
+    # Without truth the same place is what tells.
+    blind = {name: replace(one, truth=None) for name, one in (("a", content), ("b", elsewhere))}
+    assert not compare(blind).pairs[0].by_time
+    assert compare({"a": blind["a"], "b": replace(_moved(content, 2), truth=None)}).pairs[0].by_time
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_intervals_are_those_of_known_variances(content: SessionContent, apart: bool) -> None:
+    """White errors, uniform over 20 mm: the difference of two means has the variance 2 * 20^2 / 12 / T."""
+    frames = 600
+    draw = np.random.default_rng(7)
+    first, second = (_wandering(content, draw.uniform(40, 60, frames)) for _ in range(2))
+    if apart:
+        second = _later(second, 3600)
+    (pair,) = compare({"a": first, "b": second}).pairs
+    interval = pair.differences["mpjpe"].estimate.interval
+    assert pair.by_time is not apart
+    assert interval is not None
+    width = 2 * NORMAL_95 * np.sqrt(2 * 20**2 / 12 / frames)
+    # The spread of white stretches of two samples is known to 1 / sqrt(600) * sqrt(1.5) = 5 %, that of 1000
+    # draws to 2 %, their tails to 4 %: three standard deviations of all of it are 20 %.
+    assert interval[1] - interval[0] == pytest.approx(width, rel=0.2)
+    assert STRETCH_S == 2.0
+    assert RESAMPLES == 1000
+
+
+def test_verdict_names_the_better_one_and_by_how_much(content: SessionContent) -> None:
+    text = _told({"near": content, "far": _moved(content, 2)})
+    assert "“near” has the better skeleton: its joints lie 22.4 mm from the truth on average" in text
+    assert "those of “far” 44.7 mm. That is 22.4 mm or 50.0 % less (95 % interval 22.4 to 22.4 mm)" in text
+    # In the other order the sentence is the same.
+    assert "“near” has the better skeleton" in _told({"far": _moved(content, 2), "near": content})
+
+
+def test_verdict_says_that_a_difference_is_noise(content: SessionContent) -> None:
+    even = np.where(np.arange(600) % 3 == 0, 1.0, -1.0)
+    first = _wandering(content, 50 + even)
+    second = _wandering(content, 50 + np.roll(even, 1))
+    assert "The difference between “a” and “b” is within noise" in _told({"a": first, "b": second})
+
+
+def test_verdict_without_truth_is_about_the_pictures(content: SessionContent) -> None:
+    blind = replace(content, truth=None)
+    assert content.skeleton is not None
+    other = replace(
+        blind, skeleton=content.skeleton.assign(reprojection_px=content.skeleton["reprojection_px"] * 3)
+    )
+    text = _told({"a": blind, "b": other})
+    assert "“a” has the better skeleton" in text
+    assert "px from the keypoints in the pictures on average" in text
+    assert "the verdict is about distances in the pictures" in text
+    assert "MPJPE" not in text
+
+
+def test_sessions_that_cannot_be_compared_are_said(content: SessionContent) -> None:
+    bare = replace(content, skeleton=None, metrics=None, truth=None)
+    text = _told({"a": content, "b": bare})
+    assert "“a” and “b” cannot be compared: “b” holds no reconstructed joint." in text
+    short = replace(content, skeleton=make_skeleton(5), truth=make_truth(5))
+    assert "cannot be told: there are too few moments" in _told({"a": short, "b": short})
+    assert content.skeleton is not None
+    markers = content.skeleton.assign(
+        joint=content.skeleton["joint"].map({n: f"M{k}" for k, n in enumerate(JOINTS)})
+    )
+    foreign = replace(content, skeleton=markers, truth=None)
+    assert "they have no joint in common" in _told({"a": content, "b": foreign})
+
+
+def test_unlike_sessions_are_doubted(content: SessionContent) -> None:
+    simulated = {**content.session, "simulated": True}
+    other = replace(content, session=simulated, metrics={"method": "dlt"})
+    text = _told({"a": content, "b": other})
+    assert "The sessions were reconstructed by different methods: “a” robust and “b” dlt." in text
+    assert "The sessions are not all simulated: “a” real and “b” simulated." in text
+
+
+def _three(content: SessionContent) -> dict[str, SessionContent]:
+    stages = {name: dict(record) for name, record in content.stages.items()}
+    gates = {"method": "robust", "gates": {"pixel_sigma_px": 2.0}}
+    stages["reconstruct"] |= {"key": "c3" * 32, "settings": gates}
+    other = replace(content, stages=stages, metrics={"method": "dlt"})
+    return {"a": _moved(content, 3), "b": _moved(content, 2), "c": other}
+
+
+@pytest.fixture(scope="module")
+def page(content: SessionContent) -> str:
+    return render_comparison(_three(content))[0]
+
+
+def test_three_sessions_are_set_against_the_first(page: str) -> None:
+    outline = _Outline(page)
+    first = "Of 3 sessions, “c” has the smallest mean distance of its joints from the truth: 22.4 mm"
+    assert first in outline.text
+    assert "“b” less “a”" in outline.text
+    assert "“c” less “a”" in outline.text
+    assert outline.count("figure") == 3
+    # 67.1 mm and 44.7 mm are three and two times sqrt(500) mm; every joint of the second is nearer.
+    assert "MPJPE, mm 67.1 44.7 −22.4 −22.4 to −22.4" in outline.text
+    assert "17 of 17 better" in outline.text
+
+
+def test_settings_that_differ_are_listed(page: str) -> None:
+    text = _Outline(page).text
+    assert "reconstruct: gates.pixel_sigma_px 3.0 3.0 2.0" in text
+    assert f"reconstruct: key {'b2' * 32} {'b2' * 32} {'c3' * 32}" in text
+    assert "reconstruct: method" not in text
+
+
+def test_page_needs_nothing_and_is_the_same_every_time(content: SessionContent, page: str) -> None:
+    outline = _Outline(page)
+    assert render_comparison(_three(content))[0] == page
+    assert GENERATOR in page[:2048]
+    assert all(link.startswith("#") for link in outline.links)
+    assert outline.scripts == []
+    assert len(set(outline.ids)) == len(outline.ids)
+    assert set(outline.references) <= set(outline.ids)
+    assert len(page.encode()) < 500_000
+    assert all("scope" in names for tag, names in outline.elements if tag == "th")
+
+
+def test_names_from_files_stay_text(content: SessionContent, page: str) -> None:
+    """A session of every hostile name, as its label, its flight, a joint, a method and a setting."""
+    contents = {}
+    for name in HOSTILE:
+        stages: dict[str, dict[str, object]] = {"reconstruct": {"key": name, "settings": {name: name}}}
+        contents[name] = replace(_named(content, name), stages=stages)
+    outline = _Outline(render_comparison(contents)[0])
+    # No kind of element or attribute that a page with harmless names does not have.
+    assert set(outline.elements) <= set(_Outline(page).elements)
+    assert outline.scripts == []
+    assert all(link.startswith("#") for link in outline.links)
+    text = outline.text.replace("\x00", "\ufffd")
+    for name in HOSTILE:
+        assert text.count(" ".join(name.replace("\x00", "\ufffd").split())[:30]) >= 6, name
+
+
+def test_labels_are_as_long_as_they_must_be() -> None:
+    assert labels_of([("x", "monday"), ("x", "tuesday")]) == ["monday", "tuesday"]
+    assert labels_of([("x", "monday", "flight"), ("x", "tuesday", "flight")]) == [
+        "monday/flight",
+        "tuesday/flight",
+    ]
+    assert labels_of([("flight",), ("x", "flight")]) == ["flight", "x/flight"]

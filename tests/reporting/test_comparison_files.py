@@ -1,0 +1,56 @@
+"""The comparison as a file: where it goes, and that nothing of somebody else's is written over."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import pipelines.report
+from pipelines.report import compare_sessions
+from pipelines.reporting.comparison_page import GENERATOR
+from pipelines.reporting.content import SessionContent
+from pipelines.session.errors import DataError
+
+
+@pytest.fixture
+def sessions(tmp_path: Path, content: SessionContent, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Two folders, whose contents and page are stood in for: here it is about files alone."""
+    folders = [tmp_path / f"{name}.session" for name in ("a", "b")]
+    for folder in folders:
+        folder.mkdir()
+    monkeypatch.setattr(pipelines.report, "open_session", lambda folder: folder)
+    monkeypatch.setattr(pipelines.report, "_finished_stages", lambda _: {})
+    monkeypatch.setattr(pipelines.report, "_load", lambda *_: content)
+    monkeypatch.setattr(
+        pipelines.report, "render_comparison", lambda contents: (f"{GENERATOR} {' '.join(contents)}", {})
+    )
+    return folders
+
+
+def test_page_lies_beside_the_first_session(sessions: list[Path], tmp_path: Path) -> None:
+    done = compare_sessions(sessions)
+    assert (done.page, done.skipped) == (tmp_path / "comparison" / "index.html", False)
+    assert done.page.read_text() == f"{GENERATOR} a b"
+    assert compare_sessions(sessions).skipped
+    # A page of ours is written anew.
+    assert not compare_sessions(sessions[::-1]).skipped
+    assert done.page.read_text() == f"{GENERATOR} b a"
+    assert [path.name for path in done.page.parent.iterdir()] == ["index.html"]
+
+
+def test_nothing_foreign_is_written_over(sessions: list[Path], tmp_path: Path) -> None:
+    mine = tmp_path / "thesis.html"
+    mine.write_text("my own words")
+    with pytest.raises(DataError, match=r"no earlier comparison.*--overwrite"):
+        compare_sessions(sessions, mine)
+    assert mine.read_text() == "my own words"
+    compare_sessions(sessions, mine, overwrite=True)
+    assert mine.read_text().startswith(GENERATOR)
+    with pytest.raises(DataError, match="is a folder"):
+        compare_sessions(sessions, tmp_path, overwrite=False)
+
+
+def test_a_session_is_not_compared_with_itself(sessions: list[Path]) -> None:
+    with pytest.raises(DataError, match="stated twice"):
+        compare_sessions([sessions[0], sessions[1], sessions[0] / ".." / "a.session"])

@@ -1,0 +1,67 @@
+"""The cameras as a reconstruction took them: refined poses before logged ones, frames by estimated clocks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.reporting.content import SessionContent
+from pipelines.reporting.overlays import collect_moments
+from pipelines.reporting.placing import as_reconstructed, camera_positions
+from pipelines.reporting.summary import summarise
+
+from .conftest import ASIDE_PX, CAMERAS, START_NS, _camera_at
+
+TURN_RAD = 0.01
+"""By which the logged pose of drone1 is wrong: 14 px at a focal length of 1400 px."""
+OFFSET_S = 0.2
+
+
+def _misplaced(content: SessionContent) -> SessionContent:
+    """The log turns drone1 about its own x axis; the reconstruction has found where it was."""
+    from scipy.spatial.transform import Rotation
+
+    logged = content.poses["drone1"].copy()
+    turn = Rotation.from_rotvec([TURN_RAD, 0, 0])
+    columns = ["qx", "qy", "qz", "qw"]
+    logged[columns] = (Rotation.from_quat(logged[columns].to_numpy()) * turn).as_quat()
+    poses = content.poses | {"drone1": logged}
+    return replace(content, poses=poses, refined={"drone1": content.poses["drone1"]})
+
+
+def _residual_px(content: SessionContent, camera: str) -> float:
+    medians = [
+        view.median_px
+        for moment in collect_moments(content, summarise(content), None)
+        for view in moment.views
+        if view.camera == camera and view.median_px is not None
+    ]
+    return float(np.median(medians))
+
+
+def test_residuals_are_those_of_refined_poses(content: SessionContent) -> None:
+    misplaced, aside = _misplaced(content), float(np.linalg.norm(ASIDE_PX))
+    assert _residual_px(misplaced, "drone1") > aside + 4  # 14 px across or along 5 px leave 9 px at least
+    assert _residual_px(as_reconstructed(misplaced), "drone1") == pytest.approx(aside, abs=0.05)
+    assert _residual_px(as_reconstructed(misplaced), "drone2") == _residual_px(misplaced, "drone2")
+
+
+def test_frames_come_by_the_clocks_that_were_estimated(content: SessionContent) -> None:
+    early = content.frames["drone1"].assign(t_ns=content.frames["drone1"]["t_ns"] - round(OFFSET_S * 1e9))
+    metrics = {**(content.metrics or {}), "clock_offsets_s": {"drone1": OFFSET_S, "drone2": None}}
+    late = replace(content, frames=content.frames | {"drone1": early}, metrics=metrics)
+    mended = as_reconstructed(late)
+    for name in CAMERAS:
+        assert mended.frames[name]["t_ns"].tolist() == content.frames[name]["t_ns"].tolist()
+
+
+def test_positions_are_refined_where_they_can_be(content: SessionContent) -> None:
+    t_s = np.array([0.0, 1.01, 5.0])
+    t_ns = START_NS + np.round(1e9 * t_s).astype(np.int64)
+    moved = content.poses["drone1"].assign(z=content.poses["drone1"]["z"] + 2)
+    found = camera_positions(replace(content, refined={"drone1": moved}), summarise(content), t_ns)
+    for k, up in enumerate((2.0, 0.0, 0.0)):
+        # The chord of 20 ms lies within 0.1 mm of a path of at most 5 m/s^2.
+        assert found[k] == pytest.approx(_camera_at(k, t_s)[0] + [0, 0, up], abs=1e-3)
