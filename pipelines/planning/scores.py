@@ -110,7 +110,8 @@ def near_obstacle(t_s: Float, slot_position: Float, actor: Float, field: Distanc
     levels = np.arange(1, occupied.shape[2] + 1)
     top_m = grid.origin[2] + grid.resolution_m * (occupied * levels).max(axis=2)
     top_m[~occupied.any(axis=2)] = -np.inf  # the map may begin above the actor
-    looks = np.unique(np.searchsorted(t_s, np.arange(t_s[0], t_s[-1] + 1e-9, 1.0 / _LOOKS_PER_S)))
+    wanted = np.minimum(np.arange(t_s[0], t_s[-1] + 1e-9, 1.0 / _LOOKS_PER_S), t_s[-1])
+    looks = np.unique(np.searchsorted(t_s, wanted))
     found = np.zeros(len(looks), dtype=np.bool_)
     centres = [grid.origin[a] + grid.resolution_m * (np.arange(top_m.shape[a]) + 0.5) for a in range(2)]
     for k, look in enumerate(looks):

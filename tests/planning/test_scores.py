@@ -108,3 +108,12 @@ def test_empty_columns_of_a_map_that_begins_above_the_actor_are_no_obstacles() -
     actor = np.tile([12.0, -25.0, -4.0], (len(T_S), 1))  # the map begins at 0
     assert not near_obstacle(T_S, slot, actor, wall()).any()
     assert not near_obstacle(T_S, slot, actor, open_space()).any()
+
+
+@pytest.mark.parametrize("last", [30, 390, 1000])
+def test_looks_for_obstacles_end_with_the_flight(last: int) -> None:
+    """Five looks a second up to 0.6 and 7.8 s: steps of 0.2 add up to more by rounding."""
+    t_s = np.arange(last + 1) / 50
+    near = near_obstacle(t_s, np.zeros((1, last + 1, 3)), np.zeros((last + 1, 3)), open_space())
+    assert near.shape == (last + 1,)
+    assert not near.any()
