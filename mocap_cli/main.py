@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from mocap_cli.ablate import ablate_command
+from mocap_cli.batch import batch_command
 from mocap_cli.export import export_command
 from mocap_cli.info import info_command
 from mocap_cli.ingest import ingest_command
@@ -60,6 +61,7 @@ for command in (
     reconstruct_command,
     replan_compare_command,
     report_command,
+    batch_command,
     export_command,
     simulate_command,
     ablate_command,

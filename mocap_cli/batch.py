@@ -1,0 +1,127 @@
+"""`mocap batch`: all of it over many flights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import click
+
+from mocap_cli.options import any_path, force_option, json_option, level, overwrite_option, verbosity_options
+from mocap_cli.several import expanded
+from mocap_cli.terminal import one_line, print_json, watching
+
+if TYPE_CHECKING:
+    from pipelines.geometry.triangulation import Method
+
+
+@click.command("batch", short_help="All of it over many flights, on Dask.")
+@click.argument("flights", nargs=-1, required=True, metavar="FLIGHT.yaml...")
+@click.option(
+    "-o",
+    "--output",
+    type=any_path,
+    metavar="FOLDER",
+    help="Where sessions and summary go [default: sessions beside their flights, the summary in ./batch].",
+)
+@click.option(
+    "--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes here [default: all cores]."
+)
+@click.option(
+    "--scheduler",
+    metavar="tcp://HOST:PORT",
+    help="Use the Dask cluster there, whose machines see the same folders under the same paths.",
+)
+@click.option(
+    "--stages",
+    default="ingest,reconstruct,replan-compare,report",
+    show_default=True,
+    metavar="NAME,...",
+    help="Which of them.",
+)
+@click.option(
+    "--method",
+    type=click.Choice(["dlt", "midpoint", "robust", "refined"]),
+    default="robust",
+    show_default=True,
+    help="Of `mocap reconstruct`, as the next two are.",
+)
+@click.option("--detector", default="blazepose", show_default=True, help="For flights without keypoints.")
+@click.option(
+    "--every",
+    type=click.IntRange(1, 1000),
+    default=1,
+    show_default=True,
+    metavar="N",
+    help="Let the detector look at every N-th picture only.",
+)
+@force_option
+@overwrite_option
+@json_option
+@verbosity_options
+@click.pass_context
+def batch_command(
+    context: click.Context,
+    flights: tuple[str, ...],
+    output: Path | None,
+    workers: int | None,
+    scheduler: str | None,
+    stages: str,
+    method: Method | Literal["refined"],
+    detector: str,
+    every: int,
+    force: bool,
+    overwrite: bool,
+    as_json: bool,
+    quiet: bool,
+    verbose: int,
+) -> None:
+    """Ingest, reconstruct, replan and report many flights, and sum them up in a table.
+
+    A flight that fails does not stop the others; in the end the exit status is 1. The same command again
+    continues: what is finished is skipped. Results are those of single runs, byte for byte.
+    """
+    if workers is not None and scheduler is not None:
+        raise click.UsageError("--workers are those of this machine: leave them out with --scheduler.")
+    from pipelines.batch import Settings, batch
+
+    settings = Settings(
+        stages=tuple(name.strip() for name in stages.split(",") if name.strip()),
+        method=method,
+        detector=detector,
+        every=every,
+    )
+    with watching(level(quiet, verbose)) as progress:
+        result = batch(
+            expanded(flights),
+            output,
+            settings,
+            workers=workers,
+            scheduler=scheduler,
+            force=force,
+            overwrite=overwrite,
+            progress=progress,
+        )
+    failures = [row for row in result.rows if row.error is not None]
+    if quiet:  # else they were told as they came
+        for row in failures:
+            click.echo(f"failed: {one_line(str(row.error))}", err=True)
+    if as_json:
+        print_json(
+            {
+                "flights": len(result.rows),
+                "failed": len(failures),
+                "unchanged": result.unchanged,
+                "table": str(result.table),
+                "page": str(result.page),
+            }
+        )
+    else:
+        done = len(result.rows) - len(failures)
+        if not quiet:
+            click.echo(f"{done} of {len(result.rows)} flights done, {result.unchanged} of them unchanged")
+        click.echo(f"written: {result.table}")
+        click.echo(f"written: {result.page}")
+    if failures:
+        click.echo(f"mocap: {len(failures)} of {len(result.rows)} flights failed", err=True)
+        context.exit(1)

@@ -1,0 +1,100 @@
+"""Commands of one flight or session, for several: one after the other, a failure stops none of the rest."""
+
+from __future__ import annotations
+
+import functools
+import glob
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from mocap_cli.options import any_path
+from mocap_cli.terminal import one_line, print_json
+from pipelines.session.errors import DataError, MocapError
+from pipelines.session.several import names_of
+
+Command = Callable[..., dict[str, Any] | None]
+
+
+def expanded(paths: Iterable[str | Path]) -> list[Path]:
+    """The paths, with the patterns among them that no shell expanded, each once.
+
+    Raises:
+        DataError: nothing is called like a pattern.
+    """
+    found: dict[Path, None] = {}
+    for text in map(str, paths):
+        if not glob.has_magic(text) or Path(text).exists():
+            found[Path(text)] = None
+            continue
+        matches = sorted(glob.glob(text, recursive=True))  # noqa: PTH207  # Path's knows no absolute pattern
+        if not matches:
+            raise DataError(text, "matches nothing", "check the pattern")
+        found.update(dict.fromkeys(map(Path, matches)))
+    return list(found)
+
+
+def each(argument: str, metavar: str, suffix: str = "") -> Callable[[Command], Callable[..., None]]:
+    """Let a command of one flight or session take several, or patterns.
+
+    The command returns what --json prints; it must print that not itself.
+
+    Args:
+        argument: its name there.
+        metavar: as it is shown.
+        suffix: of the folders that are made below --output for several.
+    """
+
+    def decorated(command: Command) -> Callable[..., None]:
+        @click.argument("paths", nargs=-1, required=True, type=any_path, metavar=f"{metavar}...")
+        @functools.wraps(command)
+        def run(*, paths: tuple[Path, ...], **options: Any) -> None:
+            ones = expanded(paths)
+            if len(ones) == 1:
+                result = command(**{argument: ones[0]}, **options)
+                if result is not None:
+                    print_json(result)
+                return
+            own: list[dict[str, Any]] = [{argument: path} for path in ones]
+            if "output" in options:
+                for mine, output in zip(own, _outputs(ones, options["output"], suffix), strict=True):
+                    mine["output"] = output
+            _run_all([functools.partial(command, **options | mine) for mine in own], ones, options)
+
+        return run
+
+    return decorated
+
+
+def _outputs(paths: list[Path], folder: Path | None, suffix: str) -> list[Path | None]:
+    """The --output of each, below the one that was given for all."""
+    if folder is None:
+        return [None] * len(paths)
+    if folder.is_file() or (folder / "session.json").exists():
+        what = "a file" if folder.is_file() else "a session"
+        raise DataError(
+            folder, f"is {what}: several need a folder around them all", "give another --output, or none"
+        )
+    return [folder / f"{name}{suffix}" for name in names_of(paths)]
+
+
+def _run_all(
+    calls: list[Callable[[], dict[str, Any] | None]], paths: list[Path], options: dict[str, Any]
+) -> None:
+    results: dict[str, Any] = {}
+    failed: dict[str, str] = {}
+    for path, call in zip(paths, calls, strict=True):
+        if not (options.get("as_json") or options.get("quiet")):
+            click.echo(f"{one_line(str(path))}:")
+        try:
+            results[str(path)] = call()
+        except MocapError as error:
+            failed[str(path)] = one_line(str(error))
+            click.echo(f"mocap: {failed[str(path)]}", err=True)
+    if options.get("as_json"):
+        print_json({"results": results, "failed": failed})
+    if failed:
+        click.echo(f"mocap: {len(failed)} of {len(paths)} failed", err=True)
+        click.get_current_context().exit(1)

@@ -1,0 +1,411 @@
+"""Stages over many flights, on Dask: the only thing above the stages.
+
+A flight is one task, so that what a worker loses with its life is the flight it was at; whoever takes that up
+again continues where the stages left off. Sessions are those of single runs, byte for byte.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+import os
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from pipelines.formats.extras import need
+from pipelines.geometry.triangulation import Method
+from pipelines.ingest import ingest
+from pipelines.reconstruct import Settings as ReconstructSettings
+from pipelines.reconstruct import reconstruct
+from pipelines.replan import replan
+from pipelines.report import report
+from pipelines.reporting.flights import COLUMNS, FlightRow, render_flights
+from pipelines.session.description import read_description
+from pipelines.session.errors import BusyError, DataError, MocapError
+from pipelines.session.progress import Progress, Silent
+from pipelines.session.several import names_of
+from pipelines.session.storage import as_data_error, read_json, write_json
+
+STAGES = ("ingest", "reconstruct", "replan-compare", "report")
+
+_FOLDER = "batch"  # of the summary, where sessions lie beside their flights
+_TABLE, _PAGE, _TIMES = "summary.csv", "summary.html", "run.json"
+_OWNER_LEAVES_S = 30.0
+_ANSWER_S = 20.0
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is done with every flight."""
+
+    stages: tuple[str, ...] = STAGES
+    method: Method | Literal["refined"] = "robust"
+    detector: str = "blazepose"
+    every: int = 1
+
+
+@dataclass(frozen=True)
+class Job:
+    """One flight, for whichever worker takes it."""
+
+    flight: Path  # absolute: workers stand elsewhere
+    session: Path
+    settings: Settings
+    force: bool
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a flight."""
+
+    failed_stage: str | None = None
+    error: str | None = None  # one line
+    unchanged: bool = False  # no stage had anything to do
+    name: str | None = None
+    figures: dict[str, float] = field(default_factory=dict)  # by column of the summary
+    warnings: tuple[str, ...] = ()
+    seconds: dict[str, dict[str, float]] = field(default_factory=dict)  # of every stage: wall and cpu
+    peak_memory_mb: float | None = None  # of the worker, until then
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What a batch left behind."""
+
+    rows: tuple[FlightRow, ...]
+    unchanged: int  # flights of which no stage had anything to do
+    table: Path
+    page: Path
+
+    @property
+    def failed(self) -> int:
+        """How many flights did not go through."""
+        return sum(row.error is not None for row in self.rows)
+
+
+def batch(
+    flights: Sequence[Path],
+    output: Path | None = None,
+    settings: Settings | None = None,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    force: bool = False,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Batch:
+    """Run the stages over many flights, and sum up.
+
+    A flight that fails does not stop the others, and gets its report all the same if it was ingested.
+
+    Args:
+        flights: manifests.
+        output: the folder of the sessions and the summary. By default sessions lie beside their manifests,
+            and the summary in `batch/` where the command was given.
+        settings: what decides the results.
+        workers: processes on this machine, by default one for each core; without `scheduler`.
+        scheduler: the address of a Dask cluster, which reads and writes the same folders by the same paths.
+        force: do everything again although nothing changed.
+        overwrite: replace files that are called like the summary's and are not a batch's.
+        progress: who watches.
+
+    Raises:
+        DataError: Dask is not installed, no scheduler answers, sessions would be called alike, or the summary
+            cannot be written. What is wrong with a flight is told in its row.
+    """
+    settings, progress = settings or Settings(), progress or Silent()
+    unknown = [stage for stage in settings.stages if stage not in STAGES]
+    if unknown:
+        raise DataError(f"--stages {unknown[0]}", "no such stage", f"there are {', '.join(STAGES)}")
+    need("distributed", "batch")
+    flights = list({path.resolve(): path for path in flights}.values())
+    folder = output or Path(_FOLDER)
+    _refuse_foreign(folder, overwrite)
+    jobs = [
+        Job(_absolute(flight), _absolute(session), settings, force)
+        for flight, session in zip(flights, _sessions(flights, output), strict=True)
+    ]
+    outcomes = dict(_outcomes(jobs, workers, scheduler, progress))
+    rows = tuple(_row(folder, job, outcomes[k]) for k, job in enumerate(jobs))
+    _store(folder, rows, [outcomes[k] for k in range(len(jobs))])
+    unchanged = sum(outcome.unchanged for outcome in outcomes.values())
+    return Batch(rows, unchanged, folder / _TABLE, folder / _PAGE)
+
+
+def run_flight(job: Job) -> Outcome:
+    """All stages of one flight; what goes wrong is part of the outcome."""
+    flight = _Flight(job)
+    for stage in STAGES:
+        if stage in job.settings.stages and flight.can(stage):
+            flight.run(stage)
+    return flight.outcome()
+
+
+class _Flight:
+    """A flight on its way through the stages."""
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self.error: str | None = None
+        self.failed_stage: str | None = None
+        self.unchanged = True
+        self.finished: list[str] = []
+        self.seconds: dict[str, dict[str, float]] = {}
+
+    @property
+    def ingested(self) -> bool:
+        return (self.job.session / "session.json").is_file() and self.failed_stage != "ingest"
+
+    def can(self, stage: str) -> bool:
+        """Whether a stage is of use: what there is gets a report, even if it is not much."""
+        return self.error is None or (stage == "report" and self.ingested)
+
+    def run(self, stage: str) -> None:
+        wall_s, cpu_s = time.perf_counter(), time.process_time()
+        try:
+            self.unchanged &= _patiently(lambda: self._skipped(stage))
+            self.finished.append(stage)
+        except MocapError as error:
+            self._fail(stage, str(error))
+        except Exception as error:  # our own bug in one flight must not stop the others
+            self._fail(
+                stage, f"{self.job.flight}: a bug of mocap stopped {stage} ({type(error).__name__}: {error})"
+            )
+        self.seconds[stage] = {
+            "wall": round(time.perf_counter() - wall_s, 3),
+            "cpu": round(time.process_time() - cpu_s, 3),
+        }
+
+    def _skipped(self, stage: str) -> bool:
+        """Run a stage; whether there was nothing to do."""
+        job, force = self.job, self.job.force
+        match stage:
+            case "ingest":
+                job.session.parent.mkdir(parents=True, exist_ok=True)
+                return ingest(job.flight, job.session, force=force).skipped
+            case "reconstruct":
+                chosen = job.settings
+                settings = ReconstructSettings(chosen.method, detector=chosen.detector, every=chosen.every)
+                return reconstruct(job.session, settings, force=force).skipped
+            case "replan-compare":
+                return replan(job.session, force=force).skipped
+            case _:
+                return report(job.session, force=force).skipped
+
+    def _fail(self, stage: str, line: str) -> None:
+        if self.error is None:
+            self.failed_stage, self.error = stage, " ".join(line.split())
+
+    def outcome(self) -> Outcome:
+        name: str | None = None
+        figures: dict[str, float] = {}
+        warnings: tuple[str, ...] = ()
+        try:
+            if self.ingested:
+                name, figures, warnings = _told(self.job.session, self.finished)
+        except MocapError as error:
+            self._fail("report", str(error))
+        return Outcome(
+            failed_stage=self.failed_stage,
+            error=self.error,
+            unchanged=self.unchanged and self.error is None,
+            name=name,
+            figures=figures,
+            warnings=warnings,
+            seconds=self.seconds,
+            peak_memory_mb=_peak_memory_mb(),
+        )
+
+
+def _patiently(call: Callable[[], T]) -> T:
+    """Make a call; wait a while for a session that is held, by a worker that was given up and still ends."""
+    until_s = time.monotonic() + _OWNER_LEAVES_S
+    while True:
+        try:
+            return call()
+        except BusyError:
+            if time.monotonic() > until_s:
+                raise
+            time.sleep(0.5)
+
+
+def _told(session: Path, stages: Sequence[str]) -> tuple[str, dict[str, float], tuple[str, ...]]:
+    """The flight's name, and the figures and warnings of its finished stages."""
+    description = read_description(session)
+    found: dict[str, object] = {}
+    warnings = list(description.warnings)
+    for stage, folder in (("reconstruct", "reconstruct"), ("replan-compare", "replan")):
+        if stage not in stages:
+            continue
+        metrics = read_json(session / folder / "metrics.json")
+        warnings += read_json(session / folder / "stage.json").get("warnings", [])
+        if stage == "reconstruct":
+            found |= {name: metrics.get(name) for name in ("reconstructed_share", "mpjpe_mm", "pa_mpjpe_mm")}
+            found["reprojection_px"] = metrics["reprojection_px"]["median"]
+        else:
+            found |= {f"tilt_deg_{name}": arm["tilt_deg"]["mean"] for name, arm in metrics["arms"].items()}
+    figures = {name: float(value) for name, value in found.items() if isinstance(value, int | float)}
+    return description.flight, figures, tuple(dict.fromkeys(warnings))
+
+
+def _peak_memory_mb() -> float:
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(most / (2**20 if sys.platform == "darwin" else 2**10), 1)  # macOS counts bytes
+
+
+# --- on Dask -------------------------------------------------------------------------------------------
+
+
+def _outcomes(
+    jobs: Sequence[Job], workers: int | None, scheduler: str | None, progress: Progress
+) -> Iterator[tuple[int, Outcome]]:
+    """The outcome of every job, with its number, as they end."""
+    distributed = need("distributed", "batch")
+    progress.start("Flights", len(jobs))
+    with _client(min(workers or os.cpu_count() or 1, len(jobs)), scheduler) as client:
+        futures = {client.submit(run_flight, job, pure=False): k for k, job in enumerate(jobs)}
+        if scheduler and not client.scheduler_info()["workers"]:
+            progress.note(f"{scheduler} has no workers yet: waiting for them")
+        for future in distributed.as_completed(futures):
+            k = futures[future]
+            outcome = _result(future, jobs[k])
+            if outcome.error is not None:
+                progress.note(f"failed: {_as_here(outcome.error)}")
+            progress.advance()
+            yield k, outcome
+
+
+def _result(future: Any, job: Job) -> Outcome:
+    if future.cancelled():
+        return Outcome(error=f"{job.flight}: the Dask cluster went away; give the same command again")
+    error = future.exception()
+    if error is None:
+        result: Outcome = future.result()
+        return result
+    if isinstance(error, need("distributed", "batch").KilledWorker):
+        return Outcome(error=f"{job.flight}: every worker that took it died, perhaps for lack of memory")
+    # The job itself raises nothing: a cluster that does not know this program, or another version of it.
+    line = " ".join(f"{type(error).__name__}: {error}".split())
+    return Outcome(error=f"{job.flight}: the Dask worker could not run it ({line})")
+
+
+@contextmanager
+def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
+    """A client of the cluster at an address, or of one made here for the time."""
+    distributed = need("distributed", "batch")
+    if scheduler is not None:
+        try:
+            client = distributed.Client(scheduler, timeout=_ANSWER_S)
+        except (OSError, ValueError, TypeError) as error:
+            raise DataError(
+                f"--scheduler {scheduler}",
+                "no Dask scheduler answers there",
+                "start one with `dask scheduler`, or leave it out to use this machine",
+            ) from error
+        with client:
+            yield client
+        return
+    cluster = distributed.LocalCluster(
+        n_workers=workers,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address=None,
+        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # its usual port may be taken
+        memory_limit=0,  # Dask pauses workers near theirs for good, where memory is not given back
+        silence_logs=logging.CRITICAL,
+        env={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
+    )
+    with cluster, distributed.Client(cluster) as client:
+        yield client
+
+
+# --- the summary ---------------------------------------------------------------------------------------
+
+
+def _absolute(path: Path) -> Path:
+    return Path(os.path.abspath(path))  # noqa: PTH100  # links stay: media are named relative to the session
+
+
+def _sessions(flights: Sequence[Path], output: Path | None) -> list[Path]:
+    """Where the flights' sessions go."""
+    if output is None:
+        return [flight.with_suffix(".session") for flight in flights]
+    return [output / f"{name}.session" for name in names_of(flights)]
+
+
+def _refuse_foreign(folder: Path, overwrite: bool) -> None:
+    """Refuse to replace a table of somebody else's."""
+    table = folder / _TABLE
+    try:
+        if overwrite or not table.exists():
+            return
+        with table.open(encoding="utf-8", errors="replace") as file:
+            first = file.readline()
+    except OSError as error:
+        raise as_data_error(error, table) from error
+    if not first.startswith(",".join(COLUMNS[:4])):
+        raise DataError(
+            table, "is not the summary of a batch", "choose another --output, or give --overwrite"
+        )
+
+
+def _row(folder: Path, job: Job, outcome: Outcome) -> FlightRow:
+    """A row of the summary, its paths relative to the summary's folder."""
+    page = job.session / "report" / "index.html"
+    return FlightRow(
+        flight=_from(folder, job.flight),
+        name=outcome.name,
+        failed_stage=outcome.failed_stage,
+        error=None if outcome.error is None else _as_here(outcome.error),
+        figures=outcome.figures,
+        warnings=outcome.warnings,
+        report=_from(folder, page) if page.is_file() else None,
+    )
+
+
+def _as_here(line: str) -> str:
+    """A line with its paths as a single run would name them."""
+    return line.replace(f"{Path.cwd()}{os.sep}", "")
+
+
+def _from(folder: Path, path: Path) -> str:
+    return Path(os.path.relpath(path, folder)).as_posix()
+
+
+def _store(folder: Path, rows: Sequence[FlightRow], outcomes: Sequence[Outcome]) -> None:
+    arms = list(dict.fromkeys(name for row in rows for name in row.arms))
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*COLUMNS, *arms, "warnings", "report"])
+    for row in rows:
+        writer.writerow(
+            [*row.cells(), *(row.figures.get(arm) for arm in arms), len(row.warnings), row.report]
+        )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_text(folder / _TABLE, text.getvalue())
+        _write_text(folder / _PAGE, render_flights(rows))
+        times = [
+            {"flight": row.flight, **{k: asdict(outcome)[k] for k in ("seconds", "peak_memory_mb")}}
+            for row, outcome in zip(rows, outcomes, strict=True)
+        ]
+        write_json(folder / _TIMES, {"schema": 1, "flights": times})
+    except OSError as error:
+        raise as_data_error(error, folder) from error
+
+
+def _write_text(path: Path, text: str) -> None:
+    """Replace a file in one piece; names that are not UTF-8 lose what cannot be written."""
+    new = path.with_name(f"{path.name}.new")
+    new.write_bytes(text.encode("utf-8", "replace"))
+    new.replace(path)

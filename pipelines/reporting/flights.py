@@ -1,0 +1,87 @@
+"""The table over many flights: what became of each, and its figures."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from urllib.parse import quote
+
+from pipelines.reporting import wording
+from pipelines.reporting.templating import environment
+
+COLUMNS = (
+    "flight",
+    "name",
+    "status",
+    "failed_stage",
+    "error",
+    "reconstructed_share",
+    "mpjpe_mm",
+    "pa_mpjpe_mm",
+    "reprojection_px",
+)
+"""Of the table as CSV; behind them stand the mean tilt of every planner arm, `warnings` and `report`."""
+
+_FIGURES = COLUMNS[5:]
+_TILT = "tilt_deg_"
+
+
+@dataclass(frozen=True)
+class FlightRow:
+    """One flight."""
+
+    flight: str  # its manifest, as seen from the summary
+    name: str | None  # what it calls itself; None if it was not ingested
+    failed_stage: str | None
+    error: str | None  # one line; None if all went well
+    figures: dict[str, float]  # by column; what was not measured is not in it
+    warnings: tuple[str, ...]
+    report: str | None  # path of its page, as seen from the summary
+
+    @property
+    def status(self) -> str:
+        """`done` or `failed`."""
+        return "done" if self.error is None else "failed"
+
+    @property
+    def arms(self) -> list[str]:
+        """The columns of the planner arms that it has."""
+        return [name for name in self.figures if name.startswith(_TILT)]
+
+    @property
+    def link(self) -> str | None:
+        """The address of its page."""
+        return None if self.report is None else quote(os.fsencode(self.report))
+
+    def cells(self) -> list[object]:
+        """What stands in COLUMNS."""
+        figures = [self.figures.get(name) for name in _FIGURES]
+        return [self.flight, self.name, self.status, self.failed_stage, self.error, *figures]
+
+
+def render_flights(rows: Sequence[FlightRow]) -> str:
+    """The complete HTML of the summary; it loads nothing, and what stands in files is escaped.
+
+    Args:
+        rows: of every flight, in the order in which they are shown.
+    """
+    arms = list(dict.fromkeys(name for row in rows for name in row.arms))
+    failed = sum(row.error is not None for row in rows)
+    return (
+        environment()
+        .get_template("flights.html.j2")
+        .render(
+            rows=rows,
+            arms={name: name.removeprefix(_TILT) for name in arms},
+            failed=failed,
+            lead=_lead(len(rows), failed),
+            plural=wording.plural,
+        )
+    )
+
+
+def _lead(flights: int, failed: int) -> str:
+    if failed == 0:
+        return f"{wording.plural(flights, 'flight')} went through all stages that were asked for."
+    return f"{failed} of {wording.plural(flights, 'flight')} failed; the others went through."

@@ -1,0 +1,206 @@
+"""`mocap batch`: many flights on Dask, with what single runs would have made of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from unittest.mock import ANY
+
+import pandas as pd
+import pytest
+
+from pipelines import batch
+from pipelines.batch import Job, Settings, run_flight
+from pipelines.report import Reported
+from pipelines.reporting.flights import FlightRow, render_flights
+from pipelines.session.errors import BusyError
+from tests.commands.runner import MOCAP, content, mocap, refused, succeeds
+from tests.synthetic.flights import write_flight
+
+DASK = str(Path(sys.executable).with_name("dask"))
+FEW_STAGES = "ingest,reconstruct"
+
+
+class Cluster:
+    """A Dask scheduler and two workers, each a process of its own, that talk over TCP."""
+
+    def __init__(self, folder: Path) -> None:
+        self._stack = ExitStack()
+        self._log = self._stack.enter_context((folder / "dask.log").open("w"))
+        file = folder / "scheduler.json"
+        self._start(
+            "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", file
+        )
+        while not file.exists():
+            time.sleep(0.05)
+        self.address: str = json.loads(file.read_text(encoding="utf-8"))["address"]
+        self.workers = [
+            self._start(
+                *("worker", "--scheduler-file", file, "--nthreads", "1", "--memory-limit", "0"),
+                *("--no-nanny", "--no-dashboard", "--local-directory", folder),
+            )
+            for _ in range(2)
+        ]
+
+    def _start(self, *arguments: str | Path) -> subprocess.Popen[bytes]:
+        process = subprocess.Popen([DASK, *map(str, arguments)], stdout=self._log, stderr=self._log)
+        self._stack.callback(process.wait)
+        self._stack.callback(process.kill)
+        return process
+
+    def close(self) -> None:
+        self._stack.close()
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    made = Cluster(tmp_path_factory.mktemp("dask"))
+    yield made
+    made.close()
+
+
+def flights_and_single_runs(folder: Path, count: int) -> tuple[list[Path], list[dict[str, str]]]:
+    """Manifests in folders of their own, and what single runs make of copies of them."""
+    manifests, single = [], []
+    for k in range(count):
+        for place in ("alone", "batch"):
+            flight = write_flight(folder / place / f"day{k}", seconds=0.4, seed=k)
+        session = folder / "alone" / f"day{k}" / "flight.session"
+        succeeds("ingest", folder / "alone" / f"day{k}" / "flight.yaml")
+        succeeds("reconstruct", session)
+        single.append(content(session))
+        manifests.append(flight.manifest)
+    return manifests, single
+
+
+@pytest.mark.slow
+def test_cluster_makes_the_bytes_of_single_runs_and_a_killed_worker_loses_nothing(
+    tmp_path: Path, cluster: Cluster
+) -> None:
+    manifests, single = flights_and_single_runs(tmp_path, 2)
+    (manifests[1].parent / "broken.yaml").write_text("schema: 1\nname: [", encoding="utf-8")
+    pattern = tmp_path / "batch" / "*" / "*.yaml"  # no shell expands it
+    command = ["batch", str(pattern), "--scheduler", cluster.address, "--stages", FEW_STAGES]
+    process = subprocess.Popen(
+        [MOCAP, *command], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    # The first worker that holds a session dies there and then.
+    numbers = {worker.pid: worker for worker in cluster.workers}
+    killed = None
+    while killed is None and process.poll() is None:
+        for holder in (tmp_path / "batch").glob("*/flight.session/.lock.pid"):
+            with suppress(OSError, ValueError):
+                killed = numbers[int(holder.read_text())]
+                os.kill(killed.pid, signal.SIGKILL)
+                break
+        time.sleep(0.01)
+    _, told = process.communicate(timeout=120)
+    assert killed is not None, told
+    assert killed.wait() == -signal.SIGKILL
+
+    assert process.returncode == 1
+    failed, counted = told.strip().splitlines()[-2:]
+    assert failed.startswith("failed: batch/day1/broken.yaml: ")
+    assert counted == "mocap: 1 of 3 flights failed"
+    assert [content(manifest.with_suffix(".session")) for manifest in manifests] == single
+
+    table = pd.read_csv(tmp_path / "batch" / "summary.csv").set_index("flight")
+    assert list(table["status"]) == ["done", "failed", "done"]
+    metrics = json.loads((manifests[0].parent / "flight.session/reconstruct/metrics.json").read_text())
+    for name in ("reconstructed_share", "mpjpe_mm"):
+        assert table.loc["day0/flight.yaml", name] == metrics[name]
+    times = json.loads((tmp_path / "batch" / "run.json").read_text())["flights"]
+    assert set(times[0]["seconds"]) == set(FEW_STAGES.split(","))
+
+    # The same again, now on a cluster that this machine makes for itself, finds all done, and is silent.
+    (manifests[1].parent / "broken.yaml").unlink()
+    local = [MOCAP, "batch", str(pattern), "--workers", "1", "--stages", FEW_STAGES, "--json"]
+    again = subprocess.run(local, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+    assert (again.returncode, again.stderr) == (0, "")
+    counts = json.loads(again.stdout)
+    assert (counts["flights"], counts["failed"], counts["unchanged"]) == (2, 0, 2)
+
+
+def test_all_stages_of_a_flight_are_those_of_the_commands(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, seconds=1.2)
+    session = tmp_path / "flight.session"
+    outcome = run_flight(Job(flight.manifest, session, Settings(), force=False))
+    assert outcome.error is None
+    assert not outcome.unchanged
+    assert {"reconstructed_share", "mpjpe_mm", "tilt_deg_adaptive", "tilt_deg_fixed"} <= set(outcome.figures)
+    for command in ("reconstruct", "replan-compare", "report"):
+        assert "unchanged" in succeeds(command, session)
+    assert run_flight(Job(flight.manifest, session, Settings(), force=False)).unchanged
+
+
+def test_flight_that_fails_late_gets_its_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = write_flight(tmp_path, seconds=0.4)  # too short for planners
+    session = tmp_path / "flight.session"
+    reported: list[Path] = []
+
+    def write_no_page(folder: Path, *, force: bool) -> Reported:
+        reported.append(folder)
+        return Reported(folder, ANY, skipped=False)
+
+    monkeypatch.setattr(batch, "report", write_no_page)  # a real one takes seconds
+    settings = Settings(stages=("ingest", "replan-compare", "report"))
+    outcome = run_flight(Job(flight.manifest, session, settings, force=False))
+    assert outcome.failed_stage == "replan-compare"
+    assert reported == [session]
+    flight.manifest.unlink()
+    assert run_flight(Job(flight.manifest, session, settings, force=False)).failed_stage == "ingest"
+    assert reported == [session], "a session of before is not the flight's"
+
+
+def test_session_that_is_held_for_a_moment_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def busy_once() -> bool:
+        calls.append(1)
+        if len(calls) == 1:
+            raise BusyError("held")
+        return True
+
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    assert batch._patiently(busy_once)
+    monkeypatch.setattr(batch, "_OWNER_LEAVES_S", -1.0)
+    calls.clear()
+    with pytest.raises(BusyError):
+        batch._patiently(busy_once)
+
+
+def test_what_a_batch_cannot_start_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_flight(tmp_path / "a", seconds=0.1)
+    write_flight(tmp_path / "b" / "a", seconds=0.1)
+    pattern = tmp_path / "**" / "*.yaml"
+    assert "would be called a" in refused("batch", pattern, "-o", tmp_path / "out")
+    assert "matches nothing" in refused("batch", tmp_path / "*.nothing")
+    assert "no such stage" in refused("batch", pattern, "--stages", "ingest,fly")
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "summary.csv").write_text("my,own,table\n", encoding="utf-8")
+    assert "--overwrite" in refused("batch", tmp_path / "a" / "*.yaml", "-o", foreign)
+    assert mocap("batch", pattern, "--workers", "1", "--scheduler", "tcp://x:1").returncode == 2
+    monkeypatch.setattr(batch, "_ANSWER_S", 0.2)
+    assert "no Dask scheduler answers" in refused(
+        "batch", tmp_path / "a" / "*.yaml", "--scheduler", "tcp://127.0.0.1:9", "-o", tmp_path / "out"
+    )
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert 'pip install "mocap-pipeline[batch]"' in refused("batch", tmp_path / "a" / "*.yaml")
+
+
+def test_page_escapes_what_stands_in_files() -> None:
+    evil = '<script>alert("x")</script>'
+    row = FlightRow(evil, evil, "ingest", evil, {"tilt_deg_<b>": 1.0}, (evil,), f"{evil}#/index.html")
+    page = render_flights([row])
+    assert "<script" not in page
+    assert "<b>&" in page  # the cell's own mark, the name escaped
+    assert 'href="%3Cscript' in page
+    assert "%23/index.html" in page
