@@ -1,0 +1,101 @@
+"""Everything that commands do with a file they were given, by every reader that takes it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+from pipelines.formats.frame_times import read_frame_times
+from pipelines.formats.video import frames
+from pipelines.ingest import ingest
+from pipelines.session.errors import MocapError
+from pipelines.session.registries import (
+    FORMATS,
+    CalibrationFormat,
+    Format,
+    JointFormat,
+    KeypointFormat,
+    LogFormat,
+    MapFormat,
+    TrajectoryFormat,
+    VideoFormat,
+)
+from pipelines.session.telemetry import TelemetryChoice, TelemetryFormat, TriggerFormat
+
+
+class NotOneLineError(AssertionError):
+    """A refusal that a terminal would show on several lines."""
+
+
+def read_or_refuse(path: Path, stated: str) -> tuple[int, int]:
+    """Read a file in every way; how many ways worked, and how many refused it in one line.
+
+    Args:
+        path: the file, the folder, or a flight.yaml.
+        stated: the format that a user names, whatever the content says.
+
+    Raises:
+        Exception: whatever a reader lets through that is no refusal.
+    """
+    read = refused = 0
+    for way in _ways(path, stated):
+        try:
+            way()
+            read += 1
+        except MocapError as error:
+            refused += 1
+            if "\n" in str(error).strip():
+                raise NotOneLineError(str(error)) from error
+    return read, refused
+
+
+def _ways(path: Path, stated: str) -> Iterator[Callable[[], object]]:
+    if path.name == "flight.yaml":
+        yield partial(_ingest, path)
+        return
+    for format_ in FORMATS.all():
+        if format_.recognises(path) or format_.name == stated:  # the first never raises, as it promises
+            yield partial(format_.describe, path)
+            yield from _ways_of(format_, path)
+    if stated == "frame_times":
+        yield partial(read_frame_times, path)
+
+
+def _ways_of(format_: Format, path: Path) -> Iterator[Callable[[], object]]:
+    if isinstance(format_, KeypointFormat):
+        yield lambda: format_.read_keypoints(path, skeleton=None, first_frame=0)
+        yield lambda: format_.read_keypoints(path, skeleton="coco17", first_frame=3)
+    if isinstance(format_, TrajectoryFormat):
+        yield lambda: format_.read_trajectory(path)
+    if isinstance(format_, CalibrationFormat):
+        yield lambda: format_.read_calibration(path)
+    if isinstance(format_, JointFormat):
+        yield lambda: format_.read_joints(path, unit=None, axes=None)
+        yield lambda: format_.read_joints(path, unit="mm", axes="y-up")
+    if isinstance(format_, MapFormat):
+        yield lambda: format_.read_map(path)
+    if isinstance(format_, LogFormat):
+        yield lambda: _messages(format_, path)
+    if isinstance(format_, VideoFormat):
+        yield lambda: (format_.index(path), list(frames(path)))
+    if isinstance(format_, TelemetryFormat):
+        yield lambda: format_.read_telemetry(path, TelemetryChoice())
+    if isinstance(format_, TriggerFormat):
+        yield lambda: format_.picture_times(path, TelemetryChoice())
+
+
+def _messages(format_: LogFormat, path: Path) -> None:
+    with format_.open_log([path]) as log:
+        for _ in log.messages([topic.name for topic in log.topics]):
+            pass
+        _ = log.dropped
+
+
+def _ingest(flight: Path) -> None:
+    session = flight.with_suffix(".session")
+    try:
+        ingest(flight, session)
+    finally:
+        shutil.rmtree(session, ignore_errors=True)

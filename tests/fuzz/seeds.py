@@ -1,0 +1,179 @@
+"""A small sound file, or folder, of every format and of its variants: what is damaged."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.formats import bvh_writing, joints_csv, mcap_writing, trc, tum
+from pipelines.session.registries import Export
+from tests.formats import (
+    test_anipose_toml,
+    test_bvh,
+    test_c3d,
+    test_coco_results,
+    test_colmap,
+    test_grid_npz,
+    test_kalibr,
+    test_mmpose,
+    test_octomap,
+    test_opencv_yaml,
+    test_pcd,
+    test_ply,
+    test_pose_csv,
+    test_ros_camera_info,
+    test_ros_map,
+    test_trc,
+)
+from tests.formats.exported import flown, recording, walking
+from tests.formats.log_entries import entries
+from tests.synthetic import drone_logs, logs, map_logs, videos
+from tests.synthetic.flights import write_flight
+from tests.synthetic.logged_flights import write_logged_flight
+
+Writer = Callable[[Path], object]
+"""Writes into an empty folder. What lies there then, if it is one entry, is what is read; else the folder."""
+
+
+TREE = test_octomap.at([7] * 13, [3.5, None, -2.0, [3.5, None] * 4, *[None] * 4])
+"""A block of 8 x 8 x 8 of the finest voxels: a whole octant of the world would be refused."""
+MMPOSE = test_mmpose.video(
+    [test_mmpose.instance(1.0), test_mmpose.instance(2.0)], [], [test_mmpose.instance()]
+)
+
+
+def _text(name: str, text: str | bytes) -> Writer:
+    return lambda folder: (folder / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+
+
+def _json(name: str, content: object) -> Writer:
+    return _text(name, json.dumps(content))
+
+
+def _export(writer: Export, frames: int = 12) -> Writer:
+    return lambda folder: writer.write(recording(frames), folder)
+
+
+def _openpose(folder: Path) -> None:
+    write_flight(folder / "f", cameras=1, seconds=0.1, keypoint_format="openpose")
+    shutil.move(folder / "f" / "drone1", folder / "drone1")
+    shutil.rmtree(folder / "f")
+
+
+def _keypoints(kind: str) -> Writer:
+    def write(folder: Path) -> None:
+        write_flight(folder / "f", cameras=1, seconds=0.2, keypoint_format=kind)
+        shutil.move(folder / "f" / "drone1.json", folder / "drone1.json")
+        shutil.rmtree(folder / "f")
+
+    return write
+
+
+def _truth(folder: Path) -> drone_logs.DroneTruth:
+    truth = drone_logs.drone_of(write_flight(folder / "f", cameras=1, seconds=0.3, clean=True), 0)
+    shutil.rmtree(folder / "f")
+    return truth
+
+
+def _ulog(folder: Path) -> None:
+    drone_logs.write_ulog(folder / "a.ulg", drone_logs.ulog_rows(_truth(folder)))
+
+
+def _colmap(kind: str) -> Writer:
+    def write(folder: Path) -> None:
+        every = dict(enumerate(test_colmap.PARAMETERS.items(), start=1))
+        made = test_colmap.model(every, {f"{name} a.jpg": k for k, (name, _) in every.items()})
+        getattr(made, f"write_{kind}")(str(folder))
+
+    return write
+
+
+def _logged_flight(folder: Path) -> None:
+    write_logged_flight(folder, "mcap-cdr", seconds=0.2)
+    (folder / "truth.csv").unlink()
+    flight = folder / "flight.yaml"
+    text = flight.read_text(encoding="utf-8")
+    flight.write_text(text[: text.index("truth:")], encoding="utf-8")
+
+
+def _map_log(folder: Path) -> None:
+    grid = np.full((4, 4), 100, np.int8)
+    cloud = map_logs.cloud_fields(np.eye(3))
+    maps = [
+        map_logs.octomap_entry(test_octomap.file_of(TREE), 10**9),
+        map_logs.grid_entry(grid, 2 * 10**9),
+        map_logs.cloud_entry(cloud, 3 * 10**9),
+        map_logs.transform_entry("map", "odom", map_logs.AT_REST, 4 * 10**9),
+    ]
+    logs.write_mcap(folder / "maps.mcap", maps, "cdr", compression="none")
+
+
+SEEDS: dict[str, Writer] = {
+    "alphapose": _keypoints("alphapose"),
+    "anipose": _text("calib.toml", test_anipose_toml.CAMERA),
+    "ardupilot": lambda folder: drone_logs.write_dataflash(folder / "a.bin", _truth(folder)),
+    "bvh": _text("a.bvh", test_bvh.TEXT),
+    "bvh of ours": _export(bvh_writing.EXPORT),
+    "c3d": lambda folder: test_c3d.write(folder / "a.c3d", walking(12)),
+    "camera_info": lambda folder: test_ros_camera_info.stored(folder / "left.yaml"),
+    "camera_info as ini": _text("left.ini", test_ros_camera_info.INI),
+    "coco": _keypoints("coco"),
+    "coco data set": _json("set.json", test_coco_results.dataset()),
+    "colmap": _colmap("binary"),
+    "colmap as text": _colmap("text"),
+    "csv": _text("poses.csv", test_pose_csv.EUROC * 2),
+    "dji": lambda folder: drone_logs.write_srt(folder / "a.SRT", _truth(folder)),
+    "flight": lambda folder: write_flight(folder, seconds=0.2),
+    "flight from logs": _logged_flight,
+    "frame_times": _text("f.csv", "frame,t_ns\n" + "".join(f"{k},17000000001{k}3456789\n" for k in range(9))),
+    "joints_csv": lambda folder: joints_csv.write_joints(folder / "joints.csv", walking(4)),
+    "kalibr": lambda folder: test_kalibr.chain(folder / "chain.yaml"),
+    "map log": _map_log,
+    "mcap": lambda folder: logs.write_mcap(folder / "a.mcap", entries(0.2), "cdr", compression="none"),
+    "mcap in chunks": lambda folder: logs.write_log(folder, "a", "mcap-ros1", entries(0.2)),
+    "mcap of ours": _export(mcap_writing.EXPORT, 8),
+    "mmpose": _json("walk.json", MMPOSE),
+    "npz": lambda folder: test_grid_npz.write(folder / "site.npz"),
+    "octomap": _text("a.bt", test_octomap.file_of(TREE)),
+    "octomap with odds": _text("a.ot", test_octomap.file_of(TREE, "ot")),
+    "opencv": lambda folder: test_opencv_yaml.store(folder / "calib.yml"),
+    "opencv as xml": lambda folder: test_opencv_yaml.store(folder / "calib.xml"),
+    "openpose": _openpose,
+    "pcd": lambda folder: test_pcd.write(folder / "a.pcd", "ascii"),
+    "pcd, binary": lambda folder: test_pcd.write(folder / "a.pcd", "binary"),
+    "pcd, compressed": lambda folder: test_pcd.write(folder / "a.pcd", "binary_compressed"),
+    "ply": lambda folder: test_ply.write(folder / "a.ply", "ascii"),
+    "ply, binary": lambda folder: test_ply.write(folder / "a.ply", "binary_little_endian"),
+    "ros1": lambda folder: logs.write_ros1(folder / "a.bag", entries(0.2)),
+    "ros1, compressed": lambda folder: logs.write_ros1(folder / "a.bag", entries(0.2), compression="lz4"),
+    "ros2": lambda folder: logs.write_ros2(folder / "bag", entries(0.2)),
+    "ros2 in mcap": lambda folder: logs.write_ros2(folder / "bag", entries(0.2), storage="mcap"),
+    "ros2, compressed": lambda folder: logs.write_ros2(folder / "bag", entries(0.2), compression="file"),
+    "ros_map": test_ros_map.write,
+    "trc": _export(trc.EXPORT),
+    "trc of others": _text(
+        "a.trc", test_trc.HEADER + "\n1\t0.0\t1000\t2000\t3000\t\t\t\n2\t0.0166\t1\t2\t3\t4\t5\t6\n"
+    ),
+    "tum": lambda folder: tum.write_trajectory(folder / "a.tum", flown(12)),
+    "ulog": _ulog,
+    "video": lambda folder: videos.write_video(folder / "a.mp4", videos.even_ticks(15)),
+    "video, mkv": lambda folder: videos.write_video(folder / "a.mkv", videos.even_ticks(15)),
+}
+
+
+def sown(folder: Path, names: list[str] | None = None) -> dict[str, Path]:
+    """Write the seeds, each into its own folder; what is to be read of each."""
+    paths = {}
+    for number, name in enumerate(names or SEEDS):
+        place = folder / f"{number}"
+        place.mkdir(parents=True)
+        SEEDS[name](place)
+        inside = sorted(place.iterdir())
+        # What stands alone is read as it is; of a floor plan and a flight the file that names the others.
+        heads = [entry for entry in inside if entry.name in {"map.yaml", "flight.yaml"}]
+        paths[name] = heads[0] if heads else inside[0] if len(inside) == 1 else place
+    return paths
