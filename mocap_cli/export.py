@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -12,10 +13,10 @@ from mocap_cli.options import (
     json_option,
     level,
     overwrite_option,
-    session_argument,
     verbosity_options,
 )
-from mocap_cli.terminal import print_json, watching
+from mocap_cli.several import each
+from mocap_cli.terminal import watching
 
 
 class _ListsFormats(click.Command):
@@ -36,7 +37,7 @@ class _ListsFormats(click.Command):
 
 
 @click.command("export", cls=_ListsFormats, short_help="Write TRC, C3D, BVH, CSV, TUM, MCAP, Rerun.")
-@session_argument
+@each("session", "SESSION", suffix=".export")
 @click.option(
     "--to",
     "formats",
@@ -44,7 +45,12 @@ class _ListsFormats(click.Command):
     metavar="FORMAT[,FORMAT...]",
     help="What to write, as listed below; several at once.",
 )
-@click.option("-o", "--output", type=any_path, help="Folder [default: the session's name with .export].")
+@click.option(
+    "-o",
+    "--output",
+    type=any_path,
+    help="Folder, or of several sessions the folder around them [default: the session's name with .export].",
+)
 @click.option("--unit", metavar="m|cm|mm|inch", help="Unit of lengths, for formats that have a choice.")
 @click.option("--axes", metavar="z-up|y-up", help="Which way is up, for formats that have a choice.")
 @click.option(
@@ -66,7 +72,7 @@ def export_command(
     as_json: bool,
     quiet: bool,
     verbose: int,
-) -> None:
+) -> dict[str, Any] | None:
     """Write the skeleton and the cameras in the formats of other programs.
 
     Beside the files, export.json says what each is, in which unit and axes, and what was left out or held.
@@ -89,14 +95,12 @@ def export_command(
             progress=progress,
         )
     if as_json:
-        print_json(
-            {
-                "written": [str(path) for path in result.written],
-                "unchanged": [str(path) for path in result.unchanged],
-            }
-        )
-        return
+        return {
+            "written": [str(path) for path in result.written],
+            "unchanged": [str(path) for path in result.unchanged],
+        }
     for path in result.written:
         click.echo(f"written: {path}")
     for path in result.unchanged:
         click.echo(f"unchanged: {path}")
+    return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,16 +16,21 @@ from mocap_cli.options import (
     overwrite_option,
     verbosity_options,
 )
-from mocap_cli.terminal import one_line, print_json, print_table, say_warnings, watching
+from mocap_cli.several import each
+from mocap_cli.terminal import one_line, print_table, say_warnings, watching
 
 if TYPE_CHECKING:
     from pipelines.ingest import Ingested
 
 
 @click.command("ingest", short_help="Read a flight into a session.")
-@click.argument("flight", type=any_path, metavar="FLIGHT.yaml")
+@each("flight", "FLIGHT.yaml", suffix=".session")
 @click.option(
-    "-o", "--output", type=any_path, help="Session folder [default: the manifest's name with .session]."
+    "-o",
+    "--output",
+    type=any_path,
+    help="Session folder, or of several flights the folder around them [default: the manifest's name with"
+    " .session].",
 )
 @click.option(
     "--max-pose-gap",
@@ -59,8 +64,8 @@ def ingest_command(
     as_json: bool,
     quiet: bool,
     verbose: int,
-) -> None:
-    """Read logs, keypoints, calibration and truth of one flight into a session."""
+) -> dict[str, Any] | None:
+    """Read logs, keypoints, calibration and truth of each flight into a session."""
     from pipelines.ingest import ingest
 
     with watching(level(quiet, verbose)) as progress:
@@ -76,13 +81,13 @@ def ingest_command(
         )
     say_warnings(result.description.warnings, quiet)
     if as_json:
-        print_json(result.description.model_dump(mode="json", by_alias=True))
-        return
+        return result.description.model_dump(mode="json", by_alias=True)
     if not quiet:
         _print(result)
         _print_stamps(result)
         _print_origin(result)
     click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder}")
+    return None
 
 
 def _print_stamps(result: Ingested) -> None:

@@ -14,7 +14,6 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 any_path = click.Path(path_type=Path)
 """Whether a path is there and of the right kind is told by whoever reads it, in the words of the house."""
 
-session_argument = click.argument("session", type=any_path, metavar="SESSION")
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Write where something else lies. Never done without this."
 )

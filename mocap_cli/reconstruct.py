@@ -14,10 +14,10 @@ from mocap_cli.options import (
     force_option,
     json_option,
     level,
-    session_argument,
     verbosity_options,
 )
-from mocap_cli.terminal import print_json, print_table, say_warnings, watching
+from mocap_cli.several import each
+from mocap_cli.terminal import print_table, say_warnings, watching
 
 if TYPE_CHECKING:
     from pipelines.geometry.triangulation import Method
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @click.command("reconstruct", short_help="Detect, triangulate, measure the errors.")
-@session_argument
+@each("session", "SESSION")
 @click.option(
     "--method",
     type=click.Choice(["dlt", "midpoint", "robust", "refined"]),
@@ -160,7 +160,7 @@ def reconstruct_command(
     as_json: bool,
     quiet: bool,
     verbose: int,
-) -> None:
+) -> dict[str, Any] | None:
     """Find the actor's joints in the pictures, triangulate them, and measure the errors."""
     from pipelines.overlay import write_overlays
     from pipelines.reconstruct import Settings, reconstruct
@@ -192,13 +192,13 @@ def reconstruct_command(
         )
     say_warnings(result.record.warnings, quiet)
     if as_json:
-        print_json(result.metrics)
-        return
+        return result.metrics
     if not quiet:
         _print(result, every_joint=verbose > 0)
     click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'reconstruct'}")
     for video in videos:
         click.echo(f"written: {video}")
+    return None
 
 
 def _print(result: Reconstructed, *, every_joint: bool) -> None:

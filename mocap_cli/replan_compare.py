@@ -14,17 +14,17 @@ from mocap_cli.options import (
     force_option,
     json_option,
     level,
-    session_argument,
     verbosity_options,
 )
-from mocap_cli.terminal import print_json, print_table, say_warnings, watching
+from mocap_cli.several import each
+from mocap_cli.terminal import print_table, say_warnings, watching
 
 if TYPE_CHECKING:
     from pipelines.planning.replay import Mode
 
 
 @click.command("replan-compare", short_help="Fly other planners against the log, compare.")
-@session_argument
+@each("session", "SESSION")
 @click.option(
     "--arms",
     metavar="NAME,...",
@@ -94,7 +94,7 @@ def replan_compare_command(
     as_json: bool,
     quiet: bool,
     verbose: int,
-) -> None:
+) -> dict[str, Any] | None:
     """Replay formation planners against the logged actor and map, and compare them in numbers.
 
     The actor's own skeleton is filmed again from each planner's cameras, with simulated errors of detector
@@ -122,13 +122,13 @@ def replan_compare_command(
             filmed = film_arms(session, rendering, force=force, progress=progress)
     say_warnings(result.record.warnings, quiet)
     if as_json:
-        print_json(result.metrics if filmed is None else result.metrics | {"filmed": filmed})
-        return
+        return result.metrics if filmed is None else result.metrics | {"filmed": filmed}
     if not quiet:
         _print(result.metrics)
         if filmed is not None:
             print_filmed(filmed)
     click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'replan'}")
+    return None
 
 
 def _print(metrics: dict[str, Any]) -> None:

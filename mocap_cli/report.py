@@ -14,7 +14,9 @@ from mocap_cli.options import (
     overwrite_option,
     verbosity_options,
 )
+from mocap_cli.several import end, expanded, tell
 from mocap_cli.terminal import print_json, say_warnings, watching
+from pipelines.session.errors import MocapError
 
 
 @click.command("report", short_help="Write a page about each session, and one that compares them.")
@@ -45,17 +47,24 @@ def report_command(
     """
     from pipelines.report import compare_sessions, report
 
-    if output is not None and len(sessions) < 2:
+    ones = expanded(sessions)
+    if output is not None and len(ones) < 2:
         raise click.UsageError("--output is the page that compares sessions: state two or more.")
     compared = None
     results = []
+    failed: dict[str, str] = {}
     with watching(level(quiet, verbose)) as progress:
-        progress.start("Writing pages", len(sessions) + (len(sessions) > 1))
-        for session in sessions:
-            results.append(report(session, force=force))
+        progress.start("Writing pages", len(ones) + (len(ones) > 1))
+        for session in ones:
+            try:
+                results.append(report(session, force=force))
+            except MocapError as error:
+                if len(ones) == 1:
+                    raise
+                failed[str(session)] = tell(error)
             progress.advance()
-        if len(sessions) > 1:
-            compared = compare_sessions(sessions, output, overwrite=overwrite)
+        if len(ones) > 1 and not failed:  # else the first may be missing, which all are compared with
+            compared = compare_sessions(ones, output, overwrite=overwrite)
             progress.advance()
     for result in results:
         say_warnings(result.record.warnings, quiet)
@@ -64,10 +73,13 @@ def report_command(
             {
                 "pages": [str(result.page) for result in results],
                 "comparison": None if compared is None else str(compared.page),
+                "failed": failed,
             }
         )
+        end(failed, ones)
         return
     pages = [(one.skipped, one.page) for one in results]
     pages += [] if compared is None else [(compared.skipped, compared.page)]
     for skipped, page in pages:
         click.echo(f"{'unchanged' if skipped else 'written'}: {page}")
+    end(failed, ones)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import glob
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -91,10 +91,21 @@ def _run_all(
         try:
             results[str(path)] = call()
         except MocapError as error:
-            failed[str(path)] = one_line(str(error))
-            click.echo(f"mocap: {failed[str(path)]}", err=True)
+            failed[str(path)] = tell(error)
     if options.get("as_json"):
         print_json({"results": results, "failed": failed})
+    end(failed, paths)
+
+
+def tell(error: MocapError) -> str:
+    """The line of one that failed, which stops none of the others."""
+    line = one_line(str(error))
+    click.echo(f"mocap: {line}", err=True)
+    return line
+
+
+def end(failed: Collection[str], paths: Collection[Path]) -> None:
+    """Exit with 1, and the count, where any failed."""
     if failed:
         click.echo(f"mocap: {len(failed)} of {len(paths)} failed", err=True)
         click.get_current_context().exit(1)

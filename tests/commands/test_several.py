@@ -1,0 +1,74 @@
+"""Every command of one flight or session takes several, or a pattern that no shell expanded."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pipelines.session.several import names_of
+from tests.commands.runner import content, mocap, refused, succeeds
+from tests.synthetic.flights import write_flight
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two flights, and one between them that is none."""
+    made = tmp_path_factory.mktemp("several")
+    for k, name in enumerate(("friday", "monday")):
+        write_flight(made / name, seconds=0.2, seed=k)
+    (made / "lost").mkdir()
+    (made / "lost" / "flight.yaml").write_text("schema: 1\nname: [", encoding="utf-8")
+    return made
+
+
+def test_one_that_fails_stops_none_of_the_others(folder: Path, tmp_path: Path) -> None:
+    done = mocap("ingest", folder / "*" / "flight.yaml", "-o", tmp_path, "--json")
+    assert done.returncode == 1
+    line, count = done.stderr.strip().splitlines()
+    assert line.startswith(f"mocap: {folder}/lost/flight.yaml")
+    assert count == "mocap: 1 of 3 failed"
+    told = json.loads(done.stdout)
+    assert list(told["results"]) == [f"{folder}/{name}/flight.yaml" for name in ("friday", "monday")]
+    assert told["failed"] == {f"{folder}/lost/flight.yaml": line.removeprefix("mocap: ")}
+
+    sessions = [tmp_path / f"{name}.session" for name in ("friday", "monday")]
+    printed = succeeds("reconstruct", tmp_path / "*.session", "--method", "dlt")
+    assert [f"{session}:" in printed and f"written: {session}" in printed for session in sessions] == [
+        True
+    ] * 2
+    assert "unchanged" in succeeds("reconstruct", sessions[1], "--method", "dlt")  # as one alone
+    (tmp_path / "no.session").mkdir()
+    for command in (["reconstruct"], ["replan-compare"], ["export", "--to", "csv", "-o", tmp_path / "out"]):
+        done = mocap(*command, tmp_path / "no.session", sessions[0])
+        assert done.returncode == 1, command
+        assert "no.session: is not a session" in done.stderr
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["friday.export"]
+    assert "friday.export/Test_flight.csv" in content(tmp_path / "out")
+
+
+def test_pages_of_the_others_are_written(folder: Path, tmp_path: Path) -> None:
+    succeeds("ingest", folder / "friday" / "flight.yaml", "-o", tmp_path / "a.session")
+    done = mocap("report", tmp_path / "no.session", tmp_path / "a.session", "--json")
+    assert done.returncode == 1
+    told = json.loads(done.stdout)
+    assert told["pages"] == [f"{tmp_path}/a.session/report/index.html"]
+    assert told["comparison"] is None
+    assert list(told["failed"]) == [f"{tmp_path}/no.session"]
+
+
+def test_output_of_several_is_a_folder_around_them(folder: Path, tmp_path: Path) -> None:
+    flights = [folder / name / "flight.yaml" for name in ("friday", "monday")]
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    assert "is a file: several need a folder" in refused("ingest", *flights, "-o", tmp_path / "file")
+    succeeds("ingest", flights[0], "-o", tmp_path / "one.session")
+    assert "is a session: several need a folder" in refused(
+        "ingest", *flights, "-o", tmp_path / "one.session"
+    )
+    assert "matches nothing" in refused("ingest", folder / "*.yml")
+
+
+def test_what_sessions_of_several_are_called() -> None:
+    assert names_of([Path("/a/flight.yaml"), Path("/b/tuesday.yaml")]) == ["a", "tuesday"]
+    assert names_of([Path("/a/flight.session"), Path("/b/c.session")]) == ["a", "c"]
