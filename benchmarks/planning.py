@@ -64,7 +64,7 @@ def print_central(repeats: int) -> list[tuple[str, float, float]]:
             name = "central plan, D {}, T {}, n {}, median ms".format(*size)
             aims.append((name, median, CENTRAL_AIMS_MS[size]))
     for arm, drones in ((COVARIANCE, 2), (GREEDY, 2), (GREEDY, 3)):
-        _print_central(arm, (8, 10, drones), field, repeats)
+        _print_central(arm, (8, 10, drones), field, repeats)  # their lattice decides at every other knot
     return aims
 
 
