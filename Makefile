@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO := demo
 
-.PHONY: setup demo test lint bench sample lock clean
+.PHONY: setup demo test lint bench fuzz wheel docs sample lock clean
 .DELETE_ON_ERROR:
 
 setup: $(STAMP)
@@ -46,6 +46,17 @@ bench: setup
 	$(BIN)/python -m benchmarks.detection
 	$(BIN)/python -m benchmarks.detector_by_tilt
 	$(BIN)/python -m benchmarks.refine
+
+# Damaged files into every reader, for some minutes.
+fuzz: setup
+	$(BIN)/python -m tests.fuzz --inputs 2000
+
+# The wheel in an empty environment.
+wheel:
+	.ci/wheel
+
+docs: setup
+	$(BIN)/mkdocs build --strict --site-dir build/site
 
 # Make the sample flight again: the same logs and truth as in the repository, byte for byte.
 sample: setup
