@@ -6,7 +6,6 @@ is one pass over the messages of one topic: logs of any size stream.
 
 from __future__ import annotations
 
-from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -39,7 +38,7 @@ from pipelines.formats.map_topics import (
     map_messages,
     nothing_usable,
 )
-from pipelines.formats.pictures import Stamped, later_pictures, picture_stamps, stamp_of
+from pipelines.formats.pictures import later_times, picture_stamps
 from pipelines.formats.recordings import OpenLog
 from pipelines.geometry.poses import compose, matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.session.errors import DataError
@@ -233,25 +232,15 @@ class FlightLogs:
         stamps = self.settings(log).stamps
         with self._open(log) as (recording, source):
             name = self._choose(recording, source, "pictures", topic)
-            seen = 0
-            t_ns = array("q")
-
-            def pictures() -> Iterator[Stamped]:
-                nonlocal seen
-                for picture in picture_stamps(recording, name, source):
-                    seen += 1
-                    yield picture
-
-            for picture in later_pictures(pictures(), stamps):
-                t_ns.append(stamp_of(picture, stamps))
+            taken_ns, received_ns = picture_stamps(recording, name, source)
+            t_ns = later_times(taken_ns, received_ns, stamps)
             lost = Counter(recording.dropped)
             started_ns = _start_ns(recording)
-        if not t_ns:
+        if not len(t_ns):
             raise DataError(source, f"{name} holds no picture", "name another topic")
-        if seen > len(t_ns):
-            lost["picture without a later stamp"] += seen - len(t_ns)
-        times = np.frombuffer(t_ns, dtype=np.int64)
-        return Frames(name, self._world_times(log, times, started_ns), dict(lost))
+        if len(taken_ns) > len(t_ns):
+            lost["picture without a later stamp"] += len(taken_ns) - len(t_ns)
+        return Frames(name, self._world_times(log, t_ns, started_ns), dict(lost))
 
     def maps(
         self, stated: MapSource, to_world: Callable[[Trajectory], Trajectory], *, max_gap_ns: int

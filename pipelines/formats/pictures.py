@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -129,8 +130,10 @@ def picture_samples(recording: Log, topic: str, source: Path | str) -> Iterator[
     return all_samples(recording.messages([topic]), source)
 
 
-def picture_stamps(recording: Log, topic: str, source: Path | str) -> Iterator[Stamped]:
-    """When the pictures of a topic were taken and received, in the order of receipt.
+def picture_stamps(recording: Log, topic: str, source: Path | str) -> tuple[Int64, Int64]:
+    """When the pictures of a topic were taken (0 where it does not say) and received: [N] and [N].
+
+    In the order of receipt.
 
     Of the same pictures as `picture_samples` gives. Where their messages are laid out alike, only the
     beginning of each is looked at.
@@ -139,12 +142,14 @@ def picture_stamps(recording: Log, topic: str, source: Path | str) -> Iterator[S
         DataError: the topic holds something else.
     """
     if (at_once := _stamps_at_once(recording, topic)) is not None:
-        yield from map(_Stamps, *(stamps.tolist() for stamps in at_once))
-        return
+        return at_once
+    header_ns, receive_ns = array("q"), array("q")
     for sample in picture_samples(recording, topic, source):
         if not isinstance(sample, PictureSample):
             raise DataError(source, f"{topic} holds no pictures", "name another topic")
-        yield sample
+        header_ns.append(sample.stamp_ns)
+        receive_ns.append(sample.receive_ns)
+    return np.array(header_ns, np.int64), np.array(receive_ns, np.int64)
 
 
 def _stamps_at_once(recording: Log, topic: str) -> tuple[Int64, Int64] | None:
@@ -174,6 +179,22 @@ def later_pictures(pictures: Iterator[_Stamped], stamps: str) -> Iterator[_Stamp
                 continue
         newest, leapt = picture, None
         yield picture
+
+
+def later_times(header_ns: Int64, receive_ns: Int64, stamps: str) -> Int64:
+    """The stamps of the `later_pictures`, [n], strictly increasing.
+
+    Args:
+        header_ns: [N] stamps of the headers of all pictures, in the order of receipt; 0 without one.
+        receive_ns: [N] of receipt.
+        stamps: which of them order the pictures: header or receive.
+    """
+    times = np.where((header_ns != 0) & (stamps == "header"), header_ns, receive_ns)
+    leaps = np.where((header_ns[1:] != 0) & (header_ns[:-1] != 0), np.diff(header_ns - receive_ns), 0)
+    if (np.diff(times) > 0).all() and (leaps <= _MAY_LEAP_NS).all():
+        return times  # as those of a camera are
+    pictures = map(_Stamps, header_ns.tolist(), receive_ns.tolist())
+    return np.array([stamp_of(picture, stamps) for picture in later_pictures(pictures, stamps)], np.int64)
 
 
 def _leap_ns(before: Stamped, after: Stamped) -> int:

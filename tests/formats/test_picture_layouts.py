@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from pipelines.formats.log_messages import all_samples
 from pipelines.formats.message_decoders import Schema, decoder
 from pipelines.formats.picture_layouts import HEAD_LENGTH, PictureFields, picture_decoder, read_stamps
-from pipelines.formats.pictures import picture_samples, picture_stamps
+from pipelines.formats.pictures import later_pictures, later_times, picture_samples, picture_stamps, stamp_of
 from pipelines.formats.recordings import OpenLog
 from pipelines.formats.ros_messages import build
 from pipelines.session.errors import DataError
-from pipelines.session.records import PictureSample
+from pipelines.session.records import Int64, PictureSample
 from pipelines.session.registries import LogFormat, recognise
 from tests.synthetic.logs import CONTAINERS, ROS1, ROS2, Container, Entry, write_log
 
@@ -84,6 +84,28 @@ def alike(k: int, received_ns: int) -> Entry:
     return Entry(TOPIC, COMPRESSED, received_ns, stated)
 
 
+def stamps_of(arrays: tuple[Int64, Int64]) -> list[tuple[int, int]]:
+    header_ns, receive_ns = arrays
+    return list(zip(header_ns.tolist(), receive_ns.tolist(), strict=True))
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12),
+    st.sampled_from(["header", "receive"]),
+)
+def test_later_times_are_those_of_the_later_pictures(rows: list[tuple[int, int]], stamps: str) -> None:
+    """Seconds that repeat, go back, leap and are missing (0), or go on as those of a camera do."""
+    rows = rows if len(rows) > 3 else [(k + 1, k + 1) for k in range(len(rows))]
+    header_ns, receive_ns = (np.array([r[i] for r in rows], np.int64) * 10**9 for i in range(2))
+    samples = [
+        PictureSample(int(h), int(r), "jpeg", None, None, None, np.zeros(1, np.uint8))
+        for h, r in zip(header_ns, receive_ns, strict=True)
+    ]
+    expected = [stamp_of(picture, stamps) for picture in later_pictures(iter(samples), stamps)]
+    assert later_times(header_ns, receive_ns, stamps).tolist() == expected
+
+
 @pytest.mark.parametrize("container", CONTAINERS)
 def test_stamps_at_once_are_those_of_the_pictures(tmp_path: Path, container: Container) -> None:
     """Of two files that interleave, with equal stamps of receipt and some out of order."""
@@ -95,7 +117,7 @@ def test_stamps_at_once_are_those_of_the_pictures(tmp_path: Path, container: Con
     ]
     with recognise(paths[0], LogFormat, "log").open_log(paths) as log:
         expected = [(s.stamp_ns, s.receive_ns) for s in picture_samples(log, TOPIC, "log")]
-        found = [(s.stamp_ns, s.receive_ns) for s in picture_stamps(log, TOPIC, "log")]
+        found = stamps_of(picture_stamps(log, TOPIC, "log"))
         assert isinstance(log, OpenLog)
         (topic,) = log.topics
         (schema,) = log.schemas(topic)
@@ -132,10 +154,13 @@ def test_damage_costs_both_ways_the_same(tmp_path: Path, name: str, data: st.Dat
     hurt = tmp_path / f"hurt{'.db3' if whole.is_dir() else whole.suffix}"
     hurt.write_bytes(content)
     results = []
-    for read in (picture_stamps, picture_samples):
+    for at_once in (True, False):
         try:
             with recognise(hurt, LogFormat, "log").open_log([hurt]) as log:
-                stamps = [(s.stamp_ns, s.receive_ns) for s in read(log, TOPIC, "log")]
+                if at_once:
+                    stamps = stamps_of(picture_stamps(log, TOPIC, "log"))
+                else:
+                    stamps = [(s.stamp_ns, s.receive_ns) for s in picture_samples(log, TOPIC, "log")]
                 results.append((stamps, log.dropped))
         except DataError as error:
             results.append(([], {str(error): 1}))
