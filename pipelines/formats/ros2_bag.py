@@ -402,7 +402,7 @@ def _read_metadata(path: Path) -> _Metadata:
                 "span_s": int(information["duration"]["nanoseconds"]) / 1e9,
             },
         )
-    except (YAMLError, OSError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (YAMLError, OSError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise ValueError(str(error)) from error
 
 

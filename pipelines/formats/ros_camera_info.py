@@ -77,11 +77,12 @@ def _matrix(path: Path, name: str, value: object) -> Float:
     block = value if isinstance(value, dict) else {}
     cells = numbers(path, f"{name}.data", block.get("data"))
     rows, columns = block.get("rows"), block.get("cols")
-    if not isinstance(rows, int) or not isinstance(columns, int) or min(rows, columns) < 0:
+    # `true` is an integer to isinstance, and to nobody else.
+    if type(rows) is not int or type(columns) is not int or min(rows, columns) < 0:
         raise DataError(path, f"{name} states no rows and cols", "write the calibration again")
     if rows * columns != len(cells):
         raise DataError(path, f"{name} is {rows} x {columns} but has {len(cells)} numbers", "write it again")
-    return cells.reshape(rows, columns)
+    return cells.reshape(rows, columns) if len(cells) else cells.reshape(0, 0)
 
 
 def _read_ini(path: Path) -> dict[str, CalibratedCamera]:

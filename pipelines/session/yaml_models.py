@@ -88,7 +88,33 @@ def _read_yaml(path: Path, noun: str) -> object:
     except (YAMLError, ValueError, RecursionError) as error:
         problem = " ".join(str(error).split())[:200]
         raise DataError(path, f"is no valid YAML ({problem})", "mend it") from None
+    _refuse_impossible_text(path, value)
     return value
+
+
+def _refuse_impossible_text(path: Path, value: object) -> None:
+    """Refuse escapes for what no name of a file can hold: zero bytes, halves of characters."""
+    seen: set[int] = set()  # aliases of aliases are one thing, however often they stand there
+    waiting = [value]
+    while waiting:
+        item = waiting.pop()
+        if id(item) in seen:
+            continue
+        seen.add(id(item))
+        if isinstance(item, Mapping):
+            waiting += [*item, *item.values()]
+        elif isinstance(item, list):
+            waiting += item
+        elif isinstance(item, str) and ("\0" in item or not _is_unicode(item)):
+            raise DataError(path, f"holds a text with impossible characters ({item[:60]!r})", "mend it")
+
+
+def _is_unicode(text: str) -> bool:
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _describe(problem: Any, model: type[Part]) -> str:  # ErrorDetails, whose ctx has no fixed shape

@@ -178,6 +178,13 @@ def test_session_of_another_flight_is_not_replaced_silently(flight: SyntheticFli
     assert content(tmp_path / "flight.session") == before
 
 
+@pytest.mark.parametrize("escape", [r"\0", r"\ud800"])
+def test_text_that_no_name_of_a_file_can_hold(flight: SyntheticFlight, escape: str) -> None:
+    text = flight.manifest.read_text(encoding="utf-8")
+    flight.manifest.write_text(text.replace("drone1.tum", f'"drone1{escape}.tum"', 1), encoding="utf-8")
+    assert "holds a text with impossible characters" in refused("ingest", flight.manifest)
+
+
 def test_unknown_export_lists_those_there_are(flight: SyntheticFlight, tmp_path: Path) -> None:
     succeeds("ingest", flight.manifest)
     assert "bvh, c3d, csv, mcap, parquet, rerun, trc, tum" in refused(

@@ -156,6 +156,8 @@ def test_a_missing_part_costs_its_messages_and_is_said(tmp_path: Path) -> None:
         "{[",
         "rosbag2_bagfile_information: 3",
         "rosbag2_bagfile_information:\n  relative_file_paths: [bag.db3]",
+        "rosbag2_bagfile_information:\n  relative_file_paths: [bag.db3]\n  message_count: 1\n"
+        f"  starting_time: {{nanoseconds_since_epoch: 1}}\n  duration: {{nanoseconds: 1{'0' * 400}}}",
     ],
 )
 def test_a_damaged_metadata_file_is_said_and_not_needed(tmp_path: Path, content: str) -> None:

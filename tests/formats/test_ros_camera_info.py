@@ -131,6 +131,8 @@ def test_without_a_name_or_model(tmp_path: Path) -> None:
         ({"camera_matrix": "[1, 2, 3]"}, "camera_matrix.data is no list"),
         ({"camera_matrix": "{rows: 3, cols: 3, data: [1, 2, 3]}"}, "is 3 x 3 but has 3 numbers"),
         ({"camera_matrix": "{rows: -3, cols: -3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}"}, "no rows and cols"),
+        ({"distortion_coefficients": "{rows: true, cols: 5, data: [0, 0, 0, 0, 0]}"}, "no rows and cols"),
+        ({"camera_matrix": f"{{rows: 1{'0' * 40}, cols: 0, data: []}}"}, "has no 3 x 3 matrix"),
         ({"camera_matrix": "{rows: 3, cols: 3, data: [0, 0, 0, 0, 0, 0, 0, 0, 0]}"}, "not fx 0 cx"),
         (
             {"distortion_coefficients": "{rows: 900000000000, cols: 5, data: [0, 0, 0, 0, 0]}"},

@@ -15,7 +15,20 @@ _BLOW_UPS = [
 ]
 _BINARY = [struct.pack("<Q", n) for n in (0, 10**12, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)]
 _BINARY += [struct.pack("<d", x) for x in (float("nan"), float("inf"), 1e308, -1e300)]
-_PIECES = (b"\xff", b"\0" * 8, b"\n", b"{", b"[" * 3000, b"]", b'"', b"&a *a", b"!!python/object:os.system")
+_PIECES = (
+    b"\\0",
+    b"\\u0000",
+    b"\\ud800",
+    b"\xff",
+    b"\0" * 8,
+    b"\n",
+    b"{",
+    b"[" * 3000,
+    b"]",
+    b'"',
+    b"&a *a",
+    b"!!python/object:os.system",
+)
 
 
 def damaged(content: bytes, choice: random.Random) -> bytes:
