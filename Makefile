@@ -42,6 +42,7 @@ bench: setup
 	$(BIN)/python -m benchmarks.loss
 	$(BIN)/python -m benchmarks.ingest_log
 	$(BIN)/python -m benchmarks.planning
+	$(BIN)/python -m benchmarks.arms
 	$(BIN)/python -m benchmarks.rendering
 	$(BIN)/python -m benchmarks.detection
 	$(BIN)/python -m benchmarks.detector_by_tilt
