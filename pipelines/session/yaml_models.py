@@ -95,18 +95,20 @@ def _read_yaml(path: Path, noun: str) -> object:
 def _refuse_impossible_text(path: Path, value: object) -> None:
     """Refuse escapes for what no name of a file can hold: zero bytes, halves of characters."""
     seen: set[int] = set()  # aliases of aliases are one thing, however often they stand there
-    waiting = [value]
+    waiting = [(value, "")]
     while waiting:
-        item = waiting.pop()
+        item, place = waiting.pop()
         if id(item) in seen:
             continue
         seen.add(id(item))
         if isinstance(item, Mapping):
-            waiting += [*item, *item.values()]
+            waiting += [(part, f"{place}.{key}".strip(".")) for key, part in item.items()]
+            waiting += [(key, place) for key in item]  # last, so looked at before they name places
         elif isinstance(item, list):
-            waiting += item
+            waiting += [(part, f"{place}.{index}".strip(".")) for index, part in enumerate(item)]
         elif isinstance(item, str) and ("\0" in item or not _is_unicode(item)):
-            raise DataError(path, f"holds a text with impossible characters ({item[:60]!r})", "mend it")
+            said = f"holds a text with impossible characters ({item[:60]!r})"
+            raise DataError(path, f"{place[:200]}: {said}" if place else said, "mend it")
 
 
 def _is_unicode(text: str) -> bool:
