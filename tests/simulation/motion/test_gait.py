@@ -24,7 +24,7 @@ from tests.simulation.motion.performing import (
     slid_m,
     slope,
 )
-from tests.simulation.motion.published_gait import AT_TOE_OFF, EVENTS, STANCE_SHARE, Event
+from tests.simulation.motion.published_gait import AT_TOE_OFF, EVENTS, Event, stance_share
 
 Float = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ def stride_of(motion: BodyMotion, side: int, rig: Rig = RIG) -> tuple[slice, flo
 
 
 def published(angles: dict[str, Float], toe_off: float, events: Sequence[Event]) -> dict[str, bool]:
-    """Which extremes are as far, and where, as in the books."""
+    """Which extremes are as far, and where, as measured people's."""
     share = np.linspace(0.0, 1.0, len(angles["knee"]), endpoint=False)
     within = {}
     for event in events:
@@ -85,6 +85,11 @@ def published(angles: dict[str, Float], toe_off: float, events: Sequence[Event])
     return within
 
 
+def assert_stance_is_as_long_as_published(toe_off: float, speed_mps: float) -> None:
+    low, high = stance_share(speed_mps / np.sqrt(9.81 * RIG.length_of_leg))
+    assert low <= toe_off <= high
+
+
 @pytest.mark.parametrize("side", [0, 1])
 @pytest.mark.parametrize("speed", [1.2, 1.3, 1.4])
 def test_walking_angles_lie_in_the_published_bands(speed: float, side: int) -> None:
@@ -93,7 +98,7 @@ def test_walking_angles_lie_in_the_published_bands(speed: float, side: int) -> N
     stride, toe_off = stride_of(motion, side)
     angles = {joint: curve[stride] for joint, curve in leg_angles_deg(motion, side).items()}
     assert all((within := published(angles, toe_off, EVENTS)).values()), within
-    assert STANCE_SHARE[0] <= toe_off <= STANCE_SHARE[1]
+    assert_stance_is_as_long_as_published(toe_off, speed)
     # Winter 2009: the pelvis rises and falls by 4 cm or so, twice a stride.
     assert 0.02 < np.ptp(motion.root[stride, 2]) < 0.06
     # A stride of 2 x 0.384 v m: the walk ratio of Sekiya & Nagasaki 1998; a frame is 0.2 % of it.
@@ -103,13 +108,16 @@ def test_walking_angles_lie_in_the_published_bands(speed: float, side: int) -> N
 
 @pytest.mark.parametrize("speed", [0.7, 1.0, 1.7, 2.0])
 def test_slow_and_fast_walkers_bend_their_knees_when_others_do(speed: float) -> None:
-    """Timing hardly depends on speed, flexion little; stance is shorter when fast (Winter 1991)."""
+    """At the shares of usual speed, as in Schwartz 2008; stance is shorter when fast.
+
+    Slow people also bend their knees less (55 deg in swing at 0.87 m/s, 59 at 1.3). The walker does not.
+    """
     motion = performed({"walk": {"distance_m": 9 * speed, "speed_mps": speed}}, seconds=7.0, step_s=0.002)
     stride, toe_off = stride_of(motion, 0)
     angles = {joint: curve[stride] for joint, curve in leg_angles_deg(motion, 0).items()}
     knee = [event for event in EVENTS if event.joint == "knee" and event.searched != AT_TOE_OFF]
     assert all((within := published(angles, toe_off, knee)).values()), within
-    assert toe_off == pytest.approx(0.61 - 0.05 * (speed - 1.3), abs=0.03)
+    assert_stance_is_as_long_as_published(toe_off, speed)
 
 
 @pytest.mark.parametrize("sex", ["female", "male"])
