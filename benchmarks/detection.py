@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.detect import detect
-from pipelines.formats.video import frames
+from pipelines.formats.videos.video import frames
 from pipelines.ingest import ingest
 from pipelines.keypoints.blazepose import BlazePose, _Network
 from pipelines.session.registries import find_detector

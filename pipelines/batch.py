@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pipelines.formats.extras import need
+from pipelines.formats.common.extras import need
 from pipelines.geometry.triangulation import Method
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings as ReconstructSettings

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.formats.pictures import Picture, Pictures, open_pictures
+from pipelines.formats.flights.pictures import Picture, Pictures, open_pictures
 from pipelines.geometry.poses import interpolate_poses
 from pipelines.keypoints.hints import Hint, project_actor
 from pipelines.keypoints.tracking import PeopleTracker

@@ -29,11 +29,11 @@ from pipelines.drafting.found import (
 )
 from pipelines.drafting.manifest_text import write_manifest
 from pipelines.drafting.matching import match
-from pipelines.formats.dji_srt import read_subtitles
-from pipelines.formats.frame_times import read_frame_times
-from pipelines.formats.log_messages import kind_of, samples
-from pipelines.formats.log_presets import namespaces, parts_of
-from pipelines.formats.summaries import median_step_ns
+from pipelines.formats.common.summaries import median_step_ns
+from pipelines.formats.drone_logs.dji_srt import read_subtitles
+from pipelines.formats.logs.messages import kind_of, samples
+from pipelines.formats.logs.presets import namespaces, parts_of
+from pipelines.formats.videos.frame_times import read_frame_times
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
 from pipelines.session.progress import Progress, Silent

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.formats.even_frames import thinned
-from pipelines.formats.pictures import Picture, open_pictures
+from pipelines.formats.flights.pictures import Picture, open_pictures
+from pipelines.formats.skeletons.even_frames import thinned
 from pipelines.reporting.filmed import origin_ns, read_filmed, refined_poses
 from pipelines.reporting.frame_drawing import caption_of, draw_frame
 from pipelines.reporting.motion import motion_from_skeleton

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.formats.bvh import read_motion
-from pipelines.formats.video import VideoReader
-from pipelines.formats.video_writing import Picture, write_h264
+from pipelines.formats.skeletons.bvh import read_motion
+from pipelines.formats.videos.video import VideoReader
+from pipelines.formats.videos.video_writing import Picture, write_h264
 from pipelines.geometry.cameras import Intrinsics, project
 from pipelines.geometry.metrics import common, measure
 from pipelines.geometry.noise import NoiseModel

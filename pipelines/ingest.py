@@ -19,7 +19,7 @@ from typing import Self
 
 import numpy as np
 
-from pipelines.formats.flight_sources import CameraFrames, FlightSources, losses, source_files
+from pipelines.formats.flights.flight_sources import CameraFrames, FlightSources, losses, source_files
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.poses import gaps, interpolate_poses

@@ -18,8 +18,8 @@ from threading import Event
 
 import numpy as np
 
-from pipelines.formats.pictures import Picture, open_pictures
-from pipelines.formats.video_writing import TICK_S, join_videos, write_h264
+from pipelines.formats.flights.pictures import Picture, open_pictures
+from pipelines.formats.videos.video_writing import TICK_S, join_videos, write_h264
 from pipelines.reporting.filmed import origin_ns, read_filmed
 from pipelines.reporting.frame_drawing import blank_frame, caption_of, draw_frame, padded_to_even
 from pipelines.reporting.motion import Motion, motion_from_skeleton

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.detect import detect
-from pipelines.formats.pictures import Picture, open_pictures
+from pipelines.formats.flights.pictures import Picture, open_pictures
 from pipelines.geometry.poses import interpolate_poses
 from pipelines.geometry.triangulation import (
     STATUS,

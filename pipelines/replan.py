@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.formats.yaml_text import read_yaml
+from pipelines.formats.common.yaml_text import read_yaml
 from pipelines.planning.arm_flights import FLOWN, film_arm, flight_from, fly_arm, trajectories
 from pipelines.planning.config import PlannerConfig, planner_config
 from pipelines.planning.contest import Entrant, compare

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.formats.pictures import Picture, Pictures, open_pictures
+from pipelines.formats.flights.pictures import Picture, Pictures, open_pictures
 from pipelines.reporting.comparison import labels_of
 from pipelines.reporting.comparison_page import GENERATOR, render_comparison
 from pipelines.reporting.content import ReplanContent, SessionContent, section

@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.formats.bvh import read_motion
-from pipelines.formats.camera_info_writing import write_camera_info
-from pipelines.formats.octomap_writing import write_octomap
-from pipelines.formats.ros2_recording import Ros2Recording
-from pipelines.formats.video_writing import Picture, join_videos, write_h264
+from pipelines.formats.calibrations.camera_info_writing import write_camera_info
+from pipelines.formats.logs.ros2_recording import Ros2Recording
+from pipelines.formats.maps.octomap_writing import write_octomap
+from pipelines.formats.skeletons.bvh import read_motion
+from pipelines.formats.videos.video_writing import Picture, join_videos, write_h264
 from pipelines.geometry.pose_covariance import pose_covariance_in_body
 from pipelines.geometry.poses import conjugate
 from pipelines.planning.config import PlannerConfig

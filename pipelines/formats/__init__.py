@@ -1,1 +1,1 @@
-"""Every foreign file format, one module each, registered by an entry point."""
+"""Every foreign file format, one module each, in a folder for each kind; registered by entry points."""

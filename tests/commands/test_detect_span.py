@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from pipelines.detect import detect
-from pipelines.formats.video import VideoReader
+from pipelines.formats.videos.video import VideoReader
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
 from pipelines.session.stages import StageRecord, locked

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.formats.trc import FORMAT as TRC
+from pipelines.formats.skeletons.trc import FORMAT as TRC
 from pipelines.session.registries import find_detector
 from pipelines.session.tabular import motion_from
 from tests.commands.runner import content, mocap_process, refused, succeeds

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.formats.octomap import FORMAT
+from pipelines.formats.maps.octomap import FORMAT
 from pipelines.session.maps import load_maps
 from pipelines.session.records import Occupancy
 from tests.commands.runner import content, mocap, refused, succeeds

@@ -14,8 +14,8 @@ import pytest
 from numpy.typing import NDArray
 
 import pipelines.overlay
-from pipelines.formats.video import VideoReader, index_video
-from pipelines.formats.video_writing import write_h264
+from pipelines.formats.videos.video import VideoReader, index_video
+from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.poses import conjugate, rotate
 from pipelines.ingest import ingest
 from pipelines.overlay import write_overlays

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.formats.video import VideoReader
+from pipelines.formats.videos.video import VideoReader
 from pipelines.geometry.cameras import Intrinsics, undistort
 from pipelines.geometry.poses import (
     conjugate,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pipelines.filming import Shooting, film
-from pipelines.formats.video import index_video
+from pipelines.formats.videos.video import index_video
 from pipelines.ingest import ingest
 from pipelines.reconstruct import reconstruct
 from pipelines.session.errors import DataError

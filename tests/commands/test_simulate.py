@@ -16,8 +16,8 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from pipelines.formats import video
-from pipelines.formats.video_writing import write_h264
+from pipelines.formats.videos import video
+from pipelines.formats.videos.video_writing import write_h264
 from tests.commands.runner import MOCAP, content, refused, succeeds
 from tests.real_data import real_data
 

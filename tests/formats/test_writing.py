@@ -12,10 +12,12 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from pipelines.formats import mcap_log, ros_camera_info, video
-from pipelines.formats.camera_info_writing import write_camera_info
-from pipelines.formats.ros2_recording import Ros2Recording
-from pipelines.formats.video_writing import TICK_S, join_videos, write_h264
+from pipelines.formats.calibrations import ros_camera_info
+from pipelines.formats.calibrations.camera_info_writing import write_camera_info
+from pipelines.formats.logs import mcap_log
+from pipelines.formats.logs.ros2_recording import Ros2Recording
+from pipelines.formats.videos import video
+from pipelines.formats.videos.video_writing import TICK_S, join_videos, write_h264
 from pipelines.geometry.cameras import Intrinsics, project
 from tests.synthetic.videos import SIZE, bar_code, read_bar_code
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-from pipelines.formats.frame_times import read_frame_times
-from pipelines.formats.video import frames
+from pipelines.formats.videos.frame_times import read_frame_times
+from pipelines.formats.videos.video import frames
 from pipelines.ingest import ingest
 from pipelines.session.errors import MocapError
 from pipelines.session.registries import (

@@ -9,28 +9,23 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats import bvh_writing, joints_csv, mcap_writing, trc, tum
+from pipelines.formats.poses import tum
+from pipelines.formats.scenes import mcap_writing
+from pipelines.formats.skeletons import bvh_writing, joints_csv, trc
 from pipelines.session.registries import Export
-from tests.formats import (
+from tests.formats.calibrations import (
     test_anipose_toml,
-    test_bvh,
-    test_c3d,
-    test_coco_results,
     test_colmap,
-    test_grid_npz,
     test_kalibr,
-    test_mmpose,
-    test_octomap,
     test_opencv_yaml,
-    test_pcd,
-    test_ply,
-    test_pose_csv,
     test_ros_camera_info,
-    test_ros_map,
-    test_trc,
 )
 from tests.formats.exported import flown, recording, walking
+from tests.formats.keypoint_files import test_coco_results, test_mmpose
 from tests.formats.log_entries import entries
+from tests.formats.maps import test_grid_npz, test_octomap, test_pcd, test_ply, test_ros_map
+from tests.formats.poses import test_pose_csv
+from tests.formats.skeletons import test_bvh, test_c3d, test_trc
 from tests.synthetic import drone_logs, logs, map_logs, videos
 from tests.synthetic.flights import write_flight
 from tests.synthetic.logged_flights import write_logged_flight

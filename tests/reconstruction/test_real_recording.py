@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.formats.trc import FORMAT as TRC
+from pipelines.formats.skeletons.trc import FORMAT as TRC
 from pipelines.session.tabular import motion_from
 from tests.commands.runner import succeeds
 from tests.real_data import real_data

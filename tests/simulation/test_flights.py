@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.formats.alphapose import FORMAT as ALPHAPOSE
-from pipelines.formats.anipose_toml import FORMAT as ANIPOSE
-from pipelines.formats.coco_results import FORMAT as COCO
-from pipelines.formats.openpose import FORMAT as OPENPOSE
-from pipelines.formats.pose_csv import FORMAT as POSE_CSV
-from pipelines.formats.tum import FORMAT as TUM
+from pipelines.formats.calibrations.anipose_toml import FORMAT as ANIPOSE
+from pipelines.formats.keypoint_files.alphapose import FORMAT as ALPHAPOSE
+from pipelines.formats.keypoint_files.coco_results import FORMAT as COCO
+from pipelines.formats.keypoint_files.openpose import FORMAT as OPENPOSE
+from pipelines.formats.poses.pose_csv import FORMAT as POSE_CSV
+from pipelines.formats.poses.tum import FORMAT as TUM
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.poses import interpolate_poses, rotate
 from pipelines.session.manifest import read_flight

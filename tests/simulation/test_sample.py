@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.formats.joints_csv import FORMAT as JOINTS_CSV
-from pipelines.formats.mcap_log import FORMAT as MCAP
-from pipelines.formats.octomap import FORMAT as OCTOMAP
-from pipelines.formats.tum import FORMAT as TUM
-from pipelines.formats.video import FORMAT as VIDEO
+from pipelines.formats.logs.mcap_log import FORMAT as MCAP
+from pipelines.formats.maps.octomap import FORMAT as OCTOMAP
+from pipelines.formats.poses.tum import FORMAT as TUM
+from pipelines.formats.skeletons.joints_csv import FORMAT as JOINTS_CSV
+from pipelines.formats.videos.video import FORMAT as VIDEO
 from pipelines.session.manifest import read_flight
 from pipelines.simulate import simulate
 

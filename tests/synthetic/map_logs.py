@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import get_types_from_msg
 
-from pipelines.formats.map_topics import OCCUPANCY_GRID, OCTOMAP, POINT_CLOUD
-from pipelines.formats.octomap_writing import write_octomap
+from pipelines.formats.logs.map_topics import OCCUPANCY_GRID, OCTOMAP, POINT_CLOUD
+from pipelines.formats.maps.octomap_writing import write_octomap
 from pipelines.session.records import Occupancy
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import ROS1, ROS2, Entry

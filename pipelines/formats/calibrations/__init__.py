@@ -1,0 +1,1 @@
+"""Lenses and places of cameras, as programs that calibrate write them."""

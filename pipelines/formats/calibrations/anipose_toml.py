@@ -1,0 +1,107 @@
+"""Calibrations as TOML: anipose, Pose2Sim and caliscope write the same tables, one for each camera.
+
+`matrix`, `distortions` (OpenCV's order), `size` (floats in Pose2Sim's files), `rotation` (Rodrigues) and
+`translation` map world to camera, whatever metres mean to the file: Pose2Sim and caliscope use metres,
+anipose the unit of its board.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.formats.calibrations.camera_matrices import intrinsics, invert_rodrigues
+from pipelines.formats.common.summaries import describe_cameras
+from pipelines.formats.common.text_tables import read_head, read_text
+from pipelines.session.errors import DataError
+from pipelines.session.records import CalibratedCamera, Float
+
+
+class AniposeToml:
+    """Cameras are called what `name` says, or else as their table is.
+
+    Tables without a matrix (`[metadata]`, uncalibrated cameras) and those with `ignore = true` are
+    left out. A camera without rotation and translation has intrinsics alone.
+    """
+
+    name = "anipose"
+    title = "anipose, Pose2Sim or caliscope calibration"
+    suffixes: tuple[str, ...] = (".toml",)
+
+    def recognises(self, path: Path) -> bool:
+        """Whether a TOML file speaks of a matrix and distortions."""
+        if path.suffix.lower() not in self.suffixes or not path.is_file():
+            return False
+        head = read_head(path)
+        return all(re.search(rf"(?m)^\s*{key}\s*=", head) for key in ("matrix", "distortions"))
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Every camera, and the tables that look like cameras but are left out."""
+        summary = describe_cameras(self.read_calibration(path))
+        left_out = [
+            key for key, table in _tables(path).items() if "size" in table and not _is_calibrated(table)
+        ]
+        return {**summary, "not calibrated": left_out} if left_out else summary
+
+    def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
+        """Read every calibrated camera.
+
+        Raises:
+            DataError: not TOML, no calibrated camera, two of one name, or numbers that are no camera.
+        """
+        cameras: dict[str, CalibratedCamera] = {}
+        for key, table in _tables(path).items():
+            if not _is_calibrated(table):
+                continue
+            name = str(table.get("name", key))
+            if name in cameras:
+                raise DataError(path, f"two cameras are called {name}", "rename one")
+            cameras[name] = _camera(path, name, table)
+        if not cameras:
+            raise DataError(path, "holds no calibrated camera (a table with a matrix)", "calibrate first")
+        return cameras
+
+
+def _tables(path: Path) -> dict[str, dict[str, object]]:
+    try:
+        content = tomllib.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise DataError(path, f"is not TOML ({error})", "it may be truncated; write it again") from error
+    return {key: value for key, value in content.items() if isinstance(value, dict)}
+
+
+def _is_calibrated(table: dict[str, object]) -> bool:
+    return "matrix" in table and not table.get("ignore", False)
+
+
+def _camera(path: Path, name: str, table: dict[str, object]) -> CalibratedCamera:
+    lens = intrinsics(
+        path,
+        name,
+        size=_numbers(path, name, table, "size").ravel().tolist(),
+        matrix=_numbers(path, name, table, "matrix"),
+        distortion=_numbers(path, name, table, "distortions").ravel().tolist(),
+        fisheye=bool(table.get("fisheye", False)),
+    )
+    given = [key for key in ("rotation", "translation") if key in table]
+    if not given:
+        return CalibratedCamera(lens)
+    rotation, translation = (_numbers(path, name, table, key).ravel() for key in ("rotation", "translation"))
+    return CalibratedCamera(lens, *invert_rodrigues(path, name, rotation, translation))
+
+
+def _numbers(path: Path, camera: str, table: dict[str, object], key: str) -> Float:
+    """A value of the table as an array of finite numbers."""
+    try:
+        values = np.array(table.get(key), dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        values = np.array(np.nan)
+    if not np.isfinite(values).all():
+        raise DataError(path, f"camera {camera}: {key} is missing or not made of numbers")
+    return values
+
+
+FORMAT = AniposeToml()

@@ -1,0 +1,147 @@
+"""Calibrations that OpenCV's FileStorage wrote, as YAML or XML: one camera each.
+
+ROS's camera_info YAML looks alike but has no `!!opencv-matrix`: it is another format.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.formats.calibrations.camera_matrices import intrinsics, invert_matrix, invert_rodrigues
+from pipelines.formats.common.summaries import describe_cameras
+from pipelines.formats.common.text_tables import read_head, read_text
+from pipelines.session.errors import DataError
+from pipelines.session.records import CalibratedCamera, Float
+
+# OpenCV's own samples spell their keys in more than one way.
+_MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K")
+_DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D")
+_WIDTH = ("image_width", "image_Width", "width")
+_HEIGHT = ("image_height", "image_Height", "height")
+_MOST_CELLS = 64  # of a calibration's matrices; a stated size beyond is a mistake, never allocated
+
+
+class OpencvStorage:
+    """Keys: camera_matrix, distortion_coefficients, image_width, image_height.
+
+    Optional: camera_name (else "camera"), `fisheye_model: 1` or `distortion_model: equidistant`, and the pose
+    camera_from_world as R (3 x 3) or rvec with T or tvec, in metres.
+    """
+
+    name = "opencv"
+    title = "OpenCV calibration"
+    suffixes: tuple[str, ...] = (".yaml", ".yml", ".xml")
+
+    def recognises(self, path: Path) -> bool:
+        """Whether FileStorage wrote it and it names a camera matrix."""
+        if path.suffix.lower() not in self.suffixes or not path.is_file():
+            return False
+        head = read_head(path)
+        stored = "!!opencv-matrix" in head or "<opencv_storage>" in head
+        return stored and re.search(rf"(?m)^\s*<?(?:{'|'.join(_MATRIX)})\b", head) is not None
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """The camera."""
+        return describe_cameras(self.read_calibration(path))
+
+    def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
+        """Read the one camera.
+
+        Raises:
+            DataError: FileStorage cannot parse it, keys are missing, or the numbers are no camera.
+        """
+        storage = _Storage(path)
+        name = storage.text("camera_name") or "camera"
+        size = storage.vector("image_size") or [storage.number(_WIDTH), storage.number(_HEIGHT)]
+        if not all(size):
+            raise DataError(path, "states no picture size", "add image_width and image_height")
+        matrix, distortion = storage.matrix(*_MATRIX), storage.matrix(*_DISTORTION)
+        if matrix is None or distortion is None:
+            raise DataError(path, "has no camera_matrix or no distortion_coefficients", "add them")
+        model = storage.text("distortion_model").lower()
+        fisheye = bool(storage.number(("fisheye_model",))) or model in {"equidistant", "fisheye"}
+        lens = intrinsics(
+            path, name, size=size, matrix=matrix, distortion=distortion.ravel().tolist(), fisheye=fisheye
+        )
+        return {name: _with_pose(path, name, storage, CalibratedCamera(lens))}
+
+
+def _with_pose(path: Path, name: str, storage: _Storage, camera: CalibratedCamera) -> CalibratedCamera:
+    rotation, translation = storage.matrix("R", "rvec"), storage.matrix("T", "tvec")
+    if rotation is None and translation is None:
+        return camera
+    if rotation is None or translation is None:
+        raise DataError(
+            path, "has a rotation or a translation, but not both", "give R and T, or rvec and tvec"
+        )
+    if rotation.size == 3:
+        pose = invert_rodrigues(path, name, rotation.ravel(), translation.ravel())
+    else:
+        pose = invert_matrix(path, name, rotation, translation.ravel())
+    return CalibratedCamera(camera.intrinsics, *pose)
+
+
+class _Storage:
+    """The top of a FileStorage, read with care."""
+
+    def __init__(self, path: Path) -> None:
+        import cv2
+
+        self._path = path
+        self._cv2 = cv2
+        try:
+            # From memory: OpenCV's own file access fails on some names, and unpacks archives.
+            self._file = cv2.FileStorage(read_text(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+            self._root = self._file.root()
+            whole = self._root.isMap()
+        except (
+            cv2.error,
+            SystemError,
+        ) as error:  # SystemError is how the binding reports a failed constructor
+            raise DataError(path, "OpenCV cannot parse it", "it may be truncated; write it again") from error
+        if not whole:
+            raise DataError(path, "is empty", "write the calibration again")
+
+    def text(self, key: str) -> str:
+        """A string; empty if there is none."""
+        node = self._root.getNode(key)
+        return str(node.string()) if node.isString() else ""
+
+    def number(self, keys: tuple[str, ...]) -> float:
+        """The first of the keys that holds a number; 0 if none does."""
+        nodes = (self._root.getNode(key) for key in keys)
+        return next((float(node.real()) for node in nodes if node.isInt() or node.isReal()), 0.0)
+
+    def vector(self, key: str) -> list[float]:
+        """A list of numbers; empty if there is none."""
+        node = self._root.getNode(key)
+        if not node.isSeq() or node.size() > _MOST_CELLS:
+            return []
+        return [float(node.at(i).real()) for i in range(node.size())]
+
+    def matrix(self, *keys: str) -> Float | None:
+        """The first of the keys that holds a matrix."""
+        for key in keys:
+            node = self._root.getNode(key)
+            if node.isMap():
+                return self._cells(key)
+        return None
+
+    def _cells(self, key: str) -> Float:
+        node = self._root.getNode(key)
+        rows, columns = (node.getNode(side).real() for side in ("rows", "cols"))
+        cells = node.getNode("data").size()
+        if not 0 < cells <= _MOST_CELLS or rows * columns != cells:
+            raise DataError(
+                self._path, f"{key} is {rows:g} x {columns:g} but has {cells} numbers", "write it again"
+            )
+        try:
+            return np.asarray(node.mat(), dtype=np.float64).reshape(int(rows), int(columns))
+        except (self._cv2.error, TypeError, ValueError) as error:
+            raise DataError(self._path, f"{key} is not a matrix of numbers", "write it again") from error
+
+
+FORMAT = OpencvStorage()

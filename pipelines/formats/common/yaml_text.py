@@ -1,0 +1,59 @@
+"""Safe YAML of other people's tools: plain mappings, lists and numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.formats.common.text_tables import read_text
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float
+
+_LARGEST = 1 << 20  # bytes; the parser is slow, and no calibration comes near
+
+
+def read_yaml(path: Path) -> dict[str, object]:
+    """The mapping at the top of a YAML file, built of plain types only.
+
+    The first line `%YAML:1.0` of old OpenCV and Kalibr files, which is no YAML, is skipped.
+
+    Raises:
+        DataError: unreadable, larger than a megabyte, no valid YAML, or no mapping of names.
+    """
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+    text = read_text(path)
+    if len(text) > _LARGEST:
+        raise DataError(path, f"has {len(text)} characters", f"a calibration has less than {_LARGEST}")
+    if text.startswith("%YAML:"):
+        text = "#" + text
+    try:
+        value: object = YAML(typ="safe", pure=True).load(text)
+    except MarkedYAMLError as error:
+        line = f" in line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        problem = " ".join(str(error.problem or error.context).split())
+        raise DataError(path, f"is no valid YAML{line} ({problem})", "it may be truncated") from error
+    except (YAMLError, ValueError, RecursionError) as error:
+        problem = " ".join(str(error).split())[:200]
+        raise DataError(path, f"is no valid YAML ({problem})", "write it again") from error
+    if not isinstance(value, dict):
+        raise DataError(path, "is no YAML mapping of names to values", "write it again")
+    return {str(key): item for key, item in value.items()}
+
+
+def numbers(source: Path, name: str, value: object) -> Float:
+    """A list of numbers [N]; `name` is said where it is none.
+
+    Raises:
+        DataError: no list, or something in it is no number.
+    """
+    if not isinstance(value, list) or not all(
+        isinstance(cell, int | float) and not isinstance(cell, bool) for cell in value
+    ):
+        raise DataError(source, f"{name} is no list of numbers", "write it again")
+    try:
+        return np.array(value, dtype=np.float64)
+    except OverflowError:  # an integer of hundreds of digits
+        raise DataError(source, f"{name} holds a number too large", "write it again") from None

@@ -1,0 +1,389 @@
+"""ArduPilot's DataFlash logs (.bin), by pymavlink (extra `drones`): estimates, GPS, mounts and pictures.
+
+pymavlink finds the messages, past damage too; their numbers are then read many at a time. ArduPilot has
+its world in NED and its body in FRD, and stamps in microseconds since boot (docs/drones.md).
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterator, Mapping, MutableMapping, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.formats.common.extras import need
+from pipelines.formats.drone_logs.telemetry_rows import (
+    attitude_track,
+    on_gps_time,
+    position_track,
+    said_of_fit,
+    turned_as_stated,
+    world_from_heading,
+)
+from pipelines.geometry.clocks import ClockFit, fit_clock
+from pipelines.geometry.geodesy import Place
+from pipelines.geometry.mounting import attitude_from_angles
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float, Int64
+from pipelines.session.telemetry import AttitudeTrack, PositionTrack, Telemetry, TelemetryChoice
+
+_START = b"\xa3\x95\x80"  # a FMT message: the first of every log
+_HEAD = 3  # bytes before each message's fields
+_3D_FIX = 3
+_GPS_EPOCH_NS = 315_964_800_000_000_000  # 1980-01-06, UTC
+_WEEK_NS = 7 * 24 * 3600 * 1_000_000_000
+_LEAP_SECONDS = ((1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16))
+"""UTC from which on GPS time is ahead by so many seconds, as announced by the IERS up to 2026."""
+
+# What a format's letters stand for, and what their numbers are to be multiplied with (AP_Logger's README).
+_LETTERS: dict[str, tuple[str, float]] = {
+    "b": ("i1", 1),
+    "B": ("u1", 1),
+    "M": ("u1", 1),
+    "h": ("<i2", 1),
+    "H": ("<u2", 1),
+    "c": ("<i2", 1e-2),
+    "C": ("<u2", 1e-2),
+    "i": ("<i4", 1),
+    "I": ("<u4", 1),
+    "e": ("<i4", 1e-2),
+    "E": ("<u4", 1e-2),
+    "L": ("<i4", 1e-7),
+    "g": ("<f2", 1),
+    "f": ("<f4", 1),
+    "d": ("<f8", 1),
+    "q": ("<i8", 1),
+    "Q": ("<u8", 1),
+    "a": ("V64", 0),
+    "n": ("V4", 0),
+    "N": ("V16", 0),
+    "Z": ("V64", 0),
+}
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The messages of one name, in the order of the log."""
+
+    name: str
+    raw: NDArray[np.void]  # [N] a field for each column
+    scales: Mapping[str, float]
+    lost: int  # cut off at the end
+
+    def __len__(self) -> int:
+        return len(self.raw)
+
+    def __contains__(self, field: str) -> bool:
+        return bool(self.scales.get(field))  # texts have none
+
+    def integers(self, field: str) -> Int64:
+        """[N] a field as it stands."""
+        return np.asarray(self.raw[field]).astype(np.int64)
+
+    def numbers(self, *fields: str) -> Float:
+        """[N] of one field, [N, F] of several, in their units; NaN where there is no such field."""
+        columns = [
+            np.asarray(self.raw[field]).astype(np.float64) * self.scales[field]
+            if self.scales.get(field)
+            else np.full(len(self), np.nan)
+            for field in fields
+        ]
+        return columns[0] if len(columns) == 1 else np.stack(columns, axis=1)
+
+    def t_ns(self) -> Int64:
+        """[N] since boot."""
+        return self.integers("TimeUS") * 1000
+
+    def of(self, instance: int, *columns: str) -> _Rows:
+        """Those of one instance, by the first of some columns that there is; all of them without any."""
+        for column in columns:
+            if column in self:
+                return replace(self, raw=self.raw[self.integers(column) == instance])
+        return self
+
+
+class ArduPilotFormat:
+    """DataFlash logs of ArduPilot autopilots."""
+
+    name = "ardupilot"
+    title = "ArduPilot log"
+    suffixes: tuple[str, ...] = (".bin",)
+
+    def recognises(self, path: Path) -> bool:
+        """Whether it begins with the definition of its own definitions."""
+        if not path.is_file():
+            return False
+        try:
+            with path.open("rb") as file:
+                head = file.read(11)
+        except OSError:
+            return False
+        return head.startswith(_START) and head[5:9].rstrip(b"\0") == b"FMT"
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Messages by name, times, GPS, and what was lost."""
+        log = _Log(path)
+        timed = [rows for name in log.counts if (rows := log.rows(name)) is not None and "TimeUS" in rows]
+        every = np.concatenate([np.zeros(0, np.int64), *(rows.t_ns() for rows in timed)])
+        facts: dict[str, object] = {"messages": sum(log.counts.values())}
+        facts["span_s"] = round(int(np.ptp(every)) / 1e9, 6) if len(every) else 0.0
+        gps = log.rows("GPS")
+        if gps is not None and len(gps):
+            facts["gps_fixes"] = int(np.count_nonzero(gps.numbers("Status") >= _3D_FIX))
+        if (fit := _gps_time(log)) is not None:
+            facts["gps_time"] = said_of_fit(fit)
+        if lost := sum(rows.lost for rows in timed):
+            facts["dropped: cut off"] = lost
+        facts["topics"] = [f"{name} {count}" for name, count in sorted(log.counts.items())]
+        return facts
+
+    def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
+        """Position, attitude and mount.
+
+        The position is POS (`global`), else that of the estimator XKF1 or NKF1 (`local`, metres from ORGN),
+        else GPS.
+
+        Raises:
+            DataError: no DataFlash log, pymavlink is missing, or no position in it.
+        """
+        log = _Log(path)
+        dropped: dict[str, int] = {}
+        notes: list[str] = []
+        fit = on_gps_time(path, _gps_time(log), choice.time, notes)
+        body = _body(log, dropped)
+        position = _position(log, choice, dropped, notes)
+        gimbal = _mount(log, choice.instance or 0, body, dropped)
+        if fit is not None:
+            position = replace(position, t_ns=fit.other_ns(position.t_ns))
+            body = replace(body, t_ns=fit.other_ns(body.t_ns)) if body else None
+            gimbal = replace(gimbal, t_ns=fit.other_ns(gimbal.t_ns)) if gimbal else None
+        return Telemetry(
+            position=position,
+            body=body,
+            gimbal=gimbal,
+            clock="UTC by GPS" if fit else "boot",
+            fit=fit,
+            notes=tuple(f"{path}: {note}" for note in notes),
+            dropped=dropped,
+        )
+
+    def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
+        """When pictures were taken: CAM, by the camera's feedback where it has one, else TRIG.
+
+        Raises:
+            DataError: no DataFlash log, pymavlink is missing, or nothing was triggered.
+        """
+        log = _Log(path)
+        for name in ("CAM", "TRIG"):
+            rows = log.first([name], choice.instance or 0, "I")
+            if rows is not None:
+                t_ns = np.unique(rows.t_ns())
+                fit = on_gps_time(path, _gps_time(log), choice.time, [])
+                return t_ns if fit is None else np.unique(fit.other_ns(t_ns))
+        raise DataError(path, "holds no CAM or TRIG message", "take the times of frames otherwise")
+
+
+# --- what a log says -----------------------------------------------------------------------------------
+
+
+def _position(
+    log: _Log, choice: TelemetryChoice, dropped: MutableMapping[str, int], notes: list[str]
+) -> PositionTrack:
+    instance = choice.instance or 0
+    there = {
+        "global": log.first(["POS"]),
+        "local": log.first(["XKF1", "NKF1"], instance, "C", "I"),
+        "gps": log.first(["GPS"], instance, "I"),
+    }
+    found = {kind: rows for kind, rows in there.items() if rows is not None}
+    if choice.position is not None and choice.position not in found:
+        raise DataError(
+            log.path, f"has no {choice.position} position", f"there is {', '.join(found) or 'none'}"
+        )
+    if not found:
+        raise DataError(log.path, "has no POS, XKF1, NKF1 or GPS message", "log them (LOG_BITMASK)")
+    kind: str = choice.position or next(iter(found))
+    rows = found[kind]
+    notes.append(f"took the {kind} position from {rows.name}")
+    if rows.lost:
+        dropped["cut off"] = dropped.get("cut off", 0) + rows.lost
+    if kind == "local":
+        enu = rows.numbers("PE", "PN", "PD") * [1, 1, -1]
+        origin = _estimators_origin(log)
+        return position_track(log.path, rows.name, rows.t_ns(), enu, dropped, on_earth=False, origin=origin)
+    values = rows.numbers("Lat", "Lng", "Alt")
+    fixed = rows.numbers("Status") >= _3D_FIX if kind == "gps" else np.ones(len(rows), dtype=np.bool_)
+    track = position_track(
+        log.path,
+        rows.name,
+        rows.t_ns(),
+        values,
+        dropped,
+        on_earth=True,
+        height="sea level",
+        unusable={"no 3D fix": np.asarray(~fixed)},
+    )
+    accuracy = log.first(["GPA"], instance, "I") if kind == "gps" else None
+    if accuracy is None:
+        return track
+    across, up = np.median(accuracy.numbers("HAcc", "VAcc"), axis=0).tolist()
+    return replace(track, accuracy_m=(across / float(np.sqrt(2)), up))
+
+
+def _estimators_origin(log: _Log) -> Place | None:
+    """Where the estimator's metres count from: ORGN of type 0."""
+    rows = log.first(["ORGN"], 0, "Type")
+    return None if rows is None else Place(*rows.numbers("Lat", "Lng", "Alt")[0].tolist())
+
+
+def _body(log: _Log, dropped: MutableMapping[str, int]) -> AttitudeTrack | None:
+    for name in ("ATT", "AHR2"):
+        rows = log.first([name])
+        if rows is not None:
+            turned = turned_as_stated(rows.numbers("Yaw", "Pitch", "Roll"))
+            return attitude_track(rows.name, rows.t_ns(), turned, dropped)
+    return None
+
+
+def _mount(
+    log: _Log, instance: int, body: AttitudeTrack | None, dropped: MutableMapping[str, int]
+) -> AttitudeTrack | None:
+    """MNT: roll and pitch against the horizon, yaw from north where it is stated, else from the nose."""
+    rows = log.first(["MNT"], instance, "I")
+    if rows is None or "Pitch" not in rows:
+        return None
+    roll, pitch, from_nose, from_north = (rows.numbers(f) for f in ("Roll", "Pitch", "YawB", "YawE"))
+    turned = turned_as_stated(np.stack([from_north, pitch, roll], axis=1))
+    unknown = np.isnan(from_north)
+    if unknown.any() and body is not None:
+        angles = np.stack([from_nose, pitch, roll], axis=1)[unknown]
+        with np.errstate(invalid="ignore"):
+            heading_from_mount = attitude_from_angles(angles, order="ypr", units="deg")
+        turned[unknown] = world_from_heading(body, rows.t_ns()[unknown], heading_from_mount)
+    return attitude_track(rows.name, rows.t_ns(), turned, dropped)
+
+
+def _gps_time(log: _Log) -> ClockFit | None:
+    """From time since boot to UTC, by the first receiver; None without a time of it."""
+    rows = log.first(["GPS"], 0, "I")
+    if rows is None or "GWk" not in rows or "GMS" not in rows:
+        return None
+    known = (rows.numbers("Status") >= _3D_FIX) & (rows.integers("GWk") > 0)
+    gps_ns = rows.integers("GWk")[known] * _WEEK_NS + rows.integers("GMS")[known] * 1_000_000 + _GPS_EPOCH_NS
+    return fit_clock(rows.t_ns()[known], gps_ns - _leap_ns(gps_ns))
+
+
+def _leap_ns(gps_ns: Int64) -> Int64:
+    """By how much GPS time is ahead of UTC; it has no leap seconds."""
+    ahead = np.full(len(gps_ns), _LEAP_SECONDS[-1][1] - 1, dtype=np.int64)
+    for since_s, seconds in reversed(_LEAP_SECONDS):
+        ahead[gps_ns >= (since_s + seconds) * 1_000_000_000] = seconds
+    return ahead * 1_000_000_000
+
+
+# --- reading -------------------------------------------------------------------------------------------
+
+
+class _Log:
+    """The messages of a log, found once, read by name.
+
+    Raises:
+        DataError: pymavlink is missing, or cannot make sense of the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        reader = _index(path)
+        self._bytes = np.memmap(path, dtype=np.uint8, mode="r")
+        self._formats = {
+            reader.id_to_name[k]: reader.formats[k] for k in reader.id_to_name if k in reader.formats
+        }
+        self._places = {
+            name: np.asarray(reader.offsets[f.type], np.int64) for name, f in self._formats.items()
+        }
+        self.counts = {name: len(places) for name, places in self._places.items() if len(places)}
+
+    def first(self, names: Sequence[str], instance: int = 0, *columns: str) -> _Rows | None:
+        """The messages of the first of some names that has any of an instance."""
+        for name in names:
+            rows = self.rows(name)
+            if rows is not None and "TimeUS" in rows and len(found := rows.of(instance, *columns)):
+                return found
+        return None
+
+    def rows(self, name: str) -> _Rows | None:
+        """The messages of a name; None without any, or where their definition makes no sense."""
+        places = self._places.get(name)
+        if places is None or not len(places):
+            return None
+        stated = self._formats[name]
+        letters, columns = str(stated.format), [str(column) for column in stated.columns]
+        if len(letters) != len(columns) or len(set(columns)) < len(columns) or set(letters) - set(_LETTERS):
+            return None
+        layout = np.dtype([(column, _LETTERS[c][0]) for column, c in zip(columns, letters, strict=True)])
+        if layout.itemsize + _HEAD != stated.len:
+            return None
+        whole = places + stated.len <= len(self._bytes)
+        wanted = places[whole, None] + np.arange(_HEAD, stated.len)
+        raw = (
+            np.ascontiguousarray(self._bytes[wanted]).view(layout)[:, 0]
+            if whole.any()
+            else np.zeros(0, layout)
+        )
+        scales = {column: _LETTERS[c][1] for column, c in zip(columns, letters, strict=True)}
+        return _Rows(name, raw, scales, int(np.count_nonzero(~whole)))
+
+
+def _index(path: Path) -> Any:
+    """Where each message is, as pymavlink lists it."""
+    try:
+        with path.open("rb") as file:
+            if file.read(len(_START)) != _START:
+                raise DataError(path, "is no ArduPilot log", "give the .bin that the autopilot wrote")
+    except OSError as error:
+        raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
+    kind = need("pymavlink.DFReader", "drones").DFReader_binary
+    reader = kind.__new__(kind)  # first without the file, which it leaves open where it fails
+    try:
+        with _silence():
+            reader.__init__(str(path), zero_time_base=True)
+    except OSError as error:
+        _close(reader)
+        raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
+    except Exception as error:  # whatever damage makes of a parser that expects none
+        _close(reader)
+        problem = " ".join(str(error).split())[:100] or type(error).__name__
+        raise DataError(path, f"is damaged ({problem})", "download it from the autopilot again") from error
+    _close(reader)
+    return reader
+
+
+def _close(reader: Any) -> None:
+    """Close the file; the map of it goes with the last that looks at it."""
+    if file := getattr(reader, "filehandle", None):
+        file.close()
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Keep what pymavlink prints of each damaged byte from the terminal; its compiled part prints too."""
+    quiet = io.StringIO()
+    stderr = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        with redirect_stdout(quiet), redirect_stderr(quiet):
+            yield
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(nowhere)
+
+
+FORMAT = ArduPilotFormat()

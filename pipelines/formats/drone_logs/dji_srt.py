@@ -1,0 +1,336 @@
+"""DJI's subtitles: where the drone was and where its gimbal looked, written beside the video.
+
+Generations differ in everything but the subtitles' own form; all of these are read:
+
+- `[latitude: 41.4] [longitude: 2.2] [rel_alt: 3.6 abs_alt: 6.4] [gb_yaw: 30.0 gb_pitch: -45.0 gb_roll: 0.0]`
+  (since 2018), with blanks before the colons or without, `longitude` spelt `longtitude` by some, one
+  height called `altitude` by others, gimbal angles only from enterprise models;
+- `GPS(149.0251,-20.2533,16)`: longitude, latitude, satellites (until 2018), with `Hb:1.9`, `BAROMETER:20.1`
+  or `H 85.80m` as height above take-off, and `F.PRY (...)`, `G.PRY (...)` as the angles of body and gimbal;
+- `GPS(36.6146,-6.1120,0.0M)`: latitude, longitude, height (Matrice 300): the M tells them apart.
+
+Angles are those of an FRD body and gimbal in NED (docs/drones.md).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, MutableMapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.formats.common.stamps import Bool
+from pipelines.formats.common.summaries import describe_times
+from pipelines.formats.common.text_tables import read_head
+from pipelines.formats.drone_logs.telemetry_rows import (
+    attitude_track,
+    between_repeats,
+    position_track,
+    turned_as_stated,
+)
+from pipelines.formats.poses.pose_rows import longest_rising
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float, Int64
+from pipelines.session.telemetry import AttitudeTrack, Height, Telemetry, TelemetryChoice
+
+_TIMECODE = r"(\d+):([0-5]\d):([0-6]\d)[,.](\d{3})"  # a Matrice 300 ends its 60th second at :60
+_BLOCK = re.compile(rf"(?m)^{_TIMECODE} --> {_TIMECODE}[ \t]*$")
+_CLOCK = re.compile(
+    r"(\d{4})[-.](\d{1,2})[-.](\d{1,2}) +(\d{1,2}):(\d{2}):(\d{2})(?:[.,](\d{3}))?(?:,(\d{3}))?(?!\d)"
+)
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_SLOW_NS = 500_000_000  # subtitles further apart than this come once a second, with whole seconds
+
+_NUMBER = r"([-+]?\d+(?:\.\d+)?)"
+_BRACKETS = re.compile(r"\[([^\[\]\n]{1,300})\]")
+_PAIR = re.compile(rf"([A-Za-z_]+)\s*:\s*{_NUMBER}(?![\d/])")
+_GPS = re.compile(rf"GPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(M?)")
+_ANGLES = {
+    part: re.compile(rf"\b{letter}\.PRY\s*\(\s*{_NUMBER}[^,\d]*,\s*{_NUMBER}[^,\d]*,\s*{_NUMBER}")
+    for part, letter in (("drone", "F"), ("gb", "G"))
+}
+_ABOVE_TAKE_OFF = re.compile(rf"(?:\bBAROMETER\s*:\s*|\bHb\s*:\s*|\bH\s+){_NUMBER}")
+
+_NAMES = {"longtitude": "longitude"} | {
+    f"{old}{angle}": f"{new}_{angle}"
+    for old, new in (("gimbal_", "gb"), ("gb_", "gb"), ("drone_", "drone"), ("uav_", "drone"))
+    for angle in ("yaw", "pitch", "roll")
+}
+_COLUMNS = (
+    *("latitude", "longitude", "relative", "absolute"),
+    *("gb_yaw", "gb_pitch", "gb_roll", "drone_yaw", "drone_pitch", "drone_roll"),
+)
+_HEIGHTS = {"rel_alt": "relative", "abs_alt": "absolute", "altitude": "absolute"}
+
+
+@dataclass(frozen=True)
+class Subtitles:
+    """The subtitles of a video: when each is shown, and the clock time that it shows."""
+
+    media_ns: Int64  # [B] since the video's start
+    clock_ns: Int64  # [B] since the epoch, local time taken as UTC; 0 where none is shown
+    texts: list[str]  # [B]
+
+    @property
+    def has_clock(self) -> Bool:
+        """[B] whether a clock time is shown."""
+        shown: Bool = self.clock_ns != 0
+        return shown
+
+    @property
+    def are_slow(self) -> bool:
+        """Whether they come about once a second, and not with each frame."""
+        return len(self.media_ns) > 1 and float(np.median(np.diff(self.media_ns))) >= _SLOW_NS
+
+    def start_ns(self) -> int | None:
+        """What the clock showed when the video began, by the first subtitle with a clock; None without."""
+        shown = np.flatnonzero(self.has_clock)
+        return int(self.clock_ns[shown[0]] - self.media_ns[shown[0]]) if len(shown) else None
+
+    def times(self) -> tuple[Int64, Bool]:
+        """[B] when each was written, and whether that is known.
+
+        Subtitles of each frame: what their clock shows. Slow ones show whole seconds: the start, and then
+        the video's own time. Without any clock it is the video's own time.
+        """
+        start_ns = self.start_ns()
+        if start_ns is None:
+            return self.media_ns, np.ones(len(self.media_ns), dtype=np.bool_)
+        if self.are_slow:
+            return self.media_ns + start_ns, np.ones(len(self.media_ns), dtype=np.bool_)
+        return self.clock_ns, self.has_clock
+
+
+class DjiSrtFormat:
+    """Subtitles that say where the drone was."""
+
+    name = "dji"
+    title = "DJI telemetry (subtitles)"
+    suffixes: tuple[str, ...] = (".srt",)
+
+    def recognises(self, path: Path) -> bool:
+        """Whether there are subtitles, and one of the first says a position."""
+        if path.suffix.lower() not in self.suffixes or not path.is_file():
+            return False
+        return bool(np.isfinite(_columns(parse_subtitles(read_head(path)).texts)["latitude"]).any())
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Subtitles, times, box of the positions, heights, angles, and what was left out."""
+        subtitles = read_subtitles(path)
+        columns = _columns(subtitles.texts)
+        t_ns, _ = subtitles.times()
+        placed = np.isfinite(columns["latitude"])
+        facts: dict[str, object] = {
+            "subtitles": len(subtitles.texts),
+            "positions": int(np.count_nonzero(placed)),
+            **describe_times(t_ns),
+            "clock": _clock_name(subtitles),
+        }
+        for name in ("latitude", "longitude"):
+            facts[f"{name}_deg"] = _range(columns[name], 7)
+        heights = {"height_above_take_off_m": "relative", "height_absolute_m": "absolute"}
+        facts |= {said: _range(columns[name], 3) for said, name in heights.items() if _any(columns[name])}
+        for said, part in (("gimbal", "gb"), ("body", "drone")):
+            angles = _angles(columns, part)
+            if _any(angles):
+                facts[f"{said}_angles"] = int(np.count_nonzero(np.isfinite(angles).all(axis=1)))
+                facts[f"{said}_pitch_deg"] = _range(angles[:, 1], 2)
+        if not any(name.endswith("_angles") for name in facts):
+            facts["orientation"] = "none: state a gimbal in the manifest"
+        return facts
+
+    def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
+        """Positions, and the angles of body and gimbal where the subtitles have them.
+
+        Positions that are repeated until the next measurement are taken as lines between the two.
+
+        Raises:
+            DataError: no subtitles, no position in any, or no height where none is stated.
+        """
+        subtitles = read_subtitles(path)
+        columns = _columns(subtitles.texts)
+        t_ns, timed = subtitles.times()
+        height, which = _height(path, columns, choice)
+        dropped: dict[str, int] = {}
+        track = position_track(
+            path,
+            "its GPS",
+            t_ns,
+            np.stack([columns["latitude"], columns["longitude"], height], axis=1),
+            dropped,
+            on_earth=True,
+            height=which,
+            unusable={"no time": ~timed, "no position": ~np.isfinite(columns["latitude"])},
+        )
+        values, moved = between_repeats(track.t_ns, track.values)
+        return Telemetry(
+            position=replace(track, values=values),
+            body=_attitude("F.PRY", t_ns[timed], _angles(columns, "drone")[timed], dropped),
+            gimbal=_attitude("its gimbal angles", t_ns[timed], _angles(columns, "gb")[timed], dropped),
+            clock=_clock_name(subtitles),
+            notes=tuple(f"{path}: {note}" for note in _notes(subtitles, which, moved, len(values))),
+            dropped=dropped,
+        )
+
+
+def read_subtitles(path: Path) -> Subtitles:
+    """Read them all; bytes that are no UTF-8 become signs that no number has.
+
+    Raises:
+        DataError: the file cannot be read, or holds no subtitles.
+    """
+    try:
+        text = path.read_bytes().decode("utf-8-sig", errors="replace")
+    except OSError as error:
+        raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
+    subtitles = parse_subtitles(text.replace("\r\n", "\n").replace("\r", "\n"))
+    if not subtitles.texts:
+        raise DataError(
+            path, "holds no subtitles" if text.strip() else "is empty", "copy it from the drone again"
+        )
+    return subtitles
+
+
+def parse_subtitles(text: str) -> Subtitles:
+    """The subtitles of a text; none where it has none."""
+    blocks = list(_BLOCK.finditer(text))
+    ends = [block.start() for block in blocks[1:]] + [len(text)]
+    texts = [text[block.end() : end] for block, end in zip(blocks, ends, strict=False)]
+    return Subtitles(
+        media_ns=np.array([_timecode_ns(block) for block in blocks], dtype=np.int64),
+        clock_ns=np.array([_clock_ns(each) or 0 for each in texts], dtype=np.int64),
+        texts=texts,
+    )
+
+
+def _clock_ns(text: str) -> int | None:
+    """The clock time in a subtitle: 2022-08-07 13:40:40,774,808 and its variants."""
+    match = _CLOCK.search(text)
+    if match is None:
+        return None
+    *whole, milliseconds, microseconds = (int(part or 0) for part in match.groups())
+    try:
+        elapsed = datetime(*whole, tzinfo=UTC) - _EPOCH  # type: ignore[misc,arg-type]  # six integers
+    except ValueError:
+        return None
+    return elapsed // timedelta(microseconds=1) * 1000 + milliseconds * 1_000_000 + microseconds * 1000
+
+
+def _timecode_ns(block: re.Match[str]) -> int:
+    hours, minutes, seconds, milliseconds = (int(part[-6:]) for part in block.groups()[:4])
+    return (((hours * 60 + minutes) * 60 + seconds) * 1000 + milliseconds) * 1_000_000
+
+
+# --- what a subtitle says ------------------------------------------------------------------------------
+
+
+def _columns(texts: Sequence[str]) -> dict[str, Float]:
+    """Every number that is wanted, [B] each, NaN where a subtitle does not say it."""
+    rows = [_said(text) for text in texts]
+    return {name: np.array([row.get(name, np.nan) for row in rows]) for name in _COLUMNS}
+
+
+def _said(text: str) -> dict[str, float]:
+    said: dict[str, float] = {}
+    for bracket in _BRACKETS.findall(text):
+        for key, number in _PAIR.findall(bracket):
+            name = key.lower()
+            said[_HEIGHTS.get(name) or _NAMES.get(name, name)] = float(number)
+    if "GPS" in text and (gps := _GPS.search(text)):
+        first, second, third = (float(part) for part in gps.groups()[:3])
+        if gps[4]:  # a height: only those that write it begin with the latitude
+            said |= {"latitude": first, "longitude": second, "absolute": third}
+        else:
+            said |= {"longitude": first, "latitude": second}
+        if above := _ABOVE_TAKE_OFF.search(text):
+            said.setdefault("relative", float(above[1]))
+        for part, pattern in _ANGLES.items():
+            if angles := pattern.search(text):
+                pitch, roll, yaw = (float(angle) for angle in angles.groups())
+                said |= {f"{part}_pitch": pitch, f"{part}_roll": roll, f"{part}_yaw": yaw}
+    if "latitude" not in said or "longitude" not in said:  # one of them broke off
+        said.pop("latitude", None)
+    return said
+
+
+def _height(path: Path, columns: Mapping[str, Float], choice: TelemetryChoice) -> tuple[Float, Height]:
+    """The height of each position, and what it counts from."""
+    stated = choice.altitude
+    if isinstance(stated, int | float):
+        return np.full(len(columns["latitude"]), float(stated)), "stated"
+    there = [name for name in ("relative", "absolute") if _any(columns[name])]
+    if not there:
+        raise DataError(
+            path,
+            "holds no height",
+            "state it, in metres above the take-off: pose: {dji: ..., altitude: 30}",
+        )
+    if stated is not None and stated not in there:
+        raise DataError(path, f"holds no {stated} height", f"write altitude: {there[0]}, or the metres")
+    name = stated or there[0]
+    return columns[name], "take-off" if name == "relative" else "unknown"
+
+
+def _angles(columns: Mapping[str, Float], part: str) -> Float:
+    """[B, 3] yaw, pitch, roll in degrees; a roll that is not written is 0."""
+    yaw, pitch, roll = (columns[f"{part}_{angle}"] for angle in ("yaw", "pitch", "roll"))
+    return np.stack(
+        [yaw, pitch, np.where(np.isnan(roll), np.where(np.isnan(yaw), np.nan, 0.0), roll)], axis=1
+    )
+
+
+def _any(values: Float) -> bool:
+    return bool(np.isfinite(values).any())
+
+
+def _range(values: Float, decimals: int) -> list[float]:
+    finite = values[np.isfinite(values)]
+    return [round(float(v), decimals) for v in (finite.min(), finite.max())] if len(finite) else []
+
+
+def _attitude(
+    name: str, t_ns: Int64, yaw_pitch_roll_deg: Float, dropped: MutableMapping[str, int]
+) -> AttitudeTrack | None:
+    """The attitude that angles [B, 3] state; None where there are none."""
+    stated = np.isfinite(yaw_pitch_roll_deg).all(axis=1)
+    if not stated.any():
+        return None
+    if missing := int(np.count_nonzero(~stated)):
+        dropped[f"subtitles without {name}"] = missing
+    rows = np.flatnonzero(stated)
+    rows = rows[longest_rising(t_ns[rows])]
+    if late := int(np.count_nonzero(stated)) - len(rows):
+        dropped[f"{name} out of order"] = late
+    continuous = np.degrees(np.unwrap(np.radians(yaw_pitch_roll_deg[rows]), axis=0))
+    between, _ = between_repeats(t_ns[rows], continuous)
+    return attitude_track(name, t_ns[rows], turned_as_stated(between), dropped)
+
+
+def _clock_name(subtitles: Subtitles) -> str:
+    return "the drone's clock" if subtitles.has_clock.any() else "the video's start"
+
+
+def _notes(subtitles: Subtitles, height: Height, moved: int, rows: int) -> list[str]:
+    """What was chosen, and what is doubtful."""
+    notes = []
+    if not subtitles.has_clock.any():
+        notes.append("shows no clock: its times count from the video's start")
+    elif subtitles.are_slow:
+        notes.append("shows whole seconds of local time, taken as UTC: let clock.sigma_s be 1")
+    else:
+        notes.append("its clock is the drone's local time, taken as UTC")
+    if height == "take-off":
+        notes.append("heights count from the take-off")
+    elif height == "stated":
+        notes.append("its height is the one stated, throughout")
+    else:
+        notes.append("heights are absolute, from a barometer: drones differ by many metres")
+    if moved:
+        notes.append(f"{moved} of {rows} positions repeat the one before: taken between measurements")
+    return notes
+
+
+FORMAT = DjiSrtFormat()

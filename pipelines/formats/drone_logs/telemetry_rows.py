@@ -1,0 +1,244 @@
+"""Rows of telemetry to clean tracks: one set of rules for every drone's log."""
+
+from __future__ import annotations
+
+from collections.abc import MutableMapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pipelines.formats.common.stamps import Bool
+from pipelines.formats.poses.pose_rows import NORM_TOLERANCE, longest_rising
+from pipelines.geometry.clocks import ClockFit
+from pipelines.geometry.geodesy import Place, enu_from_geodetic, place_at
+from pipelines.geometry.mounting import attitude_from_angles, attitude_in_enu
+from pipelines.geometry.poses import (
+    interpolate_points,
+    interpolate_poses,
+    multiply,
+    quaternion_from_rotation_vector,
+    rotate,
+)
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float, Int64
+from pipelines.session.telemetry import AttitudeTrack, Height, PositionTrack
+
+_HELD_NS = 1_000_000_000  # receivers that drones carry report at least once a second
+
+
+def position_track(
+    source: Path | str,
+    name: str,
+    t_ns: Int64,
+    values: Float,
+    dropped: MutableMapping[str, int],
+    *,
+    on_earth: bool,
+    height: Height = "unknown",
+    origin: Place | None = None,
+    unusable: dict[str, Bool] | None = None,
+) -> PositionTrack:
+    """Positions without the rows that cannot be used, each counted in `dropped` under its first cause.
+
+    The causes of `unusable` come first, then "not finite", "not on Earth" (latitude beyond 90, longitude
+    beyond 360), "no fix (0, 0)", "duplicate stamp" and "stamp out of order" as in `clean_poses`.
+
+    Raises:
+        DataError: no row is left.
+    """
+    causes: dict[str, Bool] = dict(unusable or {})
+    with np.errstate(invalid="ignore"):
+        causes["not finite"] = np.asarray(~np.isfinite(values).all(axis=1))
+        if on_earth:
+            causes["not on Earth"] = (np.abs(values[:, 0]) > 90) | (np.abs(values[:, 1]) > 360)
+            causes["no fix (0, 0)"] = np.asarray((values[:, :2] == 0).all(axis=1))
+    found: dict[str, int] = {}
+    keep = _kept(t_ns, causes, found)
+    if not keep.any():
+        counts = ", ".join(f"{count} {cause}" for cause, count in found.items()) or "it is empty"
+        raise DataError(source, f"{name} holds no usable position ({counts})", "name another log")
+    for cause, count in found.items():
+        dropped[cause] = dropped.get(cause, 0) + count
+    return PositionTrack(
+        name=name,
+        t_ns=t_ns[keep],
+        values=values[keep],
+        on_earth=on_earth,
+        height=height,
+        origin=origin,
+    )
+
+
+def attitude_track(
+    name: str,
+    t_ns: Int64,
+    quaternion_xyzw: Float,
+    dropped: MutableMapping[str, int],
+    *,
+    relative_to: Literal["world", "body"] = "world",
+) -> AttitudeTrack | None:
+    """Attitudes without the rows that cannot be used, counted as "attitude ...", or None without any.
+
+    Args:
+        name: what the log calls it.
+        t_ns: [N] stamps.
+        quaternion_xyzw: [N, 4] of an FLU thing in an ENU world or an FLU body.
+        dropped: where losses are counted.
+        relative_to: which of the two.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        norm = np.linalg.norm(quaternion_xyzw, axis=1)
+        causes: dict[str, Bool] = {
+            "attitude not finite": ~np.isfinite(norm),
+            "attitude not a unit quaternion": np.abs(norm - 1) > NORM_TOLERANCE,
+        }
+    found: dict[str, int] = {}
+    keep = _kept(t_ns, causes, found, prefix="attitude ")
+    if not keep.any():
+        return None
+    for cause, count in found.items():
+        dropped[cause] = dropped.get(cause, 0) + count
+    return AttitudeTrack(name, t_ns[keep], quaternion_xyzw[keep] / norm[keep, None], relative_to)
+
+
+def turned_as_stated(yaw_pitch_roll_deg: Float, *, relative_to: Literal["world", "body"] = "world") -> Float:
+    """Quaternions [N, 4] of angles [N, 3] as autopilots state them: FRD in NED, yaw from north to east."""
+    with np.errstate(invalid="ignore"):
+        quaternion = attitude_from_angles(yaw_pitch_roll_deg, order="ypr", units="deg")
+    return attitude_in_enu(quaternion, relative_to=relative_to, axes="ned")
+
+
+def placed_by(track: PositionTrack, fixes: PositionTrack) -> tuple[PositionTrack, str]:
+    """A track in metres with the place on Earth that it counts from, by fixes of the same drone.
+
+    The median of what lies between the two, so that wild fixes do not count; a constant error of the fixes
+    stays in it.
+
+    Returns:
+        The track, and in words how well the two agree.
+    """
+    near = Place(*fixes.values[0].tolist())
+    latitude, longitude, height = fixes.values.T
+    at_fixes = interpolate_points(track.t_ns, track.values, fixes.t_ns, max_gap_ns=_HELD_NS)
+    apart = enu_from_geodetic(latitude, longitude, height, near) - at_fixes
+    apart = apart[np.isfinite(apart).all(axis=1)]
+    if not len(apart):
+        return track, f"{track.name} and {fixes.name} share no time: nothing says where on Earth it lies"
+    middle = np.median(apart, axis=0)
+    scatter_m = 1.4826 * float(np.median(np.linalg.norm(apart - middle, axis=1)))
+    said = f"{track.name} placed on Earth by {fixes.name}, which scatters by {scatter_m:.2g} m about it"
+    return replace(track, origin=place_at(middle, near)), said
+
+
+def world_from_heading(body: AttitudeTrack, t_ns: Int64, heading_from_gimbal: Float) -> Float:
+    """Attitudes [N, 4] of an FLU gimbal in an ENU world, of angles that count yaw from the drone's nose.
+
+    Autopilots state them so: pitch and roll against the horizon, yaw against the heading.
+
+    Args:
+        body: how the body was turned in the world.
+        t_ns: [N] stamps.
+        heading_from_gimbal: [N, 4] as stated: of an FRD gimbal in a level frame, x where the nose points,
+            z down.
+
+    Returns:
+        NaN where the body's attitude is not known within a second.
+    """
+    _, turned = interpolate_poses(
+        body.t_ns,
+        np.zeros((len(body.t_ns), 3)),
+        body.quaternion_xyzw,
+        t_ns,
+        max_gap_ns=_HELD_NS,
+        max_extrapolation_ns=_HELD_NS // 10,
+    )
+    nose = rotate(turned, np.array([1.0, 0.0, 0.0]))
+    from_north = np.arctan2(nose[:, 0], nose[:, 1])
+    still = np.zeros_like(from_north)
+    heading = quaternion_from_rotation_vector(np.stack([still, still, from_north], axis=1))
+    return attitude_in_enu(multiply(heading, heading_from_gimbal), relative_to="world", axes="ned")
+
+
+def on_gps_time(
+    source: Path, fit: ClockFit | None, wanted: Literal["gps", "boot"] | None, notes: list[str]
+) -> ClockFit | None:
+    """The fit to GPS time if it is to be used: where there is one, unless time since boot is asked for.
+
+    Raises:
+        DataError: GPS time is asked for, and there is none.
+    """
+    if wanted == "gps" and fit is None:
+        raise DataError(source, "holds no GPS time", "leave time: gps out; its stamps count from boot")
+    if fit is None:
+        notes.append("holds no GPS time: its stamps count from boot")
+        return None
+    if wanted == "boot":
+        notes.append(f"its stamps count from boot, as asked ({said_of_fit(fit)})")
+        return None
+    notes.append(f"its stamps are turned to UTC: {said_of_fit(fit)}")
+    return fit
+
+
+def said_of_fit(fit: ClockFit) -> str:
+    """How a log's own clock goes against GPS time, in words."""
+    return (
+        f"GPS time is {fit.offset_ns / 1e9:.3f} s ahead of its clock, drifting {fit.drift_ppm:.1f} ppm"
+        f" (+- {min(fit.drift_sigma_ppm, 1e6):.2g}; {fit.events} fixes, scatter"
+        f" {fit.residual_s * 1e3:.1f} ms)"
+    )
+
+
+def between_repeats(t_ns: Int64, values: Float) -> tuple[Float, int]:
+    """Values of a log that repeats each measurement until the next one comes, as lines between the two.
+
+    A value that stays the same for longer than a second before it changes is taken to have stayed so until
+    one second before.
+
+    Args:
+        t_ns: [N] increasing stamps.
+        values: [N, D].
+
+    Returns:
+        [N, D], and how many rows were moved.
+    """
+    if len(t_ns) < 3:
+        return values, 0
+    smooth = values.copy()
+    for column in range(values.shape[1]):
+        of_column = values[:, column]
+        changes = np.flatnonzero(np.diff(of_column) != 0) + 1
+        if not len(changes):
+            continue
+        next_change = np.searchsorted(changes, np.arange(len(t_ns)), side="right")
+        last = np.append(changes, len(t_ns) - 1)[next_change]
+        measured = np.zeros(len(t_ns), dtype=np.bool_)
+        measured[[0, *changes.tolist()]] = True
+        measured |= (t_ns[last] - t_ns >= _HELD_NS) | (next_change == len(changes))
+        smooth[:, column] = interpolate_points(
+            t_ns[measured], of_column[measured], t_ns, max_gap_ns=int(np.ptp(t_ns)) + 1
+        )
+    return smooth, int(np.count_nonzero((smooth != values).any(axis=1)))
+
+
+def _kept(t_ns: Int64, causes: dict[str, Bool], dropped: dict[str, int], prefix: str = "") -> Bool:
+    keep = np.ones(len(t_ns), dtype=np.bool_)
+
+    def drop(cause: str, bad: Bool) -> None:
+        if count := int(np.count_nonzero(keep & bad)):
+            dropped[cause] = count
+            keep[bad] = False
+
+    for cause, bad in causes.items():
+        drop(cause, bad)
+    rows = np.flatnonzero(keep)
+    if len(rows) > 1:
+        stamps = t_ns[rows]
+        duplicate = np.zeros(len(t_ns), dtype=np.bool_)
+        duplicate[rows[1:][stamps[1:] == stamps[:-1]]] = True
+        late = np.zeros(len(t_ns), dtype=np.bool_)
+        late[rows[~longest_rising(stamps)]] = True
+        drop(f"{prefix}duplicate stamp", duplicate)
+        drop(f"{prefix}stamp out of order", late)
+    return keep

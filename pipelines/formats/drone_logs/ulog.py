@@ -1,0 +1,472 @@
+"""PX4's .ulg logs, by pyulog (extra `drones`): estimates, GPS, gimbal and camera triggers.
+
+PX4 has its world in NED and its body in FRD, and stamps in microseconds since boot (docs/drones.md).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import struct
+from collections.abc import Collection, Mapping, MutableMapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.formats.common.extras import need
+from pipelines.formats.common.stamps import Bool
+from pipelines.formats.drone_logs.telemetry_rows import (
+    attitude_track,
+    on_gps_time,
+    position_track,
+    said_of_fit,
+    turned_as_stated,
+    world_from_heading,
+)
+from pipelines.geometry.clocks import ClockFit, fit_clock
+from pipelines.geometry.geodesy import Place, enu_from_enu
+from pipelines.geometry.mounting import attitude_in_enu
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float, Int64
+from pipelines.session.telemetry import AttitudeTrack, PositionTrack, Telemetry, TelemetryChoice
+
+_MAGIC = b"ULog\x01\x12\x35"
+_MOST_FIELDS = 20_000  # of one message, with what is nested in it; PX4's largest has some hundreds
+_FAR_OFF_NS = 5_000_000_000  # a stamp this far from most others is wrong
+_3D_FIX = 3
+_GPS = ("vehicle_gps_position", "sensor_gps")
+_YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64  # GIMBAL_DEVICE_FLAGS of MAVLink
+
+Columns = Mapping[str, Any]  # by field name, arrays [N] of whatever type the log has
+
+
+@dataclass(frozen=True)
+class _Topic:
+    """One instance of a topic."""
+
+    name: str
+    instance: int
+    columns: Columns
+
+    def __len__(self) -> int:
+        return len(self.columns["timestamp"])
+
+    def __contains__(self, field: str) -> bool:
+        return field in self.columns
+
+    def numbers(self, *fields: str) -> Float:
+        """[N] of one field, [N, F] of several, NaN throughout where the log has no such field."""
+        missing = np.full(len(self), np.nan)
+        columns = [np.asarray(self.columns.get(field, missing), dtype=np.float64) for field in fields]
+        return columns[0] if len(columns) == 1 else np.stack(columns, axis=1)
+
+    def flags(self, field: str) -> Bool:
+        """[N] whether a field is set; True throughout where the log has no such field."""
+        return np.asarray(self.columns.get(field, np.ones(len(self))) != 0, dtype=np.bool_)
+
+    def t_ns(self) -> Int64:
+        """[N] since boot: when it was sampled where the log says so, else when it was published."""
+        published = np.asarray(self.columns["timestamp"]).astype(np.int64)
+        sampled = np.asarray(self.columns.get("timestamp_sample", published)).astype(np.int64)
+        stamps: Int64 = np.where(sampled > 0, sampled, published) * 1000
+        return stamps
+
+
+class UlogFormat:
+    """Logs of PX4 autopilots."""
+
+    name = "ulog"
+    title = "PX4 log"
+    suffixes: tuple[str, ...] = (".ulg", ".ulog")
+
+    def recognises(self, path: Path) -> bool:
+        """Whether it begins as every ULog does."""
+        if not path.is_file():
+            return False
+        try:
+            with path.open("rb") as file:
+                return file.read(len(_MAGIC)) == _MAGIC
+        except OSError:
+            return False
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Topics and their messages, times, GPS, what of the estimates is valid, and damage."""
+        log = _open(path, None)
+        topics = _topics(log)
+        stamps = [np.asarray(topic.columns["timestamp"]).astype(np.int64) for topic in topics]
+        every = np.concatenate([np.zeros(0, dtype=np.int64), *stamps]) * 1000
+        begun = every >= log.start_timestamp * 1000
+        near = begun & ~_far_off(every, begun)
+        facts: dict[str, object] = {
+            "hardware": str(log.msg_info_dict.get("ver_hw", "")),
+            "messages": len(every),
+            "span_s": round(float(np.ptp(every[near])) / 1e9, 6) if near.any() else 0.0,
+        }
+        if early := int(np.count_nonzero(~begun)):
+            facts["messages_stamped_before_the_log_began"] = early
+        if stray := int(np.count_nonzero(begun & ~near)):
+            facts["messages_stamped_far_off"] = stray
+        facts["dropouts"] = len(log.dropouts)
+        if log.file_corruption:
+            facts["damaged"] = "yes"
+        by_name = {f"{topic.name}:{topic.instance}": topic for topic in topics}
+        if local := by_name.get("vehicle_local_position:0"):
+            facts["local_positions_valid"] = int(np.count_nonzero(_local_is_valid(local)))
+        for name in _GPS:
+            if gps := by_name.get(f"{name}:0"):
+                values, fixed = _fixes(gps)
+                facts["gps_fixes"] = int(np.count_nonzero(fixed))
+                facts["first_position"] = [round(v, 7) for v in values[0].tolist()]
+                break
+        if (fit := _gps_time(topics)) is not None:
+            facts["gps_time"] = said_of_fit(fit)
+        facts["topics"] = [f"{name} {len(topic)}" for name, topic in sorted(by_name.items())]
+        return facts
+
+    def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
+        """Position, attitude and gimbal.
+
+        The position is the estimator's own (`local`) where it ever calls it valid, else its global one,
+        else that of GPS; a local one that is never valid is taken last, and doubted.
+
+        Raises:
+            DataError: no ULog, pyulog is missing, or no position in it.
+        """
+        topics = _topics(_open(path, _WANTED))
+        dropped: dict[str, int] = {}
+        notes: list[str] = []
+        fit = on_gps_time(path, _gps_time(topics), choice.time, notes)
+        body = _body(topics, choice.instance, dropped)
+        position = _position(path, topics, choice, dropped, notes)
+        gimbal = _gimbal(topics, body, dropped, notes)
+        if fit is not None:
+            position = replace(position, t_ns=fit.other_ns(position.t_ns))
+            body = replace(body, t_ns=fit.other_ns(body.t_ns)) if body else None
+            gimbal = replace(gimbal, t_ns=fit.other_ns(gimbal.t_ns)) if gimbal else None
+        return Telemetry(
+            position=position,
+            body=body,
+            gimbal=gimbal,
+            clock="UTC by GPS" if fit else "boot",
+            fit=fit,
+            notes=tuple(f"{path}: {note}" for note in notes),
+            dropped=dropped,
+        )
+
+    def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
+        """When pictures were taken: by the camera's feedback, else by the trigger.
+
+        Raises:
+            DataError: no ULog, pyulog is missing, or nothing was triggered.
+        """
+        topics = _topics(_open(path, {"camera_capture", "camera_trigger", *_GPS}))
+        for name in ("camera_capture", "camera_trigger"):
+            if found := [topic for topic in topics if topic.name == name and len(topic)]:
+                t_ns = np.unique(found[0].t_ns())
+                fit = on_gps_time(path, _gps_time(topics), choice.time, [])
+                return t_ns if fit is None else np.unique(fit.other_ns(t_ns))
+        raise DataError(
+            path, "holds no camera_capture or camera_trigger", "take the times of frames otherwise"
+        )
+
+
+_WANTED = {
+    *_GPS,
+    "vehicle_local_position",
+    "estimator_local_position",
+    "vehicle_global_position",
+    "estimator_global_position",
+    "vehicle_attitude",
+    "estimator_attitude",
+    "gimbal_device_attitude_status",
+    "mount_orientation",
+}
+
+# --- what a log says -----------------------------------------------------------------------------------
+
+
+def _position(
+    path: Path,
+    topics: Sequence[_Topic],
+    choice: TelemetryChoice,
+    dropped: MutableMapping[str, int],
+    notes: list[str],
+) -> PositionTrack:
+    there = {
+        "local": _instance(path, topics, ("vehicle_local_position", "estimator_local_position"), choice),
+        "global": _instance(path, topics, ("vehicle_global_position", "estimator_global_position"), choice),
+        "gps": _instance(path, topics, _GPS, choice),
+    }
+    found = {kind: topic for kind, topic in there.items() if topic is not None}
+    if choice.position is not None and choice.position not in found:
+        raise DataError(path, f"has no {choice.position} position", f"there is {', '.join(found) or 'none'}")
+    if not found:
+        raise DataError(
+            path,
+            "has no vehicle_local_position, vehicle_global_position or GPS",
+            "log them (SDLOG_PROFILE), or give the poses from elsewhere",
+        )
+    kind = choice.position or _likeliest(found)
+    topic = found[kind]
+    notes.append(f"took the {kind} position from {topic.name} (instance {topic.instance})")
+    if kind == "local":
+        return _local(path, topic, dropped, notes)
+    if kind == "global":
+        values, usable = topic.numbers("lat", "lon", "alt"), np.ones(len(topic), dtype=np.bool_)
+    else:
+        values, usable = _fixes(topic)
+    track = position_track(
+        path,
+        topic.name,
+        topic.t_ns(),
+        values,
+        dropped,
+        on_earth=True,
+        height="sea level",
+        unusable={"no 3D fix": ~usable},
+    )
+    return replace(track, accuracy_m=_accuracy(topic, usable))
+
+
+def _likeliest(found: Mapping[str, _Topic]) -> str:
+    """The estimator's own where it is ever valid, else what is on Earth."""
+    if "local" in found and _local_is_valid(found["local"]).any():
+        return "local"
+    if "global" in found:
+        return "global"
+    if "gps" in found and _fixes(found["gps"])[1].any():
+        return "gps"
+    return next(iter(found))
+
+
+def _local(path: Path, topic: _Topic, dropped: MutableMapping[str, int], notes: list[str]) -> PositionTrack:
+    """The estimator's metres, and where on Earth they count from: it may move that in flight."""
+    enu = topic.numbers("y", "x", "z") * [1, 1, -1]
+    valid = _local_is_valid(topic)
+    if not valid.any():
+        notes.append(
+            f"{topic.name} never calls its horizontal position valid: its poses are of no use, unless the"
+            " drone was held in place"
+        )
+        valid = np.ones(len(topic), dtype=np.bool_)
+    if (resets := _resets(topic, valid)) > 0:
+        notes.append(f"the estimator moved its position {resets} times at once (xy_reset_counter)")
+    references, stated = topic.numbers("ref_lat", "ref_lon", "ref_alt"), topic.flags("xy_global")
+    stated &= np.isfinite(references).all(axis=1) & (references[:, :2] != 0).any(axis=1)
+    origin: Place | None = None
+    unusable = {"not valid to its estimator": ~valid}
+    if (valid & stated).any():
+        unusable["before its place on Earth was known"] = ~stated
+        places = np.unique(references[valid & stated], axis=0)
+        first = references[np.flatnonzero(valid & stated)[0]]
+        origin = Place(*first.tolist())
+        for place in places:
+            moved = stated & (references == place).all(axis=1)
+            rotation, position = enu_from_enu(Place(*place.tolist()), origin)
+            enu[moved] = enu[moved] @ rotation.T + position
+        if len(places) > 1:
+            notes.append(f"the estimator moved its origin {len(places) - 1} times; followed")
+    track = position_track(
+        path, topic.name, topic.t_ns(), enu, dropped, on_earth=False, origin=origin, unusable=unusable
+    )
+    return replace(track, accuracy_m=_accuracy(topic, valid))
+
+
+def _local_is_valid(topic: _Topic) -> Bool:
+    return topic.flags("xy_valid") & topic.flags("z_valid")
+
+
+def _resets(topic: _Topic, valid: Bool) -> int:
+    if "xy_reset_counter" not in topic:
+        return 0
+    counter = topic.numbers("xy_reset_counter")[valid]
+    return int(np.count_nonzero(np.diff(counter)))
+
+
+def _fixes(topic: _Topic) -> tuple[Float, Bool]:
+    """Latitude, longitude and height [N, 3], and whether there was a fix in 3D."""
+    if "latitude_deg" in topic:
+        values = topic.numbers("latitude_deg", "longitude_deg", "altitude_msl_m")
+    else:
+        values = topic.numbers("lat", "lon", "alt") * [1e-7, 1e-7, 1e-3]
+    return values, np.asarray(topic.numbers("fix_type") >= _3D_FIX)
+
+
+def _accuracy(topic: _Topic, usable: Bool) -> tuple[float, float] | None:
+    stated = topic.numbers("eph", "epv")[usable]
+    stated = stated[np.isfinite(stated).all(axis=1) & (stated > 0).all(axis=1)]
+    if not len(stated):
+        return None
+    across, up = np.median(stated, axis=0).tolist()
+    return across / float(np.sqrt(2)), up  # eph is the root of both variances' sum
+
+
+def _body(
+    topics: Sequence[_Topic], instance: int | None, dropped: MutableMapping[str, int]
+) -> AttitudeTrack | None:
+    found = [topic for topic in topics if topic.name == "vehicle_attitude"]
+    if instance:
+        found = [t for t in topics if t.name == "estimator_attitude" and t.instance == instance] or found
+    if not found:
+        return None
+    topic = found[0]
+    ned_from_frd = topic.numbers("q[1]", "q[2]", "q[3]", "q[0]")
+    turned = attitude_in_enu(ned_from_frd, relative_to="world", axes="ned")
+    return attitude_track(topic.name, topic.t_ns(), turned, dropped)
+
+
+def _gimbal(
+    topics: Sequence[_Topic],
+    body: AttitudeTrack | None,
+    dropped: MutableMapping[str, int],
+    notes: list[str],
+) -> AttitudeTrack | None:
+    """The gimbal's own attitude, or else what it was told relative to the body."""
+    for topic in topics:
+        if topic.name == "gimbal_device_attitude_status" and len(topic):
+            return _gimbal_device(topic, body, dropped)
+    for topic in topics:
+        if topic.name == "mount_orientation" and len(topic):
+            roll, pitch, yaw = (topic.numbers(f"attitude_euler_angle[{k}]") for k in range(3))
+            angles = np.degrees(np.stack([yaw, pitch, roll], axis=1))
+            notes.append(
+                "mount_orientation is taken as relative to the body (else gimbal: {relative_to: world})"
+            )
+            turned = turned_as_stated(angles, relative_to="body")
+            return attitude_track(topic.name, topic.t_ns(), turned, dropped, relative_to="body")
+    return None
+
+
+def _gimbal_device(
+    topic: _Topic, body: AttitudeTrack | None, dropped: MutableMapping[str, int]
+) -> AttitudeTrack | None:
+    """MAVLink's GIMBAL_DEVICE_ATTITUDE_STATUS: pitch and roll against the horizon, yaw as its flags say."""
+    stated = topic.numbers("q[1]", "q[2]", "q[3]", "q[0]")
+    flags = np.asarray(topic.columns.get("device_flags", np.zeros(len(topic)))).astype(np.int64)
+    framed = (flags & (_YAW_IN_VEHICLE | _YAW_IN_EARTH)) != 0
+    from_north = np.where(framed, (flags & _YAW_IN_EARTH) != 0, (flags & _YAW_LOCK) != 0)
+    turned = attitude_in_enu(stated, relative_to="world", axes="ned")
+    if not from_north.all():
+        if body is None:
+            turned[~from_north] = np.nan
+        else:
+            turned[~from_north] = world_from_heading(body, topic.t_ns()[~from_north], stated[~from_north])
+    return attitude_track(topic.name, topic.t_ns(), turned, dropped)
+
+
+def _gps_time(topics: Sequence[_Topic]) -> ClockFit | None:
+    """From time since boot to UTC, by what the receiver says; None without a time of it."""
+    for topic in sorted(topics, key=lambda topic: (topic.name not in _GPS[:1], topic.instance)):
+        if topic.name in _GPS and "time_utc_usec" in topic:
+            utc_ns = np.asarray(topic.columns["time_utc_usec"]).astype(np.int64) * 1000
+            known = utc_ns > 0
+            published = np.asarray(topic.columns["timestamp"]).astype(np.int64) * 1000
+            return fit_clock(published[known], utc_ns[known])
+    return None
+
+
+def _instance(
+    path: Path, topics: Sequence[_Topic], names: Sequence[str], choice: TelemetryChoice
+) -> _Topic | None:
+    """The topic of the instance asked for, the first by default; None where there is none of these names.
+
+    vehicle_* is what the autopilot flew by, estimator_* what each of several estimators thought.
+    """
+    of_kind = [topic for name in names for topic in topics if topic.name == name and len(topic)]
+    if not of_kind or choice.instance is None:
+        return of_kind[0] if of_kind else None
+    found = [topic for topic in of_kind if topic.instance == choice.instance]
+    if not found and choice.position is not None:
+        listed = ", ".join(f"{topic.name} {topic.instance}" for topic in of_kind)
+        raise DataError(path, f"has no instance {choice.instance} of {names[0]}", f"there are {listed}")
+    return found[-1] if found else of_kind[0]
+
+
+# --- reading -------------------------------------------------------------------------------------------
+
+
+def _open(path: Path, wanted: Collection[str] | None) -> Any:
+    """A log with some topics, or all of them.
+
+    Raises:
+        DataError: pyulog is missing, or cannot read the file.
+    """
+    core = need("pyulog", "drones")
+    _refuse_bombs(path)
+    try:
+        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):  # it prints its doubts
+            return core.ULog(file, None if wanted is None else sorted(wanted))
+    except DataError:
+        raise
+    except OSError as error:
+        raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
+    except Exception as error:  # whatever damage makes of a parser that expects none
+        problem = " ".join(str(error).split())[:100] or type(error).__name__
+        raise DataError(path, f"is damaged ({problem})", "download it from the autopilot again") from error
+
+
+def _topics(log: Any) -> list[_Topic]:
+    """By name and instance; those without a stamp say nothing."""
+    found = [_Topic(str(d.name), int(d.multi_id), d.data) for d in log.data_list if "timestamp" in d.data]
+    return sorted(found, key=lambda topic: (topic.name, topic.instance))
+
+
+def _far_off(t_ns: Int64, among: Bool) -> Bool:
+    """Which stamps lie behind nearly all of some by more than a tenth of their span and some seconds."""
+    if not among.any():
+        return np.zeros(len(t_ns), dtype=np.bool_)
+    first, last = np.percentile(t_ns[among], [0, 99.5])
+    return np.asarray(t_ns > last + (last - first) / 10 + _FAR_OFF_NS)
+
+
+def _refuse_bombs(path: Path) -> None:
+    """Refuse definitions that unfold without end: nested arrays may stand for billions of fields.
+
+    Raises:
+        DataError: no ULog, or a definition beyond reason.
+    """
+    try:
+        formats = dict(_definitions(path))
+    except OSError as error:
+        raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
+    sizes: dict[str, int] = {}
+
+    def size(name: str, depth: int) -> int:
+        if depth > 20:
+            raise DataError(path, f"defines {name} by itself", "download it from the autopilot again")
+        if name not in formats:
+            return 1  # a plain type
+        if name not in sizes:
+            sizes[name] = sum(count * size(inner, depth + 1) for inner, count in formats[name])
+        if sizes[name] > _MOST_FIELDS:
+            raise DataError(
+                path, f"defines {name} with {sizes[name]} fields", "download it from the autopilot again"
+            )
+        return sizes[name]
+
+    for name in formats:
+        size(name, 0)
+
+
+def _definitions(path: Path) -> list[tuple[str, list[tuple[str, int]]]]:
+    """What messages consist of: (type, how many), by name; up to where the data begin."""
+    found: list[tuple[str, list[tuple[str, int]]]] = []
+    with path.open("rb") as file:
+        if file.read(16)[: len(_MAGIC)] != _MAGIC:
+            raise DataError(path, "is no PX4 log", "give the .ulg that the autopilot wrote")
+        while len(head := file.read(3)) == 3:
+            size, kind = struct.unpack("<HB", head)
+            body = file.read(size)
+            if kind in {ord("A"), ord("D"), ord("L")} or len(body) < size:
+                break
+            if kind == ord("F"):
+                name, _, fields = body.decode("utf-8", errors="replace").partition(":")
+                parts = re.findall(r"([^\s;\[]+)(?:\[(\d{1,9})\])?\s+[^;]+;?", fields)
+                found.append((name, [(inner, int(count or 1)) for inner, count in parts]))
+    return found
+
+
+FORMAT = UlogFormat()

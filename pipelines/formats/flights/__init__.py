@@ -1,0 +1,1 @@
+"""What a manifest names, as records, whichever format holds it."""

@@ -1,0 +1,478 @@
+"""What a manifest takes from logs: which recording, which topic, and what it holds there.
+
+A topic that is left out is the only candidate of its kind, and what was chosen is said. Every reading
+is one pass over the messages of one topic: logs of any size stream.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, Self
+
+import numpy as np
+
+from pipelines.formats.flights.pictures import later_times, picture_stamps
+from pipelines.formats.logs.fixed_layouts import PoseArrays, read_poses
+from pipelines.formats.logs.frames import frames_of_poses, place_of_frame, transforms_in
+from pipelines.formats.logs.map_topics import (
+    MAP_TYPES,
+    OCCUPANCY_GRID,
+    LoggedMaps,
+    MapTopic,
+    frame_of,
+    map_messages,
+    nothing_usable,
+)
+from pipelines.formats.logs.maps import read_maps
+from pipelines.formats.logs.messages import Kind, all_samples, kind_of
+from pipelines.formats.logs.presets import NAV_SAT_FIX, read_pair, read_positions, read_preset
+from pipelines.formats.logs.recordings import OpenLog
+from pipelines.formats.logs.trajectories import (
+    Gathered,
+    StampCheck,
+    attitudes_of,
+    chained,
+    trajectory_of,
+    trajectory_of_arrays,
+)
+from pipelines.formats.logs.triggers import TRIGGER_TYPES, read_triggers
+from pipelines.geometry.poses import compose, matrix_from_quaternion, quaternion_from_rotation_vector
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import Flight, PoseSource
+from pipelines.session.manifest import Log as LogSource
+from pipelines.session.manifest import Map as MapSource
+from pipelines.session.records import (
+    Int64,
+    IntrinsicsSample,
+    Message,
+    Occupancy,
+    Topic,
+    Trajectory,
+)
+from pipelines.session.registries import Log, LogFormat, recognise
+from pipelines.session.telemetry import PositionTrack, Telemetry, TelemetryChoice
+
+_MAY_DISAGREE_S = 0.5  # header and receive stamps: transport and decoding take less
+_KEPT_MESSAGES = 4_000_000  # of all logs that stay open: their tables have 160 MB
+_KEPT_FILES = 64
+_MAY_JUMP_S = 1.0  # from one message to the next, beyond what time itself passed
+
+_Wanted = Kind | Literal["maps"]
+
+_NOUNS: dict[_Wanted, str] = {
+    "poses": "poses",
+    "transforms": "transforms",
+    "angles": "gimbal angles",
+    "intrinsics": "camera info",
+    "pictures": "pictures",
+    "maps": "maps",
+}
+
+DEFAULT_HEIGHT_M = 2.5
+"""Of what stands on a floor plan: an ordinary storey."""
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The pictures of a topic: when each was taken, strictly increasing."""
+
+    topic: str
+    t_ns: Int64
+    dropped: dict[str, int] = field(default_factory=dict)
+
+
+class FlightLogs:
+    """The logs of one flight; a context manager that closes those that it keeps open.
+
+    Args:
+        flight: the manifest.
+        base: the folder that its paths are relative to.
+        note: told what was chosen and what is doubtful, one line each.
+    """
+
+    def __init__(self, flight: Flight, base: Path, note: Callable[[str], None]) -> None:
+        self._flight = flight
+        self._base = base
+        self._note = note
+        self._kept: dict[tuple[Path, ...], OpenLog] = {}  # the one that was used last comes last
+
+    def __enter__(self) -> Self:
+        """The logs themselves."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Close the files."""
+        for paths in list(self._kept):
+            self._close(paths)
+
+    def settings(self, log: str) -> LogSource:
+        """What the manifest says of a log: one of its names, or a path."""
+        return self._flight.logs.get(log) or LogSource(path=[log])
+
+    def paths(self, log: str) -> list[Path]:
+        """The files of a log."""
+        return [self._base / path for path in self.settings(log).path]
+
+    def trajectory(
+        self, log: str, topic: str | None, parent: str | None, child: str | None, *, max_gap_ns: int
+    ) -> Trajectory:
+        """Poses in the log's own world and axes, at world times.
+
+        Raises:
+            DataError: no such topic or frame, several candidates, or nothing usable.
+        """
+        with self._open(log) as (recording, source):
+            if parent is not None and child is not None:
+                gathered = self._chained(log, recording, source, topic, parent, child, max_gap_ns)
+            else:
+                name = self._choose(recording, source, "poses", topic)
+                gathered = self._poses(log, recording, source, name)
+            lost = dict(recording.dropped)
+            started_ns = _start_ns(recording)
+        return self._at_world_times(log, source, gathered, lost, started_ns)
+
+    def telemetry(self, pose: PoseSource, choice: TelemetryChoice) -> Telemetry:
+        """What a driver's usual topics, or two that are named, say of a drone, at the log's own times.
+
+        Raises:
+            DataError: no such topics, those of several drones, or nothing usable.
+        """
+        log = pose.log or ""
+        settings = self.settings(log)
+        with self._open(log) as (recording, source):
+            if pose.preset:
+                found = read_preset(recording, source, pose.preset, pose.namespace, choice, settings.stamps)
+            else:
+                axes = pose.axes or settings.axes or self._flight.world.frame
+                named = (pose.topic or "", pose.attitude or "")
+                found = read_pair(recording, source, *named, axes, settings.stamps)
+            lost = Counter(recording.dropped)
+        return replace(found, dropped=dict(Counter(found.dropped) + lost))
+
+    def triggers(self, log: str, topic: str | None) -> Frames | None:
+        """When a topic says that pictures were taken, at world times; None where it is none of triggers."""
+        with self._open(log) as (recording, source):
+            types = {known.name: known.type for known in recording.topics}
+            if topic is None or types.get(topic) not in TRIGGER_TYPES:
+                return None
+            t_ns, repeated = read_triggers(recording, source, topic)
+            lost = Counter(recording.dropped)
+            started_ns = _start_ns(recording)
+        if repeated:
+            lost["trigger without a later stamp"] += repeated
+        return Frames(topic, self._world_times(log, t_ns, started_ns), dict(lost))
+
+    def positions(self, log: str, topic: str | None) -> PositionTrack | None:
+        """Positions on Earth of a topic, at world times; None where it is no NavSatFix."""
+        with self._open(log) as (recording, source):
+            types = {known.name: known.type for known in recording.topics}
+            if topic is None or types.get(topic) != NAV_SAT_FIX:
+                return None
+            track = read_positions(recording, source, topic, self.settings(log).stamps)
+            started_ns = _start_ns(recording)
+        return replace(track, t_ns=self._world_times(log, track.t_ns, started_ns))
+
+    def attitudes(
+        self,
+        log: str,
+        topic: str,
+        *,
+        order: Literal["ypr", "rpy", "pry"],
+        units: Literal["deg", "rad"],
+    ) -> Trajectory:
+        """A gimbal's attitude in the log's axes, at world times; its positions mean nothing."""
+        with self._open(log) as (recording, source):
+            name = self._choose(recording, source, "angles", topic)
+            gathered = attitudes_of(
+                all_samples(recording.messages([name]), source),
+                f"{source} {name}",
+                stamps=self.settings(log).stamps,
+                order=order,
+                units=units,
+                may_disagree_s=_MAY_DISAGREE_S,
+                may_jump_s=_MAY_JUMP_S,
+            )
+            lost = dict(recording.dropped)
+            started_ns = _start_ns(recording)
+        return self._at_world_times(log, source, gathered, lost, started_ns)
+
+    def intrinsics(self, log: str, topic: str | None) -> IntrinsicsSample:
+        """The first camera info of a topic.
+
+        Raises:
+            DataError: no such topic, or it is empty or changes during the flight.
+        """
+        with self._open(log) as (recording, source):
+            name = self._choose(recording, source, "intrinsics", topic)
+            first: IntrinsicsSample | None = None
+            for sample in all_samples(recording.messages([name]), source):
+                if not isinstance(sample, IntrinsicsSample):
+                    raise DataError(source, f"{name} holds no camera info", "name another topic")
+                if first is not None and sample.intrinsics != first.intrinsics:
+                    raise DataError(
+                        source,
+                        f"{name} changes during the flight (zoom?)",
+                        "give one calibration in a file or inline",
+                    )
+                first = first or sample
+        if first is None:
+            raise DataError(source, f"{name} is empty", "name another topic, or give the intrinsics")
+        return first
+
+    def frames(self, log: str, topic: str | None) -> Frames:
+        """When the pictures of a topic were taken, at world times.
+
+        Raises:
+            DataError: no such topic, or no picture in it.
+        """
+        stamps = self.settings(log).stamps
+        with self._open(log) as (recording, source):
+            name = self._choose(recording, source, "pictures", topic)
+            taken_ns, received_ns = picture_stamps(recording, name, source)
+            t_ns = later_times(taken_ns, received_ns, stamps)
+            lost = Counter(recording.dropped)
+            started_ns = _start_ns(recording)
+        if not len(t_ns):
+            raise DataError(source, f"{name} holds no picture", "name another topic")
+        if len(taken_ns) > len(t_ns):
+            lost["picture without a later stamp"] += len(taken_ns) - len(t_ns)
+        return Frames(name, self._world_times(log, t_ns, started_ns), dict(lost))
+
+    def maps(
+        self, stated: MapSource, to_world: Callable[[Trajectory], Trajectory], *, max_gap_ns: int
+    ) -> LoggedMaps:
+        """The maps of a topic, in the world, at world times.
+
+        Args:
+            stated: the log and topic.
+            to_world: takes poses from the axes and origin of the log to those of the world.
+            max_gap_ns: the longest stretch between two transforms that is bridged.
+
+        Raises:
+            DataError: no such topic, several candidates, no map that could be read, or one in a frame of
+                which the log does not say where it is.
+        """
+        log = stated.log or ""
+        with self._open(log) as (recording, source):
+            topic = self._choose(recording, source, "maps", stated.topic)
+            type_ = next(each.type for each in recording.topics if each.name == topic)
+            first = next(map_messages(recording, topic), None)
+            if first is None:
+                raise nothing_usable(f"{source} {topic}", recording.dropped)
+            if stated.height_m is not None and type_ != OCCUPANCY_GRID:
+                problem = f"{topic} holds {type_}, which has heights of its own"
+                raise DataError(source, problem, "leave `height_m` out")
+            place, frame = f"{source} {topic}", frame_of(first, f"{source} {topic}")
+            log_from_frame = place_of_frame(
+                recording,
+                source,
+                place,
+                frame,
+                parent=stated.parent,
+                poses_in=frames_of_poses(recording, source, self._poses_taken(log)),
+                stamps=self.settings(log).stamps,
+                max_gap_ns=max_gap_ns,
+                note=self._note,
+            )
+            started_ns = _start_ns(recording)
+        lost: dict[str, int] = {}
+
+        def read() -> Iterator[Message]:
+            with self._open(log) as (recording, _):
+                yield from map_messages(recording, topic)
+                lost.update(recording.dropped)
+
+        about = MapTopic(
+            source=place,
+            frame=frame,
+            stamps=self.settings(log).stamps,
+            world_from_frame=to_world(log_from_frame),
+            max_gap_ns=max_gap_ns,
+            resolution_m=stated.resolution_m,
+            height_m=DEFAULT_HEIGHT_M if stated.height_m is None else stated.height_m,
+        )
+        found = read_maps(read, type_, about)
+        from_ns = self._world_times(log, found.from_ns, started_ns)
+        return replace(
+            found,
+            maps=_at_times(found.maps, from_ns),
+            from_ns=from_ns,
+            dropped=dict(Counter(found.dropped) + Counter(lost)),
+        )
+
+    def _poses_taken(self, log: str) -> list[tuple[str | None, str | None]]:
+        """Topic and parent of all poses that the flight takes from a log."""
+        paths = self.paths(log)
+        poses = [camera.pose for camera in self._flight.cameras.values()]
+        taken = [(pose.log, pose.topic, pose.parent) for pose in poses]
+        if actor := self._flight.actor:
+            taken.append((actor.log, actor.topic, None))
+        return [(topic, parent) for name, topic, parent in taken if name and self.paths(name) == paths]
+
+    @contextmanager
+    def _open(self, log: str) -> Iterator[tuple[Log, str]]:
+        """A recording for one reading; those of our own formats stay open for the next."""
+        paths = tuple(self.paths(log))
+        recording: Log | None = self._kept.pop(paths, None)
+        if recording is None:
+            recording = recognise(paths[0], LogFormat, "log").open_log(paths)
+        if not isinstance(recording, OpenLog):
+            with recording:
+                yield recording, str(paths[0])
+            return
+        self._kept[paths] = recording
+        self._close_all_beyond_bounds()
+        recording.forget()  # what was lost in reading another topic
+        yield recording, str(paths[0])
+
+    def _close_all_beyond_bounds(self) -> None:
+        while len(self._kept) > 1 and (
+            sum(topic.count for log in self._kept.values() for topic in log.topics) > _KEPT_MESSAGES
+            or sum(len(log.parts) for log in self._kept.values()) > _KEPT_FILES
+        ):
+            self._close(next(iter(self._kept)))
+
+    def _close(self, paths: tuple[Path, ...]) -> None:
+        with self._kept.pop(paths):
+            pass
+
+    def _choose(self, recording: Log, source: str, kind: _Wanted, topic: str | None) -> str:
+        """The topic that is named, or the only one of its kind."""
+        there = {candidate.name: candidate for candidate in recording.topics if _kind_of(candidate) == kind}
+        listed = ", ".join(sorted(there)) or "none"
+        if topic is not None:
+            every = {candidate.name: candidate for candidate in recording.topics}
+            if topic in there:
+                return topic
+            if topic in every:
+                problem = f"topic {topic} holds {every[topic].type}, no {_NOUNS[kind]}"
+            else:
+                problem = f"has no topic {topic}"
+            raise DataError(source, problem, f"topics with {_NOUNS[kind]}: {listed}")
+        if len(there) != 1:
+            problem = f"has {len(there)} topics with {_NOUNS[kind]} ({listed})"
+            raise DataError(source, problem, "say which with `topic:`" if there else "name another log")
+        (only,) = there
+        self._note(f"{source}: took {_NOUNS[kind]} from {only}, the only candidate")
+        return only
+
+    def _poses(self, log: str, recording: Log, source: str, topic: str) -> Gathered:
+        """The poses of a topic: all at once where its messages are alike, else one by one."""
+        place, stamps = f"{source} {topic}", self.settings(log).stamps
+        arrays = poses_at_once(recording, topic)
+        if arrays is not None:
+            return trajectory_of_arrays(
+                arrays, place, stamps=stamps, may_disagree_s=_MAY_DISAGREE_S, may_jump_s=_MAY_JUMP_S
+            )
+        samples = all_samples(recording.messages([topic]), source)
+        return trajectory_of(
+            samples, place, stamps=stamps, may_disagree_s=_MAY_DISAGREE_S, may_jump_s=_MAY_JUMP_S
+        )
+
+    def _chained(
+        self,
+        log: str,
+        recording: Log,
+        source: str,
+        topic: str | None,
+        parent: str,
+        child: str,
+        max_gap_ns: int,
+    ) -> Gathered:
+        named = None if topic is None else self._choose(recording, source, "transforms", topic)
+        return chained(
+            transforms_in(recording, source, named),
+            source,
+            parent=parent,
+            child=child,
+            stamps=self.settings(log).stamps,
+            max_gap_ns=max_gap_ns,
+            may_disagree_s=_MAY_DISAGREE_S,
+            may_jump_s=_MAY_JUMP_S,
+        )
+
+    def _at_world_times(
+        self, log: str, source: str, gathered: Gathered, lost: dict[str, int], started_ns: int
+    ) -> Trajectory:
+        self._doubt(source, self.settings(log).stamps, gathered.stamps)
+        trajectory = gathered.trajectory
+        return replace(
+            trajectory,
+            t_ns=self._world_times(log, trajectory.t_ns, started_ns),
+            dropped=dict(Counter(trajectory.dropped) + Counter(lost)),
+        )
+
+    def _world_times(self, log: str, t_ns: Int64, started_ns: int) -> Int64:
+        clock = self.settings(log).clock
+        since_start = t_ns - started_ns
+        drift_ns = np.round(since_start * (clock.drift_ppm * 1e-6)).astype(np.int64)
+        world_ns: Int64 = t_ns + drift_ns + round(clock.offset_s * 1e9)
+        return world_ns
+
+    def _doubt(self, source: str, stamps: str, check: StampCheck) -> None:
+        """Say how the stamps of a log disagree with each other."""
+        used = f"{stamps} stamps are used"
+        if check.without_header:
+            self._note(
+                f"{source}: {check.without_header} of {check.count} messages have no header stamp,"
+                " their time of receipt is taken"
+            )
+        if check.disagreeing:
+            self._note(
+                f"{source}: header and receive stamps disagree by up to {check.largest_disagreement_s:.3g} s"
+                f" in {check.disagreeing} of {check.count} messages; {used}"
+            )
+        drift = check.drift
+        if drift is not None and drift.drift_ppm and not check.jumps:
+            self._note(
+                f"{source}: header stamps drift {drift.drift_ppm:.1f} ppm (+- {drift.drift_sigma_ppm:.1g})"
+                f" against those of receipt; {used}, not corrected (logs: clock: drift_ppm does)"
+            )
+        for jump in check.jumps[:5]:
+            self._note(
+                f"{source}: the clock jumps by {jump.jump_s:.3g} s at {jump.header_ns / 1e9:.3f} s; {used}"
+            )
+
+
+def _kind_of(topic: Topic) -> _Wanted | None:
+    return "maps" if topic.type in MAP_TYPES else kind_of(topic)
+
+
+def _start_ns(recording: Log) -> int:
+    """When the first message of a recording was received: what its clock's drift counts from."""
+    return min((topic.first_ns for topic in recording.topics if topic.first_ns is not None), default=0)
+
+
+def _at_times(maps: Iterator[Occupancy], from_ns: Int64) -> Iterator[Occupancy]:
+    for occupancy, since_ns in zip(maps, from_ns.tolist(), strict=True):
+        yield replace(occupancy, from_ns=since_ns)
+
+
+def poses_at_once(recording: Log, topic: str) -> PoseArrays | None:
+    """All poses of a topic, if one file format of ours holds it and its messages are alike."""
+    if not isinstance(recording, OpenLog):
+        return None
+    of_that_name = [known for known in recording.topics if known.name == topic]
+    schemas = {schema for known in of_that_name for schema in recording.schemas(known)}
+    if len(of_that_name) != 1 or len(schemas) != 1:
+        return None
+    return read_poses(schemas.pop(), recording.arrays(of_that_name[0]))
+
+
+def in_world(trajectory: Trajectory, log: LogSource) -> Trajectory:
+    """A trajectory in the ENU axes of its log, moved to where the log's origin lies in the world."""
+    place = log.world_from_log
+    turn = quaternion_from_rotation_vector(np.array([0.0, 0.0, np.radians(place.yaw_deg)]))
+    position, quaternion = compose(
+        (np.array(place.translation), turn), (trajectory.position, trajectory.quaternion_xyzw)
+    )
+    covariance = trajectory.covariance
+    if covariance is not None:
+        rotated = np.eye(6)
+        rotated[:3, :3] = matrix_from_quaternion(turn)  # the rotation part stays in the body
+        covariance = rotated @ covariance @ rotated.T
+    return replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)

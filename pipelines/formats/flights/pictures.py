@@ -1,0 +1,231 @@
+"""The pictures of a camera by frame number, wherever they lie: in a video file or in a topic of a log."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import NamedTuple, Protocol, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.formats.logs.messages import all_samples
+from pipelines.formats.logs.picture_layouts import HEAD_LENGTH, picture_decoder, read_stamps
+from pipelines.formats.logs.recordings import OpenLog
+from pipelines.formats.videos.video import VideoReader
+from pipelines.session.description import MediaEntry
+from pipelines.session.errors import DataError
+from pipelines.session.records import Int64, PictureSample, Sample
+from pipelines.session.registries import Log, LogFormat, recognise
+
+Picture = NDArray[np.uint8]
+
+_MAY_LEAP_NS = 1_000_000_000  # transport and decoding take less
+
+_CHANNELS = {"mono8": 1, "8uc1": 1, "rgb8": 3, "bgr8": 3, "8uc3": 3, "rgba8": 4, "bgra8": 4}
+
+
+class Pictures(Protocol):
+    """Pictures at hand; a context manager."""
+
+    def read(self, number: int) -> Picture | None:
+        """One picture, BGR; None where it cannot be decoded."""
+
+    def __enter__(self) -> Self:
+        """The pictures themselves."""
+
+    def __exit__(self, *exception: object) -> None:
+        """Close the files."""
+
+
+class Stamped(Protocol):
+    """What is known of a picture without its pixels."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of its header; 0 without one."""
+
+    @property
+    def receive_ns(self) -> int:
+        """Of its receipt."""
+
+
+class _Stamps(NamedTuple):
+    stamp_ns: int
+    receive_ns: int
+
+
+_Stamped = TypeVar("_Stamped", bound=Stamped)
+
+
+def open_pictures(media: MediaEntry, session: Path) -> Pictures:
+    """Open the pictures that a session was made from.
+
+    Args:
+        media: where they lay, relative to the session.
+        session: its folder.
+
+    Raises:
+        DataError: they are not there any more, or cannot be read.
+    """
+    paths = [session / path for path in media.paths]
+    return VideoReader(paths[0]) if media.topic is None else LoggedPictures(paths, media.topic, media.stamps)
+
+
+class LoggedPictures:
+    """Pictures of a topic, numbered as ingest numbers them; reading forward is cheap, backward starts anew.
+
+    Args:
+        paths: the files of the recording.
+        topic: the topic.
+        stamps: which stamps order the pictures: header or receive.
+    """
+
+    def __init__(self, paths: list[Path], topic: str, stamps: str) -> None:
+        self._source = paths[0]
+        self._topic = topic
+        self._stamps = stamps
+        self._stack = ExitStack()
+        log_format = recognise(paths[0], LogFormat, "log")
+        self._log: Log = self._stack.enter_context(log_format.open_log(paths))
+        self._next = 0
+        self._samples = self._begin()
+
+    def __enter__(self) -> Self:
+        """The pictures themselves."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Close the files."""
+        self._stack.close()
+
+    def read(self, number: int) -> Picture | None:
+        """One picture, BGR; None where it cannot be decoded or the log ends before it."""
+        if number < self._next:
+            self._next, self._samples = 0, self._begin()
+        for sample in self._samples:
+            self._next += 1
+            if self._next > number:
+                return decode(sample)
+        return None
+
+    def _begin(self) -> Iterator[PictureSample]:
+        samples = picture_samples(self._log, self._topic, self._source)
+        pictures = (sample for sample in samples if isinstance(sample, PictureSample))
+        return later_pictures(pictures, self._stamps)
+
+
+def picture_samples(recording: Log, topic: str, source: Path | str) -> Iterator[Sample]:
+    """What a topic of pictures holds, in the order of receipt; see `all_samples`.
+
+    Args:
+        recording: an open log.
+        topic: its name.
+        source: the log, for messages to the user.
+    """
+    if isinstance(recording, OpenLog):
+        return all_samples(recording.messages([topic], picture_decoder), source)
+    return all_samples(recording.messages([topic]), source)
+
+
+def picture_stamps(recording: Log, topic: str, source: Path | str) -> tuple[Int64, Int64]:
+    """When the pictures of a topic were taken (0 where it does not say) and received: [N] and [N].
+
+    In the order of receipt.
+
+    Of the same pictures as `picture_samples` gives. Where their messages are laid out alike, only the
+    beginning of each is looked at.
+
+    Raises:
+        DataError: the topic holds something else.
+    """
+    if (at_once := _stamps_at_once(recording, topic)) is not None:
+        return at_once
+    header_ns, receive_ns = array("q"), array("q")
+    for sample in picture_samples(recording, topic, source):
+        if not isinstance(sample, PictureSample):
+            raise DataError(source, f"{topic} holds no pictures", "name another topic")
+        header_ns.append(sample.stamp_ns)
+        receive_ns.append(sample.receive_ns)
+    return np.array(header_ns, np.int64), np.array(receive_ns, np.int64)
+
+
+def _stamps_at_once(recording: Log, topic: str) -> tuple[Int64, Int64] | None:
+    if not isinstance(recording, OpenLog):
+        return None
+    of_that_name = [known for known in recording.topics if known.name == topic]
+    schemas = {schema for known in of_that_name for schema in recording.schemas(known)}
+    if len(of_that_name) != 1 or len(schemas) != 1:
+        return None
+    return read_stamps(schemas.pop(), recording.heads(of_that_name[0], HEAD_LENGTH))
+
+
+def later_pictures(pictures: Iterator[_Stamped], stamps: str) -> Iterator[_Stamped]:
+    """The pictures whose stamp is above all before: frame k of a topic is the k-th of these."""
+    newest: _Stamped | None = None
+    leapt: _Stamped | None = None
+    for picture in pictures:
+        if newest is not None:
+            if stamp_of(picture, stamps) <= stamp_of(newest, stamps):
+                continue
+            # One damaged stamp far ahead must not cost all the pictures behind it; a clock that was set
+            # forward shows in the next picture too.
+            if _leap_ns(newest, picture) > _MAY_LEAP_NS and (
+                leapt is None or abs(_leap_ns(leapt, picture)) > _MAY_LEAP_NS
+            ):
+                leapt = picture
+                continue
+        newest, leapt = picture, None
+        yield picture
+
+
+def later_times(header_ns: Int64, receive_ns: Int64, stamps: str) -> Int64:
+    """The stamps of the `later_pictures`, [n], strictly increasing.
+
+    Args:
+        header_ns: [N] stamps of the headers of all pictures, in the order of receipt; 0 without one.
+        receive_ns: [N] of receipt.
+        stamps: which of them order the pictures: header or receive.
+    """
+    times = np.where((header_ns != 0) & (stamps == "header"), header_ns, receive_ns)
+    leaps = np.where((header_ns[1:] != 0) & (header_ns[:-1] != 0), np.diff(header_ns - receive_ns), 0)
+    if (np.diff(times) > 0).all() and (leaps <= _MAY_LEAP_NS).all():
+        return times  # as those of a camera are
+    pictures = map(_Stamps, header_ns.tolist(), receive_ns.tolist())
+    return np.array([stamp_of(picture, stamps) for picture in later_pictures(pictures, stamps)], np.int64)
+
+
+def _leap_ns(before: Stamped, after: Stamped) -> int:
+    """How much more the header's clock went on between two pictures than that of receipt."""
+    if not before.stamp_ns or not after.stamp_ns:
+        return 0
+    return (after.stamp_ns - before.stamp_ns) - (after.receive_ns - before.receive_ns)
+
+
+def stamp_of(picture: Stamped, stamps: str) -> int:
+    """The stamp that counts: that of the header where it has one and it is wanted."""
+    return picture.stamp_ns if stamps == "header" and picture.stamp_ns else picture.receive_ns
+
+
+def decode(sample: PictureSample) -> Picture | None:
+    """A picture of a log as BGR; None where its bytes are damaged or its encoding is not known."""
+    import cv2
+
+    if sample.width is None or sample.height is None:
+        decoded = (
+            cv2.imdecode(np.asarray(sample.data, np.uint8), cv2.IMREAD_COLOR) if len(sample.data) else None
+        )
+        return None if decoded is None else np.asarray(decoded, np.uint8)
+    encoding = sample.encoding.lower()
+    channels = _CHANNELS.get(encoding)
+    step = sample.step or sample.width * (channels or 0)
+    if channels is None or step < sample.width * channels or len(sample.data) < step * sample.height:
+        return None
+    rows = sample.data[: step * sample.height].reshape(sample.height, step)
+    pixels = rows[:, : sample.width * channels].reshape(sample.height, sample.width, channels)
+    if channels == 1:
+        return np.repeat(pixels, 3, axis=2)
+    colours = pixels[..., :3]
+    return np.ascontiguousarray(colours[..., ::-1] if encoding.startswith("rgb") else colours)

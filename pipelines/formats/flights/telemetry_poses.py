@@ -1,0 +1,378 @@
+"""Drones' own logs to the poses of their cameras, all in one world: ENU about one origin on Earth.
+
+A drone logs where it was and how its body and gimbal were turned apart from each other, each at a rate of
+its own; here they come together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pipelines.formats.flights.flight_logs import FlightLogs, in_world
+from pipelines.formats.flights.gimbal_angles import attitudes_at, stated_angles
+from pipelines.geometry.clocks import ClockFit
+from pipelines.geometry.geodesy import Place, enu_from_enu, enu_from_geodetic
+from pipelines.geometry.mounting import compose_gimbal, compose_mount
+from pipelines.geometry.poses import (
+    compose,
+    interpolate_points,
+    multiply,
+    quaternion_from_matrix,
+    quaternion_from_rotation_vector,
+    rotate,
+)
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import Camera, Flight, PoseSource
+from pipelines.session.manifest import Log as LogSource
+from pipelines.session.records import Float, Int64, Trajectory
+from pipelines.session.registries import FORMATS
+from pipelines.session.telemetry import (
+    AttitudeTrack,
+    PositionTrack,
+    Telemetry,
+    TelemetryChoice,
+    TelemetryFormat,
+    TriggerFormat,
+)
+
+_ABOVE_TAKE_OFF = ("take-off", "stated")
+_ADD_ANGLES = (
+    "add gimbal: {log, topic, relative_to: world} with the angles of another log, or"
+    " gimbal: {fixed: {yaw_deg: 90, pitch_deg: -30}} if the camera never turned"
+)
+_ADD_MOUNT = "say how the camera sits on the body, mount: {looks: forward, down_deg: 0}, or add a gimbal"
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where on Earth the world's origin lies."""
+
+    place: Place
+    source: str  # "world.origin", or the log whose first position it is
+
+
+class TelemetryPoses:
+    """Poses of cameras whose drones say themselves where they were.
+
+    Args:
+        flight: the manifest.
+        manifest: its path.
+        logs: the flight's logs, for presets and gimbals.
+        max_gap_ns: the longest stretch between two positions or angles that is bridged.
+        note: told what was chosen and what is doubtful, one line each.
+    """
+
+    def __init__(
+        self,
+        flight: Flight,
+        manifest: Path,
+        logs: FlightLogs,
+        *,
+        max_gap_ns: int,
+        note: Callable[[str], None],
+    ) -> None:
+        self._flight = flight
+        self._manifest = manifest
+        self._logs = logs
+        self._max_gap_ns = max_gap_ns
+        self._note = note
+        self._origin: Origin | None = None
+        self._read: dict[str, Telemetry] = {}
+
+    # --- what is read ----------------------------------------------------------------------------------
+
+    def telemetry(self, pose: PoseSource) -> Telemetry:
+        """What a drone's own log says, at its own times; read once."""
+        stated = _stated(pose)
+        choice = TelemetryChoice(pose.position, pose.instance, pose.time, pose.altitude)
+        key = pose.model_dump_json(exclude={"of"})
+        if key not in self._read:
+            if pose.log:
+                self._read[key] = self._logs.telemetry(pose, choice)
+            else:
+                reader = FORMATS.get(_kind(pose))
+                path = self._one_file(stated)
+                if not isinstance(reader, TelemetryFormat):
+                    raise DataError(path, f"the format {_kind(pose)} reads no telemetry")
+                self._read[key] = reader.read_telemetry(path, choice)
+        return self._read[key]
+
+    def fit(self, pose: PoseSource) -> ClockFit | None:
+        """How the log's own clock was taken to GPS time."""
+        return self.telemetry(pose).fit
+
+    def triggers(self, kind: Literal["ulog", "ardupilot"], stated: str) -> Int64:
+        """When a drone's own log says that pictures were triggered, at world times."""
+        reader, path = FORMATS.get(kind), self._one_file(stated)
+        if not isinstance(reader, TriggerFormat):
+            raise DataError(path, f"the format {kind} reads no triggers")
+        t_ns = reader.picture_times(path, TelemetryChoice())
+        return self._world_times(stated, t_ns, int(t_ns[0]))
+
+    def _one_file(self, stated: str) -> Path:
+        paths = self._logs.paths(stated)
+        if len(paths) != 1:
+            raise DataError(self._manifest, f"logs.{stated}: a drone's own log is one file", "name one")
+        return paths[0]
+
+    def _world_times(self, stated: str, t_ns: Int64, since_ns: int) -> Int64:
+        """Times of a log with its stated clock; `since_ns` is what the drift counts from."""
+        clock = self._logs.settings(stated).clock
+        drift_ns = np.round((t_ns - since_ns) * (clock.drift_ppm * 1e-6)).astype(np.int64)
+        moved: Int64 = t_ns + drift_ns + round(clock.offset_s * 1e9)
+        return moved
+
+    # --- the origin ------------------------------------------------------------------------------------
+
+    def origin(self) -> Origin | None:
+        """Where the world lies: as stated, or the first position of the first camera that has one on Earth.
+
+        None where no camera has. Its height is that of the first camera with heights that are no heights
+        above the take-off, for these say nothing of where the ground lies.
+        """
+        if self._origin is not None:
+            return self._origin
+        if stated := self._flight.world.origin:
+            place = Place(stated.latitude_deg, stated.longitude_deg, stated.altitude_m)
+            self._origin = Origin(place, "world.origin")
+            return self._origin
+        for camera in self._flight.cameras.values():
+            if not camera.pose.is_telemetry:
+                continue
+            track = self.telemetry(camera.pose).position
+            first = track.origin or (_first_place(track) if track.on_earth else None)
+            if first is not None:
+                self._origin = Origin(first, _stated(camera.pose))
+                return self._origin
+        return None
+
+    def doubt_heights(self) -> None:
+        """Note cameras that count their heights from different things."""
+        kinds = {
+            name: self.telemetry(camera.pose).position.height
+            for name, camera in self._flight.cameras.items()
+            if camera.pose.is_telemetry and self.telemetry(camera.pose).position.on_earth
+        }
+        if len(set(kinds.values())) > 1:
+            said = ", ".join(f"{name}: {height}" for name, height in kinds.items())
+            self._note(f"heights are counted from different things ({said}): expect metres between them")
+
+    def _in_world(self, name: str, track: PositionTrack) -> tuple[Float, Float]:
+        """Positions [N, 3] m in the world, and how the track's own ENU is turned in it (unit quaternion)."""
+        level = np.array([0.0, 0.0, 0.0, 1.0])
+        origin = self.origin()
+        if not track.on_earth and (track.origin is None or origin is None):
+            if origin is not None:
+                self._note(
+                    f"{name}: its {track.name} counts from a place that its log does not state: taken for the"
+                    " world's origin (else say world_from_log under `logs`)"
+                )
+            return track.values, level
+        if origin is None:
+            raise AssertionError("a track on Earth gives the origin")
+        if not track.on_earth and track.origin is not None:
+            rotation, position = enu_from_enu(track.origin, origin.place)
+            turned = quaternion_from_matrix(rotation)
+            return compose((position, turned), (track.values, level))[0], turned
+        latitude, longitude, height = track.values.T
+        if track.height in _ABOVE_TAKE_OFF:  # z counts from the take-off, wherever that lies
+            height = height + origin.place.altitude_m
+        return enu_from_geodetic(latitude, longitude, height, origin.place), level
+
+    def points(self, name: str, log: str, track: PositionTrack) -> Trajectory:
+        """Where something without a direction was, in the world; its rotation means nothing.
+
+        Raises:
+            DataError: nothing says where on Earth the world lies.
+        """
+        if self.origin() is None:
+            raise DataError(
+                self._manifest,
+                f"{name}: {log} says where it was on Earth, and no camera does",
+                "write world: {origin: {latitude_deg: ..., longitude_deg: ..., altitude_m: ...}}",
+            )
+        values, _ = self._in_world(name, track)
+        still = np.tile([0.0, 0.0, 0.0, 1.0], (len(values), 1))
+        return in_world(Trajectory(track.t_ns, values, still), self._logs.settings(log))
+
+    # --- poses of cameras ------------------------------------------------------------------------------
+
+    def trajectory(self, name: str, camera: Camera, mounted: tuple[Float, Float]) -> Trajectory:
+        """world_from_camera over time.
+
+        At the stamps of positions or of attitudes, whichever come faster; the others are taken between
+        theirs, never across a gap.
+
+        Args:
+            name: the camera's.
+            camera: its part of the manifest.
+            mounted: lever arm [3] m in the body, and rotation [4] of the camera in its gimbal, or in the
+                body where there is none.
+
+        Raises:
+            DataError: the log cannot be used, says nothing of how the camera was turned, or its parts
+                share no time.
+        """
+        pose = camera.pose
+        telemetry = self.telemetry(pose)
+        for note in telemetry.notes:
+            self._note(note)
+        body, gimbal = telemetry.body, self._gimbal(name, camera, telemetry)
+        self._refuse_unturned(name, camera, telemetry, gimbal)
+        stated = _stated(pose)
+        settings = self._logs.settings(stated)
+        track = telemetry.position
+        since_ns = int(track.t_ns[0])
+        track = replace(track, t_ns=self._world_times(stated, track.t_ns, since_ns))
+        if body is not None:
+            body = replace(body, t_ns=self._world_times(stated, body.t_ns, since_ns))
+        values, turned = self._in_world(name, track)
+        self._doubt(name, track)
+
+        t_ns = _fastest(track.t_ns, [part.t_ns for part in (gimbal or body,) if part is not None])
+        position = interpolate_points(track.t_ns, values, t_ns, max_gap_ns=self._max_gap_ns)
+        lever_arm, rotation = mounted
+        attitude = self._at(gimbal, t_ns)
+        world_from_body = self._at(body, t_ns)
+        if attitude is None and world_from_body is not None:
+            position, quaternion = compose_mount((position, world_from_body), (lever_arm, rotation))
+        elif attitude is not None and gimbal is not None:
+            if world_from_body is None:
+                world_from_body = _level_heading(attitude)
+                if lever_arm.any():
+                    self._note(f"{name}: {stated} does not say how its body was turned: taken as level")
+            position, quaternion = compose_gimbal(
+                (position, world_from_body), lever_arm, attitude, rotation, relative_to=gimbal.relative_to
+            )
+        else:
+            raise AssertionError("refused above")
+        return self._complete(name, settings, telemetry, t_ns, position, multiply(turned, quaternion))
+
+    def _gimbal(self, name: str, camera: Camera, telemetry: Telemetry) -> AttitudeTrack | None:
+        """The angles that the manifest names, or those of the drone's own log unless it asks for the body."""
+        gimbal, own = camera.gimbal, telemetry.gimbal
+        if gimbal is None:
+            if own is None or camera.pose.of == "body":
+                return None
+            self._note(f"{name}: its camera is turned as {own.name} of {_stated(camera.pose)} say")
+            return self._at_world_times(camera.pose, telemetry, own)
+        if gimbal.fixed is None and gimbal.log is None:
+            if own is None:
+                raise DataError(
+                    self._manifest,
+                    f"cameras.{name}.gimbal: {_stated(camera.pose)} holds no gimbal angles",
+                    "name the log and topic that do, or fixed angles",
+                )
+            moved = self._at_world_times(camera.pose, telemetry, own)
+            return replace(moved, relative_to=gimbal.relative_to or "world")
+        return stated_angles(gimbal, self._logs, self._flight.world.frame)
+
+    def _at_world_times(self, pose: PoseSource, telemetry: Telemetry, track: AttitudeTrack) -> AttitudeTrack:
+        since_ns = int(telemetry.position.t_ns[0])
+        return replace(track, t_ns=self._world_times(_stated(pose), track.t_ns, since_ns))
+
+    def _refuse_unturned(
+        self, name: str, camera: Camera, telemetry: Telemetry, gimbal: AttitudeTrack | None
+    ) -> None:
+        place = f"{self._manifest}: cameras.{name}"
+        stated = _stated(camera.pose)
+        if telemetry.body is None and gimbal is None:
+            raise DataError(
+                place, f"{stated} says where the drone was but not how it was turned", _ADD_ANGLES
+            )
+        if telemetry.body is None and gimbal is not None and gimbal.relative_to == "body":
+            raise DataError(
+                place,
+                f"its gimbal's angles are relative to the body, but {stated} does not say how that turned",
+                "give angles relative to the world",
+            )
+        if gimbal is None and camera.mount is None:
+            raise DataError(place, f"{stated} holds no gimbal angles", _ADD_MOUNT)
+
+    def _at(self, track: AttitudeTrack | None, t_ns: Int64) -> Float | None:
+        return None if track is None else attitudes_at(track, t_ns, max_gap_ns=self._max_gap_ns)
+
+    def _complete(
+        self,
+        name: str,
+        settings: LogSource,
+        telemetry: Telemetry,
+        t_ns: Int64,
+        position: Float,
+        quaternion: Float,
+    ) -> Trajectory:
+        placed, turned = ~np.isnan(position[:, 0]), ~np.isnan(quaternion[:, 0])
+        known = placed & turned
+        if not known.any():
+            raise DataError(
+                self._manifest,
+                f"cameras.{name}: its positions and attitudes share no time (or are further apart than"
+                f" {self._max_gap_ns / 1e9:g} s)",
+                "check the clocks of the two logs, or raise --max-pose-gap",
+            )
+        dropped = dict(telemetry.dropped)
+        for cause, count in (
+            ("attitude without a position", np.count_nonzero(~placed)),
+            ("position without an attitude", np.count_nonzero(placed & ~turned)),
+        ):
+            if count:
+                dropped[cause] = int(count)
+        poses = Trajectory(t_ns[known], position[known], quaternion[known], dropped=dropped)
+        return in_world(poses, settings)
+
+    def _doubt(self, name: str, track: PositionTrack) -> None:
+        if len(track.t_ns) < 2:
+            return
+        step_s = float(np.median(np.diff(track.t_ns))) / 1e9
+        if step_s * 1e9 > self._max_gap_ns:
+            self._note(
+                f"{name}: {track.name} comes every {step_s:.3g} s, further apart than what is bridged"
+                f" ({self._max_gap_ns / 1e9:g} s): raise --max-pose-gap above {step_s:.3g}"
+            )
+        if (track.values[:, :2] == track.values[0, :2]).all():
+            where = "0" if not track.values[0, :2].any() else "the same"
+            self._note(
+                f"{name}: the horizontal position of {track.name} is {where} throughout: it had no fix, or"
+                " never moved"
+            )
+        if track.accuracy_m:
+            horizontal, vertical = track.accuracy_m
+            self._note(
+                f"{name}: {track.name} states its own sigma as {horizontal:.3g} m across and {vertical:.3g} m"
+                " in height"
+            )
+
+
+def _kind(pose: PoseSource) -> str:
+    return next(kind for kind in ("dji", "ulog", "ardupilot") if getattr(pose, kind) is not None)
+
+
+def _stated(pose: PoseSource) -> str:
+    """The log as the manifest names it."""
+    return pose.dji or pose.ulog or pose.ardupilot or pose.log or ""
+
+
+def _first_place(track: PositionTrack) -> Place:
+    latitude, longitude, height = track.values[0].tolist()
+    return Place(latitude, longitude, 0.0 if track.height in _ABOVE_TAKE_OFF else height)
+
+
+def _fastest(position_t_ns: Int64, others: Sequence[Int64]) -> Int64:
+    """The stamps that come fastest; positions win a tie."""
+
+    def step(t_ns: Int64) -> float:
+        return float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else np.inf
+
+    return min([position_t_ns, *others], key=step)
+
+
+def _level_heading(attitude: Float) -> Float:
+    """A level body that heads where a gimbal [N, 4] looks: what is known where the body's attitude is not."""
+    ahead = rotate(attitude, np.array([1.0, 0.0, 0.0]))
+    yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
+    return quaternion_from_rotation_vector(np.stack([np.zeros_like(yaw), np.zeros_like(yaw), yaw], axis=1))

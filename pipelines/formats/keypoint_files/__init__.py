@@ -1,0 +1,1 @@
+"""People in pictures, as other detectors write them."""

@@ -1,0 +1,64 @@
+"""AlphaPose results: one JSON list with an entry for every person in every picture.
+
+An entry is `{"image_id": "12.jpg", "category_id": 1, "keypoints": [x, y, score, ...], "score": s,
+"box": [...], "idx": n}`. The frame is the last digits of `image_id`. `idx` is the tracker's id of the person,
+as a number, `[n]`, or `[[n], [m]]` where AlphaPose merged poses (the first counts). Without its tracker
+AlphaPose writes 0 for everybody; then people are numbered by their place within the frame.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipelines.formats.keypoint_files.keypoint_json import (
+    first_entry,
+    is_alphapose_entry,
+    load_json,
+    objects,
+    samples,
+    triples,
+    whole_number,
+)
+from pipelines.formats.keypoint_files.keypoint_people import Gathering, choose_skeleton, describe_detections
+from pipelines.session.errors import DataError
+from pipelines.session.records import Detections
+
+
+class AlphaPose:
+    """`alphapose-results.json` of AlphaPose, old and new."""
+
+    name = "alphapose"
+    title = "AlphaPose keypoints"
+    suffixes = (".json",)
+
+    def recognises(self, path: Path) -> bool:
+        """Whether it is a list of results that name pictures, or have AlphaPose's `box` or `idx`."""
+        return path.is_file() and any(is_alphapose_entry(first_entry(s)) for s in samples(path))
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Frames, people, the skeleton guessed from the number of keypoints, and confidences."""
+        return describe_detections(self.read_keypoints(path, skeleton=None, first_frame=0))
+
+    def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
+        """Read every person; pixels and keypoint scores as AlphaPose wrote them.
+
+        Raises:
+            DataError: not such a file, no keypoints, or another number of them than `skeleton` has.
+        """
+        people = Gathering(path)
+        for where, entry in objects(load_json(path), path, "results"):
+            frame = people.frame_of(entry.get("image_id"), where)
+            if "keypoints" not in entry:
+                raise DataError(where, "has no keypoints", "check the file's format")
+            people.add(frame, triples(entry["keypoints"], where), where, own_id=_track(entry.get("idx")))
+        chosen = choose_skeleton(path, people.count(), skeleton)
+        return people.detections(chosen, first_frame)
+
+
+def _track(idx: object) -> int | None:
+    while isinstance(idx, list) and idx:
+        idx = idx[0]
+    return whole_number(idx)
+
+
+FORMAT = AlphaPose()

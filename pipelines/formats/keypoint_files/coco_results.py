@@ -1,0 +1,149 @@
+"""COCO keypoints: a list of results, or an annotation file.
+
+Results are `[{"image_id": 12, "category_id": 1, "keypoints": [x, y, score, ...], "score": s}, ...]`.
+Annotation files are `{"images": [{"id": 3, "file_name": "0012.jpg", "width": 640, "height": 480}],
+"annotations": [...]}`; there the frame is the last digits of `file_name` (of the id without one), and the
+third value is a visibility: 0 is missing, 1 (hidden, but placed) and 2 (seen) become confidence 0.5 and 1.
+`track_id` numbers people where every annotation has it. A list with AlphaPose's marks is recognised as
+AlphaPose's; `format: coco` reads it all the same.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.formats.keypoint_files.keypoint_json import (
+    first_entry,
+    is_alphapose_entry,
+    load_json,
+    objects,
+    samples,
+    triples,
+    whole_number,
+)
+from pipelines.formats.keypoint_files.keypoint_people import Gathering, choose_skeleton, describe_detections
+from pipelines.session.errors import DataError
+from pipelines.session.records import Detections
+
+Float = NDArray[np.float64]
+
+
+class Coco:
+    """COCO keypoint results and annotations."""
+
+    name = "coco"
+    title = "COCO keypoints"
+    suffixes = (".json",)
+
+    def recognises(self, path: Path) -> bool:
+        """Whether it is a COCO file, even one of boxes only or an empty list: reading says what is amiss."""
+        return path.is_file() and any(_is_annotations(s) or _is_results(s) for s in samples(path))
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Frames, people, the skeleton, and confidences."""
+        return describe_detections(self.read_keypoints(path, skeleton=None, first_frame=0))
+
+    def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
+        """Read every person; an annotation file also gives the joint names and the picture size.
+
+        Raises:
+            DataError: no keypoints, boxes only, or another number of keypoints than `skeleton` has.
+        """
+        people = Gathering(path)
+        content = load_json(path)
+        names, image_size = None, None
+        if isinstance(content, dict):
+            _add_annotations(content, people)
+            names, image_size = _joint_names(content), _picture_size(content, path)
+        else:
+            _add_results(content, people)
+        chosen = choose_skeleton(path, people.count(), skeleton, names)
+        return people.detections(chosen, first_frame, image_size)
+
+
+def _is_annotations(sample: object) -> bool:
+    return isinstance(sample, dict) and {"images", "annotations"} <= sample.keys()
+
+
+def _is_results(sample: object) -> bool:
+    entry = first_entry(sample)
+    return sample == [] or (
+        {"image_id", "category_id"} <= entry.keys()
+        and ("keypoints" in entry or "bbox" in entry)
+        and not is_alphapose_entry(entry)
+    )
+
+
+def _add_results(content: object, people: Gathering) -> None:
+    boxes = 0
+    for where, entry in objects(content, people.path, "results"):
+        frame = people.frame_of(entry.get("image_id"), where)
+        if entry.get("keypoints"):
+            people.add(frame, triples(entry["keypoints"], where), where)
+        else:
+            boxes += 1
+    _check_keypoints(people, boxes)
+
+
+def _add_annotations(content: dict[str, object], people: Gathering) -> None:
+    frames: dict[str, int] = {}
+    for where, image in objects(content.get("images"), people.path, "images"):
+        name = image.get("file_name", image.get("id"))
+        frames[str(image.get("id"))] = people.frame_of(name, where)
+    boxes = 0
+    for where, annotation in objects(content.get("annotations"), people.path, "annotations"):
+        if not annotation.get("keypoints"):
+            boxes += 1
+            continue
+        image_id = str(annotation.get("image_id"))
+        if image_id not in frames:
+            raise DataError(
+                where, f"its image_id {image_id} is not among the images", "check the images list"
+            )
+        rows = _with_confidence(triples(annotation["keypoints"], where), where)
+        people.add(frames[image_id], rows, where, own_id=whole_number(annotation.get("track_id")))
+    _check_keypoints(people, boxes)
+
+
+def _check_keypoints(people: Gathering, boxes: int) -> None:
+    if boxes and not len(people):
+        raise DataError(
+            people.path,
+            f"holds boxes only, no keypoints, in all of its {boxes} entries",
+            "run a keypoint detector",
+        )
+    people.dropped["entry without keypoints"] += boxes
+
+
+def _with_confidence(rows: Float, where: str) -> Float:
+    """Rows of x, y, visibility as x, y, confidence; all 0 where the visibility is 0."""
+    visibility = rows[:, 2:]
+    if not np.isin(visibility, (0, 1, 2)).all():
+        raise DataError(
+            where, "its third values are not the visibilities 0, 1 and 2", "store it as COCO results"
+        )
+    return np.where(visibility > 0, np.hstack([rows[:, :2], visibility / 2]), 0.0)
+
+
+def _joint_names(content: dict[str, object]) -> tuple[str, ...] | None:
+    """What the first category calls its keypoints, in the way this program spells joints."""
+    names = first_entry(content.get("categories")).get("keypoints")
+    if not isinstance(names, list):
+        return None
+    return tuple(str(name).strip().lower().replace(" ", "_") for name in names)
+
+
+def _picture_size(content: dict[str, object], path: Path) -> tuple[int, int] | None:
+    """The size of the pictures, if all state the same."""
+    sizes = {
+        (whole_number(image.get("width")), whole_number(image.get("height")))
+        for _, image in objects(content.get("images"), path, "images")
+    }
+    width, height = sizes.pop() if len(sizes) == 1 else (None, None)
+    return (width, height) if width and height else None
+
+
+FORMAT = Coco()

@@ -1,0 +1,243 @@
+"""Gathering the people of a keypoint file into Detections: skeleton, identities, missing joints, counts."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.formats.keypoint_files.keypoint_json import frame_number, json_files, load_json
+from pipelines.session.errors import DataError
+from pipelines.session.records import Detections
+from pipelines.session.skeletons import SKELETONS, Skeleton, get_skeleton, skeleton_with
+
+Float = NDArray[np.float64]
+
+
+def choose_skeleton(
+    path: Path, count: int, stated: str | None, names: tuple[str, ...] | None = None
+) -> Skeleton:
+    """The skeleton of `count` keypoints: as the user states, as the file's joint names say, or the likeliest.
+
+    Raises:
+        DataError: the stated skeleton is unknown or has another number of joints, or no skeleton fits.
+    """
+    known = ", ".join(f"{s.name} ({len(s.joints)})" for s in SKELETONS.values())
+    if stated is not None:
+        skeleton = get_skeleton(stated)
+        if len(skeleton.joints) != count:
+            problem = f"has {count} keypoints per person where {stated} has {len(skeleton.joints)}"
+            raise DataError(path, problem, f"state the skeleton it was detected with: {known}")
+        return skeleton
+    candidates = skeleton_with(count)
+    if not candidates:
+        raise DataError(path, f"has {count} keypoints per person, as no known skeleton", f"there are {known}")
+    if names is None:
+        return candidates[0]
+    for skeleton in candidates:
+        if skeleton.joints == names:
+            return skeleton
+    raise DataError(
+        path,
+        f"names its {count} keypoints {', '.join(names[:4])}, ..., as no known skeleton",
+        f"state the skeleton if it is one of {known}",
+    )
+
+
+class Gathering:
+    """People and frames of one camera as a reader meets them, in any order."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.dropped: Counter[str] = Counter()
+        self._listed: dict[int, str] = {}
+        self._people: Counter[int] = Counter()
+        self._frame: list[int] = []
+        self._rank: list[int] = []
+        self._own_id: list[int | None] = []
+        self._rows: list[Float] = []
+
+    def __len__(self) -> int:
+        """How many people there are so far, over all frames."""
+        return len(self._rows)
+
+    def contents(self) -> Iterator[tuple[Path, object]]:
+        """The content of the file, or of every JSON file of the folder, one at a time.
+
+        In a folder, files that cannot be read are left out and counted.
+
+        Raises:
+            DataError: the file cannot be read, or none of the folder.
+        """
+        if not self.path.is_dir():
+            yield self.path, load_json(self.path)
+            return
+        files = json_files(self.path)
+        for file in files:
+            try:
+                content = load_json(file)
+            except DataError:
+                self.dropped["unreadable file"] += 1
+                continue
+            yield file, content
+        if self.dropped["unreadable file"] == len(files):
+            problem = f"none of its {len(files)} JSON files can be read" if files else "holds no JSON files"
+            raise DataError(self.path, problem, "check the folder, or export the keypoints again")
+
+    def frame_of(self, name: object, where: str, file: Path | None = None) -> int:
+        """List the frame that a picture's name or number means.
+
+        Args:
+            name: the name or number.
+            where: the words for the entry in a message.
+            file: the one file among several that counts frames by itself.
+
+        Raises:
+            DataError: it has no number, or another picture has the same (several cameras in one place).
+        """
+        frame = frame_number(name)
+        if frame is None:
+            raise DataError(
+                where, f"picture {name!r} has no frame number", "name pictures with the number at the end"
+            )
+        picture = name if isinstance(name, str) else str(frame)
+        label = f"{file.name}, {picture}" if file else picture
+        other = self._listed.setdefault(frame, label)
+        if other != label:
+            problem = f"'{other}' and '{label}' are both frame {frame}"
+            raise DataError(self.path, problem, "give each camera a file or folder of its own")
+        return frame
+
+    def add(
+        self, frame: int, rows: Float, where: str, *, rank: int | None = None, own_id: int | None = None
+    ) -> None:
+        """Take one person.
+
+        Args:
+            frame: as `frame_of` gave it.
+            rows: [K, 3] x, y, confidence.
+            where: the words for the entry in a message.
+            rank: the place within the frame, where the file groups people by frame; else the next one.
+            own_id: the tracker's id of the person.
+
+        Raises:
+            DataError: the number of keypoints differs from the people before.
+        """
+        if self._rows and len(rows) != len(self._rows[0]):
+            problem = f"holds {len(rows)} keypoints where the people before hold {len(self._rows[0])}"
+            raise DataError(where, problem, "one file or folder holds one skeleton")
+        self._rank.append(self._people[frame] if rank is None else rank)
+        self._people[frame] += 1
+        self._frame.append(frame)
+        self._own_id.append(own_id)
+        self._rows.append(rows)
+
+    def keypoints(self) -> Float:
+        """All people so far [M, K, 3]; DataError without people."""
+        self.count()
+        return np.stack(self._rows)
+
+    def count(self) -> int:
+        """How many keypoints each person has.
+
+        Raises:
+            DataError: there are no people; the message says in how many frames, and what was left out.
+        """
+        if not self._rows:
+            causes = [f"{number} x {cause}" for cause, number in sorted(self.dropped.items()) if number]
+            causes += [f"{len(self._listed)} x frame without people"] if self._listed else []
+            detail = f" ({', '.join(causes)})" if causes else ""
+            raise DataError(
+                self.path, f"holds no keypoints{detail}", "check that the detector saw the person"
+            )
+        return len(self._rows[0])
+
+    def detections(
+        self, skeleton: Skeleton, first_frame: int, image_size: tuple[int, int] | None = None
+    ) -> Detections:
+        """Everything gathered, cleaned and sorted.
+
+        Frames before `first_frame` are left out. A joint is missing (NaN, confidence 0) if its position is
+        not finite, or if position and confidence are all 0, which is how detectors write "not found".
+        A confidence that is not finite becomes 0. All of it but "not found" is counted in `dropped`.
+
+        Raises:
+            DataError: no joint of any person is left.
+        """
+        frame = np.array(self._frame, dtype=np.int64) - first_frame
+        listed = np.array(sorted(self._listed), dtype=np.int64) - first_frame
+        kept = frame >= 0
+        xy, confidence, dropped = _missing_marked(self.keypoints()[kept])
+        frame, person = frame[kept], self._person_numbers()[kept]
+
+        somebody = np.isfinite(xy).any(axis=(1, 2))
+        if not somebody.any():
+            last = int(listed[-1]) + first_frame
+            problem = f"holds no keypoints from frame {first_frame} on (its last frame is {last})"
+            raise DataError(self.path, problem, "check first_frame, and that the detector saw the person")
+        rows = np.flatnonzero(somebody)
+        rows = rows[np.lexsort((person[rows], frame[rows]))]
+        again = (np.diff(frame[rows], prepend=-1) == 0) & (np.diff(person[rows], prepend=-1) == 0)
+        rows = rows[~again]
+
+        dropped += self.dropped
+        dropped["frame before first_frame"] = int((listed < 0).sum())
+        dropped["person without a joint"] = int((~somebody).sum())
+        dropped["same person twice in a frame"] = int(again.sum())
+        return Detections(
+            joints=skeleton.joints,
+            frame=frame[rows],
+            person=person[rows],
+            xy=xy[rows],
+            confidence=confidence[rows],
+            frames_listed=listed[listed >= 0],
+            image_size=image_size,
+            dropped={cause: number for cause, number in sorted(dropped.items()) if number},
+        )
+
+    def _person_numbers(self) -> NDArray[np.int64]:
+        """The detector's own ids, unless somebody has none or several people share the only one there is."""
+        own = [own_id for own_id in self._own_id if own_id is not None]
+        crowded = max(self._people.values()) > 1
+        tracked = len(own) == len(self._own_id) and not (crowded and len(set(own)) == 1)
+        return np.array(own if tracked else self._rank, dtype=np.int64)
+
+
+def _missing_marked(keypoints: Float) -> tuple[Float, Float, Counter[str]]:
+    """Positions [M, K, 2] and confidences [M, K] of keypoints [M, K, 3], and how many were not finite."""
+    xy, confidence = keypoints[..., :2].copy(), keypoints[..., 2].copy()
+    bad_confidence = ~np.isfinite(confidence)
+    confidence[bad_confidence] = 0.0
+    bad_position = ~np.isfinite(xy).all(axis=-1)
+    not_found = (xy == 0).all(axis=-1) & (confidence == 0)
+    xy[bad_position | not_found] = np.nan
+    confidence[bad_position] = 0.0
+    causes = {"joint not finite": bad_position, "confidence not finite": bad_confidence & ~bad_position}
+    return xy, confidence, Counter({cause: int(rows.sum()) for cause, rows in causes.items()})
+
+
+def describe_detections(detections: Detections) -> dict[str, object]:
+    """What `mocap info` says of a keypoint file."""
+    found = np.isfinite(detections.xy).all(axis=-1)
+    confidence = detections.confidence[found]
+    fits = next(s for s in SKELETONS.values() if s.joints == detections.joints)
+    listed = detections.frames_listed
+    facts: dict[str, object] = {
+        "frames": len(listed),
+        "first frame": int(listed[0]),
+        "last frame": int(listed[-1]),
+        "people": len(detections.frame),
+        "people per frame, at most": int(np.unique(detections.frame, return_counts=True)[1].max()),
+        "skeleton": f"{fits.name} ({len(fits.joints)} keypoints)",
+        "joints found, share": round(float(found.mean()), 3),
+        "confidence, mean": round(float(confidence.mean()), 3),
+        "confidence, range": [round(float(confidence.min()), 3), round(float(confidence.max()), 3)],
+    }
+    if detections.image_size:
+        facts["picture size"] = list(detections.image_size)
+    if detections.dropped:
+        facts["left out"] = detections.dropped
+    return facts

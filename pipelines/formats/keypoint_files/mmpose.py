@@ -1,0 +1,103 @@
+"""MMPose predictions: what its inferencer and its demos save, for a video or for pictures.
+
+People are `{"keypoints": [[x, y], ...], "keypoint_scores": [...], "bbox": ...}`. They come as
+
+* one file for a video, a list of `{"frame_id": n, "instances": [people]}` (the inferencer counts from 0, the
+  top-down demo from 1: `first_frame: 1`),
+* a list of people for one picture, or a folder of such files; the frame is the last digits of the name,
+* either of these under `instance_info`, beside `meta_info` with the joint names (the demos).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.formats.keypoint_files.keypoint_json import (
+    first_entry,
+    frame_number,
+    numbers,
+    objects,
+    samples,
+)
+from pipelines.formats.keypoint_files.keypoint_people import Gathering, choose_skeleton, describe_detections
+from pipelines.session.errors import DataError
+from pipelines.session.records import Detections
+
+
+class MMPose:
+    """A file of MMPose predictions, or a folder of one file for every picture."""
+
+    name = "mmpose"
+    title = "MMPose keypoints"
+    suffixes = (".json",)
+
+    def recognises(self, path: Path) -> bool:
+        """Whether a file, or some files across a folder, hold MMPose's frames or people."""
+        return any(_is_prediction(sample) for sample in samples(path))
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Frames, people, the skeleton, and confidences."""
+        return describe_detections(self.read_keypoints(path, skeleton=None, first_frame=0))
+
+    def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
+        """Read every person, file by file; pixels and scores as MMPose wrote them.
+
+        Raises:
+            DataError: no file can be read, no keypoints, or another number of them than `skeleton` has.
+        """
+        people = Gathering(path)
+        names = None
+        for file, content in people.contents():
+            names = _read_file(file, content, people) or names
+        chosen = choose_skeleton(path, people.count(), skeleton, names)
+        return people.detections(chosen, first_frame)
+
+
+def _is_prediction(sample: object) -> bool:
+    if isinstance(sample, dict):
+        return "instance_info" in sample
+    keys = first_entry(sample).keys()
+    return {"frame_id", "instances"} <= keys or {"keypoints", "keypoint_scores"} <= keys
+
+
+def _read_file(file: Path, content: object, people: Gathering) -> tuple[str, ...] | None:
+    """Add the people of one file; the joint names, where it states them."""
+    names = None
+    if isinstance(content, dict):
+        names = _joint_names(content.get("meta_info"))
+        content = content.get("instance_info")
+    if not isinstance(content, list):
+        people.dropped["file without predictions"] += 1
+    elif "instances" in first_entry(content):
+        for where, entry in objects(content, file, "frames"):
+            frame = people.frame_of(entry.get("frame_id"), where, file)
+            _add_people(frame, entry.get("instances"), where, people)
+    elif frame_number(file.stem) is None:
+        people.dropped["file without a frame number"] += 1
+    else:
+        _add_people(people.frame_of(file.stem, str(file)), content, str(file), people)
+    return names
+
+
+def _add_people(frame: int, instances: object, where: str, people: Gathering) -> None:
+    for rank, (who, person) in enumerate(objects(instances, where, "instances")):
+        points = numbers(person.get("keypoints"), who)
+        scores = numbers(person.get("keypoint_scores"), who)
+        if points.ndim != 2 or points.shape[1] != 2 or scores.shape != points.shape[:1]:
+            shapes = f"{list(points.shape)} and {list(scores.shape)}"
+            problem = f"keypoints and keypoint_scores are of shape {shapes}, not [K, 2] and [K]"
+            raise DataError(who, problem, "save 2D predictions")
+        people.add(frame, np.column_stack([points, scores]), who, rank=rank)
+
+
+def _joint_names(meta: object) -> tuple[str, ...] | None:
+    """The joints in order, from the data set's `keypoint_id2name`, if it is there."""
+    by_id = meta.get("keypoint_id2name") if isinstance(meta, dict) else None
+    if not isinstance(by_id, dict):
+        return None
+    return tuple(str(by_id.get(str(index))) for index in range(len(by_id)))
+
+
+FORMAT = MMPose()

@@ -1,0 +1,128 @@
+"""Clouds of points in logs (sensor_msgs/PointCloud2) as maps that grow.
+
+A voxel is occupied from the first point in it on; the maps are what had been seen by a few moments of the
+flight. What moves, the actor above all, leaves its trace in them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from pipelines.formats.logs.map_topics import (
+    DAMAGED,
+    PLACELESS,
+    RECORD_AGAIN,
+    LoggedMaps,
+    MapTopic,
+    evenly,
+    nothing_usable,
+    place_at,
+    time_of,
+)
+from pipelines.formats.logs.messages import bytes_of
+from pipelines.formats.maps.placed_grids import Pose
+from pipelines.formats.maps.point_voxels import VoxelSet
+from pipelines.geometry.poses import transform
+from pipelines.session.errors import DataError
+from pipelines.session.maps import MOST_VOXELS
+from pipelines.session.records import Float, Message
+
+MOST_CLOUD_MAPS = 10
+"""Moments of a flight at which what its clouds had shown by then becomes a map."""
+
+# sensor_msgs/PointField: the types that coordinates can have.
+_FLOAT_TYPES = {7: "f4", 8: "f8"}
+
+
+def accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:
+    """The maps that the clouds of a topic make, in the world's axes and by the log's times.
+
+    Raises:
+        DataError: no point is usable, or their box is too large.
+    """
+    lost: Counter[str] = Counter()
+    faults: list[DataError] = []
+    voxels = VoxelSet(about.source, about.resolution_m)
+    clouds = 0
+    for message in messages:
+        try:
+            t_ns = time_of(message, about)
+            pose = place_at(t_ns, about)
+            points = cloud_points(message.value, about.source)
+        except (AttributeError, TypeError, ValueError, OverflowError) as error:
+            lost[DAMAGED] += 1
+            faults.append(
+                DataError(about.source, f"a cloud cannot be read ({str(error)[:100]})", RECORD_AGAIN)
+            )
+            del faults[1:]
+            continue
+        except DataError as fault:
+            lost[DAMAGED] += 1
+            faults.append(fault)
+            del faults[1:]
+            continue
+        if pose is None:
+            lost[PLACELESS] += 1
+            continue
+        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite stays so, and is counted
+            voxels.add(points if _is_the_world(pose) else transform(pose, points), t_ns)
+        clouds += 1
+    lost.update(voxels.dropped)
+    grew_ns = voxels.grew_ns
+    if not len(grew_ns):
+        raise nothing_usable(about.source, +lost, faults)
+    most = max(1, min(MOST_CLOUD_MAPS, MOST_VOXELS // int(np.prod(voxels.shape))))
+    from_ns = grew_ns[evenly(len(grew_ns), most)]
+    notes = [f"{about.source}: {faults[0].problem} ({lost[DAMAGED]} such messages)"] if faults else []
+    notes.append(
+        f"{about.source}: {clouds} clouds make {len(from_ns)} maps, each of what had been seen by then;"
+        " what moved, like the actor, stays in them"
+    )
+    return LoggedMaps((voxels.occupancy(int(t_ns)) for t_ns in from_ns), from_ns, dict(+lost), notes)
+
+
+def cloud_points(value: Any, source: str) -> Float:
+    """The points [N, 3] of a PointCloud2 in its own frame, NaN where it has NaN.
+
+    Raises:
+        DataError: no x, y, z of float32 or float64, or fewer bytes than it states.
+    """
+    width, height, stride = int(value.width), int(value.height), int(value.point_step)
+    order = ">" if value.is_bigendian else "<"
+    fields = {str(each.name): each for each in value.fields}
+    columns: dict[str, tuple[str, int]] = {}
+    for name in ("x", "y", "z"):
+        kind = _FLOAT_TYPES.get(int(fields[name].datatype)) if name in fields else None
+        if kind is None:
+            stated = f"of type {int(fields[name].datatype)}" if name in fields else "not there"
+            raise DataError(source, f"its field {name} is {stated}", "x, y, z of float32 or float64 are read")
+        offset = int(fields[name].offset)
+        if offset < 0 or offset + int(kind[1]) > stride:
+            raise DataError(
+                source, f"its field {name} lies beyond the {stride} bytes of a point", RECORD_AGAIN
+            )
+        columns[name] = order + kind, offset
+    row_bytes = int(value.row_step) or width * stride
+    data = bytes_of(value.data)
+    if row_bytes < width * stride or len(data) < row_bytes * height:
+        raise DataError(
+            source, f"a cloud breaks off: {len(data)} bytes for {width} x {height} points", RECORD_AGAIN
+        )
+    # Rows may be padded, and the values may begin anywhere: they are copied where they belong.
+    rows = np.ascontiguousarray(data[: row_bytes * height].reshape(height, row_bytes)[:, : width * stride])
+    records = rows.reshape(-1, stride) if width * height else rows.reshape(0, stride)
+    points = np.empty((len(records), 3))
+    with np.errstate(invalid="ignore"):  # a NaN that signals becomes one that does not
+        for axis, (kind, offset) in enumerate(columns.values()):
+            values = np.ascontiguousarray(records[:, offset : offset + np.dtype(kind).itemsize])
+            points[:, axis] = values.view(kind)[:, 0] if len(values) else 0
+    return points
+
+
+def _is_the_world(pose: Pose) -> bool:
+    """Whether a frame is the world's: points then keep every bit."""
+    return not pose[0].any() and pose[1].tolist() == [0.0, 0.0, 0.0, 1.0]

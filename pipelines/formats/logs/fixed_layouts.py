@@ -1,0 +1,156 @@
+"""Poses straight from the bytes of a whole topic, where every message has the same layout.
+
+The messages of one topic of poses differ in nothing but numbers: the same frames, the same length. Then a
+thousand of them are one array, read ten times as fast as one at a time. Wherever that does not hold,
+nothing is said here and the messages are decoded one by one.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.formats.logs.message_decoders import Schema, is_standard
+from pipelines.formats.logs.recordings import UnlikeError
+from pipelines.session.records import Float, Int64
+
+Messages = tuple[Int64, NDArray[np.uint8]]
+"""Stamps of receipt [n], and the bytes of messages of one length [n, length]."""
+
+_LATEST_NS = 2**62  # stamps beyond are no times, which is for others to say
+_CDR_LITTLE_ENDIAN = (0, 1, 0, 0)
+
+
+@dataclass(frozen=True)
+class _Fields:
+    """What follows the header of a message."""
+
+    has_child: bool  # the id of a second frame
+    has_covariance: bool
+    doubles: int  # from the position to the end
+
+
+_KNOWN = {
+    "geometry_msgs/msg/PoseStamped": _Fields(False, False, 7),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": _Fields(False, True, 43),
+    "geometry_msgs/msg/TransformStamped": _Fields(True, False, 7),
+    "nav_msgs/msg/Odometry": _Fields(True, True, 43 + 42),
+}
+
+
+@dataclass(frozen=True)
+class PoseArrays:
+    """Poses of one topic as it states them."""
+
+    frames: tuple[str, str]  # target and source
+    header_ns: Int64  # [N]
+    receive_ns: Int64  # [N]
+    pose: Float  # [N, 7] position, then quaternion xyzw
+    covariance: Float | None  # [N, 36], for types that have one
+
+
+class _OtherLayoutError(Exception):
+    """A message that is not laid out as the first."""
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where things are in every message of a topic."""
+
+    is_cdr: bool
+    length: int
+    stamp: slice  # seconds, signed as rosbags reads them, then nanoseconds
+    text: slice  # lengths and characters of the frames' names, with what pads them
+    text_bytes: NDArray[np.uint8]
+    names: tuple[str, str]
+    doubles: slice  # position, quaternion xyzw, and the covariance of types that have one
+
+
+def read_poses(schema: Schema, messages: Iterable[Messages]) -> PoseArrays | None:
+    """All poses of a topic in the order of receipt; None where they are not of one known layout.
+
+    Args:
+        schema: of the topic.
+        messages: in any order; those of equal stamps keep theirs. Read to the end, or to the first that
+            differs.
+    """
+    fields = _KNOWN.get(schema.type)
+    if fields is None or schema.encoding not in {"cdr", "ros1"} or not is_standard(schema):
+        return None
+    stamps: list[Int64] = []
+    parts: list[NDArray[np.uint8]] = []
+    layout: _Layout | None = None
+    try:
+        for receive_ns, raw in messages:
+            layout = layout or _layout(schema.encoding, fields, raw[0].tobytes())
+            stamps.append(receive_ns)
+            parts.append(_numbers(layout, raw))
+    except (_OtherLayoutError, UnlikeError):
+        return None
+    if layout is None:
+        return None
+    receive_ns = np.concatenate(stamps)
+    if np.abs(receive_ns).max() >= _LATEST_NS:
+        return None
+    order = np.argsort(receive_ns, kind="stable")
+    numbers = np.concatenate(parts)[order]
+    seconds = numbers[:, :4].copy().view("<i4")[:, 0].astype(np.int64)
+    nanoseconds = numbers[:, 4:8].copy().view("<u4")[:, 0]
+    doubles: Float = numbers[:, 8:].copy().view("<f8").astype(np.float64, copy=False)
+    return PoseArrays(
+        frames=layout.names,
+        header_ns=seconds * 1_000_000_000 + nanoseconds,
+        receive_ns=receive_ns[order],
+        pose=doubles[:, :7],
+        covariance=doubles[:, 7:] if fields.has_covariance else None,
+    )
+
+
+def _numbers(layout: _Layout, raw: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The stamp and the doubles that are used; all else must be as in the first message."""
+    if raw.shape[1] != layout.length or (raw[:, layout.text] != layout.text_bytes).any():
+        raise _OtherLayoutError
+    if layout.is_cdr and (raw[:, :4] != _CDR_LITTLE_ENDIAN).any():
+        raise _OtherLayoutError
+    return np.concatenate([raw[:, layout.stamp], raw[:, layout.doubles]], axis=1)
+
+
+def _layout(encoding: str, fields: _Fields, first: bytes) -> _Layout:
+    """The layout of a message, by its first one.
+
+    CDR (OMG DDSI-RTPS 2.5, section 10) aligns to the size of a number, counted behind its four bytes of
+    head, and ends text with a zero; ROS 1 does neither.
+    """
+    cdr = encoding == "cdr"
+    stamp_at = 4  # behind the head of CDR, or the sequence number of ROS 1
+    position = text_at = stamp_at + 8
+    names = ["", ""]
+    for index in range(1 + fields.has_child):
+        position += -position % 4 if cdr else 0
+        if position + 4 > len(first):
+            raise _OtherLayoutError
+        (length,) = struct.unpack_from("<I", first, position)
+        text = first[position + 4 : position + 4 + length]
+        position += 4 + length
+        try:
+            names[index] = (text[:-1] if cdr else text).decode()
+        except UnicodeDecodeError:
+            raise _OtherLayoutError from None
+        if cdr and not text.endswith(b"\x00"):
+            raise _OtherLayoutError
+    doubles_at = position + (-(position - 4) % 8 if cdr else 0)
+    if doubles_at + 8 * fields.doubles != len(first):
+        raise _OtherLayoutError
+    return _Layout(
+        is_cdr=cdr,
+        length=len(first),
+        stamp=slice(stamp_at, text_at),
+        text=slice(text_at, position),
+        text_bytes=np.frombuffer(first, np.uint8)[text_at:position],
+        names=(names[0], names[1]),
+        doubles=slice(doubles_at, doubles_at + 8 * (43 if fields.has_covariance else 7)),
+    )

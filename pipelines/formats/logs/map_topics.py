@@ -1,0 +1,156 @@
+"""What messages of every kind of map have in common: their time, their frame, where it is, their losses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pipelines.formats.logs.message_decoders import Decoder, Schema, decoder
+from pipelines.formats.logs.messages import nanoseconds
+from pipelines.formats.logs.recordings import OpenLog
+from pipelines.formats.logs.trajectories import Stamps
+from pipelines.formats.maps.placed_grids import Pose
+from pipelines.geometry.poses import interpolate_poses
+from pipelines.session.errors import DataError
+from pipelines.session.records import Int64, Message, Occupancy, Trajectory
+from pipelines.session.registries import Log
+
+OCTOMAP = "octomap_msgs/msg/Octomap"
+OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+MAP_TYPES = (OCTOMAP, OCCUPANCY_GRID, POINT_CLOUD)
+
+DAMAGED = "map messages that cannot be used"
+PLACELESS = "map messages at whose time no transform is known"
+RECORD_AGAIN = "check what wrote the log"
+
+# What rosbags does not know: logs of ROS 2 up to Humble carry no definitions.
+_OCTOMAP_DEFINITION = """std_msgs/Header header
+bool binary
+string id
+float64 resolution
+int8[] data
+================================================================================
+MSG: std_msgs/Header
+{sequence}builtin_interfaces/Time stamp
+string frame_id
+"""
+
+
+@dataclass(frozen=True)
+class MapTopic:
+    """How the messages of a topic are to be read.
+
+    Args:
+        source: log and topic, for messages.
+        frame: of all its messages.
+        stamps: which of their stamps counts: header or receive.
+        world_from_frame: where that frame is; a single row holds always.
+        max_gap_ns: the longest stretch between two rows of it that is bridged.
+        resolution_m: of the voxels, if it is stated.
+        height_m: how high what is on a floor plan stands.
+    """
+
+    source: str
+    frame: str
+    stamps: Stamps
+    world_from_frame: Trajectory
+    max_gap_ns: int
+    resolution_m: float | None
+    height_m: float
+
+
+@dataclass(frozen=True)
+class LoggedMaps:
+    """The maps of a topic in the order of their times, and what it holds besides."""
+
+    maps: Iterator[Occupancy]  # made one at a time
+    from_ns: Int64  # [K] of each, strictly increasing
+    dropped: dict[str, int]  # by cause
+    notes: list[str] = field(default_factory=list)
+
+
+def map_messages(recording: Log, topic: str) -> Iterator[Message]:
+    """The messages of a topic of maps, in the order of receipt."""
+    if isinstance(recording, OpenLog):
+        return recording.messages([topic], _decoder)
+    return recording.messages([topic])
+
+
+def frame_of(message: Message, source: str) -> str:
+    """The frame in which a map lies, without the leading slash of ROS 1.
+
+    Raises:
+        DataError: it states none that could be read.
+    """
+    try:
+        return str(message.value.header.frame_id).lstrip("/")
+    except AttributeError as error:
+        raise DataError(source, f"its messages lack the field {error.name!r}", RECORD_AGAIN) from error
+
+
+def nothing_usable(source: str, lost: Mapping[str, int], faults: Sequence[DataError] = ()) -> DataError:
+    """What to say where a topic gives no map: the first fault, else what was lost."""
+    if faults:
+        return faults[0]
+    causes = ", ".join(f"{count} {cause}" for cause, count in lost.items())
+    return DataError(
+        source, f"holds no map ({causes or 'it is empty'})", "name another topic, or leave `map:` out"
+    )
+
+
+def evenly(count: int, most: int) -> list[int]:
+    """Rows of `count`, the last one always among them."""
+    if count <= most:
+        return list(range(count))
+    rows: list[int] = np.linspace(count - 1, 0, most).round().astype(int)[::-1].tolist()
+    return rows
+
+
+def time_of(message: Message, about: MapTopic) -> int:
+    """The stamp that counts.
+
+    Raises:
+        DataError: the message lies in another frame than those before it.
+    """
+    if (frame := frame_of(message, about.source)) != about.frame:
+        raise DataError(
+            about.source, f"lies in frame {frame!r}, the messages before in {about.frame!r}", RECORD_AGAIN
+        )
+    stamp_ns = nanoseconds(message.value.header.stamp) if about.stamps == "header" else 0
+    return stamp_ns or message.receive_ns
+
+
+def place_at(t_ns: int, about: MapTopic) -> Pose | None:
+    """Where the frame of a topic is in the world; None where nothing says it."""
+    poses = about.world_from_frame
+    if len(poses.t_ns) == 1:
+        return poses.position[0], poses.quaternion_xyzw[0]
+    after = int(np.searchsorted(poses.t_ns, t_ns))
+    around = slice(max(after - 1, 0), after + 1)
+    position, quaternion = interpolate_poses(
+        poses.t_ns[around],
+        poses.position[around],
+        poses.quaternion_xyzw[around],
+        np.array([t_ns], np.int64),
+        max_gap_ns=about.max_gap_ns,
+        max_extrapolation_ns=0,
+    )
+    return None if np.isnan(position[0, 0]) else (position[0], quaternion[0])
+
+
+def _decoder(schema: Schema) -> Decoder:
+    """As `decoder`, also for octomap_msgs/Octomap that the log does not define."""
+    if schema.type == OCTOMAP and not schema.definition and schema.encoding in {"ros1", "cdr"}:
+        is_ros1 = schema.encoding == "ros1"
+        text = _OCTOMAP_DEFINITION.format(sequence="uint32 seq\n" if is_ros1 else "")
+        if is_ros1:
+            text = text.replace("builtin_interfaces/Time", "time")
+        else:
+            text += "=" * 80 + "\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+        schema = replace(
+            schema, definition_encoding="ros1msg" if is_ros1 else "ros2msg", definition=text.encode()
+        )
+    return decoder(schema)

@@ -1,0 +1,220 @@
+"""MCAP files (mcap.dev/spec), whole or cut off, chunked or not, with any profile.
+
+The records are parsed by the mcap library. Its readers stop at the first damage, and the one for files
+without an index ignores checksums and size limits, so the file is walked here.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from numpy.typing import NDArray
+
+from pipelines.formats.logs.chunked_logs import CHUNK_LIMIT, Chunk, ChunkedPart, Content, RecordShape
+from pipelines.formats.logs.message_decoders import Schema, ros2_name
+from pipelines.formats.logs.recordings import Channel, OpenLog, describe_log, open_file, open_parts
+from pipelines.session.errors import DataError
+from pipelines.session.records import Int64
+
+_MAGIC = b"\x89MCAP0\r\n"
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _STATISTICS = 2, 3, 4, 5, 6, 7, 11
+_DAMAGE = (McapError, struct.error, ValueError)  # what the library raises for records that are none
+_HEAD = struct.Struct("<BQ")  # kind and length of a record
+_MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # then channel, sequence, log time, publish time
+_CHUNK_HEAD = struct.Struct("<QQQII")  # first and last stamp, size, checksum, length of what follows
+_INDEX_ROW = np.dtype([("stamp", "<u8"), ("place", "<u8")])
+_NO_SCHEMA = records.Schema(id=0, data=b"", encoding="", name="")
+_RUN = 1 << 20  # bytes of messages outside chunks that are read together
+_STAMP_LIMIT = 1 << 63  # our stamps are int64
+
+
+class McapLog:
+    """MCAP files with messages in ros1, cdr, json or protobuf.
+
+    Checksums of chunks are verified; that of the whole data section is not, for it would take a reading
+    of the whole file.
+    """
+
+    name = "mcap"
+    title = "MCAP log"
+    suffixes: tuple[str, ...] = (".mcap",)
+
+    def recognises(self, path: Path) -> bool:
+        """Whether the file begins as MCAP does, or is an empty one."""
+        try:
+            with path.open("rb") as file:
+                head = file.read(len(_MAGIC))
+        except OSError:
+            return False
+        return head == _MAGIC or (not head and path.suffix.lower() in self.suffixes)
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Messages, times, storage, topics, and what was lost."""
+        with self.open_log([path]) as log:
+            return describe_log(log)
+
+    def open_log(self, paths: Sequence[Path]) -> OpenLog:
+        """Open one file, or the parts of a split one.
+
+        Raises:
+            DataError: no file can be read as MCAP, or holds anything.
+        """
+        return OpenLog(*open_parts(paths, open_mcap))
+
+
+def open_mcap(path: Path) -> McapPart:
+    """Open one file as a part of a recording.
+
+    Raises:
+        DataError: it is no MCAP, or damaged without a message that can be read.
+    """
+    return McapPart(path, *open_file(path))
+
+
+class McapPart(ChunkedPart):
+    """One MCAP file. Messages outside chunks are taken as chunks that are not compressed."""
+
+    record_overhead = _MESSAGE_HEAD.size
+
+    def walk(self) -> tuple[int, bool]:
+        """Walk the records up to the end of the file or to the first that is not whole."""
+        if self.bytes_at(0, len(_MAGIC)) != _MAGIC:
+            raise DataError(self.path, "is no MCAP file (it does not begin with its magic bytes)")
+        self._schemas: dict[int, records.Schema] = {}
+        position, closed = len(_MAGIC), False
+        run: Chunk | None = None
+        while not closed:
+            head = self.bytes_at(position, _HEAD.size)
+            if len(head) < _HEAD.size:
+                break
+            kind, length = _HEAD.unpack(head)
+            content_at, end = position + _HEAD.size, position + _HEAD.size + length
+            try:
+                if kind == _CHUNK:
+                    self._take_chunk(content_at, length)
+                if end > self.file_size:
+                    break
+                run = self._extended(run, position, end) if kind == _MESSAGE else None
+                if kind == _INDEX and self.chunks:
+                    self.chunks[-1].index.append(self._index_rows(content_at, length))
+                elif kind in {_SCHEMA, _CHANNEL, _STATISTICS}:
+                    self._take_record(
+                        kind, self.bytes_at(content_at, min(length, CHUNK_LIMIT)), self.channels
+                    )
+                closed = kind == _FOOTER
+            except _DAMAGE:
+                break
+            position = end
+        if closed and self.bytes_at(position, len(_MAGIC)) == _MAGIC:
+            position += len(_MAGIC)
+        return position, closed
+
+    def look(self, content: memoryview) -> Content:
+        """Find messages, channels and schemas in a chunk."""
+        channels: dict[int, Channel] = {}
+        index: list[tuple[int, int, int]] = []
+        position = 0
+        try:
+            while position < len(content):
+                kind, length = _HEAD.unpack_from(content, position)
+                end = position + _HEAD.size + length
+                if end > len(content):
+                    break
+                if kind == _MESSAGE:
+                    index.append(_message_row(content, position))
+                elif kind in {_SCHEMA, _CHANNEL}:
+                    self._take_record(kind, bytes(content[position + _HEAD.size : end]), channels)
+                position = end
+        except _DAMAGE:
+            pass
+        return Content(channels, index, position)
+
+    def payload(self, content: memoryview, place: int, channel: int, stamp_ns: int) -> memoryview:
+        """The bytes of a message."""
+        try:
+            kind, length, of_channel, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content, place)
+        except struct.error as error:
+            raise ValueError("no record here") from error
+        end = place + _HEAD.size + length
+        if kind != _MESSAGE or of_channel != channel or log_time != stamp_ns or end > len(content):
+            raise ValueError("another record")
+        return content[place + _MESSAGE_HEAD.size : end]
+
+    def shape(self, content: memoryview, place: int) -> RecordShape:
+        """Sequence number, log time and publish time differ."""
+        head = _MESSAGE_HEAD.size
+        length = _MESSAGE_HEAD.unpack_from(content, place)[1]
+        return RecordShape(head, length - (head - _HEAD.size), slice(15, 23), slice(11, head))
+
+    def stamp_bytes(self, stamp_ns: Int64) -> NDArray[np.uint8]:
+        """One unsigned number."""
+        return stamp_ns.astype("<u8").view(np.uint8).reshape(-1, 8)
+
+    def _take_chunk(self, content_at: int, length: int) -> None:
+        head = self.bytes_at(content_at, _CHUNK_HEAD.size)
+        _, _, size, crc, name_length = _CHUNK_HEAD.unpack(head)
+        name_at = content_at + _CHUNK_HEAD.size
+        name = self.bytes_at(name_at, min(name_length, 16)).decode()
+        data_at = name_at + name_length + 8
+        stated = int.from_bytes(self.bytes_at(data_at - 8, 8), "little")
+        if data_at + stated > content_at + length:
+            raise ValueError("the chunk's content is longer than its record")
+        here = min(stated, self.file_size - data_at)
+        if here < 0:
+            raise ValueError("nothing of the chunk's content is here")
+        self.chunks.append(Chunk(data_at, here, name, size, crc, cut=here < stated))
+        if (name or "uncompressed") not in self.storage:
+            self.storage.append(name or "uncompressed")
+
+    def _extended(self, run: Chunk | None, position: int, end: int) -> Chunk:
+        """The run of messages outside chunks, with one more; a new one if there is none or it is full."""
+        if run is None or run.length >= _RUN:
+            run = Chunk(position, 0, "", 0)
+            self.chunks.append(run)
+        run.length = run.size = end - run.offset
+        if "unchunked" not in self.storage:
+            self.storage.append("unchunked")
+        return run
+
+    def _take_record(self, kind: int, content: bytes, channels: dict[int, Channel]) -> None:
+        stream = ReadDataStream(BytesIO(content))
+        if kind == _SCHEMA:
+            schema = records.Schema.read(stream)
+            self._schemas[schema.id] = schema
+        elif kind == _STATISTICS:
+            self.messages_stated = records.Statistics.read(stream).message_count
+        else:
+            channel = records.Channel.read(stream)
+            channels.setdefault(channel.id, self._channel(channel))
+
+    def _channel(self, channel: records.Channel) -> Channel:
+        schema = self._schemas.get(channel.schema_id, _NO_SCHEMA)
+        encoding = channel.message_encoding
+        type_ = ros2_name(schema.name) if encoding in {"ros1", "cdr"} else schema.name
+        return Channel(channel.topic, Schema(type_, encoding, schema.encoding, schema.data))
+
+    def _index_rows(self, content_at: int, length: int) -> Int64:
+        channel = int.from_bytes(self.bytes_at(content_at, 2), "little")
+        raw = np.frombuffer(self.bytes_at(content_at + 6, (length - 6) // 16 * 16), _INDEX_ROW)
+        if len(raw) and int(raw["stamp"].max()) >= _STAMP_LIMIT:
+            raise ValueError("a stamp after the year 2262")
+        return np.stack(
+            [np.full(len(raw), channel), raw["stamp"].astype(np.int64), raw["place"].astype(np.int64)], axis=1
+        )
+
+
+def _message_row(content: memoryview | bytes, position: int) -> tuple[int, int, int]:
+    _, _, channel, _, stamp, _ = _MESSAGE_HEAD.unpack_from(content, position)
+    if stamp >= _STAMP_LIMIT:
+        raise ValueError("a stamp after the year 2262")
+    return channel, stamp, position
+
+
+FORMAT = McapLog()

@@ -1,0 +1,254 @@
+"""From the bytes of a message to a value with the schema's fields as attributes, for every encoding."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+from pipelines.formats.logs.inflation import ZSTD_MAGIC, inflate
+
+if TYPE_CHECKING:
+    from google.protobuf.descriptor_pb2 import FileDescriptorProto
+    from rosbags.interfaces.typing import Typesdict
+    from rosbags.typesys.store import Typestore
+
+Decoder = Callable[[memoryview | bytes], Any]
+
+MESSAGE_LIMIT = 1 << 28  # bytes of one message that was compressed by itself
+ARRAY_LIMIT = 1 << 20  # entries of a fixed array; rosbags unrolls arrays of messages into code
+_TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)+", re.ASCII)
+_BASE64 = "base64"
+
+
+@dataclass(frozen=True)
+class Schema:
+    """How the messages of a channel are written."""
+
+    type: str  # in the spelling of ROS 2, or the schema's own
+    encoding: str  # of the messages: ros1, cdr, json, protobuf, or what the file says
+    definition_encoding: str = ""  # ros1msg, ros2msg, ros2idl, jsonschema, protobuf; empty without
+    definition: bytes = b""
+
+
+def ros2_name(name: str) -> str:
+    """The spelling of ROS 2 for a type of either ROS: nav_msgs/Odometry is nav_msgs/msg/Odometry."""
+    package, _, rest = name.partition("/")
+    return f"{package}/msg/{rest}" if rest and "/" not in rest else name
+
+
+@lru_cache(maxsize=256)
+def decoder(schema: Schema) -> Decoder:
+    """A function that decodes messages of a schema; it raises ValueError for bytes that do not fit.
+
+    ros1 and cdr: dataclasses of rosbags, numeric arrays as views into the message. Without a definition
+    in the file, the types of ROS 1 Noetic or of the newest ROS 2 that rosbags knows are used. Messages of
+    a ROS 2 bag in compression mode `message` are decompressed. json: namespaces, with the binary fields
+    of the schema as bytes. protobuf: messages of the protobuf library.
+
+    Raises:
+        ValueError: why messages of this schema cannot be decoded.
+    """
+    if schema.encoding in {"ros1", "cdr"}:
+        return _ros_decoder(schema)
+    if schema.encoding == "json":
+        return _json_decoder(schema)
+    if schema.encoding == "protobuf":
+        return _protobuf_decoder(schema)
+    raise ValueError(f"messages in encoding {schema.encoding or 'none'!r} are not read")
+
+
+@lru_cache(maxsize=256)
+def is_standard(schema: Schema) -> bool:
+    """Whether a type of ROS is defined in this log as ROS itself defines it, with all that it is made of."""
+    from rosbags.typesys import Stores, get_typestore
+
+    ours = get_typestore(Stores.ROS1_NOETIC if schema.encoding == "ros1" else Stores.LATEST)
+    try:
+        theirs = _typestore(schema)
+        return _same_type(theirs, ours, schema.type)
+    except (ValueError, KeyError):
+        return False
+
+
+def _same_type(theirs: Typestore, ours: Typestore, type_: str) -> bool:
+    from rosbags.interfaces import Nodetype
+
+    fields, expected = theirs.fielddefs[type_][1], ours.fielddefs[type_][1]
+    return fields == expected and all(
+        _same_type(theirs, ours, str(kind[1])) for _, kind in fields if kind[0] == Nodetype.NAME
+    )
+
+
+def _ros_decoder(schema: Schema) -> Decoder:
+    from rosbags.serde import SerdeError
+
+    store = _typestore(schema)
+    deserialize = store.deserialize_ros1 if schema.encoding == "ros1" else store.deserialize_cdr
+
+    def decode(data: memoryview | bytes) -> Any:
+        if data[:4] == ZSTD_MAGIC and schema.encoding == "cdr":
+            data = _inflate_message(data)
+        try:
+            return deserialize(data, schema.type)
+        except (SerdeError, AssertionError, IndexError, OverflowError) as error:
+            raise ValueError(str(error)) from error
+
+    return decode
+
+
+def _inflate_message(data: memoryview | bytes) -> memoryview | bytes:
+    content, complete = inflate(data, "zstd", MESSAGE_LIMIT)
+    if not complete:
+        raise ValueError("the compressed message is cut off or too large")
+    return content
+
+
+def _typestore(schema: Schema) -> Typestore:
+    """A store that knows the type of a channel, and every type that it is made of."""
+    from rosbags.typesys import Stores, TypesysError, get_typestore
+
+    if not _TYPE_NAME.fullmatch(schema.type):
+        raise ValueError(f"{schema.type!r} is no type of ROS")
+    if schema.definition:
+        store = get_typestore(Stores.EMPTY)
+    else:
+        store = get_typestore(Stores.ROS1_NOETIC if schema.encoding == "ros1" else Stores.LATEST)
+    try:
+        if schema.definition:
+            types = _ros_types(schema)
+            _check_arrays(types)
+            store.register(types)
+        store.get_msgdef(schema.type)
+    except KeyError as error:
+        raise ValueError(f"the log does not define {error}") from error
+    except (TypesysError, SyntaxError, AssertionError, RecursionError, ValueError) as error:
+        first_line = str(error).partition("\n")[0][:120]
+        raise ValueError(f"the definition of {schema.type} cannot be used ({first_line})") from error
+    return store
+
+
+def _ros_types(schema: Schema) -> Typesdict:
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg
+
+    text = schema.definition.decode("utf-8", errors="replace")
+    if schema.definition_encoding in {"ros1msg", "ros2msg"}:
+        return get_types_from_msg(text, schema.type)
+    if schema.definition_encoding not in {"ros2idl", "omgidl"}:
+        raise ValueError(f"definitions in {schema.definition_encoding!r} are not read")
+    separator = "=" * 80 + "\n"
+    if not text.startswith(f"{separator}IDL: "):
+        return get_types_from_idl(text)
+    types: Typesdict = {}
+    for section in text.split(separator)[1:]:
+        types.update(get_types_from_idl(section.partition("\n")[2]))
+    return types
+
+
+def _check_arrays(types: Typesdict) -> None:
+    from rosbags.interfaces import Nodetype
+
+    for _, fields in types.values():
+        for name, description in fields:
+            if description[0] == Nodetype.ARRAY and description[1][1] > ARRAY_LIMIT:
+                raise ValueError(f"{name} has {description[1][1]} entries")
+
+
+def _json_decoder(schema: Schema) -> Decoder:
+    binary = _binary_fields(schema)
+
+    def decode(data: memoryview | bytes) -> Any:
+        try:
+            value = json.loads(bytes(data), object_hook=lambda fields: SimpleNamespace(**fields))
+        except RecursionError as error:
+            raise ValueError("JSON nested too deeply") from error
+        if not isinstance(value, SimpleNamespace):
+            raise ValueError("the message is no JSON object")
+        _decode_base64(value, binary)
+        return value
+
+    return decode
+
+
+def _binary_fields(schema: Schema) -> dict[str, Any]:
+    """The fields that hold base64: names to `_BASE64`, or to the fields of the objects below them."""
+    if not schema.definition and schema.type.startswith("foxglove."):
+        return {"data": _BASE64}
+    try:
+        definition = json.loads(schema.definition or b"{}")
+        return _binary_properties(definition) if isinstance(definition, dict) else {}
+    except (ValueError, RecursionError):
+        return {}
+
+
+def _binary_properties(definition: dict[str, Any]) -> dict[str, Any]:
+    fields: dict[str, Any] = {}
+    properties = definition.get("properties")
+    for name, field in properties.items() if isinstance(properties, dict) else ():
+        inner = field.get("items", field) if isinstance(field, dict) else None
+        if isinstance(inner, dict):
+            if inner.get("contentEncoding") == _BASE64:
+                fields[name] = _BASE64
+            elif below := _binary_properties(inner):
+                fields[name] = below
+    return fields
+
+
+def _decode_base64(value: SimpleNamespace, fields: dict[str, Any]) -> None:
+    for name, below in fields.items():
+        field = getattr(value, name, None)
+        if isinstance(field, str) and below == _BASE64:
+            try:
+                setattr(value, name, base64.b64decode(field, validate=True))
+            except binascii.Error as error:
+                raise ValueError(f"{name} is no base64") from error
+        for item in field if isinstance(field, list) else [field]:
+            if isinstance(item, SimpleNamespace) and isinstance(below, dict):
+                _decode_base64(item, below)
+
+
+def _protobuf_decoder(schema: Schema) -> Decoder:
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.descriptor_pool import DescriptorPool
+    from google.protobuf.message import DecodeError
+    from google.protobuf.message_factory import GetMessageClass
+
+    if schema.definition_encoding != "protobuf":
+        raise ValueError(f"protobuf defined by {schema.definition_encoding or 'nothing'!r} is not read")
+    pool = DescriptorPool()
+    try:
+        for file in _by_dependency(FileDescriptorSet.FromString(schema.definition).file):
+            pool.AddSerializedFile(file.SerializeToString())
+        message_class = GetMessageClass(pool.FindMessageTypeByName(schema.type))
+    except (DecodeError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"the definition of {schema.type} cannot be used") from error
+
+    def decode(data: memoryview | bytes) -> Any:
+        try:
+            return message_class.FromString(bytes(data))
+        except DecodeError as error:
+            raise ValueError(str(error)) from error
+
+    return decode
+
+
+def _by_dependency(files: Any) -> list[FileDescriptorProto]:
+    """The files so that each comes after those that it imports; a pool takes them in no other order."""
+    waiting = {file.name: file for file in files}
+    ordered: list[FileDescriptorProto] = []
+
+    def add(name: str) -> None:
+        if file := waiting.pop(name, None):
+            for imported in file.dependency:
+                add(imported)
+            ordered.append(file)
+
+    for name in list(waiting):
+        add(name)
+    return ordered

@@ -1,0 +1,432 @@
+"""Decoded log messages to samples: poses, transforms, gimbal angles, intrinsics and pictures.
+
+Messages of ROS 1 and ROS 2 and Foxglove's schemas (in protobuf, JSON or ROS) say the same things under
+slightly different names; what differs is settled here and nowhere else. A sample whose `stamp_ns` is 0
+comes from a message without a header stamp: it has only the time of its receipt.
+"""
+
+from __future__ import annotations
+
+import base64
+import operator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.formats.calibrations.camera_matrices import intrinsics
+from pipelines.formats.logs.picture_layouts import PictureFields
+from pipelines.geometry.cameras import Intrinsics
+from pipelines.session.errors import DataError
+from pipelines.session.records import (
+    AngleSample,
+    Float,
+    IntrinsicsSample,
+    Message,
+    PictureSample,
+    PoseSample,
+    Sample,
+    Topic,
+)
+
+Kind = Literal["poses", "transforms", "angles", "intrinsics", "pictures"]
+Source = Path | str
+
+# Stamps beyond (the year 2116) are no times, and their differences would not fit int64.
+_LARGEST_STAMP_NS = 2**62
+
+_FISHEYE_MODELS = {"equidistant", "fisheye"}
+_RADTAN_MODELS = {"plumb_bob", "rational_polynomial", "radtan"}
+
+_SIGNATURES = {b"\xff\xd8\xff": "jpeg", b"\x89PNG": "png"}
+
+
+def kind_of(topic: Topic) -> Kind | None:
+    """What a topic's messages hold, by the name of their type; None for what is not read.
+
+    "poses" are those of one thing, "transforms" those of any number of frames. Left out are arrays of
+    poses at one moment (PoseArray, foxglove.PosesInFrame): they say not which thing each pose is of.
+    Nor maps, which are no samples: see `log_maps`.
+    """
+    known = _READERS.get(topic.type)
+    return known[0] if known else None
+
+
+def samples(message: Message, source: Source) -> Iterator[Sample]:
+    """What one message says.
+
+    A nav_msgs/Path gives every pose at its own stamp, in the message's order. It is taken as received when
+    its last pose was new, so earlier ones get their receive stamp set back by as much as their own stamps lie
+    before the last one's.
+
+    A CameraInfo's K is of the full sensor; region of interest and binning are applied, so that the
+    intrinsics are those of the pictures beside it.
+
+    Args:
+        message: of a topic that `kind_of` knows.
+        source: the log, for messages to the user.
+
+    Raises:
+        DataError: the type is not read, a field is missing or no number, a camera is not calibrated
+            (K is zero) or distorts in a way that is not known, or a path's poses have no stamps.
+    """
+    known = _READERS.get(message.topic.type)
+    if known is None:
+        raise DataError(source, f"topic {message.topic.name} holds {message.topic.type}, which is not read")
+    try:
+        _checked(message.receive_ns)
+        yield from known[1](message, source)
+    except AttributeError as error:
+        raise _unreadable(message, source, f"lacks the field {error.name!r}") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise _unreadable(message, source, f"cannot be read ({error})") from error
+
+
+def all_samples(messages: Iterable[Message], source: Source) -> Iterator[Sample]:
+    """What many messages say, in order; see `samples`.
+
+    A nav_msgs/Path repeats what earlier ones said and adds to it. Of each only the poses later than all
+    before on its topic are given: the poses as they were first published, as an odometry topic would have
+    them. Where a later path moves earlier poses (a loop was closed), that is not taken over.
+    """
+    newest: dict[str, int] = {}
+    for message in messages:
+        if message.topic.type != _PATH:
+            yield from samples(message, source)
+            continue
+        for sample in samples(message, source):
+            if sample.stamp_ns > newest.get(message.topic.name, -_LARGEST_STAMP_NS):
+                newest[message.topic.name] = sample.stamp_ns
+                yield sample
+
+
+def _unreadable(message: Message, source: Source, problem: str) -> DataError:
+    topic = message.topic
+    return DataError(
+        source, f"topic {topic.name}: a message of type {topic.type} {problem}", "check what wrote the log"
+    )
+
+
+# --- poses and transforms ------------------------------------------------------------------------------
+
+
+def _odometry(message: Message, _: Source) -> Iterator[Sample]:
+    value = message.value
+    yield _pose(
+        value.header, message.receive_ns, str(value.child_frame_id), value.pose.pose, value.pose.covariance
+    )
+
+
+def _pose_stamped(message: Message, _: Source) -> Iterator[Sample]:
+    yield _pose(message.value.header, message.receive_ns, "", message.value.pose)
+
+
+def _pose_with_covariance(message: Message, _: Source) -> Iterator[Sample]:
+    stated = message.value.pose
+    yield _pose(message.value.header, message.receive_ns, "", stated.pose, stated.covariance)
+
+
+def _path(message: Message, source: Source) -> Iterator[Sample]:
+    poses = message.value.poses
+    stamps = [nanoseconds(pose.header.stamp) for pose in poses]
+    if 0 in stamps:
+        raise DataError(
+            source,
+            f"topic {message.topic.name}: the poses of a path have no stamps of their own",
+            "name a topic of Odometry or PoseStamped instead",
+        )
+    for pose, stamp_ns in zip(poses, stamps, strict=True):
+        yield _pose(pose.header, _checked(message.receive_ns + stamp_ns - stamps[-1]), "", pose.pose)
+
+
+def _transform(message: Message, _: Source) -> Iterator[Sample]:
+    yield _link(message.value, message.receive_ns)
+
+
+def _transforms(message: Message, _: Source) -> Iterator[Sample]:
+    for stated in message.value.transforms:
+        yield _link(stated, message.receive_ns)
+
+
+def _foxglove_pose(message: Message, _: Source) -> Iterator[Sample]:
+    value = message.value
+    yield PoseSample(
+        stamp_ns=nanoseconds(value.timestamp),
+        receive_ns=message.receive_ns,
+        target=str(value.frame_id),
+        source="",
+        position=_vector(value.pose.position),
+        quaternion_xyzw=_quaternion(value.pose.orientation),
+    )
+
+
+def _foxglove_transform(message: Message, _: Source) -> Iterator[Sample]:
+    yield _foxglove_link(message.value, message.receive_ns)
+
+
+def _foxglove_transforms(message: Message, _: Source) -> Iterator[Sample]:
+    for stated in message.value.transforms:
+        yield _foxglove_link(stated, message.receive_ns)
+
+
+def _pose(header: Any, receive_ns: int, frame: str, pose: Any, covariance: Any = None) -> PoseSample:
+    return PoseSample(
+        stamp_ns=nanoseconds(header.stamp),
+        receive_ns=receive_ns,
+        target=str(header.frame_id),
+        source=frame,
+        position=_vector(pose.position),
+        quaternion_xyzw=_quaternion(pose.orientation),
+        covariance=None if covariance is None else _covariance(covariance),
+    )
+
+
+def _link(stated: Any, receive_ns: int) -> PoseSample:
+    return PoseSample(
+        stamp_ns=nanoseconds(stated.header.stamp),
+        receive_ns=receive_ns,
+        target=str(stated.header.frame_id),
+        source=str(stated.child_frame_id),
+        position=_vector(stated.transform.translation),
+        quaternion_xyzw=_quaternion(stated.transform.rotation),
+    )
+
+
+def _foxglove_link(stated: Any, receive_ns: int) -> PoseSample:
+    return PoseSample(
+        stamp_ns=nanoseconds(stated.timestamp),
+        receive_ns=receive_ns,
+        target=str(stated.parent_frame_id),
+        source=str(stated.child_frame_id),
+        position=_vector(stated.translation),
+        quaternion_xyzw=_quaternion(stated.rotation),
+    )
+
+
+# --- gimbal angles -------------------------------------------------------------------------------------
+
+
+def _quaternion_stamped(message: Message, _: Source) -> Iterator[Sample]:
+    value = message.value
+    yield AngleSample(
+        nanoseconds(value.header.stamp), message.receive_ns, None, _quaternion(value.quaternion)
+    )
+
+
+def _vector_stamped(message: Message, _: Source) -> Iterator[Sample]:
+    value = message.value
+    yield AngleSample(nanoseconds(value.header.stamp), message.receive_ns, _vector(value.vector), None)
+
+
+# --- intrinsics ----------------------------------------------------------------------------------------
+
+
+def _camera_info(message: Message, source: Source) -> Iterator[Sample]:
+    stamp = message.value.header.stamp
+    yield IntrinsicsSample(nanoseconds(stamp), message.receive_ns, _lens(message, source))
+
+
+def _foxglove_calibration(message: Message, source: Source) -> Iterator[Sample]:
+    stamp = message.value.timestamp
+    yield IntrinsicsSample(nanoseconds(stamp), message.receive_ns, _lens(message, source))
+
+
+def _lens(message: Message, source: Source) -> Intrinsics:
+    value, topic = message.value, message.topic.name
+    # ROS 1, and Foxglove outside ROS 2, write the matrices in capitals.
+    stated_matrix, stated_distortion = (value.k, value.d) if hasattr(value, "k") else (value.K, value.D)
+    matrix = np.asarray(stated_matrix, dtype=np.float64).reshape(3, 3)
+    distortion = np.asarray(stated_distortion, dtype=np.float64).tolist()
+    if not matrix[0, 0] or not matrix[1, 1]:
+        raise DataError(
+            source,
+            f"topic {topic}: the camera is not calibrated (focal lengths {matrix[0, 0]:g}, {matrix[1, 1]:g})",
+            "calibrate it, or give a calibration file under `intrinsics`",
+        )
+    model = value.distortion_model.lower()
+    if model not in _FISHEYE_MODELS | _RADTAN_MODELS and (model or any(distortion)):
+        raise DataError(
+            source,
+            f"topic {topic}: its distortion model {value.distortion_model!r} is none of"
+            f" {', '.join(sorted(_FISHEYE_MODELS | _RADTAN_MODELS))}",
+            "give a calibration file under `intrinsics`",
+        )
+    full = intrinsics(
+        source,
+        topic,
+        size=(value.width, value.height),
+        matrix=matrix,
+        distortion=distortion,
+        fisheye=model in _FISHEYE_MODELS,
+    )
+    return _of_the_picture(full, value)
+
+
+def _of_the_picture(full: Intrinsics, value: Any) -> Intrinsics:
+    """The sensor's intrinsics cut to the region of interest, then binned (sensor_msgs/CameraInfo)."""
+    bin_x, bin_y = max(getattr(value, "binning_x", 0), 1), max(getattr(value, "binning_y", 0), 1)
+    region = getattr(value, "roi", None)
+    if region is None or not region.width or not region.height:  # zero means the whole sensor
+        left, top, width, height = 0, 0, full.width, full.height
+    else:
+        left, top, width, height = region.x_offset, region.y_offset, region.width, region.height
+    if left < 0 or top < 0 or left + width > full.width or top + height > full.height:
+        raise ValueError(
+            f"its region of interest {width} x {height} at {left}, {top} leaves the sensor's"
+            f" {full.width} x {full.height}"
+        )
+    return replace(
+        full,
+        width=width // bin_x,
+        height=height // bin_y,
+        fx=full.fx / bin_x,
+        fy=full.fy / bin_y,
+        cx=(full.cx - left) / bin_x,
+        cy=(full.cy - top) / bin_y,
+    )
+
+
+# --- pictures ------------------------------------------------------------------------------------------
+
+
+def _compressed_image(message: Message, _: Source) -> Iterator[Sample]:
+    if isinstance(message.value, PictureFields):
+        yield _laid_out_picture(message.value, message.receive_ns)
+        return
+    yield _encoded_picture(message.value.header.stamp, message)
+
+
+def _image(message: Message, _: Source) -> Iterator[Sample]:
+    if isinstance(message.value, PictureFields):
+        yield _laid_out_picture(message.value, message.receive_ns)
+        return
+    yield _raw_picture(message.value.header.stamp, message)
+
+
+def _foxglove_compressed_image(message: Message, _: Source) -> Iterator[Sample]:
+    yield _encoded_picture(message.value.timestamp, message)
+
+
+def _foxglove_raw_image(message: Message, _: Source) -> Iterator[Sample]:
+    yield _raw_picture(message.value.timestamp, message)
+
+
+def _laid_out_picture(fields: PictureFields, receive_ns: int) -> PictureSample:
+    stamp_ns, stated, width, height, step, data = fields
+    encoding = _codec(data, stated) if width is None else stated
+    return PictureSample(stamp_ns, receive_ns, encoding, width, height, step, data)
+
+
+def _encoded_picture(stamp: Any, message: Message) -> PictureSample:
+    data = bytes_of(message.value.data)
+    return PictureSample(
+        stamp_ns=nanoseconds(stamp),
+        receive_ns=message.receive_ns,
+        encoding=_codec(data, str(getattr(message.value, "format", ""))),
+        width=None,
+        height=None,
+        step=None,
+        data=data,
+    )
+
+
+def _codec(data: NDArray[np.uint8], stated: str) -> str:
+    """By the first bytes: the stated format may say "jpeg", "bgr8; jpeg compressed bgr8" or nothing."""
+    start = data[:4].tobytes()
+    for signature, name in _SIGNATURES.items():
+        if start.startswith(signature):
+            return name
+    return stated.lower()
+
+
+def _raw_picture(stamp: Any, message: Message) -> PictureSample:
+    value = message.value
+    return PictureSample(
+        stamp_ns=nanoseconds(stamp),
+        receive_ns=message.receive_ns,
+        encoding=str(value.encoding),
+        width=operator.index(value.width),
+        height=operator.index(value.height),
+        step=operator.index(value.step),
+        data=bytes_of(value.data),
+    )
+
+
+# --- fields --------------------------------------------------------------------------------------------
+
+
+def nanoseconds(stamp: Any) -> int:
+    """A stamp of ROS (sec, nanosec), protobuf (seconds, nanos) or Foxglove's JSON (sec, nsec)."""
+    if hasattr(stamp, "seconds"):
+        whole, fraction = stamp.seconds, stamp.nanos
+    elif hasattr(stamp, "nanosec"):
+        whole, fraction = stamp.sec, stamp.nanosec
+    else:
+        whole, fraction = stamp.sec, stamp.nsec
+    return _checked(operator.index(whole) * 1_000_000_000 + operator.index(fraction))
+
+
+def _checked(stamp_ns: int) -> int:
+    if abs(stamp_ns) >= _LARGEST_STAMP_NS:
+        raise ValueError(f"its stamp of {stamp_ns // 1_000_000_000} s is no time")
+    return stamp_ns
+
+
+def _vector(value: Any) -> tuple[float, float, float]:
+    return float(value.x), float(value.y), float(value.z)
+
+
+def _quaternion(value: Any) -> tuple[float, float, float, float]:
+    return float(value.x), float(value.y), float(value.z), float(value.w)
+
+
+def _covariance(value: Any) -> Float:
+    return np.asarray(value, dtype=np.float64).reshape(6, 6)
+
+
+def bytes_of(data: Any) -> NDArray[np.uint8]:
+    """An array as it is, bytes viewed, base64 (JSON) decoded."""
+    if isinstance(data, np.ndarray):
+        if data.dtype.itemsize != 1:
+            raise ValueError(f"its data are {data.dtype}, not bytes")
+        return data.view(np.uint8)
+    if isinstance(data, str):
+        data = base64.b64decode(data, validate=True)
+    if isinstance(data, list):
+        data = bytes(data)
+    return np.frombuffer(data, dtype=np.uint8)
+
+
+_Reader = Callable[[Message, Source], Iterator[Sample]]
+_PATH = "nav_msgs/msg/Path"
+
+_ROS_READERS: dict[str, tuple[Kind, _Reader]] = {
+    "geometry_msgs/msg/PoseStamped": ("poses", _pose_stamped),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": ("poses", _pose_with_covariance),
+    "geometry_msgs/msg/QuaternionStamped": ("angles", _quaternion_stamped),
+    "geometry_msgs/msg/TransformStamped": ("poses", _transform),
+    "geometry_msgs/msg/Vector3Stamped": ("angles", _vector_stamped),
+    "nav_msgs/msg/Odometry": ("poses", _odometry),
+    _PATH: ("poses", _path),
+    "sensor_msgs/msg/CameraInfo": ("intrinsics", _camera_info),
+    "sensor_msgs/msg/CompressedImage": ("pictures", _compressed_image),
+    "sensor_msgs/msg/Image": ("pictures", _image),
+    "tf/msg/tfMessage": ("transforms", _transforms),
+    "tf2_msgs/msg/TFMessage": ("transforms", _transforms),
+}
+_FOXGLOVE_READERS: dict[str, tuple[Kind, _Reader]] = {
+    "CameraCalibration": ("intrinsics", _foxglove_calibration),
+    "CompressedImage": ("pictures", _foxglove_compressed_image),
+    "FrameTransform": ("transforms", _foxglove_transform),
+    "FrameTransforms": ("transforms", _foxglove_transforms),
+    "PoseInFrame": ("poses", _foxglove_pose),
+    "RawImage": ("pictures", _foxglove_raw_image),
+}
+_READERS: dict[str, tuple[Kind, _Reader]] = {
+    **_ROS_READERS,
+    **{f"foxglove.{name}": reader for name, reader in _FOXGLOVE_READERS.items()},
+    **{f"foxglove_msgs/msg/{name}": reader for name, reader in _FOXGLOVE_READERS.items()},
+}

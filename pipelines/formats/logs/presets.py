@@ -1,0 +1,410 @@
+"""The topics of known drivers: which hold position, attitude and gimbal, in what units and axes.
+
+What the drivers' sources say (docs/drones.md):
+
+`dji_osdk` (dji_sdk, dji_osdk_ros since 3.3): attitude is FLU in ENU; gps_position is NavSatFix;
+local_position is metres east, north, up of a reference set in flight; gimbal_angle is degrees in NED,
+counted from north whatever its frame_id says, as pitch, roll, yaw (M210, M300: subscription) or, where
+frame_id is ground_ENU, as roll, pitch, yaw (M100, M600 and others: broadcast).
+
+`mavros`: local_position and imu/data are ENU and FLU; global_position/global is NavSatFix above the
+ellipsoid; mount_control/orientation is a quaternion without a stamp, of FRD angles that count yaw from
+the nose.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from pipelines.formats.drone_logs.telemetry_rows import (
+    attitude_track,
+    placed_by,
+    position_track,
+    turned_as_stated,
+    world_from_heading,
+)
+from pipelines.formats.logs.messages import nanoseconds
+from pipelines.geometry.clocks import fit_clock
+from pipelines.geometry.mounting import attitude_in_enu
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import Axes
+from pipelines.session.records import Float, Int64
+from pipelines.session.registries import Log
+from pipelines.session.telemetry import (
+    AttitudeTrack,
+    Height,
+    PositionTrack,
+    Telemetry,
+    TelemetryChoice,
+)
+
+Preset = Literal["dji_osdk", "mavros"]
+Stamps = Literal["header", "receive"]
+Position = Literal["local", "global", "gps"]
+
+NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
+_NO_FIX = -1  # NavSatFix.status.status
+
+
+@dataclass(frozen=True)
+class _Driver:
+    """Where a driver's topics lie below its own name; the first that is there is taken."""
+
+    names: tuple[str, ...]
+    positions: dict[Position, tuple[str, ...]]
+    attitude: tuple[str, ...]
+    gimbal: tuple[str, ...]
+    height: Height
+
+
+DRIVERS: dict[Preset, _Driver] = {
+    "dji_osdk": _Driver(
+        names=("dji_sdk", "dji_osdk_ros"),
+        positions={"gps": ("gps_position",), "local": ("local_position",), "global": ("rtk_position",)},
+        attitude=("attitude",),
+        gimbal=("gimbal_angle",),
+        height="unknown",
+    ),
+    "mavros": _Driver(
+        names=("mavros",),
+        positions={
+            "local": ("local_position/pose", "local_position/odom"),
+            "global": ("global_position/global",),
+            "gps": ("global_position/raw/fix",),
+        },
+        attitude=("imu/data", "local_position/pose", "local_position/odom"),
+        gimbal=("mount_control/orientation",),
+        height="ellipsoid",
+    ),
+}
+
+
+@dataclass
+class _Rows:
+    """Numbers of one topic, with both of their stamps."""
+
+    header_ns: array[int] = field(default_factory=lambda: array("q"))
+    receive_ns: array[int] = field(default_factory=lambda: array("q"))
+    numbers: array[float] = field(default_factory=lambda: array("d"))
+    frames: set[str] = field(default_factory=set)
+
+    def times(self, stamps: Stamps) -> Int64:
+        header, receive = (
+            np.frombuffer(column, dtype=np.int64) for column in (self.header_ns, self.receive_ns)
+        )
+        return receive if stamps == "receive" else np.where(header == 0, receive, header)
+
+    def values(self) -> Float:
+        return np.frombuffer(self.numbers, dtype=np.float64).reshape(len(self.header_ns), -1)
+
+
+def namespaces(names: Sequence[str]) -> list[tuple[Preset, str]]:
+    """The drivers whose positions and attitudes are among some topics, each with what stands before its name.
+
+    `/uav1/mavros/imu/data` is mavros of `/uav1`.
+    """
+    found = []
+    for preset, driver in DRIVERS.items():
+        for base in driver.names:
+            for name in names:
+                before, mark, rest = name.rpartition(f"/{base}/")
+                if mark and any(rest in topics for topics in driver.positions.values()):
+                    found.append((preset, before))
+    return sorted(set(found))
+
+
+class Parts(NamedTuple):
+    """The topics of one drone that a preset reads."""
+
+    position: list[str]
+    attitude: list[str]
+    gimbal: list[str]
+
+
+def parts_of(preset: Preset, namespace: str, names: Sequence[str]) -> Parts:
+    """Those of some topics that a preset reads in a namespace."""
+    driver = DRIVERS[preset]
+
+    def among(parts: Iterable[str]) -> list[str]:
+        wanted = [f"{namespace}/{base}/{part}" for part in parts for base in driver.names]
+        return [name for name in wanted if name in names]
+
+    positions = (part for parts in driver.positions.values() for part in parts)
+    return Parts(among(positions), among(driver.attitude), among(driver.gimbal))
+
+
+def read_preset(
+    recording: Log,
+    source: str,
+    preset: Preset,
+    namespace: str | None,
+    choice: TelemetryChoice,
+    stamps: Stamps,
+) -> Telemetry:
+    """Position, attitude and gimbal of a drone, from the usual topics of its driver.
+
+    Args:
+        recording: the log.
+        source: its name, for messages.
+        preset: which driver.
+        namespace: what stands before the driver's name, where the log holds several drones.
+        choice: which of the positions.
+        stamps: which stamps of its messages count.
+
+    Raises:
+        DataError: no such topics, several drones, or nothing usable.
+    """
+    counts = {topic.name: topic.count for topic in recording.topics}
+    driver = DRIVERS[preset]
+    prefix = _prefix(source, preset, namespace, counts)
+
+    def first(parts: Sequence[str]) -> str | None:
+        topics = [f"{prefix}/{base}/{part}" for part in parts for base in driver.names]
+        return next((topic for topic in topics if counts.get(topic)), None)
+
+    wanted = [choice.position] if choice.position else list(driver.positions)
+    places = {kind: topic for kind in wanted if (topic := first(driver.positions[kind]))}
+    if not places:
+        there = [kind for kind, parts in driver.positions.items() if first(parts)]
+        raise DataError(
+            source,
+            f"has no {' or '.join(wanted)} position of {prefix}/{driver.names[0]}",
+            f"there is {', '.join(there)}" if there else "record its topics",
+        )
+    kind, place = next(iter(places.items()))
+    dropped: dict[str, int] = {}
+    notes = [f"{source}: took the {kind} position from {place}"]
+    position = _position(recording, source, place, driver.height, stamps, dropped)
+    fixes = first([part for kind in ("global", "gps") for part in driver.positions[kind]])
+    if not position.on_earth and fixes:
+        on_earth = _position(recording, source, fixes, driver.height, stamps, {})
+        position, said = placed_by(position, on_earth)
+        notes.append(f"{source}: {said}")
+
+    body: AttitudeTrack | None = None
+    if attitude := first(driver.attitude):
+        rows = _read(recording, source, attitude, _quaternion_of)
+        body = attitude_track(attitude, rows.times(stamps), rows.values(), dropped)
+    gimbal: AttitudeTrack | None = None
+    if angles := first(driver.gimbal):
+        gimbal = _gimbal(recording, source, angles, preset, body, stamps, dropped)
+    if said := _gps_time(recording, source, f"{prefix}/mavros/time_reference", counts):
+        notes.append(said)
+    return Telemetry(
+        position=position,
+        body=body,
+        gimbal=gimbal,
+        clock=f"{stamps} stamps",
+        notes=tuple(notes),
+        dropped=dropped,
+    )
+
+
+def read_pair(
+    recording: Log, source: str, position: str, attitude: str, axes: Axes, stamps: Stamps
+) -> Telemetry:
+    """A topic of positions (NavSatFix, PointStamped) and one of attitudes (Imu, QuaternionStamped).
+
+    Args:
+        recording: the log.
+        source: its name, for messages.
+        position: the topic of the positions.
+        attitude: the topic of the attitudes, of the body in the world.
+        axes: of attitudes and of positions in metres.
+        stamps: which stamps of its messages count.
+
+    Raises:
+        DataError: no such topics, or nothing usable in them.
+    """
+    counts = {topic.name: topic.count for topic in recording.topics}
+    for name in (position, attitude):
+        if not counts.get(name):
+            raise DataError(source, f"has no topic {name}, or nothing in it", "name another")
+    dropped: dict[str, int] = {}
+    track = _position(recording, source, position, "ellipsoid", stamps, dropped)
+    rows = _read(recording, source, attitude, _quaternion_of)
+    turned = rows.values()
+    if axes == "ned":
+        turned = attitude_in_enu(turned, relative_to="world", axes="ned")
+        if not track.on_earth:
+            track = replace(track, values=track.values[:, [1, 0, 2]] * [1, 1, -1])
+    return Telemetry(
+        position=track,
+        body=attitude_track(attitude, rows.times(stamps), turned, dropped),
+        gimbal=None,
+        clock=f"{stamps} stamps",
+        dropped=dropped,
+    )
+
+
+def read_positions(recording: Log, source: str, topic: str, stamps: Stamps) -> PositionTrack:
+    """A topic of positions alone.
+
+    Raises:
+        DataError: nothing usable in it.
+    """
+    return _position(recording, source, topic, "ellipsoid", stamps, {})
+
+
+def _prefix(source: str, preset: Preset, namespace: str | None, counts: dict[str, int]) -> str:
+    there = [before for known, before in namespaces(list(counts)) if known == preset]
+    if namespace is not None:
+        wanted = namespace.rstrip("/")
+        wanted = wanted if wanted.startswith("/") or not wanted else f"/{wanted}"
+        if wanted not in there:
+            listed = ", ".join(before or "/" for before in there) or "none"
+            raise DataError(
+                source, f"has no {preset} topics in {namespace}", f"namespaces with them: {listed}"
+            )
+        return wanted
+    if not there:
+        raise DataError(
+            source,
+            f"has no topics of {preset} ({'/'.join(DRIVERS[preset].names)}/...)",
+            "name the topic of the poses instead",
+        )
+    if len(there) > 1:
+        raise DataError(
+            source,
+            f"holds {preset} topics of {len(there)} drones ({', '.join(before or '/' for before in there)})",
+            "say which with `namespace:`",
+        )
+    return there[0]
+
+
+# --- topics --------------------------------------------------------------------------------------------
+
+
+def _position(
+    recording: Log,
+    source: str,
+    topic: str,
+    height: Height,
+    stamps: Stamps,
+    dropped: dict[str, int],
+) -> PositionTrack:
+    type_ = next(known.type for known in recording.topics if known.name == topic)
+    if type_ != NAV_SAT_FIX:
+        rows = _read(recording, source, topic, _point_of)
+        return position_track(source, topic, rows.times(stamps), rows.values(), dropped, on_earth=False)
+    rows = _read(recording, source, topic, _fix_of)
+    values = rows.values()
+    track = position_track(
+        source,
+        topic,
+        rows.times(stamps),
+        values[:, :3],
+        dropped,
+        on_earth=True,
+        height=height,
+        unusable={"no fix": values[:, 3] <= _NO_FIX},
+    )
+    variance = values[(values[:, 4] > 0) & (values[:, 5] > 0)][:, 4:]
+    if not len(variance):
+        return track
+    sigma = np.sqrt(np.median(variance, axis=0))
+    return replace(track, accuracy_m=(float(sigma[0]), float(sigma[1])))
+
+
+def _gimbal(
+    recording: Log,
+    source: str,
+    topic: str,
+    preset: Preset,
+    body: AttitudeTrack | None,
+    stamps: Stamps,
+    dropped: dict[str, int],
+) -> AttitudeTrack | None:
+    if preset == "mavros":
+        if body is None:
+            return None
+        rows = _read(recording, source, topic, _quaternion_of)
+        t_ns = rows.times(stamps)
+        return attitude_track(topic, t_ns, world_from_heading(body, t_ns, rows.values()), dropped)
+    rows = _read(recording, source, topic, _vector_of)
+    order = "rpy" if "ground_ENU" in rows.frames else "pry"
+    angles = rows.values()[:, [order.index(letter) for letter in "ypr"]]
+    return attitude_track(topic, rows.times(stamps), turned_as_stated(angles), dropped)
+
+
+def _gps_time(recording: Log, source: str, topic: str, counts: dict[str, int]) -> str:
+    """How the recorder's clock goes against the time that the autopilot has from GPS; empty without it."""
+    if not counts.get(topic):
+        return ""
+    pairs = [
+        (nanoseconds(message.value.header.stamp), nanoseconds(message.value.time_ref))
+        for message in recording.messages([topic])
+    ]
+    stamped = np.array([pair for pair in pairs if min(pair) > 0], dtype=np.int64).reshape(-1, 2)
+    fit = fit_clock(stamped[:, 0], stamped[:, 1])
+    if fit is None:
+        return ""
+    return (
+        f"{source}: GPS time is {fit.offset_ns / 1e9:.3f} s ahead of its stamps, drifting"
+        f" {fit.drift_ppm:.1f} ppm (+- {fit.drift_sigma_ppm:.1f}; {topic}, not applied)"
+    )
+
+
+def _read(recording: Log, source: str, topic: str, numbers: Callable[[Any], Sequence[float]]) -> _Rows:
+    """The numbers of every message of a topic.
+
+    Raises:
+        DataError: a message lacks a field, or holds what is no number.
+    """
+    rows = _Rows()
+    for message in recording.messages([topic]):
+        value = message.value
+        try:
+            header = getattr(value, "header", None)
+            said = [float(number) for number in numbers(value)]
+            rows.header_ns.append(0 if header is None else nanoseconds(header.stamp))
+            rows.receive_ns.append(message.receive_ns)
+            rows.numbers.extend(said)
+            if header is not None:
+                rows.frames.add(str(header.frame_id))
+        except (AttributeError, TypeError, ValueError, OverflowError) as error:
+            raise DataError(
+                source,
+                f"topic {topic}: a message of type {message.topic.type} cannot be read ({error})",
+                "check what wrote the log",
+            ) from error
+    return rows
+
+
+def _point_of(value: Any) -> Sequence[float]:
+    """PointStamped, PoseStamped or Odometry."""
+    if hasattr(value, "point"):
+        point = value.point
+    else:
+        pose = value.pose
+        point = (pose.pose if hasattr(pose, "pose") else pose).position
+    return point.x, point.y, point.z
+
+
+def _fix_of(value: Any) -> Sequence[float]:
+    """Latitude, longitude, altitude, status, and variances across and in height (0 where unknown)."""
+    covariance = np.asarray(value.position_covariance, dtype=np.float64).reshape(3, 3)
+    known = bool(value.position_covariance_type)
+    across = (covariance[0, 0] + covariance[1, 1]) / 2
+    variances = (float(across), float(covariance[2, 2])) if known else (0.0, 0.0)
+    return value.latitude, value.longitude, value.altitude, value.status.status, *variances
+
+
+def _quaternion_of(value: Any) -> Sequence[float]:
+    """Quaternion, QuaternionStamped, Imu, PoseStamped or Odometry."""
+    turned = value
+    for part in ("quaternion", "orientation"):
+        turned = getattr(turned, part, turned)
+    if hasattr(value, "pose"):
+        pose = value.pose
+        turned = (pose.pose if hasattr(pose, "pose") else pose).orientation
+    return turned.x, turned.y, turned.z, turned.w
+
+
+def _vector_of(value: Any) -> Sequence[float]:
+    return value.vector.x, value.vector.y, value.vector.z

@@ -1,0 +1,399 @@
+"""A log as files that each list their messages: topics, order of receipt over all files, and what is lost.
+
+A part (one file) knows where every message lies before any is read. So messages come in order and
+filtered without being held, and every loss has a cause and a number.
+"""
+
+from __future__ import annotations
+
+import heapq
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.formats.logs.message_decoders import Decoder, Schema, decoder
+from pipelines.session.errors import DataError
+from pipelines.session.records import Int64, Message, Topic
+
+UNDEFINED = "messages without a usable definition"
+UNDECODABLE = "messages that cannot be decoded"
+DAMAGED = "messages in damaged blocks"
+MISPLACED = "messages that are not where the index says"
+UNNAMED = "messages of unknown topics"
+TRUNCATED = "file truncated"
+UNCLOSED = "recording not closed"
+TAIL = "bytes after the last complete record"
+
+_BATCH = 1 << 16  # messages whose places are plain numbers at a time: 10 MB
+_HEADS = 4096  # messages whose heads are read at a time
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A topic as one file names it, and how its messages are written."""
+
+    topic: str
+    schema: Schema
+
+
+@dataclass(frozen=True)
+class MessageTable:
+    """Where the messages of a file are, in the order of the file; all arrays are [M]."""
+
+    channel: Int64
+    stamp_ns: Int64  # of receipt
+    block: Int64  # what must be read together; 0 where there are no blocks
+    place: Int64  # within the block
+    size: Int64  # bytes, uncompressed; what lies between two messages counts to the first of them
+
+
+class UnlikeError(Exception):
+    """Messages that cannot be read as one array."""
+
+
+class LogPart(ABC):
+    """One open file of a log."""
+
+    def __init__(self, path: Path, file_size: int) -> None:
+        self.path = path
+        self.file_size = file_size
+        self.channels: dict[int, Channel] = {}
+        self.storage: list[str] = []  # how it is stored, for `mocap info`
+        self.lost: Counter[str] = Counter()  # of the file as a whole
+        self.table = _empty_table()
+        self._fates: NDArray[np.uint8] = np.zeros(0, np.uint8)
+        self._causes = [""]
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the file."""
+
+    @abstractmethod
+    def read(self, rows: Int64) -> Iterator[tuple[int, memoryview | bytes]]:
+        """The bytes of messages, by rows of the table; rows that cannot be read are given to `lose`."""
+
+    @abstractmethod
+    def read_alike(self, rows: Int64) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
+        """The bytes of messages that are all of one length, many at a time.
+
+        Yields:
+            Rows of the table, increasing, and their messages [n, length]. Rows that cannot be read are
+            given to `lose`.
+
+        Args:
+            rows: of one channel, increasing.
+
+        Raises:
+            UnlikeError: their records or lengths differ, or one is not where the index says.
+        """
+
+    def read_heads(self, rows: Int64, length: int) -> Iterator[tuple[Int64, Int64, NDArray[np.uint8]]]:
+        """The first bytes of messages, many at a time.
+
+        Yields:
+            Rows of the table, in the order given; how many bytes each message has [n]; its first ones
+            [n, length], zeros behind the end of a shorter one. Rows that cannot be read, be it behind
+            their heads, are given to `lose`.
+        """
+        for start in range(0, len(rows), _HEADS):
+            batch = rows[start : start + _HEADS]
+            found = [(k, len(data), bytes(data[:length])) for k, data in self.read(batch)]
+            if found:
+                which, sizes, heads = zip(*found, strict=True)
+                yield batch[list(which)], np.array(sizes, np.int64), joined_heads(heads, length)
+
+    def take(self, table: MessageTable) -> None:
+        """Hold the messages that were found, without those of channels that nothing names."""
+        named = np.isin(table.channel, list(self.channels))
+        if strangers := int(np.count_nonzero(~named)):
+            self.lost[UNNAMED] += strangers
+            table = MessageTable(
+                table.channel[named],
+                table.stamp_ns[named],
+                table.block[named],
+                table.place[named],
+                table.size[named],
+            )
+        self.table = table
+        self._fates = np.zeros(len(table.channel), np.uint8)
+
+    def lose(self, rows: Int64 | int, cause: str) -> None:
+        """Note why messages could not be read; noting it again, on a second reading, changes nothing."""
+        if cause not in self._causes:
+            self._causes.append(cause)
+        self._fates[rows] = self._causes.index(cause)
+
+    def forget(self) -> None:
+        """Forget what the readings so far lost; what the file as a whole lost stays."""
+        self._fates[:] = 0
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Everything that was lost so far, by cause."""
+        counts = np.bincount(self._fates, minlength=len(self._causes))[1:]
+        return self.lost + Counter(dict(zip(self._causes[1:], counts.tolist(), strict=True)))
+
+    def rows_of(self, channels: Collection[int]) -> Int64:
+        """The rows of some channels, in the order of receipt; at equal stamps in the order of the file."""
+        rows = np.flatnonzero(np.isin(self.table.channel, list(channels)))
+        return rows[np.argsort(self.table.stamp_ns[rows], kind="stable")].astype(np.int64)
+
+
+class OpenLog:
+    """An open log of one or more parts."""
+
+    def __init__(self, parts: Sequence[LogPart], lost: Counter[str]) -> None:
+        self.parts = parts
+        self._lost = lost
+        self._topics = {key: self._summary(*key) for key in sorted(self._keys())}
+
+    def __enter__(self) -> OpenLog:
+        """The log itself."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Close the files."""
+        for part in self.parts:
+            part.close()
+
+    @property
+    def topics(self) -> Sequence[Topic]:
+        """The channels, by name; a name whose messages are of two types stands there twice."""
+        return list(self._topics.values())
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """What could not be read so far, counted by cause: of the files, then of the messages asked for."""
+        total = sum((part.dropped for part in self.parts), Counter(self._lost))
+        return dict(sorted(total.items()))
+
+    def forget(self) -> None:
+        """Forget what the readings so far lost, so that `dropped` is of the next one alone."""
+        for part in self.parts:
+            part.forget()
+
+    def messages(
+        self, topics: Collection[str], decoder_of: Callable[[Schema], Decoder] = decoder
+    ) -> Iterator[Message]:
+        """The messages of some topics in the order of receipt; others are neither read nor decoded.
+
+        Args:
+            topics: their names.
+            decoder_of: makes the function that decodes messages of a schema, as `decoder` does.
+        """
+        streams = [self._of_part(part, frozenset(topics), decoder_of) for part in self.parts]
+        return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("receive_ns"))
+
+    def arrays(self, topic: Topic) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
+        """The messages of a topic as arrays: stamps of receipt [n] and bytes [n, length].
+
+        In the order of the files; a stable sort by the stamps gives that of `messages`.
+
+        Raises:
+            UnlikeError: the messages of a file are not of one channel and one length.
+        """
+        for part in self.parts:
+            channels = _channels_of(part, topic.name, topic.type, topic.encoding)
+            if len(channels) > 1:
+                raise UnlikeError
+            for rows, data in part.read_alike(np.sort(part.rows_of(channels))):
+                yield part.table.stamp_ns[rows], data
+
+    def heads(self, topic: Topic, length: int) -> Iterator[tuple[Int64, Int64, NDArray[np.uint8]]]:
+        """How the messages of a topic begin: stamps of receipt [n], sizes [n], first bytes [n, length].
+
+        In the order of the files; a stable sort by the stamps gives that of `messages`. Behind the end of
+        a message that is shorter stand zeros.
+        """
+        for part in self.parts:
+            rows = part.rows_of(_channels_of(part, topic.name, topic.type, topic.encoding))
+            for found, sizes, heads in part.read_heads(np.sort(rows), length):
+                yield part.table.stamp_ns[found], sizes, heads
+
+    def schemas(self, topic: Topic) -> set[Schema]:
+        """How the messages of a topic are written; parts may differ."""
+        return {
+            part.channels[channel].schema
+            for part in self.parts
+            for channel in _channels_of(part, topic.name, topic.type, topic.encoding)
+        }
+
+    def stamps(self, topic: Topic) -> Int64:
+        """When the messages of a topic were received, sorted."""
+        stamps = [
+            part.table.stamp_ns[part.rows_of(_channels_of(part, topic.name, topic.type, topic.encoding))]
+            for part in self.parts
+        ]
+        return np.sort(np.concatenate(stamps))
+
+    def size(self, topic: Topic) -> int:
+        """How many bytes the messages of a topic have, uncompressed."""
+        return sum(
+            int(
+                part.table.size[
+                    part.rows_of(_channels_of(part, topic.name, topic.type, topic.encoding))
+                ].sum()
+            )
+            for part in self.parts
+        )
+
+    def problem(self, topic: Topic) -> str:
+        """Why the messages of a topic cannot be decoded; empty if they can."""
+        for part in self.parts:
+            for channel in _channels_of(part, topic.name, topic.type, topic.encoding):
+                try:
+                    decoder(part.channels[channel].schema)
+                except ValueError as error:
+                    return str(error)
+        return ""
+
+    def _of_part(
+        self, part: LogPart, topics: frozenset[str], decoder_of: Callable[[Schema], Decoder]
+    ) -> Iterator[Message]:
+        decoders = {}
+        for number, channel in part.channels.items():
+            if channel.topic in topics:
+                try:
+                    decoders[number] = decoder_of(channel.schema), self._topics[_key(channel)]
+                except ValueError:
+                    part.lose(part.rows_of([number]), UNDEFINED)
+        rows = part.rows_of(decoders)
+        for start in range(0, len(rows), _BATCH):
+            batch = rows[start : start + _BATCH]
+            stamps = part.table.stamp_ns[batch].tolist()
+            channels = part.table.channel[batch].tolist()
+            for k, data in part.read(batch):
+                decode, topic = decoders[channels[k]]
+                try:
+                    value = decode(data)
+                except ValueError:
+                    part.lose(int(batch[k]), UNDECODABLE)
+                    continue
+                yield Message(topic, stamps[k], value)
+
+    def _keys(self) -> set[tuple[str, str, str]]:
+        return {_key(channel) for part in self.parts for channel in part.channels.values()}
+
+    def _summary(self, name: str, type_: str, encoding: str) -> Topic:
+        stamps = self.stamps(Topic(name, type_, encoding, 0, None, None))
+        first, last = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (None, None)
+        return Topic(name, type_, encoding, len(stamps), first, last)
+
+
+def joined_heads(heads: Sequence[bytes], length: int) -> NDArray[np.uint8]:
+    """The first bytes of messages as one array [n, length], zeros behind those that are shorter."""
+    whole = b"".join(head.ljust(length, b"\0") for head in heads)
+    return np.frombuffer(whole, np.uint8).reshape(-1, length)
+
+
+def open_file(path: Path) -> tuple[IO[bytes], int]:
+    """A file and its size.
+
+    Raises:
+        DataError: missing, not a file, not allowed, or empty.
+    """
+    try:
+        size = path.stat().st_size
+        if not size:
+            raise DataError(path, "is empty (0 bytes)", "copy it again from the drone")
+        return path.open("rb"), size
+    except OSError as error:
+        raise DataError(path, f"cannot be opened ({error.strerror})", "check the path") from None
+
+
+def open_parts(
+    paths: Sequence[Path], open_part: Callable[[Path], LogPart]
+) -> tuple[list[LogPart], Counter[str]]:
+    """Open the files of a recording; those that cannot be read are counted.
+
+    Raises:
+        DataError: none can be read; the first one's reason.
+    """
+    parts: list[LogPart] = []
+    refusals: list[DataError] = []
+    for path in paths:
+        try:
+            parts.append(open_part(path))
+        except DataError as error:
+            refusals.append(error)
+        except BaseException:
+            for part in parts:
+                part.close()
+            raise
+    if refusals and not parts:
+        raise refusals[0]
+    return parts, Counter({"files that cannot be read": len(refusals)} if refusals else {})
+
+
+def require_content(part: LogPart) -> None:
+    """Refuse a damaged file that gave nothing; a whole file without messages is fine.
+
+    Raises:
+        DataError: something was lost and nothing is there.
+    """
+    if part.lost and not len(part.table.stamp_ns):
+        causes = ", ".join(f"{cause}: {count}" for cause, count in sorted(part.lost.items()))
+        part.close()
+        raise DataError(
+            part.path, f"holds no message that can be read ({causes})", "copy it again from the drone"
+        )
+
+
+def describe_log(log: OpenLog) -> dict[str, object]:
+    """Files, messages, times and storage of a log, each topic, and what was lost by cause."""
+    topics = log.topics
+    first = min((t.first_ns for t in topics if t.first_ns is not None), default=None)
+    last = max((t.last_ns for t in topics if t.last_ns is not None), default=None)
+    facts: dict[str, object] = {
+        "files": len(log.parts),
+        "storage": sorted({word for part in log.parts for word in part.storage}),
+        "size_bytes": sum(part.file_size for part in log.parts),
+        "messages": sum(topic.count for topic in topics),
+    }
+    if first is not None and last is not None:
+        facts |= {"first_ns": first, "last_ns": last, "span_s": (last - first) / 1e9}
+    facts["topics"] = {_unambiguous(topic, topics): _describe_topic(log, topic) for topic in topics}
+    return facts | {f"dropped: {cause}": count for cause, count in log.dropped.items()}
+
+
+def _describe_topic(log: OpenLog, topic: Topic) -> dict[str, object]:
+    facts: dict[str, object] = {
+        "type": topic.type,
+        "encoding": topic.encoding,
+        "messages": topic.count,
+        "size_bytes": log.size(topic),
+    }
+    if topic.first_ns is not None and topic.last_ns is not None:
+        span_ns = topic.last_ns - topic.first_ns
+        facts |= {"first_ns": topic.first_ns, "last_ns": topic.last_ns}
+        if span_ns:
+            facts["rate_hz"] = round((topic.count - 1) / span_ns * 1e9, 3)
+            facts["longest_gap_s"] = round(int(np.diff(log.stamps(topic)).max()) / 1e9, 6)
+    if problem := log.problem(topic):
+        facts["cannot be decoded"] = problem
+    return facts
+
+
+def _unambiguous(topic: Topic, topics: Sequence[Topic]) -> str:
+    alone = sum(other.name == topic.name for other in topics) == 1
+    return topic.name if alone else f"{topic.name} ({topic.type})"
+
+
+def _key(channel: Channel) -> tuple[str, str, str]:
+    return channel.topic, channel.schema.type, channel.schema.encoding
+
+
+def _channels_of(part: LogPart, name: str, type_: str, encoding: str) -> list[int]:
+    return [number for number, channel in part.channels.items() if _key(channel) == (name, type_, encoding)]
+
+
+def _empty_table() -> MessageTable:
+    none = np.zeros(0, np.int64)
+    return MessageTable(none, none, none, none, none)

@@ -1,0 +1,253 @@
+"""ROS 1 bags, version 2.0 (wiki.ros.org/Bags/Format/2.0), whole or cut off.
+
+rosbags decodes the messages. Its reader refuses bags whose index was not written and bags that end early,
+so the records are walked here.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.formats.logs.chunked_logs import Chunk, ChunkedPart, Content, RecordShape
+from pipelines.formats.logs.message_decoders import Schema, ros2_name
+from pipelines.formats.logs.recordings import Channel, OpenLog, describe_log, open_file, open_parts
+from pipelines.session.errors import DataError
+from pipelines.session.records import Int64
+
+_MAGIC = re.compile(rb"#ROSBAG V(\d+)\.(\d+)\n")
+_MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
+_HEADER_LIMIT = 1 << 20  # bytes of a record's header; real ones have some hundred
+_U32 = struct.Struct("<I")
+_U64 = struct.Struct("<Q")
+_STAMP = struct.Struct("<II")
+_INDEX_ROW = np.dtype([("s", "<u4"), ("ns", "<u4"), ("place", "<u4")])
+
+Fields = dict[bytes, bytes]
+
+
+class Ros1Bag:
+    """ROS 1 bags; chunks uncompressed, bz2 or lz4."""
+
+    name = "ros1"
+    title = "ROS 1 bag"
+    suffixes: tuple[str, ...] = (".bag",)
+
+    def recognises(self, path: Path) -> bool:
+        """Whether the file begins as a bag does, or is an empty one."""
+        try:
+            with path.open("rb") as file:
+                head = file.read(16)
+        except OSError:
+            return False
+        return bool(_MAGIC.match(head)) or (not head and path.suffix.lower() in self.suffixes)
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Messages, times, storage, topics, and what was lost."""
+        with self.open_log([path]) as log:
+            return describe_log(log)
+
+    def open_log(self, paths: Sequence[Path]) -> OpenLog:
+        """Open one bag, or several as one recording.
+
+        Raises:
+            DataError: no file can be read as a bag, or holds anything.
+        """
+        return OpenLog(*open_parts(paths, _open_part))
+
+
+@dataclass(frozen=True)
+class _Head:
+    """The head of a channel's messages, which differ in the stamp alone where one writer wrote them."""
+
+    layout: struct.Struct  # what stands before the stamp, the stamp, what stands behind it, the length
+    before: bytes
+    behind: bytes
+
+    def message(self, content: memoryview, place: int, stamp_ns: int) -> memoryview | None:
+        """The message whose head is here and has this stamp; None if another thing is."""
+        data_at = place + self.layout.size
+        if place < 0 or data_at > len(content):
+            return None
+        before, seconds, nanoseconds, behind, length = self.layout.unpack_from(content, place)
+        same = before == self.before and behind == self.behind
+        if not same or seconds * 10**9 + nanoseconds != stamp_ns or data_at + length > len(content):
+            return None
+        return content[data_at : data_at + length]
+
+
+class _Bag(ChunkedPart):
+    record_overhead = 46  # lengths of header and message, and the header's fields op, conn and time
+
+    def walk(self) -> tuple[int, bool]:
+        """Walk the records up to the end of the file or to the first that is not whole."""
+        self._heads: dict[int, _Head] = {}
+        position, chunks_stated = self._bag_header()
+        while position < self.file_size:
+            try:
+                fields, data_at, length = self._record(position)
+                kind = fields[b"op"][0]
+                end = data_at + length
+                if kind == _CHUNK:
+                    self._take_chunk(fields, data_at, length)
+                if end > self.file_size:
+                    break
+                if kind == _INDEX and self.chunks:
+                    self.chunks[-1].index.append(self._index_rows(fields, data_at, length))
+                elif kind == _CONNECTION:
+                    self._take_connection(fields, self.bytes_at(data_at, length))
+            except (struct.error, ValueError, KeyError, IndexError):
+                break
+            position = end
+        return position, position == self.file_size and chunks_stated == len(self.chunks)
+
+    def look(self, content: memoryview) -> Content:
+        """Find messages and connections in a chunk."""
+        channels: dict[int, Channel] = {}
+        index: list[tuple[int, int, int]] = []
+        position = 0
+        while position < len(content):
+            try:
+                fields, data_at, length = _parse_record(content, position)
+                if data_at + length > len(content):
+                    break
+                if fields[b"op"][0] == _MESSAGE:
+                    stamp = _stamp(fields)
+                    index.append((_U32.unpack(fields[b"conn"])[0], stamp, position))
+                elif fields[b"op"][0] == _CONNECTION:
+                    number, channel = _connection(fields, bytes(content[data_at : data_at + length]))
+                    channels[number] = channel
+            except (struct.error, ValueError, KeyError, IndexError):
+                break
+            position = data_at + length
+        return Content(channels, index, position)
+
+    def payload(self, content: memoryview, place: int, channel: int, stamp_ns: int) -> memoryview:
+        """The bytes of a message; some writers let the index point to the connection before it."""
+        head = self._heads.get(channel)
+        if head is not None and (data := head.message(content, place, stamp_ns)) is not None:
+            return data
+        try:
+            fields, data_at, length = _parse_record(content, place)
+            while fields[b"op"][0] == _CONNECTION:
+                fields, data_at, length = _parse_record(content, data_at + length)
+            right = (
+                fields[b"op"][0] == _MESSAGE
+                and _U32.unpack(fields[b"conn"])[0] == channel
+                and _stamp(fields) == stamp_ns
+                and data_at + length <= len(content)
+            )
+        except (struct.error, KeyError, IndexError) as error:
+            raise ValueError("no record here") from error
+        if not right:
+            raise ValueError("another record")
+        if channel not in self._heads:
+            self._heads[channel] = _head(bytes(content[place:data_at]), fields[b"time"])
+        return content[data_at : data_at + length]
+
+    def shape(self, content: memoryview, place: int) -> RecordShape:
+        """Only the stamp differs."""
+        fields, data_at, length = _parse_record(content, place)
+        head = _head(bytes(content[place:data_at]), fields[b"time"])
+        stamp = slice(len(head.before), len(head.before) + _STAMP.size)
+        return RecordShape(head.layout.size, length, stamp, stamp)
+
+    def stamp_bytes(self, stamp_ns: Int64) -> NDArray[np.uint8]:
+        """Seconds and nanoseconds."""
+        return np.stack(np.divmod(stamp_ns, 10**9), axis=1).astype("<u4").view(np.uint8)
+
+    def _bag_header(self) -> tuple[int, int]:
+        """Where the first record after the bag's header begins, and how many chunks that header states."""
+        head = self.bytes_at(0, 16)
+        match = _MAGIC.match(head)
+        if not match:
+            raise DataError(self.path, "is no ROS 1 bag (the first line is not `#ROSBAG V2.0`)")
+        if (version := b".".join(match.groups()).decode()) != "2.0":
+            raise DataError(self.path, f"is a bag of version {version}", "convert it with `rosbag fix`")
+        try:
+            fields, data_at, length = self._record(match.end())
+            if fields.get(b"encryptor"):
+                raise DataError(self.path, "is encrypted", "record or convert it without encryption")
+            closed = _U64.unpack(fields[b"index_pos"])[0] > 0
+            return data_at + length, _U32.unpack(fields[b"chunk_count"])[0] if closed else -1
+        except (struct.error, ValueError, KeyError):
+            return match.end(), -1
+
+    def _record(self, position: int) -> tuple[Fields, int, int]:
+        """Fields of the record's header; where its data begins in the file; how long it is said to be."""
+        header_length = _U32.unpack(self.bytes_at(position, 4))[0]
+        if header_length > _HEADER_LIMIT:
+            raise ValueError("no header")
+        head = memoryview(self.bytes_at(position, 4 + header_length + 4))
+        fields, data_at, length = _parse_record(head, 0)
+        return fields, position + data_at, length
+
+    def _take_chunk(self, fields: Fields, data_at: int, length: int) -> None:
+        compression = fields[b"compression"].decode()
+        here = min(length, self.file_size - data_at)
+        chunk = Chunk(data_at, here, compression, _U32.unpack(fields[b"size"])[0], cut=here < length)
+        self.chunks.append(chunk)
+        if compression not in self.storage:
+            self.storage.append(compression)
+
+    def _take_connection(self, fields: Fields, data: bytes) -> None:
+        number, channel = _connection(fields, data)
+        self.channels.setdefault(number, channel)
+
+    def _index_rows(self, fields: Fields, data_at: int, length: int) -> Int64:
+        raw = np.frombuffer(self.bytes_at(data_at, length - length % _INDEX_ROW.itemsize), _INDEX_ROW)
+        stamp = raw["s"].astype(np.int64) * 10**9 + raw["ns"]
+        connection = np.full(len(raw), _U32.unpack(fields[b"conn"])[0], np.int64)
+        return np.stack([connection, stamp, raw["place"].astype(np.int64)], axis=1)
+
+
+def _parse_record(content: memoryview, position: int) -> tuple[Fields, int, int]:
+    """Fields of the header of a record; where its data begins; how long it is said to be."""
+    header_end = position + 4 + _U32.unpack_from(content, position)[0]
+    (length,) = _U32.unpack_from(content, header_end)
+    return _fields(bytes(content[position + 4 : header_end])), header_end + 4, length
+
+
+def _head(head: bytes, stamp: bytes) -> _Head:
+    """What stands about the stamp in the bytes from a message's place to its data."""
+    before, name, behind = head.partition(b"time=")
+    behind = behind[len(stamp) : -_U32.size]
+    layout = struct.Struct(f"<{len(before + name)}sII{len(behind)}sI")
+    return _Head(layout, before + name, behind)
+
+
+def _fields(header: bytes) -> Fields:
+    fields: Fields = {}
+    position = 0
+    while position < len(header):
+        end = position + 4 + _U32.unpack_from(header, position)[0]
+        name, separator, value = header[position + 4 : end].partition(b"=")
+        if not separator or end > len(header):
+            raise ValueError("no field")
+        fields[name] = value
+        position = end
+    return fields
+
+
+def _stamp(fields: Fields) -> int:
+    seconds, nanoseconds = _STAMP.unpack(fields[b"time"])
+    return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def _connection(fields: Fields, data: bytes) -> tuple[int, Channel]:
+    about = _fields(data)
+    schema = Schema(ros2_name(about[b"type"].decode()), "ros1", "ros1msg", about[b"message_definition"])
+    return _U32.unpack(fields[b"conn"])[0], Channel(fields[b"topic"].decode(), schema)
+
+
+def _open_part(path: Path) -> _Bag:
+    return _Bag(path, *open_file(path))
+
+
+FORMAT = Ros1Bag()

@@ -1,0 +1,360 @@
+"""Samples of a log to trajectories: of poses, of a chain of transforms, of a gimbal.
+
+Samples are taken one at a time into flat arrays (72 bytes a pose, 288 more with a covariance), so a log
+of any length streams through.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pipelines.formats.logs.fixed_layouts import PoseArrays
+from pipelines.formats.poses.pose_rows import clean_poses
+from pipelines.geometry.clocks import ClockFit, fit_clock
+from pipelines.geometry.mounting import attitude_from_angles
+from pipelines.geometry.pose_covariance import pose_covariance_in_body
+from pipelines.geometry.transform_tree import Link, chain, find_route
+from pipelines.session.errors import DataError
+from pipelines.session.records import AngleSample, Float, Int64, PoseSample, Sample, Trajectory
+
+Stamps = Literal["header", "receive"]
+Source = Path | str
+Edge = tuple[str, str]
+"""Target and source of a transform."""
+
+
+@dataclass(frozen=True)
+class ClockJump:
+    """Where header stamps jump against the stamps of receipt."""
+
+    index: int  # of the first sample after the jump, in the order of receipt
+    header_ns: int  # its header stamp
+    jump_s: float  # negative is backward
+
+
+@dataclass(frozen=True)
+class StampCheck:
+    """How header stamps and stamps of receipt go together."""
+
+    count: int  # samples
+    without_header: int  # had no header stamp: that of receipt stands for it
+    disagreeing: int  # of the others, header and receipt further apart than they may
+    largest_disagreement_s: float  # header - receipt, where that is largest in size
+    jumps: tuple[ClockJump, ...]
+    drift: ClockFit | None = None  # from receipt to header, where both are stated
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """A trajectory from a log, and what is to be said of its stamps."""
+
+    trajectory: Trajectory
+    stamps: StampCheck
+    frames: Edge  # as the log names them; empty where it does not
+
+
+@dataclass(frozen=True)
+class TransformLog:
+    """Every transform that a log states, by target and source."""
+
+    moving: Mapping[Edge, SampleRows]
+    static: Mapping[Edge, SampleRows]
+
+
+class SampleRows:
+    """Samples of one thing, gathered into flat arrays."""
+
+    def __init__(self) -> None:
+        self._header_ns = array("q")
+        self._receive_ns = array("q")
+        self._values = array("d")
+        self._covariances = array("d")
+
+    def __len__(self) -> int:
+        return len(self._header_ns)
+
+    def add(self, sample: PoseSample | AngleSample, values: Iterable[float]) -> None:
+        """One more; always as many values."""
+        self._header_ns.append(sample.stamp_ns)
+        self._receive_ns.append(sample.receive_ns)
+        self._values.extend(values)
+
+    def add_pose(self, pose: PoseSample) -> None:
+        """One more pose; always with a covariance, or never."""
+        self.add(pose, pose.position + pose.quaternion_xyzw)
+        if pose.covariance is not None:
+            self._covariances.frombytes(pose.covariance.tobytes())
+
+    def add_arrays(self, poses: PoseArrays) -> None:
+        """Many poses at once."""
+        self._header_ns.frombytes(poses.header_ns.tobytes())
+        self._receive_ns.frombytes(poses.receive_ns.tobytes())
+        self._values.frombytes(poses.pose.tobytes())
+        if poses.covariance is not None:
+            self._covariances.frombytes(poses.covariance.tobytes())
+
+    def values(self, width: int) -> Float:
+        """[N, width]."""
+        return np.frombuffer(self._values, dtype=np.float64).reshape(-1, width)
+
+    def times(self, stamps: Stamps) -> Int64:
+        """[N] the stamps asked for; where the header has none, those of receipt."""
+        header, receive = self._stamps()
+        return receive if stamps == "receive" else np.where(header == 0, receive, header)
+
+    def trajectory(self, source: Source, stamps: Stamps) -> Trajectory:
+        """The poses, cleaned.
+
+        Raises:
+            DataError: none is usable.
+        """
+        position, quaternion = np.split(self.values(7), [3], axis=1)
+        covariance = np.frombuffer(self._covariances, dtype=np.float64).reshape(-1, 6, 6)
+        poses = clean_poses(
+            source,
+            self.times(stamps),
+            np.ones(len(self), dtype=np.bool_),
+            position,
+            quaternion,
+            covariance if covariance.any() else None,  # zero throughout says nothing
+        )
+        if poses.covariance is None:
+            return poses
+        turned = pose_covariance_in_body(poses.covariance, poses.quaternion_xyzw)
+        return replace(poses, covariance=turned)
+
+    def check(self, may_disagree_s: float, may_jump_s: float) -> StampCheck:
+        """Compare the stamps of header and receipt."""
+        header, receive = self._stamps()
+        (stamped,) = np.nonzero(header)
+        lead_ns = (header - receive)[stamped]
+        drift = fit_clock(receive[stamped], header[stamped]) if lead_ns.any() else None
+        jump_ns = np.diff(lead_ns)
+        return StampCheck(
+            count=len(header),
+            without_header=len(header) - len(stamped),
+            disagreeing=int(np.count_nonzero(np.abs(lead_ns) > may_disagree_s * 1e9)),
+            largest_disagreement_s=float(lead_ns[np.argmax(np.abs(lead_ns))]) / 1e9 if len(stamped) else 0.0,
+            jumps=tuple(
+                ClockJump(int(stamped[k + 1]), int(header[stamped[k + 1]]), float(jump_ns[k]) / 1e9)
+                for k in np.flatnonzero(np.abs(jump_ns) > may_jump_s * 1e9)
+            ),
+            drift=drift,
+        )
+
+    def _stamps(self) -> tuple[Int64, Int64]:
+        return np.frombuffer(self._header_ns, dtype=np.int64), np.frombuffer(self._receive_ns, dtype=np.int64)
+
+
+def trajectory_of(
+    samples: Iterable[Sample],
+    source: Source,
+    *,
+    stamps: Stamps,
+    may_disagree_s: float = 0.5,
+    may_jump_s: float = 1.0,
+) -> Gathered:
+    """Poses of one thing, in the axes of the log; covariances turned to ours (rotation in the body).
+
+    Rows are cleaned by `clean_poses`, every loss counted. A covariance that is zero throughout is unknown
+    and left out.
+
+    Args:
+        samples: poses in the order of receipt.
+        source: the log and topic, for messages.
+        stamps: which stamp is the time of a pose. A header without one (0) takes that of receipt.
+        may_disagree_s: header and receipt may lie this far apart, for what is transmitted late.
+        may_jump_s: their difference may change by this much from one sample to the next.
+
+    Raises:
+        DataError: no usable pose, samples that are no poses, or poses of several things.
+    """
+    rows = SampleRows()
+    frames: Edge | None = None
+    for sample in samples:
+        if not isinstance(sample, PoseSample):
+            raise DataError(source, "holds no poses", "name a topic of poses")
+        edge = (sample.target, sample.source)
+        if frames is not None and edge != frames:
+            raise DataError(
+                source,
+                f"holds poses of several frames ({_said(frames)}, {_said(edge)})",
+                "say which with `parent` and `child`",
+            )
+        frames = edge
+        rows.add_pose(sample)
+    trajectory = rows.trajectory(source, stamps)
+    return Gathered(trajectory, rows.check(may_disagree_s, may_jump_s), frames or ("", ""))
+
+
+def trajectory_of_arrays(
+    poses: PoseArrays,
+    source: Source,
+    *,
+    stamps: Stamps,
+    may_disagree_s: float = 0.5,
+    may_jump_s: float = 1.0,
+) -> Gathered:
+    """The same of poses that were read at once; arguments as those of `trajectory_of`."""
+    rows = SampleRows()
+    rows.add_arrays(poses)
+    trajectory = rows.trajectory(source, stamps)
+    return Gathered(trajectory, rows.check(may_disagree_s, may_jump_s), poses.frames)
+
+
+def attitudes_of(
+    samples: Iterable[Sample],
+    source: Source,
+    *,
+    stamps: Stamps,
+    order: Literal["ypr", "rpy", "pry"] = "ypr",
+    units: Literal["deg", "rad"] = "deg",
+    may_disagree_s: float = 0.5,
+    may_jump_s: float = 1.0,
+) -> Gathered:
+    """A gimbal's attitude over time, in the axes of the log, about its own pivot (every position is 0).
+
+    Args:
+        samples: angles or quaternions in the order of receipt.
+        source: the log and topic, for messages.
+        stamps: as of `trajectory_of`, like the last two.
+        order: how the log lists angles (`attitude_from_angles`); nothing to quaternions.
+        units: of the angles.
+        may_disagree_s: see there.
+        may_jump_s: see there.
+
+    Raises:
+        DataError: no usable attitude, or samples that are none.
+    """
+    rows, of_angles = SampleRows(), False
+    for sample in samples:
+        if not isinstance(sample, AngleSample):
+            raise DataError(source, "holds no gimbal angles", "name a topic of angles or quaternions")
+        of_angles = sample.angles is not None
+        rows.add(sample, sample.angles or sample.quaternion_xyzw or ())
+    if of_angles:
+        with np.errstate(invalid="ignore"):  # an infinite angle becomes NaN and is dropped as such
+            quaternion = attitude_from_angles(rows.values(3), order=order, units=units)
+    else:
+        quaternion = rows.values(4)
+    trajectory = clean_poses(
+        source,
+        rows.times(stamps),
+        np.ones(len(rows), dtype=np.bool_),
+        np.zeros((len(rows), 3)),
+        quaternion,
+    )
+    return Gathered(trajectory, rows.check(may_disagree_s, may_jump_s), ("", ""))
+
+
+def transforms_of(
+    samples: Iterable[Sample], source: Source, *, static: Iterable[Sample] = ()
+) -> TransformLog:
+    """Every transform of a log, whatever it is between; cleaned when it is used.
+
+    Args:
+        samples: of /tf and its like, in the order of receipt.
+        source: the log, for messages.
+        static: of /tf_static: these hold always.
+
+    Raises:
+        DataError: samples that are no transforms.
+    """
+    return TransformLog(_by_edge(samples, source), _by_edge(static, source))
+
+
+def chained(
+    transforms: TransformLog,
+    source: Source,
+    *,
+    parent: str,
+    child: str,
+    stamps: Stamps,
+    max_gap_ns: int,
+    may_disagree_s: float = 0.5,
+    may_jump_s: float = 1.0,
+) -> Gathered:
+    """The pose of one frame in another over time, through the log's tree of transforms.
+
+    At the stamps of the fastest transform on the way. A transform is static if it was given as such, or
+    is stated once only, as Foxglove's logs do. Losses are counted by cause and transform; stamps
+    at which another transform on the way says nothing under "no transform".
+
+    Args:
+        transforms: what the log states.
+        source: the log, for messages.
+        parent: the frame in which the poses are wanted; a leading slash is of no account.
+        child: the frame whose poses are wanted.
+        stamps: as of `trajectory_of`, like the last two.
+        max_gap_ns: a moving transform says nothing between stamps further apart than this.
+        may_disagree_s: see there.
+        may_jump_s: see there.
+
+    Raises:
+        DataError: an unknown frame, frames that nothing connects, or no moment at which all the
+            transforms on the way are known.
+    """
+    parent, child = parent.lstrip("/"), child.lstrip("/")
+    every = {**transforms.static, **transforms.moving}
+    try:
+        route = find_route(every, parent, child)
+    except ValueError as error:
+        raise DataError(source, str(error), "name `parent` and `child` as the log does") from None
+    links: dict[Edge, Link] = {}
+    dropped: dict[str, int] = {}
+    checks = []
+    for edge in route.edges:
+        rows = every[edge]
+        poses = rows.trajectory(f"{source}: {_said(edge)}", stamps)
+        is_static = edge not in transforms.moving or len(rows) == 1
+        links[edge] = Link(poses.t_ns, poses.position, poses.quaternion_xyzw, is_static)
+        if not is_static:
+            checks.append(rows.check(may_disagree_s, may_jump_s))
+            dropped |= {f"{cause} ({_said(edge)})": count for cause, count in poses.dropped.items()}
+    found = chain(links, parent, child, max_gap_ns=max_gap_ns)
+    known = ~np.isnan(found.position[:, 0])
+    if not known.any():
+        raise DataError(
+            source,
+            f"never states all the transforms from {parent!r} to {child!r} at one time",
+            "raise --max-pose-gap, or choose other frames",
+        )
+    if not known.all():
+        dropped["no transform"] = int(np.count_nonzero(~known))
+    trajectory = Trajectory(
+        found.t_ns[known], found.position[known], found.quaternion_xyzw[known], dropped=dropped
+    )
+    return Gathered(trajectory, _together(checks), (parent, child))
+
+
+def _by_edge(samples: Iterable[Sample], source: Source) -> dict[Edge, SampleRows]:
+    by_edge: dict[Edge, SampleRows] = {}
+    for sample in samples:
+        if not isinstance(sample, PoseSample):
+            raise DataError(source, "holds no transforms", "name a topic of transforms")
+        # ROS 1 wrote frames with and without a leading slash.
+        edge = (sample.target.lstrip("/"), sample.source.lstrip("/"))
+        by_edge.setdefault(edge, SampleRows()).add_pose(sample)
+    return by_edge
+
+
+def _together(checks: Sequence[StampCheck]) -> StampCheck:
+    return StampCheck(
+        count=sum(check.count for check in checks),
+        without_header=sum(check.without_header for check in checks),
+        disagreeing=sum(check.disagreeing for check in checks),
+        largest_disagreement_s=max((c.largest_disagreement_s for c in checks), key=abs, default=0.0),
+        jumps=tuple(jump for check in checks for jump in check.jumps),
+        drift=next((check.drift for check in checks if check.drift), None),
+    )
+
+
+def _said(edge: Edge) -> str:
+    target, source = edge
+    return f"{source!r} in {target!r}"

@@ -1,0 +1,47 @@
+"""Topics that say when pictures were taken, without the pictures."""
+
+from __future__ import annotations
+
+from array import array
+
+import numpy as np
+
+from pipelines.formats.logs.messages import nanoseconds
+from pipelines.session.errors import DataError
+from pipelines.session.records import Int64
+from pipelines.session.registries import Log
+
+TRIGGER_TYPES = (
+    "std_msgs/msg/Header",
+    "sensor_msgs/msg/TimeReference",
+    "mavros_msgs/msg/CameraImageCaptured",
+    "mavros_msgs/msg/CamIMUStamp",
+)
+
+
+def read_triggers(recording: Log, source: str, topic: str) -> tuple[Int64, int]:
+    """When pictures were triggered, increasing, and how many messages said nothing new.
+
+    By the message's own stamp: of its header, or as CamIMUStamp's frame_stamp.
+
+    Raises:
+        DataError: a message cannot be read, or none states a time.
+    """
+    stated = array("q")
+    messages = 0
+    for message in recording.messages([topic]):
+        value = message.value
+        messages += 1
+        try:
+            holder = getattr(value, "header", value)
+            stamp = getattr(value, "frame_stamp", None) or holder.stamp
+            stated.append(nanoseconds(stamp))
+        except (AttributeError, TypeError, ValueError, OverflowError) as error:
+            raise DataError(
+                source, f"topic {topic}: a message cannot be read ({error})", "check what wrote the log"
+            ) from error
+    t_ns = np.unique(np.frombuffer(stated, dtype=np.int64))
+    t_ns = t_ns[t_ns > 0]
+    if not len(t_ns):
+        raise DataError(source, f"{topic} states no time", "name another topic")
+    return t_ns, messages - len(t_ns)

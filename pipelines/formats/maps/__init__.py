@@ -1,0 +1,1 @@
+"""Voxels, clouds and floor plans."""

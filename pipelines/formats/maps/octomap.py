@@ -1,0 +1,305 @@
+"""OctoMap trees: `.bt` (each leaf occupied or free) and `.ot` (each node's log odds).
+
+Layout (octomap 1.10, OcTreeBaseImpl.hxx and OccupancyOcTreeBase.hxx), little-endian, nodes depth first:
+
+- a text header: one of the first lines below, `id`, `size` (nodes), `res` (side of the finest voxel), `data`;
+  or, in the oldest .bt, 16 bytes: int32 3, float64 res, uint32 size.
+- .bt: two bytes for every inner node, two bits for every child: 0 unknown, 1 free, 2 occupied, 3 inner.
+- .ot: for every node its float32 log odds (then three bytes of colour in a ColorOcTree) and a byte whose bits
+  say which children follow. What inner nodes say is a summary of their leaves and ignored.
+
+Child i lies on the upper side of x, y, z where its bits 0, 1, 2 are set. The root is 2 ** 16 finest voxels
+wide and centred on the world's origin; a leaf above the finest depth stands for all voxels within it.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.formats.common.binary_files import Bytes, first_bytes, read_bytes, split_header
+from pipelines.session.errors import DataError
+from pipelines.session.maps import check_resolution, check_size, describe_grid
+from pipelines.session.records import Occupancy
+
+DEPTH = 16
+_CENTRE = 1 << (DEPTH - 1)
+
+# A .bt does not say how sure it was: its leaves get the limits to which OctoMap clamps by default
+# (AbstractOccupancyOcTree's constructor), which is what OctoMap itself gives them.
+FREE_PROBABILITY, OCCUPIED_PROBABILITY = 0.1192, 0.971
+
+_BINARY = b"# Octomap OcTree binary file"
+_FULL = b"# Octomap OcTree file"
+_LEGACY = struct.Struct("<idI")
+_LEGACY_TYPE = 3
+_RECORD_BYTES = {"OcTree": 5, "ColorOcTree": 8}  # of a node in a .ot
+_COPY_AGAIN = "copy or export it again"
+
+
+@dataclass(frozen=True)
+class Leaves:
+    """What a tree knows, leaf by leaf."""
+
+    key: NDArray[np.int32]  # [L, 3] lowest corner, in finest voxels, 0 at the lower end of the tree
+    depth: NDArray[np.uint8]  # [L] 0 root, 16 finest
+    log_odds: NDArray[np.float32]  # [L] ln(p / (1 - p))
+    nodes: int
+
+    @property
+    def occupied(self) -> NDArray[np.bool_]:
+        """OctoMap's threshold: a probability of at least one half."""
+        return self.log_odds >= 0
+
+    def voxels(self, chosen: NDArray[np.bool_]) -> int:
+        """How many finest voxels some of the leaves stand for."""
+        counts = np.bincount(self.depth[chosen], minlength=DEPTH + 1).tolist()
+        return sum(count * 8 ** (DEPTH - depth) for depth, count in enumerate(counts))
+
+    def box(self, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Lowest and highest corner of some of the leaves, in finest voxels from the world's origin."""
+        key, depth = self.key[chosen].astype(np.int64), self.depth[chosen].astype(np.int64)
+        corner = key + (1 << (DEPTH - depth))[:, None]
+        return key.min(axis=0) - _CENTRE, corner.max(axis=0) - _CENTRE
+
+    def extent(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """The box of all leaves."""
+        return self.box(np.ones(len(self.depth), dtype=bool))
+
+
+@dataclass(frozen=True)
+class _Header:
+    kind: str  # bt, ot, legacy bt
+    id: str
+    resolution_m: float
+    nodes: int | None
+
+
+class OctomapFormat:
+    """Probabilities in the tree's own voxels, or in voxels 2, 4, 8, ... times as wide if the user says so.
+
+    Then a voxel has the largest probability of what is known within it: an obstacle is never lost.
+    """
+
+    name = "octomap"
+    title = "OctoMap"
+    suffixes: tuple[str, ...] = (".bt", ".ot")
+
+    def recognises(self, path: Path) -> bool:
+        """Whether it begins as OctoMap's files do."""
+        if path.suffix.lower() not in self.suffixes or not path.is_file():
+            return False
+        head = first_bytes(path, 64)
+        return head.startswith((_BINARY, _FULL)) or _is_legacy(head)
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Header, nodes, leaves, voxels and boxes; the grid itself is not made."""
+        header, leaves = _read(path)
+        occupied = leaves.occupied
+        low, high = leaves.extent()
+        return {
+            "kind": header.kind,
+            "id": header.id,
+            "nodes": leaves.nodes,
+            "leaves": len(leaves.depth),
+            "occupied_leaves": int(occupied.sum()),
+            "free_leaves": int((~occupied).sum()),
+            **describe_grid(
+                header.resolution_m,
+                low.astype(np.float64) * header.resolution_m,
+                (high - low).tolist(),
+                occupied=leaves.voxels(occupied),
+                free=leaves.voxels(~occupied),
+            ),
+            **_box("occupied", leaves, occupied, header.resolution_m),
+            **_box("free", leaves, ~occupied, header.resolution_m),
+        }
+
+    def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
+        """Read the whole tree into a grid of its box.
+
+        Raises:
+            DataError: no OctoMap, broken off or damaged, another kind of tree, nothing known in it,
+                `resolution_m` is not its own times a power of two, or too many voxels.
+        """
+        header, leaves = _read(path)
+        return occupancy_from(path, leaves, header.resolution_m, resolution_m)
+
+
+def occupancy_from(
+    source: Path | str, leaves: Leaves, finest_m: float, resolution_m: float | None
+) -> Occupancy:
+    """The dense grid of a tree's box.
+
+    Args:
+        source: the file or topic, for messages.
+        leaves: at least one.
+        finest_m: the side of the tree's finest voxel.
+        resolution_m: the side of the grid's voxels, `finest_m` times a power of two; None for the finest.
+
+    Raises:
+        DataError: `resolution_m` is none of those, or the grid is too large.
+    """
+    from pipelines.formats.maps.octree_kernels import fill
+
+    halvings = _halvings(source, finest_m, resolution_m)
+    side_m = finest_m * 2**halvings
+    low, high = leaves.extent()
+    first, end = low >> halvings, -(-high >> halvings)
+    shape = tuple((end - first).tolist())
+    check_size(source, shape, side_m, f"state resolution_m: {2 * side_m:g} or more, or crop the map")
+    grid = np.full(shape, np.nan, dtype=np.float32)
+    with np.errstate(over="ignore"):  # exp(large) is inf, and the probability 0
+        probability = (1 / (1 + np.exp(-leaves.log_odds))).astype(np.float32)
+    fill(grid, leaves.key, leaves.depth, probability, first + (_CENTRE >> halvings), halvings)
+    return Occupancy(grid, first.astype(np.float64) * side_m, side_m)
+
+
+def leaves_of(source: Path | str, payload: Bytes, *, is_binary: bool, tree: str) -> Leaves:
+    """The leaves of a tree without a header, as octomap_msgs/Octomap carries it.
+
+    Args:
+        source: the file or topic, for messages.
+        payload: what follows the header in a file.
+        is_binary: whether it is laid out as in a .bt, else as in a .ot.
+        tree: what kind of tree it is; a .bt has one layout for all.
+
+    Raises:
+        DataError: as `binary_leaves` and `full_leaves`, or nodes of a kind that is not known.
+    """
+    if is_binary:
+        return binary_leaves(source, payload)
+    if tree not in _RECORD_BYTES:
+        raise DataError(
+            source,
+            f"is a {tree[:40]}, whose nodes are not known",
+            f"save it as {' or '.join(_RECORD_BYTES)}, or as .bt",
+        )
+    return full_leaves(source, payload, _RECORD_BYTES[tree])
+
+
+def binary_leaves(source: Path | str, payload: Bytes) -> Leaves:
+    """The leaves of a .bt's data, also as octomap_msgs/Octomap carries it.
+
+    Raises:
+        DataError: broken off, damaged, or bytes beyond the tree.
+    """
+    from pipelines.formats.maps.octree_kernels import walk_binary
+
+    words = payload[: len(payload) // 2 * 2].view("<u2")
+    # The bit pairs 01 and 10 are leaves: those whose bits differ.
+    leaves = int(np.bitwise_count((words ^ (words >> 1)) & 0x5555).sum(dtype=np.int64))
+    key, depth = np.empty((leaves, 3), np.int32), np.empty(leaves, np.uint8)
+    log_odds = np.empty(leaves, np.float32)
+    used = walk_binary(
+        words, key, depth, log_odds, _log_odds(FREE_PROBABILITY), _log_odds(OCCUPIED_PROBABILITY)
+    )
+    _check_walk(source, used, 2, len(payload))
+    return Leaves(key, depth, log_odds, nodes=used + leaves)
+
+
+def full_leaves(source: Path | str, payload: Bytes, record_bytes: int) -> Leaves:
+    """The leaves of a .ot's data, also as octomap_msgs/Octomap carries it.
+
+    Raises:
+        DataError: broken off, damaged, bytes beyond the tree, or log odds that are not finite.
+    """
+    from pipelines.formats.maps.octree_kernels import walk_full
+
+    records = payload[: len(payload) // record_bytes * record_bytes].reshape(-1, record_bytes)
+    children = np.ascontiguousarray(records[:, -1])
+    leaves = int((children == 0).sum())
+    node, key = np.empty(leaves, np.int32), np.empty((leaves, 3), np.int32)
+    depth = np.empty(leaves, np.uint8)
+    used = walk_full(children, node, key, depth)
+    _check_walk(source, used, record_bytes, len(payload))
+    log_odds = np.ascontiguousarray(records[node, :4]).view("<f4")[:, 0]
+    if not np.isfinite(log_odds).all():
+        bad = int((~np.isfinite(log_odds)).sum())
+        raise DataError(source, f"{bad} leaves have log odds that are not finite", _COPY_AGAIN)
+    return Leaves(key, depth, log_odds, nodes=used)
+
+
+def _read(path: Path) -> tuple[_Header, Leaves]:
+    content = read_bytes(path)
+    header, payload = _split(path, content)
+    check_resolution(path, header.resolution_m)
+    leaves = leaves_of(path, payload, is_binary=header.kind != "ot", tree=header.id)
+    if header.nodes is not None and header.nodes != leaves.nodes:
+        raise DataError(path, f"has {leaves.nodes} nodes where its header states {header.nodes}", _COPY_AGAIN)
+    if not len(leaves.depth):
+        raise DataError(path, "is an empty map: nothing in it is known", "leave `map:` out")
+    return header, leaves
+
+
+def _split(path: Path, content: bytes) -> tuple[_Header, Bytes]:
+    if _is_legacy(content):
+        _, resolution_m, nodes = _LEGACY.unpack_from(content)
+        return _Header("legacy bt", "OcTree", resolution_m, nodes), np.frombuffer(content, np.uint8)[
+            _LEGACY.size :
+        ]
+    if not content.startswith((_BINARY, _FULL)):
+        raise DataError(path, "is no OctoMap file", f"its first line must be {_BINARY.decode()!r}")
+    lines, payload = split_header(path, content, "data")
+    values = {words[0]: words[1] for words in lines if len(words) == 2}
+    try:
+        resolution_m = float(values["res"])
+        nodes = int(values["size"]) if "size" in values else None
+    except KeyError as error:
+        raise DataError(path, "its header states no res", _COPY_AGAIN) from error
+    except ValueError as error:
+        raise DataError(path, f"its header cannot be read ({str(error)[:100]})", _COPY_AGAIN) from error
+    kind = "bt" if content.startswith(_BINARY) else "ot"
+    return _Header(kind, values.get("id", "OcTree"), resolution_m, nodes), payload
+
+
+def _is_legacy(content: bytes) -> bool:
+    return len(content) >= _LEGACY.size and _LEGACY.unpack_from(content)[0] == _LEGACY_TYPE
+
+
+def _check_walk(source: Path | str, used: int, unit_bytes: int, payload_bytes: int) -> None:
+    from pipelines.formats.maps.octree_kernels import BREAKS_OFF, TOO_DEEP
+
+    if used == BREAKS_OFF:
+        raise DataError(source, f"its tree breaks off after {payload_bytes} bytes", _COPY_AGAIN)
+    if used == TOO_DEEP:
+        raise DataError(source, f"its tree is damaged: deeper than {DEPTH} levels", _COPY_AGAIN)
+    if used * unit_bytes != payload_bytes:
+        extra = payload_bytes - used * unit_bytes
+        raise DataError(source, f"has {extra} bytes beyond its tree", _COPY_AGAIN)
+
+
+def _log_odds(probability: float) -> float:
+    return math.log(probability / (1 - probability))
+
+
+def _halvings(source: Path | str, finest_m: float, resolution_m: float | None) -> int:
+    """How many levels of the tree are merged to reach a resolution."""
+    if resolution_m is None:
+        return 0
+    halvings = round(math.log2(check_resolution(source, resolution_m) / finest_m))
+    if not 0 <= halvings <= DEPTH or not math.isclose(finest_m * 2**halvings, resolution_m, rel_tol=1e-6):
+        raise DataError(
+            source,
+            f"its voxels of {finest_m:g} m cannot be merged to {resolution_m:g} m",
+            f"state resolution_m: {finest_m:g}, {2 * finest_m:g}, {4 * finest_m:g}, ...",
+        )
+    return halvings
+
+
+def _box(name: str, leaves: Leaves, chosen: NDArray[np.bool_], resolution_m: float) -> dict[str, object]:
+    if not chosen.any():
+        return {}
+    low, high = leaves.box(chosen)
+    return {
+        f"{name}_box_min_m": [round(v, 4) for v in (low * resolution_m).tolist()],
+        f"{name}_box_max_m": [round(v, 4) for v in (high * resolution_m).tolist()],
+    }
+
+
+FORMAT = OctomapFormat()

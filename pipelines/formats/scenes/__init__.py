@@ -1,0 +1,1 @@
+"""Whole flights for programs that show them: skeleton, cameras, map and pictures in one recording."""

@@ -1,0 +1,334 @@
+"""The mcap export: one log of ROS 2 messages, for Foxglove and RViz.
+
+| topic | type | |
+| --- | --- | --- |
+| /skeleton | visualization_msgs/MarkerArray | bones and joints, at every time of the skeleton |
+| /uncertainty | visualization_msgs/MarkerArray | 95 % ellipsoids of the joints, at most 10 times a second |
+| /tf | tf2_msgs/TFMessage | the cameras in `world`, at most 50 times a second |
+| /frustums | visualization_msgs/MarkerArray | the cameras' views, in their own frames, every second |
+| /CAMERA/path | nav_msgs/Path | where it flew, at most 10 poses a second, once |
+| /CAMERA/camera_info | sensor_msgs/CameraInfo | with every picture, else every second |
+| /CAMERA/image/compressed | sensor_msgs/CompressedImage | JPEG, at most 960 px wide |
+| /map | sensor_msgs/PointCloud2 | the middles of the map's surface voxels |
+
+World axes as in the session (z up), cameras with x right, y down, z forward; metres. Poses are the refined
+ones where there are any. A joint that is missing is not in its message. The same recording gives the same
+bytes; frames are written one after the other and never all in memory.
+"""
+
+from __future__ import annotations
+
+import heapq
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.formats.calibrations.camera_info_writing import ros_distortion
+from pipelines.formats.common.export_names import safe_file_name
+from pipelines.formats.logs.ros2_recording import Ros2Recording
+from pipelines.formats.maps.map_surfaces import surface_of
+from pipelines.formats.scenes.jpegs import as_jpeg
+from pipelines.formats.scenes.uncertainty import ellipsoids_95
+from pipelines.formats.skeletons.even_frames import thinned
+from pipelines.geometry.cameras import Intrinsics
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float, JointMotion, Recording, Trajectory
+from pipelines.session.skeletons import bones_of, with_derived
+
+_TF_HZ, _ELLIPSOIDS_HZ, _PATH_HZ, _STANDING_HZ = 50.0, 10.0, 10.0, 1.0
+_FRUSTUM_M = 1.0
+_LATEST_NS = (1 << 31) * 10**9  # stamps of ROS count seconds in 31 bits
+_LINE_LIST, _SPHERE, _SPHERE_LIST = 5, 2, 7
+_DELETE_ALL = {"header": {"frame_id": "world"}, "action": 3}
+_COLOURS = {"left": (0.35, 0.72, 0.96), "right": (1.0, 0.62, 0.36), "": (0.87, 0.89, 0.90)}
+_FLOAT32 = 7
+
+Entry = tuple[int, str, str, Mapping[str, Any]]  # time, topic, type, fields
+
+
+class McapExport:
+    """`<name>.mcap`: skeleton, uncertainty, cameras, pictures and map."""
+
+    name = "mcap"
+    title = "a log of ROS 2 messages to look at in Foxglove: skeleton, cameras, map, pictures"
+
+    def write(self, recording: Recording, folder: Path) -> list[Path]:
+        """Write what the recording has; rows from before 1970 are left out and counted.
+
+        Raises:
+            DataError: it has neither joints nor camera poses, or times that ROS cannot count.
+        """
+        tracks = {name: _countable(recording, name, track) for name, track in recording.tracks.items()}
+        tracks = {name: track for name, track in tracks.items() if len(track.t_ns)}
+        motion = recording.motion
+        times = [track.t_ns for track in tracks.values()] + ([motion.t_ns] if motion is not None else [])
+        if not times:
+            raise DataError(recording.name, "holds neither joints nor camera poses", "reconstruct it first")
+        start_ns, end_ns = min(int(t[0]) for t in times), max(int(t[-1]) for t in times)
+        if start_ns < 0 or end_ns >= _LATEST_NS:
+            raise DataError(
+                recording.name, "has times outside of 1970 to 2038, which ROS cannot count", "export csv"
+            )
+        topics = _topics(list(tracks))
+        streams = [_map(recording, start_ns)]
+        for name, track in tracks.items():
+            lens = recording.lenses.get(name)
+            streams += [_path(topics[name], track, start_ns), _transforms(name, track)]
+            if lens is not None:
+                streams.append(_pictures(recording, name, topics[name], lens, (start_ns, end_ns)))
+        streams.append(_frustums(recording.lenses, list(tracks), (start_ns, end_ns)))
+        if motion is not None:
+            streams += [_skeleton(motion), _uncertainty(motion)]
+            recording.progress.start("Writing mcap", len(motion.t_ns))
+        path = folder / f"{safe_file_name(recording.name)}.mcap"
+        with Ros2Recording(path) as log:
+            for stamp_ns, topic, type_, fields in heapq.merge(*streams, key=lambda entry: entry[0]):
+                log.write(topic, type_, stamp_ns, fields)
+                if topic == "/skeleton":
+                    recording.progress.advance()
+        return [path]
+
+
+def _countable(recording: Recording, name: str, track: Trajectory) -> Trajectory:
+    """Without the rows from before 0: logs without a time of day may begin before their first picture."""
+    early = int(np.count_nonzero(track.t_ns < 0))
+    if not early:
+        return track
+    recording.progress.note(f"mcap: {early} poses of {name} from before time 0 were left out")
+    return Trajectory(track.t_ns[early:], track.position[early:], track.quaternion_xyzw[early:])
+
+
+def _topics(cameras: list[str]) -> dict[str, str]:
+    """What ROS lets a topic be called, different for different cameras."""
+    topics: dict[str, str] = {}
+    for name in cameras:
+        word = re.sub(r"[^A-Za-z0-9_]", "_", name)
+        word = word if word[:1].isalpha() else f"camera_{word}"
+        while f"/{word}" in topics.values():
+            word += "_"
+        topics[name] = f"/{word}"
+    return topics
+
+
+# --- the person ----------------------------------------------------------------------------------------
+
+
+def _skeleton(motion: JointMotion) -> Iterator[Entry]:
+    joints, position = with_derived(motion.joints, motion.position)
+    bones = [(joints.index(a), joints.index(b), a) for a, b in bones_of(joints)]
+    for t_ns, people in zip(motion.t_ns.tolist(), position, strict=True):
+        header = {"stamp": t_ns, "frame_id": "world"}
+        markers: list[Mapping[str, Any]] = [_DELETE_ALL]
+        for person, body in enumerate(people):
+            known = np.isfinite(body).all(axis=1)
+            whole = [(a, b, name) for a, b, name in bones if known[a] and known[b]]
+            if not known.any():
+                continue
+            common = {"header": header, "id": person, "pose": _POSE}
+            if whole:
+                ends = np.array([[a, b] for a, b, _ in whole]).ravel()
+                sides = [_colour(name) for _, _, name in whole for _ in range(2)]
+                markers.append(
+                    common
+                    | {"ns": "bones", "type": _LINE_LIST, "scale": {"x": 0.02}, "color": {"a": 1.0}}
+                    | {"points": _points(body[ends]), "colors": sides}
+                )
+            size = {"x": 0.05, "y": 0.05, "z": 0.05}
+            colours = [_colour(name) for name, there in zip(joints, known, strict=True) if there]
+            markers.append(
+                common
+                | {"ns": "joints", "type": _SPHERE_LIST, "scale": size, "color": {"a": 1.0}}
+                | {"points": _points(body[known]), "colors": colours}
+            )
+        yield t_ns, "/skeleton", "visualization_msgs/msg/MarkerArray", {"markers": markers}
+
+
+def _uncertainty(motion: JointMotion) -> Iterator[Entry]:
+    if motion.covariance is None:
+        return
+    for row in thinned(motion.t_ns, _ELLIPSOIDS_HZ).tolist():
+        t_ns = int(motion.t_ns[row])
+        half, turn = ellipsoids_95(motion.covariance[row])
+        markers: list[Mapping[str, Any]] = [_DELETE_ALL]
+        joints = len(motion.joints)
+        for person, joint in np.argwhere(np.isfinite(half[..., 0])).tolist():
+            at = motion.position[row, person, joint]
+            if np.isfinite(at).all():
+                markers.append(
+                    {
+                        "header": {"stamp": t_ns, "frame_id": "world"},
+                        "ns": "ellipsoids_95",
+                        "id": person * joints + joint,
+                        "type": _SPHERE,
+                        "pose": {"position": _xyz(at), "orientation": _xyzw(turn[person, joint])},
+                        "scale": _xyz(2 * half[person, joint]),
+                        "color": _colour(motion.joints[joint], 0.3),
+                    }
+                )
+        yield t_ns, "/uncertainty", "visualization_msgs/msg/MarkerArray", {"markers": markers}
+
+
+# --- the cameras ---------------------------------------------------------------------------------------
+
+
+def _transforms(name: str, track: Trajectory) -> Iterator[Entry]:
+    for row in thinned(track.t_ns, _TF_HZ).tolist():
+        t_ns = int(track.t_ns[row])
+        moved = {
+            "header": {"stamp": t_ns, "frame_id": "world"},
+            "child_frame_id": name,
+            "transform": {
+                "translation": _xyz(track.position[row]),
+                "rotation": _xyzw(track.quaternion_xyzw[row]),
+            },
+        }
+        yield t_ns, "/tf", "tf2_msgs/msg/TFMessage", {"transforms": [moved]}
+
+
+def _path(topic: str, track: Trajectory, start_ns: int) -> Iterator[Entry]:
+    poses = [
+        {
+            "header": {"stamp": int(track.t_ns[row]), "frame_id": "world"},
+            "pose": {
+                "position": _xyz(track.position[row]),
+                "orientation": _xyzw(track.quaternion_xyzw[row]),
+            },
+        }
+        for row in thinned(track.t_ns, _PATH_HZ).tolist()
+    ]
+    fields = {"header": {"stamp": start_ns, "frame_id": "world"}, "poses": poses}
+    yield start_ns, f"{topic}/path", "nav_msgs/msg/Path", fields
+
+
+def _frustums(
+    lenses: Mapping[str, Intrinsics], cameras: list[str], span_ns: tuple[int, int]
+) -> Iterator[Entry]:
+    corners = {name: _frustum(lenses[name]) for name in cameras if name in lenses}
+    if not corners:
+        return
+    for t_ns in _seconds(span_ns):
+        markers = [
+            {
+                "header": {"stamp": t_ns, "frame_id": name},
+                "ns": "frustums",
+                "id": k,
+                "type": _LINE_LIST,
+                "pose": _POSE,
+                "scale": {"x": 0.02},
+                "color": {"r": 0.6, "g": 0.6, "b": 0.6, "a": 1.0},
+                "frame_locked": True,
+                "points": _points(points),
+            }
+            for k, (name, points) in enumerate(corners.items())
+        ]
+        yield t_ns, "/frustums", "visualization_msgs/msg/MarkerArray", {"markers": markers}
+
+
+def _frustum(lens: Intrinsics) -> Float:
+    """Eight lines as pairs of points [16, 3]: from the eye to the picture's corners 1 m away, and around."""
+    across = [(-0.5 - lens.cx) / lens.fx, (lens.width - 0.5 - lens.cx) / lens.fx]
+    down = [(-0.5 - lens.cy) / lens.fy, (lens.height - 0.5 - lens.cy) / lens.fy]
+    corners = [(across[0], down[0]), (across[1], down[0]), (across[1], down[1]), (across[0], down[1])]
+    far = _FRUSTUM_M * np.array([[x, y, 1.0] for x, y in corners])
+    rays = [(np.zeros(3), corner) for corner in far]
+    return np.array([*rays, *((far[k], far[k - 1]) for k in range(4))]).reshape(-1, 3)
+
+
+def _pictures(
+    recording: Recording, name: str, topic: str, lens: Intrinsics, span_ns: tuple[int, int]
+) -> Iterator[Entry]:
+    """Pictures with their CameraInfo; the latter alone every second where there are none."""
+    is_empty = True
+    for t_ns, picture in recording.pictures(name):
+        if span_ns[0] <= t_ns <= span_ns[1]:
+            smaller, jpeg = as_jpeg(name, picture, lens)
+            header = {"stamp": t_ns, "frame_id": name}
+            yield _info(t_ns, name, topic, smaller)
+            image = {"header": header, "format": "jpeg", "data": jpeg}
+            yield t_ns, f"{topic}/image/compressed", "sensor_msgs/msg/CompressedImage", image
+            is_empty = False
+    if is_empty:
+        for t_ns in _seconds(span_ns):
+            yield _info(t_ns, name, topic, lens)
+
+
+def _info(t_ns: int, name: str, topic: str, lens: Intrinsics) -> Entry:
+    fields = {"header": {"stamp": t_ns, "frame_id": name}, **_camera_info(lens)}
+    return t_ns, f"{topic}/camera_info", "sensor_msgs/msg/CameraInfo", fields
+
+
+def _camera_info(lens: Intrinsics) -> dict[str, Any]:
+    model, distortion = ros_distortion(lens)
+    return {
+        "width": lens.width,
+        "height": lens.height,
+        "distortion_model": model,
+        "d": distortion,
+        "k": [lens.fx, 0, lens.cx, 0, lens.fy, lens.cy, 0, 0, 1],
+        "r": [1, 0, 0, 0, 1, 0, 0, 0, 1],
+        "p": [lens.fx, 0, lens.cx, 0, 0, lens.fy, lens.cy, 0, 0, 0, 1, 0],
+    }
+
+
+# --- what stands around --------------------------------------------------------------------------------
+
+
+def _map(recording: Recording, start_ns: int) -> Iterator[Entry]:
+    for occupancy in recording.maps():
+        surface = surface_of(occupancy)
+        if surface.cube_m > occupancy.resolution_m * 1.001:
+            recording.progress.note(
+                f"mcap: the map's {surface.voxels} surface voxels are gathered in cubes of "
+                f"{surface.cube_m:g} m, {len(surface.middle)} of them"
+            )
+        stamp_ns = max(occupancy.from_ns, start_ns)
+        yield (
+            stamp_ns,
+            "/map",
+            "sensor_msgs/msg/PointCloud2",
+            {
+                "header": {"stamp": stamp_ns, "frame_id": "world"},
+                "height": 1,
+                "width": len(surface.middle),
+                "fields": [
+                    {"name": axis, "offset": 4 * k, "datatype": _FLOAT32, "count": 1}
+                    for k, axis in enumerate("xyz")
+                ],
+                "point_step": 12,
+                "row_step": 12 * len(surface.middle),
+                "data": surface.middle.astype("<f4").tobytes(),
+                "is_dense": True,
+            },
+        )
+
+
+# --- pieces --------------------------------------------------------------------------------------------
+
+_POSE = {"orientation": {"w": 1.0}}
+
+
+def _seconds(span_ns: tuple[int, int]) -> range:
+    return range(span_ns[0], span_ns[1] + 1, round(1e9 / _STANDING_HZ))
+
+
+def _xyz(point: Float) -> dict[str, float]:
+    return dict(zip("xyz", point.tolist(), strict=True))
+
+
+def _xyzw(quaternion: Float) -> dict[str, float]:
+    return dict(zip("xyzw", quaternion.tolist(), strict=True))
+
+
+def _points(points: Float) -> list[dict[str, float]]:
+    return [{"x": x, "y": y, "z": z} for x, y, z in points.tolist()]
+
+
+def _colour(joint: str, alpha: float = 1.0) -> dict[str, float]:
+    side = joint.partition("_")[0] if joint.startswith(("left_", "right_")) else ""
+    return {**dict(zip("rgb", _COLOURS[side], strict=True)), "a": alpha}
+
+
+EXPORT = McapExport()

@@ -1,0 +1,190 @@
+"""The rerun export: a recording for Rerun's viewer. Needs rerun-sdk.
+
+    world                             z up, metres
+    world/map                         surface voxels of the map
+    world/person<k>/skeleton          joints with their bones, at every time of the skeleton
+    world/person<k>/uncertainty       95 % ellipsoids
+    world/cameras/<camera>            where it is (the refined pose where there is one), over time
+    world/cameras/<camera>/image      pinhole, and pictures with the skeleton drawn into them (JPEG, 960 px)
+    world/paths/<camera>              where it flew
+
+The timeline `time` is the session's own: a date, or seconds where the flight knows no date. A joint that is
+missing is not there. The viewer's pinhole has no distortion; the pictures are as the lens showed them.
+Recordings of the same session differ in their bytes (rerun numbers its chunks at random).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.formats.common.export_names import safe_file_name
+from pipelines.formats.common.extras import need
+from pipelines.formats.maps.map_surfaces import surface_of
+from pipelines.formats.scenes.jpegs import as_jpeg
+from pipelines.formats.scenes.uncertainty import ellipsoids_95
+from pipelines.formats.skeletons.even_frames import thinned
+from pipelines.geometry.cameras import Intrinsics, camera_matrix
+from pipelines.session.errors import DataError
+from pipelines.session.records import Int64, JointMotion, Recording, Trajectory
+from pipelines.session.skeletons import bones_of, with_derived
+
+_PATH_HZ = 10.0
+_JOINT_M, _PICTURE_PLANE_M = 0.025, 1.0
+_COLOURS = {"left": (89, 183, 245), "right": (255, 157, 92), "": (223, 226, 229)}
+_STONE = (150, 146, 140)
+_LAST_WITHOUT_DATE_NS = 10**9 * 10**8  # 1973: smaller stamps count from the start of a log
+
+
+class RerunExport:
+    """`<name>.rrd`: skeleton, uncertainty, cameras, pictures with the skeleton, and map."""
+
+    name = "rerun"
+    title = "a recording to look at in Rerun: skeleton, cameras, map, pictures (extra rerun)"
+
+    def write(self, recording: Recording, folder: Path) -> list[Path]:
+        """Write what the recording has.
+
+        Raises:
+            DataError: rerun-sdk is not installed, or there are neither joints nor camera poses.
+        """
+        motion, tracks = recording.motion, recording.tracks
+        if motion is None and not tracks:
+            raise DataError(recording.name, "holds neither joints nor camera poses", "reconstruct it first")
+        rr = need("rerun", "rerun")
+        name = safe_file_name(recording.name)
+        path = folder / f"{name}.rrd"
+        with rr.RecordingStream("mocap", recording_id=name, send_properties=False) as stream:
+            stream.save(path, default_blueprint=_blueprint(rr, list(tracks)))
+            stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+            recording.progress.start("Writing rerun", len(tracks) + 2)
+            _log_map(rr, stream, recording)
+            recording.progress.advance()
+            if motion is not None:
+                _log_people(rr, stream, motion)
+            recording.progress.advance()
+            for camera, track in tracks.items():
+                _log_track(rr, stream, camera, track)
+                if camera in recording.lenses:
+                    _log_pictures(rr, stream, recording, camera, recording.lenses[camera])
+                recording.progress.advance()
+            stream.flush()
+            stream.disconnect()
+        return [path]
+
+
+def _times(rr: Any, t_ns: Int64) -> Any:
+    if len(t_ns) and t_ns[-1] < _LAST_WITHOUT_DATE_NS:
+        return rr.TimeColumn("time", duration=t_ns.astype("timedelta64[ns]"))
+    return rr.TimeColumn("time", timestamp=t_ns.astype("datetime64[ns]"))
+
+
+def _log_people(rr: Any, stream: Any, motion: JointMotion) -> None:
+    joints, position = with_derived(motion.joints, motion.position)
+    described = rr.ClassDescription(
+        info=rr.AnnotationInfo(id=1, label="person"),
+        keypoint_annotations=[
+            rr.AnnotationInfo(id=k, label=name, color=_colour(name)) for k, name in enumerate(joints)
+        ],
+        keypoint_connections=[(joints.index(a), joints.index(b)) for a, b in bones_of(joints)],
+    )
+    stream.log("world", rr.AnnotationContext([described]), static=True)
+    for person in range(position.shape[1]):
+        body = position[:, person]
+        known = np.isfinite(body).all(axis=-1)
+        total = int(known.sum())
+        stream.send_columns(
+            f"world/person{person}/skeleton",
+            [_times(rr, motion.t_ns)],
+            rr.Points3D.columns(
+                positions=body[known],
+                radii=np.full(total, _JOINT_M),
+                class_ids=np.ones(total, np.uint16),
+                keypoint_ids=np.nonzero(known)[1].astype(np.uint16),
+            ).partition(known.sum(axis=1)),
+        )
+        if motion.covariance is None:
+            continue
+        half, turn = ellipsoids_95(motion.covariance[:, person])
+        stated = np.isfinite(half).all(axis=-1) & np.isfinite(motion.position[:, person]).all(axis=-1)
+        colours = np.array([(*_colour(name), 80) for name in motion.joints], np.uint8)
+        stream.send_columns(
+            f"world/person{person}/uncertainty",
+            [_times(rr, motion.t_ns)],
+            rr.Ellipsoids3D.columns(
+                half_sizes=half[stated],
+                centers=motion.position[:, person][stated],
+                quaternions=turn[stated],
+                colors=colours[np.nonzero(stated)[1]],
+            ).partition(stated.sum(axis=1)),
+        )
+
+
+def _log_track(rr: Any, stream: Any, name: str, track: Trajectory) -> None:
+    part = rr.escape_entity_path_part(name)
+    stream.send_columns(
+        f"world/cameras/{part}",
+        [_times(rr, track.t_ns)],
+        rr.Transform3D.columns(translation=track.position, quaternion=track.quaternion_xyzw),
+    )
+    flown = track.position[thinned(track.t_ns, _PATH_HZ)]
+    stream.log(f"world/paths/{part}", rr.LineStrips3D([flown], colors=[_STONE]), static=True)
+
+
+def _log_pictures(rr: Any, stream: Any, recording: Recording, name: str, lens: Intrinsics) -> None:
+    entity = f"world/cameras/{rr.escape_entity_path_part(name)}/image"
+    shown = lens
+    for t_ns, picture in recording.overlays(name):
+        shown, jpeg = as_jpeg(name, picture, lens)
+        stream.send_columns(
+            entity,
+            [_times(rr, np.array([t_ns], np.int64))],
+            rr.EncodedImage.columns(blob=[jpeg], media_type=["image/jpeg"]),
+        )
+    stream.log(
+        entity,
+        rr.Pinhole(
+            image_from_camera=camera_matrix(shown),
+            resolution=(shown.width, shown.height),
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=_PICTURE_PLANE_M,
+        ),
+        static=True,
+    )
+
+
+def _log_map(rr: Any, stream: Any, recording: Recording) -> None:
+    for occupancy in recording.maps():
+        surface = surface_of(occupancy)
+        if surface.cube_m > occupancy.resolution_m * 1.001:
+            recording.progress.note(
+                f"rerun: the map's {surface.voxels} surface voxels are gathered in cubes of "
+                f"{surface.cube_m:g} m, {len(surface.middle)} of them"
+            )
+        points = rr.Points3D(surface.middle, radii=surface.cube_m / 2, colors=[_STONE])
+        if occupancy.from_ns:
+            stream.set_time("time", timestamp=np.datetime64(occupancy.from_ns, "ns"))
+            stream.log("world/map", points)
+            stream.reset_time()
+        else:
+            stream.log("world/map", points, static=True)
+
+
+def _blueprint(rr: Any, cameras: list[str]) -> Any:
+    """The world beside the pictures."""
+    views = need("rerun.blueprint", "rerun")
+    scene = views.Spatial3DView(origin="/world", name="World")
+    pictures = [
+        views.Spatial2DView(origin=f"/world/cameras/{rr.escape_entity_path_part(name)}/image", name=name)
+        for name in cameras
+    ]
+    return views.Blueprint(views.Horizontal(scene, views.Grid(*pictures)) if pictures else scene)
+
+
+def _colour(joint: str) -> tuple[int, int, int]:
+    return _COLOURS[joint.partition("_")[0] if joint.startswith(("left_", "right_")) else ""]
+
+
+EXPORT = RerunExport()

@@ -1,0 +1,1 @@
+"""Joints over time, as biomechanics and animation take them."""

@@ -1,0 +1,369 @@
+"""Biovision's BVH: a skeleton of bones, then one line of channels per frame.
+
+Layout (Biovision; Meredith & Maddock, "Motion Capture File Formats Explained", 2001): `HIERARCHY`, then
+`ROOT`, `JOINT` and `End Site` blocks in braces, each with its `OFFSET` from the parent and its `CHANNELS`;
+`MOTION`, `Frames:`, `Frame Time:`, then the channels of all bones in the order of the hierarchy. Rotations
+are degrees and apply in the order in which they stand: `Zrotation Yrotation Xrotation` is Rz Ry Rx. Position
+channels take the place of the bone's offset (so do Blender and the readers of published data sets), except
+where they are zero throughout.
+
+The file states neither unit nor axes. A y-up file's (x, y, z) becomes the world's (z, x, y), as in TRC: who
+faces the file's +z, with the left hand towards +x, faces the world's +x (east) with the left towards +y.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.formats.common.text_tables import read_head, read_text
+from pipelines.geometry.poses import multiply, rotate
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float, SkeletalMotion
+
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+AXES = ("y-up", "z-up")
+
+_MOST_STRETCH_M = 0.05
+"""How far a bone may move against its parent, either way, before its mean place no longer stands for it."""
+
+_EXPORT_AGAIN = "export it again"
+_IN_WORLD = {"y-up": [2, 0, 1], "z-up": [0, 1, 2]}  # which of the file's axes are the world's x, y, z
+
+
+@dataclass
+class _Bone:
+    name: str
+    parent: int
+    offset: Float  # [3], the file's unit and axes
+    channels: list[str] = field(default_factory=list)  # xposition, zrotation, ...
+    first_channel: int = 0
+    end: Float | None = None
+
+
+@dataclass(frozen=True)
+class _Contents:
+    bones: list[_Bone]
+    frame_time_s: float
+    values: Float  # [T, C]
+
+
+class BvhFormat:
+    """What `mocap info` says of a BVH file; lengths are in the file's own unit, which it does not state."""
+
+    name = "bvh"
+    title = "Biovision motion (BVH)"
+    suffixes: tuple[str, ...] = (".bvh",)
+
+    def recognises(self, path: Path) -> bool:
+        """Whether it begins as every BVH does."""
+        if path.suffix.lower() not in self.suffixes or not path.is_file():
+            return False
+        return read_head(path).split(maxsplit=2)[:2] == ["HIERARCHY", "ROOT"]
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Bones, frames, rate, seconds, how large the resting skeleton is, and how far its root goes."""
+        contents = _read(path)
+        frames, bones = len(contents.values), contents.bones
+        places = _rest_places(bones)
+        place, _ = _bone_places(bones[0], contents.values)
+        return {
+            "bones": len(bones),
+            "root": bones[0].name,
+            "names": [bone.name for bone in bones],
+            "frames": frames,
+            "rate_hz": round(1 / contents.frame_time_s, 3),
+            "seconds": round((frames - 1) * contents.frame_time_s, 6),
+            "rest_pose_extent": [round(v, 4) for v in np.ptp(places, axis=0).tolist()],
+            "root_box_min": [round(v, 4) for v in place.min(axis=0).tolist()],
+            "root_box_max": [round(v, 4) for v in place.max(axis=0).tolist()],
+        }
+
+
+def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:
+    """Read a BVH file as metres with z up.
+
+    Bones above the one that moves, each with a single child (an export's `Reference` or scene root), are
+    merged into it: its motion is then the root's. A bone further down whose position channels move stands
+    at their mean, if none is further than 5 cm from it.
+
+    Args:
+        path: the file.
+        unit: of its lengths: m, cm, mm or inch.
+        axes: y-up or z-up.
+
+    Raises:
+        DataError: an unknown unit or unknown axes; no BVH, an unfinished hierarchy, names that occur twice,
+            unknown channels; frames that are missing, too many or broken off, or hold what is no finite
+            number; a bone that moves against its parent by more than 5 cm.
+    """
+    if unit not in METRES:
+        raise DataError(path, f"the unit {unit!r} is none of {', '.join(METRES)}", "state one of them")
+    if axes not in AXES:
+        raise DataError(path, f"the axes {axes!r} are none of {', '.join(AXES)}", "state one of them")
+    contents = _read(path)
+    metres, order = METRES[unit], _IN_WORLD[axes]
+    turned = [*order, 3]  # a rotation's axis is turned like any other vector
+    places, rotations = [], []
+    for bone in contents.bones:
+        place, moves = _bone_places(bone, contents.values)
+        places.append((place[:, order] * metres, moves))
+        rotations.append(_rotation(bone, contents.values)[:, turned])
+    first = _carriers(contents.bones, [moves for _, moves in places])
+    root, root_rotation = places[0][0], rotations[0]
+    for k in range(1, first + 1):
+        root = root + rotate(root_rotation, places[k][0])
+        root_rotation = multiply(root_rotation, rotations[k])
+    rotations[first] = root_rotation
+    kept = contents.bones[first:]
+    offsets = [np.zeros(3)]
+    offsets += [
+        _fixed_place(path, bone, place)
+        for bone, (place, _) in zip(kept[1:], places[first + 1 :], strict=True)
+    ]
+    ends = {k: bone.end[order] * metres for k, bone in enumerate(kept) if bone.end is not None}
+    return SkeletalMotion(
+        t_s=np.arange(len(contents.values), dtype=np.float64) * contents.frame_time_s,
+        bones=tuple(bone.name for bone in kept),
+        parent=tuple(max(bone.parent - first, -1) for bone in kept),
+        offset=np.array(offsets),
+        end=ends,
+        root=root,
+        rotation=np.stack(rotations[first:], axis=1),
+    )
+
+
+# --- from channels to motion ---------------------------------------------------------------------------
+
+
+def _bone_places(bone: _Bone, values: Float) -> tuple[Float, bool]:
+    """Where a bone's joint is in its parent's, [T, 3] in the file's unit, and whether it moves there."""
+    place = np.tile(bone.offset, (len(values), 1))
+    columns = {
+        "xyz".index(channel[0]): bone.first_channel + k
+        for k, channel in enumerate(bone.channels)
+        if channel.endswith("position")
+    }
+    stated = values[:, list(columns.values())]
+    if not stated.any():
+        return place, False
+    place[:, list(columns)] = stated
+    return place, bool(np.ptp(place, axis=0).any())
+
+
+def _rotation(bone: _Bone, values: Float) -> Float:
+    """parent_from_bone [T, 4] in the file's axes: the channels' turns, one after the other."""
+    total = np.tile([0.0, 0.0, 0.0, 1.0], (len(values), 1))
+    for k, channel in enumerate(bone.channels):
+        if channel.endswith("rotation"):
+            half = np.radians(values[:, bone.first_channel + k]) / 2
+            turn = np.zeros((len(values), 4))
+            turn[:, "xyz".index(channel[0])] = np.sin(half)
+            turn[:, 3] = np.cos(half)
+            total = multiply(total, turn)
+    return total
+
+
+def _carriers(bones: list[_Bone], moves: list[bool]) -> int:
+    """How many bones above the body only carry it: a lone child moves against each of them."""
+    count = 0
+    while sum(bone.parent == count for bone in bones) == 1 and bones[count].end is None and moves[count + 1]:
+        count += 1
+    return count
+
+
+def _fixed_place(path: Path, bone: _Bone, place: Float) -> Float:
+    middle: Float = place.mean(axis=0)
+    stretch_m = float(np.abs(place - middle).max())
+    if stretch_m > _MOST_STRETCH_M:
+        raise DataError(
+            path,
+            f"the bone {bone.name} moves by up to {stretch_m:.3g} m against its parent",
+            "state the unit that the file is in, or export it with bones of fixed lengths",
+        )
+    return place[0] if stretch_m == 0 else middle
+
+
+def _rest_places(bones: list[_Bone]) -> Float:
+    """Joints and end sites of the unturned skeleton [N, 3]."""
+    places: list[Float] = []
+    ends = []
+    for bone in bones:
+        places.append(bone.offset + (places[bone.parent] if bone.parent >= 0 else 0))
+        if bone.end is not None:
+            ends.append(places[-1] + bone.end)
+    return np.array(places + ends)
+
+
+# --- from text to channels -----------------------------------------------------------------------------
+
+
+def _read(path: Path) -> _Contents:
+    text = read_text(path)
+    head, marker, tail = text.partition("\nMOTION")
+    if not head.lstrip().startswith("HIERARCHY"):
+        raise DataError(path, "is no BVH file", "its first word must be HIERARCHY")
+    if not marker:
+        raise DataError(path, "ends before its line MOTION", _EXPORT_AGAIN)
+    bones = _bones(path, head.split("\n"))
+    channels = sum(len(bone.channels) for bone in bones)
+    first_line = head.count("\n") + 2
+    lines = tail.split("\n", maxsplit=3) + [""] * 3
+    frames = _stated(path, lines[1], "Frames:", first_line + 1)
+    frame_time_s = _stated(path, lines[2], "Frame Time:", first_line + 2)
+    if not (frame_time_s > 0 and math.isfinite(frame_time_s)):
+        raise DataError(path, f"line {first_line + 2}: a frame time of {frame_time_s:g} s", "correct it")
+    values = _numbers(path, lines[3], channels, frames, first_line + 3)
+    return _Contents(bones, frame_time_s, values)
+
+
+def _bones(path: Path, lines: list[str]) -> list[_Bone]:
+    """The hierarchy, parents first, in the order of the file."""
+    bones: list[_Bone] = []
+    open_blocks: list[int | None] = []  # bones, and None for an end site
+    coming: int | None = None
+    channels = 0
+    for number, line in enumerate(lines, start=1):
+        words = line.replace("{", " { ").replace("}", " } ").split()
+        while words:
+            word, rest = words[0].upper(), words[1:]
+            words = []
+            if word == "HIERARCHY":
+                words = rest
+            elif word in {"ROOT", "JOINT"}:
+                brace = rest.index("{") if "{" in rest else len(rest)
+                name, words = " ".join(rest[:brace]), rest[brace:]
+                above = open_blocks[-1] if open_blocks else None
+                if not name or (above is None) != (word == "ROOT") or (bones and word == "ROOT"):
+                    raise _bad_line(path, number, line)
+                if any(bone.name == name for bone in bones):
+                    raise DataError(path, f"line {number}: a second bone is called {name}", "rename one")
+                bones.append(_Bone(name, -1 if above is None else above, np.zeros(3), [], channels))
+                coming = len(bones) - 1
+            elif word == "END" and rest and rest[0].upper() == "SITE":
+                coming, words = None, rest[1:]
+                words = words[words.index("{") :] if "{" in words else []
+            elif word == "{":
+                open_blocks.append(coming)
+                words = rest
+            elif word == "}" and open_blocks:
+                open_blocks.pop()
+                words = rest
+            elif word == "OFFSET" and open_blocks:
+                offset = _offset(path, rest[:3], number, line)
+                inner = open_blocks[-1]
+                if inner is not None:
+                    bones[inner].offset = offset
+                elif len(open_blocks) > 1 and (above := open_blocks[-2]) is not None:
+                    bones[above].end = offset
+                words = rest[3:]
+            elif word == "CHANNELS" and open_blocks and (inner := open_blocks[-1]) is not None:
+                count = int(rest[0]) if rest and rest[0].isdecimal() else -1
+                named = [channel.lower() for channel in rest[1 : 1 + count]]
+                _check_channels(path, number, count, named)
+                if bones[inner].channels:
+                    raise _bad_line(path, number, line)
+                bones[inner].channels, bones[inner].first_channel = named, channels
+                channels += count
+                words = rest[1 + count :]
+            else:
+                raise _bad_line(path, number, line)
+    if open_blocks or not bones:
+        lack = f"lacks {len(open_blocks)} closing braces" if bones else "holds no bones"
+        raise DataError(path, f"its hierarchy {lack}", _EXPORT_AGAIN)
+    return bones
+
+
+def _check_channels(path: Path, number: int, count: int, named: list[str]) -> None:
+    unknown = [channel for channel in named if channel not in _CHANNELS]
+    twice = {channel for channel in named if channel.endswith("position") and named.count(channel) > 1}
+    if count < 0 or len(named) != count or unknown or twice:
+        what = f"{unknown[0]!r}" if unknown else f"{len(named)} channels"
+        raise DataError(
+            path,
+            f"line {number}: cannot make sense of {what} in CHANNELS",
+            f"a count, then that many of {', '.join(_CHANNELS)}",
+        )
+
+
+_CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "xyz")
+
+
+def _offset(path: Path, words: list[str], number: int, line: str) -> Float:
+    try:
+        offset = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise _bad_line(path, number, line) from error
+    if offset.shape != (3,) or not np.isfinite(offset).all():
+        raise _bad_line(path, number, line)
+    return offset
+
+
+def _bad_line(path: Path, number: int, line: str) -> DataError:
+    return DataError(path, f"line {number}: {line.strip()[:60]!r} has no place there", _EXPORT_AGAIN)
+
+
+def _stated(path: Path, line: str, key: str, number: int) -> float:
+    """The number behind `Frames:` or `Frame Time:`."""
+    words = line.split()
+    named = key.split()
+    if [word.lower() for word in words[: len(named)]] == [word.lower() for word in named]:
+        try:
+            return float(words[len(named)])
+        except (ValueError, IndexError):
+            pass
+    raise DataError(
+        path, f"line {number} must be `{key}` and a number, it is {line.strip()[:60]!r}", _EXPORT_AGAIN
+    )
+
+
+def _numbers(path: Path, body: str, channels: int, frames: float, first_line: int) -> Float:
+    """The frames [T, channels]: all at once, and line by line only to find what is wrong."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # how numpy says that text is no number
+            values = np.fromstring(body, sep=" ")
+    except (DeprecationWarning, ValueError):
+        values = np.empty(0)
+    rows = sum(1 for line in body.split("\n") if line.strip())
+    if not channels or not rows or values.size != rows * channels or not np.isfinite(values).all():
+        raise _first_bad_frame(path, body, channels, first_line)
+    if rows != frames:
+        last = first_line + body.rstrip().count("\n")
+        raise DataError(
+            path,
+            f"states {frames:g} frames but holds {rows}, the last on line {last}",
+            _EXPORT_AGAIN if rows < frames else "correct the line `Frames:`",
+        )
+    return values.reshape(rows, channels)
+
+
+def _first_bad_frame(path: Path, body: str, channels: int, first_line: int) -> DataError:
+    if not channels or not body.strip():
+        return DataError(path, "holds no frames" if channels else "has no channels", _EXPORT_AGAIN)
+    lines = body.split("\n")
+    last = max(k for k, line in enumerate(lines) if line.strip())
+    for k, line in enumerate(lines):
+        words = line.split()
+        if words and len(words) != channels:
+            remedy = _EXPORT_AGAIN
+            if k == last:
+                remedy += ", or delete that line and lower the number behind `Frames:`"
+            return DataError(path, f"line {first_line + k} has {len(words)} of {channels} numbers", remedy)
+        for word in words:
+            try:
+                usable = math.isfinite(float(word))
+            except ValueError:
+                usable = False
+            if not usable:
+                return DataError(
+                    path, f"line {first_line + k}: {word[:40]!r} is no finite number", _EXPORT_AGAIN
+                )
+    return DataError(path, "holds numbers that cannot be read", _EXPORT_AGAIN)
+
+
+FORMAT = BvhFormat()

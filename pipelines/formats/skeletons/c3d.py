@@ -1,0 +1,358 @@
+"""C3D, the file of biomechanics laboratories: 3D points at a constant rate, in 32-bit floats. Needs ezc3d.
+
+Layout: C3D.org's user guide (2021). A point that is missing has the residual -1; any other residual is how
+far the point can be trusted: here its standard deviation per axis, sqrt(trace / 3) of its covariance, in
+whole millimetres up to 255. Header and POINT:FRAMES count to 65535; what lies beyond is counted by
+TRIAL:ACTUAL_END_FIELD (two 16-bit words).
+
+A C3D knows no time of day. Files of ours say in MOCAP:FIRST_T_NS and LAST_T_NS when they begin and end, as
+text because its numbers are too short; other files begin at the time of their first frame's number.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.formats.common.export_names import people_of
+from pipelines.formats.common.extras import need
+from pipelines.formats.common.summaries import describe_motion
+from pipelines.formats.skeletons.even_frames import EvenMotion, at_even_times
+from pipelines.formats.skeletons.joint_axes import METRES, to_metres_z_up, to_y_up
+from pipelines.formats.skeletons.trc import joint_names, marker_name, metric_unit
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float, Int64, JointMotion, Recording
+from pipelines.session.storage import as_data_error
+
+_BLOCK = 512
+_MAGIC = 0x50  # the second byte of every C3D
+_DEC, _MIPS = 85, 86  # processors, by which numbers are stored
+_MOST_COUNTED = 65535
+_LONGEST_LABEL = 30  # what the programs of laboratories show
+_LONGEST_TEXT = 255  # bytes
+_MOST_RESIDUAL = 255
+_MOST_FIRST_FRAME = 1_000_000_000
+_SCREEN_UP = {"+Z": "z-up", "+Y": "y-up"}
+_EXPORT_AGAIN = "export it again"
+
+
+class C3dFormat:
+    """One person. Labels that Pose2Sim names get our joint names (RHip is right_hip), others keep theirs.
+
+    POINT:UNITS counts unless the user states the unit; POINT:Y_SCREEN says what is up (+Z or +Y), and
+    z is without it. Analog channels are not read.
+    """
+
+    name = "c3d"
+    title = "Biomechanics points (C3D)"
+    suffixes: tuple[str, ...] = (".c3d",)
+
+    def recognises(self, path: Path) -> bool:
+        """Whether its second byte is that of every C3D."""
+        if path.suffix.lower() not in self.suffixes or not path.is_file():
+            return False
+        with path.open("rb") as file:
+            start = file.read(2)
+        return len(start) == 2 and start[1] == _MAGIC
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Unit, axes and rate as stated, points, times, what is missing, and the box in the world (z up)."""
+        contents = _open(path)
+        stated: dict[str, object] = {
+            "POINT:UNITS": _text(contents, "POINT", "UNITS"),
+            "POINT:Y_SCREEN": _text(contents, "POINT", "Y_SCREEN"),
+            "POINT:RATE": _number(contents, "POINT", "RATE"),
+        }
+        said = {key: value for key, value in stated.items() if value is not None}
+        return {**said, **describe_motion(_motion(path, contents, unit=None, axes=None))}
+
+    def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
+        """Read every frame; a point whose residual is negative is NaN.
+
+        Raises:
+            DataError: ezc3d is not installed, or the file is no C3D, is damaged or breaks off, has no
+                points, no rate, or no unit that we know.
+        """
+        return _motion(path, _open(path), unit=unit, axes=axes)
+
+
+def _open(path: Path) -> Any:
+    ezc3d = need("ezc3d", "c3d")
+    _check_layout(path)
+    try:
+        return ezc3d.c3d(str(path))
+    except (OSError, ValueError, RuntimeError, IndexError, KeyError, MemoryError) as error:
+        raise DataError(path, f"is no readable C3D ({str(error)[:120]})", _EXPORT_AGAIN) from error
+
+
+def _check_layout(path: Path) -> None:
+    """Refuse a file that is shorter than its header says, or whose parameters run into each other.
+
+    ezc3d searches minutes for what is not there, or dies of it.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(_BLOCK)
+            file.seek(max(head[0] - 1, 0) * _BLOCK if head else 0)
+            section = file.read(_BLOCK)
+            # Some writers count no blocks; the data's own block, then, says where the section ends.
+            until_data = max(head[16 if section[3] != _MIPS else 17] - head[0], 0) if len(section) > 3 else 0
+            section += file.read(max(*section[2:3], until_data, 1) * _BLOCK - _BLOCK)
+            size = file.seek(0, 2)
+    except OSError as error:
+        raise as_data_error(error, path) from error
+    if len(head) < _BLOCK or head[1] != _MAGIC or len(section) < 4:
+        raise DataError(path, "is no readable C3D (it ends in its header)", _EXPORT_AGAIN)
+    processor = section[3]
+    order = ">" if processor == _MIPS else "<"
+    points, analogs, first, last = struct.unpack_from(f"{order}4H", head, 2)
+    scale, start = struct.unpack_from(f"{order}fH", head, 12)
+    # DEC stores the half with the sign first.
+    is_float = head[13] & 0x80 if processor == _DEC else scale < 0
+    frames = max(last - first + 1, 0)
+    needed = (start - 1) * _BLOCK + frames * (4 * points + analogs) * (4 if is_float else 2)
+    if size < needed:
+        raise DataError(
+            path, f"is no readable C3D (it holds {size} of the {needed} bytes of its header)", _EXPORT_AGAIN
+        )
+    if not _is_chain(section, order):
+        raise DataError(path, "is no readable C3D (its parameters are damaged)", _EXPORT_AGAIN)
+
+
+def _is_chain(section: bytes, order: str) -> bool:
+    """Whether the parameters follow each other within their section, each as long as it says.
+
+    A record is the length of its name (negative: locked), a group's number (negative: the group itself), the
+    name, how far it is to the next, then of a parameter its type, its dimensions and its values.
+    """
+    at, groups = 4, set()
+    asked: set[int] = set()
+    try:
+        while at < len(section) and section[at]:
+            name, group = struct.unpack_from("2b", section, at)
+            step = at + 2 + abs(name)
+            (further,) = struct.unpack_from(f"{order}H", section, step)
+            if group < 0:
+                groups.add(-group)
+                end = step + 3 + section[step + 2]
+            else:
+                asked.add(group)
+                kind, dimensions = struct.unpack_from("bB", section, step + 2)
+                sides = section[step + 4 : step + 4 + dimensions]
+                end = step + 4 + dimensions + abs(kind) * math.prod(sides)
+                end += 1 + section[end]
+                if kind not in {-1, 1, 2, 4} or dimensions > 7 or len(sides) < dimensions:
+                    return False
+            if end > len(section) or (further and step + further < end):
+                return False
+            if not further:
+                break
+            at = step + further
+            if at > len(section):
+                return False
+    except (IndexError, struct.error):
+        return False
+    return asked <= groups
+
+
+def _motion(path: Path, contents: Any, *, unit: str | None, axes: str | None) -> JointMotion:
+    points = np.asarray(contents["data"]["points"], np.float64)  # [4, N, T]
+    residual = np.asarray(contents["data"]["meta_points"]["residuals"], np.float64)[0]
+    frames = _frames(contents)
+    if not points.shape[1] or not frames:
+        raise DataError(path, "holds no points", _EXPORT_AGAIN)
+    xyz = np.where(residual < 0, np.nan, points[:3]).transpose(2, 1, 0)
+    if frames > len(xyz):
+        xyz = np.concatenate([xyz, _beyond(path, contents, len(xyz), frames)])
+    labels = _labels(contents, xyz.shape[1])
+    unit = unit or metric_unit(_text(contents, "POINT", "UNITS") or "")
+    axes = axes or _SCREEN_UP.get(_text(contents, "POINT", "Y_SCREEN") or "", "z-up")
+    position = to_metres_z_up(path, xyz, unit, axes)
+    return JointMotion(_times(path, contents, frames), joint_names(labels), position[:, None])
+
+
+def _frames(contents: Any) -> int:
+    """How many there are, by whatever counts furthest."""
+    read = int(np.shape(contents["data"]["points"])[2])
+    first, last = (_words(contents, f"ACTUAL_{end}_FIELD") for end in ("START", "END"))
+    return max(read, last - first + 1) if first is not None and last is not None else read
+
+
+def _words(contents: Any, name: str) -> int | None:
+    values = _values(contents, "TRIAL", name)
+    if len(values) == 0:
+        return None
+    low, high = (int(v) & 0xFFFF for v in [*values, 0][:2])
+    return low | high << 16
+
+
+def _beyond(path: Path, contents: Any, read: int, frames: int) -> Float:
+    """[T, N, 3] the frames that ezc3d leaves out because the header cannot count them."""
+    points = int(np.shape(contents["data"]["points"])[1])
+    first = _number(contents, "POINT", "DATA_START")
+    scale = _number(contents, "POINT", "SCALE") or 0.0
+    if np.size(contents["data"]["analogs"]) or scale >= 0 or first is None:
+        raise DataError(
+            path, f"holds {frames} frames beside analog channels or in integers", "export it in parts"
+        )
+    start = (int(first) - 1) * _BLOCK + read * points * 16
+    values = np.fromfile(path, "<f4", count=(frames - read) * points * 4, offset=start)
+    if len(values) < (frames - read) * points * 4:
+        raise DataError(path, f"breaks off before the last of its {frames} frames", _EXPORT_AGAIN)
+    rows = values.reshape(frames - read, points, 4).astype(np.float64)
+    return np.where(rows[..., 3:] < 0, np.nan, rows[..., :3])
+
+
+def _labels(contents: Any, count: int) -> tuple[str, ...]:
+    """The points' names; ours in full, where a label was cut for others' sake."""
+    labels = [*_texts(contents, "LABELS"), *(f"point{k + 1}" for k in range(count))][:count]
+    if _text(contents, "MOCAP", "FIRST_T_NS") is not None:
+        labels = [
+            full or label for full, label in zip(_texts(contents, "DESCRIPTIONS"), labels, strict=False)
+        ]
+    return tuple(_unique(labels))
+
+
+def _texts(contents: Any, name: str) -> list[str]:
+    """A list of POINT, which goes on in LABELS2, LABELS3 after 255 of them."""
+    more = [f"{name}{k}" if k > 1 else name for k in range(1, 100)]
+    return [str(text) for part in more for text in _values(contents, "POINT", part)]
+
+
+def _times(path: Path, contents: Any, frames: int) -> Int64:
+    first, last = (_text(contents, "MOCAP", f"{end}_T_NS") for end in ("FIRST", "LAST"))
+    rate = _number(contents, "POINT", "RATE")
+    if first is not None and last is not None:
+        try:
+            start, span = int(first), int(last) - int(first)
+        except ValueError as error:
+            raise DataError(path, "its MOCAP:FIRST_T_NS is no number", _EXPORT_AGAIN) from error
+        step_ns = span / max(frames - 1, 1)
+        since: Int64 = np.rint(np.arange(frames) * step_ns).astype(np.int64)
+        return np.asarray(start + since, np.int64)
+    if not rate or not 0 < rate < 1e6:
+        raise DataError(path, f"states a rate of {rate} Hz", _EXPORT_AGAIN)
+    number = contents["header"]["points"]["first_frame"]
+    began = number if 0 <= number < _MOST_FIRST_FRAME else 0
+    times: Int64 = np.rint((began + np.arange(frames)) * (1e9 / rate)).astype(np.int64)
+    return times
+
+
+def _values(contents: Any, group: str, name: str) -> Sequence[Any]:
+    try:
+        return list(contents["parameters"][group][name]["value"])
+    except (KeyError, TypeError):
+        return []
+
+
+def _text(contents: Any, group: str, name: str) -> str | None:
+    values = _values(contents, group, name)
+    return str(values[0]).strip() if len(values) else None
+
+
+def _number(contents: Any, group: str, name: str) -> float | None:
+    values = _values(contents, group, name)
+    return float(values[0]) if len(values) else None
+
+
+# --- writing -------------------------------------------------------------------------------------------
+
+
+class C3dExport:
+    """`<name>.c3d`, or `<name>_person<k>.c3d` for each of several people, at a constant rate."""
+
+    name = "c3d"
+    title = "C3D points with their uncertainty as residual; float32 (extra c3d)"
+    units = ("mm", "cm", "m")
+    axes = ("z-up", "y-up")
+
+    def write(self, recording: Recording, folder: Path) -> list[Path]:
+        """Write every person of whom a joint is known.
+
+        Raises:
+            DataError: there is none, ezc3d is not installed, or the times are too scattered for a rate.
+        """
+        motion, files = people_of(recording, folder, ".c3d")
+        need("ezc3d", "c3d")
+        even = at_even_times("c3d", motion, recording.progress)
+        if even.empty:
+            recording.progress.note(
+                f"c3d: {even.empty} frames lie in pauses of the skeleton and hold no points"
+            )
+        for person, path in files.items():
+            write_joints(path, even, person, unit=recording.unit or "mm", axes=recording.axes or "z-up")
+        return sorted(files.values())
+
+
+def write_joints(path: Path, even: EvenMotion, person: int, *, unit: str, axes: str) -> None:
+    """Write one person's joints; see the module for what residuals mean."""
+    ezc3d = need("ezc3d", "c3d")
+    motion = even.motion
+    position = motion.position[:, person]
+    missing = ~np.isfinite(position).all(axis=-1).T  # [N, T]
+    turned = to_y_up(position) if axes == "y-up" else position
+    points = np.ones((4, *missing.shape))
+    points[:3] = np.where(missing, np.nan, turned.transpose(2, 1, 0) / METRES[unit])
+    step = METRES["mm"] / METRES[unit]  # a residual's unit is POINT:SCALE
+    file = ezc3d.c3d()
+    file["data"]["points"] = points
+    file["data"]["meta_points"] = {
+        "residuals": _residuals(motion, person, missing, step)[None],
+        "camera_masks": np.zeros((7, *missing.shape), bool),
+    }
+    names = [" ".join(marker_name(joint).split()) or "_" for joint in motion.joints]
+    stated = file["parameters"]["POINT"]
+    stated["RATE"]["value"] = [even.rate_hz]
+    stated["SCALE"]["value"] = [-step]
+    stated["UNITS"]["value"] = [unit]
+    stated["LABELS"]["value"] = _short(names)
+    stated["DESCRIPTIONS"]["value"] = [_cut(name, _LONGEST_TEXT) for name in names]
+    file.add_parameter("POINT", "X_SCREEN", ["+X"])
+    file.add_parameter("POINT", "Y_SCREEN", ["+Y" if axes == "y-up" else "+Z"])
+    count = len(motion.t_ns)
+    file.add_parameter("TRIAL", "ACTUAL_START_FIELD", [1, 0])
+    file.add_parameter("TRIAL", "ACTUAL_END_FIELD", [count & 0xFFFF, count >> 16])
+    file.add_parameter("MANUFACTURER", "SOFTWARE", ["mocap"])
+    file.add_parameter("MOCAP", "FIRST_T_NS", [str(int(motion.t_ns[0]))])
+    file.add_parameter("MOCAP", "LAST_T_NS", [str(int(motion.t_ns[-1]))])
+    file.write(str(path))
+
+
+def _residuals(motion: JointMotion, person: int, missing: Any, step: float) -> Float:
+    """[N, T] standard deviations in whole steps; 0 where none is stated, -1 where there is no point."""
+    steps = np.zeros(missing.shape)
+    if motion.covariance is not None:
+        trace = motion.covariance[:, person][..., [0, 3, 5]].sum(axis=-1).T
+        sigma_mm = 1000 * np.sqrt(np.where(np.isfinite(trace), np.maximum(trace, 0.0), 0.0) / 3)
+        steps = np.minimum(np.rint(sigma_mm), _MOST_RESIDUAL)
+    # ezc3d cuts off what lies behind the point: a quarter keeps 7 from becoming 6.9999.
+    return np.where(missing, -1.0, (steps + 0.25) * step)
+
+
+def _short(names: Sequence[str]) -> list[str]:
+    """Labels of at most 30 bytes, as programs show them; those that would be alike are numbered."""
+    return _unique([_cut(name, _LONGEST_LABEL) for name in names], _LONGEST_LABEL)
+
+
+def _unique(names: Sequence[str], longest: int = _LONGEST_TEXT) -> list[str]:
+    taken: list[str] = []
+    for name in names:
+        number, free = 2, name
+        while free in taken:
+            free = f"{_cut(name, longest - len(str(number)) - 1)}_{number}"
+            number += 1
+        taken.append(free)
+    return taken
+
+
+def _cut(text: str, most: int) -> str:
+    return text.encode()[:most].decode(errors="ignore")
+
+
+FORMAT = C3dFormat()
+EXPORT = C3dExport()

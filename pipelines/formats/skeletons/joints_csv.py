@@ -1,0 +1,206 @@
+"""3D joints as a long CSV, one row per time, person and joint; and the csv export, which adds the cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.formats.common.export_names import safe_file_name, tracks_of
+from pipelines.formats.common.stamps import cell_name, parse_stamps, stamp_column
+from pipelines.formats.common.summaries import describe_motion
+from pipelines.formats.common.text_tables import parse_table, read_head, read_text
+from pipelines.formats.poses import pose_csv
+from pipelines.formats.skeletons.joint_axes import to_metres_z_up
+from pipelines.session.errors import DataError
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Int64, JointMotion, Recording
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_MOST_EMPTY = 100  # dense cells per row before a file is refused as scattered
+
+
+class JointsCsvFormat:
+    """Header `t_ns,[person,]joint,x,y,z` in any order; the time may be t, time, ... in seconds.
+
+    Metres and z up unless the user says otherwise. Rows may come in any order. People are ranked by
+    their number, joints in order of appearance. A position that is blank, infinite or not there at all is
+    missing (NaN).
+    """
+
+    name = "joints_csv"
+    title = "3D joints as CSV"
+    suffixes: tuple[str, ...] = (".csv", ".txt")
+
+    def recognises(self, path: Path) -> bool:
+        """Whether its header names a time, a joint and x y z."""
+        if path.suffix.lower() not in self.suffixes or not path.is_file():
+            return False
+        return _find_columns(read_head(path).split("\n", 1)[0]) is not None
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Joints, people, times, what is missing, and the box as if in metres with z up."""
+        return describe_motion(self.read_joints(path, unit=None, axes=None))
+
+    def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
+        """Read every joint.
+
+        Raises:
+            DataError: not text, no such header, a malformed or truncated line, a time or person that is no
+                number, a joint stated twice, or rows too scattered for a dense table.
+        """
+        first, _, body = read_text(path).partition("\n")
+        columns = _find_columns(first)
+        if columns is None:
+            raise DataError(
+                path, "has no header that names the time, joint and x y z", "begin with t_ns,joint,x,y,z"
+            )
+        person = {} if columns.person is None else {"person": columns.person}
+        table = parse_table(
+            path,
+            body,
+            delimiter=",",
+            columns=columns.count,
+            text={"stamp": columns.stamp, "joint": columns.joint, **person},
+            numbers=dict(zip("xyz", columns.xyz, strict=True)),
+            first_line=2,
+        )
+        if table.truncated:
+            raise DataError(path, "its last line broke off", "copy the file again, or delete that line")
+        stamps, readable = parse_stamps(path, table.text["stamp"], columns.stamp_unit)
+        if not readable.all():
+            raise DataError(path, f"{np.count_nonzero(~readable)} rows have no readable time", "correct them")
+        position = to_metres_z_up(path, table.stack(("x", "y", "z")), unit or "m", axes or "z-up")
+        people = _people(path, table.text.get("person"), len(stamps))
+        return _dense(path, stamps, people, table.text["joint"], position)
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """Where the columns are, and how many there are in all."""
+
+    count: int
+    stamp: int
+    stamp_unit: int
+    joint: int
+    xyz: tuple[int, int, int]
+    person: int | None
+
+
+def _find_columns(line: str) -> _Columns | None:
+    """The columns that a header names; None if one of those needed is absent."""
+    cells = line.split(",")
+    stamp = stamp_column(cells)
+    index = {cell_name(cell)[0]: column for column, cell in reversed(list(enumerate(cells)))}
+    if stamp is None or not index.keys() >= {"joint", "x", "y", "z"}:
+        return None
+    xyz = (index["x"], index["y"], index["z"])
+    return _Columns(len(cells), stamp[0], stamp[1], index["joint"], xyz, index.get("person"))
+
+
+def _people(path: Path, column: pa.ChunkedArray | None, rows: int) -> Int64:
+    """[N] whole numbers; 0 where the file has no such column."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    if column is None:
+        return np.zeros(rows, dtype=np.int64)
+    try:
+        numbers = pc.cast(pc.utf8_trim_whitespace(column), pa.int64())
+    except pa.ArrowInvalid as error:
+        raise DataError(
+            path, "holds a person that is no whole number", "number the people 0, 1, ..."
+        ) from error
+    if numbers.null_count:
+        raise DataError(path, f"{numbers.null_count} rows name no person", "number the people 0, 1, ...")
+    return np.asarray(numbers.to_numpy(), dtype=np.int64)
+
+
+def _dense(
+    path: Path, stamps: Int64, people: Int64, names: pa.ChunkedArray, position: NDArray[np.float64]
+) -> JointMotion:
+    """Long rows [N] to [T, P, J, 3]."""
+    import pandas as pd
+
+    t_ns, row = np.unique(stamps, return_inverse=True)
+    persons, person = np.unique(people, return_inverse=True)
+    joint, joints = pd.factorize(pd.Series(names.to_pylist(), dtype=object).fillna("").str.strip())
+    if not len(t_ns) or "" in joints:
+        raise DataError(path, "holds no joints, or rows without a joint's name", "write t_ns,joint,x,y,z")
+    shape = (len(t_ns), len(persons), len(joints))
+    cells = shape[0] * shape[1] * shape[2]
+    if cells > _MOST_EMPTY * len(stamps) + 10**6:
+        raise DataError(
+            path,
+            f"{len(stamps)} rows are scattered over {shape[0]} times, {shape[1]} people, {shape[2]} joints",
+            "check the columns of time, person and joint",
+        )
+    flat = np.ravel_multi_index((row, person, joint), shape)
+    twice = np.flatnonzero(np.bincount(flat, minlength=cells) > 1)
+    if len(twice):
+        t, p, j = np.unravel_index(twice[0], shape)
+        raise DataError(
+            path,
+            f"{len(twice)} joints are stated more than once at one time, first {joints[j]} of person "
+            f"{persons[p]} at {t_ns[t]} ns",
+            "leave one row for each",
+        )
+    dense = np.full((cells, 3), np.nan)
+    dense[flat] = position
+    return JointMotion(t_ns=t_ns, joints=tuple(map(str, joints)), position=dense.reshape(*shape, 3))
+
+
+def write_joints(path: Path, motion: JointMotion) -> None:
+    """Write `t_ns,person,joint,x,y,z` and what else is known of each (covariance in m^2); NaN is blank."""
+    import pandas as pd
+
+    times, people, joints = motion.position.shape[:3]
+    t_ns, person, joint = np.meshgrid(motion.t_ns, np.arange(people), np.arange(joints), indexing="ij")
+    columns: dict[str, object] = {
+        "t_ns": t_ns.ravel(),
+        "person": person.ravel(),
+        "joint": np.array(motion.joints, dtype=object)[joint.ravel()],
+        **dict(zip("xyz", motion.position.reshape(times * people * joints, 3).T, strict=True)),
+    }
+    if motion.covariance is not None:
+        columns |= dict(zip(POINT_COVARIANCE_COLUMNS, motion.covariance.reshape(-1, 6).T, strict=True))
+    if motion.views is not None:
+        columns["views"] = motion.views.ravel()
+    if motion.status is not None:
+        columns["status"] = motion.status.ravel()
+    if motion.reprojection_px is not None:
+        columns["reprojection_px"] = motion.reprojection_px.ravel()
+    pd.DataFrame(columns).to_csv(path, index=False, lineterminator="\n")
+
+
+class CsvExport:
+    """`<name>.csv`, the skeleton as a long table, and `<name>_<camera>.csv`, the poses of each camera."""
+
+    name = "csv"
+    title = "long tables of the skeleton and of each camera's poses, as text"
+
+    def write(self, recording: Recording, folder: Path) -> list[Path]:
+        """Write what the recording has.
+
+        Raises:
+            DataError: it has neither joints nor camera poses.
+        """
+        name = safe_file_name(recording.name)
+        paths: list[Path] = []
+        if recording.motion is not None and recording.motion.position.size:
+            paths.append(folder / f"{name}.csv")
+            write_joints(paths[-1], recording.motion)
+        for camera, trajectory in tracks_of(recording).items():
+            paths.append(folder / f"{name}_{safe_file_name(camera)}.csv")
+            pose_csv.write_trajectory(paths[-1], trajectory)
+        if not paths:
+            raise DataError(recording.name, "holds neither joints nor camera poses", "reconstruct it first")
+        return sorted(paths)
+
+
+FORMAT = JointsCsvFormat()
+EXPORT = CsvExport()

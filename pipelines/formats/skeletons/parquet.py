@@ -1,0 +1,70 @@
+"""The parquet export: the skeleton's table and the cameras' poses, as pandas, polars and DuckDB read them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.formats.common.export_names import safe_file_name, tracks_of
+from pipelines.session.errors import DataError
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording
+from pipelines.session.tables import POSES, POSES_WITH_COVARIANCE, SKELETON, write_table
+from pipelines.session.tabular import pose_table
+
+
+class ParquetExport:
+    """`<name>.parquet`, the session's skeleton table, and `<name>_<camera>.parquet`, its tables of poses.
+
+    Metres, z up; one row for each time, person and joint, NaN and a status where it is missing. The same
+    recording gives the same bytes.
+    """
+
+    name = "parquet"
+    title = "the same tables, typed and small, for pandas"
+
+    def write(self, recording: Recording, folder: Path) -> list[Path]:
+        """Write what the recording has.
+
+        Raises:
+            DataError: it has neither joints nor camera poses.
+        """
+        name = safe_file_name(recording.name)
+        paths: list[Path] = []
+        if recording.motion is not None and recording.motion.position.size:
+            paths.append(folder / f"{name}.parquet")
+            write_joints(paths[-1], recording.motion)
+        for camera, trajectory in tracks_of(recording).items():
+            paths.append(folder / f"{name}_{safe_file_name(camera)}.parquet")
+            schema = POSES if trajectory.covariance is None else POSES_WITH_COVARIANCE
+            write_table(paths[-1], pose_table(trajectory), schema)
+        if not paths:
+            raise DataError(recording.name, "holds neither joints nor camera poses", "reconstruct it first")
+        return sorted(paths)
+
+
+def write_joints(path: Path, motion: JointMotion) -> None:
+    """Write `tables.SKELETON`; what a motion does not know of its joints is NaN, 0 views and no status."""
+    import pandas as pd
+
+    times, people, joints = shape = motion.position.shape[:3]
+    t_ns, person, joint = np.meshgrid(motion.t_ns, np.arange(people), np.arange(joints), indexing="ij")
+    unknown = np.full(shape, np.nan)
+    covariance = np.full((*shape, 6), np.nan) if motion.covariance is None else motion.covariance
+    reprojection = unknown if motion.reprojection_px is None else motion.reprojection_px
+    views = np.zeros(shape, np.int64) if motion.views is None else motion.views
+    status = np.full(shape, "") if motion.status is None else motion.status
+    columns: dict[str, object] = {
+        "t_ns": t_ns.ravel(),
+        "person": person.ravel(),
+        "joint": np.array(motion.joints, dtype=object)[joint.ravel()],
+        **dict(zip("xyz", motion.position.reshape(times * people * joints, 3).T, strict=True)),
+        **dict(zip(POINT_COVARIANCE_COLUMNS, covariance.reshape(-1, 6).T, strict=True)),
+        "views": views.ravel(),
+        "reprojection_px": reprojection.ravel(),
+        "status": status.ravel().astype(object),
+    }
+    write_table(path, pd.DataFrame(columns), SKELETON)
+
+
+EXPORT = ParquetExport()

@@ -1,0 +1,229 @@
+"""OpenSim's TRC: marker positions over time, tab-separated below five header lines.
+
+Layout (OpenSim documentation, "Marker (.trc) Files"): 1 file type and name, 2 keys, 3 values (rates, counts,
+unit), 4 `Frame#`, `Time` and marker names, 5 X1 Y1 Z1 ..., an optional blank line, then one row per frame.
+Coordinates are y up by OpenSim's convention; a marker that was not seen has blank cells.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.formats.common.export_names import people_of
+from pipelines.formats.common.stamps import format_seconds, parse_stamps
+from pipelines.formats.common.summaries import describe_motion, median_step_ns
+from pipelines.formats.common.text_tables import read_head, read_text
+from pipelines.formats.skeletons.joint_axes import METRES, to_metres_z_up, to_y_up
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float, JointMotion, Recording
+from pipelines.session.skeletons import SKELETONS
+
+_UNITS = {
+    "m": "m",
+    "meters": "m",
+    "metres": "m",
+    "cm": "cm",
+    "centimeters": "cm",
+    "mm": "mm",
+    "millimeters": "mm",
+}
+_DECIMALS = 7  # of a metre: far below anything measured, and rows stay readable
+
+
+def metric_unit(stated: str) -> str:
+    """m, cm or mm for what files call them; anything else as it is."""
+    return _UNITS.get(stated.lower(), stated)
+
+
+def marker_name(joint: str) -> str:
+    """How Pose2Sim and its OpenSim models call a joint of ours: right_big_toe is RBigToe, nose is Nose.
+
+    Joints that no skeleton of ours has are left as they are.
+    """
+    return _MARKERS.get(joint, joint)
+
+
+def _camel_case(joint: str) -> str:
+    words = joint.split("_")
+    if words[0] in {"left", "right"}:
+        words[0] = words[0][0]
+    return "".join(word[0].upper() + word[1:] for word in words)
+
+
+_MARKERS = {joint: _camel_case(joint) for skeleton in SKELETONS.values() for joint in skeleton.joints}
+_JOINTS = {
+    **{marker: joint for joint, marker in _MARKERS.items()},
+    **{joint.title().replace("_", ""): joint for joint in _MARKERS},  # RightBigToe
+    "CHip": "hip",
+    "MidHip": "hip",
+    "HipCenter": "hip",
+    "LFootIndex": "left_big_toe",
+    "RFootIndex": "right_big_toe",
+}
+
+
+@dataclass(frozen=True)
+class _Header:
+    keys: dict[str, str]
+    markers: tuple[str, ...]
+
+
+class TrcFormat:
+    """One person. Markers that Pose2Sim names get our joint names (RHip is right_hip), others keep theirs.
+
+    `unit` stated by the user overrides the header, because files that say m and mean mm are common;
+    without it the header's Units count. `axes` is y-up unless stated: world = (z, x, y) of the file.
+    """
+
+    name = "trc"
+    title = "OpenSim markers (TRC)"
+    suffixes: tuple[str, ...] = (".trc",)
+
+    def recognises(self, path: Path) -> bool:
+        """Whether it begins as every TRC does."""
+        if path.suffix.lower() not in self.suffixes or not path.is_file():
+            return False
+        return read_head(path).startswith("PathFileType")
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Header, joints, times, what is missing, and the box in the world (z up)."""
+        header, _, _ = _split(path, read_text(path))
+        stated = {key: header.keys[key] for key in ("Units", "DataRate", "NumFrames") if key in header.keys}
+        return {
+            **{f"header: {key}": value for key, value in stated.items()},
+            **describe_motion(self.read_joints(path, unit=None, axes=None)),
+        }
+
+    def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
+        """Read every row; blank cells are NaN.
+
+        Raises:
+            DataError: no TRC header, no unit that we know, a row with another number of cells or
+                cells that are no numbers, times that do not increase, or no rows.
+        """
+        header, rows, first_line = _split(path, read_text(path))
+        if unit is None:
+            unit = metric_unit(header.keys.get("Units", ""))
+        times, values = _numbers(path, rows, len(header.markers), first_line)
+        t_ns, readable = parse_stamps(path, times)
+        if not readable.all() or (np.diff(t_ns) <= 0).any():
+            bad = np.flatnonzero(~readable | (np.diff(t_ns, prepend=t_ns[0] - 1) <= 0))
+            raise DataError(
+                path, f"the time of row {bad[0] + 1} ({times[bad[0]]!r}) does not increase", "export it again"
+            )
+        position = to_metres_z_up(path, values, unit, axes or "y-up")
+        return JointMotion(t_ns=t_ns, joints=joint_names(header.markers), position=position[:, None])
+
+
+def _split(path: Path, text: str) -> tuple[_Header, list[str], int]:
+    """Header, the lines below it, and the number of the first of those in the file."""
+    lines = text.split("\n")
+    if len(lines) < 5 or not lines[0].startswith("PathFileType") or not lines[3].startswith("Frame#"):
+        raise DataError(
+            path, "has no TRC header (five lines from PathFileType to X1 Y1 Z1)", "export it again"
+        )
+    markers = tuple(cell.strip() for cell in lines[3].split("\t")[2:] if cell.strip())
+    columns = len(lines[4].split())
+    if not markers or columns != 3 * len(markers):
+        raise DataError(
+            path, f"names {len(markers)} markers above {columns} columns of coordinates", "export it again"
+        )
+    twice = sorted({marker for marker in markers if markers.count(marker) > 1})
+    if twice:
+        raise DataError(path, f"names the marker {twice[0]} more than once", "rename one")
+    keys = zip(lines[1].split("\t"), lines[2].split("\t"), strict=False)
+    return _Header({key.strip(): value.strip() for key, value in keys}, markers), lines[5:], 6
+
+
+def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tuple[list[str], Float]:
+    """Times as text, and coordinates [T, M, 3]."""
+    times: list[str] = []
+    values: list[list[float]] = []
+    for number, line in enumerate(lines, start=first_line):
+        if not line.strip():
+            continue
+        cells = line.split("\t")
+        if len(cells) == 3 * markers + 3 and not cells[-1].strip():
+            cells.pop()  # many writers end their lines with a tab
+        if len(cells) != 3 * markers + 2:
+            raise DataError(
+                path, f"line {number} has {len(cells)} cells instead of {3 * markers + 2}", "export it again"
+            )
+        try:
+            values.append([float(cell) if cell.strip() else np.nan for cell in cells[2:]])
+        except ValueError as error:
+            raise DataError(path, f"line {number}: {error}", "export it again") from error
+        times.append(cells[1])
+    if not times:
+        raise DataError(path, "holds no frames", "export it again")
+    return times, np.array(values).reshape(len(times), markers, 3)
+
+
+def joint_names(markers: tuple[str, ...]) -> tuple[str, ...]:
+    """Our names where they are known and free: of Hip and MidHip in one file only the first becomes hip."""
+    names: list[str] = []
+    for marker in markers:
+        joint = _JOINTS.get(marker, marker)
+        names.append(marker if joint in names else joint)
+    return tuple(names)
+
+
+class TrcExport:
+    """`<name>.trc`, or `<name>_person<k>.trc` for each of several people: metres and y up unless asked.
+
+    OpenSim's (x, y, z) is our world's (y, z, x). The header states the unit; no TRC states its axes. Times
+    are the session's own (seconds, nine decimals), so that a file lines up with its flight and reads back
+    as truth.
+    """
+
+    name = "trc"
+    title = "markers for OpenSim and Pose2Sim"
+    units = ("m", "cm", "mm")
+    axes = ("y-up", "z-up")
+
+    def write(self, recording: Recording, folder: Path) -> list[Path]:
+        """Write every person of whom a joint is known.
+
+        Raises:
+            DataError: there is none.
+        """
+        motion, files = people_of(recording, folder, ".trc")
+        for person, path in files.items():
+            write_joints(path, motion, person, unit=recording.unit or "m", axes=recording.axes or "y-up")
+        return sorted(files.values())
+
+
+def write_joints(
+    path: Path, motion: JointMotion, person: int, *, unit: str = "m", axes: str = "y-up"
+) -> None:
+    """Write one person's joints; a joint that is missing at a time has three blank cells."""
+    step = median_step_ns(motion.t_ns)
+    rate = f"{1e9 / step:.6g}" if step else "1"
+    markers = [re.sub(r"\s+", " ", marker_name(joint)) for joint in motion.joints]
+    frames, count = len(motion.t_ns), len(markers)
+    lines = [
+        f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
+        f"{rate}\t{rate}\t{frames}\t{count}\t{unit}\t{rate}\t1\t{frames}",
+        "Frame#\tTime\t" + "\t\t\t".join(markers) + "\t\t",
+        "\t\t" + "\t".join(f"{axis}{k}" for k in range(1, count + 1) for axis in "XYZ"),
+        "",
+    ]
+    position = motion.position[:, person] / METRES[unit]
+    rows = (to_y_up(position) if axes == "y-up" else position).reshape(frames, 3 * count)
+    decimals = _DECIMALS + round(math.log10(METRES[unit]))
+    for frame, (stamp, row) in enumerate(
+        zip(format_seconds(motion.t_ns), rows.tolist(), strict=True), start=1
+    ):
+        cells = ["" if math.isnan(value) else f"{value:.{decimals}f}" for value in row]
+        lines.append("\t".join([str(frame), stamp, *cells]))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+
+
+FORMAT = TrcFormat()
+EXPORT = TrcExport()

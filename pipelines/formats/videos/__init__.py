@@ -1,0 +1,1 @@
+"""Videos, and when their frames were taken."""

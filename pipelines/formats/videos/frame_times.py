@@ -1,0 +1,248 @@
+"""When each frame of a video was taken: a CSV, or the subtitles that DJI drones write beside the video."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.formats.common.stamps import Bool, cell_name, format_seconds, parse_stamps, stamp_column
+from pipelines.formats.common.summaries import describe_times
+from pipelines.formats.common.text_tables import parse_table, read_head, read_text
+from pipelines.formats.drone_logs.dji_srt import parse_subtitles, read_subtitles
+from pipelines.session.errors import DataError
+from pipelines.session.records import Int64
+
+_FRAME_NAMES = {"frame", "frame_id", "frame_index", "frame_number"}
+
+
+@dataclass(frozen=True)
+class FrameStamps:
+    """Times of frames, sorted: frame numbers and times both strictly increase; frames may be absent.
+
+    Where `media_ns` is there, it tells the frames apart better than `frame` does: a recorder that skipped a
+    frame leaves a hole in it and in the video's own stamps, but not in the numbers of the video's frames.
+    """
+
+    frame: Int64  # [N] from 0
+    t_ns: Int64  # [N] since the epoch, or whatever the file counts from
+    media_ns: Int64 | None = None  # [N] the place in the video that the file itself states
+    dropped: dict[str, int] = field(default_factory=dict)  # rows left out, by cause
+
+
+class FrameTimesFormat:
+    """Frame times as CSV or as DJI's .srt; `read_frame_times` says how they are read."""
+
+    name = "frame_times"
+    title = "frame times"
+    suffixes: tuple[str, ...] = (".csv", ".srt", ".txt", ".tsv")
+
+    def recognises(self, path: Path) -> bool:
+        """Whether it is a table of times, with frame numbers or without, or subtitles of each frame."""
+        if path.suffix.lower() not in self.suffixes or not path.is_file():
+            return False
+        head = read_head(path)
+        if path.suffix.lower() == ".srt":
+            subtitles = parse_subtitles(head)
+            return bool(subtitles.has_clock.any()) and not subtitles.are_slow
+        header = _find_header(head)
+        return header is not None and header.columns == (1 if header.frame is None else 2)
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Rows, frame numbers, times, gaps, and what was left out."""
+        stamps = read_frame_times(path)
+        return {
+            "rows": len(stamps.frame),
+            "first_frame": int(stamps.frame[0]),
+            "last_frame": int(stamps.frame[-1]),
+            **describe_times(stamps.t_ns),
+            **{f"dropped: {cause}": count for cause, count in stamps.dropped.items()},
+        }
+
+
+def read_frame_times(path: Path) -> FrameStamps:
+    """Read the time of each frame.
+
+    CSV (commas, semicolons or tabs) needs a header. The time is t_ns, or t, time, timestamp or stamp in
+    seconds or with a unit (`time_ms`, `timestamp [ns]`); the frame is frame, frame_id, frame_index or
+    frame_number, from 0. Without a frame column row k is frame k. Other columns are ignored.
+
+    SRT: the clock time that each subtitle shows, taken as UTC since DJI writes local time without its
+    zone; frames are numbered by the subtitles' own times, so that a missing one leaves a hole.
+
+    Rows are left out and counted under the first cause that applies: "truncated last line", "no time" (blank,
+    no number, no clock in the subtitle), "no frame number" (blank, negative, not whole), "duplicate
+    frame" (the first stays), "time not increasing" (of rows sorted by frame, each time must be above the
+    largest before it).
+
+    Raises:
+        DataError: not text, no header, stamps too large for their unit, subtitles without clock times or
+            fewer than two a second, or no usable row.
+    """
+    return _read_subtitles(path) if path.suffix.lower() == ".srt" else _read_csv(path)
+
+
+def times_of_frames(stamps: FrameStamps, pts_ns: Int64) -> tuple[Int64, Bool]:
+    """The time of each frame of a video.
+
+    By `media_ns` where the stamps have it, each frame taking the nearest within half a frame (subtitles
+    round to a millisecond); else by frame number.
+
+    Args:
+        stamps: what was read beside the video.
+        pts_ns: [N] the video's presentation times since its first frame.
+
+    Returns:
+        [N] times, 0 where unknown, and [N] whether each is known.
+    """
+    keys, wanted = stamps.frame, np.arange(len(pts_ns), dtype=np.int64)
+    tolerance = 0
+    if stamps.media_ns is not None:
+        keys, wanted = stamps.media_ns, pts_ns
+        tolerance = int(np.median(np.diff(keys))) // 2 if len(keys) > 1 else 0
+    after = np.clip(np.searchsorted(keys, wanted), 0, len(keys) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(np.abs(keys[before] - wanted) < np.abs(keys[after] - wanted), before, after)
+    known: Bool = np.abs(keys[nearest] - wanted) <= tolerance
+    return np.where(known, stamps.t_ns[nearest], 0), known
+
+
+# --- CSV ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Header:
+    line: int  # its index in the file
+    delimiter: str
+    columns: int
+    stamp: int
+    unit: int
+    frame: int | None
+
+
+def _find_header(text: str) -> _Header | None:
+    """The first line that is not blank, when it names a time."""
+    for index, line in enumerate(text.split("\n", 100)[:100]):
+        if not line.strip():
+            continue
+        delimiter = next((mark for mark in ",;\t" if mark in line), ",")
+        cells = line.split(delimiter)
+        stamp = stamp_column(cells)
+        frame = next((k for k, cell in enumerate(cells) if cell_name(cell)[0] in _FRAME_NAMES), None)
+        return None if stamp is None else _Header(index, delimiter, len(cells), *stamp, frame)
+    return None
+
+
+def _read_csv(path: Path) -> FrameStamps:
+    text = read_text(path)
+    header = _find_header(text)
+    if header is None:
+        raise DataError(
+            path, "has no header that names the time", "begin it with the line frame,t_ns (or t in seconds)"
+        )
+    body = text.split("\n", header.line + 1)[header.line + 1 :]
+    if header.columns == 1:
+        # Blank lines count here: row k is frame k.
+        lines = body[0].rstrip().split("\n") if body and body[0].strip() else []
+        t_ns, readable = parse_stamps(path, lines, header.unit)
+        return _clean(path, np.arange(len(t_ns)), t_ns, None, {"no time": ~readable}, {})
+    table = parse_table(
+        path,
+        body[0] if body else "",
+        delimiter=header.delimiter,
+        columns=header.columns,
+        text={"stamp": header.stamp} | ({} if header.frame is None else {"frame": header.frame}),
+        numbers={},
+        first_line=header.line + 2,
+    )
+    t_ns, readable = parse_stamps(path, table.text["stamp"], header.unit)
+    frame, numbered = np.arange(len(t_ns)), np.ones(len(t_ns), dtype=np.bool_)
+    if header.frame is not None:
+        frame, numbered = _frame_numbers(table.text["frame"].to_pylist())
+    dropped = {"truncated last line": table.truncated} if table.truncated else {}
+    return _clean(path, frame, t_ns, None, {"no time": ~readable, "no frame number": ~numbered}, dropped)
+
+
+def _frame_numbers(cells: list[str]) -> tuple[Int64, Bool]:
+    """Whole numbers, also as 12.0; 0 and False where a cell is none."""
+    matches = [re.fullmatch(r"\s*(\d{1,18})(?:\.0*)?\s*", cell or "") for cell in cells]
+    frame = np.array([int(match[1]) if match else 0 for match in matches], dtype=np.int64)
+    return frame, np.array([match is not None for match in matches], dtype=np.bool_)
+
+
+# --- subtitles ------------------------------------------------------------------------------------------
+
+
+def _read_subtitles(path: Path) -> FrameStamps:
+    subtitles = read_subtitles(path)
+    known, media_ns = subtitles.has_clock, subtitles.media_ns
+    start_ns = subtitles.start_ns()
+    if start_ns is None:
+        raise DataError(
+            path, f"its {len(media_ns)} subtitles show no clock time", "state frame_times: {start: SECONDS}"
+        )
+    if subtitles.are_slow:  # with whole seconds: not the time of each frame
+        raise DataError(
+            path,
+            f"shows a time every {np.median(np.diff(media_ns)) / 1e9:g} s, not for each frame",
+            f"write frame_times: {{start: {_plain_seconds(start_ns)}}} and let clock.sigma_s be 1",
+        )
+    return _clean(path, _slots(media_ns), subtitles.clock_ns, media_ns, {"no time": ~known}, {})
+
+
+def _plain_seconds(t_ns: int) -> str:
+    """Seconds without zeros behind the dot."""
+    return format_seconds(np.array([t_ns]))[0].rstrip("0").rstrip(".")
+
+
+def _slots(media_ns: Int64) -> Int64:
+    """Frame numbers from the subtitles' own times, one or more for each step.
+
+    Counted step by step: 33, 33, 34 ms do not add up to multiples of their median.
+    """
+    steps = np.diff(np.maximum.accumulate(media_ns))  # a subtitle that goes back has its frame twice
+    typical = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    counts = np.where(steps > 0, np.maximum(np.rint(steps / typical), 1), 0)
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+
+
+def _clean(
+    path: Path,
+    frame: Int64,
+    t_ns: Int64,
+    media_ns: Int64 | None,
+    causes: dict[str, Bool],
+    dropped: dict[str, int],
+) -> FrameStamps:
+    """Sort by frame, then leave out what `read_frame_times` says."""
+    order = np.argsort(frame, kind="stable")
+    keep = np.ones(len(order), dtype=np.bool_)
+
+    def drop(cause: str, bad: Bool) -> None:
+        if count := int(np.count_nonzero(keep & bad)):
+            dropped[cause] = count
+            keep[bad] = False
+
+    for cause, bad in causes.items():
+        drop(cause, bad[order])
+    drop("duplicate frame", _not_rising(frame[order], keep))
+    drop("time not increasing", _not_rising(t_ns[order], keep))
+    kept = order[keep]
+    if not len(kept):
+        counts = ", ".join(f"{count} {cause}" for cause, count in dropped.items()) or "it has no rows"
+        raise DataError(path, f"holds no usable frame time ({counts})", "check how it was written")
+    return FrameStamps(frame[kept], t_ns[kept], None if media_ns is None else media_ns[kept], dropped)
+
+
+def _not_rising(values: Int64, among: Bool) -> Bool:
+    """Which of some rows are not above the largest before them."""
+    rows = np.flatnonzero(among)
+    bad = np.zeros(len(values), dtype=np.bool_)
+    if len(rows) > 1:
+        bad[rows[1:]] = values[rows][1:] <= np.maximum.accumulate(values[rows])[:-1]
+    return bad
+
+
+FORMAT = FrameTimesFormat()

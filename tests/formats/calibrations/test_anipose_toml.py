@@ -1,0 +1,154 @@
+"""Calibrations of anipose, Pose2Sim and caliscope, on real files and against OpenCV's projection."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pipelines.formats.calibrations import anipose_toml
+from pipelines.geometry.cameras import project
+from pipelines.session.errors import DataError
+from pipelines.session.registries import CalibrationFormat
+from tests.real_data import real_data
+
+READER: CalibrationFormat = anipose_toml.FORMAT
+POSE2SIM = "pose2sim_single/calibration/Calib_qualisys.toml"
+
+CAMERA = """
+[one]
+size = [640, 480]
+matrix = [[500, 0, 320], [0, 501, 240], [0, 0, 1]]
+distortions = [0.1, 0, 0, 0, 0]
+rotation = [0.0, 0.0, 1.5707963267948966]
+translation = [1, 2, 3]
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "calib.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    "relative", [POSE2SIM, "calib/pose2sim_Calib_scene.toml", "calib/caliscope_base_config.toml"]
+)
+def test_real_cameras_project_as_opencv_does(relative: str) -> None:
+    path = real_data(relative)
+    assert READER.recognises(path)
+    cameras = READER.read_calibration(path)
+    assert len(cameras) == 4
+    tables = {t.get("name", k): t for k, t in tomllib.loads(path.read_text()).items() if isinstance(t, dict)}
+    # Points half a metre around one two metres ahead of the camera: all well inside the picture.
+    ahead = np.array([[0, 0, 2.0], [0.5, -0.4, 2.0], [-0.3, 0.5, 2.5], [0.1, 0.2, 3.0]])
+    for name, camera in cameras.items():
+        assert camera.intrinsics is not None
+        assert camera.position is not None
+        assert camera.quaternion_xyzw is not None
+        table = tables[name]
+        world_from_camera = Rotation.from_quat(camera.quaternion_xyzw)
+        world = world_from_camera.apply(ahead) + camera.position
+        expected, _ = cv2.projectPoints(
+            world,
+            np.array(table["rotation"]),
+            np.array(table["translation"]),
+            np.array(table["matrix"]),
+            np.array(table["distortions"]),
+        )
+        # Both compute in float64; pixels are of order 1e3.
+        np.testing.assert_allclose(project(ahead, camera.intrinsics), expected[:, 0], rtol=0, atol=1e-9)
+
+
+def test_real_sizes_and_names() -> None:
+    cameras = READER.read_calibration(real_data(POSE2SIM))
+    assert list(cameras) == ["cam01", "cam02", "cam03", "cam04"]
+    lens = cameras["cam01"].intrinsics
+    assert lens is not None
+    assert (lens.width, lens.height, lens.model) == (1088, 1920, "radtan")
+    assert isinstance(lens.width, int)
+    # What an independent reader noted for this file, to its six decimals.
+    position = cameras["cam01"].position
+    assert position is not None
+    np.testing.assert_allclose(position, [1.460232, -1.909159, 1.896506], atol=1e-6)
+
+
+def test_uncalibrated_and_ignored_cameras_are_left_out() -> None:
+    path = real_data("calib/caliscope_base_config.toml")
+    assert list(READER.read_calibration(path)) == ["cam_1", "cam_2", "cam_3", "cam_4"]
+    summary = READER.describe(path)
+    assert summary["cameras"] == 4
+    assert summary["not calibrated"] == ["cam_0"]
+
+
+def test_a_pose_from_paper(tmp_path: Path) -> None:
+    camera = READER.read_calibration(write(tmp_path, CAMERA))["one"]
+    # R turns 90 deg about z, so -R' (1, 2, 3) = -(2, -1, 3); the inverse rotation is -90 deg about z.
+    np.testing.assert_allclose(camera.position, [-2, 1, -3], atol=1e-15)  # type: ignore[arg-type]  # not None here
+    half = np.sqrt(0.5)
+    assert camera.quaternion_xyzw is not None
+    same = camera.quaternion_xyzw * np.sign(camera.quaternion_xyzw[3])
+    np.testing.assert_allclose(same, [0, 0, -half, half], atol=1e-15)
+
+
+def test_names_models_and_missing_poses(tmp_path: Path) -> None:
+    text = CAMERA.replace("[one]", '[one]\nname = "left"\nfisheye = true').replace(
+        "[0.1, 0, 0, 0, 0]", "[0, 0, 0, 0]"
+    )
+    text = text.replace("rotation =", "# ").replace("translation =", "# ")
+    camera = READER.read_calibration(write(tmp_path, text))["left"]
+    assert camera.position is None
+    assert camera.intrinsics is not None
+    assert camera.intrinsics.model == "fisheye"
+    plain = READER.read_calibration(write(tmp_path, CAMERA.replace("0.1,", "0,")))["one"].intrinsics
+    assert plain is not None
+    assert plain.model == "none"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("[0, 0, 1]]", "[0, 0, 1]", "is not TOML"),
+        ("[[500, 0,", "[[500, 7,", "skew"),
+        ("[[500, 0, 320], ", "[", "no 3 x 3 matrix"),
+        ("[[500,", "[[nan,", "matrix is missing or not made of numbers"),
+        ("[[500,", "[[-500,", "focal lengths"),
+        ("[640, 480]", "[640.5, 480]", "size"),
+        ("[640, 480]", "[640]", "size of two"),
+        ("0.1, 0, 0, 0, 0]", "0.1, 0, 0]", "3 coefficients"),
+        ("0.1, 0, 0, 0, 0]", "0, 0, 0, 0, 0, 0, 0, 0, 1]", "thin prism"),
+        ("distortions", "distortion", "distortions is missing"),
+        ("translation = [1, 2, 3]", "", "translation is missing"),
+        ("translation = [1, 2, 3]", 'translation = ["a", 2, 3]', "translation is missing or not"),
+        ("translation = [1, 2, 3]", "translation = [1, 2]", "are no pose"),
+        ("rotation = [0.0, ", "rotation = [", "three numbers"),
+        ("matrix", "matrices", "no calibrated camera"),
+        ("[one]", "[other]\nname = 'one'\nsize=1\nmatrix=1\n[one]", "camera one"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, old: str, new: str, problem: str) -> None:
+    assert old in CAMERA
+    with pytest.raises(DataError, match=problem):
+        READER.read_calibration(write(tmp_path, CAMERA.replace(old, new, 1)))
+
+
+def test_two_cameras_of_one_name_are_refused(tmp_path: Path) -> None:
+    text = CAMERA + CAMERA.replace("[one]", '[two]\nname = "one"')
+    with pytest.raises(DataError, match="two cameras are called one"):
+        READER.read_calibration(write(tmp_path, text))
+
+
+def test_deep_nesting_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="is not TOML"):
+        READER.read_calibration(write(tmp_path, "a = " + "[" * 20_000))
+
+
+def test_other_toml_is_not_recognised(tmp_path: Path) -> None:
+    assert READER.recognises(write(tmp_path, CAMERA))
+    assert not READER.recognises(write(tmp_path, "[project]\nname = 'x'\n"))
+    assert not READER.recognises(real_data("pose2sim_single/Config.toml"))
+    assert not READER.recognises(tmp_path / "absent.toml")

@@ -1,0 +1,197 @@
+"""COLMAP models, text and binary, against pycolmap's own writing and projection."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pipelines.formats.calibrations import colmap
+from pipelines.geometry.cameras import project
+from pipelines.session.errors import DataError
+from pipelines.session.registries import CalibrationFormat
+from tests.real_data import real_data
+
+READER: CalibrationFormat = colmap.FORMAT
+PARAMETERS = {
+    "SIMPLE_PINHOLE": [700.0, 320, 240],
+    "PINHOLE": [700.0, 710, 320, 240],
+    "SIMPLE_RADIAL": [700.0, 320, 240, -0.1],
+    "RADIAL": [700.0, 320, 240, -0.1, 0.02],
+    "OPENCV": [700.0, 710, 320, 240, -0.1, 0.02, 0.001, -0.002],
+    "FULL_OPENCV": [700.0, 710, 320, 240, -0.1, 0.02, 0.001, -0.002, 0.01, 0.02, -0.01, 0.003],
+    "OPENCV_FISHEYE": [700.0, 710, 320, 240, 0.02, -0.01, 0.003, 0.001],
+    "SIMPLE_RADIAL_FISHEYE": [700.0, 320, 240, 0.02],
+    "RADIAL_FISHEYE": [700.0, 320, 240, 0.02, -0.01],
+}
+POINTS = np.array([[0.1, -0.2, 2.0], [0.6, 0.4, 2.0], [-0.5, 0.3, 1.5]])
+
+
+def model(cameras: dict[int, tuple[str, list[float]]], images: dict[str, int]) -> pycolmap.Reconstruction:
+    """A reconstruction made by pycolmap: camera id to model, image name to camera id, poses by rank."""
+    reconstruction = pycolmap.Reconstruction()
+    for camera, (name, parameters) in cameras.items():
+        reconstruction.add_camera_with_trivial_rig(
+            pycolmap.Camera(model=name, width=640, height=480, params=parameters, camera_id=camera)
+        )
+    for index, (name, camera) in enumerate(images.items(), start=1):
+        image = pycolmap.Image(name=name, camera_id=camera, image_id=index)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(np.array([1.5, 2.5]))] * (index % 3))
+        reconstruction.add_image_with_trivial_frame(image, pose(index))
+    return reconstruction
+
+
+def pose(index: int) -> pycolmap.Rigid3d:
+    rotation = Rotation.from_rotvec([0.3 * index, -0.2, 0.1])
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation.as_quat()), np.array([1.0, 2.0, 3.0 + index]))
+
+
+@pytest.fixture(params=["text", "binary"])
+def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    every = dict(enumerate(PARAMETERS.items(), start=1))
+    reconstruction = model(every, {f"{name} a.jpg": k for k, (name, _) in every.items()})
+    getattr(reconstruction, f"write_{request.param}")(str(tmp_path))
+    return tmp_path
+
+
+def test_every_model_and_pose_as_pycolmap_has_it(folder: Path) -> None:
+    assert READER.recognises(folder)
+    cameras = READER.read_calibration(folder)
+    assert sorted(cameras) == sorted(f"{name} a" for name in PARAMETERS)
+    for index, (name, parameters) in enumerate(PARAMETERS.items(), start=1):
+        camera = cameras[f"{name} a"]
+        theirs = pycolmap.Camera(model=name, width=640, height=480, params=parameters)
+        assert camera.intrinsics is not None
+        # Both compute in float64. COLMAP's half pixel is not shifted, in either.
+        expected = np.array([theirs.img_from_cam(point) for point in POINTS])
+        np.testing.assert_allclose(project(POINTS, camera.intrinsics), expected, rtol=0, atol=1e-9)
+        world_from_camera = pose(index).inverse()
+        assert camera.position is not None
+        assert camera.quaternion_xyzw is not None
+        np.testing.assert_allclose(camera.position, world_from_camera.translation, atol=1e-12)
+        np.testing.assert_allclose(
+            Rotation.from_quat(camera.quaternion_xyzw).as_matrix(),
+            world_from_camera.rotation.matrix(),
+            atol=1e-12,
+        )
+
+
+def test_a_real_model() -> None:
+    path = real_data("calib/colmap_maupertuis_txt")
+    assert READER.recognises(path)
+    cameras = READER.read_calibration(path)
+    assert list(cameras) == ["00", "01", "02", "03"]
+    theirs = pycolmap.Reconstruction(str(path))
+    for image in theirs.images.values():
+        camera = cameras[Path(image.name).stem]
+        assert camera.position is not None
+        # The file's six digits leave a quaternion's norm off by up to 1e-6. We normalise, pycolmap does
+        # not: centres some ten metres from the origin differ by up to 2e-5 m.
+        np.testing.assert_allclose(camera.position, image.projection_center(), atol=2e-5)
+    lens = cameras["00"].intrinsics
+    assert lens is not None
+    assert (lens.width, lens.height, lens.fx, lens.cx, lens.model) == (1919, 1079, 1847.53, 959.5, "none")
+
+
+def test_images_that_share_a_name_keep_their_folder(tmp_path: Path) -> None:
+    images = {"cam1/000.jpg": 1, "cam2/000.jpg": 1, "cam2/001.jpg": 1}
+    model({1: ("PINHOLE", PARAMETERS["PINHOLE"])}, images).write_binary(str(tmp_path))
+    assert list(READER.read_calibration(tmp_path)) == ["001", "cam1/000", "cam2/000"]
+
+
+def test_an_unsupported_model_is_refused_by_name(tmp_path: Path) -> None:
+    images = {"a.jpg": 1}
+    reconstruction = model({1: ("FOV", [700.0, 700, 320, 240, 0.9])}, images)
+    for write in (reconstruction.write_text, reconstruction.write_binary):
+        write(str(tmp_path))
+        with pytest.raises(DataError, match="model FOV, which is not supported; use one of SIMPLE_PINHOLE"):
+            READER.read_calibration(tmp_path)
+
+
+def test_every_truncation_of_a_binary_model_is_an_error(tmp_path: Path) -> None:
+    model({1: ("PINHOLE", PARAMETERS["PINHOLE"])}, {"a.jpg": 1, "b.jpg": 1}).write_binary(str(tmp_path))
+    for name in ("cameras.bin", "images.bin"):
+        whole = (tmp_path / name).read_bytes()
+        for size in range(len(whole)):
+            (tmp_path / name).write_bytes(whole[:size])
+            with pytest.raises(DataError, match=f"{name}: ends early"):
+                READER.read_calibration(tmp_path)
+        (tmp_path / name).write_bytes(whole)
+
+
+def test_counts_are_not_believed(tmp_path: Path) -> None:
+    model({1: ("PINHOLE", PARAMETERS["PINHOLE"])}, {"a.jpg": 1}).write_binary(str(tmp_path))
+    path = tmp_path / "images.bin"
+    whole = path.read_bytes()
+    path.write_bytes(struct.pack("<Q", 2**62) + whole[8:])
+    with pytest.raises(DataError, match="ends early"):
+        READER.read_calibration(tmp_path)
+    points = len(whole) - 8 - 24  # one image with one point: its count stands before the last 24 bytes
+    path.write_bytes(whole[:points] + struct.pack("<Q", 2**63) + whole[points + 8 :])
+    with pytest.raises(DataError, match="ends early"):
+        READER.read_calibration(tmp_path)
+
+
+CAMERAS = "# comment\n1 PINHOLE 640 480 700 710 320 240\n"
+IMAGES = "# comment\n1 1 0 0 0 0 0 5 1 a.jpg\n\n2 1 0 0 0 0 0 6 1 b.jpg\n1.5 2.5 -1\n"
+
+
+def write(folder: Path, cameras: str = CAMERAS, images: str = IMAGES) -> Path:
+    (folder / "cameras.txt").write_text(cameras)
+    (folder / "images.txt").write_text(images)
+    return folder
+
+
+def test_text_with_blank_point_lines(tmp_path: Path) -> None:
+    cameras = READER.read_calibration(write(tmp_path))
+    assert list(cameras) == ["a", "b"]
+    assert cameras["b"].position is not None
+    assert cameras["b"].position.tolist() == [0, 0, -6]
+
+
+@pytest.mark.parametrize(
+    ("cameras", "images", "problem"),
+    [
+        (CAMERAS, "", "no image with a pose"),
+        (CAMERAS, IMAGES.replace("\n\n", "\n"), "line 3 is not the points of image a.jpg"),
+        (CAMERAS, IMAGES.replace(" 1 a.jpg", " 9 a.jpg"), "uses camera 9"),
+        (CAMERAS, IMAGES.replace("1 1 0 0 0 0 0 5", "1 0 0 0 0 0 0 5"), "are no pose"),
+        (CAMERAS, IMAGES.replace("0 0 5 1 a", "0 nan 5 1 a"), "are no pose"),
+        (CAMERAS, IMAGES.replace("1 1 0 0 0 0 0 5", "1 1e200 0 0 0 0 0 5"), "are no pose"),
+        (CAMERAS, IMAGES.replace("a.jpg", "/"), "an image without a name"),
+        (CAMERAS, IMAGES.replace("1 1 0 0 0 0 0 5 1 a.jpg", "1 1 0 0"), "line 2 is not an image"),
+        (CAMERAS, IMAGES.replace(" a.jpg", ""), "an image without a name"),
+        (CAMERAS, IMAGES.replace("b.jpg", "a.jpg"), "two images are called a"),
+        (CAMERAS.replace(" 320 240", " 320"), IMAGES, "line 2 is not a PINHOLE with 4 parameters"),
+        (CAMERAS.replace("700", "x"), IMAGES, "line 2 is not a camera"),
+        (CAMERAS.replace("700", "-700"), IMAGES, "focal lengths"),
+        (CAMERAS.replace("700", "nan"), IMAGES, "focal lengths"),
+        (CAMERAS.replace("PINHOLE", "EUCM"), IMAGES, "model EUCM"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, cameras: str, images: str, problem: str) -> None:
+    with pytest.raises(DataError, match=problem):
+        READER.read_calibration(write(tmp_path, cameras, images))
+
+
+def test_an_unknown_model_number_is_refused(tmp_path: Path) -> None:
+    model({1: ("PINHOLE", PARAMETERS["PINHOLE"])}, {"a.jpg": 1}).write_binary(str(tmp_path))
+    path = tmp_path / "cameras.bin"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:12] + struct.pack("<i", 999) + whole[16:])
+    with pytest.raises(DataError, match="model number 999"):
+        READER.read_calibration(tmp_path)
+
+
+def test_a_folder_without_a_model(tmp_path: Path) -> None:
+    assert not READER.recognises(tmp_path)
+    assert not READER.recognises(tmp_path / "absent")
+    (tmp_path / "cameras.txt").write_text(CAMERAS)
+    (tmp_path / "images.bin").write_bytes(b"")
+    assert not READER.recognises(tmp_path)
+    with pytest.raises(DataError, match="no cameras and images"):
+        READER.read_calibration(tmp_path)

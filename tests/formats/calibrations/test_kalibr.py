@@ -1,0 +1,127 @@
+"""Kalibr camera chains: a real one, and what is wrong with others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipelines.formats.calibrations import kalibr
+from pipelines.geometry.cameras import project
+from pipelines.session.errors import DataError
+from pipelines.session.registries import FORMATS, CalibrationFormat
+from tests.real_data import real_data
+
+READER: CalibrationFormat = kalibr.FORMAT
+CAMERA = {
+    "camera_model": "pinhole",
+    "intrinsics": "[460.0, 458.5, 366.25, 248.5]",
+    "distortion_model": "radtan",
+    "distortion_coeffs": "[-0.28, 0.07, 0.0002, -0.0003]",
+    "resolution": "[752, 480]",
+    "T_cam_imu": "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]",
+    "rostopic": "/cam0/image_raw",
+}
+
+
+def chain(path: Path, **keys: str | None) -> Path:
+    """A chain of one camera with some keys changed; None leaves one out."""
+    lines = [f"  {key}: {value}" for key, value in {**CAMERA, **keys}.items() if value is not None]
+    path.write_text("\n".join(["cam0:", *lines, ""]))
+    return path
+
+
+def test_a_real_chain() -> None:
+    path = real_data("calib/kalibr_euroc_voxblox_T_cam_imu.yaml")
+    assert [format_.name for format_ in FORMATS.all() if format_.recognises(path)] == ["kalibr"]
+    cameras = READER.read_calibration(path)
+    assert list(cameras) == ["cam0", "cam1"]
+    lens = cameras["cam1"].intrinsics
+    assert lens is not None
+    assert (lens.width, lens.height, lens.model) == (752, 480, "fisheye")
+    assert (lens.fx, lens.fy, lens.cx, lens.cy) == (
+        459.6820431465863,
+        458.37659300282706,
+        380.01198798196646,
+        255.55347731935623,
+    )
+    assert lens.distortion[3] == -0.010717188529046507
+    assert cameras["cam0"].position is None, "T_cam_imu is no pose in the world"
+    assert "752 x 480 px" in str(READER.describe(path)["cam0"])
+
+
+@pytest.mark.parametrize("model", ["radtan", "equidistant", "none"])
+def test_it_projects_as_opencv_does(tmp_path: Path, model: str) -> None:
+    coefficients = np.zeros(4) if model == "none" else np.array([-0.28, 0.07, 0.0002, -0.0003])
+    stated = None if model == "none" else str(coefficients.tolist())
+    path = chain(tmp_path / "c.yaml", distortion_model=model, distortion_coeffs=stated)
+    assert READER.recognises(path)
+    lens = READER.read_calibration(path)["cam0"].intrinsics
+    assert lens is not None
+    points = np.array([[0.1, 0.2, 2.0], [-0.5, 0.3, 2.5]])
+    matrix = np.array([[460.0, 0, 366.25], [0, 458.5, 248.5], [0, 0, 1]])
+    if model == "equidistant":
+        expected = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, coefficients)[
+            0
+        ]
+    else:
+        expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, coefficients)[0]
+    np.testing.assert_allclose(project(points, lens), expected.reshape(-1, 2), rtol=0, atol=1e-9)
+
+
+def test_the_header_of_old_files_is_skipped(tmp_path: Path) -> None:
+    path = chain(tmp_path / "c.yaml")
+    path.write_text("%YAML:1.0\n" + path.read_text())
+    assert READER.recognises(path)
+    assert list(READER.read_calibration(path)) == ["cam0"]
+
+
+@pytest.mark.parametrize(
+    ("keys", "problem"),
+    [
+        ({"camera_model": "omni"}, "cam0 has the projection 'omni'"),
+        ({"camera_model": "eucm"}, "cam0 has the projection 'eucm'"),
+        ({"distortion_model": "fov", "distortion_coeffs": "[0.9]"}, "cam0 has the distortion 'fov'"),
+        ({"distortion_model": "[1]"}, "cam0 has the distortion"),
+        ({"intrinsics": "[460, 458, 366]"}, "3 intrinsics and 4 distortion coefficients instead of 4 and 4"),
+        ({"distortion_coeffs": None}, "4 intrinsics and 0 distortion coefficients"),
+        ({"intrinsics": "[460, a, 366, 248]"}, "cam0.intrinsics is no list of numbers"),
+        ({"intrinsics": "[460, true, 366, 248]"}, "cam0.intrinsics is no list of numbers"),
+        ({"intrinsics": "[-460, 458, 366, 248]"}, "focal lengths"),
+        ({"intrinsics": f"[1{'0' * 400}, 458, 366, 248]"}, "a number too large"),
+        ({"distortion_coeffs": "[.nan, 0, 0, 0]"}, "not all finite"),
+        ({"resolution": None}, "cam0 lacks resolution"),
+        ({"resolution": "752"}, "cam0.resolution is no list"),
+        ({"resolution": "[752.5, 480]"}, "picture size"),
+        ({"rostopic": "[1, 2"}, r"is no valid YAML in line \d+"),
+        ({"rostopic": "!!python/object/apply:os.system [true]"}, "is no valid YAML"),
+        ({"rostopic": "[" * 1200}, "is no valid YAML"),
+        ({"rostopic": "x" * (1 << 20)}, "characters"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, keys: dict[str, str | None], problem: str) -> None:
+    with pytest.raises(DataError, match=problem) as caught:
+        READER.read_calibration(chain(tmp_path / "c.yaml", **keys))
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("content", ["", "cam0: 3", "other: {a: 1}", "- cam0", "cam0:\n  camera_model:\n"])
+def test_what_is_no_chain(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text(content)
+    READER.recognises(path)
+    with pytest.raises(DataError):
+        READER.read_calibration(path)
+
+
+def test_truncated_files_are_refused_or_hold_less(tmp_path: Path) -> None:
+    whole = chain(tmp_path / "whole.yaml", rostopic=None).read_text()
+    path = tmp_path / "cut.yaml"
+    needed = whole.index("T_cam_imu")
+    for size in range(0, needed - 3, 11):
+        path.write_text(whole[:size])
+        with pytest.raises(DataError):
+            READER.read_calibration(path)

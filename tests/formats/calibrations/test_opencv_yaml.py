@@ -1,0 +1,132 @@
+"""OpenCV FileStorage calibrations, written by OpenCV itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipelines.formats.calibrations import opencv_yaml
+from pipelines.geometry.cameras import project
+from pipelines.session.errors import DataError
+from pipelines.session.records import CalibratedCamera
+from pipelines.session.registries import CalibrationFormat
+from tests.real_data import real_data
+
+READER: CalibrationFormat = opencv_yaml.FORMAT
+K = np.array([[800.0, 0, 330.5], [0, 790.0, 241.25], [0, 0, 1]])
+D = np.array([[-0.21, 0.08, 0.001, -0.002, 0.01]])
+
+
+def store(path: Path, **values: object) -> Path:
+    """Write a calibration as OpenCV's own tools do; None leaves a key out."""
+    content: dict[str, object] = {
+        "calibration_time": "now",
+        "image_width": 640,
+        "image_height": 480,
+        "camera_matrix": K,
+        "distortion_coefficients": D,
+        **values,
+    }
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for key, value in content.items():
+        if value is not None:
+            storage.write(key, value)
+    storage.release()
+    return path
+
+
+def only(path: Path) -> CalibratedCamera:
+    cameras = READER.read_calibration(path)
+    assert list(cameras) == ["camera"]
+    return cameras["camera"]
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".yml", ".xml"])
+def test_it_projects_as_opencv_does(tmp_path: Path, suffix: str) -> None:
+    path = store(tmp_path / f"calib{suffix}")
+    assert READER.recognises(path)
+    camera = only(path)
+    assert camera.position is None
+    assert camera.intrinsics is not None
+    assert (camera.intrinsics.width, camera.intrinsics.height) == (640, 480)
+    points = np.array([[0.1, 0.2, 2.0], [-0.5, 0.3, 2.5]])
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, D)
+    np.testing.assert_allclose(project(points, camera.intrinsics), expected[:, 0], rtol=0, atol=1e-9)
+    assert "640 x 480 px" in str(READER.describe(path)["camera"])
+
+
+@pytest.mark.parametrize("flag", [{"fisheye_model": 1}, {"distortion_model": "equidistant"}])
+def test_fisheye(tmp_path: Path, flag: dict[str, object]) -> None:
+    coefficients = np.array([[0.05], [-0.01], [0.002], [0.0]])
+    camera = only(store(tmp_path / "c.yml", distortion_coefficients=coefficients, **flag))
+    assert camera.intrinsics is not None
+    assert camera.intrinsics.model == "fisheye"
+    points = np.array([[[0.7, 0.2, 1.0]], [[-0.5, 1.3, 1.5]]])
+    expected, _ = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), K, coefficients)
+    np.testing.assert_allclose(project(points[:, 0], camera.intrinsics), expected[:, 0], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("as_vector", [True, False])
+def test_pose(tmp_path: Path, as_vector: bool) -> None:
+    rvec, tvec = np.array([[0.3], [-0.8], [1.1]]), np.array([[0.5], [-1.5], [4.0]])
+    matrix = cv2.Rodrigues(rvec)[0]
+    given = {"rvec": rvec, "tvec": tvec} if as_vector else {"R": matrix, "T": tvec}
+    camera = only(store(tmp_path / "c.yml", **given))
+    assert camera.position is not None
+    np.testing.assert_allclose(camera.position, (-matrix.T @ tvec).ravel(), atol=1e-12)
+
+
+def test_name_and_size_list(tmp_path: Path) -> None:
+    path = tmp_path / "c.yml"
+    store(path, camera_name="left", image_width=None, image_height=None)
+    path.write_text(path.read_text() + "image_size: [ 1920, 1080 ]\n")
+    lens = READER.read_calibration(path)["left"].intrinsics
+    assert lens is not None
+    assert (lens.width, lens.height) == (1920, 1080)
+
+
+@pytest.mark.parametrize(
+    ("values", "problem"),
+    [
+        ({"image_width": None}, "no picture size"),
+        ({"camera_matrix": None}, "no camera_matrix"),
+        ({"camera_matrix": 3.0}, "no camera_matrix"),
+        ({"distortion_coefficients": None}, "no distortion_coefficients"),
+        ({"camera_matrix": np.eye(2)}, "no 3 x 3 matrix"),
+        ({"camera_matrix": np.zeros((3, 3))}, "skew|0 0 1"),
+        ({"R": np.eye(3)}, "not both"),
+        ({"R": 2 * np.eye(3), "T": np.zeros((3, 1))}, "not a rotation matrix"),
+        ({"R": np.diag([1.0, 1, -1]), "T": np.zeros((3, 1))}, "not a rotation matrix"),
+        ({"fisheye_model": 1}, "5 coefficients"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, values: dict[str, object], problem: str) -> None:
+    with pytest.raises(DataError, match=problem):
+        READER.read_calibration(store(tmp_path / "c.yml", **values))
+
+
+def test_stated_sizes_are_not_believed(tmp_path: Path) -> None:
+    path = store(tmp_path / "c.yml")
+    path.write_text(path.read_text().replace("rows: 3", "rows: 300000000", 1))
+    with pytest.raises(DataError, match=r"3e\+08 x 3 but has 9 numbers"):
+        READER.read_calibration(path)
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".xml"])
+def test_truncated_and_foreign_files(tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]) -> None:
+    whole = store(tmp_path / f"c{suffix}").read_text()
+    path = tmp_path / f"t{suffix}"
+    for size in range(0, len(whole) - 40, 37):
+        path.write_text(whole[:size])
+        READER.recognises(path)
+        with pytest.raises(DataError):
+            READER.read_calibration(path)
+    assert capfd.readouterr().err == "", "OpenCV's own words would stand beside our one line"
+
+
+def test_ros_camera_info_is_another_format() -> None:
+    for other in ("calib/ros_camera_info_manager_test.yaml", "calib/kalibr_euroc_voxblox_T_cam_imu.yaml"):
+        assert not READER.recognises(real_data(other))

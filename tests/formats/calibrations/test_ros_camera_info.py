@@ -1,0 +1,197 @@
+"""ROS camera calibrations: real files of both forms, and what is wrong with others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipelines.formats.calibrations import ros_camera_info
+from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.session.errors import DataError
+from pipelines.session.registries import FORMATS, CalibrationFormat
+from tests.real_data import real_data
+
+READER: CalibrationFormat = ros_camera_info.FORMAT
+MATRIX = np.array([[800.0, 0, 330.5], [0, 790.0, 241.25], [0, 0, 1]])
+POINTS = np.array([[0.1, 0.2, 2.0], [-0.5, 0.3, 2.5]])
+
+KEYS = {
+    "image_width": "640",
+    "image_height": "480",
+    "camera_name": "left",
+    "camera_matrix": "{rows: 3, cols: 3, data: [800, 0, 330.5, 0, 790, 241.25, 0, 0, 1]}",
+    "distortion_model": "plumb_bob",
+    "distortion_coefficients": "{rows: 1, cols: 5, data: [-0.21, 0.08, 0.001, -0.002, 0.01]}",
+    "rectification_matrix": "{rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}",
+}
+INI = """# Camera intrinsics
+[image]
+width
+640
+height
+480
+[left]
+camera matrix
+800.0 0.0 330.5
+0.0 790.0 241.25
+0.0 0.0 1.0
+distortion
+-0.21 0.08 0.001 -0.002 0.01
+rectification
+1 0 0
+0 1 0
+0 0 1
+"""
+
+
+def stored(path: Path, **keys: str | None) -> Path:
+    """A calibration with some keys changed; None leaves one out."""
+    lines = [f"{key}: {value}" for key, value in {**KEYS, **keys}.items() if value is not None]
+    path.write_text("\n".join([*lines, ""]))
+    return path
+
+
+def only(path: Path, name: str) -> Intrinsics:
+    cameras = READER.read_calibration(path)
+    assert list(cameras) == [name]
+    assert cameras[name].position is None
+    lens = cameras[name].intrinsics
+    assert lens is not None
+    return lens
+
+
+def test_the_real_yaml() -> None:
+    path = real_data("calib/ros_camera_info_manager_test.yaml")
+    assert [format_.name for format_ in FORMATS.all() if format_.recognises(path)] == ["camera_info"]
+    assert only(path, "08144361026320a0") == Intrinsics(
+        640, 480, 1168.68, 1169.01, 295.015, 252.247, "radtan", (-1.04482, 1.59252, -0.0196308, 0.0287906, 0)
+    )
+    assert "640 x 480 px" in str(READER.describe(path))
+
+
+def test_the_real_ini() -> None:
+    path = real_data("calib/ros_calib5.ini")
+    assert [format_.name for format_ in FORMATS.all() if format_.recognises(path)] == ["camera_info"]
+    assert only(path, "mono_left") == Intrinsics(
+        640,
+        480,
+        369.344588,
+        367.154330,
+        320.739078,
+        203.592450,
+        "radtan",
+        (0.189544, -0.018229, -0.000630, 0.000054, -0.000212),
+    )
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".yml", ".ini", ".txt"])
+def test_both_forms_project_as_opencv_does(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"ost{suffix}"
+    stored(path) if suffix.startswith(".y") else path.write_text(INI)
+    assert [format_.name for format_ in FORMATS.all() if format_.recognises(path)] == ["camera_info"]
+    coefficients = np.array([-0.21, 0.08, 0.001, -0.002, 0.01])
+    expected, _ = cv2.projectPoints(POINTS, np.zeros(3), np.zeros(3), MATRIX, coefficients)
+    np.testing.assert_allclose(project(POINTS, only(path, "left")), expected[:, 0], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("model", "cells", "expected"),
+    [
+        ("equidistant", 4, "fisheye"),
+        ("fisheye", 4, "fisheye"),
+        ("plumb_bob", 4, "radtan"),
+        ("rational_polynomial", 8, "radtan"),
+        ("''", 5, "radtan"),
+        ("plumb_bob", 0, "none"),
+    ],
+)
+def test_models(tmp_path: Path, model: str, cells: int, expected: str) -> None:
+    data = [0.01 * (k + 1) for k in range(cells)]
+    block = f"{{rows: 1, cols: {cells}, data: {data}}}"
+    path = stored(tmp_path / "c.yaml", distortion_model=model, distortion_coefficients=block)
+    lens = only(path, "left")
+    assert lens.model == expected
+    assert list(lens.distortion) == data
+
+
+def test_without_a_name_or_model(tmp_path: Path) -> None:
+    only(stored(tmp_path / "c.yaml", camera_name=None, distortion_model=None), "camera")
+
+
+@pytest.mark.parametrize(
+    ("keys", "problem"),
+    [
+        ({"distortion_model": "ftheta"}, "distortion model 'ftheta'"),
+        ({"image_width": None, "camera_matrix": None}, "lacks image_width, camera_matrix"),
+        ({"image_width": "wide"}, "image_width, image_height is no list of numbers"),
+        ({"image_width": "0"}, "picture size"),
+        ({"camera_matrix": "[1, 2, 3]"}, "camera_matrix.data is no list"),
+        ({"camera_matrix": "{rows: 3, cols: 3, data: [1, 2, 3]}"}, "is 3 x 3 but has 3 numbers"),
+        ({"camera_matrix": "{rows: -3, cols: -3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}"}, "no rows and cols"),
+        ({"distortion_coefficients": "{rows: true, cols: 5, data: [0, 0, 0, 0, 0]}"}, "no rows and cols"),
+        ({"camera_matrix": f"{{rows: 1{'0' * 40}, cols: 0, data: []}}"}, "has no 3 x 3 matrix"),
+        ({"camera_matrix": "{rows: 3, cols: 3, data: [0, 0, 0, 0, 0, 0, 0, 0, 0]}"}, "not fx 0 cx"),
+        (
+            {"distortion_coefficients": "{rows: 900000000000, cols: 5, data: [0, 0, 0, 0, 0]}"},
+            "has 5 numbers",
+        ),
+        ({"camera_name": "[1, 2"}, "is no valid YAML"),
+        ({"camera_name": "&a [*a]"}, None),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, keys: dict[str, str | None], problem: str | None) -> None:
+    path = stored(tmp_path / "c.yaml", **keys)
+    if problem is None:
+        assert len(READER.read_calibration(path)) == 1
+        return
+    with pytest.raises(DataError, match=problem) as caught:
+        READER.read_calibration(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("640", "wide", "lacks width"),
+        ("640", "6x", "width is no table"),
+        ("0.0 790.0 241.25", "0.0 790.0", "camera matrix is no table"),
+        ("800.0 0.0", "8e2 0x1", "camera matrix is no table"),
+        ("distortion\n", "", "lacks distortion"),
+        ("-0.21 0.08 0.001 -0.002 0.01", "nan 0 0 0 0", "not all finite"),
+        ("800.0 0.0", "-800.0 0.0", "focal lengths"),
+        ("640", "640 640", "size of two"),
+    ],
+)
+def test_what_is_wrong_with_an_ini(tmp_path: Path, old: str, new: str, problem: str) -> None:
+    path = tmp_path / "c.ini"
+    path.write_text(INI.replace(old, new, 1))
+    with pytest.raises(DataError, match=problem) as caught:
+        READER.read_calibration(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_truncated_files_are_refused(tmp_path: Path) -> None:
+    yaml = stored(tmp_path / "whole.yaml", rectification_matrix=None).read_text()
+    for name, whole, needed in (
+        ("c.yaml", yaml, len(yaml) - 2),
+        ("c.ini", INI, INI.index("distortion\n") + 11),
+    ):
+        path = tmp_path / name
+        for size in range(0, needed, 13):
+            path.write_text(whole[:size])
+            READER.recognises(path)
+            with pytest.raises(DataError):
+                READER.read_calibration(path)
+
+
+def test_opencvs_own_files_and_manifests_are_others(tmp_path: Path) -> None:
+    storage = cv2.FileStorage(str(tmp_path / "cv.yaml"), cv2.FILE_STORAGE_WRITE)
+    for key, value in {"image_width": 640, "image_height": 480, "camera_matrix": MATRIX}.items():
+        storage.write(key, value)
+    storage.release()
+    assert not READER.recognises(tmp_path / "cv.yaml")
+    (tmp_path / "flight.yaml").write_text("schema: 1\ncameras:\n  cam0:\n    intrinsics: left.yaml\n")
+    assert not any(format_.recognises(tmp_path / "flight.yaml") for format_ in FORMATS.all())

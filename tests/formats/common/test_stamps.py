@@ -1,0 +1,120 @@
+"""Stamps keep every nanosecond, whatever their form."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipelines.formats.common.stamps import (
+    MILLISECONDS,
+    NANOSECONDS,
+    SECONDS,
+    cell_name,
+    format_seconds,
+    parse_stamps,
+    stamp_column,
+)
+from pipelines.session.errors import DataError
+
+# Whole seconds of an epoch stamp leave no room for the nanoseconds in a float64 (0.2 us there).
+STAMPS = st.lists(st.integers(-(2**62), 2**62), min_size=1, max_size=30)
+
+
+def test_a_stamp_that_no_float_can_hold_survives() -> None:
+    t_ns, readable = parse_stamps("log", ["1700000000.123456789"])
+    assert t_ns.tolist() == [1700000000123456789]
+    assert readable.all()
+
+
+@given(STAMPS)
+def test_formatted_stamps_read_back_exactly(stamps: list[int]) -> None:
+    t_ns, readable = parse_stamps("log", format_seconds(np.array(stamps)))
+    assert readable.all()
+    assert t_ns.tolist() == stamps
+
+
+@given(st.lists(st.integers(-(10**18), 10**18), min_size=1, max_size=20), st.sampled_from([0, 3, 6, 9]))
+def test_exponents_and_plain_forms_agree(values: list[int], unit: int) -> None:
+    plain = [str(Decimal(value).scaleb(-unit)) for value in values]
+    exponent = [f"{value}e-{unit}" for value in values]
+    assert parse_stamps("log", plain, unit)[0].tolist() == values
+    assert parse_stamps("log", exponent, unit)[0].tolist() == values
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (".5", 500_000_000),
+        ("5.", 5_000_000_000),
+        ("-0.25", -250_000_000),
+        ("+1.5e-3", 1_500_000),
+        ("  7 ", 7_000_000_000),
+        ("0.0166666666666666666", 16_666_667),  # the eleventh digit rounds it up
+        ("0.0000000004", 0),
+        ("0.0000000005", 1),
+        ("0.9999999996", 1_000_000_000),
+        ("-0.0000000005", -1),
+        ("00000000000000000012.5", 12_500_000_000),
+    ],
+)
+def test_odd_forms(text: str, expected: int) -> None:
+    t_ns, readable = parse_stamps("log", [text])
+    assert readable.all()
+    assert t_ns.tolist() == [expected]
+
+
+@pytest.mark.parametrize("text", ["", "nan", "inf", "-inf", "abc", ".", "-", "1e999999999", "1.2.3", "0x10"])
+def test_what_is_no_stamp_is_said_to_be_none(text: str) -> None:
+    t_ns, readable = parse_stamps("log", ["1.0", "2.0", text])
+    assert readable.tolist() == [True, True, False]
+    assert t_ns.tolist() == [1_000_000_000, 2_000_000_000, 0]
+
+
+def test_one_impossible_stamp_does_not_condemn_the_rest() -> None:
+    _, readable = parse_stamps("log", ["1.0", "2.0", "1700000000000.0"])
+    assert readable.tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("stamp", "word"),
+    [
+        ("1700000000000", "milliseconds"),
+        ("1700000000000000", "microseconds"),
+        ("1700000000000000000", "nanoseconds"),
+    ],
+)
+def test_epoch_stamps_that_are_not_seconds_are_refused(stamp: str, word: str) -> None:
+    with pytest.raises(DataError, match=f"too large.*look like {word}"):
+        parse_stamps("log", [stamp, stamp])
+
+
+def test_units() -> None:
+    assert parse_stamps("log", ["1700000000123456789"], NANOSECONDS)[0].tolist() == [1700000000123456789]
+    assert parse_stamps("log", ["1700000000123.456"], MILLISECONDS)[0].tolist() == [1700000000123456000]
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        ("t_ns,x", (0, NANOSECONDS)),
+        ("x,Time", (1, SECONDS)),
+        ("#timestamp [ns],x", (0, NANOSECONDS)),
+        ("Timestamp (ms),x", (0, MILLISECONDS)),
+        ("t,t_ns", (1, NANOSECONDS)),
+        ("time_of_day,x", None),
+        ("time [h],x", None),
+    ],
+)
+def test_time_columns(header: str, expected: tuple[int, int] | None) -> None:
+    assert stamp_column(header.split(",")) == expected
+
+
+def test_cell_names() -> None:
+    assert cell_name(" #timestamp [ns]") == ("timestamp", "ns")
+    assert cell_name('"p_RS_R_x [m]"') == ("p_rs_r_x", "m")
+    assert cell_name("pose.position.x") == ("pose_position_x", "")
+    assert cell_name("q_RS_w []") == ("q_rs_w", "")

@@ -1,0 +1,146 @@
+"""ArduPilot's logs, written byte for byte by the published format, with known truth."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.formats.drone_logs.ardupilot import FORMAT
+from pipelines.geometry.geodesy import enu_from_geodetic
+from pipelines.geometry.poses import conjugate, multiply, rotate
+from pipelines.session.errors import DataError
+from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from tests.synthetic.drone_logs import BOOT_NS, HOME, DroneTruth, drone_of, write_dataflash
+from tests.synthetic.flights import write_flight
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> DroneTruth:
+    return drone_of(write_flight(tmp_path_factory.mktemp("flight"), cameras=1, seconds=0.5, clean=True), 0)
+
+
+def read(path: Path, **choice: Any) -> Telemetry:
+    return FORMAT.read_telemetry(path, TelemetryChoice(**choice))
+
+
+def test_what_is_in_it(tmp_path: Path, truth: DroneTruth) -> None:
+    path = write_dataflash(tmp_path / "a.bin", truth)
+    assert FORMAT.recognises(path)
+    described = FORMAT.describe(path)
+    rows = len(truth.t_ns)
+    assert described["topics"] == [
+        f"ATT {rows}",
+        f"CAM {rows}",
+        "FMT 8",
+        f"GPS {rows}",
+        f"MNT {rows}",
+        "ORGN 2",
+        f"POS {rows}",
+        f"XKF1 {rows}",
+    ]
+    assert described["gps_fixes"] == rows - 1
+
+
+@pytest.mark.parametrize(
+    ("position", "tolerance_m"),
+    [("local", 2e-6), ("global", 0.013), ("gps", 0.013)],  # floats; 1e-7 deg, and heights in cm
+)
+def test_positions(tmp_path: Path, truth: DroneTruth, position: str, tolerance_m: float) -> None:
+    telemetry = read(write_dataflash(tmp_path / "a.bin", truth), position=position)
+    track = telemetry.position
+    latitude, longitude, height = track.values.T
+    values = enu_from_geodetic(latitude, longitude, height, HOME) if track.on_earth else track.values
+    lost = len(truth.t_ns) - len(values)
+    assert telemetry.dropped == ({"no 3D fix": 1} if position == "gps" else {})
+    np.testing.assert_allclose(values, truth.enu[lost:], atol=tolerance_m)
+    if position == "local":
+        assert track.origin is not None
+        assert track.origin.latitude_deg == pytest.approx(HOME.latitude_deg, abs=1e-7)
+
+
+def test_attitudes(tmp_path: Path, truth: DroneTruth) -> None:
+    telemetry = read(write_dataflash(tmp_path / "a.bin", truth))
+    assert telemetry.body is not None
+    assert telemetry.gimbal is not None
+    off = multiply(conjugate(truth.body), telemetry.body.quaternion_xyzw)
+    # Three angles rounded to 0.01 deg: 0.009 deg together at worst, half of that in the quaternion.
+    assert np.abs(off[:, :3]).max() < np.radians(0.009) / 2
+    ahead = rotate(telemetry.gimbal.quaternion_xyzw, np.array([1.0, 0, 0]))
+    yaw = np.degrees(np.arctan2(ahead[:, 0], ahead[:, 1]))
+    np.testing.assert_allclose(yaw, truth.gimbal_ypr_deg[:, 0], atol=1e-4)
+    np.testing.assert_allclose(np.degrees(np.arcsin(ahead[:, 2])), truth.gimbal_ypr_deg[:, 1], atol=1e-4)
+
+
+def test_a_mount_that_counts_from_the_nose_alone(tmp_path: Path, truth: DroneTruth) -> None:
+    by_north = read(write_dataflash(tmp_path / "a.bin", truth)).gimbal
+    by_nose = read(write_dataflash(tmp_path / "b.bin", truth, yaw_from_north=False)).gimbal
+    assert by_north is not None
+    assert by_nose is not None
+    off = multiply(conjugate(by_north.quaternion_xyzw), by_nose.quaternion_xyzw)
+    assert np.abs(off[:, :3]).max() < np.radians(0.01)  # the body's yaw is rounded to 0.01 deg
+
+
+def test_time_by_gps(tmp_path: Path, truth: DroneTruth) -> None:
+    path = write_dataflash(tmp_path / "a.bin", truth)
+    telemetry = read(path)
+    assert telemetry.clock == "UTC by GPS"
+    # GPS states whole ms, cut: half a ms in the middle, and the autopilot's clock 1 us.
+    assert np.abs(telemetry.position.t_ns - truth.t_ns).max() < 1_000_000
+    np.testing.assert_array_equal(read(path, time="boot").position.t_ns, truth.boot_us * 1000)
+    assert np.abs(FORMAT.picture_times(path, TelemetryChoice()) - truth.t_ns).max() < 1_000_000
+    no_gps = write_dataflash(tmp_path / "b.bin", truth, kinds=("POS", "ATT"))
+    assert read(no_gps).clock == "boot"
+    assert int(read(no_gps).position.t_ns[0]) == BOOT_NS
+
+
+def test_a_clock_that_drifts_is_found(tmp_path: Path) -> None:
+    t_ns = 1_700_000_000_000_000_000 + np.arange(600, dtype=np.int64) * 1_000_000_000
+    still = np.zeros((600, 3))
+    level = np.tile([0.0, 0.0, 0.0, 1.0], (600, 1))
+    place = np.full(600, HOME.latitude_deg), np.full(600, HOME.longitude_deg), np.full(600, HOME.altitude_m)
+    truth = DroneTruth(t_ns, still, *place, level, still, still)
+    path = write_dataflash(tmp_path / "a.bin", truth, kinds=("GPS", "POS", "ATT"), drift_ppm=35.0)
+    telemetry = read(path)
+    assert telemetry.fit is not None
+    assert telemetry.fit.drift_ppm == pytest.approx(35.0, abs=1.0)
+    # 35 ppm of 600 s are 21 ms; whole ms of GPS are left.
+    assert np.abs(telemetry.position.t_ns - t_ns).max() < 1_500_000
+
+
+def test_damage(tmp_path: Path, truth: DroneTruth, capfd: pytest.CaptureFixture[str]) -> None:
+    path = write_dataflash(tmp_path / "a.bin", truth)
+    whole = path.read_bytes()
+    middle = len(whole) // 2
+    path.write_bytes(whole[:middle] + b"\x00\xa3\x17garbage" + whole[middle:-5])
+    telemetry = read(path)
+    assert len(telemetry.position.t_ns) >= len(truth.t_ns) - 2
+    assert capfd.readouterr().err == ""  # pymavlink prints each byte that it does not understand
+    path.write_bytes(whole[:700])
+    with pytest.raises(DataError, match="has no POS, XKF1, NKF1 or GPS"):
+        read(path)
+    path.write_bytes(b"")
+    assert not FORMAT.recognises(path)
+    with pytest.raises(DataError, match="is no ArduPilot log"):
+        read(path)
+
+
+def test_what_is_not_there(tmp_path: Path, truth: DroneTruth) -> None:
+    path = write_dataflash(tmp_path / "a.bin", truth, kinds=("GPS", "ATT"))
+    with pytest.raises(DataError, match="has no local position; there is gps"):
+        read(path, position="local")
+    with pytest.raises(DataError, match="holds no CAM or TRIG"):
+        FORMAT.picture_times(path, TelemetryChoice())
+    assert read(path).gimbal is None
+
+
+def test_without_pymavlink_it_is_said_what_to_install(
+    tmp_path: Path, truth: DroneTruth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_dataflash(tmp_path / "a.bin", truth)
+    monkeypatch.setitem(sys.modules, "pymavlink.DFReader", None)
+    with pytest.raises(DataError, match=r'pip install "mocap-pipeline\[drones\]"'):
+        read(path)

@@ -1,0 +1,214 @@
+"""DJI's subtitles: every generation on real files, and what each of them means."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.formats.drone_logs.dji_srt import FORMAT, read_subtitles
+from pipelines.formats.drone_logs.telemetry_rows import between_repeats
+from pipelines.geometry.poses import rotate
+from pipelines.session.errors import DataError
+from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from tests.real_data import real_data
+
+NAMES = [
+    "MAVIC3.srt",
+    "air2s.srt",
+    "mavic_2pro_new.SRT",
+    "matrice_300.srt",
+    "old_format.SRT",
+    "p4_rtk.SRT",
+    "broken_incomplete.SRT",
+]
+
+
+def facts(name: str) -> dict[str, Any]:
+    told: dict[str, Any] = json.loads(real_data("facts.json").read_text(encoding="utf-8"))
+    found: dict[str, Any] = told[f"logs/dji_srt/{name}"]
+    return found
+
+
+def read(path: Path, **choice: Any) -> Telemetry:
+    return FORMAT.read_telemetry(path, TelemetryChoice(**choice))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_real_files_hold_what_they_are_said_to(name: str) -> None:
+    path, told = real_data(f"logs/dji_srt/{name}"), facts(name)
+    assert FORMAT.recognises(path)
+    described = FORMAT.describe(path)
+    assert described["subtitles"] == told["blocks"]
+    assert described["positions"] == told["positions"]
+    box = told["lat_lon_bbox"]
+    assert [described["latitude_deg"], described["longitude_deg"]] == [
+        [low, high] for low, high in zip(box["min"], box["max"], strict=True)
+    ]
+    relative = told.get("rel_alt") or told.get("barometer") or told.get("H_m")
+    if relative:
+        assert described["height_above_take_off_m"] == [relative["min"], relative["max"]]
+    telemetry = read(path, altitude=None if name != "mavic_2pro_new.SRT" else 50)
+    assert len(telemetry.position.t_ns) + sum(telemetry.dropped.values()) == told["blocks"]
+    # The first fix is not moved; what it is read from is printed as it stands.
+    assert telemetry.position.values[0, :2].tolist() == told["lat_lon_first"]
+    assert (telemetry.gimbal is not None) == ("gimbal_pry_first" in told)
+
+
+def test_the_gimbal_of_a_real_phantom_looks_where_it_flew() -> None:
+    telemetry = read(real_data("logs/dji_srt/p4_rtk.SRT"))
+    assert telemetry.gimbal is not None
+    assert telemetry.body is not None
+    pitch, _, yaw = facts("p4_rtk.SRT")["gimbal_pry_first"]
+    ahead = rotate(telemetry.gimbal.quaternion_xyzw[0], np.array([1.0, 0.0, 0.0]))
+    assert np.degrees(np.arctan2(ahead[0], ahead[1])) == pytest.approx(yaw, abs=1e-9)
+    assert np.degrees(np.arcsin(ahead[2])) == pytest.approx(pitch, abs=1e-9)
+    assert telemetry.clock == "the video's start"
+
+
+def test_an_empty_file_is_none_of_them() -> None:
+    path = real_data("logs/dji_srt/broken_empty.SRT")
+    assert not FORMAT.recognises(path)
+    with pytest.raises(DataError, match="is empty"):
+        read(path)
+
+
+BLOCK = (
+    '{n}\n00:00:0{n},000 --> 00:00:0{n},040\n<font size="36">2024-05-01 10:00:0{n}.000\n{text} </font>\n\n'
+)
+
+
+def subtitles(path: Path, *texts: str, newline: str = "\n", bom: bool = False) -> Path:
+    blocks = "".join(BLOCK.format(n=n, text=text) for n, text in enumerate(texts, 1))
+    data = blocks.replace("\n", newline).encode()
+    path.write_bytes(b"\xef\xbb\xbf" * bom + data)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "position"),
+    [
+        ("[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5 abs_alt: 480.0]", (47.5, 8.25, 3.5)),
+        ("[latitude : 47.5] [longtitude : 8.25] [altitude: 480.0]", (47.5, 8.25, 480.0)),
+        ("GPS(8.25,47.5,16) Hb:3.5 Hs:1.9", (47.5, 8.25, 3.5)),
+        ("HOME(8.2,47.4) 2017.8.5 14:11:51\nGPS(8.25, 47.5, 16) BAROMETER:3.5", (47.5, 8.25, 3.5)),
+        ("GPS(47.5,8.25,0.0M) BAROMETER:3.5M", (47.5, 8.25, 3.5)),
+        ("GPS (8.25, 47.5, 15), HOME (8, 47, -5.0m), D 3.0m, H 3.50m, H.S 9.00m/s", (47.5, 8.25, 3.5)),
+        ("GPS(-58.4563,-34.7383,19) BAROMETER:-2.0", (-34.7383, -58.4563, -2.0)),
+    ],
+)
+@pytest.mark.parametrize(("newline", "bom"), [("\n", False), ("\r\n", True)])
+def test_every_form(tmp_path: Path, text: str, position: tuple[float, ...], newline: str, bom: bool) -> None:
+    path = subtitles(tmp_path / "a.SRT", text, text, newline=newline, bom=bom)
+    assert FORMAT.recognises(path)
+    np.testing.assert_array_equal(read(path).position.values, [position, position])
+
+
+@pytest.mark.parametrize(
+    ("angles", "ahead", "up"),
+    [
+        ("gb_yaw: 0.0 gb_pitch: 0.0 gb_roll: 0.0", (0, 1, 0), (0, 0, 1)),
+        ("gb_yaw: 90.0 gb_pitch: 0.0 gb_roll: 0.0", (1, 0, 0), (0, 0, 1)),
+        ("gb_yaw: 90.0 gb_pitch: -90.0 gb_roll: 0.0", (0, 0, -1), (1, 0, 0)),
+        ("gb_yaw: 0.0 gb_pitch: -30.0 gb_roll: 0.0", (0, 0.75**0.5, -0.5), (0, 0.5, 0.75**0.5)),
+        ("gimbal_yaw: 0.0 gimbal_pitch: 0.0 gimbal_roll: 90.0", (0, 1, 0), (1, 0, 0)),
+    ],
+)
+def test_where_a_gimbal_looks(
+    tmp_path: Path, angles: str, ahead: tuple[float, ...], up: tuple[float, ...]
+) -> None:
+    text = f"[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5 abs_alt: 480.0] [{angles}]"
+    gimbal = read(subtitles(tmp_path / "a.srt", text, text)).gimbal
+    assert gimbal is not None
+    turned = gimbal.quaternion_xyzw[0]
+    np.testing.assert_allclose(rotate(turned, np.array([1.0, 0, 0])), ahead, atol=1e-12)
+    np.testing.assert_allclose(rotate(turned, np.array([0, 0, 1.0])), up, atol=1e-12)
+
+
+def test_yaw_is_followed_across_north(tmp_path: Path) -> None:
+    texts = [
+        f"[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5] [gb_yaw: {yaw} gb_pitch: 0.0 gb_roll: 0.0]"
+        for yaw in (179.0, 179.0, -179.0)
+    ]
+    gimbal = read(subtitles(tmp_path / "a.srt", *texts)).gimbal
+    assert gimbal is not None
+    ahead = rotate(gimbal.quaternion_xyzw, np.array([1.0, 0, 0]))
+    np.testing.assert_allclose(ahead[:, 1], -1, atol=2e-4)  # south throughout, never by way of north
+
+
+def test_angles_whose_clock_goes_back_are_dropped(tmp_path: Path) -> None:
+    text = "[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5] [gb_yaw: 1.0 gb_pitch: 0.0 gb_roll: 0.0]"
+    path = tmp_path / "a.srt"
+    blocks = "".join(
+        f"{n}\n00:00:00,{n * 40:03d} --> 00:00:00,{n * 40 + 40:03d}\n2024-05-01 {clock}\n{text}\n\n"
+        for n, clock in enumerate(("10:00:01.000", "09:00:00.000", "10:00:01.080"))
+    )
+    path.write_text(blocks)
+    telemetry = read(path)
+    assert telemetry.gimbal is not None
+    assert len(telemetry.gimbal.t_ns) == 2
+    assert telemetry.dropped == {"stamp out of order": 1, "its gimbal angles out of order": 1}
+
+
+def test_which_height(tmp_path: Path) -> None:
+    text = "[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5 abs_alt: 480.0]"
+    path = subtitles(tmp_path / "a.srt", text, text)
+    assert read(path, altitude="absolute").position.values[0, 2] == 480
+    assert read(path, altitude=12.5).position.values[0, 2] == 12.5
+    assert read(path).position.height == "take-off"
+    bare = subtitles(tmp_path / "b.srt", "[latitude: 47.5] [longitude: 8.25]", "")
+    with pytest.raises(DataError, match=r"holds no height; state it.*altitude: 30"):
+        read(bare)
+    with pytest.raises(DataError, match="holds no relative height; write altitude: absolute"):
+        read(
+            subtitles(tmp_path / "c.srt", "[latitude: 4.5] [longitude: 8.25] [altitude: 3]"),
+            altitude="relative",
+        )
+
+
+def test_losses_are_counted(tmp_path: Path) -> None:
+    good = "[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5 abs_alt: 480.0]"
+    path = subtitles(
+        tmp_path / "a.srt",
+        good,
+        "[latitude: 0.0] [longitude: 0.0] [rel_alt: 3.5 abs_alt: 480.0]",
+        "[latitude: 147.5] [longitude: 8.25] [rel_alt: 3.5 abs_alt: 480.0]",
+        "[latitude: 47.5] [longitu",
+        good,
+    )
+    telemetry = read(path)
+    assert len(telemetry.position.t_ns) == 2
+    assert telemetry.dropped == {"no position": 1, "not on Earth": 1, "no fix (0, 0)": 1}
+    # Cut in the middle of a character of two bytes.
+    path.write_bytes(path.read_bytes()[:-60] + b"\xc2")
+    assert len(read(path).position.t_ns) == 1
+
+
+def test_times_are_those_of_frame_times(tmp_path: Path) -> None:
+    every_second = read_subtitles(subtitles(tmp_path / "a.srt", "x", "x", "x"))
+    assert every_second.are_slow
+    start_ns = every_second.start_ns()
+    t_ns, known = every_second.times()
+    assert known.all()
+    assert start_ns is not None
+    np.testing.assert_array_equal(t_ns, start_ns + every_second.media_ns)
+
+
+def test_repeated_measurements_become_lines() -> None:
+    # 30 pictures a second, a fix every fifth: a drone that flies straight is on a line again.
+    t_ns = np.arange(31, dtype=np.int64) * 33_000_000
+    true = np.stack([2.0 * t_ns / 1e9, -t_ns / 1e9], axis=1)
+    seen = true[np.arange(31) // 5 * 5]
+    smooth, moved = between_repeats(t_ns, seen)
+    np.testing.assert_allclose(smooth, true, atol=1e-12)
+    assert moved == 24
+    # One that hovers for three seconds and then moves at once did not drift there all the while.
+    t_ns = np.arange(40, dtype=np.int64) * 100_000_000
+    seen = np.where(t_ns >= 3_000_000_000, 5.0, 0.0)[:, None]
+    smooth, _ = between_repeats(t_ns, seen)
+    assert smooth[t_ns <= 2_000_000_000].max() == 0
+    np.testing.assert_allclose(smooth[t_ns == 2_500_000_000], 2.5)
+    np.testing.assert_array_equal(between_repeats(t_ns, np.ones((40, 1)))[0], 1)

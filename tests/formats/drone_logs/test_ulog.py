@@ -1,0 +1,182 @@
+"""PX4's logs: real ones by facts.json, and written ones whose truth is known."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.formats.drone_logs.ulog import FORMAT
+from pipelines.geometry.geodesy import place_at
+from pipelines.geometry.poses import conjugate, multiply
+from pipelines.session.errors import DataError
+from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from tests.real_data import real_data
+from tests.synthetic.drone_logs import (
+    BOOT_NS,
+    HOME,
+    DroneTruth,
+    drone_of,
+    ulog_record,
+    ulog_rows,
+    write_ulog,
+)
+from tests.synthetic.flights import write_flight
+
+NAMES = ["sample.ulg", "sample_log_small.ulg", "sample_px4_events.ulg"]
+
+
+def facts(name: str) -> dict[str, Any]:
+    told: dict[str, Any] = json.loads(real_data("facts.json").read_text(encoding="utf-8"))
+    found: dict[str, Any] = told[f"logs/ulog/{name}"]
+    return found
+
+
+def read(path: Path, **choice: Any) -> Telemetry:
+    return FORMAT.read_telemetry(path, TelemetryChoice(**choice))
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> DroneTruth:
+    return drone_of(write_flight(tmp_path_factory.mktemp("flight"), cameras=1, seconds=0.5, clean=True), 0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_real_logs_hold_what_they_are_said_to(name: str) -> None:
+    path, told = real_data(f"logs/ulog/{name}"), facts(name)
+    assert FORMAT.recognises(path)
+    described = FORMAT.describe(path)
+    assert described["messages"] == told["messages"]
+    assert described["dropouts"] == told["dropouts"]
+    assert described["topics"] == [f"{topic} {count}" for topic, count in sorted(told["topics"].items())]
+    telemetry = read(path)
+    assert telemetry.body is not None
+    assert len(telemetry.body.t_ns) == told["attitude_samples"]
+    local = read(path, position="local")
+    counted = len(local.position.t_ns) + sum(local.dropped.values())
+    assert counted == told["topics"]["vehicle_local_position:0"]
+    if "gps_samples" in told:
+        gps = read(path, position="gps")
+        assert len(gps.position.t_ns) + sum(gps.dropped.values()) == told["gps_samples"]
+        assert described["first_position"] == told["gps_lat_lon_alt_first"]
+
+
+def test_one_message_stamped_twenty_minutes_late() -> None:
+    described = FORMAT.describe(real_data("logs/ulog/sample_log_small.ulg"))
+    assert described["messages_stamped_far_off"] == 1
+    assert described["span_s"] == pytest.approx(6.5, abs=0.05)
+
+
+def test_a_drone_that_never_knew_where_it_was_is_doubted() -> None:
+    telemetry = read(real_data("logs/ulog/sample.ulg"))
+    assert any("never calls its horizontal position valid" in note for note in telemetry.notes)
+    assert any("no GPS time" in note for note in telemetry.notes)
+    assert telemetry.clock == "boot"
+    assert not telemetry.position.values[:, :2].any()
+
+
+def test_local_positions_before_the_estimator_was_ready_are_dropped() -> None:
+    path, told = real_data("logs/ulog/sample_px4_events.ulg"), facts("sample_px4_events.ulg")
+    telemetry = read(path)
+    assert telemetry.dropped == {"not valid to its estimator": 98}
+    reference = [*told["local_ref_lat_lon_alt"]]
+    origin = telemetry.position.origin
+    assert origin is not None
+    assert [origin.latitude_deg, origin.longitude_deg, origin.altitude_m] == pytest.approx(reference)
+    assert telemetry.position.values[:, 2].max() == pytest.approx(
+        -told["local_position_ned_bbox"]["min"][2], abs=1e-4
+    )
+
+
+def test_axes_and_times(tmp_path: Path, truth: DroneTruth) -> None:
+    telemetry = read(write_ulog(tmp_path / "a.ulg", ulog_rows(truth)))
+    # Floats of 32 bits: 10 m to 1e-6, a quaternion to 1e-7.
+    np.testing.assert_allclose(telemetry.position.values, truth.enu, atol=2e-6)
+    assert telemetry.position.origin == HOME
+    assert telemetry.position.accuracy_m == pytest.approx((0.3 / 2**0.5, 0.5))
+    assert telemetry.body is not None
+    assert telemetry.gimbal is not None
+    assert np.abs(multiply(conjugate(truth.body), telemetry.body.quaternion_xyzw)[:, :3]).max() < 1e-6
+    # The moment of the sample counts, not that of publication 2 ms later; both clocks in whole microseconds.
+    assert np.abs(telemetry.position.t_ns - truth.t_ns).max() <= 1001
+    assert telemetry.clock == "UTC by GPS"
+    assert telemetry.fit is not None
+    assert abs(telemetry.fit.offset_ns - (int(truth.t_ns[0]) - BOOT_NS)) <= 1001
+
+
+def test_a_gimbal_that_counts_from_the_nose(tmp_path: Path, truth: DroneTruth) -> None:
+    by_north = read(write_ulog(tmp_path / "a.ulg", ulog_rows(truth))).gimbal
+    by_nose = read(write_ulog(tmp_path / "b.ulg", ulog_rows(truth, from_north=False))).gimbal
+    assert by_north is not None
+    assert by_nose is not None
+    off = multiply(conjugate(by_north.quaternion_xyzw), by_nose.quaternion_xyzw)
+    # Yaw of the nose from a body that leans by 5 deg, from floats of 32 bits.
+    assert np.abs(off[:, :3]).max() < 1e-6
+
+
+def test_an_estimator_that_moves_its_origin_is_followed(tmp_path: Path, truth: DroneTruth) -> None:
+    away = np.array([35.0, -20.0, 4.0])
+    there = place_at(away, HOME)
+    rows, moved = ulog_rows(truth), ulog_rows(truth, origin=there)
+    half = len(rows) // 2 // 5 * 5
+    later = []
+    for name, instance, fields in moved[half:]:
+        if name == "vehicle_local_position":
+            place = fields[5] - away[1], fields[6] - away[0], fields[7] + away[2]
+            later.append((name, instance, (*fields[:5], *place, *fields[8:])))
+        else:
+            later.append((name, instance, fields))
+    telemetry = read(write_ulog(tmp_path / "a.ulg", rows[:half] + later))
+    # The vertical 40 m away is turned by 6e-6: 0.1 mm; heights of 280 m fit floats of 32 bits to 3e-5.
+    np.testing.assert_allclose(telemetry.position.values, truth.enu, atol=5e-4)
+    assert any("moved its origin 1 times" in note for note in telemetry.notes)
+
+
+def test_triggers(tmp_path: Path, truth: DroneTruth) -> None:
+    path = write_ulog(tmp_path / "a.ulg", ulog_rows(truth))
+    assert np.abs(FORMAT.picture_times(path, TelemetryChoice()) - truth.t_ns).max() <= 2000
+    boot = FORMAT.picture_times(path, TelemetryChoice(time="boot"))
+    np.testing.assert_array_equal(boot, truth.boot_us * 1000)
+    rows = [row for row in ulog_rows(truth) if row[0] != "camera_trigger"]
+    with pytest.raises(DataError, match="holds no camera_capture"):
+        FORMAT.picture_times(write_ulog(tmp_path / "b.ulg", rows), TelemetryChoice())
+
+
+def test_what_is_not_there(tmp_path: Path, truth: DroneTruth) -> None:
+    rows = [row for row in ulog_rows(truth) if row[0] == "vehicle_attitude"]
+    with pytest.raises(DataError, match="has no vehicle_local_position"):
+        read(write_ulog(tmp_path / "a.ulg", rows))
+    path = write_ulog(tmp_path / "b.ulg", ulog_rows(truth))
+    with pytest.raises(DataError, match="has no global position; there is local, gps"):
+        read(path, position="global")
+    with pytest.raises(DataError, match="has no instance 3"):
+        read(path, position="local", instance=3)
+    no_gps = write_ulog(tmp_path / "c.ulg", [row for row in ulog_rows(truth) if "gps" not in row[0]])
+    with pytest.raises(DataError, match="holds no GPS time"):
+        read(no_gps, time="gps")
+
+
+def test_damage(tmp_path: Path, truth: DroneTruth) -> None:
+    whole = write_ulog(tmp_path / "a.ulg", ulog_rows(truth)).read_bytes()
+    cut = tmp_path / "cut.ulg"
+    cut.write_bytes(whole[: len(whole) * 2 // 3])
+    assert 5 < len(read(cut).position.t_ns) < len(truth.t_ns)
+    cut.write_bytes(whole[:12])
+    with pytest.raises(DataError, match=r"cut\.ulg"):
+        read(cut)
+
+
+def test_definitions_that_unfold_without_end_are_refused(tmp_path: Path) -> None:
+    head = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)
+    nested = [f"m{k}:m{k + 1}[60000] a;" for k in range(8)] + ["m8:float[60000] a;"]
+    bomb = tmp_path / "bomb.ulg"
+    bomb.write_bytes(head + b"".join(ulog_record("F", text.encode()) for text in nested))
+    with pytest.raises(DataError, match="fields"):
+        FORMAT.describe(bomb)
+    bomb.write_bytes(head + ulog_record("F", b"loop:loop a;"))
+    with pytest.raises(DataError, match="by itself"):
+        FORMAT.describe(bomb)

@@ -1,0 +1,161 @@
+"""AlphaPose results: the real file, and small ones with every oddity of the format."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pipelines.formats.keypoint_files.alphapose import FORMAT
+from pipelines.session.errors import DataError
+from pipelines.session.registries import FORMATS, KeypointFormat, recognise
+from tests.real_data import real_data
+
+
+def entry(picture: object, idx: object = 0.0, x: float = 10.0, count: int = 17) -> dict[str, object]:
+    keypoints = [value for joint in range(count) for value in (x + joint, 20.0, 0.5)]
+    return {"image_id": picture, "keypoints": keypoints, "score": 2.5, "box": [0, 0, 1, 1], "idx": idx}
+
+
+def written(folder: Path, content: object) -> Path:
+    path = folder / "alphapose-results.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_the_real_file_holds_what_is_known_of_it() -> None:
+    path = real_data("keypoints/alphapose_halpe26_video.json")
+    facts = json.loads(real_data("facts.json").read_text())["keypoints/alphapose_halpe26_video.json"]
+    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
+    assert len(found.frame) == facts["entries"]
+    assert len(found.frames_listed) == facts["images"]
+    assert len(found.joints) == facts["keypoints"][0]
+    assert np.unique(found.frame, return_counts=True)[1].max() == facts["max_persons_per_image"]
+    np.testing.assert_allclose([*found.xy[0, 0], found.confidence[0, 0]], facts["first_keypoint"], atol=5e-4)
+    np.testing.assert_allclose(np.nanmin(found.xy, axis=(0, 1)), facts["xy_bbox"]["min"], atol=0.005)
+    np.testing.assert_allclose(np.nanmax(found.xy, axis=(0, 1)), facts["xy_bbox"]["max"], atol=0.005)
+    assert found.confidence.max() == pytest.approx(facts["conf_range"][1], abs=5e-4)
+    # Everybody's idx is 0 (no tracker), so the second person of one frame must not be taken for the first.
+    assert found.dropped == {}
+    assert sorted(set(found.person.tolist())) == [0, 1]
+
+
+def test_the_real_file_is_recognised_and_described() -> None:
+    path = real_data("keypoints/alphapose_halpe26_video.json")
+    assert recognise(path, KeypointFormat, "keypoint file").name == "alphapose"
+    facts = FORMAT.describe(path)
+    assert (facts["frames"], facts["last frame"], facts["people"]) == (809, 808, 810)
+    assert facts["skeleton"] == "halpe26 (26 keypoints)"
+    assert json.loads(json.dumps(facts)) == facts
+
+
+def test_frames_and_tracks(tmp_path: Path) -> None:
+    merged = entry("cam1_0012.jpg", [[3.0], [4.0]])
+    path = written(tmp_path, [merged, entry("cam1_0010.jpg", [7]), entry("cam1_0010.jpg", 3)])
+    found = FORMAT.read_keypoints(path, skeleton="coco17", first_frame=10)
+    assert found.frame.tolist() == [0, 0, 2]
+    assert found.person.tolist() == [3, 7, 3]
+    assert found.frames_listed.tolist() == [0, 2]
+
+
+def test_a_track_twice_in_a_frame_keeps_the_first(tmp_path: Path) -> None:
+    path = written(tmp_path, [entry("1.jpg", 1, x=5.0), entry("1.jpg", 2), entry("1.jpg", 1, x=9.0)])
+    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
+    assert found.person.tolist() == [1, 2]
+    assert found.xy[0, 0, 0] == 5.0
+    assert found.dropped == {"same person twice in a frame": 1}
+
+
+def test_values_that_are_missing_or_not_finite(tmp_path: Path) -> None:
+    one = entry("1.jpg")
+    one["keypoints"] = [None, 2, 0.5, 0, 0, 0, 3, float("inf"), 0.5, 4, 5, float("nan"), *[1.0] * 39]
+    found = FORMAT.read_keypoints(written(tmp_path, [one]), skeleton=None, first_frame=0)
+    assert np.isnan(found.xy[0, :3]).all()
+    assert found.confidence[0, :4].tolist() == [0, 0, 0, 0]
+    assert found.xy[0, 3].tolist() == [4, 5]
+    assert found.dropped == {"joint not finite": 2, "confidence not finite": 1}
+
+
+def test_frames_before_the_first_are_left_out_and_counted(tmp_path: Path) -> None:
+    path = written(tmp_path, [entry(f"{n}.jpg") for n in range(5)])
+    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=2)
+    assert found.frame.tolist() == found.frames_listed.tolist() == [0, 1, 2]
+    assert found.dropped == {"frame before first_frame": 2}
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([], "holds no keypoints; check"),
+        ([entry("a.jpg")], "'a.jpg' has no frame number"),
+        ([entry("1.jpg", count=18)], "has 18 keypoints per person, as no known skeleton; there are coco17"),
+        ([entry("1.jpg"), entry("2.jpg", count=26)], r"results \[1\]: holds 26 keypoints where .* hold 17"),
+        ([entry("a/1.jpg"), entry("b/1.jpg")], "'a/1.jpg' and 'b/1.jpg' are both frame 1"),
+        ([{"image_id": "1.jpg", "keypoints": [1, 2, 3, 4]}], "4 values are not x, y, confidence"),
+        ([{"image_id": "1.jpg", "keypoints": ["x", {}, []]}], "keypoints are not plain numbers"),
+        ([{"image_id": "1.jpg", "box": []}], "has no keypoints"),
+        ([{"image_id": "1.jpg", "keypoints": [0.0] * 51}], "holds no keypoints from frame 0 on"),
+        ([entry("1.jpg"), 7], r"results \[1\]: is not a JSON object"),
+        ({"a": 1}, "the results are not a list"),
+    ],
+)
+def test_bad_content_is_one_clear_line(tmp_path: Path, content: object, message: str) -> None:
+    path = written(tmp_path, content)
+    with pytest.raises(DataError, match=message) as caught:
+        FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_stated_skeleton_must_fit(tmp_path: Path) -> None:
+    path = written(tmp_path, [entry("1.jpg")])
+    with pytest.raises(DataError, match="has 17 keypoints per person where halpe26 has 26"):
+        FORMAT.read_keypoints(path, skeleton="halpe26", first_frame=0)
+    with pytest.raises(DataError, match="its last frame is 1"):
+        FORMAT.read_keypoints(path, skeleton="coco17", first_frame=2)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        ("[{", "is not JSON"),
+        ("\x00\xff", "is not JSON"),
+        ("[" * 100_000, "is nested too deeply"),
+    ],
+)
+def test_damaged_files_are_one_clear_line_and_belong_to_no_format(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    path = tmp_path / "results.json"
+    path.write_text(text, encoding="latin-1")
+    for name in ("alphapose", "coco", "mmpose", "openpose"):
+        reader = FORMATS.get(name)
+        assert isinstance(reader, KeypointFormat)
+        assert not reader.recognises(path)
+        with pytest.raises(DataError, match=message):
+            reader.read_keypoints(path, skeleton=None, first_frame=0)
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, 30), st.integers(1, 5)), min_size=1, max_size=12, unique=True),
+    st.randoms(use_true_random=False),
+)
+def test_the_order_of_entries_does_not_matter_for_tracked_people(
+    tmp_path: Path, seen: list[tuple[int, int]], random: object
+) -> None:
+    entries = [entry(f"{frame}.jpg", idx, x=100.0 * frame + idx) for frame, idx in [(0, 6), *seen]]
+    shuffled = list(entries)
+    random.shuffle(shuffled)  # type: ignore[attr-defined]  # hypothesis does not export the type
+    one, other = (
+        FORMAT.read_keypoints(written(tmp_path, content), skeleton=None, first_frame=0)
+        for content in (entries, shuffled)
+    )
+    assert list(zip(one.frame.tolist(), one.person.tolist(), strict=True)) == sorted([(0, 6), *seen])
+    np.testing.assert_array_equal(one.person, other.person)
+    np.testing.assert_array_equal(one.xy, other.xy)

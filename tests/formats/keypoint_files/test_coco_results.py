@@ -1,0 +1,147 @@
+"""COCO keypoint results and annotations: the real files, and small ones."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pipelines.formats.keypoint_files.coco_results import FORMAT
+from pipelines.session.errors import DataError
+from pipelines.session.registries import KeypointFormat, recognise
+from pipelines.session.skeletons import get_skeleton
+from tests.real_data import real_data
+
+
+def result(image: object, x: float = 10.0, count: int = 17) -> dict[str, object]:
+    keypoints = [value for joint in range(count) for value in (x + joint, 20.0, 0.5)]
+    return {"image_id": image, "category_id": 1, "keypoints": keypoints, "score": 0.9}
+
+
+def dataset(**changes: object) -> dict[str, object]:
+    keypoints = [0, 0, 0, 7, 8, 0, 1, 2, 1, *[5, 6, 2] * 14]
+    content: dict[str, object] = {
+        "images": [
+            {"id": 100, "file_name": "cam1/0002.jpg", "width": 640, "height": 480},
+            {"id": 200, "file_name": "cam1/0004.jpg", "width": 640, "height": 480},
+        ],
+        "annotations": [{"id": 1, "image_id": 100, "category_id": 1, "keypoints": keypoints}],
+        "categories": [{"id": 1, "name": "person", "keypoints": list(get_skeleton("coco17").joints)}],
+    }
+    return content | changes
+
+
+def written(folder: Path, content: object) -> Path:
+    path = folder / "results.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_the_real_annotations_hold_what_is_known_of_them() -> None:
+    path = real_data("keypoints/coco_gt_mmpose_test_coco.json")
+    facts = json.loads(real_data("facts.json").read_text())["keypoints/coco_gt_mmpose_test_coco.json"]
+    assert recognise(path, KeypointFormat, "keypoint file").name == "coco"
+    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
+    assert len(found.frame) == facts["with_keypoints"]
+    assert found.dropped == {"person without a joint": facts["annotations"] - facts["with_keypoints"]}
+    assert found.frames_listed.tolist() == [int(Path(name).stem) for name in facts["file_names"]]
+    assert len(found.joints) == facts["category_keypoints"]
+    assert set(np.unique(found.confidence)) <= {0.0, 0.5, 1.0}
+    # The first annotation: nose (367, 81, visible) in picture 785.
+    assert found.frame[0] == 785
+    assert found.xy[0, 0].tolist() == [367, 81]
+    assert found.image_size is None  # four pictures of four sizes
+
+
+def test_the_real_detections_are_refused_as_boxes_only() -> None:
+    path = real_data("keypoints/coco_det_mmpose_AP_H_56.json")
+    reader = recognise(path, KeypointFormat, "keypoint file")
+    with pytest.raises(DataError, match="holds boxes only, no keypoints, in all of its 118 entries"):
+        reader.read_keypoints(path, skeleton=None, first_frame=0)
+
+
+def test_results_by_number_or_name(tmp_path: Path) -> None:
+    path = written(tmp_path, [result(12, x=1.0), result("frame_9", x=2.0), result(12.0, x=3.0)])
+    found = FORMAT.read_keypoints(path, skeleton="coco17", first_frame=9)
+    assert found.frame.tolist() == [0, 3, 3]
+    assert found.person.tolist() == [0, 0, 1]
+    assert found.xy[:, 0, 0].tolist() == [2.0, 1.0, 3.0]
+
+
+def test_some_entries_without_keypoints_are_counted(tmp_path: Path) -> None:
+    box = {"image_id": 3, "category_id": 1, "bbox": [1, 2, 3, 4]}
+    found = FORMAT.read_keypoints(written(tmp_path, [result(1), box]), skeleton=None, first_frame=0)
+    assert found.frames_listed.tolist() == [1, 3]
+    assert found.dropped == {"entry without keypoints": 1}
+
+
+def test_annotations_give_visibility_size_and_frames(tmp_path: Path) -> None:
+    found = FORMAT.read_keypoints(written(tmp_path, dataset()), skeleton=None, first_frame=0)
+    assert found.frames_listed.tolist() == [2, 4]
+    assert found.frame.tolist() == [2]
+    assert found.image_size == (640, 480)
+    assert np.isnan(found.xy[0, :2]).all()
+    assert found.confidence[0, :4].tolist() == [0, 0, 0.5, 1]
+
+
+def test_tracks_of_annotations(tmp_path: Path) -> None:
+    keypoints = [1, 2, 2] * 17
+    tracked = [{"image_id": 100, "track_id": track, "keypoints": keypoints} for track in (5, 3)]
+    path = written(tmp_path, dataset(annotations=tracked))
+    assert FORMAT.read_keypoints(path, skeleton=None, first_frame=0).person.tolist() == [3, 5]
+
+
+def test_joint_names_of_the_file_are_heeded(tmp_path: Path) -> None:
+    animal = [{"name": "dog", "keypoints": [f"paw_{n}" for n in range(17)]}]
+    path = written(tmp_path, dataset(categories=animal))
+    with pytest.raises(
+        DataError, match=r"names its 17 keypoints paw_0, paw_1, paw_2, paw_3, \.\.\., as no known"
+    ):
+        FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
+    assert len(FORMAT.read_keypoints(path, skeleton="coco17", first_frame=0).frame) == 1
+    spaced = [{"keypoints": [joint.replace("_", " ").title() for joint in get_skeleton("coco17").joints]}]
+    path = written(tmp_path, dataset(categories=spaced))
+    assert FORMAT.read_keypoints(path, skeleton=None, first_frame=0).joints == get_skeleton("coco17").joints
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([], "holds no keypoints"),
+        (dataset(annotations=[]), "holds no keypoints .2 x frame without people."),
+        (dataset(annotations=[{"image_id": 100, "bbox": [1, 2, 3, 4]}]), "boxes only"),
+        (dataset(annotations=[{"image_id": 300, "keypoints": [1, 2, 2] * 17}]), "image_id 300 is not among"),
+        (dataset(annotations=[{"image_id": 100, "keypoints": [1, 2, 0.7] * 17}]), "not the visibilities"),
+        (dataset(images=[{"file_name": "a/1.jpg"}, {"file_name": "b/1.jpg"}]), "both frame 1"),
+        (dataset(images=None), "the images are not a list"),
+        ([result(None)], "picture None has no frame number"),
+        ([result(10**30)], "has no frame number"),
+    ],
+)  # fmt: skip
+def test_bad_content_is_one_clear_line(tmp_path: Path, content: object, message: str) -> None:
+    path = written(tmp_path, content)
+    assert FORMAT.recognises(path)
+    with pytest.raises(DataError, match=message):
+        FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
+
+
+def test_alphapose_lists_are_left_to_alphapose_but_can_be_read(tmp_path: Path) -> None:
+    path = written(tmp_path, [result("0003.jpg")])
+    assert not FORMAT.recognises(path)
+    assert FORMAT.read_keypoints(path, skeleton=None, first_frame=0).frame.tolist() == [3]
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(st.lists(st.integers(0, 20), min_size=1, max_size=15))
+def test_every_person_arrives_once_in_the_order_of_the_file(tmp_path: Path, frames: list[int]) -> None:
+    entries = [result(frame, x=1000.0 * index + 1) for index, frame in enumerate(frames)]
+    found = FORMAT.read_keypoints(written(tmp_path, entries), skeleton=None, first_frame=0)
+    assert found.frame.tolist() == sorted(frames)
+    expected = sorted(range(len(frames)), key=lambda index: (frames[index], index))
+    assert found.xy[:, 0, 0].tolist() == [1000.0 * index + 1 for index in expected]
+    ranks = [frames[:index].count(frames[index]) for index in expected]
+    assert found.person.tolist() == ranks

@@ -1,0 +1,165 @@
+"""MMPose predictions in each of the shapes that its inferencer and demos save."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pipelines.formats.keypoint_files.mmpose import FORMAT
+from pipelines.session.errors import DataError
+from pipelines.session.registries import FORMATS, KeypointFormat, recognise
+from pipelines.session.skeletons import get_skeleton
+from tests.real_data import real_data
+
+HALPE = get_skeleton("halpe26").joints
+
+
+def instance(x: float = 10.0, count: int = 17) -> dict[str, object]:
+    return {
+        "keypoints": [[x + joint, 20.0] for joint in range(count)],
+        "keypoint_scores": [0.5] * count,
+        "bbox": [[0, 0, 100, 200]],
+        "bbox_score": 0.9,
+    }
+
+
+def video(*people_of_frames: list[dict[str, object]], first: int = 0) -> list[dict[str, object]]:
+    return [{"frame_id": first + k, "instances": people} for k, people in enumerate(people_of_frames)]
+
+
+def written(path: Path, content: object) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_a_video(tmp_path: Path) -> None:
+    path = written(tmp_path / "walk.json", video([instance(1.0), instance(2.0)], [], [instance(3.0)]))
+    assert recognise(path, KeypointFormat, "keypoint file").name == "mmpose"
+    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
+    assert found.joints == get_skeleton("coco17").joints
+    assert found.frame.tolist() == [0, 0, 2]
+    assert found.person.tolist() == [0, 1, 0]
+    assert found.xy[:, 0, 0].tolist() == [1.0, 2.0, 3.0]
+    assert found.frames_listed.tolist() == [0, 1, 2]
+    assert (found.confidence == 0.5).all()
+
+
+def test_a_demo_counts_from_one_and_names_its_joints(tmp_path: Path) -> None:
+    meta = {"keypoint_id2name": {str(index): joint for index, joint in enumerate(HALPE)}}
+    content = {"meta_info": meta, "instance_info": video([instance(count=26)], [instance(count=26)], first=1)}
+    path = written(tmp_path / "results_walk.json", content)
+    assert recognise(path, KeypointFormat, "keypoint file").name == "mmpose"
+    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=1)
+    assert found.joints == HALPE
+    assert found.frame.tolist() == [0, 1]
+    other = {"keypoint_id2name": {str(index): f"h36m_{index}" for index in range(26)}}
+    path = written(tmp_path / "other.json", content | {"meta_info": other})
+    with pytest.raises(DataError, match="names its 26 keypoints h36m_0"):
+        FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
+
+
+def test_a_folder_of_pictures(tmp_path: Path) -> None:
+    folder = tmp_path / "predictions"
+    written(folder / "img_0003.json", [])
+    written(folder / "img_0004.json", [instance()])
+    written(folder / "img_0005.json", {"meta_info": {}, "instance_info": [instance(), instance()]})
+    (folder / "img_0006.json").write_text("[{")
+    written(folder / "settings.json", {})
+    assert recognise(folder, KeypointFormat, "keypoint file").name == "mmpose"
+    found = FORMAT.read_keypoints(folder, skeleton=None, first_frame=3)
+    assert found.frames_listed.tolist() == [0, 1, 2]
+    assert found.frame.tolist() == [1, 2, 2]
+    assert found.dropped == {"file without predictions": 1, "unreadable file": 1}
+    assert FORMAT.describe(folder)["people per frame, at most"] == 2
+
+
+def test_missing_joints(tmp_path: Path) -> None:
+    one = instance()
+    one["keypoints"] = [[0, 0], [None, 3], [0, 0], *[[1, 2]] * 14]
+    one["keypoint_scores"] = [0, 0.5, 0.25, *[0.5] * 14]
+    path = written(tmp_path / "walk.json", video([one]))
+    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
+    assert np.isnan(found.xy[0, :2]).all()
+    assert found.xy[0, 2].tolist() == [0, 0]  # a score says that the corner is meant
+    assert found.confidence[0, :3].tolist() == [0, 0, 0.25]
+    assert found.dropped == {"joint not finite": 1}
+
+
+def test_a_frame_twice_keeps_the_first(tmp_path: Path) -> None:
+    content = [*video([instance(1.0)]), *video([instance(2.0)])]
+    found = FORMAT.read_keypoints(written(tmp_path / "walk.json", content), skeleton=None, first_frame=0)
+    assert found.xy[:, 0, 0].tolist() == [1.0]
+    assert found.dropped == {"same person twice in a frame": 1}
+
+
+def test_two_videos_in_a_folder_are_refused(tmp_path: Path) -> None:
+    written(tmp_path / "both" / "a.json", video([instance()]))
+    written(tmp_path / "both" / "b.json", video([instance()]))
+    with pytest.raises(DataError, match=r"'a\.json, 0' and 'b.json, 0' are both frame 0"):
+        FORMAT.read_keypoints(tmp_path / "both", skeleton=None, first_frame=0)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([], "holds no keypoints"),
+        (video([], []), "holds no keypoints .2 x frame without people."),
+        ([instance()], "file without a frame number"),
+        (video([{"keypoints": [[1, 2, 3]], "keypoint_scores": [1]}]), r"of shape \[1, 3\] and \[1\]"),
+        (video([{"keypoints": [[1, 2]], "keypoint_scores": [1, 1]}]), r"of shape \[1, 2\] and \[2\]"),
+        (video([{"keypoints": [[1, 2], [1]], "keypoint_scores": [1, 1]}]), "not plain numbers"),
+        (video([{"keypoints": [[1, 2]]}]), "of shape"),
+        ([{"frame_id": 0, "instances": None}], "the instances are not a list"),
+        ([{"frame_id": "x", "instances": []}], "'x' has no frame number"),
+        ({"instance_info": 3}, "file without predictions"),
+        (video([instance(count=133)]), "has 133 keypoints per person, as no known skeleton"),
+    ],
+)
+def test_bad_content_is_one_clear_line(tmp_path: Path, content: object, message: str) -> None:
+    with pytest.raises(DataError, match=message) as caught:
+        FORMAT.read_keypoints(written(tmp_path / "walk.json", content), skeleton=None, first_frame=0)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "relative",
+    [
+        "keypoints/alphapose_halpe26_video.json",
+        "keypoints/openpose_gait",
+        "keypoints/coco_det_mmpose_AP_H_56.json",
+        "keypoints/coco_gt_mmpose_test_coco.json",
+        "facts.json",
+        "calib",
+        "pose2sim_single",
+    ],
+)
+def test_real_files_are_of_one_keypoint_format_at_most(relative: str) -> None:
+    path = real_data(relative)
+    names = ("alphapose", "coco", "mmpose", "openpose")
+    matches = [name for name in names if FORMATS.get(name).recognises(path)]
+    assert len(matches) == relative.startswith("keypoints/")
+    assert "mmpose" not in matches
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(st.lists(st.integers(0, 3), min_size=1, max_size=8), st.integers(-3, 3))
+def test_a_video_and_its_pictures_say_the_same(
+    tmp_path_factory: pytest.TempPathFactory, crowd: list[int], first_frame: int
+) -> None:
+    frames = [[instance(100.0 * k + n) for n in range(count)] for k, count in enumerate([*crowd, 1, 1, 1, 1])]
+    folder = tmp_path_factory.mktemp("predictions")
+    for k, people in enumerate(frames):
+        written(folder / f"{k:06}.json", people)
+    path = written(tmp_path_factory.mktemp("video") / "walk.json", video(*frames))
+    one = FORMAT.read_keypoints(path, skeleton=None, first_frame=first_frame)
+    other = FORMAT.read_keypoints(folder, skeleton=None, first_frame=first_frame)
+    for field in ("frame", "person", "xy", "confidence", "frames_listed"):
+        np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
+    assert one.frames_listed.tolist() == [k - first_frame for k in range(max(0, first_frame), len(frames))]
+    assert one.dropped == other.dropped

@@ -1,0 +1,172 @@
+"""OpenPose folders: the real recordings, and small ones with every oddity of the format."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pipelines.formats.keypoint_files.openpose import FORMAT
+from pipelines.session.errors import DataError
+from pipelines.session.registries import KeypointFormat, recognise
+from pipelines.session.skeletons import take_joints
+from tests.real_data import real_data
+
+
+def person(x: float = 10.0, count: int = 17, track: int = -1) -> dict[str, object]:
+    keypoints = [value for joint in range(count) for value in (x + joint, 20.0, 0.5)]
+    return {"person_id": [track], "pose_keypoints_2d": keypoints}
+
+
+def frame_file(folder: Path, name: str, *people: object) -> None:
+    folder.mkdir(exist_ok=True)
+    (folder / name).write_text(json.dumps({"version": 1.3, "people": people}))
+
+
+def test_the_real_gait_recording_holds_what_is_known_of_it() -> None:
+    folder = real_data("keypoints/openpose_gait")
+    facts = json.loads(real_data("facts.json").read_text())["keypoints/openpose_gait"]
+    found = FORMAT.read_keypoints(folder, skeleton=None, first_frame=0)
+    assert found.frames_listed.tolist() == list(range(facts["frames"]))
+    assert len(found.frame) == facts["people_total"]
+    assert len(set(found.frame.tolist())) == facts["frames"] - facts["frames_without_people"]
+    assert found.person.max() + 1 == facts["max_people"]
+    assert found.joints[1] == "neck"
+    assert found.joints[8] == "hip"
+    assert [*found.xy[0, 0], found.confidence[0, 0]] == facts["first_keypoint"]
+    box = facts["xy_bbox_conf_gt_0"]
+    np.testing.assert_allclose(np.nanmin(found.xy, axis=(0, 1)), box["min"], atol=0.005)
+    np.testing.assert_allclose(np.nanmax(found.xy, axis=(0, 1)), box["max"], atol=0.005)
+    assert (np.isnan(found.xy[..., 0]) == (found.confidence == 0)).all()
+    assert recognise(folder, KeypointFormat, "keypoint file").name == "openpose"
+
+
+@pytest.mark.parametrize("camera", ["cam01", "cam02", "cam03", "cam04"])
+@pytest.mark.parametrize("kind", ["pose", "pose-associated"])
+def test_the_real_four_camera_recording_is_told_to_be_body25b(camera: str, kind: str) -> None:
+    folder = real_data(f"pose2sim_single/{kind}/{camera}_json")
+    found = FORMAT.read_keypoints(folder, skeleton=None, first_frame=0)
+    stated = FORMAT.read_keypoints(folder, skeleton="body25b", first_frame=0)
+    assert found.joints == stated.joints
+    assert found.frames_listed.tolist() == list(range(100))
+    assert recognise(folder, KeypointFormat, "keypoint file").name == "openpose"
+    facts = FORMAT.describe(folder)
+    assert facts["skeleton"] == "body25b (25 keypoints)"
+    # An upright person: in the median frame the head is above the neck, and the ankles below the knees.
+    order = ("head", "neck", "left_hip", "left_knee", "left_ankle")
+    first_person = take_joints(found.xy[found.person == 0], found.joints, order)
+    assert np.all(np.diff(np.nanmedian(first_person[..., 1], axis=0)) > 0)
+
+
+def test_a_person_who_was_not_seen_keeps_the_places_of_the_others() -> None:
+    found = FORMAT.read_keypoints(
+        real_data("pose2sim_single/pose-associated/cam03_json"), skeleton=None, first_frame=0
+    )
+    assert 52 not in found.frame  # cam03.0052.json holds people: [{}]
+    assert 52 in found.frames_listed
+    assert found.dropped == {}
+
+
+def test_places_frames_and_missing_joints(tmp_path: Path) -> None:
+    folder = tmp_path / "cam1"
+    unseen = person()
+    unseen["pose_keypoints_2d"] = [0.0] * 51
+    partly = person(x=50.0)
+    partly["pose_keypoints_2d"][3:6] = [0, 0, 0]  # type: ignore[index]  # a list by construction above
+    frame_file(folder, "video1_000000000007_keypoints.json", {}, person(x=30.0))
+    frame_file(folder, "video1_000000000005_keypoints.json", partly, unseen)
+    frame_file(folder, "video1_000000000006_keypoints.json")
+    found = FORMAT.read_keypoints(folder, skeleton=None, first_frame=5)
+    assert found.frame.tolist() == [0, 2]
+    assert found.person.tolist() == [0, 1]
+    assert found.frames_listed.tolist() == [0, 1, 2]
+    assert np.isnan(found.xy[0, 1]).all()
+    assert found.confidence[0, 1] == 0
+    assert found.xy[1, 0].tolist() == [30.0, 20.0]
+    assert found.dropped == {"person without a joint": 1}
+
+
+def test_tracks_are_used_where_openpose_gives_them(tmp_path: Path) -> None:
+    frame_file(tmp_path / "a", "cam.0001.json", person(track=4), person(track=2))
+    found = FORMAT.read_keypoints(tmp_path / "a", skeleton=None, first_frame=0)
+    assert found.person.tolist() == [2, 4]
+    frame_file(tmp_path / "b", "cam.0001.json", person(track=0), person(track=0))
+    assert FORMAT.read_keypoints(tmp_path / "b", skeleton=None, first_frame=0).person.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(("count", "joint"), [(17, "right_ankle"), (26, "right_heel"), (25, "right_heel")])
+def test_other_detectors_in_this_shape(tmp_path: Path, count: int, joint: str) -> None:
+    frame_file(tmp_path / "a", "cam.0001.json", person(count=count))
+    assert FORMAT.read_keypoints(tmp_path / "a", skeleton=None, first_frame=0).joints[-1] == joint
+
+
+def test_one_frame_alone_and_the_mess_of_a_mac(tmp_path: Path) -> None:
+    folder = tmp_path / "a"
+    frame_file(folder, "cam.0003.json", person())
+    (folder / "._cam.0003.json").write_bytes(b"\x00\x05\x16\x07")
+    assert FORMAT.recognises(folder / "cam.0003.json")
+    one = FORMAT.read_keypoints(folder / "cam.0003.json", skeleton=None, first_frame=0)
+    assert one.frame.tolist() == [3]
+    assert FORMAT.read_keypoints(folder, skeleton=None, first_frame=0).dropped == {}
+
+
+def test_damaged_files_among_many_are_left_out_and_counted(tmp_path: Path) -> None:
+    folder = tmp_path / "a"
+    for frame in range(4):
+        frame_file(folder, f"cam.{frame:04}.json", person())
+    (folder / "cam.0004.json").write_text('{"version": 1.3, "peop')
+    (folder / "cam.0005.json").write_text("")
+    (folder / "settings.json").write_text("{}")
+    (folder / "cam.0006.json").write_text("[1, 2]")
+    assert FORMAT.recognises(folder)
+    found = FORMAT.read_keypoints(folder, skeleton=None, first_frame=0)
+    assert found.frames_listed.tolist() == [0, 1, 2, 3]
+    assert found.dropped == {
+        "file without a frame number": 1,
+        "file without a list of people": 1,
+        "unreadable file": 2,
+    }
+
+
+def test_bad_folders_are_one_clear_line(tmp_path: Path) -> None:
+    def refusal(name: str) -> str:
+        with pytest.raises(DataError) as caught:
+            FORMAT.read_keypoints(tmp_path / name, skeleton=None, first_frame=0)
+        return str(caught.value)
+
+    (tmp_path / "empty").mkdir()
+    assert "holds no JSON files" in refusal("empty")
+    assert not FORMAT.recognises(tmp_path / "empty")
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "cam.0001.json").write_text("{")
+    assert "none of its 1 JSON files can be read" in refusal("bad")
+    frame_file(tmp_path / "nobody", "cam.0001.json")
+    frame_file(tmp_path / "nobody", "cam.0002.json", {})
+    assert "holds no keypoints (2 x frame without people)" in refusal("nobody")
+    frame_file(tmp_path / "two", "cam1.0001.json", person())
+    frame_file(tmp_path / "two", "cam2.0001.json", person())
+    assert "'cam1.0001' and 'cam2.0001' are both frame 1" in refusal("two")
+    frame_file(tmp_path / "mixed", "cam.0001.json", person())
+    frame_file(tmp_path / "mixed", "cam.0002.json", person(count=25))
+    assert "cam.0002.json, people [0]: holds 25 keypoints where the people before hold 17" in refusal("mixed")
+    assert "cannot be opened" in refusal("absent")
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(st.lists(st.lists(st.booleans(), max_size=3), min_size=1, max_size=6))
+def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, seen: list[list[bool]]) -> None:
+    """Each frame is a list of places, each filled by a person or by {}."""
+    seen = [*seen, [True]]
+    folder = tmp_path_factory.mktemp("frames")
+    for frame, places in enumerate(seen):
+        people = [person(x=100.0 * frame + place) if there else {} for place, there in enumerate(places)]
+        frame_file(folder, f"cam.{frame}.json", *people)
+    expected = [(f, p) for f, places in enumerate(seen) for p, there in enumerate(places) if there]
+    found = FORMAT.read_keypoints(folder, skeleton=None, first_frame=0)
+    assert list(zip(found.frame.tolist(), found.person.tolist(), strict=True)) == expected
+    assert found.xy[:, 0, 0].tolist() == [100.0 * frame + place for frame, place in expected]
+    assert found.frames_listed.tolist() == list(range(len(seen)))

@@ -1,0 +1,117 @@
+"""Poses read at once are those read one by one; where messages differ, nothing is read at once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.formats.flights.flight_logs import poses_at_once
+from pipelines.formats.logs.fixed_layouts import PoseArrays
+from pipelines.formats.logs.messages import all_samples
+from pipelines.formats.logs.trajectories import trajectory_of, trajectory_of_arrays
+from pipelines.session.registries import LogFormat, recognise
+from tests.synthetic.logs import CONTAINERS, Container, Entry, write_log
+
+TOPIC = "/pose"
+TYPES = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+    "nav_msgs/msg/Odometry",
+)
+START_NS = 1_700_000_000_000_000_000
+
+
+def entry(type_: str, k: int, rng: np.random.Generator, *, frame: str = "odom", child: str = "base") -> Entry:
+    """A message of random numbers, whose stamp of receipt is not that of its header."""
+    x, y, z = rng.standard_normal(3).tolist()
+    turned = rng.standard_normal(4)
+    # Some rows cannot be used, which both ways must say alike.
+    qx, qy, qz, qw = (turned / np.linalg.norm(turned) * (k % 7 != 3)).tolist()
+    place, turn = {"x": x, "y": y, "z": z}, {"x": qx, "y": qy, "z": qz, "w": qw}
+    pose: Any = {"position": place, "orientation": turn}
+    fields: dict[str, Any] = {
+        "header": {"stamp": START_NS + 10_000_000 * k + int(rng.integers(1000)), "frame_id": frame},
+        "child_frame_id": child,
+        "transform": {"translation": place, "rotation": turn},
+        "pose": pose,
+    }
+    if "Covariance" in type_ or "Odometry" in type_:
+        fields["pose"] = {"pose": pose, "covariance": rng.standard_normal(36)}
+    return Entry(TOPIC, type_, START_NS + 10_000_000 * k + 3_000_000, fields)
+
+
+def at_once(path: Path) -> PoseArrays | None:
+    with recognise(path, LogFormat, "log").open_log([path]) as log:
+        return poses_at_once(log, TOPIC)
+
+
+@pytest.mark.parametrize("frame", ["odom", "o", "", "drone1/öst"])
+@pytest.mark.parametrize("type_", TYPES)
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_the_same_as_one_by_one(tmp_path: Path, container: Container, type_: str, frame: str) -> None:
+    rng = np.random.default_rng(5)
+    path = write_log(tmp_path, "log", container, [entry(type_, k, rng, frame=frame) for k in range(30)])
+    read = at_once(path)
+    assert read is not None
+    with recognise(path, LogFormat, "log").open_log([path]) as log:
+        samples = list(all_samples(log.messages([TOPIC]), "log"))
+    assert read.frames == (samples[0].target, samples[0].source)  # type: ignore[union-attr]
+    assert read.header_ns.tolist() == [sample.stamp_ns for sample in samples]
+    assert read.receive_ns.tolist() == [sample.receive_ns for sample in samples]
+    expected = trajectory_of(iter(samples), "log", stamps="header")
+    found = trajectory_of_arrays(read, "log", stamps="header")
+    assert found.stamps == expected.stamps
+    for name in ("t_ns", "position", "quaternion_xyzw", "covariance"):
+        np.testing.assert_array_equal(
+            getattr(found.trajectory, name), getattr(expected.trajectory, name), strict=True
+        )
+    assert found.trajectory.dropped == expected.trajectory.dropped == {"zero quaternion": 4}
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+@pytest.mark.parametrize("changed", [{"frame": "map"}, {"frame": "odom2"}, {"child": "bass"}])
+def test_frames_that_change_are_left_to_the_slow_way(
+    tmp_path: Path, container: Container, changed: dict[str, str]
+) -> None:
+    rng = np.random.default_rng(6)
+    entries = [entry("nav_msgs/msg/Odometry", k, rng, **(changed if k == 7 else {})) for k in range(9)]
+    assert at_once(write_log(tmp_path, "log", container, entries)) is None
+
+
+def test_other_types_are_left_to_the_slow_way(tmp_path: Path) -> None:
+    gimbal = Entry(TOPIC, "geometry_msgs/msg/QuaternionStamped", START_NS, {"quaternion": {"w": 1.0}})
+    assert at_once(write_log(tmp_path, "log", "mcap-cdr", [gimbal])) is None
+
+
+def test_many_more_than_one_batch(tmp_path: Path) -> None:
+    rng = np.random.default_rng(7)
+    entries = [entry("nav_msgs/msg/Odometry", k, rng) for k in range(9000)]
+    read = at_once(write_log(tmp_path, "log", "mcap-cdr", entries))
+    assert read is not None
+    assert read.pose[8999].tolist() == [
+        *entries[8999].fields["pose"]["pose"]["position"].values(),
+        *entries[8999].fields["pose"]["pose"]["orientation"].values(),
+    ]
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_the_order_of_receipt_over_several_files(tmp_path: Path, container: Container) -> None:
+    """Messages of two files interleave, some were received at the same time, some are not in order."""
+    rng = np.random.default_rng(8)
+    entries = [entry("geometry_msgs/msg/PoseStamped", k, rng) for k in range(40)]
+    received = rng.integers(0, 15, len(entries)).tolist()
+    entries = [replace(e, stamp_ns=START_NS + r) for e, r in zip(entries, received, strict=True)]
+    paths = [
+        write_log(tmp_path, name, container, part)
+        for name, part in (("first", entries[:20]), ("second", entries[20:]))
+    ]
+    with recognise(paths[0], LogFormat, "log").open_log(paths) as log:
+        expected = [sample.stamp_ns for sample in all_samples(log.messages([TOPIC]), "log")]
+        read = poses_at_once(log, TOPIC)
+    assert read is not None
+    assert read.header_ns.tolist() == expected

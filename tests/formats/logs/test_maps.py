@@ -1,0 +1,580 @@
+"""Maps in logs: the same map as in a file, in every container, and in the world where the log says it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+from numpy.typing import NDArray
+
+from pipelines.formats.flights.flight_logs import FlightLogs, in_world
+from pipelines.formats.logs import clouds as log_clouds
+from pipelines.formats.logs import maps as log_maps
+from pipelines.formats.logs.clouds import cloud_points
+from pipelines.formats.logs.map_topics import evenly
+from pipelines.formats.maps import octomap
+from pipelines.formats.maps.point_voxels import occupancy_of
+from pipelines.geometry.poses import enu_from_ned
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import Flight, Log, Map, WorldFromLog
+from pipelines.session.records import Occupancy, Trajectory
+from pipelines.session.registries import MapFormat
+from tests.formats.maps.test_octomap import at, file_of, ot_body
+from tests.synthetic.logs import CONTAINERS, Container, Entry, write_log, write_ros2
+from tests.synthetic.map_logs import (
+    Pose,
+    as_bt,
+    cloud_entry,
+    cloud_fields,
+    grid_entry,
+    octomap_entry,
+    transform_entry,
+)
+
+READER: MapFormat = octomap.FORMAT
+T0 = 1_700_000_000_000_000_000
+SECOND = 10**9
+ROOT_HALF = math.sqrt(0.5)
+
+Cells = NDArray[np.int8]
+
+
+class Read:
+    """What a log's topic of maps gives."""
+
+    def __init__(
+        self,
+        folder: Path,
+        entries: Sequence[Entry],
+        *,
+        container: Container = "mcap-cdr",
+        place: WorldFromLog | None = None,
+        ned: bool = False,
+        pose_topic: str | None = None,
+        stamps: str = "header",
+        **stated: Any,
+    ) -> None:
+        log = write_log(folder, f"log{len(list(folder.iterdir()))}", container, entries)
+        self.notes: list[str] = []
+        camera: dict[str, Any] = {"pose": {"tum": "x"}, "intrinsics": "x", "keypoints": "y"}
+        if pose_topic:
+            camera["pose"] = {"log": "a", "topic": pose_topic}
+        flight = Flight.model_validate(
+            {"schema": 1, "cameras": {"c": camera}, "logs": {"a": {"path": log.name, "stamps": stamps}}}
+        )
+
+        def to_world(poses: Trajectory) -> Trajectory:
+            if ned:
+                position, quaternion = enu_from_ned(poses.position, poses.quaternion_xyzw)
+                poses = Trajectory(poses.t_ns, position, quaternion)
+            return in_world(poses, Log(path=["x"], world_from_log=place or WorldFromLog()))
+
+        with FlightLogs(flight, folder, self.notes.append) as logs:
+            found = logs.maps(Map(log="a", **stated), to_world, max_gap_ns=SECOND)
+            self.maps = list(found.maps)
+        self.dropped = found.dropped
+        self.notes += found.notes
+        assert [one.from_ns for one in self.maps] == found.from_ns.tolist()
+
+    @property
+    def only(self) -> Occupancy:
+        (one,) = self.maps
+        return one
+
+
+def same(a: Occupancy, b: Occupancy) -> None:
+    np.testing.assert_array_equal(a.probability, b.probability)
+    np.testing.assert_array_equal(a.origin, b.origin)
+    assert a.resolution_m == b.resolution_m
+
+
+def box(changed: float = 0.971) -> Occupancy:
+    """Nothing symmetric: an L of obstacles, free air beside it."""
+    grid = np.full((6, 5, 4), np.nan, dtype=np.float32)
+    grid[1:5, 3, 0:2], grid[1, 1:4, 2] = 0.971, 0.971
+    grid[0, :, 3] = 0.1192
+    grid[5, 0, 0] = changed
+    return Occupancy(grid, np.array([-1.0, 0.4, 0.2]), 0.2)
+
+
+# --- OctoMaps ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_octomap_is_that_of_its_file(tmp_path: Path, container: Container) -> None:
+    file = as_bt(box(), tmp_path / "site")
+    found = Read(tmp_path, [octomap_entry(file, T0)], container=container)
+    same(found.only, READER.read_map(tmp_path / "site" / "map.bt"))
+    assert (found.only.from_ns, found.dropped) == (T0, {})
+
+
+def test_octomap_of_a_log_without_definitions(tmp_path: Path) -> None:
+    """ROS 2 up to Humble recorded none, and octomap_msgs is no part of ROS itself."""
+    file = as_bt(box(), tmp_path / "site")
+    path = write_ros2(tmp_path / "bag", [octomap_entry(file, T0)], definitions=False)
+    camera = {"pose": {"tum": "x"}, "intrinsics": "x", "keypoints": "y"}
+    flight = Flight.model_validate({"schema": 1, "cameras": {"c": camera}})
+    with FlightLogs(flight, tmp_path, lambda _: None) as logs:
+        (one,) = logs.maps(Map(log=path.name), lambda poses: poses, max_gap_ns=SECOND).maps
+    same(one, READER.read_map(tmp_path / "site" / "map.bt"))
+
+
+@pytest.mark.parametrize(("tree", "colour"), [("OcTree", b""), ("ColorOcTree", b"\x01\xff\x80")])
+def test_full_octomap_keeps_its_probabilities(tmp_path: Path, tree: str, colour: bytes) -> None:
+    node = at([1] * 14, [-0.4, 0.3, [2.0, None, -1.5, *[None] * 5], *[None] * 5])
+    file = file_of(node, "ot", tree=tree, body=ot_body(node, colour))
+    (tmp_path / "a.ot").write_bytes(file)
+    same(Read(tmp_path, [octomap_entry(file, T0)]).only, READER.read_map(tmp_path / "a.ot"))
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_octomap_of_octomap_itself(tmp_path: Path, binary: bool) -> None:
+    """Trees that OctoMap's own library made and wrote."""
+    pyoctomap = pytest.importorskip("pyoctomap")
+    tree = pyoctomap.OcTree(0.25)
+    hits = np.array([[1.1, -2.3, 0.6], [1.4, -2.3, 0.6], [-3.0, 4.0, 1.1]])
+    for point in hits:
+        tree.updateNode(point, True)
+    tree.updateNode(np.array([0.1, 0.1, 0.1]), False)
+    path = tmp_path / ("a.bt" if binary else "a.ot")
+    assert (tree.writeBinary if binary else tree.write)(str(path))
+    one = Read(tmp_path, [octomap_entry(path.read_bytes(), T0)]).only
+    index = np.floor((hits - one.origin) / 0.25).astype(int)
+    assert int((one.probability >= 0.5).sum()) == 3
+    assert (one.probability[*index.T] >= 0.5).all()
+    assert int((one.probability < 0.5).sum()) == 1
+
+
+def test_maps_that_follow_each_other(tmp_path: Path) -> None:
+    first, second = (as_bt(box(p), tmp_path / "site") for p in (0.971, 0.1192))
+    files = [first, first, second, second, second, first]
+    found = Read(tmp_path, [octomap_entry(file, T0 + k * SECOND) for k, file in enumerate(files)])
+    assert [one.from_ns for one in found.maps] == [T0, T0 + 2 * SECOND, T0 + 5 * SECOND]
+    assert [float(one.probability[5, 0, 0]) for one in found.maps] == [
+        pytest.approx(0.971),
+        pytest.approx(0.1192),
+        pytest.approx(0.971),
+    ]
+    assert found.dropped == {}
+    assert any("3 maps that follow each other (3 repeat the one before)" in note for note in found.notes)
+
+
+def test_no_more_maps_than_a_replay_can_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = [as_bt(box(p), tmp_path / "site") for p in (0.971, 0.1192)]
+    entries = [octomap_entry(files[k % 2], T0 + k * SECOND) for k in range(10)]
+    monkeypatch.setattr(log_maps, "MOST_MAPS", 4)
+    found = Read(tmp_path, entries)
+    # Of rows 0 to 9 four, evenly.
+    assert [(one.from_ns - T0) // SECOND for one in found.maps] == [0, 3, 6, 9]
+    assert found.dropped == {"maps between those that are kept": 6}
+    assert any("4 of 10 changes of the map are kept" in note for note in found.notes)
+    monkeypatch.setattr(log_maps, "MOST_VOXELS", 2 * box().probability.size)
+    assert [(one.from_ns - T0) // SECOND for one in Read(tmp_path, entries).maps] == [0, 9]
+
+
+@given(st.integers(1, 300), st.integers(1, 120))
+def test_what_is_kept_is_spread_evenly(count: int, most: int) -> None:
+    rows = evenly(count, most)
+    assert len(rows) == min(count, most)
+    assert rows[-1] == count - 1
+    assert (rows[0] == 0) or most == 1
+    steps = np.diff(rows)
+    # Each of the equal steps is rounded at both ends.
+    assert not len(steps) or (steps.min() >= 1 and np.ptp(steps) <= 2)
+
+
+def test_stamps_that_stand_still_are_counted(tmp_path: Path) -> None:
+    files = [as_bt(box(p), tmp_path / "site") for p in (0.971, 0.1192)]
+    entries = [octomap_entry(files[k % 2], T0, received_ns=T0 + k * SECOND) for k in range(4)]
+    found = Read(tmp_path, entries)
+    assert found.dropped == {"maps without a later stamp": 2}
+    assert any("`stamps: receive` may be better" in note for note in found.notes)
+    assert len(Read(tmp_path, entries, stamps="receive").maps) == 4
+
+
+def test_header_without_a_stamp_takes_that_of_receipt(tmp_path: Path) -> None:
+    file = as_bt(box(), tmp_path / "site")
+    assert Read(tmp_path, [octomap_entry(file, 0, received_ns=T0)]).only.from_ns == T0
+
+
+def test_damaged_and_empty_maps_are_counted(tmp_path: Path) -> None:
+    file = as_bt(box(), tmp_path / "site")
+    entries = [
+        octomap_entry(file.partition(b"data\n")[0] + b"data\n", T0),
+        octomap_entry(file[:-2], T0 + 1),
+        octomap_entry(file, T0 + 2),
+        octomap_entry(file + b"\0\0", T0 + 3),
+    ]
+    found = Read(tmp_path, entries)
+    assert found.only.from_ns == T0 + 2
+    assert found.dropped == {"empty maps": 1, "map messages that cannot be used": 2}
+    assert any("breaks off" in note and "2 such messages" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda file: file[:-2], "its tree breaks off after"),
+        (lambda file: file + b"\0\0", "has 2 bytes beyond its tree"),
+        (lambda file: file.partition(b"data\n")[0] + b"data\n", "holds no map .1 empty maps."),
+        (lambda file: file.replace(b"res 0.2", b"res nan"), "voxels of nan m"),
+        (lambda file: file.replace(b" binary", b"").replace(b"id OcTree", b"id TsdfTree"), "is a TsdfTree"),
+    ],
+)
+def test_unusable_octomaps_are_one_clear_line(
+    tmp_path: Path, change: Callable[[bytes], bytes], problem: str
+) -> None:
+    file = change(as_bt(box(), tmp_path / "site"))
+    with pytest.raises(DataError, match=problem) as caught:
+        Read(tmp_path, [octomap_entry(file, T0)])
+    assert "\n" not in str(caught.value)
+    assert "/octomap" in str(caught.value)
+
+
+def test_coarser_octomap(tmp_path: Path) -> None:
+    file = as_bt(box(), tmp_path / "site")
+    one = Read(tmp_path, [octomap_entry(file, T0)], resolution_m=0.4).only
+    same(one, READER.read_map(tmp_path / "site" / "map.bt", resolution_m=0.4))
+    with pytest.raises(DataError, match=r"voxels of 0\.2 m cannot be merged to 0\.3 m"):
+        Read(tmp_path, [octomap_entry(file, T0)], resolution_m=0.3)
+
+
+# --- where the log's world is --------------------------------------------------------------------------
+
+
+def occupied_centres(one: Occupancy) -> NDArray[np.float64]:
+    index = np.argwhere(one.probability >= 0.5)
+    return one.origin + (index + 0.5) * one.resolution_m
+
+
+def in_order(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    rounded = np.round(points, 6) + 0.0
+    return rounded[np.lexsort(rounded.T)]
+
+
+@pytest.mark.parametrize("yaw_deg", [0, 90, 180, 270, -90, 450])
+@pytest.mark.parametrize("ned", [False, True])
+def test_right_angles_keep_every_voxel(tmp_path: Path, yaw_deg: float, ned: bool) -> None:
+    file = as_bt(box(), tmp_path / "site")
+    place = WorldFromLog(translation=[10.0, -3.3, 0.7], yaw_deg=yaw_deg)
+    one = Read(tmp_path, [octomap_entry(file, T0)], place=place, ned=ned).only
+    still = READER.read_map(tmp_path / "site" / "map.bt")
+    centres = occupied_centres(still)
+    if ned:
+        centres = centres[:, [1, 0, 2]] * [1, 1, -1]
+    c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
+    expected = centres @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + place.translation
+    np.testing.assert_allclose(in_order(occupied_centres(one)), in_order(expected), rtol=0, atol=1e-5)
+    for state in (lambda p: p < 0.5, np.isnan):
+        assert int(state(one.probability).sum()) == int(state(still.probability).sum())
+
+
+@pytest.mark.parametrize("yaw_deg", [30.0, 45.0, -100.0])
+def test_other_turns_lose_no_obstacle_and_grow_by_a_voxel_at_most(tmp_path: Path, yaw_deg: float) -> None:
+    file = as_bt(box(), tmp_path / "site")
+    place = WorldFromLog(translation=[1.0, 2.0, 3.0], yaw_deg=yaw_deg)
+    one = Read(tmp_path, [octomap_entry(file, T0)], place=place).only
+    c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
+    true = occupied_centres(READER.read_map(tmp_path / "site" / "map.bt"))
+    true = true @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + place.translation
+    found = occupied_centres(one)
+    apart = np.linalg.norm(true[:, None, :2] - found[None, :, :2], axis=2)
+    level = np.abs(true[:, None, 2] - found[None, :, 2]) < 1e-6
+    apart = np.where(level, apart, np.inf)
+    # A sample within both voxels: centres are at most two half diagonals apart.
+    limit = 0.2 * math.sqrt(2) + 1e-9
+    assert apart.min(axis=1).max() <= limit
+    assert apart.min(axis=0).max() <= limit
+
+
+def test_tilted_grids_are_refused(tmp_path: Path) -> None:
+    file = as_bt(box(), tmp_path / "site")
+    tilted: Pose = ((0.0, 0.0, 0.0), (math.sin(0.2), 0.0, 0.0, math.cos(0.2)))
+    entries = [
+        transform_entry("map", "lidar", tilted, T0, topic="/tf_static"),
+        octomap_entry(file, T0, frame="lidar"),
+    ]
+    with pytest.raises(DataError, match=r"tilted by 22\.9 deg"):
+        Read(tmp_path, entries)
+
+
+def test_transforms_of_the_log_place_a_map(tmp_path: Path) -> None:
+    """map <- odom, yawed by a right angle; poses are in map."""
+    file = as_bt(box(), tmp_path / "site")
+    turned: Pose = ((2.0, 0.0, 0.0), (0.0, 0.0, ROOT_HALF, ROOT_HALF))
+    pose = {"header": {"stamp": T0, "frame_id": "/map"}, "pose": {"orientation": {"w": 1.0}}}
+    entries = [
+        Entry("/pose", "geometry_msgs/msg/PoseStamped", T0, pose),
+        transform_entry("map", "site", turned, T0, topic="/tf_static"),
+        octomap_entry(file, T0, frame="site"),
+    ]
+    found = Read(tmp_path, entries, pose_topic="/pose")
+    true = occupied_centres(READER.read_map(tmp_path / "site" / "map.bt"))
+    true = true[:, [1, 0, 2]] * [-1, 1, 1] + [2, 0, 0]
+    np.testing.assert_allclose(in_order(occupied_centres(found.only)), in_order(true), rtol=0, atol=1e-5)
+    assert any("lies in 'site', which the log's transforms place in 'map'" in note for note in found.notes)
+
+
+def test_frames_that_nothing_connects(tmp_path: Path) -> None:
+    file = as_bt(box(), tmp_path / "site")
+    pose = {"header": {"stamp": T0, "frame_id": "odom"}, "pose": {"orientation": {"w": 1.0}}}
+    poses = [Entry("/pose", "geometry_msgs/msg/PoseStamped", T0, pose)]
+    found = Read(tmp_path, [*poses, octomap_entry(file, T0)], pose_topic="/pose")
+    assert any("lies in 'map', poses in 'odom'; nothing in the log connects" in note for note in found.notes)
+    elsewhere = [*poses, octomap_entry(file, T0, frame="sensor")]
+    with pytest.raises(DataError, match="'sensor', which no transforms of the log connect with 'odom'"):
+        Read(tmp_path, elsewhere, pose_topic="/pose")
+    same(Read(tmp_path, elsewhere, pose_topic="/pose", parent="/sensor").only, found.only)
+
+
+# --- floor plans ---------------------------------------------------------------------------------------
+
+
+def plan() -> Cells:
+    cells = np.zeros((4, 3), np.int8)
+    cells[1, 2], cells[3, 0], cells[0, 0] = 100, 60, -1
+    return cells
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_plan_is_raised_from_its_origin(tmp_path: Path, container: Container) -> None:
+    origin: Pose = ((-3.0, 7.0, 1.25), (0.0, 0.0, 0.0, 0.0))  # many leave the quaternion zero
+    one = Read(tmp_path, [grid_entry(plan(), T0, origin=origin)], container=container, height_m=1.6).only
+    cells = plan().astype(float)
+    cells[cells < 0] = np.nan
+    # 1.6 m are 3.2 layers of 0.5 m: four.
+    np.testing.assert_array_equal(
+        one.probability, np.repeat((cells / 100)[:, :, None], 4, axis=2).astype("f4")
+    )
+    assert (one.origin.tolist(), one.resolution_m) == ([-3.0, 7.0, 1.25], 0.5)
+
+
+def test_cells_are_as_wide_as_was_meant(tmp_path: Path) -> None:
+    """The message's float32 is 0.0500000007; it was written as 0.05."""
+    one = Read(tmp_path, [grid_entry(plan(), T0, cell_m=0.05)]).only
+    assert one.resolution_m == 0.05
+    assert one.probability.shape == (4, 3, 50)  # 2.5 m
+
+
+@settings(deadline=None, max_examples=20)
+@given(
+    cells=arrays(np.int8, array_shapes(min_dims=2, max_dims=2, max_side=5), elements=st.integers(-1, 100)),
+    turns=st.integers(0, 3),
+    ned=st.booleans(),
+)
+def test_turned_plans(tmp_path_factory: pytest.TempPathFactory, cells: Cells, turns: int, ned: bool) -> None:
+    """Every known cell is where its corner, its turn and the axes put it, and stands upward."""
+    cells[0, 0] = 100
+    angle = turns * math.pi / 2
+    origin: Pose = ((4.0, -2.0, 1.5), (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2)))
+    entries = [grid_entry(cells, T0, origin=origin)]
+    one = Read(tmp_path_factory.mktemp("plan"), entries, ned=ned, height_m=1.0).only
+    assert one.probability.shape[2] == 2
+    assert one.origin[2] == pytest.approx(-1.5 if ned else 1.5, abs=1e-9)
+    centre = (np.argwhere(cells >= 0) + 0.5) * 0.5
+    c, s = round(math.cos(angle)), round(math.sin(angle))
+    x = centre[:, 0] * c - centre[:, 1] * s + 4.0
+    y = centre[:, 0] * s + centre[:, 1] * c - 2.0
+    if ned:
+        x, y = y, x
+    index = np.floor((np.stack([x, y], axis=1) - one.origin[:2]) / 0.5 + 1e-6).astype(int)
+    assert int((~np.isnan(one.probability)).sum()) == 2 * len(centre)
+    for layer in (0, 1):
+        np.testing.assert_allclose(one.probability[*index.T, layer], cells[cells >= 0] / 100, atol=1e-7)
+
+
+def test_yawed_plan_loses_no_wall(tmp_path: Path) -> None:
+    cells = np.full((20, 3), 0, np.int8)
+    cells[:, 1] = 100
+    angle = math.radians(33)
+    origin: Pose = ((0.0, 0.0, 0.0), (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2)))
+    for resolution_m in (None, 0.3, 1.0):
+        one = Read(tmp_path, [grid_entry(cells, T0, origin=origin)], resolution_m=resolution_m).only
+        along = np.linspace(0.01, 9.99, 400)
+        across = 0.75  # the middle of the wall
+        points = np.stack(
+            [
+                along * math.cos(angle) - across * math.sin(angle),
+                along * math.sin(angle) + across * math.cos(angle),
+            ],
+            axis=1,
+        )
+        index = np.floor((points - one.origin[:2]) / one.resolution_m).astype(int)
+        # The voxel at the middle of the wall, of half a metre, or one that it touches.
+        padded = np.pad(one.probability[:, :, 0], 1, constant_values=np.nan) >= 0.5
+        near = [padded[index[:, 0] + i, index[:, 1] + j] for i in range(3) for j in range(3)]
+        assert np.any(near, axis=0).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"data": np.zeros(5, np.int8)}, "holds 5 of 4 x 3 cells"),
+        ({"data": np.full(12, 101, np.int8)}, "holds a cell of 101"),
+        ({"data": np.full(12, -1, np.int8)}, "1 empty maps"),
+    ],
+)
+def test_unusable_plans_are_one_clear_line(tmp_path: Path, change: dict[str, Any], problem: str) -> None:
+    entry = grid_entry(plan(), T0)
+    with pytest.raises(DataError, match=problem):
+        Read(tmp_path, [Entry(entry.topic, entry.type, T0, {**entry.fields, **change})])
+
+
+def test_plan_on_edge_is_refused(tmp_path: Path) -> None:
+    upright: Pose = ((0.0, 0.0, 0.0), (ROOT_HALF, 0.0, 0.0, ROOT_HALF))
+    with pytest.raises(DataError, match="tilted by 90 deg"):
+        Read(tmp_path, [grid_entry(plan(), T0, origin=upright)])
+
+
+# --- clouds --------------------------------------------------------------------------------------------
+
+POINTS = np.array(
+    [[0.1, 0.1, 0.1], [0.15, 0.1, 0.1], [-3.7, 2.2, 5.01], [1.0, np.nan, 2.0], [4.3, -2.1, 0.3], [9, 9, 9]]
+)
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_cloud_is_that_of_a_file(tmp_path: Path, container: Container) -> None:
+    found = Read(tmp_path, [cloud_entry(cloud_fields(POINTS), T0)], container=container)
+    expected = occupancy_of("cloud", POINTS.astype(np.float32).astype(np.float64), None)
+    same(found.only, expected)
+    assert found.dropped == {"points that are not finite": 1}
+
+
+@settings(deadline=None)
+@given(
+    points=arrays(
+        np.float64,
+        st.tuples(st.integers(1, 4).map(lambda rows: 2 * rows), st.just(3)),
+        elements=st.floats(-1e3, 1e3, width=32) | st.just(math.nan) | st.just(math.inf),
+    ),
+    kind=st.sampled_from(["f4", "f8"]),
+    big_endian=st.booleans(),
+    rows=st.sampled_from([1, 2]),
+    row_padding=st.integers(0, 5),
+    order=st.permutations("xyz").map("".join),
+)
+def test_every_layout_gives_the_same_points(
+    points: NDArray[np.float64], kind: str, big_endian: bool, rows: int, row_padding: int, order: str
+) -> None:
+    fields = cloud_fields(
+        points, kind=kind, big_endian=big_endian, rows=rows, row_padding=row_padding, order=order
+    )
+    np.testing.assert_array_equal(cloud_points(_as_message(fields), "cloud"), points)
+
+
+def _as_message(fields: dict[str, Any]) -> Any:
+    described = [SimpleNamespace(**each) for each in fields["fields"]]
+    return SimpleNamespace(**{**fields, "fields": described})
+
+
+def test_clouds_add_up_and_nothing_is_known_before_it_was_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(3)
+    clouds = [rng.uniform(-4, 4, (50, 3)) for _ in range(7)]
+    entries = [cloud_entry(cloud_fields(c, kind="f8"), T0 + k * SECOND) for k, c in enumerate(clouds)]
+    found = Read(tmp_path, entries)
+    assert [(one.from_ns - T0) // SECOND for one in found.maps] == list(range(7))
+    whole = occupancy_of("all", np.concatenate(clouds), None)
+    same(found.maps[-1], whole)
+    for k, one in enumerate(found.maps):
+        index = np.floor((np.concatenate(clouds[: k + 1]) - one.origin) / 0.2 + 1e-9).astype(int)
+        seen = np.full(whole.probability.shape, np.nan, np.float32)
+        seen[*index.T] = 1
+        np.testing.assert_array_equal(one.probability, seen)
+    monkeypatch.setattr(log_clouds, "MOST_CLOUD_MAPS", 3)
+    few = Read(tmp_path, entries)
+    assert [(one.from_ns - T0) // SECOND for one in few.maps] == [0, 3, 6]
+    same(few.maps[1], found.maps[3])
+
+
+def test_clouds_that_show_nothing_new_make_no_map(tmp_path: Path) -> None:
+    entries = [cloud_entry(cloud_fields(POINTS), T0 + k * SECOND) for k in range(5)]
+    assert Read(tmp_path, entries).only.from_ns == T0
+
+
+def test_cloud_of_a_moving_sensor_is_placed_by_transforms(tmp_path: Path) -> None:
+    """One point, seen from a sensor that flies along x and turns round from cloud to cloud."""
+    wall = np.array([5.05, 1.05, 2.05])
+    entries: list[Entry] = [
+        transform_entry("base", "lidar", ((0.0, 0.0, -0.5), (0.0, 0.0, 0.0, 1.0)), T0, topic="/tf_static")
+    ]
+    for k in range(5):
+        at_ns, x = T0 + k * SECOND // 10, 0.5 * k
+        turned = k % 2 == 1
+        quaternion = (0.0, 0.0, 1.0, 0.0) if turned else (0.0, 0.0, 0.0, 1.0)
+        entries.append(transform_entry("world", "base", ((x, 0.0, 1.0), quaternion), at_ns))
+        seen = wall - [x, 0.0, 0.5]
+        seen = seen * [-1, -1, 1] if turned else seen
+        entries.append(cloud_entry(cloud_fields(seen[None], kind="f8"), at_ns, frame="lidar"))
+    late = cloud_entry(cloud_fields(wall[None]), T0 + 9 * SECOND, frame="lidar")
+    found = Read(tmp_path, [*entries, late], resolution_m=0.1)
+    assert found.only.probability.shape == (1, 1, 1)
+    np.testing.assert_allclose(found.only.origin, wall - 0.05, rtol=0, atol=1e-9)
+    assert found.dropped == {"map messages at whose time no transform is known": 1}
+
+
+def test_cloud_of_a_sensor_without_transforms_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="lies in 'lidar', which no transforms of the log connect") as caught:
+        Read(tmp_path, [cloud_entry(cloud_fields(POINTS), T0, frame="lidar")])
+    assert "parent" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_clouds_of_any_turn_are_turned_point_by_point(tmp_path: Path) -> None:
+    place = WorldFromLog(translation=[1, 2, 3], yaw_deg=30)
+    one = Read(tmp_path, [cloud_entry(cloud_fields(POINTS[:3], kind="f8"), T0)], place=place).only
+    c, s = math.cos(math.radians(30)), math.sin(math.radians(30))
+    turned = POINTS[:3] @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + [1, 2, 3]
+    same(one, occupancy_of("turned", turned, None))
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"width": 7}, "breaks off"),
+        ({"fields": []}, "its field x is not there"),
+        ({"point_step": 6}, "lies beyond the 6 bytes"),
+        ({"fields": [{"name": n, "datatype": 5} for n in "xyz"]}, "its field x is of type 5"),
+        ({"width": 0, "row_step": 0, "data": np.zeros(0, np.uint8)}, "holds no map"),
+    ],
+)
+def test_unusable_clouds_are_one_clear_line(tmp_path: Path, change: dict[str, Any], problem: str) -> None:
+    bad = cloud_entry({**cloud_fields(POINTS), **change}, T0)
+    with pytest.raises(DataError, match=problem):
+        Read(tmp_path, [bad])
+    if "width" not in change:
+        found = Read(tmp_path, [bad, cloud_entry(cloud_fields(POINTS), T0 + 1)])
+        assert found.only.from_ns == T0 + 1
+        assert found.dropped["map messages that cannot be used"] == 1
+
+
+def test_stray_points_are_one_clear_line(tmp_path: Path) -> None:
+    stray = np.array([[0.0, 0, 0], [9e3, 9e3, 9e3], [1e300, 0, 0]])
+    with pytest.raises(DataError, match=r"its box is 45001 x 45001 x 45001 voxels"):
+        Read(tmp_path, [cloud_entry(cloud_fields(stray, kind="f8"), T0)])
+    found = Read(tmp_path, [cloud_entry(cloud_fields(stray[[0, 2]], kind="f8"), T0)])
+    assert found.dropped == {"points beyond 104858 m": 1}
+
+
+def test_only_plans_take_a_height(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="PointCloud2, which has heights of its own"):
+        Read(tmp_path, [cloud_entry(cloud_fields(POINTS), T0)], height_m=3.0)
+
+
+def test_no_topic_of_maps(tmp_path: Path) -> None:
+    pose = {"header": {"stamp": T0, "frame_id": "odom"}, "pose": {"orientation": {"w": 1.0}}}
+    poses = [Entry("/pose", "geometry_msgs/msg/PoseStamped", T0, pose)]
+    with pytest.raises(DataError, match="has 0 topics with maps"):
+        Read(tmp_path, poses)
+    with pytest.raises(DataError, match="topic /pose holds geometry_msgs/msg/PoseStamped, no maps"):
+        Read(tmp_path, poses, topic="/pose")

@@ -1,0 +1,203 @@
+"""The usual topics of drivers: which are read, in which axes, units and order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.formats.logs.presets import Preset, namespaces, parts_of, read_preset
+from pipelines.geometry.geodesy import enu_from_geodetic
+from pipelines.geometry.poses import rotate
+from pipelines.session.errors import DataError
+from pipelines.session.registries import LogFormat, recognise
+from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from tests.synthetic.logged_flights import header
+from tests.synthetic.logs import Entry, write_log
+
+START_NS = 1_700_000_000_000_000_000
+ROWS = 8
+
+
+def stamps() -> list[int]:
+    return [START_NS + k * 50_000_000 for k in range(ROWS)]
+
+
+def fixes(topic: str, latitude: float = 47.5, **more: Any) -> list[Entry]:
+    return [
+        Entry(
+            topic,
+            "sensor_msgs/msg/NavSatFix",
+            t,
+            {
+                "header": header(t, "gps"),
+                "latitude": latitude,
+                "longitude": 8.5 + 1e-6 * k,
+                "altitude": 400.0,
+                **more,
+            },
+        )
+        for k, t in enumerate(stamps())
+    ]
+
+
+def vectors(topic: str, frame: str, x: float, y: float, z: float) -> list[Entry]:
+    vector = {"x": x, "y": y, "z": z}
+    return [
+        Entry(topic, "geometry_msgs/msg/Vector3Stamped", t, {"header": header(t, frame), "vector": vector})
+        for t in stamps()
+    ]
+
+
+def attitudes(topic: str, xyzw: tuple[float, ...]) -> list[Entry]:
+    turned = dict(zip("xyzw", xyzw, strict=True))
+    return [
+        Entry(
+            topic, "geometry_msgs/msg/QuaternionStamped", t, {"header": header(t, ""), "quaternion": turned}
+        )
+        for t in stamps()
+    ]
+
+
+def imu(topic: str, xyzw: tuple[float, ...]) -> list[Entry]:
+    turned = dict(zip("xyzw", xyzw, strict=True))
+    return [
+        Entry(topic, "sensor_msgs/msg/Imu", t, {"header": header(t, "base_link"), "orientation": turned})
+        for t in stamps()
+    ]
+
+
+def poses(topic: str, position: tuple[float, ...]) -> list[Entry]:
+    at = {"position": dict(zip("xyz", position, strict=True)), "orientation": {"w": 1.0}}
+    return [
+        Entry(topic, "geometry_msgs/msg/PoseStamped", t, {"header": header(t, "map"), "pose": at})
+        for t in stamps()
+    ]
+
+
+def read(
+    folder: Path,
+    preset: Preset,
+    *parts: list[Entry],
+    namespace: str | None = None,
+    position: Any = None,
+) -> Telemetry:
+    entries = sorted((entry for part in parts for entry in part), key=lambda e: e.stamp_ns)
+    path = write_log(folder, "log", "ros1", entries)
+    choice = TelemetryChoice(position=position)
+    with recognise(path, LogFormat, "log").open_log([path]) as log:
+        return read_preset(log, str(path), preset, namespace, choice, "header")
+
+
+@pytest.mark.parametrize(
+    ("frame", "vector"),
+    [
+        ("", (-30.0, 0.0, 90.0)),  # pitch, roll, yaw: a subscription, as of an M210
+        ("ground_ENU", (0.0, -30.0, 90.0)),  # roll, pitch, yaw: a broadcast, as of an M100
+    ],
+)
+def test_gimbals_of_the_onboard_sdk(tmp_path: Path, frame: str, vector: tuple[float, float, float]) -> None:
+    telemetry = read(
+        tmp_path,
+        "dji_osdk",
+        fixes("/dji_sdk/gps_position"),
+        vectors("/dji_sdk/gimbal_angle", frame, *vector),
+        attitudes("/dji_sdk/attitude", (0.0, 0.0, 0.5**0.5, 0.5**0.5)),
+    )
+    assert telemetry.gimbal is not None
+    assert telemetry.gimbal.relative_to == "world"
+    ahead = rotate(telemetry.gimbal.quaternion_xyzw[0], np.array([1.0, 0, 0]))
+    # Yaw 90 from north is east, 30 degrees down, whatever the frame is called.
+    np.testing.assert_allclose(ahead, [0.75**0.5, 0, -0.5], atol=1e-12)
+    assert telemetry.body is not None
+    nose = rotate(telemetry.body.quaternion_xyzw[0], np.array([1.0, 0, 0]))
+    np.testing.assert_allclose(nose, [0, 1, 0], atol=1e-12)  # FLU in ENU as it stands
+    np.testing.assert_array_equal(telemetry.position.t_ns, stamps())
+
+
+def test_local_positions_are_placed_by_the_fixes_beside_them(tmp_path: Path) -> None:
+    points = [
+        Entry(
+            "/dji_sdk/local_position",
+            "geometry_msgs/msg/PointStamped",
+            t,
+            {"header": header(t, ""), "point": {"x": 5.0 + 0.0754 * k, "y": -7.0, "z": 12.0}},
+        )
+        for k, t in enumerate(stamps())
+    ]
+    telemetry = read(tmp_path, "dji_osdk", fixes("/dji_sdk/gps_position"), points, position="local")
+    origin = telemetry.position.origin
+    assert origin is not None
+    first = enu_from_geodetic(np.array(47.5), np.array(8.5), np.array(400.0), origin)
+    # Steps of 1e-6 deg of longitude are 0.07536 m here, 0.0754 in the local positions: 0.3 mm over 8 rows.
+    np.testing.assert_allclose(first, [5.0, -7.0, 12.0], atol=1e-3)
+    assert any("placed on Earth by /dji_sdk/gps_position" in note for note in telemetry.notes)
+
+
+def test_mavros(tmp_path: Path) -> None:
+    # The mount's quaternion has no stamp and no header: pitch -30, yaw +20 from the nose, FRD angles.
+    half = np.radians([-15.0, 10.0])
+    (sp, sy), (cp, cy) = np.sin(half), np.cos(half)
+    xyzw = (float(-sp * sy), float(sp * cy), float(cp * sy), float(cp * cy))
+    turned = dict(zip("xyzw", xyzw, strict=True))
+    mount = [
+        Entry("/uav1/mavros/mount_control/orientation", "geometry_msgs/msg/Quaternion", t, turned)
+        for t in stamps()
+    ]
+    north = (0.0, 0.0, 0.5**0.5, 0.5**0.5)
+    telemetry = read(
+        tmp_path,
+        "mavros",
+        poses("/uav1/mavros/local_position/pose", (1.0, 2.0, 3.0)),
+        imu("/uav1/mavros/imu/data", north),
+        mount,
+    )
+    np.testing.assert_allclose(telemetry.position.values, [[1.0, 2.0, 3.0]] * ROWS)
+    assert telemetry.gimbal is not None
+    ahead = rotate(telemetry.gimbal.quaternion_xyzw[0], np.array([1.0, 0, 0]))
+    level = np.cos(np.radians(30))
+    expected = [level * np.sin(np.radians(20)), level * np.cos(np.radians(20)), -0.5]
+    np.testing.assert_allclose(ahead, expected, atol=1e-12)
+
+
+def test_what_a_receiver_says_of_itself(tmp_path: Path) -> None:
+    variance = [4.0, 0, 0, 0, 4.0, 0, 0, 0, 9.0]
+    known = fixes("/mavros/global_position/global", position_covariance=variance, position_covariance_type=2)
+    telemetry = read(tmp_path, "mavros", known, imu("/mavros/imu/data", (0, 0, 0, 1)))
+    assert telemetry.position.accuracy_m == (2.0, 3.0)
+    assert telemetry.position.height == "ellipsoid"
+    lost = fixes("/mavros/global_position/global", status={"status": -1})
+    with pytest.raises(DataError, match="8 no fix"):
+        read(tmp_path / "lost", "mavros", lost, imu("/mavros/imu/data", (0, 0, 0, 1)))
+
+
+def test_the_recorder_against_gps_time(tmp_path: Path) -> None:
+    ticks = [
+        Entry(
+            "/mavros/time_reference",
+            "sensor_msgs/msg/TimeReference",
+            t,
+            {"header": header(t, ""), "time_ref": t + 2_500_000_000},
+        )
+        for t in stamps()
+    ]
+    telemetry = read(tmp_path, "mavros", poses("/mavros/local_position/pose", (0, 0, 1)), ticks)
+    assert any("GPS time is 2.500 s ahead of its stamps" in note for note in telemetry.notes)
+
+
+def test_several_drones(tmp_path: Path) -> None:
+    topics = ["/a/mavros/local_position/pose", "/b/mavros/local_position/pose", "/dji_sdk/gps_position"]
+    assert namespaces(topics) == [("dji_osdk", ""), ("mavros", "/a"), ("mavros", "/b")]
+    assert parts_of("mavros", "/a", topics).position == topics[:1]
+    both = [poses(topics[0], (1, 0, 0)), poses(topics[1], (2, 0, 0))]
+    with pytest.raises(DataError, match=r"2 drones \(/a, /b\); say which with `namespace:`"):
+        read(tmp_path / "x", "mavros", *both)
+    assert read(tmp_path / "y", "mavros", *both, namespace="b").position.values[0, 0] == 2
+    with pytest.raises(DataError, match="namespaces with them: /a, /b"):
+        read(tmp_path / "z", "mavros", *both, namespace="/c")
+    with pytest.raises(DataError, match="has no topics of dji_osdk"):
+        read(tmp_path / "w", "dji_osdk", *both)
+    with pytest.raises(DataError, match="has no gps position of /a/mavros; there is local"):
+        read(tmp_path / "v", "mavros", both[0], position="gps")

@@ -1,0 +1,379 @@
+"""ROS 1 and ROS 2 bags: every way to store one gives the same; a damaged one gives what is left."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pipelines.formats.logs import ros2_bag
+from pipelines.formats.logs.chunked_logs import CHUNK_LIMIT
+from pipelines.session.errors import DataError
+from tests.formats.log_entries import (
+    OTHER,
+    PICTURE,
+    POSE,
+    START_NS,
+    entries,
+    everything,
+    everything_or_one_line,
+    log_format,
+    positions,
+    recognised_by,
+)
+from tests.synthetic.logs import (
+    CONTAINERS,
+    ROS2,
+    Container,
+    Entry,
+    cut,
+    write_log,
+    write_ros1,
+    write_ros2,
+    write_split_ros2,
+)
+
+FLIGHT = entries()
+ALL = [(e.topic, e.stamp_ns) for e in FLIGHT]
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_every_container_gives_the_same_messages(tmp_path: Path, container: Container) -> None:
+    path = write_log(tmp_path, "flight", container, FLIGHT)
+    with log_format(path).open_log([path]) as log:
+        assert {t.name: (t.type, t.count) for t in log.topics} == {
+            POSE: ("nav_msgs/msg/Odometry", 100),
+            PICTURE: ("sensor_msgs/msg/CompressedImage", 10),
+            OTHER: ("std_msgs/msg/String", 10),
+        }
+        assert log.topics[0].first_ns == START_NS + 3_000_000
+        messages = list(log.messages([POSE, PICTURE]))
+        assert not log.dropped
+    wanted = [e for e in FLIGHT if e.topic != OTHER]
+    assert [(m.topic.name, m.receive_ns) for m in messages] == [(e.topic, e.stamp_ns) for e in wanted]
+    for message, entry in zip(messages, wanted, strict=True):
+        stamp = message.value.header.stamp
+        assert stamp.sec * 10**9 + stamp.nanosec == entry.fields["header"]["stamp"]
+        if entry.topic == POSE:
+            assert message.value.pose.pose.position.x == entry.fields["pose"]["pose"]["position"]["x"]
+        else:
+            assert message.value.data.tobytes() == entry.fields["data"]
+
+
+@pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
+def test_ros1_compressions(tmp_path: Path, compression: Literal["none", "bz2", "lz4"]) -> None:
+    path = write_ros1(tmp_path / "a.bag", FLIGHT, compression=compression, chunk_size=10_000)
+    assert everything(path) == (ALL, {})
+    assert log_format(path).describe(path)["storage"] == [compression]
+
+
+@pytest.mark.parametrize("compression", ["message", "file"])
+@pytest.mark.parametrize("metadata", [True, False])
+def test_ros2_compressions(tmp_path: Path, compression: Literal["message", "file"], metadata: bool) -> None:
+    path = write_ros2(tmp_path / "bag", FLIGHT, compression=compression, metadata=metadata)
+    # rosbags calls the file bag.db3.zstd; rosbag2 would call it bag_0.db3.zstd.
+    for file in path.glob("bag.db3*"):
+        if not metadata:
+            file.rename(file.with_name(file.name.replace("bag.", "bag_0.")))
+    assert positions(path) == ([float(k) for k in range(100)], {})
+
+
+def test_describe_says_what_is_inside(tmp_path: Path) -> None:
+    late = [e for e in FLIGHT if not START_NS + 200_000_000 < e.stamp_ns < START_NS + 500_000_000]
+    path = write_ros1(tmp_path / "a.bag", late)
+    described = log_format(path).describe(path)
+    assert list(described) == [
+        "files", "storage", "size_bytes", "messages", "first_ns", "last_ns", "span_s", "topics",
+    ]  # fmt: skip
+    assert described["messages"] == len(late)
+    assert described["size_bytes"] == path.stat().st_size
+    topics = described["topics"]
+    assert isinstance(topics, dict)
+    pose = topics[POSE]
+    # 100 Hz from 0 to 0.99 s without the 30 stamps from 0.20 to 0.49 s: 70 messages, 69 steps in 0.99 s.
+    assert pose["messages"] == 70
+    assert pose["rate_hz"] == pytest.approx(69 / 0.99, abs=1e-3)
+    assert pose["longest_gap_s"] == pytest.approx(0.31)
+    # A ROS 1 Odometry: header of 12 + 4 + 4 bytes with "odom", 4 of child, 56 + 288 of pose, 48 + 288 of
+    # twist. The connection of the next topic lies behind a message and counts to it.
+    assert pose["size_bytes"] >= 70 * 704
+    assert pose["size_bytes"] < 70 * 704 + 10_000
+
+
+def test_topics_that_are_not_asked_for_are_not_decoded(tmp_path: Path) -> None:
+    path = write_ros2(tmp_path / "bag", FLIGHT)
+    database = sqlite3.connect(path / "bag.db3")
+    with database:
+        database.execute("UPDATE messages SET data = x'00010000ffffffff' WHERE length(data) < 100")
+    database.close()
+    with log_format(path).open_log([path]) as log:
+        assert len(list(log.messages([POSE]))) == 100
+        assert not log.dropped
+        assert not list(log.messages([OTHER]))
+        assert log.dropped == {"messages that cannot be decoded": 10}
+        list(log.messages([OTHER]))  # a second reading loses the same ones
+        assert log.dropped == {"messages that cannot be decoded": 10}
+        assert not list(log.messages(["/nothing"]))
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("metadata", [True, False])
+def test_split_bags_are_merged(tmp_path: Path, storage: Literal["sqlite3", "mcap"], metadata: bool) -> None:
+    # Files that overlap in time, more than ten of them: file 10 comes after file 9.
+    parts = [FLIGHT[k::12] for k in range(12)]
+    path = write_split_ros2(tmp_path / "flight", parts, storage=storage, metadata=metadata)
+    found, dropped = everything(path)
+    assert [stamp for _, stamp in found] == sorted(e.stamp_ns for e in FLIGHT)
+    assert (sorted(found), dropped) == (sorted(ALL), {})
+    assert recognised_by(path) == ["ros2"]
+    files = sorted(path.glob("flight_*"))
+    with log_format(files[0]).open_log(files) as log:
+        assert sum(topic.count for topic in log.topics) == len(FLIGHT)
+        assert len(list(log.messages([POSE]))) == 100
+    assert log_format(path).describe(path)["files"] == 12
+
+
+def test_a_missing_part_costs_its_messages_and_is_said(tmp_path: Path) -> None:
+    path = write_split_ros2(tmp_path / "flight", [FLIGHT[:40], FLIGHT[40:80], FLIGHT[80:]])
+    (path / "flight_1.db3").unlink()
+    found, dropped = everything(path)
+    assert found == ALL[:40] + ALL[80:]
+    assert dropped == {
+        "files of the bag that are missing": 1,
+        "messages that metadata.yaml counts and the files lack": 40,
+    }
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "{[",
+        "rosbag2_bagfile_information: 3",
+        "rosbag2_bagfile_information:\n  relative_file_paths: [bag.db3]",
+        "rosbag2_bagfile_information:\n  relative_file_paths: [bag.db3]\n  message_count: 1\n"
+        f"  starting_time: {{nanoseconds_since_epoch: 1}}\n  duration: {{nanoseconds: 1{'0' * 400}}}",
+    ],
+)
+def test_a_damaged_metadata_file_is_said_and_not_needed(tmp_path: Path, content: str) -> None:
+    path = write_ros2(tmp_path / "bag", FLIGHT)
+    (path / "bag.db3").rename(path / "bag_0.db3")
+    (path / "metadata.yaml").write_text(content, encoding="utf-8")
+    assert everything(path) == (ALL, {"metadata.yaml cannot be read": 1})
+
+
+def test_metadata_cannot_name_files_outside_the_bag(tmp_path: Path) -> None:
+    write_ros2(tmp_path / "other", FLIGHT)
+    path = write_ros2(tmp_path / "bag", FLIGHT[:10])
+    text = (path / "metadata.yaml").read_text(encoding="utf-8")
+    (path / "metadata.yaml").write_text(text.replace("bag.db3", "../other/other.db3"), encoding="utf-8")
+    _, dropped = everything(path)
+    assert dropped["files of the bag that are missing"] == 1
+
+
+def test_a_bag_without_its_files_is_refused(tmp_path: Path) -> None:
+    path = write_ros2(tmp_path / "bag", FLIGHT)
+    (path / "bag.db3").unlink()
+    with pytest.raises(DataError, match=r"bag: is a bag without its \.db3 or \.mcap files"):
+        log_format(path).open_log([path])
+
+
+def test_the_logs_of_several_drones_in_a_folder_are_not_one_bag(tmp_path: Path) -> None:
+    for drone in ("drone_1", "drone_2"):
+        write_log(tmp_path, drone, "mcap-cdr", FLIGHT)
+    assert recognised_by(tmp_path) == []
+    assert recognised_by(tmp_path / "drone_1.mcap") == ["mcap"]
+
+
+def test_types_without_definitions_are_those_of_ros2(tmp_path: Path) -> None:
+    path = write_ros2(tmp_path / "bag", FLIGHT, definitions=False)
+    database = sqlite3.connect(path / "bag.db3")
+    with database:
+        database.execute("UPDATE topics SET type = 'my_msgs/msg/Own' WHERE name = ?", (OTHER,))
+    database.close()
+    assert positions(path) == ([float(k) for k in range(100)], {})
+    _, dropped = everything(path)
+    assert dropped == {"messages without a usable definition": 10}
+    topics = log_format(path).describe(path)["topics"]
+    assert isinstance(topics, dict)
+    assert topics[OTHER]["cannot be decoded"] == "the log does not define 'my_msgs/msg/Own'"
+
+
+def test_chunks_out_of_order_are_sorted(tmp_path: Path) -> None:
+    shuffled = FLIGHT[60:] + FLIGHT[:60]
+    path = write_ros1(tmp_path / "a.bag", shuffled, chunk_size=5_000)
+    found, _ = everything(path)
+    assert [stamp for _, stamp in found] == sorted(e.stamp_ns for e in FLIGHT)
+
+
+@pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(share=st.floats(0, 0.999))
+def test_a_cut_ros1_bag_gives_its_beginning(
+    tmp_path: Path, compression: Literal["none", "bz2", "lz4"], share: float
+) -> None:
+    whole = tmp_path / "whole.bag"
+    if not whole.exists():
+        write_ros1(whole, FLIGHT, compression=compression, chunk_size=8_000)
+    path = cut(Path(shutil.copy(whole, tmp_path / "cut.bag")), share)
+    found, dropped = everything_or_one_line(path)
+    if not found:
+        # 4117 bytes of magic and header, then a chunk of 8 kB.
+        assert path.stat().st_size < 4117 + 10_000
+        return
+    assert found == ALL[: len(found)]
+    assert dropped.keys() <= {
+        "file truncated",
+        "bytes after the last complete record",
+        "recording not closed",
+    }
+    assert ("file truncated" in dropped) != ("recording not closed" in dropped)
+    if compression == "none":
+        # A message of at most 2.1 kB, an index and a connection can be lost at the cut, not more.
+        assert len(found) >= len(ALL) * (share - 4117 / whole.stat().st_size) - 10
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(share=st.floats(0, 0.999))
+def test_a_cut_database_gives_what_its_pages_hold(tmp_path: Path, share: float) -> None:
+    whole = tmp_path / "whole"
+    if not whole.exists():
+        write_ros2(whole, FLIGHT)
+    path = cut(Path(shutil.copy(whole / "whole.db3", tmp_path / "cut.db3")), share)
+    found, dropped = everything_or_one_line(path)
+    assert found == [message for message in ALL if message in set(found)]
+    assert dropped
+
+
+def test_most_of_a_cut_database_is_read(tmp_path: Path) -> None:
+    path = write_ros2(tmp_path / "bag", entries(10.0))
+    cut(path / "bag.db3", 0.6)
+    found, dropped = everything(path)
+    assert len(found) > 0.55 * 1200
+    assert dropped["file truncated"] == 1
+    # Listed or not: every message is either read, or counted with a reason.
+    listed = dropped["messages that metadata.yaml counts and the files lack"]
+    assert len(found) + listed + dropped.get("messages in damaged blocks", 0) == 1200
+
+
+@pytest.mark.parametrize("name", ["a.bag", "bag.db3"])
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_flipped_bytes_are_a_loss_or_one_line(tmp_path: Path, name: str, data: st.DataObject) -> None:
+    if not (tmp_path / "a.bag").exists():
+        write_ros1(tmp_path / "a.bag", FLIGHT[:40], chunk_size=8_000)
+        shutil.copy(write_ros2(tmp_path / "bag", FLIGHT[:40]) / "bag.db3", tmp_path / "bag.db3")
+    content = bytearray((tmp_path / name).read_bytes())
+    for _ in range(data.draw(st.integers(1, 8))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path / f"hurt_{name}"
+    path.write_bytes(content)
+    _, dropped = everything_or_one_line(path)
+    assert all(len(cause.splitlines()) == 1 for cause in dropped)
+
+
+def test_a_length_of_gigabytes_is_damage(tmp_path: Path) -> None:
+    path = write_ros1(tmp_path / "a.bag", FLIGHT, chunk_size=8_000)
+    content = path.read_bytes()
+    # The size that the third chunk states for its content, before compression.
+    at = -1
+    for _ in range(3):
+        at = content.index(b"size=", at + 1)
+    huge = (CHUNK_LIMIT + 1).to_bytes(4, "little")
+    path.write_bytes(content[: at + 5] + huge + content[at + 9 :])
+    found, dropped = everything(path)
+    lost = dropped["messages in damaged blocks"]
+    assert 0 < lost < 40
+    assert len(found) + lost == len(ALL)
+
+
+@pytest.mark.parametrize("lost_page", [None, 13, 20, 30])
+def test_rows_listed_together_are_those_listed_one_by_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lost_page: int | None
+) -> None:
+    path = write_ros2(tmp_path / "bag", FLIGHT) / "bag.db3"
+    database = sqlite3.connect(path)
+    with database:
+        database.execute("DELETE FROM messages WHERE id % 5 = 2")
+        database.execute("UPDATE messages SET timestamp = 'noon' WHERE id = 60")
+        database.execute("UPDATE messages SET topic_id = 77 WHERE id = 61")
+    database.close()
+    if lost_page:
+        content = bytearray(path.read_bytes())
+        content[4096 * lost_page : 4096 * (lost_page + 1)] = bytes(4096)
+        path.write_bytes(content)
+    else:
+        monkeypatch.setattr(ros2_bag, "_LISTED", 7)
+    together = everything(path)
+    monkeypatch.setattr(ros2_bag._Sqlite3Part, "_take_joined", lambda *_: False)
+    assert together == everything(path)
+    kept = [message for k, message in enumerate(ALL, start=1) if k % 5 != 2 and k not in {60, 61}]
+    if lost_page:
+        # A page holds at most ten rows of 400 bytes; the steps over it grow to twice that.
+        assert 0 < len(kept) - len(together[0]) <= 30
+        assert together[1]["gaps in the table of messages"] == 1
+    else:
+        assert together == (kept, {"messages of unknown topics": 2})
+
+
+def test_bags_that_are_not_read_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "old.bag"
+    path.write_bytes(b"#ROSBAG V1.2\n" + bytes(100))
+    with pytest.raises(DataError, match=r"old\.bag: is a bag of version 1\.2; convert it with `rosbag fix`"):
+        log_format(path).open_log([path])
+
+
+def test_one_unreadable_part_among_others_is_counted(tmp_path: Path) -> None:
+    path = write_split_ros2(tmp_path / "flight", [FLIGHT[:60], FLIGHT[60:]])
+    (path / "flight_1.db3").write_bytes(b"SQLite format 3\0" + bytes(200))
+    found, dropped = everything(path)
+    assert found == ALL[:60]
+    assert dropped["files that cannot be read"] == 1
+
+
+def test_messages_only_in_the_write_ahead_log_are_counted(tmp_path: Path) -> None:
+    path = write_ros2(tmp_path / "bag", FLIGHT)
+    (path / "bag.db3-wal").write_bytes(bytes(4152))
+    assert positions(path)[1] == {"bytes of its write-ahead log, not merged": 4152}
+
+
+def test_type_names_cannot_carry_code(tmp_path: Path) -> None:
+    path = write_ros2(tmp_path / "bag", FLIGHT)
+    database = sqlite3.connect(path / "bag.db3")
+    hostile = "std_msgs/msg/String:\n    pass\nraise SystemExit\nclass X"
+    with database:
+        for table, column in (("topics", "type"), ("message_definitions", "topic_type")):
+            database.execute(f"UPDATE {table} SET {column} = ? WHERE {column} LIKE '%String'", (hostile,))  # noqa: S608
+    database.close()
+    _, dropped = everything(path)
+    assert dropped == {"messages without a usable definition": 10}
+
+
+def test_an_index_of_two_types_under_one_name(tmp_path: Path) -> None:
+    odd = [Entry("/t", "std_msgs/msg/String", 5, {"data": "a"})]
+    first = write_ros1(tmp_path / "a.bag", odd)
+    second = write_ros1(tmp_path / "b.bag", [Entry("/t", "std_msgs/msg/Float64", 3, {"data": 2.0})])
+    with log_format(first).open_log([first, second]) as log:
+        assert [(t.name, t.type, t.count) for t in log.topics] == [
+            ("/t", "std_msgs/msg/Float64", 1),
+            ("/t", "std_msgs/msg/String", 1),
+        ]
+        assert [m.value.data for m in log.messages(["/t"])] == [2.0, "a"]
+
+
+def test_big_endian_messages(tmp_path: Path) -> None:
+    path = write_ros2(tmp_path / "bag", FLIGHT[:1])
+    value = ROS2.types["std_msgs/msg/Float64"](3.5)
+    data = bytes(ROS2.serialize_cdr(value, "std_msgs/msg/Float64", little_endian=False))
+    database = sqlite3.connect(path / "bag.db3")
+    with database:
+        database.execute("UPDATE topics SET type = 'std_msgs/msg/Float64'")
+        database.execute("UPDATE messages SET data = ?", (data,))
+    database.close()
+    with log_format(path).open_log([path]) as log:
+        assert [m.value.data for m in log.messages([POSE])] == [3.5]

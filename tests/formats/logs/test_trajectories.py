@@ -1,0 +1,255 @@
+"""Samples gathered into trajectories: stamps compared, losses counted, transforms chained."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.highlevel import AnyReader
+from scipy.spatial.transform import Rotation
+
+from pipelines.formats.logs.messages import all_samples
+from pipelines.formats.logs.trajectories import (
+    ClockJump,
+    attitudes_of,
+    chained,
+    trajectory_of,
+    transforms_of,
+)
+from pipelines.geometry.poses import matrix_from_quaternion
+from pipelines.session.errors import DataError
+from pipelines.session.records import AngleSample, Message, PoseSample, Topic
+from tests.real_data import real_data
+
+S = 1_000_000_000
+EPOCH = 1_700_000_000 * S
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+
+def flown(
+    count: int = 10, *, rate_hz: int = 10, lag_ns: int = 2_000_000, frames: tuple[str, str] = ("odom", "base")
+) -> list[PoseSample]:
+    """1 m/s to the east, received a little after it was stamped."""
+    stamps = [EPOCH + k * S // rate_hz for k in range(count)]
+    return [
+        PoseSample(t, t + lag_ns, frames[0], frames[1], ((t - EPOCH) / S, 0.0, 0.0), LEVEL) for t in stamps
+    ]
+
+
+def test_the_stamp_of_header_or_of_receipt() -> None:
+    header = trajectory_of(flown(), "d1", stamps="header")
+    receive = trajectory_of(flown(), "d1", stamps="receive")
+    np.testing.assert_array_equal(header.trajectory.t_ns, EPOCH + np.arange(10) * S // 10)
+    np.testing.assert_array_equal(receive.trajectory.t_ns - header.trajectory.t_ns, 2_000_000)
+    np.testing.assert_allclose(header.trajectory.position[:, 0], np.arange(10) / 10, atol=1e-15)
+    assert header.frames == ("odom", "base")
+    assert header.trajectory.covariance is None
+    assert header.stamps == receive.stamps
+    assert (header.stamps.count, header.stamps.disagreeing, header.stamps.jumps) == (10, 0, ())
+    assert header.stamps.largest_disagreement_s == pytest.approx(-0.002, abs=1e-12)
+
+
+def test_a_missing_header_stamp_takes_the_one_of_receipt_and_is_counted() -> None:
+    stated = flown()
+    stated[3:5] = [replace(sample, stamp_ns=0) for sample in stated[3:5]]
+    found = trajectory_of(stated, "d1", stamps="header")
+    assert found.trajectory.t_ns[3] == stated[3].receive_ns
+    assert found.stamps.without_header == 2
+    assert found.stamps.largest_disagreement_s == pytest.approx(-0.002)  # of those that have one
+    assert found.stamps.jumps == ()
+
+
+@pytest.mark.parametrize("jump_s", [-3.0, 40.0])
+def test_a_clock_jump_is_told_with_its_place_and_size(jump_s: float) -> None:
+    stated = flown(20)
+    stated[12:] = [replace(sample, stamp_ns=sample.stamp_ns + round(jump_s * S)) for sample in stated[12:]]
+    stated[5] = replace(stated[5], stamp_ns=0)  # a row without a stamp is no jump
+    found = trajectory_of(stated, "d1", stamps="header")
+    assert found.stamps.jumps == (ClockJump(12, stated[12].stamp_ns, jump_s),)
+    assert found.stamps.disagreeing == 8
+    assert found.stamps.largest_disagreement_s == pytest.approx(jump_s - 0.002)
+    if jump_s < 0:  # nothing after the jump comes later than what came before it
+        assert found.trajectory.dropped == {"stamp out of order": 8}
+    else:
+        assert found.trajectory.dropped == {}
+
+
+@given(st.lists(st.integers(-3 * S, 3 * S), min_size=1, max_size=30))
+def test_leads_and_jumps_as_a_loop_would_find_them(leads: list[int]) -> None:
+    stated = [
+        PoseSample(EPOCH + k * S + lead, EPOCH + k * S, "w", "b", (0.0, 0.0, 0.0), LEVEL)
+        for k, lead in enumerate(leads)
+    ]
+    check = trajectory_of(stated, "d1", stamps="receive", may_disagree_s=2, may_jump_s=1).stamps
+    assert check.disagreeing == sum(abs(lead) > 2 * S for lead in leads)
+    assert abs(check.largest_disagreement_s) == max(abs(lead) for lead in leads) / S
+    jumps = [b - a for a, b in pairwise(leads)]
+    assert [round(jump.jump_s * S) for jump in check.jumps] == [jump for jump in jumps if abs(jump) > S]
+    assert [jump.index for jump in check.jumps] == [k + 1 for k, jump in enumerate(jumps) if abs(jump) > S]
+
+
+def test_losses_are_counted_by_the_rules_of_every_pose_file() -> None:
+    stated = flown()
+    stated[2] = replace(stated[2], position=(np.nan, 0.0, 0.0))
+    stated[4] = replace(stated[4], quaternion_xyzw=(0.0, 0.0, 0.0, 0.0))
+    stated.append(replace(stated[-1]))
+    found = trajectory_of(stated, "d1", stamps="header")
+    assert found.trajectory.dropped == {"not finite": 1, "zero quaternion": 1, "duplicate stamp": 1}
+    assert len(found.trajectory.t_ns) == 8
+
+
+def test_covariances_turn_with_the_body() -> None:
+    """Heading north, what varies about the world's x (east) varies about the body's y, to the right."""
+    north = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
+    covariance = np.diag([1.0, 2, 3, 4, 5, 6])
+    stated = [replace(s, quaternion_xyzw=north, covariance=covariance) for s in flown()]
+    found = trajectory_of(stated, "d1", stamps="header").trajectory.covariance
+    assert found is not None
+    np.testing.assert_allclose(found, np.tile(np.diag([1.0, 2, 3, 5, 4, 6]), (10, 1, 1)), atol=1e-14)
+    unknown = [replace(s, covariance=np.zeros((6, 6))) for s in flown()]
+    assert trajectory_of(unknown, "d1", stamps="header").trajectory.covariance is None
+
+
+def test_poses_of_several_things_or_of_none_are_refused() -> None:
+    with pytest.raises(DataError, match=r"poses of several frames .'base' in 'odom', 'tag' in 'odom'"):
+        trajectory_of(flown() + flown(frames=("odom", "tag")), "d1", stamps="header")
+    with pytest.raises(DataError, match="holds no poses"):
+        trajectory_of([AngleSample(1, 1, (0, 0, 0), None)], "d1", stamps="header")
+    with pytest.raises(DataError, match=r"no usable pose .it has no rows."):
+        trajectory_of([], "d1", stamps="header")
+
+
+# --- gimbals -------------------------------------------------------------------------------------------
+
+
+def test_gimbal_angles_and_quaternions_say_the_same() -> None:
+    angles = np.random.default_rng(5).uniform(-80, 80, size=(20, 3))
+    turned = Rotation.from_euler("ZYX", angles, degrees=True)
+    stamps = [EPOCH + k * S for k in range(20)]
+    as_angles = [
+        AngleSample(t, t, (float(r), float(p), float(y)), None)
+        for t, (y, p, r) in zip(stamps, angles, strict=True)
+    ]
+    as_quaternions = [
+        AngleSample(t, t, None, tuple(q)) for t, q in zip(stamps, turned.as_quat().tolist(), strict=True)
+    ]
+    for stated in (as_angles, as_quaternions):
+        found = attitudes_of(stated, "d1", stamps="header", order="rpy", units="deg").trajectory
+        assert found.t_ns.tolist() == stamps
+        np.testing.assert_allclose(
+            matrix_from_quaternion(found.quaternion_xyzw), turned.as_matrix(), rtol=0, atol=1e-12
+        )
+        assert not found.position.any()
+
+
+def test_angles_that_are_no_numbers_are_dropped_and_counted() -> None:
+    stated = [AngleSample(k, k, (0.0, value, 0.0), None) for k, value in ((1, 0.0), (2, np.inf), (3, np.nan))]
+    found = attitudes_of(stated, "d1", stamps="header")
+    assert found.trajectory.dropped == {"not finite": 2}
+    with pytest.raises(DataError, match="holds no gimbal angles"):
+        attitudes_of(flown(), "d1", stamps="header")
+
+
+# --- transforms ----------------------------------------------------------------------------------------
+
+
+def static(frames: tuple[str, str], position: tuple[float, float, float]) -> PoseSample:
+    return PoseSample(0, EPOCH, frames[0], frames[1], position, LEVEL)
+
+
+def test_chains_of_moving_and_static_transforms() -> None:
+    odometry = flown(50, rate_hz=50)
+    correction = [
+        replace(s, position=(0.0, 100.0, 0.0)) for s in flown(5, rate_hz=5, frames=("/map", "odom"))
+    ]
+    transforms = transforms_of(
+        sorted(odometry + correction, key=lambda s: s.receive_ns),
+        "d1",
+        static=[static(("base", "camera"), (0.5, 0.0, 0.0))],
+    )
+    found = chained(transforms, "d1", parent="map", child="/camera", stamps="header", max_gap_ns=S)
+    # 5 Hz ends at 0.8 s: of 0.00 to 0.98 s at 50 Hz the last nine have no correction.
+    assert found.trajectory.dropped == {"no transform": 9}
+    np.testing.assert_allclose(
+        found.trajectory.position, [[k / 50 + 0.5, 100, 0] for k in range(41)], rtol=0, atol=1e-12
+    )
+    assert found.frames == ("map", "camera")
+    assert found.stamps.count == 55  # static ones have no time to compare
+
+
+def test_what_is_stated_once_holds_always() -> None:
+    transforms = transforms_of([*flown(), static(("base", "camera"), (0.5, 0.0, 0.0))], "d1")
+    found = chained(transforms, "d1", parent="odom", child="camera", stamps="header", max_gap_ns=S)
+    assert len(found.trajectory.t_ns) == 10
+    assert found.stamps.without_header == 0
+
+
+def test_losses_of_a_chain_say_which_transform_they_are_of() -> None:
+    stated = flown()
+    stated[2] = replace(stated[2], position=(np.inf, 0.0, 0.0))
+    transforms = transforms_of([*stated, *flown(frames=("odom", "other"))], "d1")
+    found = chained(transforms, "d1", parent="base", child="other", stamps="header", max_gap_ns=S)
+    assert found.trajectory.dropped == {"not finite ('base' in 'odom')": 1}
+
+
+def test_frames_that_cannot_be_chained_are_refused() -> None:
+    late = [replace(s, stamp_ns=s.stamp_ns + 1000 * S) for s in flown(frames=("base", "camera"))]
+    transforms = transforms_of([*flown(), *late], "d1.mcap")
+    with pytest.raises(DataError, match=r"d1.mcap: there is no frame 'bace' .nearest: base"):
+        chained(transforms, "d1.mcap", parent="odom", child="bace", stamps="header", max_gap_ns=S)
+    with pytest.raises(DataError, match="never states all the transforms from 'odom' to 'camera'"):
+        chained(transforms, "d1.mcap", parent="odom", child="camera", stamps="header", max_gap_ns=S)
+    with pytest.raises(DataError, match="holds no transforms"):
+        transforms_of([AngleSample(1, 1, (0, 0, 0), None)], "d1.mcap")
+
+
+# --- real logs -----------------------------------------------------------------------------------------
+
+
+def real_messages(path: Path, topics: Sequence[str]) -> Iterator[Message]:
+    with AnyReader([path]) as reader:
+        connections = [c for c in reader.connections if c.topic in topics]
+        for connection, receive_ns, data in reader.messages(connections=connections):
+            topic = Topic(connection.topic, connection.msgtype, "ros1", connection.msgcount, None, None)
+            yield Message(topic, receive_ns, reader.deserialize(data, connection.msgtype))
+
+
+def test_the_odometry_of_a_real_robot() -> None:
+    path = real_data("logs/ros1/husky_gps_imu_odom.bag")
+    messages = real_messages(path, ["/husky_velocity_controller/odom"])
+    found = trajectory_of(all_samples(messages, path), path, stamps="header")
+    assert len(found.trajectory.t_ns) == 3952
+    assert found.trajectory.dropped == {}
+    assert found.frames == ("odom", "base_link")
+    assert abs(found.stamps.largest_disagreement_s) < 0.01
+    covariance = found.trajectory.covariance
+    assert covariance is not None
+    # The robot turns about the vertical alone: what it states in the world holds in the body too.
+    np.testing.assert_allclose(covariance[0], np.diag([1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 0.03]), atol=1e-12)
+
+
+def test_the_transforms_of_two_real_turtles() -> None:
+    """One turtle is followed by the other, which steers for a carrot 1 m before the first one's nose."""
+    path = real_data("logs/ros1/foxglove_example.bag")
+    transforms = transforms_of(
+        all_samples(real_messages(path, ["/tf"]), path),
+        path,
+        static=all_samples(real_messages(path, ["/tf_static"]), path),
+    )
+    to_carrot, to_turtle = (
+        chained(transforms, path, parent="world", child=child, stamps="header", max_gap_ns=S).trajectory
+        for child in ("carrot", "turtle1")
+    )
+    assert len(to_turtle.t_ns) == 1344
+    nose = matrix_from_quaternion(to_turtle.quaternion_xyzw)[:, :, 0]
+    np.testing.assert_allclose(to_carrot.position, to_turtle.position + nose, rtol=0, atol=1e-12)
+    follower = chained(transforms, path, parent="turtle2", child="carrot", stamps="header", max_gap_ns=S)
+    distance = np.linalg.norm(follower.trajectory.position, axis=1)
+    assert distance[0] > 4
+    assert distance[-1] < 1

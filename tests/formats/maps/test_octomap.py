@@ -1,0 +1,268 @@
+"""OctoMap: trees written here by another rule than they are read, and real maps with known contents."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipelines.formats.maps import octomap
+from pipelines.session.errors import DataError
+from pipelines.session.registries import MapFormat
+from tests.formats.damaged_maps import refuse_or_read
+from tests.real_data import real_data
+
+READER: MapFormat = octomap.FORMAT
+FREE, OCCUPIED = np.float32(0.1192), np.float32(0.971)
+
+Leaf = float | None  # log odds; None where nothing is known
+Node = Leaf | list["Node"]
+
+# Below 13 fixed levels: at most 8 x 8 x 8 finest voxels.
+leaf_values = st.sampled_from([None, -2.0, 3.5])
+
+
+def eight(children: st.SearchStrategy[Node]) -> st.SearchStrategy[list[Node]]:
+    """An inner node: it has a child."""
+    return st.lists(children, min_size=8, max_size=8).filter(lambda node: node != [None] * 8)
+
+
+subtrees = eight(leaf_values | eight(leaf_values | eight(leaf_values)))
+paths = st.lists(st.integers(0, 7), min_size=13, max_size=13)
+
+
+def at(path: list[int], node: Node) -> Node:
+    """The tree whose only branch is a path of child numbers, with a node at its end."""
+    for child in reversed(path):
+        parent: list[Node] = [None] * 8
+        parent[child] = node
+        node = parent
+    return node
+
+
+def count(node: Node) -> int:
+    return 0 if node is None else 1 + sum(map(count, node)) if isinstance(node, list) else 1
+
+
+def bt_body(node: Node) -> bytes:
+    assert isinstance(node, list)
+    word = 0
+    for i, child in enumerate(node):
+        state = 3 if isinstance(child, list) else 0 if child is None else 2 if child >= 0 else 1
+        word |= state << (2 * i)
+    return struct.pack("<H", word) + b"".join(bt_body(child) for child in node if isinstance(child, list))
+
+
+def ot_body(node: Node, extra: bytes = b"", inner: float = math.nan) -> bytes:
+    if not isinstance(node, list):
+        return struct.pack("<f", node) + extra + b"\0"
+    mask = sum(1 << i for i, child in enumerate(node) if child is not None)
+    below = b"".join(ot_body(child, extra, inner) for child in node if child is not None)
+    return struct.pack("<f", inner) + extra + bytes([mask]) + below
+
+
+def file_of(
+    node: Node,
+    kind: Literal["bt", "ot"] = "bt",
+    *,
+    res: str = "0.2",
+    size: object = None,
+    tree: str = "OcTree",
+    body: bytes | None = None,
+) -> bytes:
+    first = "# Octomap OcTree binary file" if kind == "bt" else "# Octomap OcTree file"
+    header = (
+        f"{first}\n# a comment\nid {tree}\nsize {count(node) if size is None else size}\nres {res}\ndata\n"
+    )
+    if body is None:
+        body = bt_body(node) if kind == "bt" else ot_body(node)
+    return header.encode() + body
+
+
+def painted(path: list[int], node: Node, finest: float) -> dict[tuple[int, int, int], float]:
+    """Every known finest voxel by its index from the world's origin, found by halving cubes."""
+    voxels: dict[tuple[int, int, int], float] = {}
+
+    def visit(node: Node, low: tuple[int, int, int], side: int) -> None:
+        if node is None:
+            return
+        if not isinstance(node, list):
+            for x in range(side):
+                for y in range(side):
+                    for z in range(side):
+                        voxels[low[0] + x, low[1] + y, low[2] + z] = node
+            return
+        half = side // 2
+        for i, child in enumerate(node):
+            x, y, z = (low[axis] + (half if i >> axis & 1 else 0) for axis in range(3))
+            visit(child, (x, y, z), half)
+
+    low, side = [-32768] * 3, 65536
+    for child in path:
+        side //= 2
+        low = [low[axis] + (side if child >> axis & 1 else 0) for axis in range(3)]
+    visit(node, (low[0], low[1], low[2]), side)
+    return voxels
+
+
+@settings(deadline=None)  # the first call compiles
+@given(paths, subtrees, st.sampled_from(["bt", "ot"]))
+def test_every_voxel_is_where_halving_the_cube_puts_it(
+    tmp_path_factory: pytest.TempPathFactory, path: list[int], node: list[Node], kind: Literal["bt", "ot"]
+) -> None:
+    file = tmp_path_factory.mktemp("tree") / f"a.{kind}"
+    file.write_bytes(file_of(at(path, node), kind))
+    assert READER.recognises(file)
+    expected = painted(path, node, 0.2)
+    index = np.array(list(expected))
+    occupancy = READER.read_map(file)
+    assert occupancy.probability.dtype == np.float32
+    np.testing.assert_allclose(occupancy.origin, index.min(axis=0) * 0.2, rtol=0, atol=1e-9)
+    grid = np.full(np.ptp(index, axis=0) + 1, np.nan)
+    log_odds = np.array(list(expected.values()))
+    # Limits of a .bt are OctoMap's; a .ot says its own: p = 1 - 1 / (1 + exp(log odds)).
+    limits = np.where(log_odds > 0, OCCUPIED, FREE)
+    grid[*(index - index.min(axis=0)).T] = limits if kind == "bt" else 1 - 1 / (1 + np.exp(log_odds))
+    np.testing.assert_allclose(occupancy.probability, grid, rtol=0, atol=2e-7)  # float32
+    said = READER.describe(file)
+    assert said["occupied_voxels"] == int((log_odds > 0).sum())
+    assert said["free_voxels"] == int((log_odds < 0).sum())
+    assert said["size_voxels"] == list(grid.shape)
+
+
+@settings(deadline=None)  # the first call compiles
+@given(paths, subtrees, st.integers(1, 4))
+def test_merged_voxels_keep_the_largest_probability(
+    tmp_path_factory: pytest.TempPathFactory, path: list[int], node: list[Node], halvings: int
+) -> None:
+    file = tmp_path_factory.mktemp("tree") / "a.ot"
+    file.write_bytes(file_of(at(path, node), "ot"))
+    merged = READER.read_map(file, resolution_m=0.2 * 2**halvings)
+    assert merged.resolution_m == pytest.approx(0.2 * 2**halvings)
+    best: dict[tuple[int, ...], float] = {}
+    for index, log_odds in painted(path, node, 0.2).items():
+        place = tuple(i // 2**halvings for i in index)
+        best[place] = max(best.get(place, -math.inf), 1 / (1 + math.exp(-log_odds)))
+    first = np.rint(merged.origin / merged.resolution_m).astype(int)
+    found = {
+        tuple((np.array(index) + first).tolist()): float(merged.probability[tuple(index)])
+        for index in np.argwhere(~np.isnan(merged.probability))
+    }
+    assert found == pytest.approx(best, abs=2e-7)
+
+
+def test_colours_of_a_tree_are_passed_over(tmp_path: Path) -> None:
+    node = at([0] * 15, [1.5, None, -0.5, *[None] * 5])
+    file = tmp_path / "a.ot"
+    file.write_bytes(file_of(node, "ot", tree="ColorOcTree", body=ot_body(node, b"\x01\xff\x80")))
+    occupancy = READER.read_map(file)
+    np.testing.assert_allclose(occupancy.probability, 1 / (1 + np.exp([[[-1.5], [0.5]]])), rtol=0, atol=2e-7)
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"", "is no OctoMap file"),
+        (b"# Octomap OcTree binary file\nres 0.2\n", "no line 'data'"),
+        (b"# Octomap OcTree binary file\nid OcTree\ndata\n\0\0", "states no res"),
+        (file_of([3.5] * 8, res="abc"), "cannot be read"),
+        (file_of([3.5] * 8, res="-0.2"), "voxels of -0.2 m"),
+        (file_of([3.5] * 8, res="nan"), "voxels of nan m"),
+        (file_of([3.5] * 8, res="1e300"), r"voxels of 1e\+300 m"),
+        (file_of([3.5] * 8, size="9" * 5000), "cannot be read"),
+        (file_of([3.5] * 8, size=8), "has 9 nodes where its header states 8"),
+        (file_of(at([1] * 16, 3.5))[:-4], "breaks off after 28 bytes"),
+        (file_of(at([1] * 16, 3.5)) + b"\0\0\0", "3 bytes beyond its tree"),
+        (file_of(at([1] * 17, 3.5)), "deeper than 16 levels"),
+        (file_of([None] * 8), "nothing in it is known"),
+        (file_of(at([1] * 16, 3.5), "ot")[:-5], "breaks off"),
+        (file_of(at([1] * 17, 3.5), "ot"), "deeper than 16 levels"),
+        (file_of(at([1] * 16, math.inf), "ot"), "1 leaves have log odds that are not finite"),
+        (file_of(at([1] * 16, 3.5), "ot", tree="OcTreeWithWords"), "is a OcTreeWithWords"),
+        (struct.pack("<idI", 3, math.nan, 2) + bt_body([3.5] * 8), "voxels of nan m"),
+    ],
+)
+def test_unusable_files_are_one_clear_line(tmp_path: Path, content: bytes, problem: str) -> None:
+    file = tmp_path / "bad.bt"
+    file.write_bytes(content)
+    with pytest.raises(DataError, match=problem):
+        READER.read_map(file)
+    with pytest.raises(DataError, match=problem):
+        READER.describe(file)
+
+
+def test_a_box_that_would_not_fit_is_refused_before_it_is_made(tmp_path: Path) -> None:
+    low, high = at([0] * 15, 3.5), at([7] * 15, 3.5)
+    assert isinstance(low, list)
+    assert isinstance(high, list)
+    file = tmp_path / "wide.bt"
+    file.write_bytes(file_of([low, *[None] * 6, high]))
+    with pytest.raises(
+        DataError, match=r"65536 x 65536 x 65536 voxels of 0\.2 m.*resolution_m: 0\.4 or more"
+    ):
+        READER.read_map(file)
+    assert READER.describe(file)["occupied_voxels"] == 2
+    coarse = READER.read_map(file, resolution_m=0.2 * 2**8)
+    assert coarse.probability.shape == (256, 256, 256)
+    assert int((~np.isnan(coarse.probability)).sum()) == 2
+
+
+@pytest.mark.parametrize("resolution_m", [0.1, 0.3, 0.0, math.nan, -0.2])
+def test_voxels_merge_by_powers_of_two_only(tmp_path: Path, resolution_m: float) -> None:
+    file = tmp_path / "a.bt"
+    file.write_bytes(file_of(at([1] * 15, 3.5)))
+    with pytest.raises(DataError, match=r"0\.2, 0\.4, 0\.8|must lie between"):
+        READER.read_map(file, resolution_m=resolution_m)
+
+
+@pytest.mark.parametrize("kind", ["bt", "ot"])
+def test_damage_is_refused_or_read(tmp_path: Path, kind: Literal["bt", "ot"]) -> None:
+    content = file_of(at([3] * 13, [[-2.0, 3.5, None, 3.5] * 2, 3.5, *[None] * 6]), kind)
+    assert refuse_or_read(READER, tmp_path / f"a.{kind}", content, tries=400) > 200
+
+
+@pytest.mark.parametrize(
+    "name", ["octomap_geb079.bt", "octomap_fr_campus.bt", "octomap_simple.bt", "octomap_ecmrv4_withfree.ot"]
+)
+def test_real_maps_hold_what_octomap_says(name: str) -> None:
+    facts = json.loads(real_data("facts.json").read_text())[f"maps/{name}"]
+    file = real_data(f"maps/{name}")
+    assert READER.recognises(file)
+    said = READER.describe(file)
+    assert said["nodes"] == facts["nodes"]
+    assert said["leaves"] == facts["leafs"]
+    assert said["occupied_leaves"] == facts["occupied_leafs"]
+    assert said["free_leaves"] == facts["free_leafs"]
+    assert said["occupied_voxels"] == facts["occupied_voxels_at_finest"]
+    assert said["free_voxels"] == facts["free_voxels_at_finest"]
+    assert said["resolution_m"] == facts["resolution"]
+    for ours, theirs in (
+        ("occupied_box", "occupied_bbox"),
+        ("free_box", "free_bbox"),
+        ("box", "metric_bbox"),
+    ):
+        assert said[f"{ours}_min_m"] == pytest.approx(facts[theirs]["min"], abs=1e-9)
+        assert said[f"{ours}_max_m"] == pytest.approx(facts[theirs]["max"], abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["octomap_geb079.bt", "octomap_simple.bt", "octomap_ecmrv4_withfree.ot"])
+def test_real_grids_agree_with_their_leaves(name: str) -> None:
+    file = real_data(f"maps/{name}")
+    occupancy, said = READER.read_map(file), READER.describe(file)
+    assert int((occupancy.probability >= 0.5).sum()) == said["occupied_voxels"]
+    assert int((occupancy.probability < 0.5).sum()) == said["free_voxels"]
+    assert list(occupancy.probability.shape) == said["size_voxels"]
+    assert occupancy.origin.tolist() == pytest.approx(said["box_min_m"], abs=1e-9)
+
+
+def test_no_probability_overflows(tmp_path: Path) -> None:
+    file = tmp_path / "sure.ot"
+    file.write_bytes(file_of(at([1] * 15, [-3e38, 3e38, *[None] * 6]), "ot"))
+    assert sorted(READER.read_map(file).probability.ravel().tolist()) == [0.0, 1.0]

@@ -1,0 +1,141 @@
+"""What we write as .bt, read by ourselves and by OctoMap."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
+
+from pipelines.formats.maps import octomap
+from pipelines.formats.maps.octomap_writing import write_octomap
+from pipelines.session.errors import DataError
+from pipelines.session.records import Occupancy
+
+FREE, OCCUPIED = np.float32(octomap.FREE_PROBABILITY), np.float32(octomap.OCCUPIED_PROBABILITY)
+
+Voxels = dict[tuple[int, int, int], bool]
+
+# Blocks of one value beside single voxels, so that pruning has something to do on several levels.
+fine = hnp.arrays(
+    np.float32, st.tuples(*[st.integers(1, 5)] * 3), elements=st.sampled_from([0.0, 1.0, np.nan])
+)
+coarse = st.tuples(fine, st.sampled_from([1, 2, 4])).map(
+    lambda pair: np.kron(pair[0], np.ones((pair[1],) * 3, dtype=np.float32))
+)
+grids = coarse.filter(lambda grid: not np.isnan(grid).all())
+corners = st.tuples(*[st.integers(-9, 9)] * 3)
+
+
+def voxels_of(occupancy: Occupancy) -> Voxels:
+    """Whether it is occupied, for every known voxel by its index from the world's origin."""
+    first = np.rint(occupancy.origin / occupancy.resolution_m).astype(int)
+    known = np.argwhere(~np.isnan(occupancy.probability))
+    states = (occupancy.probability[tuple(known.T)] >= 0.5).tolist()
+    return {(x, y, z): state for (x, y, z), state in zip((known + first).tolist(), states, strict=True)}
+
+
+@settings(deadline=None)  # the first call compiles
+@given(grids, corners)
+def test_our_reader_gets_every_voxel_back(
+    tmp_path_factory: pytest.TempPathFactory, grid: NDArray[np.float32], corner: tuple[int, int, int]
+) -> None:
+    file = tmp_path_factory.mktemp("map") / "a.bt"
+    written = Occupancy(grid, np.array(corner) * 0.2, 0.2)
+    write_octomap(file, written)
+    read = octomap.FORMAT.read_map(file)
+    assert voxels_of(read) == voxels_of(written)
+    known = read.probability[~np.isnan(read.probability)]
+    # The reader's log odds are float32 of at most 3.5: a rounding of 2e-7 on the way to probabilities.
+    np.testing.assert_allclose(known, np.where(known >= 0.5, OCCUPIED, FREE), rtol=0, atol=2e-7)
+
+
+@settings(deadline=None, max_examples=60)
+@given(grids, corners)
+def test_octomap_itself_would_write_the_same_tree(
+    tmp_path_factory: pytest.TempPathFactory, grid: NDArray[np.float32], corner: tuple[int, int, int]
+) -> None:
+    """The same nodes in the same order, byte for byte, as from a tree filled voxel by voxel and pruned."""
+    pyoctomap = pytest.importorskip("pyoctomap")
+    folder = tmp_path_factory.mktemp("map")
+    occupancy = Occupancy(grid, np.array(corner) * 0.25, 0.25)
+    write_octomap(folder / "ours.bt", occupancy)
+    tree = pyoctomap.OcTree(0.25)
+    for index, state in voxels_of(occupancy).items():
+        tree.updateNode((np.array(index) + 0.5) * 0.25, state)
+    assert tree.writeBinary(str(folder / "theirs.bt"))
+    ours, theirs = ((folder / name).read_bytes().partition(b"data\n") for name in ("ours.bt", "theirs.bt"))
+    assert ours[2] == theirs[2]
+    assert ours[0].split() == theirs[0].split()
+
+
+def test_octomap_reads_the_same_leaves(tmp_path: Path) -> None:
+    pyoctomap = pytest.importorskip("pyoctomap")
+    rng = np.random.default_rng(7)
+    grid = rng.choice(np.array([0, 1, np.nan], dtype=np.float32), (9, 6, 5), p=[0.6, 0.3, 0.1])
+    grid[2:6, :4, :4] = 1
+    occupancy = Occupancy(grid, np.array([-0.4, 0.0, -0.1]), 0.1)
+    file = tmp_path / "a.bt"
+    write_octomap(file, occupancy)
+    tree = pyoctomap.OcTree(1.0)
+    assert tree.readBinary(str(file))
+    assert tree.getResolution() == 0.1
+    found: Voxels = {}
+    for leaf in tree.begin_leafs():
+        side = round(leaf.getSize() / 0.1)
+        low = np.rint(np.array(leaf.getCoordinate()) / 0.1 - side / 2).astype(int)
+        for x, y, z in np.ndindex(side, side, side):
+            place = (int(low[0]) + x, int(low[1]) + y, int(low[2]) + z)
+            found[place] = bool(tree.isNodeOccupied(leaf))
+    assert found == voxels_of(occupancy)
+    described = octomap.FORMAT.describe(file)
+    assert described["nodes"] == tree.size()
+    assert described["leaves"] == tree.getNumLeafNodes()
+
+
+def test_a_large_map_takes_seconds_at_most(tmp_path: Path) -> None:
+    """2 million voxels of which half are noise, the worst case for pruning; about 0.2 s on an idle core."""
+    rng = np.random.default_rng(3)
+    grid = np.zeros((200, 200, 50), dtype=np.float32)
+    grid[..., :25] = rng.integers(0, 2, (200, 200, 25))
+    occupancy = Occupancy(grid, np.array([-25.0, -25.0, -0.25]), 0.25)
+    write_octomap(tmp_path / "warm.bt", Occupancy(grid[:2, :2, :2], np.zeros(3), 0.25))
+    began = time.process_time()
+    write_octomap(tmp_path / "a.bt", occupancy)
+    assert time.process_time() - began < 4
+    read = octomap.FORMAT.read_map(tmp_path / "a.bt")
+    np.testing.assert_array_equal(read.probability >= 0.5, grid >= 0.5)
+    assert read.origin.tolist() == occupancy.origin.tolist()
+
+
+def test_the_corners_of_the_tree_can_be_reached_and_not_passed(tmp_path: Path) -> None:
+    file, one = tmp_path / "a.bt", np.ones((1, 1, 1), dtype=np.float32)
+    for index in (-32768, 32767):
+        write_octomap(file, Occupancy(one, np.full(3, index * 0.5), 0.5))
+        assert voxels_of(octomap.FORMAT.read_map(file)) == {(index, index, index): True}
+    for index, reach in ((-32769, "16384.5"), (32768, "16384.5")):
+        with pytest.raises(
+            DataError, match=rf"ends 16384 m from the world's origin, the map reaches {reach} m"
+        ):
+            write_octomap(file, Occupancy(one, np.array([0, index * 0.5, 0]), 0.5))
+
+
+@pytest.mark.parametrize(
+    ("grid", "origin", "problem"),
+    [
+        (np.ones((1, 1, 1)), [0.0, 0.05, 0.0], "not on OctoMap's grid, the multiples of 0.2 m"),
+        (np.ones((1, 1, 1)), [0.0, np.nan, 0.0], "not on OctoMap's grid"),
+        (np.full((2, 2, 2), np.nan), [0.0, 0.0, 0.0], "nothing in the map is known"),
+    ],
+)
+def test_what_cannot_be_written(
+    tmp_path: Path, grid: NDArray[np.float64], origin: list[float], problem: str
+) -> None:
+    with pytest.raises(ValueError, match=problem):
+        write_octomap(tmp_path / "a.bt", Occupancy(grid.astype(np.float32), np.array(origin), 0.2))
+    assert not (tmp_path / "a.bt").exists()

@@ -1,0 +1,223 @@
+"""PCD in every encoding, with fields in any order and of any type, and real clouds."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipelines.formats.maps import lzf, pcd
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float
+from pipelines.session.registries import MapFormat
+from tests.formats import clouds
+from tests.formats.damaged_maps import refuse_or_read
+from tests.real_data import real_data
+
+READER: MapFormat = pcd.FORMAT
+
+# liblzf packed this: x, intensity, y, z of 36 points, each field after the other.
+PACKED_BY_LIBLZF = bytes.fromhex(
+    "070000803f00008040200340074003e0760b400000016001000260010003600100046001000560010006600100076001"
+    "0008600100096001000a6001000b6001200020c700a0200340074003e0030b0114c18013e00717e00323e0470b004020"
+    "8b00c0200300602003e0770b016040"
+)
+
+
+def literals(content: bytes) -> bytes:
+    """LZF without any repetition: runs of up to 32 bytes."""
+    runs = [content[k : k + 32] for k in range(0, len(content), 32)]
+    return b"".join(bytes([len(run) - 1]) + run for run in runs)
+
+
+def squeezed(content: bytes) -> bytes:
+    """LZF that repeats the longest earlier match in reach, found by trying them all."""
+    packed, at = bytearray(), 0
+    while at < len(content):
+        best, back = 0, 0
+        for distance in range(1, min(at, 8192) + 1):
+            length = 0
+            while (
+                length < 264
+                and at + length < len(content)
+                and content[at + length - distance] == content[at + length]
+            ):
+                length += 1
+            if length > best:
+                best, back = length, distance
+        if best < 3:
+            packed += bytes([0, content[at]])
+            at += 1
+            continue
+        high, low = divmod(back - 1, 256)
+        packed += bytes([(best - 2) << 5 | high, low] if best < 9 else [7 << 5 | high, best - 9, low])
+        at += best
+    return bytes(packed)
+
+
+def unpacked(packed: bytes, size: int) -> bytes | None:
+    target = np.zeros(size, dtype=np.uint8)
+    written = lzf.decompress(np.frombuffer(packed, np.uint8), target)
+    return target[:written].tobytes() if written >= 0 else None
+
+
+def header(fields: str, sizes: str, types: str, counts: str, points: int, data: str) -> bytes:
+    return (
+        f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {fields}\nSIZE {sizes}\n"
+        f"TYPE {types}\nCOUNT {counts}\nWIDTH {points}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+        f"POINTS {points}\nDATA {data}\n"
+    ).encode()
+
+
+def mixed(points: Float) -> tuple[tuple[str, str, str, str], np.ndarray]:
+    """Records with z first, x as a double, padding, and a field of three values between."""
+    kind = np.dtype([("z", "<f4"), ("pad", "u1", (2,)), ("x", "<f8"), ("hist", "<u2", (3,)), ("y", "<f4")])
+    records = np.zeros(len(points), kind)
+    records["x"], records["y"], records["z"] = points.T
+    records["hist"] = 7
+    return ("z _ x hist y", "4 1 8 2 4", "F U F U F", "1 2 1 3 1"), records
+
+
+def write(path: Path, encoding: str, points: Float = clouds.POINTS) -> Path:
+    (fields, sizes, types, counts), records = mixed(points)
+    head = header(fields, sizes, types, counts, len(points), encoding)
+    if encoding == "ascii":
+        rows = (f"{z} 0 0 {x} 7 7 7 {y}" for x, y, z in points.tolist())
+        body = ("\n".join(rows) + "\n").encode()
+    elif encoding == "binary":
+        body = records.tobytes()
+    else:
+        assert records.dtype.names is not None
+        content = b"".join(records[name].tobytes() for name in records.dtype.names)
+        packed = squeezed(content)
+        body = struct.pack("<II", len(packed), len(content)) + packed
+    path.write_bytes(head + body)
+    return path
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_voxels_hold_the_points(tmp_path: Path, encoding: str) -> None:
+    path = write(tmp_path / "a.pcd", encoding)
+    assert READER.recognises(path)
+    occupancy = READER.read_map(path)
+    assert occupancy.probability.shape == clouds.SHAPE
+    assert occupancy.origin == pytest.approx(clouds.ORIGIN)
+    assert occupancy.resolution_m == 0.2
+    assert occupancy.dropped == {"not finite": 2}
+    assert np.argwhere(occupancy.probability == 1).tolist() == clouds.OCCUPIED
+    assert np.isnan(occupancy.probability).sum() == occupancy.probability.size - 2
+    said = READER.describe(path)
+    assert (said["points"], said["finite_points"], said["dropped: not finite"]) == (5, 3, 2)
+    assert (said["occupied_voxels"], said["free_voxels"]) == (2, 0)
+    assert READER.read_map(path, resolution_m=0.1).probability.shape == (3, 3, 11)
+
+
+def test_oldest_headers_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.pcd"
+    path.write_text("VERSION .5\nCOLUMNS x y z\nWIDTH 2\nDATA ascii\n1 2 3\n1.5 2 3\n")
+    assert READER.recognises(path)
+    assert READER.describe(path)["points_box_max_m"] == [1.5, 2, 3]
+
+
+def test_lzf_reads_what_liblzf_wrote() -> None:
+    points = np.tile(np.array([[1, 2, 3], [4, 5, 6], [1, 2, 3.5]], "<f4"), (12, 1))
+    points[7, 1] = -9.25
+    intensity = np.arange(36, dtype="<u2") // 3
+    fields = [points[:, 0], intensity, points[:, 1], points[:, 2]]
+    assert unpacked(PACKED_BY_LIBLZF, 504) == b"".join(field.tobytes() for field in fields)
+
+
+@settings(deadline=None)  # the first call compiles
+@given(st.lists(st.sampled_from([b"a", b"bc", b"abcabc", b"\0" * 300, b"d" * 9]), max_size=12))
+def test_lzf_round_trip(parts: list[bytes]) -> None:
+    content = b"".join(parts)
+    assert unpacked(squeezed(content), len(content)) == content
+    assert unpacked(literals(content), len(content)) == content
+
+
+@pytest.mark.parametrize(
+    "packed", [b"\x05abc", b"\x20\x00", b"\x00a\x20", b"\x00a\xe0\x05", b"\x00a\xe0", b"\x00a\x20\x05"]
+)
+def test_lzf_never_leaves_its_arrays(packed: bytes) -> None:
+    assert unpacked(packed, 64) is None
+
+
+def test_lzf_stops_at_the_end_of_the_target() -> None:
+    assert unpacked(b"\x00a\xe0\xff\x00", 100) is None
+    assert unpacked(b"\x03abcd", 3) is None
+
+
+XYZ = ("x y z", "4 4 4", "F F F", "1 1 1")
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"VERSION 0.7\nFIELDS x y z\n", "no line 'DATA'"),
+        (header("x y", "4 4", "F F", "1 1", 1, "ascii") + b"1 2\n", "its fields are x y"),
+        (header("x y z", "4 4", "F F F", "1 1 1", 1, "ascii") + b"1 2 3\n", "not equally long"),
+        (header("x y z", "4 4 3", "F F F", "1 1 1", 1, "ascii") + b"1 2 3\n", "field z is 1 times F3"),
+        (header("x y z", "4 4 4", "F F F", "1 1 -1", 1, "ascii") + b"1 2 3\n", "field z is -1 times"),
+        (header("x y z", "4 4 4", "F F F", "1 1 2", 1, "ascii") + b"1 2 3 4\n", "more than one x, y or z"),
+        (header(*XYZ, 1, "zipped") + b"1 2 3\n", "DATA is 'zipped'"),
+        (header(*XYZ, 0, "ascii"), "states 0 x 1 and 0 points"),
+        (header(*XYZ, 2, "ascii") + b"1 2 3\n", "1 of 2 points are there"),
+        (header(*XYZ, 10**15, "ascii") + b"1 2 3\n", "1 of 1000000000000000 points"),
+        (header(*XYZ, 10**15, "binary") + b"\0" * 12, "1 of 1000000000000000 points"),
+        (header(*XYZ, 1, "ascii"), "0 of 1 points are there"),
+        (header(*XYZ, 2, "ascii") + b"1 2 3\n1 2\n", "row of points is damaged"),
+        (header(*XYZ, 2, "ascii") + b"1 2 3\n1 b 3\n", "row of points is damaged"),
+        (header(*XYZ, 2, "binary") + b"\0" * 23, "1 of 2 points are there"),
+        (header(*XYZ, 1, "ascii") + b"nan 2 3\n", "none of its 1 points is finite"),
+        (header(*XYZ, 2, "ascii") + b"1 2 3\n1e9 1e9 1e9\n", r"voxels of 0\.2 m.*crop stray points"),
+        (header(*XYZ, 2, "ascii") + b"1 2 3\n1.7e308 -1.7e308 0\n", "crop stray points"),
+        (header(*XYZ, 2, "binary_compressed") + b"\1\0", "0 of 2 points"),
+        (header(*XYZ, 2, "binary_compressed") + struct.pack("<II", 9, 24), "0 of 9 bytes are there"),
+        (header(*XYZ, 2, "binary_compressed") + struct.pack("<II", 2, 25) + b"ab", "states 25 bytes for 2"),
+        (
+            header(*XYZ, 357_000_000, "binary_compressed") + struct.pack("<II", 2, 4_284_000_000) + b"ab",
+            "4284000000 bytes for 357000000 points of 12 bytes in 2 bytes",
+        ),
+        (header(*XYZ, 2, "binary_compressed") + struct.pack("<II", 2, 24) + b"\0a", "points are damaged"),
+    ],
+)
+def test_unusable_files_are_one_clear_line(tmp_path: Path, content: bytes, problem: str) -> None:
+    path = tmp_path / "bad.pcd"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=problem):
+        READER.read_map(path)
+
+
+@pytest.mark.parametrize("resolution_m", [0.0, -1.0, np.nan, np.inf, 1e-9])
+def test_impossible_resolutions_are_refused(tmp_path: Path, resolution_m: float) -> None:
+    path = write(tmp_path / "a.pcd", "binary")
+    with pytest.raises(DataError, match="must lie between"):
+        READER.read_map(path, resolution_m=resolution_m)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_damage_is_refused_or_read(tmp_path: Path, encoding: str) -> None:
+    content = write(tmp_path / "a.pcd", encoding).read_bytes()
+    assert refuse_or_read(READER, tmp_path / "a.pcd", content, tries=300) > 100
+
+
+@pytest.mark.parametrize("name", ["pcl_bunny_ascii", "pcl_colored_cloud", "ndt_omp_251370668"])
+def test_real_clouds_hold_what_other_readers_say(name: str) -> None:
+    facts = json.loads(real_data("facts.json").read_text())[f"maps/{name}.pcd"]
+    path = real_data(f"maps/{name}.pcd")
+    assert READER.recognises(path)
+    said = READER.describe(path)
+    for key in ("fields", "width", "height", "data", "points", "finite_points"):
+        assert said[key] == facts[key]
+    # Both are rounded to 0.1 mm.
+    assert said["points_box_min_m"] == pytest.approx(facts["bbox"]["min"], abs=1.01e-4)
+    assert said["points_box_max_m"] == pytest.approx(facts["bbox"]["max"], abs=1.01e-4)
+    assert said["centroid_m"] == pytest.approx(facts["centroid"], abs=1.01e-4)
+    occupancy = READER.read_map(path)
+    assert int((occupancy.probability == 1).sum()) == said["occupied_voxels"]
+    assert list(occupancy.probability.shape) == said["size_voxels"]

@@ -1,0 +1,134 @@
+"""PLY in every encoding and byte order, clouds and meshes, and a real cloud."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.formats.maps import pcd, ply
+from pipelines.session.errors import DataError
+from pipelines.session.registries import MapFormat
+from tests.formats import clouds
+from tests.formats.damaged_maps import refuse_or_read
+from tests.real_data import real_data
+
+READER: MapFormat = ply.FORMAT
+XYZ = "property float x\nproperty float y\nproperty float z\n"
+
+
+def head(encoding: str, elements: str) -> bytes:
+    return f"ply\nformat {encoding} 1.0\ncomment made here\n{elements}end_header\n".encode()
+
+
+def write(path: Path, encoding: str) -> Path:
+    """A mesh: two sensors before its vertices, whose x comes last, and a face after them."""
+    points = clouds.POINTS
+    header = head(
+        encoding,
+        "element sensor 2\nproperty uchar id\nproperty double when\n"
+        f"element vertex {len(points)}\nproperty float z\nproperty uint8 red\nproperty double y\n"
+        "property float32 x\nelement face 1\nproperty list uchar int vertex_indices\n",
+    )
+    if encoding == "ascii":
+        rows = [f"{z} 255 {y} {x}" for x, y, z in points.tolist()]
+        path.write_bytes(header + "\n".join(["1 0.5", "2 0.75", *rows, "3 0 1 2", ""]).encode())
+        return path
+    order = "<" if encoding == "binary_little_endian" else ">"
+    sensors = np.array([(1, 0.5), (2, 0.75)], dtype=[("id", "u1"), ("when", f"{order}f8")])
+    kind = [("z", f"{order}f4"), ("red", "u1"), ("y", f"{order}f8"), ("x", f"{order}f4")]
+    vertices = np.zeros(len(points), dtype=kind)
+    vertices["x"], vertices["y"], vertices["z"] = points.T
+    face = b"\3" + np.arange(3, dtype=f"{order}i4").tobytes()
+    path.write_bytes(header + sensors.tobytes() + vertices.tobytes() + face)
+    return path
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_voxels_hold_the_vertices(tmp_path: Path, encoding: str) -> None:
+    path = write(tmp_path / "a.ply", encoding)
+    assert READER.recognises(path)
+    occupancy = READER.read_map(path)
+    assert occupancy.probability.shape == clouds.SHAPE
+    assert occupancy.origin == pytest.approx(clouds.ORIGIN)
+    assert occupancy.dropped == {"not finite": 2}
+    assert np.argwhere(occupancy.probability == 1).tolist() == clouds.OCCUPIED
+    said = READER.describe(path)
+    assert said["elements"] == {"sensor": 2, "vertex": 5, "face": 1}
+    assert (said["points"], said["finite_points"], said["occupied_voxels"]) == (5, 3, 2)
+
+
+def test_lines_may_end_as_on_windows(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    path.write_bytes((head("ascii", f"element vertex 1\n{XYZ}") + b"1 2 3\n").replace(b"\n", b"\r\n"))
+    assert READER.recognises(path)
+    assert READER.describe(path)["centroid_m"] == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"ply\nformat ascii 1.0\n", "no line 'end_header'"),
+        (b"ply\nelement vertex 1\n" + XYZ.encode() + b"end_header\n1 2 3\n", "no PLY file of version 1.0"),
+        (head("binary_middle_endian", f"element vertex 1\n{XYZ}"), "line 'format binary_middle_endian 1.0'"),
+        (head("ascii", "element vertex -1\n" + XYZ), "line 'element vertex -1'"),
+        (head("ascii", "element vertex " + "9" * 5000 + "\n" + XYZ), "line 'element vertex 9999"),
+        (head("ascii", "property float x\n"), "line 'property float x'"),
+        (head("ascii", "element vertex 1\nproperty half x\n"), "line 'property half x'"),
+        (head("ascii", "element face 1\nproperty list uchar int i\n"), "has no vertices"),
+        (head("ascii", "element vertex 0\n" + XYZ), "has 0 vertices"),
+        (head("ascii", "element vertex 1\nproperty float x\n"), "its vertices have x"),
+        (head("ascii", f"element vertex 1\n{XYZ}property list uchar int i\n"), "no lists"),
+        (head("ascii", f"element vertex 1\n{XYZ}property float x\n"), "property x twice"),
+        (head("ascii", f"element vertex 2\n{XYZ}") + b"1 2 3\n", "1 of 2 points are there"),
+        (head("ascii", f"element vertex {10**15}\n{XYZ}") + b"1 2 3\n", "1 of 1000000000000000 points"),
+        (head("ascii", f"element vertex 1\n{XYZ}") + b"1 2\n", "row of points is damaged"),
+        (
+            head("binary_little_endian", f"element vertex {10**15}\n{XYZ}") + b"\0" * 12,
+            "1 of 1000000000000000 points",
+        ),
+        (
+            head("binary_little_endian", f"element s 1000000\nproperty int a\nelement vertex 1\n{XYZ}"),
+            "0 of 1 points",
+        ),
+        (
+            head(
+                "binary_little_endian",
+                f"element face 1\nproperty list uchar int i\nelement vertex 1\n{XYZ}",
+            ),
+            "lists before its vertices",
+        ),
+    ],
+)
+def test_unusable_files_are_one_clear_line(tmp_path: Path, content: bytes, problem: str) -> None:
+    path = tmp_path / "bad.ply"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=problem):
+        READER.read_map(path)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_damage_is_refused_or_read(tmp_path: Path, encoding: str) -> None:
+    content = write(tmp_path / "a.ply", encoding).read_bytes()
+    assert refuse_or_read(READER, tmp_path / "a.ply", content, tries=300) > 100
+
+
+def test_the_real_cloud_holds_what_other_readers_say() -> None:
+    facts = json.loads(real_data("facts.json").read_text())["maps/small_gicp_target.ply"]
+    path = real_data("maps/small_gicp_target.ply")
+    said = READER.describe(path)
+    for key in ("elements", "fields", "points", "finite_points"):
+        assert said[key] == facts[key]
+    # Both are rounded to 0.1 mm.
+    assert said["points_box_min_m"] == pytest.approx(facts["bbox"]["min"], abs=1.01e-4)
+    assert said["points_box_max_m"] == pytest.approx(facts["bbox"]["max"], abs=1.01e-4)
+    assert said["centroid_m"] == pytest.approx(facts["centroid"], abs=1.01e-4)
+
+
+def test_the_same_points_make_the_same_map_from_ply_and_pcd() -> None:
+    from_ply = READER.read_map(real_data("maps/small_gicp_target.ply"))
+    from_pcd = pcd.FORMAT.read_map(real_data("maps/ndt_omp_251370668.pcd"))
+    np.testing.assert_array_equal(from_ply.probability, from_pcd.probability)
+    np.testing.assert_array_equal(from_ply.origin, from_pcd.origin)

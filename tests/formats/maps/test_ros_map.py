@@ -1,0 +1,265 @@
+"""Floor plans: map_server's rules on small pictures, turned plans, and the real ones."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pipelines.formats.maps import ros_map
+from pipelines.session.errors import DataError
+from pipelines.session.registries import MapFormat
+from tests.formats.damaged_maps import damaged, refuse_or_read
+from tests.real_data import real_data
+
+READER: MapFormat = ros_map.FORMAT
+
+PICTURE = np.array([[0, 254, 205], [254, 254, 254]], dtype=np.uint8)
+"""Two rows, the upper one is the higher y: occupied, free, and (at free_thresh 0.19) unknown."""
+
+
+def pgm(values: NDArray[np.integer[Any]], most: int = 255, comment: str = "") -> bytes:
+    height, width = values.shape
+    kind = ">u2" if most > 255 else "u1"
+    return f"P5\n{comment}{width} {height}\n{most}\n".encode() + values.astype(kind).tobytes()
+
+
+def write(folder: Path, picture: bytes = pgm(PICTURE), *, name: str = "plan.pgm", **keys: object) -> Path:
+    """A plan and its picture; a key that is None is left out."""
+    values: dict[str, object] = {
+        "image": name,
+        "mode": "trinary",
+        "resolution": 0.5,
+        "origin": [1.0, 2.0, 0.0],
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.19,
+        **keys,
+    }
+    (folder / name).write_bytes(picture)
+    path = folder / "map.yaml"
+    path.write_text("".join(f"{key}: {value}\n" for key, value in values.items() if value is not None))
+    return path
+
+
+def floor(path: Path, resolution_m: float | None = None) -> NDArray[np.float32]:
+    """One level of the map, [x][y], after a look that all are alike."""
+    probability = READER.read_map(path, resolution_m=resolution_m).probability
+    np.testing.assert_array_equal(probability, probability[:, :, :1].repeat(probability.shape[2], axis=2))
+    return probability[:, :, 0]
+
+
+def test_a_plan_stands_on_its_lower_left_corner(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    assert READER.recognises(path)
+    occupancy = READER.read_map(path)
+    assert occupancy.origin.tolist() == [1, 2, 0]
+    assert occupancy.probability.shape == (3, 2, 5)  # 2.5 m high
+    np.testing.assert_array_equal(floor(path), [[0, 1], [0, 0], [0, np.nan]])
+    said = READER.describe(path)
+    assert (said["occupied_pixels"], said["free_pixels"], said["unknown_pixels"]) == (1, 4, 1)
+    assert (said["occupied_voxels"], said["free_voxels"], said["unknown_voxels"]) == (5, 20, 5)
+    assert (said["box_min_m"], said["box_max_m"]) == ([1, 2, 0], [2.5, 3, 2.5])
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        pgm(PICTURE, comment="# CREATOR: map_saver 0.050 m/pix\n"),
+        pgm(PICTURE.astype(np.uint16) * 257, most=65535),
+        b"P2 # plain\n3 2\n255\n0 254 205\n254 254 254\n",
+        cv2.imencode(".png", PICTURE)[1].tobytes(),
+        cv2.imencode(".png", PICTURE.astype(np.uint16) * 257)[1].tobytes(),
+        cv2.imencode(".png", cv2.cvtColor(PICTURE, cv2.COLOR_GRAY2BGRA))[1].tobytes(),
+    ],
+    ids=["commented", "16 bit", "plain", "png", "16 bit png", "coloured png"],
+)
+def test_every_kind_of_picture_says_the_same(tmp_path: Path, picture: bytes) -> None:
+    np.testing.assert_array_equal(floor(write(tmp_path, picture)), [[0, 1], [0, 0], [0, np.nan]])
+
+
+def test_negate_takes_white_for_walls(tmp_path: Path) -> None:
+    path = write(tmp_path, pgm(255 - PICTURE), negate=1)
+    np.testing.assert_array_equal(floor(path), [[0, 1], [0, 0], [0, np.nan]])
+
+
+def test_scale_is_in_proportion_between_the_thresholds(tmp_path: Path) -> None:
+    # Darkness 0.5 between 0.2 and 0.6 is 75 percent; a transparent pixel is unknown.
+    grey = np.array([[255 * 0.5, 0, 255, 0]]).round().astype(np.uint8)
+    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGRA)
+    picture[0, 3, 3] = 100
+    path = write(
+        tmp_path,
+        cv2.imencode(".png", picture)[1].tobytes(),
+        mode="scale",
+        occupied_thresh=0.6,
+        free_thresh=0.2,
+    )
+    np.testing.assert_allclose(floor(path), np.array([[0.75], [1], [0], [np.nan]]), rtol=0, atol=1e-7)
+
+
+def test_raw_values_are_percent(tmp_path: Path) -> None:
+    path = write(tmp_path, pgm(np.array([[0, 30, 100, 101, 255]])), mode="raw")
+    expected = np.array([[0], [0.3], [1], [np.nan], [np.nan]])
+    np.testing.assert_allclose(floor(path), expected, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("quarter_turns", [1, 2, 3, -1])
+def test_quarter_turns_turn_the_grid(tmp_path: Path, quarter_turns: int) -> None:
+    level = floor(write(tmp_path))
+    path = write(tmp_path, origin=[1.0, 2.0, quarter_turns * math.pi / 2])
+    # rot90 turns the first axis (x) to the second (y), as a positive yaw does.
+    np.testing.assert_array_equal(floor(path), np.rot90(level, quarter_turns))
+    extent = {1: (-1.0, 0), 2: (-1.5, -1.0), 3: (0, -1.5)}[quarter_turns % 4]
+    np.testing.assert_allclose(READER.read_map(path).origin, [1 + extent[0], 2 + extent[1], 0], atol=1e-12)
+
+
+@given(
+    st.floats(-math.pi, math.pi),
+    st.sampled_from([0.25, 0.5, 0.8, 1.0, 2.0]),
+    st.sets(st.tuples(st.integers(0, 8), st.integers(0, 6)), min_size=1, max_size=8),
+)
+def test_turned_walls_are_neither_lost_nor_moved(
+    tmp_path_factory: pytest.TempPathFactory, yaw: float, side: float, walls: set[tuple[int, int]]
+) -> None:
+    picture = np.full((7, 9), 254)
+    for x, y in walls:
+        picture[6 - y, x] = 0
+    path = write(tmp_path_factory.mktemp("plan"), pgm(picture), origin=[3.0, -1.0, yaw])
+    occupancy = READER.read_map(path, resolution_m=side)
+    c, s = math.cos(yaw), math.sin(yaw)
+    pixels = (np.array(sorted(walls)) + 0.5) * 0.5 @ np.array([[c, s], [-s, c]]) + [3.0, -1.0]
+    voxels = np.argwhere(occupancy.probability[:, :, 0] >= 0.5) + 0.5
+    voxels = voxels * side + occupancy.origin[:2]
+    gaps = np.linalg.norm(pixels[:, None] - voxels[None], axis=2)
+    # Each pixel shares a point with one of the voxels and the other way round: centres are at most half of
+    # both diagonals apart.
+    reach = (0.5 + side) * math.sqrt(0.5) + 1e-9
+    assert gaps.min(axis=1).max() <= reach
+    assert gaps.min(axis=0).max() <= reach
+
+
+def test_coarser_voxels_keep_every_wall(tmp_path: Path) -> None:
+    picture = np.full((8, 8), 254)
+    picture[0, 5] = 0
+    path = write(tmp_path, pgm(picture), origin=[0.0, 0.0, 0.0])
+    level = floor(path, 2.0)
+    assert np.argwhere(level == 1).tolist() == [[1, 1]]  # x 2.5, y 3.5 of 4 m
+
+
+def test_a_renamed_picture_is_found_beside_its_plan(tmp_path: Path) -> None:
+    path = write(tmp_path, image="lost.png", name="map.pgm")
+    said = READER.describe(path)
+    assert (said["image"], said["image named (absent)"]) == ("map.pgm", "lost.png")
+
+
+@pytest.mark.parametrize(
+    ("keys", "problem"),
+    [
+        ({"image": None, "negate": None}, "lacks image, negate"),
+        ({"image": "absent.pgm"}, r"its picture absent\.pgm is not there"),
+        ({"image": "x" * 5000}, "is not there"),
+        ({"image": "[1, 2]"}, "it must name a PGM or PNG"),
+        ({"image": '"a\\0b"'}, "it must name a PGM or PNG"),
+        ({"resolution": 0}, "voxels of 0 m"),
+        ({"resolution": ".nan"}, "voxels of nan m"),
+        ({"resolution": "wide"}, "no list of numbers"),
+        ({"origin": [1, 2]}, "instead of x, y, yaw"),
+        ({"origin": "[1, .inf, 0]"}, "instead of x, y, yaw"),
+        ({"origin": "{}"}, "origin is no list"),
+        ({"occupied_thresh": 0.1}, "are not 0..1"),
+        ({"free_thresh": ".nan"}, "are not 0..1"),
+        ({"mode": "fancy"}, "known are trinary, scale, raw"),
+        ({"negate": 2}, "it must be 0 or 1"),
+        ({"mode": "{"}, "is no valid YAML"),
+    ],
+)
+def test_unusable_plans_are_one_clear_line(tmp_path: Path, keys: dict[str, Any], problem: str) -> None:
+    path = write(tmp_path, **keys)
+    with pytest.raises(DataError, match=problem) as caught:
+        READER.read_map(path)
+    assert "\n" not in str(caught.value)
+
+
+PNG = cv2.imencode(".png", PICTURE)[1].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("picture", "problem"),
+    [
+        (b"", "no PGM or PNG"),
+        (b"P6 1 1 255\n123", "no PGM or PNG"),
+        (b"P5" + b" " * 50_000, "header cannot be read"),
+        (b"P5 3 2 0\n", "values up to 0"),
+        (b"P5 3 2 70000\n", "values up to 70000"),
+        (b"P5 3 2 255\n12345", "5 of 6 pixels"),
+        (b"P5 999999999 999999999 255\n1", "999999999 x 999999999 pixels"),
+        (b"P5 0 2 255\n", "0 x 2 pixels"),
+        (b"P5 1 1 9\n\xff", "values beyond 9"),
+        (b"P2 1 1 255\nx", "is damaged"),
+        (b"P2 1 1 255\n-4", "values beyond 255"),
+        (PNG[:20], "breaks off"),
+        (PNG[:40], "damaged PNG"),
+        (PNG[:16] + struct.pack(">II", 9000, 9000) + PNG[24:], "does not hold the 9000 x 9000 pixels"),
+        (PNG[:16] + struct.pack(">II", 2**31, 2**31) + PNG[24:], "2147483648 x 2147483648 pixels"),
+    ],
+)
+def test_unusable_pictures_are_one_clear_line(tmp_path: Path, picture: bytes, problem: str) -> None:
+    path = write(tmp_path, picture)
+    with pytest.raises(DataError, match=problem):
+        READER.read_map(path)
+
+
+def test_plans_without_content_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="every pixel is unknown"):
+        READER.read_map(write(tmp_path, pgm(np.full((2, 2), 180))))
+
+
+def test_a_building_that_would_not_fit_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, pgm(np.zeros((1500, 1500), np.uint8)), resolution=0.01)
+    with pytest.raises(DataError, match=r"1500 x 1500 x 250 voxels of 0\.01 m.*resolution_m: 0\.04"):
+        READER.read_map(path)
+    assert READER.describe(path)["occupied_voxels"] == 1500 * 1500 * 250
+
+
+def test_damage_is_refused_or_read(tmp_path: Path) -> None:
+    content = write(tmp_path, origin=[0.0, 0.0, 0.3]).read_bytes()
+    assert refuse_or_read(READER, tmp_path / "map.yaml", content, tries=120) > 50
+
+
+@pytest.mark.parametrize("suffix", ["pgm", "png"])
+def test_damaged_pictures_are_refused_or_read(tmp_path: Path, suffix: str) -> None:
+    content = pgm(PICTURE) if suffix == "pgm" else PNG
+    refused = 0
+    for seed in range(60):
+        path = write(tmp_path, damaged(content, seed))
+        try:
+            READER.read_map(path)
+        except DataError:
+            refused += 1
+    assert refused > 20
+
+
+@pytest.mark.parametrize("name", ["nav2_depot", "nav2_testmap"])
+def test_real_plans_hold_what_their_pictures_say(name: str) -> None:
+    facts = json.loads(real_data("facts.json").read_text())[f"maps/{name}.pgm"]
+    path = real_data(f"maps/{name}.yaml")
+    assert READER.recognises(path)
+    said = READER.describe(path)
+    assert (said["width"], said["height"]) == (facts["width"], facts["height"])
+    for state in ("occupied", "free", "unknown"):
+        assert said[f"{state}_pixels"] == facts[f"trinary_{state}"]
+    assert said["origin"] == facts["yaml"]["origin"]
+    assert said["resolution_m"] == facts["yaml"]["resolution"]
+    occupancy = READER.read_map(path)
+    assert list(occupancy.probability.shape) == said["size_voxels"]
+    assert int((occupancy.probability >= 0.5).sum()) == said["occupied_voxels"]

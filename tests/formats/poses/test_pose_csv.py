@@ -1,0 +1,137 @@
+"""Poses as CSV: columns by name, EuRoC's header, covariances."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+
+from pipelines.formats.poses import pose_csv, tum
+from pipelines.session.errors import DataError
+from pipelines.session.records import Trajectory
+from pipelines.session.registries import TrajectoryFormat
+from pipelines.session.tables import COVARIANCE_COLUMNS
+from tests.formats.trajectories import trajectories
+from tests.real_data import real_data
+
+READER: TrajectoryFormat = pose_csv.FORMAT
+
+EUROC = """#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []
+1403636580838555648,4.688319,-1.786938,0.783338,0.534108,-0.153029,-0.827383,-0.082152
+1403636580843555328,4.688177,-1.786770,0.787350,0.534640,-0.152990,-0.826976,-0.082863
+"""
+
+
+def write(folder: Path, text: str, name: str = "poses.csv") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_euroc_ground_truth(tmp_path: Path) -> None:
+    path = write(tmp_path, EUROC)
+    assert READER.recognises(path)
+    assert not tum.FORMAT.recognises(path), "its order is w first: as TUM it would be another rotation"
+    poses = READER.read_trajectory(path)
+    assert poses.t_ns.tolist() == [1403636580838555648, 1403636580843555328]
+    # Six decimals per number leave the norm within 4 * 0.5e-6 of one.
+    np.testing.assert_allclose(
+        poses.quaternion_xyzw[0], [-0.153029, -0.827383, -0.082152, 0.534108], rtol=0, atol=2e-6
+    )
+
+
+def test_the_order_of_columns_is_free_and_others_are_ignored(tmp_path: Path) -> None:
+    text = "note,qw,qx,qy,qz,pos_z,pos_y,pos_x,Time,vx\nhello,0.8,0,0,0.6,3,2,1,1700000000.123456789,9\n"
+    poses = READER.read_trajectory(write(tmp_path, text))
+    assert poses.t_ns.tolist() == [1700000000123456789]
+    assert poses.position.tolist() == [[1, 2, 3]]
+    np.testing.assert_allclose(poses.quaternion_xyzw, [[0, 0, 0.6, 0.8]], atol=1e-16)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "t,tx,ty,tz,qx,qy,qz,qw",
+        "stamp;p_x;p_y;p_z;q_x;q_y;q_z;q_w",
+        "time_s\tposition.x\tposition.y\tposition.z\torientation.x\torientation.y\torientation.z\torientation.w",
+        "# t,x,y,z,qx,qy,qz,qw",
+    ],
+)
+def test_spellings(tmp_path: Path, header: str) -> None:
+    delimiter = next(mark for mark in ",;\t" if mark in header)
+    path = write(tmp_path, f"{header}\n" + "1.5 1 2 3 0 0 0 1".replace(" ", delimiter) + "\n")
+    assert READER.recognises(path)
+    poses = READER.read_trajectory(path)
+    assert poses.t_ns.tolist() == [1_500_000_000]
+    assert poses.position.tolist() == [[1, 2, 3]]
+    assert poses.quaternion_xyzw.tolist() == [[0, 0, 0, 1]]
+
+
+def test_blank_cells_are_not_finite_and_counted(tmp_path: Path) -> None:
+    text = "t_ns,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n2,,0,0,0,0,0,1\n,0,0,0,0,0,0,1\n3,0,0,0,0,0,0,1\n4,0,"
+    poses = READER.read_trajectory(write(tmp_path, text))
+    assert poses.t_ns.tolist() == [1, 3]
+    assert poses.dropped == {"truncated last line": 1, "not finite": 2}
+
+
+def test_a_short_line_in_the_middle_is_named(tmp_path: Path) -> None:
+    text = "t_ns,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n2,0,0\n3,0,0,0,0,0,0,1\n"
+    with pytest.raises(DataError, match="line 3: 3 columns instead of 8"):
+        READER.read_trajectory(write(tmp_path, text))
+
+
+def test_covariance_is_symmetric_and_blank_means_unknown(tmp_path: Path) -> None:
+    upper = np.arange(1.0, 22.0)
+    header = "t_ns,x,y,z,qx,qy,qz,qw," + ",".join(COVARIANCE_COLUMNS)
+    pose = "0,0,0,0,0,0,1,"
+    text = "\n".join(
+        [
+            header,
+            f"1,{pose}" + ",".join(map(str, upper)),
+            f"2,{pose}" + "," * 20,
+            f"3,{pose}nan" + ",1" * 20,
+            "",
+        ]
+    )
+    poses = READER.read_trajectory(write(tmp_path, text))
+    assert poses.t_ns.tolist() == [1, 2]
+    assert poses.dropped == {"not finite": 1}
+    assert poses.covariance is not None
+    np.testing.assert_array_equal(poses.covariance[0][np.triu_indices(6)], upper)
+    np.testing.assert_array_equal(poses.covariance[0], poses.covariance[0].T)
+    np.testing.assert_array_equal(poses.covariance[1], np.zeros((6, 6)))
+
+
+def test_half_a_covariance_is_refused(tmp_path: Path) -> None:
+    text = "t_ns,x,y,z,qx,qy,qz,qw,c00,c11\n1,0,0,0,0,0,0,1,1,1\n"
+    with pytest.raises(DataError, match="lacks the covariance columns c01"):
+        READER.read_trajectory(write(tmp_path, text))
+
+
+def test_other_tables_are_not_recognised(tmp_path: Path) -> None:
+    assert not READER.recognises(write(tmp_path, "t,x,y,z\n1,2,3,4\n"))
+    assert not READER.recognises(write(tmp_path, "1,2,3,4,5,6,7,8\n"))
+    assert not READER.recognises(write(tmp_path, ""))
+    other = real_data("logs/csv/px4_ekf_iris_gps.csv")
+    assert not READER.recognises(other)
+    with pytest.raises(DataError, match="no header"):
+        READER.read_trajectory(other)
+
+
+@given(trajectory=trajectories(with_covariance=True))
+def test_writing_and_reading_gives_the_same(
+    tmp_path_factory: pytest.TempPathFactory, trajectory: Trajectory
+) -> None:
+    path = tmp_path_factory.mktemp("csv") / "poses.csv"
+    pose_csv.write_trajectory(path, trajectory)
+    assert READER.recognises(path)
+    back = READER.read_trajectory(path)
+    np.testing.assert_array_equal(back.t_ns, trajectory.t_ns)
+    np.testing.assert_array_equal(back.position, trajectory.position)
+    np.testing.assert_allclose(back.quaternion_xyzw, trajectory.quaternion_xyzw, rtol=0, atol=4e-16)
+    assert back.covariance is not None
+    assert trajectory.covariance is not None
+    rows, columns = np.triu_indices(6)
+    np.testing.assert_array_equal(back.covariance[:, rows, columns], trajectory.covariance[:, rows, columns])

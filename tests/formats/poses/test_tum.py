@@ -1,0 +1,232 @@
+"""TUM trajectories: what is read, what is dropped and counted, what is refused."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+
+from pipelines.formats.poses import tum
+from pipelines.session.errors import DataError
+from pipelines.session.records import JointMotion, Recording, Trajectory
+from pipelines.session.registries import Export, TrajectoryFormat
+from tests.formats.exported import flown, recording
+from tests.formats.trajectories import trajectories
+from tests.real_data import real_data
+
+READER: TrajectoryFormat = tum.FORMAT
+WRITER: Export = tum.EXPORT
+IDENTITY = "0 0 0 1"
+
+
+def write(folder: Path, text: str, name: str = "poses.tum") -> Path:
+    path = folder / name
+    path.write_bytes(text.encode())
+    return path
+
+
+def rows(*lines: str) -> str:
+    return "\n".join(lines) + "\n"
+
+
+def test_values_and_exact_stamps(tmp_path: Path) -> None:
+    path = write(
+        tmp_path, rows("1700000000.123456789 1 -2.5 3e2 0 0 0.6 0.8", f"1700000000.2 0 0 0 {IDENTITY}")
+    )
+    poses = READER.read_trajectory(path)
+    assert poses.t_ns.tolist() == [1700000000123456789, 1700000000200000000]
+    assert poses.position[0].tolist() == [1, -2.5, 300]
+    np.testing.assert_allclose(poses.quaternion_xyzw[0], [0, 0, 0.6, 0.8], atol=1e-16)
+    assert poses.dropped == {}
+    assert poses.covariance is None
+
+
+@pytest.mark.parametrize("separator", [" ", "\t", ",", ", ", "   ", " \t "])
+def test_separators_comments_blank_lines_and_line_ends(tmp_path: Path, separator: str) -> None:
+    row = "1.5 1 2 3 0 0 0 1".replace(" ", separator)
+    path = write(tmp_path, f"\ufeff# ground truth\r\n# timestamp tx ty tz qx qy qz qw\r\n\r\n  {row} \r\n")
+    assert READER.recognises(path)
+    poses = READER.read_trajectory(path)
+    assert poses.t_ns.tolist() == [1_500_000_000]
+    assert poses.position.tolist() == [[1, 2, 3]]
+
+
+def test_rows_are_dropped_by_cause(tmp_path: Path) -> None:
+    path = write(
+        tmp_path,
+        rows(
+            f"1 0 0 0 {IDENTITY}",
+            f"nan 0 0 0 {IDENTITY}",
+            f"2 nan 0 0 {IDENTITY}",
+            "99 0 0 inf 0 0 0 1",  # its stamp must not make those below look backward
+            "3 0 0 0 0 0 0 0",
+            "4 0 0 0 0 0 0 1.2",
+            "4 0 0 0 0 0 0 1e200",
+            "5 0 0 0 0 0 0 1.09",
+            f"5.000 0 0 7 {IDENTITY}",
+            f"5.5 0 0 0 {IDENTITY}",
+            f"4.5 0 0 0 {IDENTITY}",
+            f"6 0 0 0 {IDENTITY}",
+            "7 0 0",
+        ),
+    )
+    poses = READER.read_trajectory(path)
+    assert poses.t_ns.tolist() == [10**9, 5 * 10**9, 55 * 10**8, 6 * 10**9]
+    assert poses.dropped == {
+        "truncated last line": 1,
+        "not finite": 4,
+        "zero quaternion": 1,
+        "quaternion not unit": 1,
+        "duplicate stamp": 1,
+        "stamp out of order": 1,
+    }
+    np.testing.assert_array_equal(np.linalg.norm(poses.quaternion_xyzw, axis=1), 1)
+    assert poses.position[1, 2] == 0, "of two rows with one stamp the first is kept"
+
+
+def test_one_stamp_far_ahead_costs_one_row(tmp_path: Path) -> None:
+    stamps = [*range(1, 50), 1_000_000, *range(50, 100)]
+    poses = READER.read_trajectory(write(tmp_path, rows(*(f"{t} 0 0 0 {IDENTITY}" for t in stamps))))
+    assert poses.t_ns.tolist() == [t * 10**9 for t in range(1, 100)]
+    assert poses.dropped == {"stamp out of order": 1}
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [
+        ("2 0 0 0 0 0 1", "line 3: 7 columns instead of 8"),
+        ("2 0 0 0 0 0 0 1 5", "line 3: 9 columns instead of 8"),
+        ("2 0 x 0 0 0 0 1", r"line 3: 'x' is not a number \(y\)"),
+    ],
+)
+def test_a_malformed_line_in_the_middle_is_named(tmp_path: Path, line: str, problem: str) -> None:
+    path = write(tmp_path, rows("# c", f"1 0 0 0 {IDENTITY}", line, f"3 0 0 0 {IDENTITY}"))
+    with pytest.raises(DataError, match=problem):
+        READER.read_trajectory(path)
+
+
+@pytest.mark.parametrize("tail", ["3 0.1 0.", "3 0.1 0.2 0.3 0 0 0 -", "3"])
+def test_a_last_line_that_broke_off_is_dropped(tmp_path: Path, tail: str) -> None:
+    path = write(tmp_path, rows(f"1 0 0 0 {IDENTITY}", f"2 0 0 0 {IDENTITY}") + tail)
+    poses = READER.read_trajectory(path)
+    assert poses.t_ns.tolist() == [10**9, 2 * 10**9]
+    assert poses.dropped == {"truncated last line": 1}
+
+
+@pytest.mark.parametrize(
+    "text", ["", "# only a comment\n", rows("nan 0 0 0 0 0 0 1"), rows("1 0 0 0 0 0 0 0")]
+)
+def test_nothing_usable_is_refused(tmp_path: Path, text: str) -> None:
+    with pytest.raises(DataError, match="holds no usable pose"):
+        READER.read_trajectory(write(tmp_path, text))
+
+
+def test_milliseconds_are_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, rows(f"1700000000000 0 0 0 {IDENTITY}", f"1700000000100 0 0 0 {IDENTITY}"))
+    with pytest.raises(DataError, match="milliseconds"):
+        READER.read_trajectory(path)
+
+
+def test_missing_and_binary_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="cannot be read"):
+        READER.read_trajectory(tmp_path / "none.tum")
+    path = tmp_path / "binary.tum"
+    path.write_bytes(b"\xff\xfe\x00\x01" * 100)
+    assert not READER.recognises(path)
+    with pytest.raises(DataError, match="not UTF-8"):
+        READER.read_trajectory(path)
+
+
+def test_recognises_by_content(tmp_path: Path) -> None:
+    assert READER.recognises(write(tmp_path, f"1 0 0 0 {IDENTITY}\n", "a.txt"))
+    assert READER.recognises(write(tmp_path, "1,0,0,0,0,0,0,1\n", "b.csv"))
+    assert not READER.recognises(write(tmp_path, "t,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n", "c.csv"))
+    assert not READER.recognises(write(tmp_path, "1 0 0 0\n", "d.txt"))
+    assert not READER.recognises(write(tmp_path, "", "e.txt"))
+    assert not READER.recognises(tmp_path)
+    for other in ("logs/csv/px4_ekf_iris_gps.csv", "calib/colmap_maupertuis_txt/images.txt"):
+        assert not READER.recognises(real_data(other))
+
+
+def test_describe(tmp_path: Path) -> None:
+    lines = [f"{0.1 * k:.3f} {k} 0 0 {IDENTITY}" for k in range(11)]
+    lines += [f"{2 + 0.1 * k:.3f} 10 -1 0 {IDENTITY}" for k in range(3)]
+    summary = READER.describe(write(tmp_path, rows(*lines, f"2.2 0 0 0 {IDENTITY}")))
+    assert summary["rows"] == 14
+    assert summary["span_s"] == 2.2
+    assert summary["rate_hz"] == 10.0
+    assert summary["gaps"] == 1
+    assert summary["longest_gap_s"] == 1.0
+    assert summary["box_min_m"] == [0, -1, 0]
+    assert summary["box_max_m"] == [10, 0, 0]
+    assert summary["dropped: duplicate stamp"] == 1
+
+
+@given(trajectory=trajectories())
+def test_writing_and_reading_gives_the_same(
+    tmp_path_factory: pytest.TempPathFactory, trajectory: Trajectory
+) -> None:
+    path = tmp_path_factory.mktemp("tum") / "poses.tum"
+    tum.write_trajectory(path, trajectory)
+    back = READER.read_trajectory(path)
+    np.testing.assert_array_equal(back.t_ns, trajectory.t_ns)
+    np.testing.assert_array_equal(back.position, trajectory.position)
+    # Reading normalises again, which moves the last bit at most.
+    np.testing.assert_allclose(back.quaternion_xyzw, trajectory.quaternion_xyzw, rtol=0, atol=4e-16)
+    assert back.dropped == {}
+
+
+def test_export_writes_each_camera(tmp_path: Path) -> None:
+    pose = Trajectory(np.array([5]), np.zeros((1, 3)), np.array([[0.0, 0, 0, 1]]))
+    none = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
+    recording = Recording("Mound walk / 2", None, {"b": pose, "a": pose, "empty": none})
+    paths = WRITER.write(recording, tmp_path)
+    assert [path.name for path in paths] == ["Mound_walk_2_a.tum", "Mound_walk_2_b.tum"]
+    assert paths[0].read_text().splitlines()[1].split()[0] == "0.000000005"
+    assert READER.recognises(paths[0])
+    with pytest.raises(DataError, match="neither camera poses nor joints"):
+        WRITER.write(Recording("x", None, {"empty": none}), tmp_path)
+
+
+def test_cameras_and_joints_as_evo_reads_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))  # evo writes its settings there when it is imported
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        file_interface = pytest.importorskip("evo.tools.file_interface")
+    walked = recording()
+    motion = walked.motion
+    assert motion is not None
+    better = replace(flown(), position=flown().position + 0.1)
+    (tmp_path / "out").mkdir()
+    paths = {
+        path.stem.removeprefix("Mound_walk_"): path
+        for path in WRITER.write(replace(walked, refined={"cam-1": better}), tmp_path / "out")
+    }
+    assert set(paths) == {"cam-1", "cam-1_refined", *motion.joints}
+    for name, track in (("cam-1", flown()), ("cam-1_refined", better)):
+        read = file_interface.read_tum_trajectory_file(str(paths[name]))
+        np.testing.assert_array_equal(read.positions_xyz, track.position)
+        np.testing.assert_array_equal(read.orientations_quat_wxyz[:, [1, 2, 3, 0]], track.quaternion_xyzw)
+        # evo keeps seconds as float64: a quarter of a microsecond so far from 1970.
+        np.testing.assert_allclose(read.timestamps, track.t_ns / 1e9, rtol=0, atol=2.5e-7)
+    wrist = motion.position[:, 0, motion.joints.index("left_wrist")]
+    read = file_interface.read_tum_trajectory_file(str(paths["left_wrist"]))
+    np.testing.assert_array_equal(read.positions_xyz, np.delete(wrist, 7, axis=0))
+    assert (read.orientations_quat_wxyz == [1, 0, 0, 0]).all()
+
+
+def test_joints_whose_names_are_alike_get_their_own_files(tmp_path: Path) -> None:
+    motion = JointMotion(np.array([0]), ("a b", "a/b"), np.arange(6.0).reshape(1, 1, 2, 3))
+    paths = WRITER.write(Recording("x", motion, {}), tmp_path)
+    assert [path.name for path in paths] == ["x_a_b.tum", "x_a_b_.tum"]
+    assert [READER.read_trajectory(path).position[0, 0] for path in paths] == [0, 3]
+
+
+def test_people_are_told_apart(tmp_path: Path) -> None:
+    motion = JointMotion(np.array([0]), ("nose",), np.ones((1, 2, 1, 3)))
+    paths = WRITER.write(Recording("x", motion, {}), tmp_path)
+    assert [path.name for path in paths] == ["x_person0_nose.tum", "x_person1_nose.tum"]

@@ -1,0 +1,171 @@
+"""The MCAP export: the mcap library finds valid schemas, rosbags decodes what was written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from pipelines.formats.scenes import mcap_writing
+from pipelines.formats.scenes.uncertainty import CHI2_95
+from pipelines.session.errors import DataError
+from pipelines.session.records import Recording
+from pipelines.session.registries import Export
+from tests.formats.exported import (
+    LENS,
+    LOOKING_NORTH,
+    SIGMA_M,
+    START_NS,
+    VOXEL_M,
+    Listener,
+    flown,
+    recording,
+    stamps,
+)
+
+WRITER: Export = mcap_writing.EXPORT
+LINE_LIST, SPHERE_LIST, DELETE_ALL = 5, 7, 3
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    (path,) = WRITER.write(recording(), tmp_path_factory.mktemp("mcap"))
+    assert path.name == "Mound_walk.mcap"
+    return path
+
+
+def messages(path: Path, topic: str) -> list[tuple[int, Any]]:
+    with AnyReader([path]) as reader:
+        wanted = [connection for connection in reader.connections if connection.topic == topic]
+        return [
+            (stamp, reader.deserialize(data, connection.msgtype))
+            for connection, stamp, data in reader.messages(connections=wanted)
+        ]
+
+
+def test_the_mcap_reader_finds_every_topic_with_a_schema_that_parses(log: Path) -> None:
+    with log.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        stamps_ns = [message.log_time for _, _, message in reader.iter_messages()]
+    assert summary is not None
+    assert summary.statistics is not None
+    counts = summary.statistics.channel_message_counts
+    assert {channel.topic: counts[key] for key, channel in summary.channels.items()} == {
+        "/map": 1,
+        "/cam_1/path": 1,
+        "/tf": 60,
+        "/frustums": 2,
+        "/cam_1/camera_info": 4,
+        "/cam_1/image/compressed": 4,
+        "/skeleton": 60,
+        "/uncertainty": 20,
+    }
+    assert stamps_ns == sorted(stamps_ns)
+    reference = get_typestore(Stores.ROS2_HUMBLE)
+    for schema in summary.schemas.values():
+        assert schema.encoding == "ros2msg"
+        stated = get_types_from_msg(schema.data.decode(), schema.name)
+        assert stated[schema.name][1] == reference.fielddefs[schema.name][1]
+
+
+def test_the_skeleton_is_there_at_its_own_times(log: Path) -> None:
+    motion = recording().motion
+    assert motion is not None
+    read = messages(log, "/skeleton")
+    assert [stamp for stamp, _ in read] == motion.t_ns.tolist()
+    for row, (_, message) in enumerate(read):
+        cleared, bones, joints = message.markers
+        assert (cleared.action, bones.type, joints.type) == (DELETE_ALL, LINE_LIST, SPHERE_LIST)
+        assert joints.header.frame_id == "world"
+        points = np.array([[point.x, point.y, point.z] for point in joints.points])
+        seen = motion.position[row, 0][np.isfinite(motion.position[row, 0, :, 0])]
+        np.testing.assert_array_equal(points[: len(seen)], seen)
+        assert len(points) == len(seen) + 2  # neck and hip
+        assert len(joints.colors) == len(points)
+        assert len(bones.colors) == len(bones.points)
+        assert len(joints.points) == 19 - (row == 7)
+    # One bone ends in the wrist that is missing in frame 7.
+    assert len(read[6][1].markers[1].points) - len(read[7][1].markers[1].points) == 2
+
+
+def test_ellipsoids_hold_95_percent(log: Path) -> None:
+    _, message = messages(log, "/uncertainty")[0]
+    marker = message.markers[1]
+    axes = np.array([marker.scale.x, marker.scale.y, marker.scale.z])
+    np.testing.assert_allclose(sorted(axes), 2 * np.sqrt(CHI2_95) * np.sort(SIGMA_M), rtol=1e-12)
+    assert {entry.ns for entry in message.markers[1:]} == {"ellipsoids_95"}
+    assert len({entry.id for entry in message.markers[1:]}) == len(message.markers) - 1 == 17
+
+
+def test_cameras_fly_and_look_where_they_do(log: Path) -> None:
+    track = flown()
+    moved = [message.transforms[0] for _, message in messages(log, "/tf")]
+    assert {(entry.header.frame_id, entry.child_frame_id) for entry in moved} == {("world", "cam-1")}
+    east = [entry.transform.translation.x for entry in moved]
+    np.testing.assert_array_equal(east, track.position[:, 0])
+    rotation = moved[0].transform.rotation
+    np.testing.assert_array_equal([rotation.x, rotation.y, rotation.z, rotation.w], LOOKING_NORTH)
+    ((_, path),) = messages(log, "/cam_1/path")
+    assert [pose.pose.position.x for pose in path.poses] == track.position[::3, 0].tolist()
+    _, frustums = messages(log, "/frustums")[0]
+    corner = frustums.markers[0].points[1]
+    # The picture's corner, half a pixel outside the middle of the first one.
+    np.testing.assert_allclose(
+        [corner.x, corner.y, corner.z],
+        [(-0.5 - LENS.cx) / LENS.fx, (-0.5 - LENS.cy) / LENS.fy, 1.0],
+        rtol=1e-12,
+    )
+    assert (frustums.markers[0].header.frame_id, frustums.markers[0].frame_locked) == ("cam-1", True)
+
+
+def test_pictures_come_with_the_lens_of_their_size(log: Path) -> None:
+    pictures, lenses = messages(log, "/cam_1/image/compressed"), messages(log, "/cam_1/camera_info")
+    assert [stamp for stamp, _ in pictures] == stamps(60)[::15].tolist()
+    for (_, picture), (_, info), level in zip(pictures, lenses, range(40, 100, 15), strict=True):
+        decoded = cv2.imdecode(np.frombuffer(bytes(picture.data), np.uint8), cv2.IMREAD_COLOR)
+        assert decoded is not None
+        assert decoded.shape == (540, 960, 3)
+        assert np.abs(decoded.astype(int) - level).max() <= 2  # JPEG
+        assert (info.width, info.height, info.distortion_model) == (960, 540, "plumb_bob")
+        assert info.k[0] == pytest.approx(LENS.fx * 0.75)
+        assert info.k[2] == pytest.approx(LENS.cx * 0.75)
+        assert info.d.tolist() == [*LENS.distortion, 0.0]
+
+
+def test_the_map_is_its_surface(log: Path) -> None:
+    ((stamp, cloud),) = messages(log, "/map")
+    assert stamp == START_NS
+    points = np.frombuffer(bytes(cloud.data), "<f4").reshape(-1, 3)
+    assert len(points) == cloud.width == 26
+    np.testing.assert_allclose(points.min(axis=0), np.array([10, 20, 0]) + 1.5 * VOXEL_M)
+    assert [field.name for field in cloud.fields] == ["x", "y", "z"]
+
+
+def test_the_same_recording_gives_the_same_bytes(log: Path, tmp_path: Path) -> None:
+    (again,) = WRITER.write(recording(), tmp_path)
+    assert again.read_bytes() == log.read_bytes()
+
+
+def test_poses_from_before_the_zero_of_a_clock_are_left_out_and_counted(tmp_path: Path) -> None:
+    listener, track = Listener(), flown(10)
+    early = replace(track, t_ns=track.t_ns - START_NS - 100_000_000)
+    (path,) = WRITER.write(Recording("x", None, {"a": early}, progress=listener), tmp_path)
+    assert len(messages(path, "/tf")) == 7
+    assert "3 poses of a from before time 0" in listener.notes[0]
+
+
+def test_times_that_ros_cannot_count_are_refused(tmp_path: Path) -> None:
+    late = replace(flown(2), t_ns=np.array([2**31 * 10**9, 2**31 * 10**9 + 1]))
+    with pytest.raises(DataError, match="outside of 1970 to 2038"):
+        WRITER.write(Recording("x", None, {"a": late}), tmp_path)
+    with pytest.raises(DataError, match="neither joints nor camera poses"):
+        WRITER.write(Recording("x", None, {}), tmp_path)
+    assert not list(tmp_path.iterdir())

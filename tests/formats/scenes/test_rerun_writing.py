@@ -1,0 +1,102 @@
+"""The Rerun export, read back by Rerun's own reader."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.formats.common import extras
+from pipelines.formats.scenes import rerun_writing
+from pipelines.session.errors import DataError
+from pipelines.session.registries import Export
+from tests.formats.exported import LENS, SIGMA_M, flown, recording, stamps
+
+rerun_chunk = pytest.importorskip("rerun.chunk", reason="the extra rerun is not installed")
+WRITER: Export = rerun_writing.EXPORT
+FLOAT32 = 2.0**-24
+
+
+@pytest.fixture(scope="module")
+def chunks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
+    """Record batches by entity."""
+    (path,) = WRITER.write(recording(), tmp_path_factory.mktemp("rerun"))
+    assert path.name == "Mound_walk.rrd"
+    found: dict[str, list[Any]] = {}
+    for chunk in rerun_chunk.RrdReader(str(path)).stream():
+        found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
+    return found
+
+
+def column(chunks: dict[str, list[Any]], entity: str, name: str) -> list[Any]:
+    """A column of an entity, row after row."""
+    batches = [batch for batch in chunks[entity] if name in batch.schema.names]
+    return [row for batch in batches for row in batch.column(name).to_pylist()]
+
+
+def test_joints_and_ellipsoids_come_back(chunks: dict[str, list[Any]]) -> None:
+    motion = recording().motion
+    assert motion is not None
+    entity = "/world/person0/skeleton"
+    (batch,) = chunks[entity]
+    times = np.asarray(batch.column("time").to_numpy(zero_copy_only=False)).astype(np.int64)
+    assert times.tolist() == motion.t_ns.tolist()
+    wrist = motion.joints.index("left_wrist")
+    for row, (points, ids) in enumerate(
+        zip(
+            column(chunks, entity, "Points3D:positions"),
+            column(chunks, entity, "Points3D:keypoint_ids"),
+            strict=True,
+        )
+    ):
+        assert ids == [k for k in range(19) if not (row == 7 and k == wrist)]
+        measured = motion.position[row, 0, [k for k in ids if k < 17]]
+        np.testing.assert_allclose(points[: len(measured)], measured, rtol=FLOAT32)
+    half = np.array(column(chunks, "/world/person0/uncertainty", "Ellipsoids3D:half_sizes")[0])
+    np.testing.assert_allclose(np.sort(half[0]), np.sqrt(7.815) * np.sort(SIGMA_M), rtol=1e-6)
+
+
+def test_bones_are_connections_of_keypoints(chunks: dict[str, list[Any]]) -> None:
+    (((described_class,),),) = column(chunks, "/world", "AnnotationContext:context")
+    described = described_class["class_description"]
+    labels = [entry["label"] for entry in described["keypoint_annotations"]]
+    pairs = {(pair["keypoint0"], pair["keypoint1"]) for pair in described["keypoint_connections"]}
+    assert labels[:2] == ["nose", "left_eye"]
+    assert (labels.index("left_elbow"), labels.index("left_wrist")) in pairs
+
+
+def test_cameras_move_and_show_their_pictures(chunks: dict[str, list[Any]]) -> None:
+    entity = "/world/cameras/cam\\-1" if "/world/cameras/cam\\-1" in chunks else "/world/cameras/cam-1"
+    moved = np.array([row[0] for row in column(chunks, entity, "Transform3D:translation")])
+    np.testing.assert_allclose(moved, flown().position, rtol=FLOAT32, atol=1e-7)
+    images = f"{entity}/image"
+    assert len(column(chunks, images, "EncodedImage:blob")) == 4
+    times = [
+        int(stamp)
+        for batch in chunks[images]
+        if "EncodedImage:blob" in batch.schema.names
+        for stamp in np.asarray(batch.column("time").to_numpy(zero_copy_only=False)).astype(np.int64)
+    ]
+    assert times == stamps(60)[::15].tolist()
+    ((matrix,),) = column(chunks, images, "Pinhole:image_from_camera")
+    assert matrix[0] == pytest.approx(LENS.fx * 0.75)  # stored column by column
+    ((resolution,),) = column(chunks, images, "Pinhole:resolution")
+    assert resolution == [960, 540]
+
+
+def test_the_map_is_there(chunks: dict[str, list[Any]]) -> None:
+    (points,) = column(chunks, "/world/map", "Points3D:positions")
+    assert len(points) == 26
+
+
+def test_without_rerun_one_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(name: str) -> None:
+        raise ImportError(name)
+
+    monkeypatch.setattr(extras, "import_module", absent)
+    with pytest.raises(DataError) as caught:
+        WRITER.write(recording(), tmp_path)
+    assert str(caught.value) == 'rerun: is not installed; run `pip install "mocap-pipeline[rerun]"`'
+    assert not list(tmp_path.iterdir())

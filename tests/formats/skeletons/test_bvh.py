@@ -1,0 +1,325 @@
+"""BVH: hand-made files whose joints can be worked out on paper, and real ones that others read before."""
+
+from __future__ import annotations
+
+import json
+import time
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pipelines.formats.skeletons import bvh
+from pipelines.formats.skeletons.bvh import read_motion
+from pipelines.geometry.poses import matrix_from_quaternion, multiply, rotate
+from pipelines.session.errors import DataError
+from pipelines.session.records import SkeletalMotion
+from pipelines.session.registries import Format
+from tests.real_data import real_data
+
+READER: Format = bvh.FORMAT
+Float = NDArray[np.float64]
+
+HIERARCHY = """HIERARCHY
+ROOT Hips
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation
+  JOINT Left Leg
+  {
+    OFFSET 10 -5 0
+    CHANNELS 3 Zrotation Xrotation Yrotation
+    End Site
+    {
+      OFFSET 0 -40 2
+    }
+  }
+  JOINT Spine
+  {
+    OFFSET 0 2e1 0.0
+    CHANNELS 1 Yrotation
+    End Site
+    {
+      OFFSET 0 30 0
+    }
+  }
+}
+"""
+FRAMES = """MOTION
+Frames: 2
+Frame Time: 0.04
+1 100 3 0 0 0  0 0 0  0
+-1.5E0 1.0e+2 30 90 0 0  0 -90 0  45
+"""
+TEXT = HIERARCHY + FRAMES
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "a.bvh"
+    path.write_bytes(text.encode())
+    return path
+
+
+def joint_places(motion: SkeletalMotion) -> tuple[Float, dict[int, Float]]:
+    """World positions of joints [T, B, 3] and of end sites, as the record's docstring defines them."""
+    place, turn = np.empty((len(motion.t_s), len(motion.bones), 3)), motion.rotation.copy()
+    for bone, parent in enumerate(motion.parent):
+        if parent < 0:
+            place[:, bone] = motion.root
+        else:
+            place[:, bone] = place[:, parent] + rotate(turn[:, parent], motion.offset[bone])
+            turn[:, bone] = multiply(turn[:, parent], turn[:, bone])
+    ends = {bone: place[:, bone] + rotate(turn[:, bone], end) for bone, end in motion.end.items()}
+    return place, ends
+
+
+def test_joints_are_where_they_are_on_paper(tmp_path: Path) -> None:
+    path = write(tmp_path, TEXT)
+    assert READER.recognises(path)
+    motion = read_motion(path, unit="cm", axes="y-up")
+    assert motion.bones == ("Hips", "Left Leg", "Spine")
+    assert motion.parent == (-1, 0, 0)
+    assert motion.t_s.tolist() == [0, 0.04]
+    place, ends = joint_places(motion)
+    # (x, y, z) of the file is (z, x, y) of the world.
+    expected = [[0.03, 0.01, 1.0], [0.03, 0.11, 0.95], [0.03, 0.01, 1.2]]
+    np.testing.assert_allclose(place[0], expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(ends[1][0], [0.05, 0.11, 0.55], rtol=0, atol=1e-12)
+    # Then the hips are turned by 90 about z: file x becomes y, y becomes -x. The leg sits at
+    # (-1.5, 100, 30) + (5, 10, 0). Its own -90 about x takes its end (0, -40, 2) to (0, 2, 40), the hips
+    # that to (-2, 0, 40).
+    np.testing.assert_allclose(place[1, 1], [0.30, 0.035, 1.10], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(ends[1][1], [0.70, 0.015, 1.10], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(ends[2][1], [0.30, -0.515, 1.0], rtol=0, atol=1e-12)
+
+
+def test_units_and_axes(tmp_path: Path) -> None:
+    path = write(tmp_path, TEXT)
+    metres = read_motion(path, unit="m", axes="z-up")
+    assert metres.root[0].tolist() == [1, 100, 3]
+    assert metres.offset[1].tolist() == [10, -5, 0]
+    for unit, scale in (("cm", 0.01), ("mm", 0.001), ("inch", 0.0254)):
+        np.testing.assert_allclose(
+            read_motion(path, unit=unit, axes="z-up").end[1], metres.end[1] * scale, rtol=1e-15
+        )
+    # A turn of the axes turns every joint alike.
+    upright, _ = joint_places(read_motion(path, unit="m", axes="y-up"))
+    np.testing.assert_allclose(upright, joint_places(metres)[0][..., [2, 0, 1]], rtol=0, atol=1e-12)
+
+
+def turn_about(axis: str, deg: float) -> Float:
+    """The textbook matrices."""
+    c, s = np.cos(np.radians(deg)), np.sin(np.radians(deg))
+    return np.array(
+        {
+            "X": [[1, 0, 0], [0, c, -s], [0, s, c]],
+            "Y": [[c, 0, s], [0, 1, 0], [-s, 0, c]],
+            "Z": [[c, -s, 0], [s, c, 0], [0, 0, 1]],
+        }[axis]
+    )
+
+
+angles = st.floats(-720, 720)
+
+
+@given(
+    st.sampled_from([*permutations("XYZ"), *permutations("XY"), ("Z",), ("Z", "X", "Z")]),
+    st.tuples(angles, angles, angles),
+)
+def test_channels_turn_in_the_order_in_which_they_stand(
+    tmp_path_factory: pytest.TempPathFactory, order: tuple[str, ...], deg: tuple[float, float, float]
+) -> None:
+    path = tmp_path_factory.mktemp("bvh") / "a.bvh"
+    channels = " ".join(f"{axis}rotation" for axis in order)
+    used = deg[: len(order)]
+    path.write_text(
+        f"HIERARCHY\nROOT a\n{{\nOFFSET 0 0 0\nCHANNELS {len(order)} {channels}\n}}\nMOTION\nFrames: 1\n"
+        f"Frame Time: 1\n{' '.join(map(repr, used))}\n"
+    )
+    expected = np.eye(3)
+    for axis, angle in zip(order, used, strict=True):
+        expected = expected @ turn_about(axis, angle)
+    found = matrix_from_quaternion(read_motion(path, unit="m", axes="z-up").rotation[0, 0])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)  # of 720 deg, 1e-13 rad are one rounding
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text.replace("\n", "\r\n"),
+        lambda text: text.replace("\n{", " {").replace("  ", "\t"),
+        lambda text: text.replace("Zrotation", "ZROTATION").replace("Frame Time:", "Frame Time:\t"),
+        lambda text: text + "\n\n",
+        lambda text: text.rstrip(),
+        lambda text: "\ufeff" + text,
+        lambda text: text.replace("0  45\n", "0  45 \n").replace("0  0\n", "0\t0\t\n"),
+    ],
+)
+def test_other_ways_to_write_the_same(tmp_path: Path, change: object) -> None:
+    assert callable(change)
+    path = tmp_path / "b.bvh"
+    path.write_bytes(change(TEXT).encode())
+    assert READER.recognises(path)
+    other, plain = (read_motion(p, unit="cm", axes="y-up") for p in (path, write(tmp_path, TEXT)))
+    assert other.bones == plain.bones
+    for name in ("t_s", "offset", "root", "rotation"):
+        np.testing.assert_array_equal(getattr(other, name), getattr(plain, name))
+
+
+SIX = "CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation"
+
+
+def carried(rows: str) -> str:
+    """A scene's root that carries hips with a leg; all have position channels."""
+    return (
+        f"HIERARCHY\nROOT Scene\n{{\nOFFSET 0 0 0\n{SIX}\nJOINT Hips\n{{\nOFFSET 0 9 0\n{SIX}\n"
+        f"JOINT Leg\n{{\nOFFSET 1 2 3\n{SIX}\nEnd Site\n{{\nOFFSET 0 -4 0\n}}\n}}\n}}\n}}\n"
+        f"MOTION\nFrames: 2\nFrame Time: 0.01\n{rows}\n"
+    )
+
+
+def test_what_only_carries_the_body_is_merged_into_its_root(tmp_path: Path) -> None:
+    """The scene stands at (100, 0, 0), turned by 90 about y: its x is -z, its z is x."""
+    scene = "100 0 0 0 90 0"
+    path = write(tmp_path, carried(f"{scene} 10 90 0 0 0 0 1 2 3 0 0 0\n{scene} 20 90 5 0 -90 0 1 2 3 0 0 0"))
+    motion = read_motion(path, unit="m", axes="z-up")
+    assert motion.bones == ("Hips", "Leg")
+    assert motion.parent == (-1, 0)
+    np.testing.assert_allclose(motion.root, [[100, 90, -10], [105, 90, -20]], rtol=0, atol=1e-12)
+    place, ends = joint_places(motion)
+    np.testing.assert_allclose(place[:, 1] - motion.root, [[3, 2, -1], [1, 2, 3]], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(ends[1] - place[:, 1], [[0, -4, 0]] * 2, rtol=0, atol=1e-12)
+
+
+def test_position_channels_take_the_place_of_an_offset_unless_they_are_zero(tmp_path: Path) -> None:
+    path = write(
+        tmp_path, carried("0 0 0 0 0 0 0 9 0 0 0 0 1.02 2 3 0 0 0\n0 0 0 0 0 0 0 9 0 0 0 0 1 2 3 0 0 0")
+    )
+    motion = read_motion(path, unit="m", axes="z-up")
+    assert motion.bones == ("Scene", "Hips", "Leg"), "nothing moves, nothing is merged"
+    np.testing.assert_allclose(motion.offset[2], [1.01, 2, 3], rtol=1e-15)
+    zeros = write(tmp_path, carried("\n".join(["0 0 0 0 0 0 0 9 0 0 0 0 0 0 0 0 0 0"] * 2)))
+    assert read_motion(zeros, unit="m", axes="z-up").offset[2].tolist() == [1, 2, 3]
+    stretched = write(
+        tmp_path, carried("0 0 0 0 0 0 0 9 0 0 0 0 1.2 2 3 0 0 0\n0 0 0 0 0 0 0 9 0 0 0 0 1 2 3 0 0 0")
+    )
+    with pytest.raises(DataError, match=r"bone Leg moves by up to 0\.1 m against its parent"):
+        read_motion(stretched, unit="m", axes="z-up")
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("", "is no BVH file"),
+        ("HIERARCHY\nROOT a\n{\n", "ends before its line MOTION"),
+        (TEXT.replace("}\n}\nMOTION", "}\nMOTION"), "lacks 1 closing braces"),
+        ("HIERARCHY\n" + FRAMES, "its hierarchy holds no bones"),
+        (TEXT.replace("CHANNELS 1 Y", "CHANNELS 1 Xrotation CHANNELS 1 Y"), "line 18: .* has no place there"),
+        (TEXT.replace("JOINT Spine", "JOINT Hips"), "line 15: a second bone is called Hips"),
+        (TEXT.replace("JOINT Spine", "BONE Spine"), "line 15: 'BONE Spine' has no place there"),
+        (TEXT.replace("OFFSET 10 -5 0", "OFFSET 10 -5"), "line 8: 'OFFSET 10 -5' has no place"),
+        (
+            TEXT.replace("CHANNELS 1 Yrotation", "CHANNELS 1 Wrotation"),
+            "line 18: cannot make sense of 'wrotation'",
+        ),
+        (
+            TEXT.replace("CHANNELS 1 Yrotation", "CHANNELS 2 Yrotation"),
+            "line 18: cannot make sense of 1 channels",
+        ),
+        (TEXT.replace("Frames: 2", "Frames: two"), "line 26 must be `Frames:` and a number"),
+        (TEXT.replace("Frame Time: 0.04", "Frame Time: 0"), "line 27: a frame time of 0 s"),
+        (TEXT.replace("Frame Time: 0.04\n", ""), "line 27 must be `Frame Time:` and a number"),
+        (TEXT.replace("Frames: 2", "Frames: 3"), "states 3 frames but holds 2, the last on line 29"),
+        (TEXT.replace("Frames: 2", "Frames: 1"), "states 1 frames but holds 2.*correct the line `Frames:`"),
+        (TEXT.replace("  45\n", ""), "line 29 has 9 of 10 numbers; export it again, or delete that line"),
+        (TEXT.replace("1 100 3 0", "1 100 3"), "line 28 has 9 of 10 numbers; export it again$"),
+        (TEXT.replace("-1.5E0", "-1,5"), "line 29: '-1,5' is no finite number"),
+        (TEXT.replace("-1.5E0", "nan"), "line 29: 'nan' is no finite number"),
+        (TEXT.replace("-1.5E0", "1e999"), "line 29: '1e999' is no finite number"),
+        (HIERARCHY + "MOTION\nFrames: 0\nFrame Time: 0.04\n", "holds no frames"),
+        ("HIERARCHY\nROOT a\n{\nOFFSET 0 0 0\n}\nMOTION\nFrames: 1\nFrame Time: 1\n1\n", "has no channels"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, text: str, problem: str) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(DataError, match=problem):
+        read_motion(path, unit="cm", axes="y-up")
+    with pytest.raises(DataError, match=problem):
+        READER.describe(path)
+
+
+def test_damage_never_escapes_as_another_error(tmp_path: Path) -> None:
+    rng = np.random.default_rng(11)
+    refused = 0
+    for _ in range(300):
+        content = bytearray(TEXT.encode())
+        start = int(rng.integers(len(content)))
+        content[start : start + int(rng.integers(1, 6))] = (
+            rng.integers(32, 127, rng.integers(0, 4)).astype(np.uint8).tobytes()
+        )
+        path = tmp_path / "a.bvh"
+        path.write_bytes(content)
+        try:
+            read_motion(path, unit="cm", axes="y-up")
+        except DataError:
+            refused += 1
+    assert refused > 100
+
+
+def test_other_units_and_axes_are_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, TEXT)
+    with pytest.raises(DataError, match="the unit 'furlong' is none of m, cm, mm, inch"):
+        read_motion(path, unit="furlong", axes="y-up")
+    with pytest.raises(DataError, match="the axes 'x-up' are none of y-up, z-up"):
+        read_motion(path, unit="m", axes="x-up")
+
+
+@pytest.mark.parametrize("name", ["cmu_10_04_walk", "cmu_10_01_soccer_kick", "xia_neutral_01_000"])
+def test_real_files_hold_what_others_read(name: str) -> None:
+    facts = json.loads(real_data("facts.json").read_text())[f"motion/{name}.bvh"]
+    path = real_data(f"motion/{name}.bvh")
+    assert READER.recognises(path)
+    said = READER.describe(path)
+    assert (said["bones"], said["frames"]) == (facts["joints"], facts["frames"])
+    assert said["names"] == facts["joint_names"]
+    assert said["rate_hz"] == pytest.approx(facts["fps"], rel=1e-4)
+    motion = read_motion(path, unit="m", axes="y-up")
+    place, _ = joint_places(motion)
+    in_file = place[..., [1, 2, 0]]
+    for joint, frames in facts["fk_positions"].items():
+        for frame, expected in frames.items():
+            found = in_file[int(frame.removeprefix("frame_")), motion.bones.index(joint)]
+            np.testing.assert_allclose(found, expected, rtol=0, atol=6e-5)  # the facts have four decimals
+
+
+def test_a_real_person_walks_towards_the_file_s_z() -> None:
+    """CMU 10_04 walks along +z: east in the world, with the left hip towards north, as documented."""
+    motion = read_motion(real_data("motion/cmu_10_04_walk.bvh"), unit="cm", axes="y-up")
+    way = motion.root[-1] - motion.root[1]
+    assert way[0] > 20 * abs(way[1])
+    place, _ = joint_places(motion)
+    left = place[1:, motion.bones.index("LeftUpLeg")] - place[1:, motion.bones.index("RightUpLeg")]
+    assert (left[:, 1] > 0).all()
+
+
+def test_long_files_are_read_at_numpy_s_speed(tmp_path: Path) -> None:
+    """Ten minutes at 120 Hz of 3 bones; about 0.15 s on an idle core."""
+    row = "-1.123456 100.123456 3.123456 12.123456 -0.123456 3.123456 1.5 2.5 3.5 4.5"
+    path = write(tmp_path, HIERARCHY + "MOTION\nFrames: 72000\nFrame Time: 0.0083333\n" + f"{row}\n" * 72_000)
+    began = time.process_time()
+    motion = read_motion(path, unit="cm", axes="y-up")
+    assert time.process_time() - began < 3
+    assert motion.rotation.shape == (72_000, 3, 4)
+    assert motion.t_s[-1] == pytest.approx(71_999 * 0.0083333)
+
+
+def test_other_files_are_not_recognised(tmp_path: Path) -> None:
+    for name, content in (("a.bvh", "MOTION"), ("a.txt", TEXT), ("b.bvh", "HIERARCHY\nJOINT a")):
+        path = tmp_path / name
+        path.write_text(content)
+        assert not READER.recognises(path)
+    assert not READER.recognises(tmp_path / "absent.bvh")

@@ -1,0 +1,137 @@
+"""BVH out: rigs of motions whose bones are known, read by bvhtoolbox and by ourselves."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from pipelines.formats.skeletons import bvh_writing
+from pipelines.formats.skeletons.bvh import read_motion
+from pipelines.formats.skeletons.bvh_rig import fit_rig, joint_positions
+from pipelines.geometry.poses import matrix_from_quaternion
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float, JointMotion
+from pipelines.session.registries import ChoiceOfAxes
+from pipelines.session.skeletons import take_joints, with_derived
+from tests.formats.exported import Listener, recording, walking, without
+
+WRITER: ChoiceOfAxes = bvh_writing.EXPORT
+WRITTEN_M = 1e-6  # six decimals of a degree over 2 m of bones, and of a centimetre: 0.04 micrometres
+
+
+def measured(motion: JointMotion, joints: tuple[str, ...]) -> Float:
+    """Positions [T, B, 3] of a rig's joints as they were measured; the hip is the hips' middle."""
+    return take_joints(*with_derived(motion.joints, motion.position[:, 0])[::-1], joints)
+
+
+def seen_by_bvhtoolbox(path: Path, folder: Path) -> tuple[list[str], Float]:
+    """Joints and world positions [T, B, 3] as bvhtoolbox has them, in the file's unit and axes."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it still asks for pkg_resources
+        bvhtoolbox = pytest.importorskip("bvhtoolbox")
+        converter = pytest.importorskip("bvhtoolbox.convert.bvh2csv")
+    tree = bvhtoolbox.BvhTree(path.read_text())
+    assert converter.write_joint_positions(tree, str(folder / "positions.csv"))
+    header, *rows = (folder / "positions.csv").read_text().splitlines()
+    values = np.array([[float(cell) for cell in row.split(",")] for row in rows])
+    names = [cell.rpartition(".")[0] for cell in header.split(",")[1::3]]
+    return names, values[:, 1:].reshape(len(values), -1, 3)
+
+
+def test_a_body_of_rigid_bones_is_followed_exactly() -> None:
+    motion = walking(90)
+    rigged = fit_rig("x", motion, 0)
+    assert rigged.motion.bones[:4] == ("Hips", "Spine", "Neck", "Head")
+    np.testing.assert_allclose(
+        joint_positions(rigged.motion), measured(motion, rigged.joints), rtol=0, atol=1e-9
+    )
+    assert (rigged.first, rigged.without_hips, rigged.turns_held) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("cm", 100.0), ("m", 1.0)])
+def test_another_reader_sees_the_joints_where_the_rig_has_them(
+    tmp_path: Path, unit: str, scale: float
+) -> None:
+    asked = replace(recording(15), unit=unit)
+    (path,) = WRITER.write(asked, tmp_path)
+    assert asked.motion is not None
+    rigged = fit_rig("x", asked.motion, 0)
+    names, positions = seen_by_bvhtoolbox(path, tmp_path)
+    assert names == list(rigged.motion.bones)
+    ours = joint_positions(rigged.motion)
+    # It writes five decimals of the unit; the world's (y, z, x) are the file's.
+    np.testing.assert_allclose(
+        positions / scale, ours[..., [1, 2, 0]], rtol=0, atol=WRITTEN_M + 5.1e-6 / scale
+    )
+    back = read_motion(path, unit=unit, axes="y-up")
+    assert back.bones == rigged.motion.bones
+    np.testing.assert_allclose(joint_positions(back), ours, rtol=0, atol=WRITTEN_M)
+    np.testing.assert_allclose(back.t_s, rigged.motion.t_s, atol=15 * 0.5e-9)
+
+
+def test_bones_have_their_median_length_and_point_where_they_were_measured() -> None:
+    motion = walking(61)
+    forearm = [motion.joints.index(f"left_{joint}") for joint in ("elbow", "wrist")]
+    elbow, wrist = (motion.position[:, 0, k].copy() for k in forearm)
+    length = np.linalg.norm(wrist[0] - elbow[0])
+    stretch = np.linspace(0.5, 1.5, 61)  # the median is 1
+    motion.position[:, 0, forearm[1]] = elbow + stretch[:, None] * (wrist - elbow)
+    rigged = fit_rig("x", motion, 0)
+    place = joint_positions(rigged.motion)
+    hand, arm = rigged.motion.bones.index("LeftHand"), rigged.motion.bones.index("LeftForeArm")
+    bone = place[:, hand] - place[:, arm]
+    np.testing.assert_allclose(np.linalg.norm(bone, axis=1), length, rtol=1e-12)
+    np.testing.assert_allclose(bone / length, (wrist - elbow) / length, rtol=0, atol=1e-9)
+
+
+def test_what_is_missing_is_held_left_out_and_counted(tmp_path: Path) -> None:
+    motion = without(walking(30), "left_hip", [0, 1, 10, 29])
+    without(motion, "right_wrist", [15, 16])
+    listener = Listener()
+    (path,) = WRITER.write(replace(recording(), motion=motion, progress=listener), tmp_path)
+    back = read_motion(path, unit="cm", axes="y-up")
+    assert len(back.t_s) == 27
+    place = joint_positions(back)
+    np.testing.assert_allclose(place[8, 0], place[7, 0], atol=WRITTEN_M)  # frame 10 stays where 9 was
+    forearm = back.bones.index("RightForeArm")
+    np.testing.assert_allclose(back.rotation[13, forearm], back.rotation[12, forearm], atol=1e-7)
+    np.testing.assert_allclose(back.rotation[14, forearm], back.rotation[12, forearm], atol=1e-7)
+    (note,) = listener.notes
+    assert "3 of 30 frames before and after the hips are seen were left out" in note
+    assert "the hips stay where they were in 1 of 27 frames" in note
+    # Frame 10: the turns of hips, spine and left thigh; 15 and 16: the forearm. 13 bones point somewhere.
+    assert "5 of 351 turns of bones are held" in note
+
+
+def test_no_hips_no_rig(tmp_path: Path) -> None:
+    motion = JointMotion(np.array([0]), ("nose", "left_shoulder", "right_shoulder"), np.ones((1, 1, 3, 3)))
+    with pytest.raises(DataError, match="lacks left_hip, right_hip: no rig can be fitted"):
+        WRITER.write(replace(recording(), motion=motion), tmp_path)
+    apart = without(without(walking(4), "nose", [0]), "left_hip", [0, 1])
+    without(apart, "left_shoulder", [2, 3])
+    with pytest.raises(DataError, match="never shows hips and neck at one time"):
+        WRITER.write(replace(recording(), motion=apart), tmp_path)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([None, 90.0, -90.0]))
+def test_angles_are_the_rotation_locked_or_not(seed: int, x_deg: float | None) -> None:
+    turns = Rotation.random(5, rng=np.random.default_rng(seed))
+    if x_deg is not None:
+        z, _, y = turns.as_euler("ZYX", degrees=True).T
+        turns = Rotation.from_euler("ZXY", np.stack([z, np.full(5, x_deg), y], axis=1), degrees=True)
+    angles = bvh_writing.euler_zxy_deg(turns.as_quat()[:, None])[:, 0]
+    back = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
+    # Locked within 1e-7: what is left out of y turns by as much.
+    np.testing.assert_allclose(back, matrix_from_quaternion(turns.as_quat()), atol=3e-7)
+
+
+def test_angles_go_on_without_jumps() -> None:
+    around = Rotation.from_euler("Z", np.arange(0, 1000, 7.0)[:, None], degrees=True).as_quat()[:, None]
+    np.testing.assert_allclose(np.diff(bvh_writing.euler_zxy_deg(around)[:, 0, 0]), 7.0, atol=1e-9)

@@ -1,0 +1,181 @@
+"""C3D: what we write is read by ezc3d and by us; files of others; what is damaged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.formats.common import extras
+from pipelines.formats.common.extras import need
+from pipelines.formats.skeletons import c3d
+from pipelines.formats.skeletons.even_frames import at_even_times
+from pipelines.session.errors import DataError
+from pipelines.session.progress import Silent
+from pipelines.session.records import JointMotion
+from pipelines.session.registries import ChoiceOfAxes, JointFormat
+from tests.formats.exported import SIGMA_M, Listener, recording, stamps, walking, without
+
+READER: JointFormat = c3d.FORMAT
+WRITER: ChoiceOfAxes = c3d.EXPORT
+FLOAT32 = 2.0**-24  # half a step of a float of 24 bits, relative
+
+
+def read(path: Path, unit: str | None = None, axes: str | None = None) -> JointMotion:
+    return READER.read_joints(path, unit=unit, axes=axes)
+
+
+def write(path: Path, motion: JointMotion, unit: str = "mm", axes: str = "z-up") -> Path:
+    c3d.write_joints(path, at_even_times("x", motion, Silent()), 0, unit=unit, axes=axes)
+    return path
+
+
+def foreign(path: Path, points: Any, labels: list[str], unit: str = "mm", first: int = 0) -> Path:
+    """A file as another program writes it with ezc3d: points [3, N, T]."""
+    file = need("ezc3d", "c3d").c3d()
+    file["data"]["points"] = np.concatenate([points, np.ones((1, *points.shape[1:]))])
+    file["parameters"]["POINT"]["RATE"]["value"] = [100.0]
+    file["parameters"]["POINT"]["UNITS"]["value"] = [unit]
+    file["parameters"]["POINT"]["LABELS"]["value"] = labels
+    file["header"]["points"]["first_frame"] = first
+    file.write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("unit", ["mm", "cm", "m"])
+@pytest.mark.parametrize("axes", ["z-up", "y-up"])
+def test_joints_come_back_within_float32(tmp_path: Path, unit: str, axes: str) -> None:
+    motion = without(walking(), "left_wrist", [3, 4])
+    path = write(tmp_path / "a.c3d", motion, unit, axes)
+    assert READER.recognises(path)
+    back = read(path)
+    assert back.joints == motion.joints
+    assert np.abs(back.t_ns - motion.t_ns).max() <= 1  # stamps were rounded to nanoseconds
+    np.testing.assert_allclose(back.position, motion.position, rtol=FLOAT32, atol=0)
+
+
+def test_ezc3d_reads_unit_axes_rate_labels_and_residuals(tmp_path: Path) -> None:
+    asked = replace(recording(), unit="m", axes="y-up")
+    (path,) = WRITER.write(asked, tmp_path)
+    assert path.name == "Mound_walk.c3d"
+    file = need("ezc3d", "c3d").c3d(str(path))
+    point = file["parameters"]["POINT"]
+    assert point["UNITS"]["value"] == ["m"]
+    assert [point[f"{axis}_SCREEN"]["value"] for axis in "XY"] == [["+X"], ["+Y"]]
+    assert point["RATE"]["value"][0] == pytest.approx(30, rel=1e-6)
+    assert point["LABELS"]["value"][:2] == ["Nose", "LEye"]
+    residual = file["data"]["meta_points"]["residuals"][0]
+    wrist = point["LABELS"]["value"].index("LWrist")
+    # sqrt((1 + 4 + 9) / 3) cm = 21.6 mm, in whole millimetres.
+    expected = np.full(residual.shape, 0.001 * round(1000 * np.sqrt(np.square(SIGMA_M).sum() / 3)))
+    expected[wrist, 7] = -1
+    np.testing.assert_allclose(residual, expected, rtol=1e-6)
+    # Y up: the nose's second coordinate is its height.
+    assert asked.motion is not None
+    np.testing.assert_allclose(file["data"]["points"][1, 0], asked.motion.position[:, 0, 0, 2], rtol=FLOAT32)
+
+
+def test_an_uncertainty_beyond_the_scale_is_its_end(tmp_path: Path) -> None:
+    motion = walking(2)
+    assert motion.covariance is not None
+    motion.covariance[:] *= 1000  # 680 mm
+    file = need("ezc3d", "c3d").c3d(str(write(tmp_path / "a.c3d", motion)))
+    assert set(file["data"]["meta_points"]["residuals"].ravel()) == {255}
+
+
+def test_long_names_are_shortened_for_others_and_whole_for_us(tmp_path: Path) -> None:
+    long = [f"{'très' * 10}_{k}" for k in range(2)]
+    motion = JointMotion(stamps(2), (*long, "nose"), np.ones((2, 1, 3, 3)))
+    path = write(tmp_path / "a.c3d", motion)
+    labels = need("ezc3d", "c3d").c3d(str(path))["parameters"]["POINT"]["LABELS"]["value"]
+    assert len(set(labels)) == 3
+    assert max(len(label.encode()) for label in labels) <= 30
+    assert read(path).joints == motion.joints
+
+
+def test_more_frames_than_the_header_counts(tmp_path: Path) -> None:
+    count = 65_600
+    position = np.zeros((count, 1, 1, 3))
+    position[:, 0, 0] = np.arange(count)[:, None] * [0.001, 0.002, 0.003]
+    position[65_590] = np.nan
+    path = write(tmp_path / "a.c3d", JointMotion(stamps(count), ("nose",), position))
+    trial = need("ezc3d", "c3d").c3d(str(path))["parameters"]["TRIAL"]
+    assert [int(v) & 0xFFFF for v in trial["ACTUAL_END_FIELD"]["value"]] == [count - 65_536, 1]
+    back = read(path)
+    assert len(back.t_ns) == count
+    np.testing.assert_allclose(back.position, position, rtol=FLOAT32, atol=0)
+    start = 512 * (need("ezc3d", "c3d").c3d(str(path))["parameters"]["POINT"]["DATA_START"]["value"][0] - 1)
+    path.write_bytes(path.read_bytes()[: start + 16 * 65_590])
+    with pytest.raises(DataError, match="breaks off before the last of its 65600 frames"):
+        read(path)
+
+
+def test_files_of_others_begin_at_their_first_frame(tmp_path: Path) -> None:
+    points = np.arange(18.0).reshape(3, 2, 3)
+    points[:, 1, 1] = np.nan
+    path = foreign(tmp_path / "a.c3d", points, ["RHip", "LASI"], first=50)
+    motion = read(path)
+    assert motion.joints == ("right_hip", "LASI")
+    assert motion.t_ns.tolist() == [500_000_000, 510_000_000, 520_000_000]
+    np.testing.assert_allclose(motion.position[:, 0], points.transpose(2, 1, 0) / 1000, rtol=1e-7)
+    turned = read(path, unit="m", axes="y-up").position[0, 0, 0]
+    assert turned.tolist() == points[[2, 0, 1], 0, 0].tolist()
+    facts = READER.describe(path)
+    assert (facts["POINT:UNITS"], facts["rows"], facts["joints"]) == ("mm", 3, ["right_hip", "LASI"])
+
+
+def test_what_is_wrong_is_said(tmp_path: Path) -> None:
+    whole = write(tmp_path / "a.c3d", walking(30)).read_bytes()
+    for size in (600, 1400, len(whole) - 4000):
+        cut = tmp_path / f"{size}.c3d"
+        cut.write_bytes(whole[:size])
+        with pytest.raises(DataError, match="readable C3D"):
+            read(cut)
+    with pytest.raises(DataError, match="the unit 'furlong'"):
+        read(foreign(tmp_path / "b.c3d", np.ones((3, 1, 2)), ["A"], unit="furlong"))
+    (tmp_path / "text.c3d").write_text("no C3D")
+    assert not READER.recognises(tmp_path / "text.c3d")
+
+
+@pytest.mark.parametrize("name", [b"POINT", b"LABELS", b"RATE", b"FIRST_T_NS"])
+def test_damaged_parameters_are_refused_before_ezc3d_sees_them(tmp_path: Path, name: bytes) -> None:
+    """It searches minutes for what they promise, or takes the process along."""
+    damaged = bytearray(write(tmp_path / "a.c3d", walking(30)).read_bytes())
+    behind = damaged.index(name) + len(name)  # how far it is to the next, then type and dimensions
+    damaged[behind : behind + 4] = bytes([0x77]) * 4
+    (tmp_path / "a.c3d").write_bytes(damaged)
+    with pytest.raises(DataError, match="its parameters are damaged"):
+        read(tmp_path / "a.c3d")
+
+
+def test_the_same_motion_gives_the_same_bytes(tmp_path: Path) -> None:
+    first, second = (write(tmp_path / name, walking(30)).read_bytes() for name in ("a.c3d", "b.c3d"))
+    assert first == second
+
+
+def test_without_ezc3d_one_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path / "a.c3d", walking(2))
+
+    def absent(name: str) -> None:
+        raise ImportError(name)
+
+    monkeypatch.setattr(extras, "import_module", absent)
+    for attempt in (lambda: read(path), lambda: WRITER.write(recording(), tmp_path)):
+        with pytest.raises(DataError) as caught:
+            attempt()
+        assert str(caught.value) == 'ezc3d: is not installed; run `pip install "mocap-pipeline[c3d]"`'
+
+
+def test_pauses_are_frames_without_points_and_counted(tmp_path: Path) -> None:
+    walked, listener = recording(progress=Listener()), Listener()
+    assert walked.motion is not None
+    kept = np.r_[0:20, 40:60]
+    motion = JointMotion(walked.motion.t_ns[kept], walked.motion.joints, walked.motion.position[kept])
+    (path,) = WRITER.write(replace(walked, motion=motion, progress=listener), tmp_path)
+    back = read(path)
+    assert len(back.t_ns) == 60
+    assert np.isnan(back.position[20:40]).all()
+    assert any("20 frames lie in pauses" in note for note in listener.notes)

@@ -1,0 +1,124 @@
+"""3D joints as a long CSV, and the csv export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+
+from pipelines.formats.poses import pose_csv
+from pipelines.formats.skeletons import joints_csv
+from pipelines.session.errors import DataError
+from pipelines.session.records import JointMotion, Recording, Trajectory
+from pipelines.session.registries import Export, JointFormat
+from tests.formats.motions import motions
+
+READER: JointFormat = joints_csv.FORMAT
+WRITER: Export = joints_csv.EXPORT
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "joints.csv"
+    path.write_text(text)
+    return path
+
+
+def read(path: Path, unit: str | None = None, axes: str | None = None) -> JointMotion:
+    return READER.read_joints(path, unit=unit, axes=axes)
+
+
+def test_rows_in_any_order_become_dense(tmp_path: Path) -> None:
+    path = write(
+        tmp_path, "t_ns,person,joint,x,y,z\n20,7,nose,1,2,3\n10,3,hip,4,5,6\n10,7,nose,7,8,9\n20,3,nose,,,\n"
+    )
+    assert READER.recognises(path)
+    motion = read(path)
+    assert motion.t_ns.tolist() == [10, 20]
+    assert motion.joints == ("nose", "hip")
+    assert motion.position.shape == (2, 2, 2, 3), "persons 3 and 7 are the first and the second"
+    assert motion.position[0, 0, 1].tolist() == [4, 5, 6]
+    assert motion.position[1, 1, 0].tolist() == [1, 2, 3]
+    assert np.isnan(motion.position[1, 0]).all()
+    assert np.count_nonzero(np.isfinite(motion.position)) == 9
+
+
+def test_seconds_units_and_axes(tmp_path: Path) -> None:
+    path = write(tmp_path, "time,joint,x,y,z\n1700000000.123456789,nose,1000,2000,3000\n")
+    assert read(path).t_ns.tolist() == [1700000000123456789]
+    assert read(path, unit="mm").position[0, 0, 0].tolist() == [1, 2, 3]
+    # y up: world x is the file's z, world y its x, world z its y.
+    assert read(path, unit="mm", axes="y-up").position[0, 0, 0].tolist() == [3, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("t_ns,x,y,z\n1,2,3,4\n", "no header"),
+        ("t_ns,joint,x,y,z\n", "holds no joints"),
+        ("t_ns,joint,x,y,z\n1,,1,2,3\n", "without a joint's name"),
+        ("t_ns,joint,x,y,z\n1,nose,1,2,3\n1,nose,1,2,3\n", "nose of person 0 at 1 ns"),
+        ("t_ns,joint,x,y,z\nnan,nose,1,2,3\n", "1 rows have no readable time"),
+        ("t_ns,joint,x,y,z\n1,nose,1,2,3\n2,nose,1,", "last line broke off"),
+        ("t_ns,joint,x,y,z\n1,nose,1,b,3\n2,nose,1,2,3\n", "line 2: 'b' is not a number"),
+        ("t_ns,person,joint,x,y,z\n1,anna,nose,1,2,3\n", "no whole number"),
+        ("t_ns,person,joint,x,y,z\n1,,nose,1,2,3\n", "1 rows name no person|no whole number"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, text: str, problem: str) -> None:
+    with pytest.raises(DataError, match=problem):
+        read(write(tmp_path, text))
+
+
+def test_units_and_axes_are_checked(tmp_path: Path) -> None:
+    path = write(tmp_path, "t_ns,joint,x,y,z\n1,nose,1,2,3\n")
+    with pytest.raises(DataError, match="unit 'inch'"):
+        read(path, unit="inch")
+    with pytest.raises(DataError, match="axes 'x-up'"):
+        read(path, axes="x-up")
+
+
+def test_scattered_rows_cannot_exhaust_memory(tmp_path: Path) -> None:
+    rows = "\n".join(f"{k},{k},joint{k},1,2,3" for k in range(2000))
+    with pytest.raises(DataError, match="2000 rows are scattered over 2000 times"):
+        read(write(tmp_path, f"t_ns,person,joint,x,y,z\n{rows}\n"))
+
+
+def test_describe(tmp_path: Path) -> None:
+    summary = READER.describe(write(tmp_path, "t,joint,x,y,z\n0,a,1,2,3\n0.5,a,4,5,6\n0.5,b,,,\n"))
+    assert summary["joints"] == ["a", "b"]
+    assert summary["rate_hz"] == 2.0
+    assert summary["missing_share"] == 0.5
+    assert summary["box_max_m"] == [4, 5, 6]
+
+
+@given(motion=motions())
+def test_writing_and_reading_gives_the_same(
+    tmp_path_factory: pytest.TempPathFactory, motion: JointMotion
+) -> None:
+    path = tmp_path_factory.mktemp("joints") / "joints.csv"
+    joints_csv.write_joints(path, motion)
+    assert READER.recognises(path)
+    assert not pose_csv.FORMAT.recognises(path)
+    back = read(path)
+    assert back.joints == motion.joints
+    np.testing.assert_array_equal(back.t_ns, motion.t_ns)
+    np.testing.assert_array_equal(back.position, motion.position)
+    table = pd.read_csv(path)
+    assert motion.status is not None
+    assert motion.reprojection_px is not None
+    assert table["status"].tolist() == motion.status.ravel().tolist()
+    np.testing.assert_allclose(table["reprojection_px"], motion.reprojection_px.ravel(), rtol=1e-14)
+
+
+def test_export_writes_skeleton_and_cameras(tmp_path: Path) -> None:
+    motion = JointMotion(np.array([0, 1]), ("nose",), np.zeros((2, 1, 1, 3)))
+    poses = Trajectory(np.array([5]), np.ones((1, 3)), np.array([[0.0, 0, 0, 1]]))
+    paths = WRITER.write(Recording("walk", motion, {"d1": poses}), tmp_path)
+    assert [path.name for path in paths] == ["walk.csv", "walk_d1.csv"]
+    np.testing.assert_array_equal(read(paths[0]).position, motion.position)
+    np.testing.assert_array_equal(pose_csv.FORMAT.read_trajectory(paths[1]).position, poses.position)
+    with pytest.raises(DataError, match="neither joints nor camera poses"):
+        WRITER.write(Recording("walk", None, {}), tmp_path)

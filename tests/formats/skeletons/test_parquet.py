@@ -1,0 +1,45 @@
+"""The parquet export, read by pandas alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipelines.formats.skeletons import parquet
+from pipelines.session.errors import DataError
+from pipelines.session.records import Recording
+from pipelines.session.registries import Export
+from tests.formats.exported import flown, recording
+
+WRITER: Export = parquet.EXPORT
+
+
+def test_tables_by_name_time_and_joint(tmp_path: Path) -> None:
+    walked = recording()
+    motion = walked.motion
+    assert motion is not None
+    skeleton, camera = WRITER.write(walked, tmp_path)
+    assert (skeleton.name, camera.name) == ("Mound_walk.parquet", "Mound_walk_cam-1.parquet")
+    table = pd.read_parquet(skeleton)
+    assert len(table) == 60 * 17
+    wide = table.pivot_table(index="t_ns", columns="joint", values="z", dropna=False)[list(motion.joints)]
+    np.testing.assert_array_equal(wide.to_numpy(), motion.position[:, 0, :, 2])
+    assert table.loc[table["joint"] == "left_wrist", "x"].isna().sum() == 1
+    assert set(table["status"]) == {"ok"}
+    assert table["cyy"].iloc[0] == pytest.approx(0.02**2)
+    np.testing.assert_array_equal(pd.read_parquet(camera)["x"], flown().position[:, 0])
+
+
+def test_the_same_bytes_again(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    first, second = (WRITER.write(recording(), tmp_path / name)[0] for name in ("a", "b"))
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_nothing_to_export(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="neither joints nor camera poses"):
+        WRITER.write(Recording("x", None, {}), tmp_path)

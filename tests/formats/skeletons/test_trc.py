@@ -1,0 +1,205 @@
+"""TRC: real files of Pose2Sim, hand-made ones, and what we write."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+
+from pipelines.formats.skeletons import trc
+from pipelines.session.errors import DataError
+from pipelines.session.records import JointMotion, Recording
+from pipelines.session.registries import Export, JointFormat
+from tests.formats.exported import recording
+from tests.formats.motions import motions
+from tests.real_data import real_data
+
+READER: JointFormat = trc.FORMAT
+WRITER: Export = trc.EXPORT
+
+HEADER = (
+    "PathFileType\t4\t(X/Y/Z)\ta.trc\n"
+    "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames\n"
+    "60\t60\t99\t2\tmm\t60\t1\t99\n"
+    "Frame#\tTime\tRBigToe\t\t\tC7\t\t\n"
+    "\t\tX1\tY1\tZ1\tX2\tY2\tZ2\n"
+)
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "a.trc"
+    path.write_text(text)
+    return path
+
+
+def read(path: Path, unit: str | None = None, axes: str | None = None) -> JointMotion:
+    return READER.read_joints(path, unit=unit, axes=axes)
+
+
+def test_units_axes_names_and_blank_cells(tmp_path: Path) -> None:
+    path = write(tmp_path, HEADER + "\n1\t0.0\t1000\t2000\t3000\t\t\t\n2\t0.016666666\t1\t2\t3\t4\t5\t6\t\n")
+    assert READER.recognises(path)
+    motion = read(path)
+    assert motion.joints == ("right_big_toe", "C7")
+    assert motion.t_ns.tolist() == [0, 16_666_666]
+    assert motion.position.shape == (2, 1, 2, 3)
+    # y up: world x is the file's z, world y its x, world z its y.
+    assert motion.position[0, 0, 0].tolist() == [3, 1, 2]
+    assert np.isnan(motion.position[0, 0, 1]).all()
+    assert read(path, axes="z-up").position[0, 0, 0].tolist() == [1, 2, 3]
+    assert read(path, unit="m").position[0, 0, 0].tolist() == [3000, 1000, 2000], "the user's word counts"
+
+
+@pytest.mark.parametrize(
+    "relative",
+    [
+        "pose2sim_single/pose-3d/single_0-99.trc",
+        "pose2sim_single/published_0.4.15/Balancing_for_IK.trc",
+        "motion/pose2sim_markers.trc",
+    ],
+)
+def test_real_files(relative: str) -> None:
+    path = real_data(relative)
+    assert READER.recognises(path)
+    motion = read(path)
+    assert motion.position.shape == (100, 1, 21, 3)
+    assert {"right_hip", "left_big_toe", "neck", "head", "nose", "left_wrist"} <= set(motion.joints)
+    np.testing.assert_allclose(np.diff(motion.t_ns), 1e9 / 60, atol=1)
+    # Metres with z up: a person who balances on the floor (z = 0), head above hips above heels.
+    height = {joint: motion.position[:, 0, k, 2].mean() for k, joint in enumerate(motion.joints)}
+    assert height["head"] > height["right_hip"] > height["right_heel"]
+    assert 1.4 < height["head"] < 1.9
+
+
+def test_a_real_first_row_to_the_digit() -> None:
+    motion = read(real_data("motion/pose2sim_markers.trc"))
+    # As noted by an independent reader in the file's own axes: RHip -0.065, 0.90151, -1.40057.
+    np.testing.assert_allclose(motion.position[0, 0, 0], [-1.40057, -0.065, 0.90151], atol=1e-5)
+
+
+def test_the_header_of_a_real_file_may_count_wrong() -> None:
+    """Pose2Sim's filter writes one row less than it states: rows are counted, not believed."""
+    path = real_data("pose2sim_single/pose-3d/single_0-99_filt_butterworth.trc")
+    summary = READER.describe(path)
+    assert summary["header: NumFrames"] == "100"
+    assert summary["rows"] == 99
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("", "no TRC header"),
+        (HEADER, "holds no frames"),
+        (HEADER + "1\t0\t1\t2\t3\n", "line 6 has 5 cells instead of 8"),
+        (HEADER + "1\t0\t1\t2\t3\t4\tx\t6\n", "line 6: could not convert"),
+        (HEADER + "1\t0\t1\t2\t3\t4\t5\t6\n2\t0\t1\t2\t3\t4\t5\t6\n", "time of row 2 .* does not increase"),
+        (HEADER + "1\tnan\t1\t2\t3\t4\t5\t6\n", "time of row 1"),
+        (HEADER.replace("mm", "furlong") + "1\t0\t1\t2\t3\t4\t5\t6\n", "unit 'furlong'"),
+        (HEADER.replace("C7", "RBigToe"), "RBigToe more than once"),
+        (HEADER.replace("C7", ""), "names 1 markers above 6 columns"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, text: str, problem: str) -> None:
+    with pytest.raises(DataError, match=problem):
+        read(write(tmp_path, text))
+
+
+def test_marker_names() -> None:
+    assert trc.marker_name("right_hip") == "RHip"
+    assert trc.marker_name("left_small_toe") == "LSmallToe"
+    assert trc.marker_name("nose") == "Nose"
+    assert trc.marker_name("C7") == "C7"
+
+
+def test_of_two_names_for_one_joint_the_second_is_kept(tmp_path: Path) -> None:
+    text = HEADER.replace("RBigToe", "MidHip").replace("C7", "Hip") + "1\t0\t1\t2\t3\t4\t5\t6\n"
+    assert read(write(tmp_path, text)).joints == ("hip", "Hip")
+
+
+def test_other_files_are_not_recognised(tmp_path: Path) -> None:
+    assert not READER.recognises(write(tmp_path, "t,x\n"))
+    assert not READER.recognises(write(tmp_path, ""))
+
+
+@given(motion=motions(people=1))
+def test_writing_and_reading_gives_the_same(
+    tmp_path_factory: pytest.TempPathFactory, motion: JointMotion
+) -> None:
+    path = tmp_path_factory.mktemp("trc") / "a.trc"
+    trc.write_joints(path, motion, 0)
+    back = read(path)
+    assert back.joints == motion.joints
+    np.testing.assert_array_equal(back.t_ns, motion.t_ns)
+    # Seven decimals of a metre are written.
+    np.testing.assert_allclose(back.position, motion.position, rtol=0, atol=0.5001e-7)
+
+
+def test_export_is_what_opensim_expects(tmp_path: Path) -> None:
+    position = np.full((4, 2, 2, 3), np.nan)
+    position[:, 0, 0] = [1.0, 2.0, 3.0]
+    position[1:, 1, 1] = [4.0, 5.0, 6.0]
+    t_ns = np.array([0, 33_333_333, 66_666_667, 100_000_000])
+    motion = JointMotion(t_ns, ("right_hip", "nose"), position)
+    paths = WRITER.write(Recording("Mound walk", motion, {}), tmp_path)
+    assert [path.name for path in paths] == ["Mound_walk_person0.trc", "Mound_walk_person1.trc"]
+    lines = paths[0].read_text().split("\n")
+    assert lines[0] == "PathFileType\t4\t(X/Y/Z)\tMound_walk_person0.trc"
+    assert dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=True)) == {
+        "DataRate": "30",
+        "CameraRate": "30",
+        "NumFrames": "4",
+        "NumMarkers": "2",
+        "Units": "m",
+        "OrigDataRate": "30",
+        "OrigDataStartFrame": "1",
+        "OrigNumFrames": "4",
+    }
+    assert lines[3] == "Frame#\tTime\tRHip\t\t\tNose\t\t"
+    assert lines[4] == "\t\tX1\tY1\tZ1\tX2\tY2\tZ2"
+    # World x 1, y 2, z 3 (up) are OpenSim's z, x, y (up).
+    assert lines[6] == "1\t0.000000000\t2.0000000\t3.0000000\t1.0000000\t\t\t"
+    assert {len(line.split("\t")) for line in lines[6:10]} == {8}
+
+
+@pytest.mark.parametrize(
+    "motion", [None, JointMotion(np.array([0]), ("nose",), np.full((1, 1, 1, 3), np.nan))]
+)
+def test_nothing_to_export(tmp_path: Path, motion: JointMotion | None) -> None:
+    with pytest.raises(DataError, match="holds no joints"):
+        WRITER.write(Recording("x", motion, {}), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_one_person_keeps_the_plain_name(tmp_path: Path) -> None:
+    motion = JointMotion(np.array([0]), ("nose",), np.zeros((1, 1, 1, 3)))
+    assert [path.name for path in WRITER.write(Recording("../x:y", motion, {}), tmp_path)] == ["x_y.trc"]
+
+
+def as_pose2sim_reads(path: Path) -> tuple[list[str], pd.DataFrame]:
+    """Marker names of the fourth line, numbers below the fifth: what Pose2Sim's own tools do."""
+    names = pd.read_csv(path, sep="\t", skiprows=3, nrows=0).columns[2:].tolist()
+    return names[::3], pd.read_csv(path, sep="\t", skiprows=4)
+
+
+def test_another_reader_finds_the_same(tmp_path: Path) -> None:
+    walked = recording()
+    motion = walked.motion
+    assert motion is not None
+    (path,) = WRITER.write(replace(walked, unit="mm", axes="z-up"), tmp_path)
+    names, table = as_pose2sim_reads(path)
+    assert names == [trc.marker_name(joint) for joint in motion.joints]
+    assert path.read_text().split("\n")[2].split("\t")[4] == "mm"
+    values = table.to_numpy()[:, 2:].reshape(60, -1, 3)
+    # Four decimals of a millimetre.
+    np.testing.assert_allclose(values / 1000, motion.position[:, 0], rtol=0, atol=0.5001e-7)
+    assert np.isnan(values[7, names.index("LWrist")]).all()
+    back = read(path, axes="z-up")
+    np.testing.assert_allclose(back.position, motion.position, rtol=0, atol=0.5001e-7)
+    # The same on a file of theirs: the reader above is theirs, not ours.
+    names, table = as_pose2sim_reads(real_data("motion/pose2sim_markers.trc"))
+    assert names[0] == "RHip"
+    assert table.iloc[0, 2:5].tolist() == pytest.approx([-0.065, 0.90151, -1.40057], abs=1e-5)

@@ -1,0 +1,235 @@
+"""Frame times: CSV of several forms, real DJI subtitles, and damage."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipelines.formats.videos import frame_times
+from pipelines.formats.videos.frame_times import FrameStamps, read_frame_times, times_of_frames
+from pipelines.session.errors import DataError
+from pipelines.session.registries import FORMATS
+from tests.real_data import real_data
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def utc_ns(text: str, microseconds: int = 0) -> int:
+    moment = datetime.fromisoformat(text).replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)
+    return moment // timedelta(microseconds=1) * 1000 + microseconds * 1000
+
+
+def subtitles(clocks: list[str], step_ms: int = 40) -> str:
+    """Blocks as DJI drones write them."""
+    blocks = []
+    for k, clock in enumerate(clocks):
+        start, stop = (f"00:00:{t // 1000:02d},{t % 1000:03d}" for t in (k * step_ms, (k + 1) * step_ms))
+        blocks.append(
+            f'{k + 1}\n{start} --> {stop}\n<font size="36">SrtCnt : {k + 1}\n{clock}\n[iso : 1]</font>\n'
+        )
+    return "\n".join(blocks)
+
+
+# --- CSV ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "frame,t_ns\n0,1700000000123456789\n1,1700000000223456789\n3,1700000000423456789\n",
+        "frame,t\n0,1700000000.123456789\n1,1700000000.223456789\n3,1700000000.423456789\n",
+        "#timestamp [ns];frame_id\n1700000000123456789;0\n1700000000223456789;1\n1700000000423456789;3\n",
+        "Frame\tTime\tnote\n3\t1700000000.423456789\tx\n0\t1700000000.123456789\t\n1\t1700000000.223456789\ty\n",
+        "\ufefft_ns,frame\r\n1700000000123456789,0.0\r\n1700000000223456789,1.0\r\n1700000000423456789,3.0\r\n",
+    ],
+)
+def test_forms_of_a_csv(tmp_path: Path, text: str) -> None:
+    stamps = read_frame_times(written(tmp_path / "f.csv", text))
+    assert stamps.frame.tolist() == [0, 1, 3]
+    assert stamps.t_ns.tolist() == [1700000000123456789, 1700000000223456789, 1700000000423456789]
+    assert stamps.media_ns is None
+    assert stamps.dropped == {}
+
+
+@settings(max_examples=40)
+@given(data=st.data())
+def test_any_times_come_back(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    t_ns = sorted(data.draw(st.lists(st.integers(0, 2**62), min_size=1, max_size=20, unique=True)))
+    frame = sorted(data.draw(st.sets(st.integers(0, 10**6), min_size=len(t_ns), max_size=len(t_ns))))
+    rows = list(zip(frame, t_ns, strict=True))
+    order = data.draw(st.permutations(rows))
+    text = "frame,t_ns\n" + "".join(f"{k},{t}\n" for k, t in order)
+    stamps = read_frame_times(written(tmp_path_factory.mktemp("f") / "f.csv", text))
+    assert list(zip(stamps.frame.tolist(), stamps.t_ns.tolist(), strict=True)) == rows
+    assert stamps.dropped == {}
+
+
+def test_a_lone_column_counts_its_rows(tmp_path: Path) -> None:
+    stamps = read_frame_times(written(tmp_path / "f.csv", "timestamp\n0.5\n\nbad\n2\n2.5\n"))
+    assert stamps.frame.tolist() == [0, 3, 4]
+    assert stamps.t_ns.tolist() == [500_000_000, 2_000_000_000, 2_500_000_000]
+    assert stamps.dropped == {"no time": 2}
+
+
+def test_rows_that_cannot_be_used_are_counted_by_cause(tmp_path: Path) -> None:
+    text = "frame,t\n0,1\n1,nan\n,3\n-2,3\n2.5,3\n2,3\n2,3.5\n3,2.5\n4,3\n5,4\n6"
+    stamps = read_frame_times(written(tmp_path / "f.csv", text))
+    assert stamps.frame.tolist() == [0, 2, 5]
+    assert stamps.t_ns.tolist() == [1_000_000_000, 3_000_000_000, 4_000_000_000]
+    assert stamps.dropped == {
+        "truncated last line": 1,
+        "no time": 1,
+        "no frame number": 3,
+        "duplicate frame": 1,
+        "time not increasing": 2,
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("", "no header"),
+        ("0,1.0\n1,1.1\n", "no header"),
+        ("frame,x\n0,1\n", "no header"),
+        ("frame,t\n", "no usable frame time .it has no rows"),
+        ("t\n", "no usable frame time .it has no rows"),
+        ("frame,t\na,1\nb,2\n", "2 no frame number"),
+        ("frame,t\n0,1\n1,2,3\n2,3\n", "line 3: 3 columns instead of 2"),
+        ("frame,t\n0,1700000000000\n1,1700000000100\n", "look like milliseconds"),
+    ],
+)
+def test_what_is_no_csv_of_frame_times(tmp_path: Path, text: str, problem: str) -> None:
+    with pytest.raises(DataError, match=problem) as caught:
+        read_frame_times(written(tmp_path / "f.csv", text))
+    assert "\n" not in str(caught.value)
+
+
+# --- subtitles ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "rows", "last_frame", "first_ns", "last_ns"),
+    [
+        (
+            "MAVIC3.srt",
+            12318,
+            12317,
+            utc_ns("2021-12-25 12:27:52", 373_000),
+            utc_ns("2021-12-25 12:31:58", 710_000),
+        ),
+        ("air2s.srt", 17, 16, utc_ns("2022-08-07 13:40:40", 774_808), utc_ns("2022-08-07 13:40:41", 308_639)),
+        # The last subtitle ends at 369.88 s: 9247 frames of 40 ms, of which 8952 have one.
+        (
+            "mavic_2pro_new.SRT",
+            8952,
+            9246,
+            utc_ns("2019-09-27 10:28:08", 438_904),
+            utc_ns("2019-09-27 11:11:41", 524_497),
+        ),
+    ],
+)
+def test_real_subtitles(name: str, rows: int, last_frame: int, first_ns: int, last_ns: int) -> None:
+    path = real_data(f"logs/dji_srt/{name}")
+    assert frame_times.FORMAT.recognises(path)
+    facts = frame_times.FORMAT.describe(path)
+    assert (facts["rows"], facts["first_frame"], facts["last_frame"]) == (rows, 0, last_frame)
+    assert (facts["first_ns"], facts["last_ns"]) == (first_ns, last_ns)
+    assert not any(key.startswith("dropped") for key in facts)
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        # The first subtitle of two of them stands at 1 s, so that frame 0 is a second earlier.
+        (
+            "matrice_300.srt",
+            f"every 1 s, not for each frame.*start: {utc_ns('2022-06-21 16:06:17') // 10**9}}}",
+        ),
+        ("old_format.SRT", f"every 1 s.*start: {utc_ns('2017-08-05 14:11:50') // 10**9}}}"),
+        ("broken_incomplete.SRT", f"every 1 s.*start: {utc_ns('2017-07-03 10:15:02') // 10**9}}}"),
+        ("p4_rtk.SRT", "its 55 subtitles show no clock time"),
+        ("broken_empty.SRT", "is empty"),
+    ],
+)
+def test_real_subtitles_without_frame_times(name: str, problem: str) -> None:
+    with pytest.raises(DataError, match=problem):
+        read_frame_times(real_data(f"logs/dji_srt/{name}"))
+
+
+def test_clocks_of_every_spelling(tmp_path: Path) -> None:
+    clocks = ["2022-08-07 13:40:40,774,808", "2022-08-07 13:40:40.875", "2022.8.7 13:40:41"]
+    stamps = read_frame_times(written(tmp_path / "f.srt", subtitles(clocks)))
+    assert stamps.t_ns.tolist() == [
+        utc_ns("2022-08-07 13:40:40", 774_808),
+        utc_ns("2022-08-07 13:40:40", 875_000),
+        utc_ns("2022-08-07 13:40:41"),
+    ]
+    assert stamps.media_ns is not None
+    assert stamps.media_ns.tolist() == [0, 40_000_000, 80_000_000]
+
+
+def test_subtitles_without_a_clock_are_counted(tmp_path: Path) -> None:
+    clocks = [f"2022-08-07 13:40:40.{40 * k:03d}" for k in range(10)]
+    clocks[3], clocks[5] = "nothing here", "2022-13-07 13:40:40.200"
+    clocks[8] = clocks[7]
+    text = subtitles(clocks)
+    stamps = read_frame_times(written(tmp_path / "f.srt", text[: text.index("10\n00:00")] + "10\n00:00:0"))
+    assert stamps.frame.tolist() == [0, 1, 2, 4, 6, 7]
+    assert stamps.dropped == {"no time": 2, "time not increasing": 1}
+
+
+def test_a_missing_subtitle_leaves_a_hole(tmp_path: Path) -> None:
+    text = subtitles([f"2022-08-07 13:40:40.{33 * k:03d}" for k in range(9)], step_ms=33)
+    start = text.index("5\n00:00:00,132")
+    text = text[:start] + text[text.index("6\n00:00:00,165") :]
+    stamps = read_frame_times(written(tmp_path / "f.srt", text))
+    assert stamps.frame.tolist() == [0, 1, 2, 3, 5, 6, 7, 8]
+
+
+# --- to a video's frames --------------------------------------------------------------------------------
+
+
+def test_times_by_frame_number() -> None:
+    stamps = FrameStamps(np.array([0, 2, 3, 9]), np.array([10, 30, 41, 90]))
+    t_ns, known = times_of_frames(stamps, np.arange(5) * 7)
+    assert known.tolist() == [True, False, True, True, False]
+    assert t_ns.tolist() == [10, 0, 30, 41, 0]
+
+
+def test_times_by_place_in_the_video() -> None:
+    # The recorder skipped what would have been frame 2: the video's frame 2 is shown at 120 ms.
+    media_ns = np.array([0, 40, 120, 160]) * 1_000_000
+    stamps = FrameStamps(np.array([0, 1, 3, 4]), np.array([5, 45, 125, 165]), media_ns)
+    pts_ns = np.array([0, 40_000_123, 119_999_000, 160_000_000, 200_000_000])
+    t_ns, known = times_of_frames(stamps, pts_ns)
+    assert known.tolist() == [True, True, True, True, False]
+    assert t_ns.tolist() == [5, 45, 125, 165, 0]
+
+
+def test_what_is_recognised(tmp_path: Path) -> None:
+    yes = {
+        "a.csv": "frame,t_ns\n0,1\n",
+        "b.txt": "timestamp\n1\n",
+        "c.srt": subtitles(["2022-08-07 13:40:40,774"]),
+    }
+    no = {
+        "d.csv": "t,x\n0,1\n",
+        "e.csv": "t_ns,x,y,z,qx,qy,qz,qw\n",
+        "f.csv": "0,1\n",
+        "g.srt": "",
+        "h.csv": "",
+    }
+    for name, text in (yes | no).items():
+        names = [
+            format_.name for format_ in FORMATS.all() if format_.recognises(written(tmp_path / name, text))
+        ]
+        assert ("frame_times" in names) == (name in yes), name
+        assert len(names) == 1 or name in no

@@ -1,0 +1,438 @@
+"""Videos written with known stamps; FFmpeg's plain decoding and OpenCV are the oracles."""
+
+from __future__ import annotations
+
+import weakref
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipelines.formats.videos import video
+from pipelines.formats.videos.video import (
+    Picture,
+    VideoReader,
+    created_ns,
+    frames,
+    index_video,
+    read_frame,
+)
+from pipelines.session.errors import DataError
+from pipelines.session.registries import FORMATS, VideoFormat
+from tests.real_data import real_data
+from tests.synthetic.videos import (
+    SIZE,
+    TICK_S,
+    even_ticks,
+    read_bar_code,
+    uneven_ticks,
+    write_sound,
+    write_video,
+)
+
+READER: VideoFormat = video.FORMAT
+
+
+def relative_ns(ticks: list[int], tick_s: Fraction = TICK_S) -> list[int]:
+    return [round(Fraction(t - ticks[0]) * tick_s * 10**9) for t in ticks]
+
+
+def packets(path: Path) -> list[tuple[int, int]]:
+    """Where each coded frame lies: position and size, in the order of decoding."""
+    with av.open(str(path)) as container:
+        return [(p.pos, p.size) for p in container.demux(video=0) if p.size and p.pos is not None]
+
+
+def decoded_by_opencv(path: Path) -> tuple[list[Picture], list[float]]:
+    capture = cv2.VideoCapture(str(path))
+    pictures, milliseconds = [], []
+    while (answer := capture.read())[0]:
+        pictures.append(answer[1])
+        milliseconds.append(capture.get(cv2.CAP_PROP_POS_MSEC))
+    capture.release()
+    return pictures, milliseconds
+
+
+# --- stamps --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("b_frames", [0, 2])
+@pytest.mark.parametrize("ticks", [even_ticks(40), uneven_ticks(40)], ids=["constant", "variable"])
+def test_stamps_are_those_written(tmp_path: Path, ticks: list[int], b_frames: int) -> None:
+    path = write_video(tmp_path / "v.mp4", ticks, b_frames=b_frames)
+    index = index_video(path)
+    assert index.pts_ns.tolist() == relative_ns(ticks)
+    assert index.start_ns == 0
+    assert index.variable == (ticks == uneven_ticks(40))
+    assert index.rate_hz == pytest.approx(39 / ((ticks[-1] - ticks[0]) / 90_000), rel=1e-9)
+    assert (index.width, index.height, index.codec, index.rotation_deg) == (*SIZE, "h264", 0)
+    assert index.dropped == {}
+
+
+@settings(max_examples=15, deadline=None)
+@given(steps=st.lists(st.integers(1, 300_000), min_size=1, max_size=12), first=st.integers(0, 900_000))
+def test_any_stamps_come_back(tmp_path_factory: pytest.TempPathFactory, steps: list[int], first: int) -> None:
+    ticks = [first + t for t in (0, *np.cumsum(steps).tolist())]
+    path = write_video(tmp_path_factory.mktemp("v") / "v.mp4", ticks)
+    index = index_video(path)
+    assert index.pts_ns.tolist() == relative_ns(ticks)
+    # The container states the first stamp in its movie clock of 1 ms, rounded up or down.
+    assert abs(index.start_ns - first * 100_000 / 9) < 1_000_001
+
+
+def test_ntsc_rate_is_rounded_once(tmp_path: Path) -> None:
+    tick_s = Fraction(1, 30_000)
+    ticks = even_ticks(50, step=1001)
+    index = index_video(write_video(tmp_path / "v.mp4", ticks, tick_s=tick_s))
+    assert index.pts_ns.tolist() == relative_ns(ticks, tick_s)
+    assert index.rate_hz == pytest.approx(30_000 / 1001, rel=1e-8)
+    assert not index.variable
+
+
+def test_a_start_offset_is_kept_apart(tmp_path: Path) -> None:
+    index = index_video(write_video(tmp_path / "v.mp4", even_ticks(10, first=45_000)))
+    assert index.start_ns == 500_000_000
+    assert index.pts_ns[0] == 0
+
+
+def test_a_coarse_clock_is_no_variable_rate(tmp_path: Path) -> None:
+    # Matroska counts milliseconds: 33, 33, 34.
+    index = index_video(write_video(tmp_path / "v.mkv", even_ticks(40)))
+    assert not index.variable
+    assert np.abs(index.pts_ns - relative_ns(even_ticks(40))).max() <= 500_000
+
+
+def test_one_frame(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mp4", [0])
+    index = index_video(path)
+    assert (index.count, index.rate_hz, index.span_s, index.variable) == (1, None, 0.0, False)
+    assert [number for number, _ in frames(path)] == [0]
+    assert READER.describe(path)["rate_hz"] is None
+
+
+def test_frames_that_an_edit_list_hides_are_none(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mp4", even_ticks(40), b_frames=0)
+    content = bytearray(path.read_bytes())
+    place = content.find(b"elst") + 4 + 8 + 4  # version and flags, count; the duration stands first
+    content[place : place + 4] = (10 * 3000).to_bytes(4, "big")
+    path.write_bytes(content)
+    pictures, _ = decoded_by_opencv(path)
+    with VideoReader(path) as reader:
+        assert reader.index.count == len(pictures) == 30
+        assert [read_bar_code(picture) for _, picture in reader.frames()] == list(range(10, 40))
+        assert reader.missing == set()
+
+
+# --- pictures ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "codec"),
+    [
+        ("v.mp4", "libx264"),
+        ("v.mkv", "libx264"),
+        ("v.ts", "libx264"),
+        ("v.mov", "mjpeg"),
+        ("v.webm", "libvpx-vp9"),
+    ],
+)
+def test_a_hundred_random_reads_equal_decoding_in_order(tmp_path: Path, name: str, codec: str) -> None:
+    path = write_video(tmp_path / name, uneven_ticks(100), codec=codec)
+    with VideoReader(path) as reader:
+        in_order = dict(reader.frames())
+        assert [read_bar_code(picture) for picture in in_order.values()] == list(range(100))
+        for number in np.random.default_rng(1).integers(0, 100, 100).tolist():
+            picture = reader.read(number)
+            assert picture is not None
+            assert np.array_equal(picture, in_order[number]), f"frame {number}"
+        assert reader.missing == set()
+
+
+@pytest.mark.parametrize("turned_deg", [0, 90, 180, 270])
+def test_pictures_are_opencvs(tmp_path: Path, turned_deg: int) -> None:
+    path = write_video(tmp_path / "v.mp4", uneven_ticks(30), turned_deg=turned_deg)
+    pictures, milliseconds = decoded_by_opencv(path)
+    index = index_video(path)
+    assert index.rotation_deg == turned_deg
+    assert (index.width, index.height) == (SIZE if turned_deg % 180 == 0 else SIZE[::-1])
+    # OpenCV says milliseconds as a float64 of seconds.
+    np.testing.assert_allclose(index.pts_ns / 1e6, milliseconds, rtol=0, atol=1e-6)
+    mine = [picture for _, picture in frames(path)]
+    assert len(mine) == len(pictures)
+    assert mine[0].shape == (index.height, index.width, 3)
+    assert mine[0].flags.c_contiguous
+    # The same libraries; their two conversions to BGR may round differently by a level or two.
+    assert max(np.abs(a.astype(int) - b).max() for a, b in zip(mine, pictures, strict=True)) <= 2
+
+
+def test_ranges(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mp4", uneven_ticks(60))
+    assert [number for number, _ in frames(path, 17, 51, 9)] == [17, 26, 35, 44]
+    assert [read_bar_code(picture) for _, picture in frames(path, 30)] == list(range(30, 60))
+    assert list(frames(path, 20, 20)) == []
+    last = read_frame(path, 59)
+    assert last is not None
+    assert read_bar_code(last) == 59
+    with VideoReader(path) as reader:
+        for start, stop, step in [(-1, 5, 1), (0, 61, 1), (5, 4, 1), (0, 5, 0)]:
+            with pytest.raises(DataError, match="it has 0 to 59"):
+                list(reader.frames(start, stop, step))
+        with pytest.raises(DataError, match="has no frames 60 to 60"):
+            reader.read(60)
+
+
+def test_iterations_take_turns(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mp4", uneven_ticks(60))
+    with VideoReader(path) as reader:
+        pairs = zip(reader.frames(0, 20), reader.frames(35, 55), strict=True)
+        numbers = [(a, read_bar_code(x), b, read_bar_code(y)) for (a, x), (b, y) in pairs]
+        assert numbers == [(k, k, k + 35, k + 35) for k in range(20)]
+        assert reader.missing == set()
+
+
+def test_pictures_are_not_kept(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mp4", even_ticks(30))
+    alive: list[weakref.ref[Picture]] = []
+    for _, picture in frames(path):
+        alive = [kept for kept in alive if kept() is not None] + [weakref.ref(picture)]
+        assert len(alive) <= 2  # this one, and the one before that the loop's variable held
+
+
+# --- damage --------------------------------------------------------------------------------------------
+
+
+def test_a_damaged_frame_is_missing_and_the_others_keep_their_numbers(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = write_video(tmp_path / "v.mp4", uneven_ticks(30), key_every=1, b_frames=0)
+    whole = dict(frames(path))
+    content = bytearray(path.read_bytes())
+    for number in (7, 20):
+        position, size = packets(path)[number]
+        content[position : position + size] = bytes(size)
+    path.write_bytes(content)
+    with VideoReader(path) as reader:
+        assert reader.index.pts_ns.tolist() == relative_ns(uneven_ticks(30))
+        left = dict(reader.frames())
+        assert reader.missing == {7, 20}
+        assert reader.read(7) is None
+        again = reader.read(8)
+        assert again is not None
+        assert np.array_equal(again, whole[8])
+    assert sorted(left) == sorted(set(range(30)) - {7, 20})
+    assert all(np.array_equal(left[number], whole[number]) for number in left)
+    assert capfd.readouterr().err == "", "FFmpeg's own words would stand beside ours"
+
+
+def test_damage_between_key_frames_ends_at_the_next(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mp4", even_ticks(36), key_every=12, b_frames=2)
+    whole = dict(frames(path))
+    position, size = packets(path)[13]  # decoded right after the second key frame
+    content = bytearray(path.read_bytes())
+    content[position : position + size] = bytes(size)
+    path.write_bytes(content)
+    with VideoReader(path) as reader:
+        left = dict(reader.frames())
+        assert 1 <= len(reader.missing) <= 12
+        assert reader.missing <= set(range(12, 24))
+        for number in np.random.default_rng(2).permutation(36).tolist():
+            picture = reader.read(number)
+            assert (picture is None) == (number not in left)
+            assert picture is None or np.array_equal(picture, left[number])
+    for number in (*range(12), *range(24, 36)):
+        assert np.array_equal(left[number], whole[number])
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.8, 0.95])
+def test_a_cut_mp4_is_salvaged_and_says_what_it_lost(tmp_path: Path, share: float) -> None:
+    path = write_video(tmp_path / "v.mp4", uneven_ticks(60))
+    places = packets(path)
+    content = path.read_bytes()
+    first = places[0][0]
+    length = first + int(share * (len(content) - first))
+    path.write_bytes(content[:length])
+    held = sum(position + size <= length for position, size in places)
+    with VideoReader(path) as reader:
+        count = reader.index.count
+        assert reader.index.dropped == {"cut off": 60 - count}
+        # Two frames in a row refer to later ones: decoding is that and one more ahead of showing.
+        assert held - 3 <= count <= held
+        assert reader.index.pts_ns.tolist() == relative_ns(uneven_ticks(60))[:count]
+        assert [read_bar_code(picture) for _, picture in reader.frames()] == list(range(count))
+        assert reader.missing == set()
+    assert READER.describe(path)["dropped: cut off"] == 60 - count
+
+
+@pytest.mark.parametrize("suffix", [".mkv", ".ts"])
+def test_other_containers_are_read_as_far_as_they_go(tmp_path: Path, suffix: str) -> None:
+    path = write_video(tmp_path / f"v{suffix}", even_ticks(60), b_frames=0)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) * 2 // 3])
+    numbers = [(number, read_bar_code(picture)) for number, picture in frames(path)]
+    assert 20 < len(numbers) < 50
+    assert numbers == [(k, k) for k in range(len(numbers))]
+
+
+def test_a_stated_size_beyond_reason_is_not_believed(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mov", even_ticks(3), codec="mjpeg")
+    width, height = SIZE
+    inside = height.to_bytes(2, "big") + width.to_bytes(2, "big")
+    content = path.read_bytes()
+    assert content.count(inside) >= 3
+    path.write_bytes(content.replace(inside, b"\xfe\x00\xfe\x00"))
+    with pytest.raises(DataError, match="none of its 3 frames can be decoded"):
+        index_video(path)
+
+
+def test_stamps_beyond_reason_are_refused(tmp_path: Path) -> None:
+    ticks = even_ticks(3, step=40, first=5 * 10**12)
+    with pytest.raises(DataError, match=r"stamps its frames up to 5e\+09 s"):
+        index_video(write_video(tmp_path / "v.mkv", ticks, tick_s=Fraction(1, 1000), b_frames=0))
+
+
+def test_pictures_that_change_their_size(tmp_path: Path) -> None:
+    small = write_video(tmp_path / "a.mov", even_ticks(3), codec="mjpeg", b_frames=0)
+    width, height = SIZE
+    inside = height.to_bytes(2, "big") + width.to_bytes(2, "big")
+    content = bytearray(small.read_bytes())
+    position, size = packets(small)[1]
+    place = content.index(inside, position, position + size)
+    content[place : place + 4] = (height // 2).to_bytes(2, "big") + (width // 2).to_bytes(2, "big")
+    small.write_bytes(content)
+    with pytest.raises(DataError, match="change from 320 x 96 to 160 x 48 px"):
+        list(frames(small))
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"", "is empty"),
+        (b"frame,t\n0,1\n", "no video container"),
+        (b"#EXTM3U\n#EXTINF:1,\nfile:///etc/passwd\n", "no video container"),
+        (b"\x00\x00\x00\x18ftypisom\x00\x00\x02\x00isomiso2", "no table of its frames"),
+        (b"\x00\x00\x00\x00ftyp" + bytes(40), "no table of its frames"),
+        (b"\x1a\x45\xdf\xa3" + bytes(100), "cannot be opened|no video stream"),
+        (b"RIFF\x10\x00\x00\x00AVI " + bytes(100), "cannot be opened|no video stream"),
+        ((b"G" + bytes(187)) * 5, "cannot be opened|no video stream"),
+    ],
+)
+def test_what_is_no_video_is_one_line(tmp_path: Path, content: bytes, problem: str) -> None:
+    path = tmp_path / "v.mp4"
+    path.write_bytes(content)
+    READER.recognises(path)
+    with pytest.raises(DataError, match=problem) as caught:
+        index_video(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_more_that_cannot_be_used(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mp4", even_ticks(10))
+    content = path.read_bytes()
+    cases = {
+        "cut in its table": (content[: content.index(b"moov") + 100], "no table of its frames"),
+        "cut after its table": (content[: packets(path)[0][0] + 5], "before its first frame ends"),
+        "of a foreign codec": (content.replace(b"avc1", b"zzzz").replace(b"avcC", b"zzzC"), "FFmpeg cannot"),
+    }
+    for name, (bad, problem) in cases.items():
+        path = tmp_path / f"{name}.mp4"
+        path.write_bytes(bad)
+        with pytest.raises(DataError, match=problem):
+            index_video(path)
+    with pytest.raises(DataError, match="holds no video stream"):
+        index_video(write_sound(tmp_path / "sound.mp4"))
+    with pytest.raises(DataError, match=r"holds no frames|no video stream"):
+        index_video(write_video(tmp_path / "none.mp4", []))
+    with pytest.raises(DataError, match="cannot be read"):
+        index_video(tmp_path / "absent.mp4")
+
+
+@settings(max_examples=30, deadline=None)
+@given(data=st.data())
+def test_no_damage_escapes_as_anything_but_a_data_error(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.mktemp("v")
+    content = bytearray(write_video(folder / "v.mp4", even_ticks(5)).read_bytes())
+    for _ in range(data.draw(st.integers(1, 8))):
+        content[data.draw(st.integers(8, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = folder / "damaged.mp4"
+    path.write_bytes(content[: data.draw(st.integers(8, len(content)))])
+    try:
+        numbers = [number for number, _ in frames(path)]
+    except DataError as error:
+        assert "\n" not in str(error)  # noqa: PT017 - either outcome is right
+    else:
+        assert numbers == sorted(set(numbers))
+
+
+# --- registry and real recordings -------------------------------------------------------------------------
+
+
+def test_only_this_format_recognises_a_video(tmp_path: Path) -> None:
+    for name in ("v.mp4", "v.mkv", "v.ts", "v.avi", "named_wrongly.txt.mp4"):
+        path = write_video(tmp_path / name, even_ticks(12))
+        assert [format_.name for format_ in FORMATS.all() if format_.recognises(path)] == ["video"]
+    assert isinstance(FORMATS.get("video"), VideoFormat)
+    (tmp_path / "empty.mp4").write_bytes(b"")
+    assert READER.recognises(tmp_path / "empty.mp4"), "so that the refusal can say that it is empty"
+    assert not READER.recognises(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "width"),
+    [("cam01", "h264", 1080), ("cam02", "vp9", 1080), ("cam03", "h264", 1088), ("cam04", "h264", 1088)],
+)
+def test_real_recordings(name: str, codec: str, width: int) -> None:
+    path = real_data(f"pose2sim_single/videos/{name}.mp4")
+    facts = READER.describe(path)
+    assert (facts["frames"], facts["rate_hz"], facts["rate"], facts["codec"]) == (
+        100,
+        60.0,
+        "constant",
+        codec,
+    )
+    assert facts["picture"] == f"{width} x 1920 px"
+
+
+@pytest.mark.parametrize("name", ["cam01", "cam02"])
+def test_real_recordings_decode_as_ffmpeg_does(name: str) -> None:
+    path = real_data(f"pose2sim_single/videos/{name}.mp4")
+    with av.open(str(path)) as container:
+        tick_s = container.streams.video[0].time_base
+        decoded = [frame for frame in container.decode(video=0) if frame.pts is not None]
+    stamps = [frame.pts for frame in decoded if frame.pts is not None]
+    with VideoReader(path) as reader:
+        assert reader.index.pts_ns.tolist() == relative_ns(stamps, Fraction(tick_s or 0))
+        for number in (99, 0, 55):
+            picture = reader.read(number)
+            assert picture is not None
+            assert np.array_equal(picture, decoded[number].to_ndarray(format="bgr24"))
+
+
+@pytest.mark.parametrize(
+    ("stated", "made_ns"),
+    [
+        ("2024-05-01T10:00:03.000000Z", 1_714_557_603_000_000_000),
+        ("1904-01-01T00:00:00.000000Z", None),  # the zero of MP4: its clock was never set
+        (None, None),
+    ],
+)
+def test_when_a_video_says_that_it_was_made(tmp_path: Path, stated: str | None, made_ns: int | None) -> None:
+    import av
+
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w", options={}) as container:
+        if stated is not None:
+            container.metadata["creation_time"] = stated
+        stream = container.add_stream("mpeg4", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 32, 32, "yuv420p"
+        for _ in range(3):
+            picture = av.VideoFrame.from_ndarray(np.zeros((32, 32, 3), np.uint8), format="rgb24")
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    assert created_ns(path) == made_ns
