@@ -2,8 +2,8 @@
 
 What cannot be saved is decoding every picture and running the networks as often as the stage does, back to
 back, on as many threads as the stage has workers; the mark is a stage that takes at most 1.15 times as long.
-Both take turns on the sample flight (2 cameras, 1280 x 720). Processor seconds stand beside those of the
-clock: those of a machine that does other work as well say little.
+Both take turns on the sample flight (2 cameras, 1280 x 720), and of each the fastest turn counts: what else
+the machine does only ever adds. Processor seconds stand beside those of the clock.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from pipelines.session.registries import find_detector
 from pipelines.session.stages import locked
 
 SAMPLE = Path(__file__).parent.parent / "sample_data" / "mound_walk"
+MOST_TIMES = 1.15
 _KEPT = 8  # pictures of each network: enough to see none twice in a row
 
 
@@ -54,9 +55,9 @@ class Runs:
 def main() -> None:
     """Print the table of docs/benchmarks.md."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, help="of the flight (default all 12)")
+    parser.add_argument("--seconds", type=float, default=4.0, help="of the flight (4)")
     parser.add_argument("--workers", type=int, nargs="*", default=[1, 2])
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="mocap-") as name:
         session = Path(name) / "flight.session"
@@ -64,18 +65,26 @@ def main() -> None:
         with counted() as runs:  # and everything is imported
             read = stage(session, 1, arguments.seconds)
         print(f"{sum(read.values())} pictures; networks run by the side of their input: {dict(runs.count)}\n")
-        print("| workers | decoding, s (CPU) | networks, s (CPU) | stage, s (CPU) | ratio | of CPU |")
-        print("| --- | --- | --- | --- | --- | --- |")
+        print("| workers | turn | decoding, s (CPU) | networks, s (CPU) | stage, s (CPU) |")
+        print("| --- | --- | --- | --- | --- |")
+        ratios = []
         for workers in arguments.workers:
-            for _ in range(arguments.repeats):
+            turns = np.empty((arguments.repeats, 3))
+            for turn in range(arguments.repeats):
                 rows = [
                     taken(decode, read, workers),
                     taken(infer, runs, workers),
                     taken(stage, session, workers, arguments.seconds),
                 ]
-                clock, cpu = (row[2] / (row[0] + row[1]) for row in zip(*rows, strict=True))
                 written = " | ".join(f"{wall_s:.2f} ({cpu_s:.2f})" for wall_s, cpu_s in rows)
-                print(f"| {workers} | {written} | {clock:.2f} | {cpu:.2f} |", flush=True)
+                print(f"| {workers} | {turn + 1} | {written} |", flush=True)
+                turns[turn] = [wall_s for wall_s, _ in rows]
+            decoding_s, networks_s, stage_s = turns.min(axis=0)
+            ratios.append(stage_s / (decoding_s + networks_s))
+            shown = f"{decoding_s:.2f} | {networks_s:.2f} | {stage_s:.2f}: {ratios[-1]:.2f} times"
+            print(f"| {workers} | fastest | {shown} |", flush=True)
+        verdict = "PASS" if max(ratios) <= MOST_TIMES else "FAIL"
+        print(f"\n{verdict}: the stage takes at most {max(ratios):.2f} times as long (aim {MOST_TIMES})")
 
 
 def stage(session: Path, workers: int, seconds: float | None) -> dict[str, int]:

@@ -8,10 +8,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.compilation import cached
 from pipelines.session.records import Float
 from pipelines.session.registries import Region
 
 Picture = NDArray[np.uint8]
+
+_STEPS = 32  # of a position between two pixels, as OpenCV 4 rounds it
 
 
 def sampled(picture: Picture, picture_from_crop: Float, size: tuple[int, int], *, beyond: str) -> Picture:
@@ -29,15 +32,40 @@ def sampled(picture: Picture, picture_from_crop: Float, size: tuple[int, int], *
     """
     import cv2
 
-    x, y = np.empty((2, size[1], size[0]), np.float32)
-    column, row = np.arange(size[0]), np.arange(size[1])[:, None]
-    for place, line in zip((x, y), picture_from_crop, strict=True):
-        # Added up in float64 and rounded once, without an array of float64 in between.
-        np.add(line[0] * column, line[1] * row + line[2], out=place, casting="same_kind")
-    whole, part = cv2.convertMaps(x, y, cv2.CV_16SC2)
+    whole, part = fixed_point_maps(np.ascontiguousarray(picture_from_crop, np.float64), *size)
     border = cv2.BORDER_REPLICATE if beyond == "edge" else cv2.BORDER_CONSTANT
     values = cv2.remap(picture, whole, part, cv2.INTER_LINEAR, borderMode=border)
     return np.asarray(cv2.cvtColor(values, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+@cached
+def fixed_point_maps(
+    picture_from_crop: Float, width: int, height: int
+) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+    """What `cv2.convertMaps` makes of the positions of a crop's pixels, at once: a third of its time.
+
+    Args:
+        picture_from_crop: [2, 3] from the crop's pixels to the picture's.
+        width: of the crop.
+        height: of the crop.
+
+    Returns:
+        Whole pixels [height, width, xy], and parts of them [height, width] as 32 * y + x in 1/32 px.
+    """
+    whole = np.empty((height, width, 2), np.int16)
+    part = np.empty((height, width), np.uint16)
+    steps = np.float32(_STEPS)
+    for row in range(height):
+        x_begin = picture_from_crop[0, 1] * row + picture_from_crop[0, 2]
+        y_begin = picture_from_crop[1, 1] * row + picture_from_crop[1, 2]
+        for column in range(width):
+            # OpenCV takes positions as float32.
+            x = np.int64(np.rint(np.float32(picture_from_crop[0, 0] * column + x_begin) * steps))
+            y = np.int64(np.rint(np.float32(picture_from_crop[1, 0] * column + y_begin) * steps))
+            whole[row, column, 0] = min(max(x >> 5, -32768), 32767)
+            whole[row, column, 1] = min(max(y >> 5, -32768), 32767)
+            part[row, column] = (y & 31) * _STEPS + (x & 31)
+    return whole, part
 
 
 def upright_crop(region: Region, size: tuple[int, int]) -> Float:
