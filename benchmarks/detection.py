@@ -55,9 +55,9 @@ class Runs:
 def main() -> None:
     """Print the table of docs/benchmarks.md."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=4.0, help="of the flight (4)")
+    parser.add_argument("--seconds", type=float, help="of the flight (default all 12)")
     parser.add_argument("--workers", type=int, nargs="*", default=[1, 2])
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="mocap-") as name:
         session = Path(name) / "flight.session"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.compilation import cached
+from pipelines.geometry.compilation import cached, helper
 from pipelines.session.records import Float
 from pipelines.session.registries import Region
 
@@ -38,6 +38,13 @@ def sampled(picture: Picture, picture_from_crop: Float, size: tuple[int, int], *
     return np.asarray(cv2.cvtColor(values, cv2.COLOR_BGR2RGB), np.uint8)
 
 
+@helper
+def _as_int16(whole: np.int64) -> np.int64:
+    if whole < -32768:
+        return np.int64(-32768)
+    return whole if whole < 32767 else np.int64(32767)
+
+
 @cached
 def fixed_point_maps(
     picture_from_crop: Float, width: int, height: int
@@ -62,8 +69,7 @@ def fixed_point_maps(
             # OpenCV takes positions as float32.
             x = np.int64(np.rint(np.float32(picture_from_crop[0, 0] * column + x_begin) * steps))
             y = np.int64(np.rint(np.float32(picture_from_crop[1, 0] * column + y_begin) * steps))
-            whole[row, column, 0] = min(max(x >> 5, -32768), 32767)
-            whole[row, column, 1] = min(max(y >> 5, -32768), 32767)
+            whole[row, column] = _as_int16(x >> 5), _as_int16(y >> 5)
             part[row, column] = (y & 31) * _STEPS + (x & 31)
     return whole, part
 
