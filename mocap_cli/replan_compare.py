@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 @click.option(
     "--arms",
     metavar="NAME,...",
-    help="What is compared: adaptive, fixed, covariance, greedy, and flown, what the log says"
-    " [default: adaptive, fixed, and flown where cameras moved].",
+    help="What is compared: adaptive, fixed, covariance, greedy; flown and planned, what the log says was"
+    " flown and commanded [default: adaptive, fixed, flown where cameras moved, planned where logged].",
 )
 @click.option(
     "--drones", type=click.IntRange(2, 8), help="How many [default: the session's cameras, at least 2]."
@@ -98,7 +98,7 @@ def replan_compare_command(
     """Replay formation planners against the logged actor and map, and compare them in numbers.
 
     The actor's own skeleton is filmed again from each planner's cameras, with simulated errors of detector
-    and poses. Every figure of a replay is simulated; `flown` is what the log says.
+    and poses. Every figure of a replay is simulated; `flown` and `planned` are what the log says.
     """
     from pipelines.replan import Settings, planner_settings, replan
 

@@ -35,6 +35,7 @@ from pipelines.session.description import (
     LogClockEntry,
     MapEntry,
     OriginEntry,
+    PlannedEntry,
     PosesEntry,
     TruthEntry,
 )
@@ -51,6 +52,7 @@ from pipelines.session.tables import (
     CAMERA_POSES,
     FRAMES,
     KEYPOINTS,
+    PLAN,
     POSES,
     POSES_WITH_COVARIANCE,
     TRUTH,
@@ -144,6 +146,7 @@ def ingest(
             truth = reader.store_truth(run.folder, entries)
             actor = reader.store_actor(run.folder, entries)
             map_ = reader.store_map(run.folder, entries)
+            plan = reader.store_plan(run.folder, entries)
             origin = reader.origin()
             warnings += reader.take_notes()
 
@@ -158,6 +161,7 @@ def ingest(
                 actor=actor,
                 map=map_,
                 truth=truth,
+                plan=plan,
                 sources=sources,
                 warnings=warnings,
             )
@@ -185,6 +189,7 @@ def _refuse_losses(flight_path: Path, description: Description) -> None:
     }
     parts["actor"] = description.actor.dropped if description.actor else {}
     parts["map"] = description.map.dropped if description.map else {}
+    parts |= {f"{name}: plan": sent.dropped for name, sent in (description.plan or {}).items()}
     lost = [f"{part}: {losses(dropped)}" for part, dropped in parts.items() if dropped]
     if lost:
         raise DataError(
@@ -196,12 +201,10 @@ def _refuse_losses(flight_path: Path, description: Description) -> None:
 
 def _refuse_unread_parts(flight: Flight, path: Path) -> None:
     """Refuse, in one line, what is valid in a manifest but has no reader in this version."""
-    unread = ["plan"] if flight.plan else []
-    unread += ["actors"] if flight.actors else []
-    if unread:
+    if flight.actors:
         raise NotYetReadError(
             path,
-            f"{', '.join(unread)}: this version has no reader for {'it' if len(unread) == 1 else 'them'} yet",
+            "actors: this version has no reader for it yet",
             "leave it out, or give the same data in a format of `mocap info --help`",
         )
 
@@ -266,6 +269,10 @@ def _hash_sources(
     if flight.map:
         take(flight.map.path)
         take_log(flight.map.log)
+    if flight.plan:
+        for name in flight.plan.topics:
+            take_log(flight.plan.log_of(name))
+        take(*flight.plan.files.values())
     if flight.truth:
         take(flight.truth.joints.path if flight.truth.joints else None, *flight.truth.poses.values())
     unique = list(dict.fromkeys(stated))
@@ -541,6 +548,25 @@ class _Reader:
             free=int((known < 0.5).sum()),
             dropped=dropped,
         )
+
+    def store_plan(self, folder: Path, entries: Mapping[str, CameraEntry]) -> dict[str, PlannedEntry] | None:
+        """Write where the on-board planner sent the drones."""
+        plan = self._flight.plan
+        if plan is None:
+            return None
+        import pandas as pd
+
+        tables, found = [], {}
+        for name in (camera for camera in self._flight.cameras if camera in plan.cameras):
+            stated = plan.files.get(name) or plan.log_of(name)
+            sent = self._sources.planned(name, plan)
+            self._refuse_no_overlap(stated, sent.t_ns, entries)
+            if sent.dropped:
+                self._notes.append(f"{name}: commands dropped: {losses(sent.dropped)}")
+            tables.append(pose_table(sent).assign(camera=name))
+            found[name] = PlannedEntry(source=stated, count=len(sent.t_ns), dropped=sent.dropped)
+        write_table(folder / "plan.parquet", pd.concat(tables, ignore_index=True), PLAN)
+        return found
 
     def _refuse_later_map(self, log: str, from_ns: int, entries: Mapping[str, CameraEntry]) -> None:
         last = max(entry.frames.last_t_ns for entry in entries.values())

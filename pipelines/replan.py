@@ -17,7 +17,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.formats.common.yaml_text import read_yaml
-from pipelines.planning.arm_flights import FLOWN, film_arm, flight_from, fly_arm, trajectories
+from pipelines.planning.arm_flights import (
+    FLOWN,
+    LOGGED,
+    PLANNED,
+    film_arm,
+    flight_from,
+    fly_arm,
+    logged_arm,
+    trajectories,
+)
 from pipelines.planning.config import PlannerConfig, planner_config
 from pipelines.planning.contest import Entrant, compare
 from pipelines.planning.loading import LoggedFlight, has_true_joints, load_flight
@@ -39,7 +48,7 @@ from pipelines.simulation.scenario import DetectorErrors
 if TYPE_CHECKING:
     import pandas as pd
 
-REPLAN_STAGE = Stage("replan", revision=1)
+REPLAN_STAGE = Stage("replan", revision=2)
 
 _HEIGHT_M = 1.75  # of the person, for how large a detector sees them
 _SKELETON = "reconstruct/skeleton.parquet"
@@ -49,7 +58,9 @@ _SKELETON = "reconstruct/skeleton.parquet"
 class Settings:
     """What decides the result, next to the session itself; None is what the session says."""
 
-    arms: tuple[str, ...] | None = None  # adaptive, fixed, and flown where cameras moved
+    arms: tuple[str, ...] | None = (
+        None  # adaptive, fixed, flown where cameras moved, planned where that is logged
+    )
     drones: int | None = None  # as many as there are cameras, 2 to 8
     yaw_deg: float | None = None  # where the first camera was
     mode: Mode = "closed-loop"
@@ -177,7 +188,7 @@ def _flat(settings: Settings) -> dict[str, object]:
 
 
 def _refuse_unknown(arms: tuple[str, ...]) -> None:
-    known = [*PLANNER_ARMS.names(), FLOWN]
+    known = [*PLANNER_ARMS.names(), *LOGGED]
     for arm in arms:
         if arm not in known:
             raise DataError(f"--arms {arm}", "no such planner arm", f"there are {', '.join(known)}")
@@ -185,10 +196,21 @@ def _refuse_unknown(arms: tuple[str, ...]) -> None:
 
 def _arms(folder: Path, asked: tuple[str, ...] | None, flight: LoggedFlight) -> list[str]:
     if asked is None:
-        return ["adaptive", "fixed", *([FLOWN] if flight.moves else [])]
+        return [
+            "adaptive",
+            "fixed",
+            *([FLOWN] if flight.moves else []),
+            *([PLANNED] if flight.planned else []),
+        ]
     if FLOWN in asked and not flight.moves:
         raise DataError(
             folder, "has no flight to compare with: its cameras stand still", f"leave {FLOWN} out"
+        )
+    if PLANNED in asked and not flight.planned:
+        raise DataError(
+            folder,
+            "holds no commands of a planner on board",
+            f"name them under `plan:`, or leave {PLANNED} out",
         )
     return list(dict.fromkeys(asked))
 
@@ -225,7 +247,7 @@ def _detect(
 
 def _fly(scene: Scene, arm: str, folder: Path) -> None:
     """Fly and film one arm; all that the comparison needs of it goes into the folder."""
-    flown = fly_arm(scene, None if arm == FLOWN else PLANNER_ARMS.get(arm))
+    flown = logged_arm(scene, arm) if arm in LOGGED else fly_arm(scene, PLANNER_ARMS.get(arm))
     joints = scene.flight.skeleton.joints if scene.flight.skeleton else ()
     measured = film_arm(scene, flown, partial(_detect, joints=joints))
     write_table(folder / "trajectories.parquet", trajectories(scene, flown), REPLAN)

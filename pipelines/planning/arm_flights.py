@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel
 from pipelines.planning.arms import Arm
-from pipelines.planning.formation import TILT, slot_of
+from pipelines.planning.forecast import ActorFilter
+from pipelines.planning.formation import TILT, YAW, aim, slot_of
+from pipelines.planning.loading import planned_positions
 from pipelines.planning.measuring import Detect, Filming, Measured, film
 from pipelines.planning.replay import replay
 from pipelines.planning.scene import Scene
@@ -27,6 +29,9 @@ Bool = NDArray[np.bool_]
 
 FLOWN = "flown"
 """The arm that is no planner: what the log says was flown."""
+PLANNED = "planned"
+"""Nor this: where the log says that the planner on board sent the drones."""
+LOGGED = (FLOWN, PLANNED)
 
 _POSITION = ["x", "y", "z"]
 _QUATERNION = ["qx", "qy", "qz", "qw"]
@@ -42,17 +47,45 @@ class ArmFlight:
     quaternion_xyzw: Float  # [N, T, 4] world_from_camera
     slots: Float  # [N, T, 3] commanded yaw (rad, continuous), tilt (rad), range (m); NaN for what was flown
     known: Bool  # [N, T] False where a log has a gap and the position goes straight on
-    separation: dict[str, int]  # local plans by what kept them apart; empty for what was flown
+    separation: dict[str, int]  # local plans by what kept them apart; empty for what the log says
     central_s: Sequence[float] = ()  # measured planning times, different from run to run
     local_s: Sequence[float] = ()
 
 
-def fly_arm(scene: Scene, arm: Arm | None) -> ArmFlight:
-    """Fly a scene again; None is what was flown."""
-    if arm is None:
+def logged_arm(scene: Scene, name: str) -> ArmFlight:
+    """What a log says of one of `LOGGED`.
+
+    The drones of `planned` are exactly where they were sent, each with its camera, which looks where a
+    replay's would: at the actor as the Kalman filter estimates it from the log.
+    """
+    if name == FLOWN:
         position, quaternion, known = scene.flown
         names = tuple(camera.name for camera in scene.flight.cameras)
         return ArmFlight(names, position, quaternion, np.full_like(position, np.nan), known, {})
+    position, known = planned_positions(scene.flight, scene.t_ns)
+    believed = _estimates(scene)
+    slots = slot_of(position - believed)
+    slots[..., YAW] = np.unwrap(slots[..., YAW], axis=1)
+    return ArmFlight(tuple(scene.flight.planned), position, aim(position, believed), slots, known, {})
+
+
+def _estimates(scene: Scene) -> Float:
+    """[T, 3] where planners believe the actor to be, who see no later measurement."""
+    flight, config = scene.flight, scene.config
+    believed = ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m)
+    log_s = (flight.actor_t_ns - flight.actor_t_ns[0]) / 1e9
+    until = np.searchsorted(flight.actor_t_ns, scene.t_ns, side="right")
+    found, taken = np.empty((len(scene.t_ns), 3)), 0
+    for k, t_s in enumerate((scene.t_ns - flight.actor_t_ns[0]) / 1e9):
+        for row in range(taken, until[k]):
+            believed.measure(log_s[row], flight.actor[row])
+        taken = int(until[k])
+        found[k] = believed.forecast(np.array([t_s]))[0]
+    return found
+
+
+def fly_arm(scene: Scene, arm: Arm) -> ArmFlight:
+    """Fly a scene again."""
     flight, rules = scene.flight, scene.rules
     done = replay(
         arm,
@@ -106,7 +139,8 @@ def film_arm(scene: Scene, flown: ArmFlight, detect: Detect) -> Measured | None:
 def _equipment(scene: Scene, flown: ArmFlight) -> tuple[list[Intrinsics], list[tuple[NoiseModel, ...]]]:
     """Lens and pose noise of each camera."""
     cameras = scene.flight.cameras
-    carried = [cameras[k % len(cameras)] for k in range(len(flown.position))]
+    own = {camera.name: camera for camera in cameras}
+    carried = [own.get(name, cameras[k % len(cameras)]) for k, name in enumerate(flown.names)]
     return [camera.intrinsics for camera in carried], [camera.noise for camera in carried]
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.planning.arm_flights import FLOWN, ArmFlight
+from pipelines.planning.arm_flights import LOGGED, ArmFlight
 from pipelines.planning.comparison import (
     LEVEL,
     STRETCH_S,
@@ -91,7 +91,7 @@ def _scores(scene: Scene, name: str, entrant: Entrant, shared: Bool | None) -> d
     return {
         **found,
         "mpjpe_mm": None if common is None else common.mean,
-        "simulated": name != FLOWN,
+        "simulated": name not in LOGGED,
         "drones": len(flown.position),
         "local_plans": flown.separation or None,
         "reconstruction_error": {

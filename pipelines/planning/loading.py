@@ -17,7 +17,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Int64, JointMotion, Trajectory
 from pipelines.session.registries import noise_models, parsed_noise_models
 from pipelines.session.stages import StageRecord
-from pipelines.session.tables import ACTOR, CAMERA_POSES, POSES, SKELETON, TRUTH, read_table
+from pipelines.session.tables import ACTOR, CAMERA_POSES, PLAN, POSES, SKELETON, TRUTH, read_table
 from pipelines.session.tabular import motion_from, trajectory_from
 
 Bool = NDArray[np.bool_]
@@ -26,6 +26,7 @@ Source = Literal["log", "reconstruction", "truth"]
 _LONGEST_STEP_NS = 200_000_000  # joints are interpolated across this much at least: 10 Hz and a missed frame
 _STEPS = 1.5  # or this many median steps
 _GAP_NS = 1_000_000_000  # an actor who is not measured for longer is spoken of
+_COMMAND_HOLDS_NS = 2_000_000_000  # planners send something new several times a second
 _SHORTEST_S = 1.0
 _HIPS = ("left_hip", "right_hip")
 _SANE_VARIANCE = (100.0, np.pi**2)  # m^2, rad^2: what ROS means by 1e6 is "unknown"
@@ -55,6 +56,7 @@ class LoggedFlight:
     cameras: tuple[SessionCamera, ...]
     poses_source: Source
     noise_source: str  # who states the noise of the poses
+    planned: dict[str, tuple[Int64, Float]]  # stamps [P] and [P, 3] m, world: where cameras were sent
     warnings: tuple[str, ...]
 
     @property
@@ -114,6 +116,7 @@ def load_flight(
         cameras=cameras,
         poses_source=poses_source,
         noise_source=noise_source,
+        planned=_planned(folder, description),
         warnings=tuple(warnings),
     )
 
@@ -162,6 +165,21 @@ def flown_poses(flight: LoggedFlight, description: Description, t_ns: Int64) -> 
             max_extrapolation_ns=int(np.ptp(t_ns)),
         )
     return position, quaternion, known
+
+
+def planned_positions(flight: LoggedFlight, t_ns: Int64) -> tuple[Float, Bool]:
+    """Where the on-board planner sent its cameras [K, T, 3], straight between commands, and whether it did.
+
+    [K, T]: it did not before the first command, after the last one, or between two that lie far apart.
+    """
+    position, known = np.empty((len(flight.planned), len(t_ns), 3)), []
+    for i, (stamps, sent) in enumerate(flight.planned.values()):
+        after = np.searchsorted(stamps, t_ns, side="left").clip(1, max(len(stamps) - 1, 1))
+        apart = np.diff(stamps, append=stamps[-1])[after - 1]
+        known.append((t_ns >= stamps[0]) & (t_ns <= stamps[-1]) & (apart <= _COMMAND_HOLDS_NS))
+        for axis in range(3):
+            position[i, :, axis] = np.interp(t_ns - stamps[0], stamps - stamps[0], sent[:, axis])
+    return position, np.array(known, dtype=np.bool_).reshape(position.shape[:2])
 
 
 # --- the person ----------------------------------------------------------------------------------------
@@ -291,6 +309,18 @@ def _true_poses(folder: Path, description: Description) -> dict[str, Trajectory]
         return {}
     table = read_table(folder / "truth_poses.parquet", CAMERA_POSES)
     return {name: trajectory_from(table[table["camera"] == name]) for name in sorted(moving)}
+
+
+def _planned(folder: Path, description: Description) -> dict[str, tuple[Int64, Float]]:
+    """Where the on-board planner sent each camera of the session."""
+    if not description.plan:
+        return {}
+    table = read_table(folder / "plan.parquet", PLAN)
+    found = {}
+    for name in (camera for camera in description.cameras if camera in description.plan):
+        own = table[table["camera"] == name]
+        found[name] = own["t_ns"].to_numpy(np.int64), own[["x", "y", "z"]].to_numpy(np.float64)
+    return found
 
 
 def _noise(

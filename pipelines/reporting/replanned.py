@@ -215,7 +215,7 @@ def _setting(metrics: Mapping[str, object]) -> str:
     said = [
         f"{plural(drones or 0, 'drone')} over {fixed(duration_s)} s, {text(metrics, 'mode') or 'replayed'}.",
         f"Simulated: {listing(name for name in names if name not in flown)}"
-        + (f"; {listing(flown)} is what the log says." if flown else "."),
+        + (f"; {listing(flown)} {'is' if len(flown) == 1 else 'are'} what the log says." if flown else "."),
         "No skeleton was known, so there is no reconstruction error."
         if not skeleton
         else f"Every reconstruction error is simulated: {plural(trials or 0, 'draw')} of noise, filming "

@@ -160,6 +160,14 @@ class MapEntry(Entry):
     dropped: dict[str, int]
 
 
+class PlannedEntry(Entry):
+    """Where one drone was sent, as logged."""
+
+    source: str
+    count: int
+    dropped: dict[str, int]
+
+
 class TruthEntry(Entry):
     """What is known to be true."""
 
@@ -190,6 +198,7 @@ class Description(Entry):
     actor: ActorEntry | None = None
     map: MapEntry | None = None
     truth: TruthEntry | None
+    plan: dict[str, PlannedEntry] | None = None  # by camera
     sources: dict[str, str]  # path as the manifest states it -> sha256
     warnings: list[str]
 

@@ -370,11 +370,41 @@ class Truth(Part):
     poses: dict[str, str] = {}
 
 
-class Plan(Part):
-    """What the on-board planner commanded."""
+class PlannedTopic(Part):
+    """A topic of commanded positions, and the log that holds it where that is not the plan's."""
 
-    log: str
-    topics: dict[str, str] = {}
+    shorthand = "topic"
+    topic: str
+    log: str | None = None
+
+
+class Plan(Part):
+    """Where the on-board planner sent the drones, by camera: topics of a log, or files of poses."""
+
+    log: str | None = None
+    topics: dict[str, PlannedTopic] = {}
+    files: dict[str, str] = {}
+
+    @model_validator(mode="after")
+    def _complete(self) -> Plan:
+        if not self.topics and not self.files:
+            raise ValueError("needs `topics` or `files` by camera: {drone1: /drone1/setpoint}")
+        twice = [name for name in self.topics if name in self.files]
+        if twice:
+            raise ValueError(f"{twice[0]} has a topic and a file: leave one of them out")
+        without = [name for name, stated in self.topics.items() if not (stated.log or self.log)]
+        if without:
+            raise ValueError(f"the topic of {without[0]} needs a `log`")
+        return self
+
+    @property
+    def cameras(self) -> list[str]:
+        """Of whom it says something."""
+        return [*self.topics, *self.files]
+
+    def log_of(self, camera: str) -> str:
+        """The log of a camera's topic."""
+        return self.topics[camera].log or self.log or ""
 
 
 class Flight(Part):
@@ -403,6 +433,7 @@ class Flight(Part):
             raise ValueError("two cameras differ in case only: their folders would be one on some systems")
         named = [self.clock_reference] if self.clock_reference else []
         named += list(self.truth.poses) if self.truth else []
+        named += self.plan.cameras if self.plan else []
         for name in named:
             if name not in self.cameras:
                 near = difflib.get_close_matches(name, self.cameras, n=1)

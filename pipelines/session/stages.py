@@ -46,7 +46,15 @@ SCHEMA = 1
 """Version of session.json and stage.json. Older ones are read, newer ones refused."""
 
 _AT_ROOT = {
-    "ingest": ("cameras", "actor.parquet", "map", "truth.parquet", "truth_poses.parquet", "session.json")
+    "ingest": (
+        "cameras",
+        "actor.parquet",
+        "map",
+        "plan.parquet",
+        "truth.parquet",
+        "truth_poses.parquet",
+        "session.json",
+    )
 }
 """What a stage publishes beside its own folder instead of inside it; these names are its own."""
 

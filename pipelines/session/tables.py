@@ -59,6 +59,17 @@ TRUTH = pa.schema(
 CAMERA_POSES = pa.schema([("t_ns", pa.int64()), ("camera", pa.string()), *_POSE])
 """truth_poses.parquet: the true pose of every camera."""
 
+PLAN = pa.schema(
+    [
+        ("t_ns", pa.int64()),
+        ("camera", pa.string()),
+        ("x", pa.float64()),
+        ("y", pa.float64()),
+        ("z", pa.float64()),
+    ]
+)
+"""plan.parquet: where the on-board planner sent every drone."""
+
 SKELETON = pa.schema(
     [
         ("t_ns", pa.int64()),

@@ -26,20 +26,11 @@ def test_unknown_key_names_the_nearest(flight: SyntheticFlight) -> None:
     assert "wrold: unknown key, did you mean 'world'?" in line
 
 
-@pytest.mark.parametrize(
-    ("change", "part"),
-    [
-        ({"plan": {"log": "d1"}}, "plan"),
-        ({"actors": {"anna": {"log": "d1", "topic": "/actor"}}}, "actors"),
-    ],
-)
-def test_parts_whose_readers_come_later_are_refused(
-    flight: SyntheticFlight, change: dict[str, object], part: str
-) -> None:
-    flight.settings.update(change)
+def test_parts_whose_readers_come_later_are_refused(flight: SyntheticFlight) -> None:
+    flight.settings["actors"] = {"anna": {"log": "d1", "topic": "/actor"}}
     flight.save()
     line = refused("ingest", flight.manifest)
-    assert f"{part}: this version has no reader for it yet" in line
+    assert "actors: this version has no reader for it yet" in line
 
 
 @pytest.mark.parametrize("change", [{"map": "site.bt"}, {"truth": "true.csv"}])

@@ -16,6 +16,7 @@ from typing import Literal, Self
 import numpy as np
 
 from pipelines.formats.flights.pictures import later_times, picture_stamps
+from pipelines.formats.logs.commands import COMMAND_TYPES, read_commands
 from pipelines.formats.logs.fixed_layouts import PoseArrays, read_poses
 from pipelines.formats.logs.frames import frames_of_poses, place_of_frame, transforms_in
 from pipelines.formats.logs.map_topics import (
@@ -40,6 +41,7 @@ from pipelines.formats.logs.trajectories import (
     trajectory_of_arrays,
 )
 from pipelines.formats.logs.triggers import TRIGGER_TYPES, read_triggers
+from pipelines.geometry.pose_covariance import carried_covariance
 from pipelines.geometry.poses import compose, matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight, PoseSource
@@ -175,6 +177,18 @@ class FlightLogs:
             track = read_positions(recording, source, topic, self.settings(log).stamps)
             started_ns = _start_ns(recording)
         return replace(track, t_ns=self._world_times(log, track.t_ns, started_ns))
+
+    def commands(self, log: str, topic: str) -> Trajectory | None:
+        """Where setpoints or plans sent a drone, at world times; None where they are poses, or nothing."""
+        with self._open(log) as (recording, source):
+            types = {known.name: known.type for known in recording.topics}
+            if types.get(topic) not in COMMAND_TYPES:
+                return None
+            found = read_commands(recording, source, topic, self.settings(log).stamps)
+            lost = Counter(recording.dropped)
+            started_ns = _start_ns(recording)
+        t_ns = self._world_times(log, found.t_ns, started_ns)
+        return replace(found, t_ns=t_ns, dropped=dict(Counter(found.dropped) + lost))
 
     def attitudes(
         self,
@@ -471,8 +485,8 @@ def in_world(trajectory: Trajectory, log: LogSource) -> Trajectory:
         (np.array(place.translation), turn), (trajectory.position, trajectory.quaternion_xyzw)
     )
     covariance = trajectory.covariance
-    if covariance is not None:
+    if covariance is not None and place.yaw_deg:
         rotated = np.eye(6)
         rotated[:3, :3] = matrix_from_quaternion(turn)  # the rotation part stays in the body
-        covariance = rotated @ covariance @ rotated.T
+        covariance = carried_covariance(rotated, covariance)
     return replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)

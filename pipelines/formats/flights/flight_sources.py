@@ -31,7 +31,7 @@ from pipelines.geometry.mounting import (
     compose_mount,
     flu_body_from_frd,
 )
-from pipelines.geometry.pose_covariance import mounted_covariance
+from pipelines.geometry.pose_covariance import carried_covariance, mounted_covariance
 from pipelines.geometry.poses import enu_from_ned
 from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
@@ -44,6 +44,7 @@ from pipelines.session.manifest import (
     KeypointSource,
     Map,
     Mount,
+    Plan,
     TruthJoints,
 )
 from pipelines.session.records import (
@@ -432,7 +433,8 @@ class FlightSources:
             )
         covariance = body.covariance
         if covariance is not None:
-            covariance = mounted_covariance(covariance, body.quaternion_xyzw, lever_arm, quaternion)[known]
+            covariance = mounted_covariance(covariance, body.quaternion_xyzw, lever_arm, quaternion)
+            covariance = covariance if known.all() else covariance[known]
         return Trajectory(
             t_ns=body.t_ns[known],
             position=position[known],
@@ -467,6 +469,19 @@ class FlightSources:
         settings = self._logs.settings(log)
         trajectory = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
         return in_world(_in_enu(trajectory, self._axes(settings.axes)), settings)
+
+    def planned(self, camera: str, plan: Plan) -> Trajectory:
+        """Where a drone was sent; its rotation means nothing."""
+        if camera in plan.files:
+            path = self._base / plan.files[camera]
+            filed = recognise(path, TrajectoryFormat, "file of commanded poses").read_trajectory(path)
+            return _in_enu(filed, self._flight.world.frame)
+        log, topic = plan.log_of(camera), plan.topics[camera].topic
+        settings = self._logs.settings(log)
+        sent = self._logs.commands(log, topic)
+        if sent is None:
+            sent = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
+        return in_world(_in_enu(sent, self._axes(settings.axes)), settings)
 
     def map(self, stated: str, resolution_m: float | None) -> Occupancy:
         """What stands around, from a file."""
@@ -582,7 +597,7 @@ def _in_enu(trajectory: Trajectory, axes: Axes) -> Trajectory:
     if covariance is not None:
         swap = np.eye(6)
         swap[:3, :3] = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
-        covariance = swap @ covariance @ swap.T
+        covariance = carried_covariance(swap, covariance)
     return replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)
 
 
