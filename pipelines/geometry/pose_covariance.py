@@ -7,12 +7,16 @@ thing's own: R_true = R exp(rotation). NaN in gives NaN out; all zero (unknown) 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.poses import matrix_from_quaternion, rotate
 
 Float = NDArray[np.float64]
+
+_BLOCK = 4096  # poses at a time: what lies between stays small, however long the log
 
 
 def pose_covariance_in_body(covariance: Float, world_from_body_xyzw: Float) -> Float:
@@ -28,8 +32,12 @@ def pose_covariance_in_body(covariance: Float, world_from_body_xyzw: Float) -> F
     Returns:
         [..., 6, 6] position in the world, then rotation vector in the body.
     """
-    jacobian = _block_diagonal(np.swapaxes(matrix_from_quaternion(world_from_body_xyzw), -1, -2))
-    return _propagated(jacobian, covariance)
+
+    def turned(covariance: Float, world_from_body_xyzw: Float) -> Float:
+        jacobian = _block_diagonal(np.swapaxes(matrix_from_quaternion(world_from_body_xyzw), -1, -2))
+        return _propagated(jacobian, covariance)
+
+    return _by_blocks(turned, covariance, world_from_body_xyzw)
 
 
 def mounted_covariance(
@@ -50,11 +58,32 @@ def mounted_covariance(
     Returns:
         [..., 6, 6] the camera's position in world, rotation vector in the camera.
     """
-    world_from_body = matrix_from_quaternion(world_from_body_xyzw)
-    camera_from_world = np.swapaxes(matrix_from_quaternion(world_from_camera_xyzw), -1, -2)
-    jacobian = _block_diagonal(camera_from_world @ world_from_body)
-    jacobian[..., :3, 3:] = -_cross_matrix(rotate(world_from_body_xyzw, lever_arm)) @ world_from_body
-    return _propagated(jacobian, covariance)
+
+    def mounted(covariance: Float, world_from_body_xyzw: Float, world_from_camera_xyzw: Float) -> Float:
+        world_from_body = matrix_from_quaternion(world_from_body_xyzw)
+        camera_from_world = np.swapaxes(matrix_from_quaternion(world_from_camera_xyzw), -1, -2)
+        jacobian = _block_diagonal(camera_from_world @ world_from_body)
+        jacobian[..., :3, 3:] = -_cross_matrix(rotate(world_from_body_xyzw, lever_arm)) @ world_from_body
+        return _propagated(jacobian, covariance)
+
+    return _by_blocks(mounted, covariance, world_from_body_xyzw, world_from_camera_xyzw)
+
+
+def carried_covariance(jacobian: Float, covariance: Float) -> Float:
+    """Covariances [..., 6, 6] under one linear map [6, 6] for all of them."""
+    return _by_blocks(lambda block: _propagated(jacobian, block), covariance)
+
+
+def _by_blocks(carry: Callable[..., Float], covariance: Float, *quaternions: Float) -> Float:
+    """`carry` of a covariance and quaternions, of so many poses at a time."""
+    if covariance.ndim != 3 or len(covariance) <= _BLOCK:
+        return carry(covariance, *quaternions)
+    of_each = [np.broadcast_to(quaternion, (len(covariance), 4)) for quaternion in quaternions]
+    carried = np.zeros(covariance.shape)
+    for start in range(0, len(covariance), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        carried[block] = carry(covariance[block], *(quaternion[block] for quaternion in of_each))
+    return carried
 
 
 def _block_diagonal(rotation: Float) -> Float:

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipelines.geometry.pose_covariance import Float, mounted_covariance, pose_covariance_in_body
+from pipelines.geometry.pose_covariance import (
+    Float,
+    carried_covariance,
+    mounted_covariance,
+    pose_covariance_in_body,
+)
 
 SAMPLES = 40_000
 # A sampled covariance has a standard error of at most sqrt(2 / N) sqrt(S_ii S_jj) = 0.7 %: five of them. What
@@ -64,3 +69,18 @@ def test_many_at_once_and_unknown_stays_zero() -> None:
     body = pose_covariance_in_body(covariance, quaternions)
     np.testing.assert_allclose(body[0], pose_covariance_in_body(covariance[0], quaternions[0]), atol=1e-18)
     assert not mounted_covariance(body, quaternions, LEVER_ARM, quaternions)[1].any()
+
+
+def test_a_long_log_gives_the_same_as_its_parts() -> None:
+    """9000 poses are carried a few thousand at a time; each as if it were alone, to the last bit."""
+    generator = np.random.default_rng(5)
+    covariance = generator.normal(size=(9000, 6, 6))
+    body, camera = (Rotation.random(9000, rng=generator).as_quat() for _ in range(2))
+    some = [0, 4095, 4096, 8191, 8192, 8999]
+    in_body = pose_covariance_in_body(covariance, body)
+    mounted = mounted_covariance(covariance, body, LEVER_ARM, camera)
+    moved = carried_covariance(logged_covariance(), covariance)
+    np.testing.assert_array_equal(in_body[some], pose_covariance_in_body(covariance[some], body[some]))
+    alone = mounted_covariance(covariance[some], body[some], LEVER_ARM, camera[some])
+    np.testing.assert_array_equal(mounted[some], alone)
+    np.testing.assert_array_equal(moved[some], carried_covariance(logged_covariance(), covariance[some]))

@@ -8,6 +8,7 @@ nothing is said here and the messages are decoded one by one.
 from __future__ import annotations
 
 import struct
+from array import array
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -81,42 +82,49 @@ def read_poses(schema: Schema, messages: Iterable[Messages]) -> PoseArrays | Non
     fields = _KNOWN.get(schema.type)
     if fields is None or schema.encoding not in {"cdr", "ros1"} or not is_standard(schema):
         return None
-    stamps: list[Int64] = []
-    parts: list[NDArray[np.uint8]] = []
+    # These grow in place: joining parts would need the memory of a long log twice.
+    header, received, numbers = array("q"), array("q"), array("d")
     layout: _Layout | None = None
     try:
         for receive_ns, raw in messages:
             layout = layout or _layout(schema.encoding, fields, raw[0].tobytes())
-            stamps.append(receive_ns)
-            parts.append(_numbers(layout, raw))
+            _refuse_another_layout(layout, raw)
+            received.frombytes(receive_ns.tobytes())
+            header.frombytes(_stamps(raw[:, layout.stamp]).tobytes())
+            doubles = np.ascontiguousarray(raw[:, layout.doubles]).view("<f8")
+            numbers.frombytes(doubles.astype(np.float64, copy=False).tobytes())
     except (_OtherLayoutError, UnlikeError):
         return None
     if layout is None:
         return None
-    receive_ns = np.concatenate(stamps)
+    header_ns, receive_ns = np.frombuffer(header, np.int64), np.frombuffer(received, np.int64)
     if np.abs(receive_ns).max() >= _LATEST_NS:
         return None
-    order = np.argsort(receive_ns, kind="stable")
-    numbers = np.concatenate(parts)[order]
-    seconds = numbers[:, :4].copy().view("<i4")[:, 0].astype(np.int64)
-    nanoseconds = numbers[:, 4:8].copy().view("<u4")[:, 0]
-    doubles: Float = numbers[:, 8:].copy().view("<f8").astype(np.float64, copy=False)
+    values: Float = np.frombuffer(numbers, np.float64).reshape(len(header_ns), -1)
+    if (np.diff(receive_ns) < 0).any():
+        order = np.argsort(receive_ns, kind="stable")
+        header_ns, receive_ns, values = header_ns[order], receive_ns[order], values[order]
     return PoseArrays(
         frames=layout.names,
-        header_ns=seconds * 1_000_000_000 + nanoseconds,
-        receive_ns=receive_ns[order],
-        pose=doubles[:, :7],
-        covariance=doubles[:, 7:] if fields.has_covariance else None,
+        header_ns=header_ns,
+        receive_ns=receive_ns,
+        pose=values[:, :7],
+        covariance=values[:, 7:] if fields.has_covariance else None,
     )
 
 
-def _numbers(layout: _Layout, raw: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The stamp and the doubles that are used; all else must be as in the first message."""
+def _refuse_another_layout(layout: _Layout, raw: NDArray[np.uint8]) -> None:
+    """All but the numbers that are used must be as in the first message."""
     if raw.shape[1] != layout.length or (raw[:, layout.text] != layout.text_bytes).any():
         raise _OtherLayoutError
     if layout.is_cdr and (raw[:, :4] != _CDR_LITTLE_ENDIAN).any():
         raise _OtherLayoutError
-    return np.concatenate([raw[:, layout.stamp], raw[:, layout.doubles]], axis=1)
+
+
+def _stamps(raw: NDArray[np.uint8]) -> Int64:
+    """Stamps of headers [n] from their bytes [n, 8]: seconds, signed, then nanoseconds."""
+    words = np.ascontiguousarray(raw).view("<u4")
+    return words[:, 0].view("<i4").astype(np.int64) * 1_000_000_000 + words[:, 1]
 
 
 def _layout(encoding: str, fields: _Fields, first: bytes) -> _Layout:

@@ -91,22 +91,13 @@ class SampleRows:
         if pose.covariance is not None:
             self._covariances.frombytes(pose.covariance.tobytes())
 
-    def add_arrays(self, poses: PoseArrays) -> None:
-        """Many poses at once."""
-        self._header_ns.frombytes(poses.header_ns.tobytes())
-        self._receive_ns.frombytes(poses.receive_ns.tobytes())
-        self._values.frombytes(poses.pose.tobytes())
-        if poses.covariance is not None:
-            self._covariances.frombytes(poses.covariance.tobytes())
-
     def values(self, width: int) -> Float:
         """[N, width]."""
         return np.frombuffer(self._values, dtype=np.float64).reshape(-1, width)
 
     def times(self, stamps: Stamps) -> Int64:
         """[N] the stamps asked for; where the header has none, those of receipt."""
-        header, receive = self._stamps()
-        return receive if stamps == "receive" else np.where(header == 0, receive, header)
+        return _times(*self._stamps(), stamps)
 
     def trajectory(self, source: Source, stamps: Stamps) -> Trajectory:
         """The poses, cleaned.
@@ -114,39 +105,12 @@ class SampleRows:
         Raises:
             DataError: none is usable.
         """
-        position, quaternion = np.split(self.values(7), [3], axis=1)
-        covariance = np.frombuffer(self._covariances, dtype=np.float64).reshape(-1, 6, 6)
-        poses = clean_poses(
-            source,
-            self.times(stamps),
-            np.ones(len(self), dtype=np.bool_),
-            position,
-            quaternion,
-            covariance if covariance.any() else None,  # zero throughout says nothing
-        )
-        if poses.covariance is None:
-            return poses
-        turned = pose_covariance_in_body(poses.covariance, poses.quaternion_xyzw)
-        return replace(poses, covariance=turned)
+        covariance = np.frombuffer(self._covariances, dtype=np.float64).reshape(-1, 36)
+        return _cleaned(source, self.times(stamps), self.values(7), covariance)
 
     def check(self, may_disagree_s: float, may_jump_s: float) -> StampCheck:
         """Compare the stamps of header and receipt."""
-        header, receive = self._stamps()
-        (stamped,) = np.nonzero(header)
-        lead_ns = (header - receive)[stamped]
-        drift = fit_clock(receive[stamped], header[stamped]) if lead_ns.any() else None
-        jump_ns = np.diff(lead_ns)
-        return StampCheck(
-            count=len(header),
-            without_header=len(header) - len(stamped),
-            disagreeing=int(np.count_nonzero(np.abs(lead_ns) > may_disagree_s * 1e9)),
-            largest_disagreement_s=float(lead_ns[np.argmax(np.abs(lead_ns))]) / 1e9 if len(stamped) else 0.0,
-            jumps=tuple(
-                ClockJump(int(stamped[k + 1]), int(header[stamped[k + 1]]), float(jump_ns[k]) / 1e9)
-                for k in np.flatnonzero(np.abs(jump_ns) > may_jump_s * 1e9)
-            ),
-            drift=drift,
-        )
+        return _compared(*self._stamps(), may_disagree_s, may_jump_s)
 
     def _stamps(self) -> tuple[Int64, Int64]:
         return np.frombuffer(self._header_ns, dtype=np.int64), np.frombuffer(self._receive_ns, dtype=np.int64)
@@ -202,10 +166,10 @@ def trajectory_of_arrays(
     may_jump_s: float = 1.0,
 ) -> Gathered:
     """The same of poses that were read at once; arguments as those of `trajectory_of`."""
-    rows = SampleRows()
-    rows.add_arrays(poses)
-    trajectory = rows.trajectory(source, stamps)
-    return Gathered(trajectory, rows.check(may_disagree_s, may_jump_s), poses.frames)
+    t_ns = _times(poses.header_ns, poses.receive_ns, stamps)
+    trajectory = _cleaned(source, t_ns, poses.pose, poses.covariance)
+    check = _compared(poses.header_ns, poses.receive_ns, may_disagree_s, may_jump_s)
+    return Gathered(trajectory, check, poses.frames)
 
 
 def attitudes_of(
@@ -331,6 +295,46 @@ def chained(
         found.t_ns[known], found.position[known], found.quaternion_xyzw[known], dropped=dropped
     )
     return Gathered(trajectory, _together(checks), (parent, child))
+
+
+def _times(header_ns: Int64, receive_ns: Int64, stamps: Stamps) -> Int64:
+    """The stamps asked for [N]; where the header has none, those of receipt."""
+    return receive_ns if stamps == "receive" else np.where(header_ns == 0, receive_ns, header_ns)
+
+
+def _cleaned(source: Source, t_ns: Int64, pose: Float, covariance: Float | None) -> Trajectory:
+    """Poses [N, 7] and covariances [N, 36] as logged, cleaned, with rotation errors about the body's axes."""
+    if covariance is not None and not covariance.any():
+        covariance = None  # zero throughout says nothing
+    poses = clean_poses(
+        source,
+        t_ns,
+        np.ones(len(t_ns), dtype=np.bool_),
+        pose[:, :3],
+        pose[:, 3:],
+        None if covariance is None else covariance.reshape(-1, 6, 6),
+    )
+    if poses.covariance is None:
+        return poses
+    return replace(poses, covariance=pose_covariance_in_body(poses.covariance, poses.quaternion_xyzw))
+
+
+def _compared(header_ns: Int64, receive_ns: Int64, may_disagree_s: float, may_jump_s: float) -> StampCheck:
+    (stamped,) = np.nonzero(header_ns)
+    lead_ns = (header_ns - receive_ns)[stamped]
+    drift = fit_clock(receive_ns[stamped], header_ns[stamped]) if lead_ns.any() else None
+    jump_ns = np.diff(lead_ns)
+    return StampCheck(
+        count=len(header_ns),
+        without_header=len(header_ns) - len(stamped),
+        disagreeing=int(np.count_nonzero(np.abs(lead_ns) > may_disagree_s * 1e9)),
+        largest_disagreement_s=float(lead_ns[np.argmax(np.abs(lead_ns))]) / 1e9 if len(stamped) else 0.0,
+        jumps=tuple(
+            ClockJump(int(stamped[k + 1]), int(header_ns[stamped[k + 1]]), float(jump_ns[k]) / 1e9)
+            for k in np.flatnonzero(np.abs(jump_ns) > may_jump_s * 1e9)
+        ),
+        drift=drift,
+    )
 
 
 def _by_edge(samples: Iterable[Sample], source: Source) -> dict[Edge, SampleRows]:

@@ -51,7 +51,8 @@ def clean_poses(
     """
     if covariance is not None:
         blank: Bool = np.asarray(np.isnan(covariance).all(axis=(1, 2)))
-        covariance = np.where(blank[:, None, None], 0.0, covariance)
+        if blank.any():
+            covariance = np.where(blank[:, None, None], 0.0, covariance)
     with np.errstate(over="ignore"):  # what overflows becomes infinite and is dropped as such
         norm = np.linalg.norm(quaternion_xyzw, axis=1)
     causes = {
@@ -83,7 +84,8 @@ def clean_poses(
         t_ns=t_ns[keep],
         position=position[keep],
         quaternion_xyzw=quaternion_xyzw[keep] / norm[keep, None],
-        covariance=None if covariance is None else covariance[keep],
+        # The largest part of a long log, so not copied where all of it is kept.
+        covariance=covariance if covariance is None or keep.all() else covariance[keep],
         dropped=dropped,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -115,3 +116,21 @@ def test_the_order_of_receipt_over_several_files(tmp_path: Path, container: Cont
         read = poses_at_once(log, TOPIC)
     assert read is not None
     assert read.header_ns.tolist() == expected
+
+
+def test_a_long_log_is_not_copied_over_and_over() -> None:
+    """Covariances are what is large: those of the result, and little else, come to what was read."""
+    count, rng = 40_000, np.random.default_rng(6)
+    t_ns = START_NS + 10_000_000 * np.arange(count)
+    turned = rng.standard_normal((count, 4))
+    turned /= np.linalg.norm(turned, axis=1)[:, None]
+    pose = np.hstack([rng.standard_normal((count, 3)), turned])
+    poses = PoseArrays(("odom", "base"), t_ns, t_ns, pose, rng.standard_normal((count, 36)))
+    tracemalloc.start()
+    found = trajectory_of_arrays(poses, "log", stamps="header").trajectory
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert found.covariance is not None
+    # Beside the covariances stamps, positions, rotations and a few numbers and flags a pose, and one block
+    # of 4096 poses with the steps in between: together less than another copy.
+    assert peak < 2 * found.covariance.nbytes
