@@ -27,6 +27,13 @@ from pipelines.session.errors import MocapError
     type=any_path,
     help="Page that compares the sessions [default: comparison/index.html beside the first].",
 )
+@click.option(
+    "--figures",
+    type=any_path,
+    metavar="FOLDER",
+    help="Write the page's figures there as PNG, SVG and PDF, too, with their numbers as CSV; of several "
+    "sessions, those of the page that compares them.",
+)
 @force_option
 @overwrite_option
 @json_option
@@ -34,6 +41,7 @@ from pipelines.session.errors import MocapError
 def report_command(
     sessions: tuple[Path, ...],
     output: Path | None,
+    figures: Path | None,
     force: bool,
     overwrite: bool,
     as_json: bool,
@@ -45,16 +53,16 @@ def report_command(
     Two or more sessions are compared side by side as well, every one against the first: which skeleton is
     better, by how much, and whether that is more than noise.
     """
-    from pipelines.report import compare_sessions, report
+    from pipelines.report import compare_sessions, report, write_figures_of
 
     ones = expanded(sessions)
     if output is not None and len(ones) < 2:
         raise click.UsageError("--output is the page that compares sessions: state two or more.")
-    compared = None
+    compared = drawn = None
     results = []
     failed: dict[str, str] = {}
     with watching(level(quiet, verbose)) as progress:
-        progress.start("Writing pages", len(ones) + (len(ones) > 1))
+        progress.start("Writing pages", len(ones) + (len(ones) > 1) + (figures is not None))
         for session in ones:
             try:
                 results.append(report(session, force=force))
@@ -66,6 +74,9 @@ def report_command(
         if len(ones) > 1 and not failed:  # else the first may be missing, which all are compared with
             compared = compare_sessions(ones, output, overwrite=overwrite)
             progress.advance()
+        if figures is not None and not failed:
+            drawn = write_figures_of(ones, figures, overwrite=overwrite, force=force)
+            progress.advance()
     for result in results:
         say_warnings(result.record.warnings, quiet)
     if as_json:
@@ -73,6 +84,7 @@ def report_command(
             {
                 "pages": [str(result.page) for result in results],
                 "comparison": None if compared is None else str(compared.page),
+                "figures": None if drawn is None else str(drawn.folder),
                 "failed": failed,
             }
         )
@@ -80,6 +92,7 @@ def report_command(
         return
     pages = [(one.skipped, one.page) for one in results]
     pages += [] if compared is None else [(compared.skipped, compared.page)]
+    pages += [] if drawn is None else [(drawn.skipped, drawn.folder)]
     for skipped, page in pages:
         click.echo(f"{'unchanged' if skipped else 'written'}: {page}")
     end(failed, ones)

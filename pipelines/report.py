@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -10,10 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.formats.flights.pictures import Picture, Pictures, open_pictures
-from pipelines.reporting.comparison import labels_of
+from pipelines.reporting.comparison import compare, labels_of
+from pipelines.reporting.comparison_figures import draw_comparison
 from pipelines.reporting.comparison_page import GENERATOR, render_comparison
 from pipelines.reporting.content import ReplanContent, SessionContent, section
-from pipelines.reporting.page import render_page
+from pipelines.reporting.figure_files import MARK, refuse_foreign, write_figures
+from pipelines.reporting.page import draw_session, render_page
 from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
@@ -25,7 +28,7 @@ from pipelines.session.stages import (
     open_session,
     session_name,
 )
-from pipelines.session.storage import as_data_error, read_json
+from pipelines.session.storage import as_data_error, canonical_json, read_json
 from pipelines.session.tables import (
     ACTOR,
     CAMERA_POSES,
@@ -38,11 +41,13 @@ from pipelines.session.tables import (
     TRUTH,
     read_table,
 )
+from pipelines.session.whole_folders import is_made, whole_folder
 
 if TYPE_CHECKING:
     import pandas as pd
 
 REPORT = Stage("report", revision=4)
+_FIGURES_REVISION = 1
 
 
 @dataclass(frozen=True)
@@ -110,10 +115,10 @@ def compare_sessions(
     for folder, place in zip(folders, resolved, strict=True):
         if resolved.count(place) > 1:
             raise DataError(folder, "is stated twice", "state every session once")
-    labels = labels_of([(*place.parts[1:-1], session_name(place)) for place in resolved])
-    contents = {}
-    for label, folder in zip(labels, folders, strict=True):
-        contents[label] = _load(folder, _finished_stages(open_session(folder)))
+    contents = {
+        label: _load(folder, _finished_stages(open_session(folder)))
+        for label, folder in zip(_labels(resolved), folders, strict=True)
+    }
     page = output or resolved[0].parent / "comparison" / "index.html"
     html, _ = render_comparison(contents)
     try:
@@ -126,6 +131,57 @@ def compare_sessions(
     except OSError as error:
         raise as_data_error(error, page) from error
     return Compared(page, skipped=False)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Where the figures of a page lie as files."""
+
+    folder: Path
+    skipped: bool  # nothing had changed
+
+
+def write_figures_of(
+    folders: Sequence[Path], target: Path, *, overwrite: bool = False, force: bool = False
+) -> Figures:
+    """Write the figures of a session's page, or of the page that compares several, as files.
+
+    PNG, SVG and PDF 180 mm wide (90 mm where two stand side by side), the numbers behind each as CSV, and
+    figures.json with titles and captions. The 3D viewer and the overlays on pictures are not among them.
+
+    Args:
+        folders: the sessions; two or more are compared, every one with the first.
+        target: the folder; figures that an earlier run wrote there are replaced.
+        overwrite: replace a folder with other things in it, too; never a session.
+        force: do it again although nothing changed.
+
+    Raises:
+        DataError: not a session, or damaged; the folder holds something else, or cannot be written.
+        BusyError: another process writes the same folder.
+    """
+    try:
+        refuse_foreign(target, overwrite=overwrite)
+    except OSError as error:
+        raise as_data_error(error, target) from error
+    records = [_finished_stages(open_session(folder)) for folder in folders]
+    labels = _labels([folder.resolve() for folder in folders])
+    keys = [{name: record.key for name, record in own.items()} for own in records]
+    told = {"revision": _FIGURES_REVISION, "sessions": dict(zip(labels, keys, strict=True))}
+    key = hashlib.sha256(canonical_json(told).encode()).hexdigest()
+    if not force and is_made(target, key, mark=MARK):
+        return Figures(target, skipped=True)
+    contents = {
+        label: _load(folder, own) for label, folder, own in zip(labels, folders, records, strict=True)
+    }
+    plates = draw_session(contents[labels[0]]) if len(folders) == 1 else draw_comparison(compare(contents))
+    with whole_folder(target, key, mark=MARK, overwrite=True) as making:
+        write_figures(making.folder, plates, contents, key)
+        making.publish()
+    return Figures(target, skipped=False)
+
+
+def _labels(resolved: Sequence[Path]) -> list[str]:
+    return labels_of([(*place.parts[1:-1], session_name(place)) for place in resolved])
 
 
 def write_whole(path: Path, content: bytes) -> None:

@@ -12,20 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.reporting.arms_from_above import SHADE, draw_from_above
-from pipelines.reporting.plates import LINE_STYLES, MOST_POINTS, Plate, every, quiet
+from pipelines.reporting.plates import LINE_STYLES, MOST_POINTS, Plate, every, quiet, stacked, table
 from pipelines.reporting.replanned import Arm, CostMap, Replan
 from pipelines.reporting.svg import (
     CAMERAS,
     MUTED,
     PAPER,
     WIDTH_IN,
-    inline_svg,
     page_style,
 )
 from pipelines.reporting.wording import fixed, percent, quantity, shortened, significant
 from pipelines.session.records import Float
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -74,7 +74,7 @@ def _over_time(arms: tuple[Arm, ...]) -> Plate:
         handles, labels = error.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper left", ncols=len(arms))
         title = "Tilt, range, sight and predicted error over time"
-        svg = inline_svg(figure, "figure-arms-time", title, " ".join(_told_over_time(arm) for arm in arms))
+        told = " ".join(_told_over_time(arm) for arm in arms)
     caption = (
         "Above: tilt of the cameras over the actor and their range, the mean of an arm's drones as a line "
         "and all of them within the band. Middle: a row per drone, drawn while something stands between it "
@@ -87,7 +87,21 @@ def _over_time(arms: tuple[Arm, ...]) -> Plate:
     cut = [arm for arm in arms if np.nanmax(arm.predicted_error_m, initial=0.0) * 100 > _top(arms)]
     if cut:
         caption += f" Errors above {quantity(_top(arms), 'cm', 0)} are cut off."
-    return Plate("arms-time", title, caption, svg)
+    return Plate("arms-time", title, caption, told, figure, {"": stacked([_numbers(arm) for arm in arms])})
+
+
+def _numbers(arm: Arm) -> pd.DataFrame:
+    """Every pose of an arm that the bands and rows are drawn from."""
+    cameras = len(arm.cameras)
+    return table(
+        arm=arm.name,
+        camera=np.repeat(arm.cameras, len(arm.t_s)),
+        t_s=np.tile(arm.t_s, cameras),
+        tilt_deg=arm.tilt_deg.ravel(),
+        range_m=arm.range_m.ravel(),
+        hidden=(~arm.visible).ravel().astype(int),
+        predicted_error_cm=np.tile(100 * arm.predicted_error_m, cameras),
+    )
 
 
 def _band(axes: Axes, arm: Arm, values: Float) -> None:
@@ -195,7 +209,7 @@ def _yaw(arms: tuple[Arm, ...], costs: CostMap | None) -> Plate:
         quiet(axes, grid=False)
         _legend_of_yaw(figure, axes, levels)
         title = "The formation's yaw" + ("" if costs is None else " over what it would cost")
-        svg = inline_svg(figure, "figure-arms-yaw", title, " ".join(_told_of_yaw(arm) for arm in arms))
+        told = " ".join(_told_of_yaw(arm) for arm in arms)
     caption = (
         "Solid: the yaw that an arm chose for its first drone, counterclockwise from east and without "
         "jumps of a turn; dashed: where that drone was."
@@ -208,7 +222,22 @@ def _yaw(arms: tuple[Arm, ...], costs: CostMap | None) -> Plate:
             else " Every yaw would have cost the same at any time."
         )
         caption += f" One column in {step} is drawn." if step > 1 else ""
-    return Plate("arms-yaw", title, caption, svg)
+    numbers = {
+        "": stacked(
+            [
+                table(arm=arm.name, t_s=arm.t_s, yaw_deg=arm.yaw_deg, commanded_yaw_deg=arm.commanded_yaw_deg)
+                for arm in arms
+            ]
+        )
+    }
+    if costs is not None:
+        yaws = len(costs.yaw_deg)
+        numbers["costs"] = table(
+            t_s=np.repeat(costs.t_s, yaws),
+            yaw_deg=np.tile(costs.yaw_deg, len(costs.t_s)),
+            cost=costs.cost.ravel(),
+        )
+    return Plate("arms-yaw", title, caption, told, figure, numbers)
 
 
 def _draw_costs(axes: Axes, costs: CostMap, low: float, high: float) -> tuple[list[float], int]:

@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.reporting.plates import LINE_STYLES, MOST_POINTS, Plate, axis_label, every, near_zero, quiet
+from pipelines.reporting.plates import (
+    LINE_STYLES,
+    MOST_POINTS,
+    Plate,
+    axis_label,
+    every,
+    near_zero,
+    quiet,
+    stacked,
+    table,
+)
 from pipelines.reporting.replanned import Arm, Replan, bounds_of
 from pipelines.reporting.svg import (
     CAMERAS,
@@ -16,7 +26,6 @@ from pipelines.reporting.svg import (
     PAPER,
     STATUS_COLOURS,
     WIDTH_IN,
-    inline_svg,
     page_style,
 )
 from pipelines.reporting.terrain import LOWEST_M, Heights, heights
@@ -24,6 +33,7 @@ from pipelines.reporting.wording import fixed, listing, plural, quantity, shorte
 from pipelines.session.records import Float
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -72,7 +82,7 @@ def draw_from_above(replan: Replan) -> Plate:
         levels = [] if ground is None else [m for m in HEIGHT_LEVELS_M if ground.above_m.max() >= m]
         _legend(figure, arms, levels)
         title = "The arms from above"
-        svg = inline_svg(figure, "figure-arms-top", title, " ".join(_told_from_above(arm) for arm in arms))
+        told = " ".join(_told_from_above(arm) for arm in arms)
     caption = (
         f"Paths of the drones and of the actor (thick); open circles mark the start. At {KEYFRAMES} moments, "
         "whose seconds stand beside the first drone, a line leads from each drone to the actor: "
@@ -87,7 +97,38 @@ def draw_from_above(replan: Replan) -> Plate:
         )
     step = every(len(arms[0].t_s), MOST_POINTS)
     caption += f" One pose in {step} is drawn." if step > 1 else ""
-    return Plate("arms-top", title, caption, svg)
+    numbers = {"": stacked([_numbers(arm) for arm in arms])}
+    if ground is not None:
+        east_m, north_m = np.meshgrid(ground.east_m, ground.north_m, indexing="ij")
+        numbers["heights"] = table(
+            east_m=east_m.ravel(), north_m=north_m.ravel(), above_ground_m=ground.above_m.ravel()
+        )
+    return Plate("arms-top", title, caption, told, figure, numbers)
+
+
+def _numbers(arm: Arm) -> pd.DataFrame:
+    """The paths of an arm, and which sight lines were hidden."""
+    tracks = zip(arm.cameras, arm.position, arm.visible, strict=True)
+    paths = [
+        table(
+            arm=arm.name,
+            who=camera,
+            t_s=arm.t_s,
+            east_m=path[:, 0],
+            north_m=path[:, 1],
+            hidden=(~seen).astype(int),
+        )
+        for camera, path, seen in tracks
+    ]
+    actor = table(
+        arm=arm.name,
+        who="actor",
+        t_s=arm.t_s,
+        east_m=arm.actor[:, 0],
+        north_m=arm.actor[:, 1],
+        hidden=np.full(len(arm.t_s), np.nan),
+    )
+    return stacked([*paths, actor])
 
 
 def keyframes(arm: Arm) -> NDArray[np.intp]:

@@ -11,12 +11,13 @@ import numpy as np
 
 from pipelines.reporting.comparison import MEASURES, Comparison, Judged, Measure
 from pipelines.reporting.figures import percentiles, time_bins
-from pipelines.reporting.plates import LINE_STYLES, Plate, quiet
-from pipelines.reporting.svg import CAMERAS, MUTED, WIDTH_IN, inline_svg, page_style
+from pipelines.reporting.plates import LINE_STYLES, Plate, quiet, stacked, table, tabled
+from pipelines.reporting.svg import CAMERAS, MUTED, WIDTH_IN, page_style
 from pipelines.reporting.wording import fixed, joint_label, listing, quantity, shortened
 from pipelines.session.records import Float
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
 
 _MOST_BINS = 150
@@ -71,6 +72,7 @@ def _over_time(comparison: Comparison, measure: Measure) -> Plate:
         known[key] for key in _OVER_TIME if any(key in one.values for one in comparison.sessions)
     ]
     seconds = {one.label: seconds_of(comparison, one) for one in there}
+    drawn = []
     with page_style():
         figure = Figure((WIDTH_IN, 0.7 + 1.5 + 1.1 * (len(shown) - 1)), layout="constrained")
         panels = figure.subplots(
@@ -78,9 +80,11 @@ def _over_time(comparison: Comparison, measure: Measure) -> Plate:
         )[:, 0]
         for axes, of in zip(panels, shown, strict=True):
             axes.grid(visible=True, axis="y")
-            for one in there:
-                if of.key in one.values:
-                    _draw_over_time(axes, comparison, one, of, seconds[one.label], band=of is measure)
+            drawn += [
+                _draw_over_time(axes, comparison, one, of, seconds[one.label], band=of is measure)
+                for one in there
+                if of.key in one.values
+            ]
             axes.set_ylabel(f"{of.name} ({of.unit})")
             if of.unit == "%":
                 axes.set_ylim(0, 104)
@@ -97,7 +101,7 @@ def _over_time(comparison: Comparison, measure: Measure) -> Plate:
             f"{one.label} {quantity(one.estimates[measure.key].value, measure.unit, measure.digits)}"
             for one in there
         )
-        svg = inline_svg(figure, "figure-compare-time", title, f"Means over the flights: {told}.")
+        told = f"Means over the flights: {told}."
     caption = f"From above: {listing(of.name for of in shown)}. "
     caption += "Errors are medians over joints"
     if len(there) <= _MOST_BANDS:
@@ -108,12 +112,13 @@ def _over_time(comparison: Comparison, measure: Measure) -> Plate:
         if all(pair.by_time for pair in comparison.pairs)
         else "Times of flights that do not hold the same motion count from the first frame of each."
     )
-    return Plate("compare-time", title, caption, svg)
+    return Plate("compare-time", title, caption, told, figure, {"": stacked(drawn)})
 
 
 def _draw_over_time(
     axes: Axes, comparison: Comparison, session: Judged, measure: Measure, seconds: Float, *, band: bool
-) -> None:
+) -> pd.DataFrame:
+    """Draw a session's line, and say what was drawn."""
     values = session.values[measure.key].values
     bins = time_bins(seconds, _MOST_BINS)
     centres = (bins[:-1] + bins[1:]) / 2
@@ -121,12 +126,15 @@ def _draw_over_time(
     colour = colour_of(comparison, session)
     if measure.key in {"share", "tilt"}:
         middle = means(values, seconds, bins)
+        low = high = np.full(len(middle), np.nan)
     else:
         middle, low, high = percentiles(values, seconds, bins)
         if band and len(comparison.sessions) <= _MOST_BANDS:
             axes.fill_between(centres, low, high, color=colour, alpha=0.14, linewidth=0)
     line = LINE_STYLES[k // len(CAMERAS) % len(LINE_STYLES)]
     axes.plot(centres, middle, color=colour, linestyle=line, label=shortened(session.label))
+    what = f"{measure.name} ({measure.unit})"
+    return table(session=session.label, measure=what, t_s=centres, value=middle, p10=low, p90=high)
 
 
 def means(values: Float, seconds: Float, bins: Float) -> Float:
@@ -187,9 +195,15 @@ def _joint_bars(comparison: Comparison, measure: Measure) -> Plate:
             + f" {measure.unit}."
             for one in there
         )
-        svg = inline_svg(figure, "figure-compare-joints", title, told)
     caption = "Thin lines: the 95 % intervals of the means."
-    return Plate("compare-joints", title, caption, svg)
+    rows = [
+        (one.label, f"{of.name} ({of.unit})", name, estimate.value, *(estimate.interval or (np.nan, np.nan)))
+        for of in (measure, known["share"])
+        for one in there
+        for name, estimate in one.per_joint.get(of.key, {}).items()
+    ]
+    numbers = tabled(("session", "measure", "joint", "value", "low", "high"), rows)
+    return Plate("compare-joints", title, caption, told, figure, {"": numbers})
 
 
 def _draw_bars(
@@ -230,7 +244,7 @@ def _differences(comparison: Comparison) -> Plate:
     ]
     pairs = comparison.pairs
     step = 0.7 / len(pairs)
-    told = []
+    told, found_rows = [], []
     with page_style():
         rows = len(measures)
         figure = Figure((WIDTH_IN, 0.9 + rows * max(0.2, 0.1 * len(pairs))), layout="constrained")
@@ -249,6 +263,10 @@ def _differences(comparison: Comparison) -> Plate:
                         [scale * end for end in found.estimate.interval], [y, y], color=colour, linewidth=1.4
                     )
                 axes.plot(scale * found.estimate.value, y, "o", color=colour, markersize=4)
+                ends = found.estimate.interval or (np.nan, np.nan)
+                found_rows.append(
+                    (pair.other.label, one.label, *(scale * v for v in (found.estimate.value, *ends)))
+                )
                 told.append(f"{pair.other.label} {one.label} {fixed(scale * found.estimate.value)} %")
             axes.plot([], [], "o-", color=colour, markersize=4, label=shortened(pair.other.label))
         axes.set_yticks(range(rows), [f"{one.label}{_ARROW[one.better]}" for one in measures])
@@ -260,12 +278,13 @@ def _differences(comparison: Comparison) -> Plate:
         if len(pairs) > 1:
             figure.legend(loc="outside upper left", ncols=min(len(pairs), 4))
         title = "All differences at a glance"
-        svg = inline_svg(figure, "figure-compare-differences", title, f"{listing(told)}.")
     caption = (
         "A point is the paired difference from the first session, relative to that one, its line the 95 % "
         "interval; a line across zero is within noise. Beside each measure stands which way is better."
     )
-    return Plate("compare-differences", title, caption, svg)
+    columns = ("session", "measure", "difference_percent", "low_percent", "high_percent")
+    numbers = tabled(columns, found_rows)
+    return Plate("compare-differences", title, caption, f"{listing(told)}.", figure, {"": numbers})
 
 
 _ARROW = {"less": " (less is better)", "more": " (more is better)", "": ""}

@@ -15,7 +15,18 @@ import numpy as np
 from pipelines.geometry.poses import rotate
 from pipelines.reporting.bones import side_of
 from pipelines.reporting.motion import Motion
-from pipelines.reporting.plates import LINE_STYLES, MOST_POINTS, Plate, axis_label, every, near_zero, quiet
+from pipelines.reporting.plates import (
+    LINE_STYLES,
+    MOST_POINTS,
+    Plate,
+    axis_label,
+    every,
+    near_zero,
+    quiet,
+    stacked,
+    table,
+    tabled,
+)
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.svg import (
     CAMERAS,
@@ -27,7 +38,6 @@ from pipelines.reporting.svg import (
     RIGHT,
     STATUS_COLOURS,
     WIDTH_IN,
-    inline_svg,
     page_style,
 )
 from pipelines.reporting.wording import (
@@ -94,13 +104,15 @@ def _timeline(cameras: tuple[CameraRow, ...]) -> Plate:
         axes.set_xlabel("time (s)")
         quiet(axes)
         title = "When each camera had frames and poses"
-        told = [_spoken(camera) for camera in cameras]
-        svg = inline_svg(figure, "figure-timeline", title, " ".join(told))
+    told = " ".join(_spoken(camera) for camera in cameras)
     gaps = any(camera.gaps_s for camera in cameras)
     caption = "A bar spans the frames of a camera" + (
         "; where it is cut to a thin line, its pose log has a gap." if gaps else "; no pose log has a gap."
     )
-    return Plate("timeline", title, caption, svg)
+    spans = [(c.name, "frames", c.first_s, c.last_s) for c in cameras]
+    spans += [(c.name, "gap in poses", start, end) for c in cameras for start, end in c.gaps_s]
+    numbers = tabled(("camera", "what", "start_s", "end_s"), spans)
+    return Plate("timeline", title, caption, told, figure, {"": numbers})
 
 
 def _spoken(camera: CameraRow) -> str:
@@ -131,7 +143,7 @@ def _top_view(
         figure = Figure((WIDTH_IN, height_in), layout="constrained")
         axes = figure.subplots()
         axes.grid(visible=True)
-        step = 1
+        step, drawn = 1, []
         for k, camera in enumerate(cameras):
             if camera.name in tracks:
                 track = tracks[camera.name]
@@ -141,12 +153,14 @@ def _top_view(
                 ground = track.position[:, :2] - origin
                 path, stride = _drawn_path(track.t_ns, ground, [start for start, _ in gaps_ns])
                 step = max(step, stride)
+                drawn.append(_numbers_of_path(camera.name, path + origin))
                 _draw_camera(axes, shortened(camera.name), path, ground, look, style, float(extent.max()))
         for k, person in enumerate(people):
             stride = every(len(person), MOST_POINTS)
             path = person[::stride] - origin
             step = max(step, stride)
             label = "actor" if len(people) == 1 else f"person {k}"
+            drawn.append(_numbers_of_path(label, path + origin))
             line = LINE_STYLES[k % len(LINE_STYLES)]
             axes.plot(*path.T, color=INK, linewidth=2.0, linestyle=line, label=label, zorder=4)
             start = path[np.isfinite(path[:, 0])][:1]
@@ -160,10 +174,15 @@ def _top_view(
         title = "Seen from above"
         paths = [f"{name} over {quantity(_length_m(t.position), 'm')}" for name, t in tracks.items()]
         paths += [f"the actor over {quantity(_length_m(person), 'm')}" for person in people]
-        svg = inline_svg(figure, "figure-top", title, f"Paths on the ground plane: {listing(paths)}.")
+        told = f"Paths on the ground plane: {listing(paths)}."
     caption = "Paths of the cameras" + (" and of the actor (middle of the measured joints)" if people else "")
     caption += "; an open circle marks the start, short strokes the direction of view."
-    return Plate("top", title, caption + _decimation(step, "pose"), svg)
+    return Plate("top", title, caption + _decimation(step, "pose"), told, figure, {"": stacked(drawn)})
+
+
+def _numbers_of_path(who: str, path: Float) -> pd.DataFrame:
+    """A drawn path [N, 2]; empty where it is broken."""
+    return table(who=who, east_m=path[:, 0], north_m=path[:, 1])
 
 
 def _draw_camera(
@@ -264,14 +283,19 @@ def _over_time(summary: Summary, motion: Motion) -> Plate:
             else f"The median over joints lies between {quantity(float(np.nanmin(middle)), unit)} and "
             f"{quantity(float(middle[worst]), unit)}, the largest at {quantity(float(centres[worst]), 's')}."
         )
-        svg = inline_svg(figure, "figure-time", title, told)
     caption = (
         f"Above: {what} of the measured joints, median and the range from the 10th to the 90th percentile. "
         "Below: the share of joints measured, and why the others were not."
     )
     if len(centres) < len(motion.t_ns):
         caption += f" Each point stands for {bins[1] - bins[0]:.2g} s."
-    return Plate("time", title, caption, svg)
+    shown = {word: 100 * shares[STATUS.index(word)] for word in _present(summary)}
+    numbers = table(
+        t_s=centres,
+        **{f"median_{unit}": middle, f"p10_{unit}": low, f"p90_{unit}": high},
+        **{f"{word}_percent": share for word, share in shown.items()},
+    )
+    return Plate("time", title, caption, told, figure, {"": numbers})
 
 
 def time_bins(seconds: Float, most: int = MOST_BINS) -> Float:
@@ -332,8 +356,15 @@ def _joint_bars(summary: Summary) -> Plate:
         axes.tick_params(axis="y", length=0)
         title = "What became of every joint"
         told = listing(f"{joint_label(row.name)} {percent(row.share)}" for row in rows)
-        svg = inline_svg(figure, "figure-joints", title, f"Share measured: {told}.")
-    return Plate("joints", title, "Colours as in the figure of errors over time.", svg)
+    numbers = table(
+        joint=[row.name for row in rows],
+        **{
+            f"{word}_percent": [100 * row.counts[word] / max(sum(row.counts.values()), 1) for row in rows]
+            for word in _present(summary)
+        },
+    )
+    caption = "Colours as in the figure of errors over time."
+    return Plate("joints", title, caption, f"Share measured: {told}.", figure, {"": numbers})
 
 
 def _joint_height_in(summary: Summary) -> float:
@@ -367,11 +398,18 @@ def _bone_lengths(summary: Summary) -> Plate:
             f"{f'{b.side} {b.name}'.strip()} {quantity(100 * b.median_m, 'cm')} ± {percent(b.spread)}"
             for b in bones
         )
-        svg = inline_svg(figure, "figure-bones", title, f"Median and relative spread: {told}.")
     caption = (
         "Median and the range from the 10th to the 90th percentile; left in blue, above, right in orange."
     )
-    return Plate("bones", title, caption + " A bone that changes its length was measured wrongly.", svg)
+    caption += " A bone that changes its length was measured wrongly."
+    numbers = table(
+        bone=[f"{b.side} {b.name}".strip() for b in bones],
+        median_cm=[100 * b.median_m for b in bones],
+        p10_cm=[100 * b.low_m for b in bones],
+        p90_cm=[100 * b.high_m for b in bones],
+        relative_spread=[b.spread for b in bones],
+    )
+    return Plate("bones", title, caption, f"Median and relative spread: {told}.", figure, {"": numbers})
 
 
 # --- the body ------------------------------------------------------------------------------------------
@@ -390,11 +428,13 @@ def _snapshots(summary: Summary, motion: Motion) -> Plate:
     with page_style():
         figure = Figure((WIDTH_IN, 0.5 + (WIDTH_IN - 0.6) * (top - bottom) / width), layout="constrained")
         axes = figure.subplots()
-        labels = []
+        seconds = [(int(motion.t_ns[k]) - summary.origin_ns) / 1e9 for k in chosen]
+        labels = [f"{fixed(t_s)} s" for t_s in seconds]
+        drawn = []
         for k, body in enumerate(position):
             aside, up = _three_quarter_view(body, joints)
             _draw_body(axes, aside + _STRIDE_M * k, up - ground, joints)
-            labels.append(f"{fixed((int(motion.t_ns[chosen[k]]) - summary.origin_ns) / 1e9)} s")
+            drawn.append(np.stack([aside, up - ground], axis=-1))
         axes.set_xlim(-_STRIDE_M / 2, width - _STRIDE_M / 2)
         axes.set_ylim(bottom, top)
         axes.set_yticks(np.arange(0.0, top, 0.5))
@@ -407,14 +447,20 @@ def _snapshots(summary: Summary, motion: Motion) -> Plate:
         axes.tick_params(axis="x", length=0)
         title = "The body at a few moments"
         told = f"{plural(len(chosen), 'snapshot')} at {listing(labels)}."
-        svg = inline_svg(figure, "figure-body", title, told)
     whose = "" if motion.position.shape[1] == 1 else " of the first person"
     caption = (
         f"The fullest skeleton{whose} in each stretch of time, facing right and seen from its right, "
         "half from the front; left limbs in blue, right limbs in orange. "
         "Heights count from where the feet stand."
     )
-    return Plate("body", title, caption, svg)
+    places = np.concatenate(drawn)
+    numbers = table(
+        t_s=np.repeat(seconds, len(joints)),
+        joint=list(joints) * len(chosen),
+        right_m=places[:, 0],
+        above_ground_m=places[:, 1],
+    )
+    return Plate("body", title, caption, told, figure, {"": numbers})
 
 
 def _fullest_times(motion: Motion) -> list[int]:

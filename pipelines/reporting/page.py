@@ -17,7 +17,8 @@ from pipelines.reporting.figures import draw_all
 from pipelines.reporting.overlays import Moment, ReadFrame, collect_moments
 from pipelines.reporting.panels import draw_panel, picture_width
 from pipelines.reporting.placing import as_reconstructed
-from pipelines.reporting.replanned import summarise_replan
+from pipelines.reporting.plates import Plate
+from pipelines.reporting.replanned import Replan, summarise_replan
 from pipelines.reporting.summary import Summary, errors_per_camera, give_verdict, measures, summarise
 from pipelines.reporting.templating import environment
 from pipelines.reporting.viewer import make_scene
@@ -69,12 +70,8 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
         read_frame: gives the pictures behind the overlays; without it they are drawn on plain ground.
     """
     summary = summarise(content)
-    replan = (
-        None
-        if content.replan is None
-        else summarise_replan(content.replan, summary.origin_ns, len(summary.cameras))
-    )
-    plates = draw_all(summary, content.poses) | (draw_arms(replan) if replan is not None else {})
+    replan = _replan(summary, content)
+    plates = _draw(summary, content, replan)
     script = (files("pipelines.reporting") / "templates" / "viewer.js").read_text(encoding="utf-8")
     overlays = _overlays(as_reconstructed(content), summary, read_frame)
     return (
@@ -106,6 +103,22 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
             stages=[_stage_note(stage, record) for stage, record in content.stages.items()],
         )
     )
+
+
+def draw_session(content: SessionContent) -> dict[str, Plate]:
+    """Every figure of the page that matplotlib draws, by its key: not the 3D viewer, nor the overlays."""
+    summary = summarise(content)
+    return _draw(summary, content, _replan(summary, content))
+
+
+def _draw(summary: Summary, content: SessionContent, replan: Replan | None) -> dict[str, Plate]:
+    return draw_all(summary, content.poses) | (draw_arms(replan) if replan is not None else {})
+
+
+def _replan(summary: Summary, content: SessionContent) -> Replan | None:
+    if content.replan is None:
+        return None
+    return summarise_replan(content.replan, summary.origin_ns, len(summary.cameras))
 
 
 def _policy(script: str, *, pictures: bool) -> str:

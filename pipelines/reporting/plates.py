@@ -1,18 +1,22 @@
-"""A figure with its words, and what all figures share."""
+"""A figure with its words and its numbers, and what all figures share."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from pipelines.reporting.svg import GRID
+from pipelines.reporting.svg import GRID, inline_svg
 from pipelines.reporting.wording import fixed
 from pipelines.session.records import Float
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 MOST_POINTS = 600
 LINE_STYLES: tuple[Literal["-"] | tuple[int, tuple[float, ...]], ...] = (
@@ -26,12 +30,40 @@ _FAR_M = 10_000.0
 
 @dataclass(frozen=True)
 class Plate:
-    """A figure with its words."""
+    """A figure with its words, and the numbers that it draws."""
 
     key: str
     title: str
     caption: str
-    svg: str
+    description: str  # what is to be seen, with its numbers, for readers who do not see it
+    figure: Figure
+    numbers: Mapping[str, pd.DataFrame]  # by what they are; "" for those that need no name
+
+    @cached_property
+    def svg(self) -> str:
+        """The figure as an `<svg>` element for the inside of a page."""
+        return inline_svg(self.figure, f"figure-{self.key}", self.title, self.description)
+
+
+def table(**columns: object) -> pd.DataFrame:
+    """Numbers of a figure by columns of the same length; a single value holds for all rows."""
+    import pandas as pd
+
+    return pd.DataFrame(columns)
+
+
+def tabled(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> pd.DataFrame:
+    """Numbers of a figure by rows."""
+    import pandas as pd
+
+    return pd.DataFrame(rows, columns=list(columns))
+
+
+def stacked(tables: list[pd.DataFrame]) -> pd.DataFrame:
+    """Tables of the same columns, one below the other."""
+    import pandas as pd
+
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
 def every(count: int, most: int) -> int:

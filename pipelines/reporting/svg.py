@@ -82,7 +82,7 @@ _STYLE: dict[RcKeyType, Any] = {
 
 @contextmanager
 def page_style() -> Iterator[None]:
-    """Draw in the page's style, whatever matplotlibrc says; names in any script raise no warning."""
+    """Make figures in the page's style, whatever matplotlibrc says; names in any script raise no warning."""
     import matplotlib as mpl
 
     with mpl.rc_context(), warnings.catch_warnings():
@@ -93,8 +93,33 @@ def page_style() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def settled(figure: Figure, scale: float = 1.0) -> Iterator[None]:
+    """Lay a figure out at a scale of its size and hold it so meanwhile; call it within `page_style`.
+
+    The layout's solver leaves the last bits of coordinates open; rounded, the same figure gives the same
+    bytes.
+    """
+    size_in = figure.get_size_inches()
+    figure.set_size_inches(*(scale * size_in))
+    for axes in figure.axes:  # wherever an earlier layout put them
+        if (place := axes.get_subplotspec()) is not None:
+            axes.set_position(place.get_position(figure))
+        axes.set_in_layout(True)
+    figure.set_layout_engine("constrained")
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for axes in figure.axes:
+        left, bottom, width, height = (round(float(edge), 5) for edge in axes.get_position(True).bounds)
+        axes.set_position((left, bottom, width, height))
+    try:
+        yield
+    finally:
+        figure.set_size_inches(*size_in)
+
+
 def inline_svg(figure: Figure, key: str, title: str, description: str) -> str:
-    """The figure as an `<svg>` element for the inside of a page; call it within `page_style`.
+    """The figure as an `<svg>` element for the inside of a page.
 
     Args:
         figure: what is drawn.
@@ -103,7 +128,8 @@ def inline_svg(figure: Figure, key: str, title: str, description: str) -> str:
         description: what is to be seen, with its numbers.
     """
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    with page_style(), settled(figure):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     drawing = buffer.getvalue()
     view = re.search(r'viewBox="([^"]+)"', drawing)
     if view is None:

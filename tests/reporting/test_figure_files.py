@@ -1,0 +1,154 @@
+"""The figures as files: whole, the same every time, beside the numbers that they draw."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipelines.reporting.comparison import compare
+from pipelines.reporting.comparison_figures import draw_comparison
+from pipelines.reporting.content import SessionContent
+from pipelines.reporting.figure_files import MARK, refuse_foreign, write_figures
+from pipelines.reporting.page import draw_session
+from pipelines.reporting.plates import Plate
+from pipelines.session.errors import DataError
+
+from .comparisons import TIMES, make_comparison, tilt_deg
+from .conftest import CAMERAS, JOINTS, OFFSET_M
+from .test_comparison import OFF_MM, _moved
+
+WIDTH_PX = 180 / 25.4 * 300
+
+
+@pytest.fixture(scope="module")
+def plates(content: SessionContent) -> dict[str, Plate]:
+    return draw_session(replace(content, replan=make_comparison()))
+
+
+@pytest.fixture(scope="module")
+def written(
+    plates: Mapping[str, Plate], content: SessionContent, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    folder = tmp_path_factory.mktemp("figures")
+    write_figures(folder, plates, {"walk": content}, "k" * 64)
+    return folder
+
+
+def _read(written: Path, name: str) -> pd.DataFrame:
+    return pd.read_csv(written / name, keep_default_na=True)
+
+
+def test_every_figure_is_there_in_every_form(plates: Mapping[str, Plate], written: Path) -> None:
+    told = json.loads((written / MARK).read_text(encoding="utf-8"))
+    assert told["sessions"] == {"walk": {"flight": "Walk on a circle", "simulated": False}}
+    assert [each["figure"] for each in told["figures"]] == list(plates)
+    listed = [name for each in told["figures"] for name in each["files"]]
+    assert sorted([MARK, *listed]) == sorted(path.name for path in written.iterdir())
+    for key, plate in plates.items():
+        picture = cv2.imread(str(written / f"{key}.png"))
+        assert picture is not None
+        share = plate.figure.get_size_inches()[0] / 9.0  # as wide as the page, or half of that
+        assert picture.shape[1] == pytest.approx(share * WIDTH_PX, abs=1.5)
+        assert (picture[0, 0] == 255).all()
+        drawing = (written / f"{key}.svg").read_text(encoding="utf-8")
+        width_pt = ET.fromstring(drawing).get("width", "").removesuffix("pt")  # noqa: S314 - our own file
+        assert float(width_pt) == pytest.approx(share * 180 / 25.4 * 72, abs=0.01)
+        assert "<dc:date>" not in drawing
+        document = (written / f"{key}.pdf").read_bytes()
+        assert document.startswith(b"%PDF-")
+        assert b"/FontFile2" in document  # TrueType, as journals ask
+        assert b"/Type3" not in document
+        assert not any(word in document for word in (b"CreationDate", b"Producer", b"Matplotlib"))
+        assert plate.caption == next(each["caption"] for each in told["figures"] if each["figure"] == key)
+
+
+def test_numbers_are_those_of_the_session(written: Path) -> None:
+    time = _read(written, "time.csv")
+    measured = time["median_mm"].dropna()
+    assert 0 < len(measured) < len(time)
+    np.testing.assert_allclose(measured, 1000 * np.linalg.norm(OFFSET_M), rtol=1e-6)
+    words = [name for name in time if str(name).endswith("_percent")]
+    np.testing.assert_allclose(time[words].sum(axis=1), 100.0, rtol=1e-6)
+    joints = _read(written, "joints.csv").set_index("joint")
+    assert list(joints.index) == list(JOINTS)
+    assert joints.loc["left_wrist", "ok_percent"] == pytest.approx(45.0)
+    spans = _read(written, "timeline.csv")
+    assert list(spans[spans["what"] == "frames"]["camera"]) == list(CAMERAS)
+    paths = _read(written, "top.csv")
+    actor = paths[paths["who"] == "actor"].dropna()
+    # The median of swinging joints stays near the middle, which walks at 6 m around (2, 1).
+    radius = np.hypot(actor["east_m"] - 2, actor["north_m"] - 1)
+    np.testing.assert_allclose(radius, 6.0, atol=0.35)
+
+
+def test_numbers_of_arms_are_those_of_the_comparison(written: Path) -> None:
+    arms = _read(written, "arms-time.csv")
+    assert len(arms) == 3 * 2 * TIMES
+    fixed = arms[(arms["arm"] == "fixed") & (arms["camera"] == "drone2")]
+    np.testing.assert_allclose(fixed["tilt_deg"], tilt_deg("fixed"), rtol=1e-8)
+    assert arms[arms["arm"] == "fixed"]["hidden"].sum() == 100  # 2 s at 50 Hz, one of two drones
+    costs = _read(written, "arms-yaw-costs.csv")
+    np.testing.assert_allclose(costs["cost"], 1 - np.cos(np.radians(costs["yaw_deg"])), atol=1e-8)
+
+
+def test_a_comparison_of_sessions_has_its_numbers(content: SessionContent, tmp_path: Path) -> None:
+    contents = {"a": content, "b": _moved(content, 2)}
+    write_figures(tmp_path, draw_comparison(compare(contents)), contents, "k")
+    differences = _read(tmp_path, "compare-differences.csv").set_index("measure")
+    assert differences.loc["MPJPE", "difference_percent"] == pytest.approx(100.0)
+    joints = _read(tmp_path, "compare-joints.csv")
+    errors = joints[joints["measure"].str.contains("mm")].groupby("session")["value"].mean()
+    assert errors.to_dict() == pytest.approx({"a": OFF_MM, "b": 2 * OFF_MM})
+    assert set(_read(tmp_path, "compare-time.csv")["session"]) == {"a", "b"}
+
+
+def test_files_are_the_same_every_time_and_leave_the_page_as_it_is(
+    content: SessionContent, tmp_path: Path
+) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    plates = draw_session(content)
+    chosen = {key: plates[key] for key in ("time", "bones")}
+    with mpl.rc_context({"font.size": 20, "svg.fonttype": "path", "pdf.fonttype": 3}):
+        for folder in (first, second):
+            folder.mkdir()
+            write_figures(folder, chosen, {"walk": content}, "k")
+            again = draw_session(content)
+            chosen = {key: again[key] for key in chosen}
+            assert chosen["time"].svg  # the second time its page was drawn before its files
+    for path in first.iterdir():
+        assert path.read_bytes() == (second / path.name).read_bytes(), path.name
+    # And the page's drawing is the same before and after files were written.
+    assert plates["time"].svg == chosen["time"].svg
+
+
+def test_nothing_of_others_is_written_over(written: Path, tmp_path: Path) -> None:
+    refuse_foreign(written, overwrite=False)  # figures of ours are replaced
+    refuse_foreign(tmp_path / "new", overwrite=False)
+    refuse_foreign(tmp_path, overwrite=False)  # empty
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(DataError, match=r"other files than figures \(1, the first thesis.tex\).*--overwrite"):
+        refuse_foreign(tmp_path, overwrite=False)
+    with pytest.raises(DataError, match="is a file, not a folder"):
+        refuse_foreign(tmp_path / "thesis.tex", overwrite=False)
+    refuse_foreign(tmp_path, overwrite=True)
+    (tmp_path / "session.json").write_text("{}")
+    with pytest.raises(DataError, match="is a session"):
+        refuse_foreign(tmp_path, overwrite=True)
+
+
+def test_a_file_beside_our_figures_is_not_ours(tmp_path: Path) -> None:
+    (tmp_path / MARK).write_text('{"figures": [{"files": ["top.svg"]}]}')
+    (tmp_path / "top.svg").write_text("<svg/>")
+    refuse_foreign(tmp_path, overwrite=False)
+    (tmp_path / "top edited.svg").write_text("<svg/>")
+    with pytest.raises(DataError, match=r"the first top edited.svg"):
+        refuse_foreign(tmp_path, overwrite=False)
