@@ -1,8 +1,9 @@
-"""Names of exported files."""
+"""What exported files are called, and which of them a recording gives."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -39,3 +40,28 @@ def tracks_of(recording: Recording) -> dict[str, Trajectory]:
     tracks = dict(recording.cameras)
     tracks |= {f"{camera}_refined": track for camera, track in recording.refined.items()}
     return {name: track for name, track in tracks.items() if len(track.t_ns)}
+
+
+def write_tables(
+    recording: Recording,
+    folder: Path,
+    suffix: str,
+    write_joints: Callable[[Path, JointMotion], None],
+    write_poses: Callable[[Path, Trajectory], None],
+) -> list[Path]:
+    """Write what a recording has as tables: `<name>` of the joints, `<name>_<camera>` of its poses.
+
+    Raises:
+        DataError: it has neither joints nor camera poses.
+    """
+    name = safe_file_name(recording.name)
+    paths: list[Path] = []
+    if recording.motion is not None and recording.motion.position.size:
+        paths.append(folder / f"{name}{suffix}")
+        write_joints(paths[-1], recording.motion)
+    for camera, trajectory in tracks_of(recording).items():
+        paths.append(folder / f"{name}_{safe_file_name(camera)}{suffix}")
+        write_poses(paths[-1], trajectory)
+    if not paths:
+        raise DataError(recording.name, "holds neither joints nor camera poses", "reconstruct it first")
+    return sorted(paths)

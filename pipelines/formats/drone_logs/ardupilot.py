@@ -21,6 +21,7 @@ from pipelines.formats.common.extras import need
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
     on_gps_time,
+    on_one_clock,
     position_track,
     said_of_fit,
     turned_as_stated,
@@ -159,19 +160,7 @@ class ArduPilotFormat:
         body = _body(log, dropped)
         position = _position(log, choice, dropped, notes)
         gimbal = _mount(log, choice.instance or 0, body, dropped)
-        if fit is not None:
-            position = replace(position, t_ns=fit.other_ns(position.t_ns))
-            body = replace(body, t_ns=fit.other_ns(body.t_ns)) if body else None
-            gimbal = replace(gimbal, t_ns=fit.other_ns(gimbal.t_ns)) if gimbal else None
-        return Telemetry(
-            position=position,
-            body=body,
-            gimbal=gimbal,
-            clock="UTC by GPS" if fit else "boot",
-            fit=fit,
-            notes=tuple(f"{path}: {note}" for note in notes),
-            dropped=dropped,
-        )
+        return on_one_clock(path, position, body, gimbal, fit=fit, notes=notes, dropped=dropped)
 
     def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
         """When pictures were taken: CAM, by the camera's feedback where it has one, else TRIG.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping
+from collections.abc import Iterable, MutableMapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -23,7 +23,7 @@ from pipelines.geometry.poses import (
 )
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Int64
-from pipelines.session.telemetry import AttitudeTrack, Height, PositionTrack
+from pipelines.session.telemetry import AttitudeTrack, Height, PositionTrack, Telemetry
 
 _HELD_NS = 1_000_000_000  # receivers that drones carry report at least once a second
 
@@ -159,6 +159,32 @@ def world_from_heading(body: AttitudeTrack, t_ns: Int64, heading_from_gimbal: Fl
     still = np.zeros_like(from_north)
     heading = quaternion_from_rotation_vector(np.stack([still, still, from_north], axis=1))
     return attitude_in_enu(multiply(heading, heading_from_gimbal), relative_to="world", axes="ned")
+
+
+def on_one_clock(
+    path: Path,
+    position: PositionTrack,
+    body: AttitudeTrack | None,
+    gimbal: AttitudeTrack | None,
+    *,
+    fit: ClockFit | None,
+    notes: Iterable[str],
+    dropped: dict[str, int],
+) -> Telemetry:
+    """What a log says of a drone, all of it on GPS time where the fit of its clock is used."""
+    if fit is not None:
+        position = replace(position, t_ns=fit.other_ns(position.t_ns))
+        body = replace(body, t_ns=fit.other_ns(body.t_ns)) if body else None
+        gimbal = replace(gimbal, t_ns=fit.other_ns(gimbal.t_ns)) if gimbal else None
+    return Telemetry(
+        position=position,
+        body=body,
+        gimbal=gimbal,
+        clock="UTC by GPS" if fit else "boot",
+        fit=fit,
+        notes=tuple(f"{path}: {note}" for note in notes),
+        dropped=dropped,
+    )
 
 
 def on_gps_time(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.formats.common.export_names import safe_file_name, tracks_of
+from pipelines.formats.common.export_names import write_tables
 from pipelines.formats.common.stamps import cell_name, parse_stamps, stamp_column
 from pipelines.formats.common.summaries import describe_motion
 from pipelines.formats.common.text_tables import parse_table, read_head, read_text
@@ -189,17 +189,7 @@ class CsvExport:
         Raises:
             DataError: it has neither joints nor camera poses.
         """
-        name = safe_file_name(recording.name)
-        paths: list[Path] = []
-        if recording.motion is not None and recording.motion.position.size:
-            paths.append(folder / f"{name}.csv")
-            write_joints(paths[-1], recording.motion)
-        for camera, trajectory in tracks_of(recording).items():
-            paths.append(folder / f"{name}_{safe_file_name(camera)}.csv")
-            pose_csv.write_trajectory(paths[-1], trajectory)
-        if not paths:
-            raise DataError(recording.name, "holds neither joints nor camera poses", "reconstruct it first")
-        return sorted(paths)
+        return write_tables(recording, folder, ".csv", write_joints, pose_csv.write_trajectory)
 
 
 FORMAT = JointsCsvFormat()

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.export_names import safe_file_name, tracks_of
-from pipelines.session.errors import DataError
-from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording
+from pipelines.formats.common.export_names import write_tables
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording, Trajectory
 from pipelines.session.tables import POSES, POSES_WITH_COVARIANCE, SKELETON, write_table
 from pipelines.session.tabular import pose_table
 
@@ -29,18 +28,13 @@ class ParquetExport:
         Raises:
             DataError: it has neither joints nor camera poses.
         """
-        name = safe_file_name(recording.name)
-        paths: list[Path] = []
-        if recording.motion is not None and recording.motion.position.size:
-            paths.append(folder / f"{name}.parquet")
-            write_joints(paths[-1], recording.motion)
-        for camera, trajectory in tracks_of(recording).items():
-            paths.append(folder / f"{name}_{safe_file_name(camera)}.parquet")
-            schema = POSES if trajectory.covariance is None else POSES_WITH_COVARIANCE
-            write_table(paths[-1], pose_table(trajectory), schema)
-        if not paths:
-            raise DataError(recording.name, "holds neither joints nor camera poses", "reconstruct it first")
-        return sorted(paths)
+        return write_tables(recording, folder, ".parquet", write_joints, write_poses)
+
+
+def write_poses(path: Path, trajectory: Trajectory) -> None:
+    """Write `tables.POSES`, with the covariances where the trajectory has them."""
+    schema = POSES if trajectory.covariance is None else POSES_WITH_COVARIANCE
+    write_table(path, pose_table(trajectory), schema)
 
 
 def write_joints(path: Path, motion: JointMotion) -> None:
