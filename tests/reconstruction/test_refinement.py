@@ -142,16 +142,7 @@ def test_covariances_are_those_of_the_whole_inverse() -> None:
     shared[-2:] = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)
     state = replace(state, position=still, shared=shared)
     system = with_exact_pictures(system, state)
-    at = packed(state)
-    cost = cost_of(system, state)
-    step = 1e-4
-    moves = step * np.eye(at.size)
-    hessian = np.zeros((at.size, at.size))
-    for i, move in enumerate(moves):
-        for j in range(i + 1):
-            ahead = cost(at + move + moves[j]) - cost(at + move - moves[j])
-            behind = cost(at - move + moves[j]) - cost(at - move - moves[j])
-            hessian[i, j] = hessian[j, i] = (ahead - behind) / (8 * step**2)
+    hessian = picture_hessian(system, state) + prior_hessian(system, state)
     # Lengths of which the estimate holds 1e-6 in addition, and joints 1e-4: far below what is measured.
     inverse = np.linalg.inv(hessian)
     times, joints = still.shape[:2]
@@ -160,6 +151,37 @@ def test_covariances_are_those_of_the_whole_inverse() -> None:
     found = covariances(system, eliminate(system, state))
     # Second differences of costs of size 1 with steps of 1e-4 are good to 1e-8 of a curvature of 1e4.
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
+
+
+def picture_hessian(system: System, state: State, step: float = 1e-4) -> Float:
+    """Half the second derivatives of the loss of pictures that are met exactly: J' J of their residuals."""
+    at = packed(state)
+
+    def residuals(vector: Float) -> Float:
+        return misfit(system, unpacked(vector, state))[1].ravel()
+
+    moves = step * np.eye(at.size)
+    by = np.array([(residuals(at + move) - residuals(at - move)) / (2 * step) for move in moves])
+    hessian: Float = by @ by.T
+    return hessian
+
+
+def prior_hessian(system: System, state: State, step: float = 1e-4) -> Float:
+    """Half the second derivatives of the prior, in which a white error goes with nothing else."""
+    at = packed(state)
+
+    def cost(*moves: Float) -> float:
+        return prior_cost(system, unpacked(at + sum(moves), state))
+
+    steps = step * np.eye(at.size)
+    here = cost()
+    alone = np.array([cost(move) + cost(-move) for move in steps])
+    hessian = np.diag((alone - 2 * here) / (2 * step**2))
+    for i in range(at.size - state.white.size):
+        for j in range(i):
+            both = cost(steps[i], steps[j]) + cost(-steps[i], -steps[j])
+            hessian[i, j] = hessian[j, i] = (both - alone[i] - alone[j] + 2 * here) / (4 * step**2)
+    return hessian
 
 
 def with_exact_pictures(system: System, state: State) -> System:

@@ -131,7 +131,7 @@ def initial_state(problem: Problem, known: Knowledge, position: Float) -> State:
         lengths = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
         shared[layout.bone_column :] = np.median(lengths, axis=0)
     return State(
-        position,
+        np.ascontiguousarray(position),  # of one layout: everything is compiled for that
         np.zeros((len(problem.knot_t_s), layout.knot_count)),
         shared,
         np.zeros((len(problem.pictures.first), 6)),

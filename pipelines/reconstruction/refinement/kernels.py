@@ -26,8 +26,7 @@ _NEAREST_M = 0.1  # a joint nearer to the camera's plane says nothing
 @helper
 def exponential(rotation_vector: Float, rotation: Float, jacobian: Float) -> None:
     """exp(r) [3, 3] and its left Jacobian: exp(r + dr) = exp(J dr) exp(r) (Barfoot 2017, 7.77 and 7.85)."""
-    x, y, z = rotation_vector
-    angle2 = x * x + y * y + z * z
+    angle2 = rotation_vector[0] ** 2 + rotation_vector[1] ** 2 + rotation_vector[2] ** 2
     if angle2 < 1e-8:
         a, b, c = 1.0 - angle2 / 6, 0.5 - angle2 / 24, 1.0 / 6 - angle2 / 120
     else:
@@ -35,15 +34,18 @@ def exponential(rotation_vector: Float, rotation: Float, jacobian: Float) -> Non
         a = np.sin(angle) / angle
         b = (1.0 - np.cos(angle)) / angle2
         c = (1.0 - a) / angle2
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     for i in range(3):
         for j in range(3):
-            square = 0.0
-            for k in range(3):
-                square += cross[i, k] * cross[k, j]
+            product = rotation_vector[i] * rotation_vector[j]
             one = 1.0 if i == j else 0.0
-            rotation[i, j] = one + a * cross[i, j] + b * square
-            jacobian[i, j] = one + b * cross[i, j] + c * square
+            rotation[i, j] = (1.0 - b * angle2) * one + b * product
+            jacobian[i, j] = (1.0 - c * angle2) * one + c * product
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        rotation[i, j] -= a * rotation_vector[k]
+        rotation[j, i] += a * rotation_vector[k]
+        jacobian[i, j] -= b * rotation_vector[k]
+        jacobian[j, i] += b * rotation_vector[k]
 
 
 @helper
@@ -106,7 +108,7 @@ def linearise(
                 total += turned[i, k] * camera_from_world[k, j]
             corrected_from_world[i, j] = total
     for joint in range(len(joints)):
-        residual[joint] = np.nan
+        residual[joint, 0] = residual[joint, 1] = np.nan
         if np.isnan(xy[joint, 0]):
             continue
         for i in range(3):
@@ -331,7 +333,8 @@ def assemble(
     of_numbers = np.empty((NUMBERS, NUMBERS))
     joint_gradient, number_gradient = np.empty((J, 3)), np.empty(NUMBERS)
     believed = np.empty(J)
-    factor, by_white, z = np.empty((WHITE, WHITE)), np.empty((n + NUMBERS, WHITE)), np.empty(WHITE)
+    factor, by_white = np.empty((WHITE, WHITE)), np.empty((n + NUMBERS + 1, WHITE))
+    z = by_white[n + NUMBERS]  # the gradient stands below the derivatives
     most = 2 * (entry_column.size + 1)
     column, of_number, share = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
     half = 0.0
@@ -361,22 +364,17 @@ def assemble(
                     factor[a, b] = of_numbers[a, b]
                 factor[a, a] += white_precision[c, a]
                 z[a] = number_gradient[a] + white_precision[c, a] * white[g, a]
+                for p in range(n):
+                    by_white[p, a] = across[p // 3, p % 3, a]
+                for b in range(NUMBERS):
+                    by_white[n + b, a] = of_numbers[b, a]
             factorise(factor)
             for a in range(WHITE):
                 half += np.log(factor[a, a])
-            forward(factor, z)
-            for joint in range(J):
-                for i in range(3):
-                    row = by_white[3 * joint + i]
-                    row[:] = across[joint, i, :WHITE]
-                    forward(factor, row)
-            for a in range(NUMBERS):
-                row = by_white[n + a]
-                row[:] = of_numbers[a, :WHITE]
-                forward(factor, row)
+            for row in range(len(by_white)):
+                forward(factor, by_white[row])
         else:
             by_white[:] = 0.0
-            z[:] = 0.0
 
         entries = 0
         for e in range(entry_start[c], entry_start[c + 1]):
@@ -475,18 +473,18 @@ def whiten(
 ) -> None:
     """The step of every picture's white error [G, 6] that belongs to a step of everything else."""
     J = position.shape[1]
-    out, rate, moved_by, unused = np.empty((J, 3)), np.empty((J, 3)), np.empty((J, 3)), np.empty((J, 3))
+    out, rate = np.empty((J, 3)), np.empty((J, 3))
     weight, slope, number, numbers_by = np.empty(3), np.empty(3), np.empty(NUMBERS), np.empty(NUMBERS)
     residual, by_joint, by_number = np.empty((J, 2)), np.zeros((J, 2, 3)), np.zeros((J, 2, NUMBERS))
-    factor, z, nothing = np.empty((WHITE, WHITE)), np.empty(WHITE), np.zeros(WHITE)
+    factor, nothing = np.empty((WHITE, WHITE)), np.zeros(WHITE)
     for g in range(len(camera)):
         c = camera[g]
-        step_white[g] = 0.0
+        z = step_white[g]
+        z[:] = 0.0
         if not np.isfinite(white_precision[c, 0]):
             continue
         moved = when[g] + (shared[clock_column[c]] if clock_column[c] >= 0 else 0.0)
         at_picture(first[g], t_s, moved, position, weight, slope, out, rate)
-        at_picture(first[g], t_s, moved, step_position, weight, slope, moved_by, unused)
         numbers_of(
             c, fraction[g], interval[g], entry_start, entry_number, entry_knot, entry_column, knots, shared,
             white[g], number,
@@ -511,7 +509,8 @@ def whiten(
             for axis in range(2):
                 after = residual[joint, axis]
                 for i in range(3):
-                    after += by_joint[joint, axis, i] * moved_by[joint, i]
+                    for k in range(3):
+                        after += by_joint[joint, axis, i] * weight[k] * step_position[first[g] + k, joint, i]
                 for a in range(NUMBERS):
                     after += by_number[joint, axis, a] * numbers_by[a]
                 for a in range(WHITE):
@@ -521,7 +520,6 @@ def whiten(
         factorise(factor)
         forward(factor, z)
         backward(factor, z)
-        step_white[g] = z
 
 
 @cached
@@ -556,7 +554,7 @@ def misfit(
     J = position.shape[1]
     out, rate = np.empty((J, 3)), np.empty((J, 3))
     weight, slope = np.empty(3), np.empty(3)
-    residual, by_joint, by_number = np.empty((J, 2)), np.zeros((J, 2, 3)), np.zeros((J, 2, NUMBERS))
+    by_joint, by_number = np.zeros((J, 2, 3)), np.zeros((J, 2, NUMBERS))
     total = 0.0
     for g in range(len(camera)):
         c = camera[g]
@@ -568,11 +566,10 @@ def misfit(
         )  # fmt: skip
         linearise(
             out, rate, numbers[g], xy[g], sharpness[g], pose_position[g], pose_rotation[g], speed[g], turn[g],
-            residual, by_joint, by_number,
+            residuals[g], by_joint, by_number,
         )  # fmt: skip
         for joint in range(J):
-            value = residual[joint, 0] ** 2 + residual[joint, 1] ** 2
-            residuals[g, joint] = residual[joint]
+            value = residuals[g, joint, 0] ** 2 + residuals[g, joint, 1] ** 2
             if not np.isnan(value):
                 total += trust[g, joint] * loss_of(value, bound2)
     return total
@@ -625,7 +622,7 @@ def rows_of_picture(
     of_joints, across = np.empty((J, 3, 3)), np.empty((J, 3, NUMBERS))
     of_numbers = np.empty((NUMBERS, NUMBERS))
     joint_gradient, number_gradient = np.empty((J, 3)), np.empty(NUMBERS)
-    factor, z = np.zeros((WHITE, WHITE)), np.empty(WHITE)
+    factor, variance = np.zeros((WHITE, WHITE)), np.zeros((WHITE, WHITE))
     c = camera[g]
     moved = when[g] + (shared[clock_column[c]] if clock_column[c] >= 0 else 0.0)
     at_picture(first, t_s, moved, position, weight, slope, out, rate)
@@ -654,26 +651,19 @@ def rows_of_picture(
                 factor[a, b] = of_numbers[a, b]
             factor[a, a] += white_precision[c, a]
         factorise(factor)
-        for p in range(n):
-            z[:] = across[p // 3, p % 3, :WHITE]
-            forward(factor, z)
-            backward(factor, z)
-            for k in range(3):
-                for a in range(WHITE):
-                    white_rows[a, k * n + p] -= weight[k] * z[a]
         for a in range(WHITE):
-            z[:] = 0.0
-            z[a] = 1.0
-            forward(factor, z)
-            for b in range(WHITE):
-                own[2 * J + a] += z[b] * z[b]
+            variance[a, a] = 1.0
+            forward(factor, variance[a])
+            backward(factor, variance[a])
+            own[2 * J + a] = variance[a, a]
+            for p in range(n):
+                total = 0.0
+                for b in range(WHITE):
+                    total += variance[a, b] * across[p // 3, p % 3, b]
+                for k in range(3):
+                    white_rows[a, k * n + p] -= weight[k] * total
     for e in range(entry_start[c], entry_start[c + 1]):
         d = entry_number[e]
-        z[:] = 0.0
-        if has_white:
-            z[:] = of_numbers[d, :WHITE]
-            forward(factor, z)
-            backward(factor, z)
         sides = 2 if entry_knot[e] else 1
         for side in range(sides):
             if entry_knot[e]:
@@ -683,7 +673,8 @@ def rows_of_picture(
                 column = 3 * n + 2 * knot_count + entry_column[e]
                 share = 1.0
             for a in range(WHITE):
-                white_rows[a, column] -= share * z[a]
+                for b in range(WHITE):
+                    white_rows[a, column] -= share * variance[a, b] * of_numbers[d, b]
             for joint in range(J):
                 if believed[joint] > 0:
                     for axis in range(2):
@@ -701,10 +692,8 @@ def rows_of_picture(
                     by = by_number[joint, axis, a]
                     for column in range(rows.shape[1]):
                         row[column] += by * white_rows[a, column]
-                z[:] = by_number[joint, axis, :WHITE]
-                forward(factor, z)
-                for b in range(WHITE):
-                    own[2 * joint + axis] += z[b] * z[b]
+                    for b in range(WHITE):
+                        own[2 * joint + axis] += by * variance[a, b] * by_number[joint, axis, b]
 
 
 @helper

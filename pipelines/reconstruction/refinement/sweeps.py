@@ -24,8 +24,18 @@ Int64 = NDArray[np.int64]
 
 
 @helper
-def eliminate(own: Float, across: Float, gradient: Float, inverse: Float, y: Float) -> tuple[Float, float]:
-    """W = B L^-T; in place R = L^-1 and y = -R g; half the logarithm of the determinant of `own`."""
+def copy_block(source: Float, row: int, column: int, out: Float) -> None:
+    """Part of a matrix; assigned to a slice it would take seconds longer to compile."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = source[row + i, column + j]
+
+
+@helper
+def eliminate(
+    own: Float, beside: Float, gradient: Float, inverse: Float, across: Float, y: Float
+) -> tuple[Float, float]:
+    """R = L^-1, W = B R' and y = -R g in place; W W' and half the logarithm of the determinant of `own`."""
     n = len(own)
     lower = np.linalg.cholesky(own)
     half = 0.0
@@ -47,7 +57,8 @@ def eliminate(own: Float, across: Float, gradient: Float, inverse: Float, y: Flo
         for j in range(i + 1):
             total -= inverse[i, j] * gradient[j]
         y[i] = total
-    return np.dot(across, inverse.T), half
+    np.dot(beside, inverse.T, across)
+    return np.dot(across, across.T), half
 
 
 @cached
@@ -138,13 +149,12 @@ def forwards(
                 position[time + offset], bones, lengths, bone_sigma, grown, n * offset, length_offset, front,
                 gradient,
             )  # fmt: skip
-        own[:] = front[:n, :n]
-        beside[:] = front[n:, :n]
+        copy_block(front, 0, 0, own)
+        copy_block(front, n, 0, beside)
         row = time - first
-        w, part = eliminate(own, beside, gradient[:n], inverse[row], solved[row])
+        w = across[row]
+        less, part = eliminate(own, beside, gradient[:n], inverse[row], w, solved[row])
         half += part
-        across[row] = w
-        less = np.dot(w, w.T)
         # The joints at the next two times move up; those of a third come in, of which nothing is known yet.
         for i in range(2 * n):
             down = 0.0
@@ -186,25 +196,23 @@ def eliminate_knot(
     """Eliminate the knot before; the knot after takes its place, of the next nothing is known yet."""
     size = len(gradient)
     before, after = 3 * n, 3 * n + c
-    own[:] = front[before:after, before:after]
+    copy_block(front, before, before, own)
     for i in range(c):
         for j in range(2 * n):
             beside[j, i] = front[before + i, j]
         for j in range(after, size):
             beside[2 * n + j - after, i] = front[j, before + i]
-    w, half = eliminate(own, beside, gradient[before:after], inverse, solved)
-    across[:] = w
-    less = np.dot(w, w.T)
+    less, half = eliminate(own, beside, gradient[before:after], inverse, across, solved)
     for i in range(2 * n):
         for a in range(c):
-            gradient[i] += w[i, a] * solved[a]
+            gradient[i] += across[i, a] * solved[a]
         for j in range(i + 1):
             front[i, j] -= less[i, j]
     for i in range(after, size):
         row = 2 * n + i - after
         down = 0.0
         for a in range(c):
-            down += w[row, a] * solved[a]
+            down += across[row, a] * solved[a]
         gradient[i] += down
         for j in range(2 * n):
             front[i, j] -= less[row, j]
@@ -279,24 +287,28 @@ def backwards(
     n, c = position.shape[1], knots.shape[1]
     s = len(shared)
     z, zk = np.empty(2 * n + 2 * c + s), np.empty(2 * n + c + s)
-    z[2 * n + 2 * c :] = shared
-    zk[2 * n + c :] = shared
+    for i in range(s):
+        z[2 * n + 2 * c + i] = shared[i]
+        zk[2 * n + c + i] = shared[i]
     rest_n, rest_c = np.empty(n), np.empty(c)
-    for time in range(last - 1, first - 1, -1):
-        # Which knots were alive when this time was eliminated.
-        while c and interval > of_time[time]:
+    for time in range(last - 1, first - 2, -1):
+        # Which knots were alive when this time was eliminated; at the end, those before the stretch.
+        while c and interval > (of_time[time] if time >= first else first_interval):
             interval -= 1
             follow_knot(
                 interval - first_interval, time, interval, n, c, zk, rest_c, knot_inverse, knot_across,
                 knot_solved, position, knots,
             )  # fmt: skip
-        z[:n] = position[time + 1]
-        z[n : 2 * n] = position[time + 2]
+        if time < first:
+            break
+        row = time - first
+        for i in range(n):
+            z[i] = position[time + 1, i]
+            z[n + i] = position[time + 2, i]
+            rest_n[i] = solved[row, i]
         for i in range(c):
             z[2 * n + i] = knots[interval, i]
             z[2 * n + c + i] = knots[interval + 1, i]
-        row = time - first
-        rest_n[:] = solved[row]
         for j in range(len(z)):
             for i in range(n):
                 rest_n[i] -= across[row, j, i] * z[j]
@@ -305,12 +317,6 @@ def backwards(
         for j in range(n):
             for i in range(j + 1):
                 position[time, i] += inverse[row, j, i] * rest_n[j]
-    while c and interval > first_interval:
-        interval -= 1
-        follow_knot(
-            interval - first_interval, first - 1, interval, n, c, zk, rest_c, knot_inverse, knot_across,
-            knot_solved, position, knots,
-        )  # fmt: skip
     return interval
 
 
@@ -330,10 +336,12 @@ def follow_knot(
     knots: Float,
 ) -> None:
     """A knot, once the two times after it was eliminated, `time` + 1 and + 2, and the next knot are known."""
-    z[:n] = position[time + 1]
-    z[n : 2 * n] = position[time + 2]
-    z[2 * n : 2 * n + c] = knots[interval + 1]
-    rest[:] = solved[row]
+    for i in range(n):
+        z[i] = position[time + 1, i]
+        z[n + i] = position[time + 2, i]
+    for i in range(c):
+        z[2 * n + i] = knots[interval + 1, i]
+        rest[i] = solved[row, i]
     for j in range(len(z)):
         for i in range(c):
             rest[i] -= across[row, j, i] * z[j]
@@ -352,9 +360,13 @@ def join(inverse: Float, across: Float, others: Float) -> tuple[Float, Float]:
     """Covariance of what was eliminated, and with the others, given that of the others."""
     gain = np.dot(across, inverse)  # [m, n]; x follows the others by its negative, transposed
     cross = np.dot(others, gain)  # [m, n], negative
-    own = np.dot(inverse.T, inverse) + np.dot(gain.T, cross)
+    own, more = np.dot(inverse.T, inverse), np.dot(gain.T, cross)
     # Rounding must not grow from step to step: what is not symmetric would.
-    return (own + own.T) / 2, cross
+    for i in range(len(own)):
+        for j in range(i + 1):
+            own[i, j] = own[i, j] + 0.5 * (more[i, j] + more[j, i])
+            own[j, i] = own[i, j]
+    return own, cross
 
 
 @cached
@@ -425,24 +437,27 @@ def visit(
     believed, residual = np.empty(J), np.empty((J, 2))
     rows, added = np.empty((2 * J + WHITE, size)), np.empty(2 * J + WHITE)
     joints_time = len(t_s) - 3
-    for time in range(last - 1, first - 1, -1):
-        while c and interval > of_time[time]:
+    for time in range(last - 1, first - 2, -1):
+        # As on the way forwards; at the end, the knots before the stretch.
+        while c and interval > (of_time[time] if time >= first else first_interval):
             interval -= 1
             row = interval - first_interval
             alive = before_knot(alive, n, c, knot_inverse[row], knot_across[row])
             if every:
                 walk_of(alive, n, c, knots, knot_t_s, interval, walked)
+        if time < first:
+            break
         row = time - first
         own, cross = join(inverse[row], across[row], alive)
-        whole[:n, :n] = own
+        for i in range(n):
+            for j in range(n):
+                whole[i, j] = own[i, j]
         for i in range(m):
             for j in range(n):
                 whole[n + i, j] = -cross[i, j]
+                whole[j, n + i] = -cross[i, j]
             for j in range(m):
                 whole[n + i, n + j] = alive[i, j]
-        for j in range(n):
-            for i in range(m):
-                whole[j, n + i] = -cross[i, j]
         if len(covariance):
             for k in range(3 if time == joints_time else 1):
                 for joint in range(J):
@@ -473,22 +488,13 @@ def visit(
                     p = 3 * n + 2 * c + i
                     starting[c + i, 0] = shared[i] ** 2 + whole[p, p]
                     starting[c + i, 1] = whole[p, p]
-        for i in range(2 * n):
+        # The third of the joints' times was not alive before.
+        for i in range(m):
+            below = i if i < 2 * n else i + n
             for j in range(2 * n):
-                alive[i, j] = whole[i, j]
-            for j in range(3 * n, size):
-                alive[i, j - n] = whole[i, j]
-        for i in range(3 * n, size):
-            for j in range(2 * n):
-                alive[i - n, j] = whole[i, j]
-            for j in range(3 * n, size):
-                alive[i - n, j - n] = whole[i, j]
-    while c and interval > first_interval:
-        interval -= 1
-        row = interval - first_interval
-        alive = before_knot(alive, n, c, knot_inverse[row], knot_across[row])
-        if every:
-            walk_of(alive, n, c, knots, knot_t_s, interval, walked)
+                alive[i, j] = whole[below, j]
+            for j in range(2 * n, m):
+                alive[i, j] = whole[below, n + j]
     return alive, interval
 
 
@@ -515,7 +521,9 @@ def before_knot(alive: Float, n: int, c: int, inverse: Float, across: Float) -> 
         for j in range(c):
             joined[place[i], 2 * n + j] = -cross[i, j]
             joined[2 * n + j, place[i]] = -cross[i, j]
-    joined[2 * n : 2 * n + c, 2 * n : 2 * n + c] = own
+    for i in range(c):
+        for j in range(c):
+            joined[2 * n + i, 2 * n + j] = own[i, j]
     return joined
 
 
