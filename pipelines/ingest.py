@@ -20,6 +20,7 @@ from typing import Self
 import numpy as np
 
 from pipelines.formats.flights.flight_sources import CameraFrames, FlightSources, losses, source_files
+from pipelines.formats.logs.mcap_checksums import OTHER_CHECKSUM, CheckedHash, stated_checksum
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.poses import gaps, interpolate_poses
@@ -123,7 +124,7 @@ def ingest(
     with _Reader(flight, flight_path, target, interpolation) as reader:
         # Where nothing can be skipped, what is hashed is read at the same time.
         meanwhile = reader.read_ahead() if force or _is_new(target) else iter(())
-        sources = _hash_sources(flight, flight_path.parent, progress, meanwhile)
+        sources, damage = _hash_sources(flight, flight_path.parent, progress, meanwhile)
         with locked(target, create=True, overwrite=overwrite) as writable:
             run = writable.begin(INGEST, settings=settings, inputs=sources, force=force)
             if run.finished:
@@ -149,6 +150,7 @@ def ingest(
             plan = reader.store_plan(run.folder, entries)
             origin = reader.origin()
             warnings += reader.take_notes()
+            warnings += [f"{path}: {losses(causes)}: copy it again" for path, causes in damage.items()]
 
             description = Description(
                 schema_version=1,
@@ -163,6 +165,7 @@ def ingest(
                 truth=truth,
                 plan=plan,
                 sources=sources,
+                damage=damage,
                 warnings=warnings,
             )
             if strict:
@@ -187,6 +190,7 @@ def _refuse_losses(flight_path: Path, description: Description) -> None:
             ("keypoints", camera.keypoints.dropped if camera.keypoints else {}),
         )
     }
+    parts |= description.damage
     parts["actor"] = description.actor.dropped if description.actor else {}
     parts["map"] = description.map.dropped if description.map else {}
     parts |= {f"{name}: plan": sent.dropped for name, sent in (description.plan or {}).items()}
@@ -232,8 +236,8 @@ def _is_new(target: Path) -> bool:
 
 def _hash_sources(
     flight: Flight, base: Path, progress: Progress, meanwhile: Iterator[object]
-) -> dict[str, str]:
-    """The sha256 of every file that is read, by the path that the manifest states.
+) -> tuple[dict[str, str], dict[str, dict[str, int]]]:
+    """The sha256 of every file that is read, by the path that the manifest states, and what is damaged.
 
     Args:
         flight: the manifest.
@@ -277,25 +281,37 @@ def _hash_sources(
         take(flight.truth.joints.path if flight.truth.joints else None, *flight.truth.poses.values())
     unique = list(dict.fromkeys(stated))
     progress.start("Hashing sources", len(unique))
-    hashes = {}
+    hashes, damage = {}, {}
     with ThreadPoolExecutor(_HASHERS) as pool:  # hashing releases the interpreter: long logs side by side
         hashing = {path: pool.submit(_hash_of, base / path) for path in unique}
         try:
             while not all(digest.done() for digest in hashing.values()) and next(meanwhile, None):
                 pass
             for path, digest in hashing.items():
-                hashes[path] = digest.result()
+                hashes[path], differing = digest.result()
+                if differing:
+                    damage[path] = {OTHER_CHECKSUM: differing}
                 progress.advance()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    return hashes
+    return hashes, damage
 
 
-def _hash_of(path: Path) -> str:
-    """The sha256 of a source; of a floor plan's YAML, together with the picture that it names."""
-    digests = [sha256_of(file) for file in source_files(path)]
-    return digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
+def _hash_of(path: Path) -> tuple[str, int]:
+    """The sha256 of a source, and how many of its files are not what their own checksum says.
+
+    A floor plan's YAML is hashed together with the picture that it names.
+    """
+    hashes: list[CheckedHash] = []
+
+    def hash_for(file: Path) -> CheckedHash:
+        hashes.append(CheckedHash(stated_checksum(file)))
+        return hashes[-1]
+
+    digests = [sha256_of(file, hash_for) for file in source_files(path)]
+    digest = digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
+    return digest, sum(each.differs for each in hashes)
 
 
 def _counts(entries: Mapping[str, CameraEntry]) -> dict[str, object]:

@@ -200,6 +200,7 @@ class Description(Entry):
     truth: TruthEntry | None
     plan: dict[str, PlannedEntry] | None = None  # by camera
     sources: dict[str, str]  # path as the manifest states it -> sha256
+    damage: dict[str, dict[str, int]] = {}  # of sources as wholes: path -> how often, by cause
     warnings: list[str]
 
 

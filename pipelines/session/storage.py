@@ -8,7 +8,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,29 +32,33 @@ def as_data_error(error: OSError, path: Path) -> DataError:
     return DataError(error.filename or path, error.strerror or str(error), remedy)
 
 
-def sha256_of(path: Path) -> str:
+def sha256_of(path: Path, hash_for: Callable[[Path], Any] = lambda _: hashlib.sha256()) -> str:
     """Hash of a file's content, or of a folder's: the relative names and contents of all its files, sorted.
 
     Empty folders do not count, nor does what lies behind links to folders.
+
+    Args:
+        path: the file or folder.
+        hash_for: makes what is given the bytes of a file and has their SHA-256 as its digest.
 
     Raises:
         DataError: the path is missing or cannot be read.
     """
     try:
         if not path.is_dir():
-            return _file_digest(path).hex()
+            return _file_digest(path, hash_for).hex()
         digest = hashlib.sha256()
         for name, file in sorted((file.relative_to(path).as_posix(), file) for file in _files(path)):
             # Zero byte after the name, a digest of fixed length: no two folders run together.
-            digest.update(os.fsencode(name) + b"\0" + _file_digest(file))
+            digest.update(os.fsencode(name) + b"\0" + _file_digest(file, hash_for))
         return digest.hexdigest()
     except OSError as error:
         raise as_data_error(error, path) from error
 
 
-def _file_digest(path: Path) -> bytes:
+def _file_digest(path: Path, hash_for: Callable[[Path], Any]) -> bytes:
     with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").digest()
+        return hashlib.file_digest(file, lambda: hash_for(path)).digest()
 
 
 def _files(folder: Path) -> list[Path]:

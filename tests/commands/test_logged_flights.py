@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,25 @@ def test_strict_refuses_what_is_salvaged_otherwise(tmp_path: Path) -> None:
     _, description = ingested(tmp_path)
     assert description["cameras"]["drone1"]["poses"]["dropped"]
     assert line == refused("ingest", flight.manifest, "--strict")  # though there is nothing left to do
+
+
+def test_a_log_that_differs_from_its_own_checksum_is_said_and_refused_by_strict(tmp_path: Path) -> None:
+    flight = write_logged_flight(tmp_path, "mcap-cdr")
+    stated = flight.settings["cameras"]["drone1"]["pose"]["log"]
+    log = tmp_path / stated
+    whole = log.read_bytes()
+    # The summary begins where the footer says; before it the end of the data states 0, no checksum.
+    end = int.from_bytes(whole[-28:-20], "little") - 13
+    for crc, damage in (
+        (zlib.crc32(whole[:end]), {}),
+        (1, {stated: {"data section that differs from its checksum": 1}}),
+    ):
+        log.write_bytes(whole[: end + 9] + crc.to_bytes(4, "little") + whole[end + 13 :])
+        _, description = ingested(tmp_path)
+        assert description["damage"] == damage
+        assert description["cameras"]["drone1"]["poses"]["dropped"] == {}  # every message could be read
+        assert any("differs from its checksum" in line for line in description["warnings"]) == bool(damage)
+    assert f"{stated}: 1 data section that differs" in refused("ingest", flight.manifest, "--strict")
 
 
 def test_missing_topic_lists_the_candidates(tmp_path: Path) -> None:

@@ -38,8 +38,8 @@ _STAMP_LIMIT = 1 << 63  # our stamps are int64
 class McapLog:
     """MCAP files with messages in ros1, cdr, json or protobuf.
 
-    Checksums of chunks are verified; that of the whole data section is not, for it would take a reading
-    of the whole file.
+    Checksums of chunks are verified; that of the whole data section is where the whole file is read
+    (`mcap_checksums`).
     """
 
     name = "mcap"

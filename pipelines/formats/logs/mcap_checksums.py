@@ -1,0 +1,82 @@
+"""The checksum of an MCAP file's data section, taken while the whole file is hashed anyway.
+
+Record DataEnd states the CRC-32 of everything before it, or 0 (mcap.dev/spec, "Data End"). Checking it takes
+a reading of the whole file, which reading a topic or two does not; hashing a source is one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+OTHER_CHECKSUM = "data section that differs from its checksum"
+
+_MAGIC = b"\x89MCAP0\r\n"
+_FOOTER = struct.Struct("<BQQQI8s")  # kind, length; start of summary and of its offsets, checksum; magic
+_DATA_END = struct.Struct("<BQI")  # kind, length; checksum
+_FOOTER_KIND, _FOOTER_LENGTH, _DATA_END_KIND, _DATA_END_LENGTH = 2, 20, 15, 4
+
+
+@dataclass(frozen=True)
+class StatedChecksum:
+    """What a file says of its own bytes."""
+
+    crc: int
+    size: int  # of the data section: bytes from the beginning of the file
+
+
+class CheckedHash:
+    """A hash for `hashlib.file_digest` that takes the checksum of the first bytes as well."""
+
+    def __init__(self, stated: StatedChecksum | None) -> None:
+        self._sha256 = hashlib.sha256()
+        self._stated = stated
+        self._left = stated.size if stated else 0
+        self._crc = 0
+
+    @property
+    def differs(self) -> bool:
+        """Whether a checksum is stated and is not that of the bytes."""
+        return self._stated is not None and self._crc != self._stated.crc
+
+    def update(self, data: memoryview) -> None:
+        """Take some more bytes."""
+        self._sha256.update(data)
+        if self._left:
+            begin = data[: self._left]
+            self._crc = zlib.crc32(begin, self._crc)
+            self._left -= len(begin)
+
+    def digest(self) -> bytes:
+        """The SHA-256 of all bytes."""
+        return self._sha256.digest()
+
+
+def stated_checksum(path: Path) -> StatedChecksum | None:
+    """The checksum that a file states; None where it states none, is no MCAP, or has lost its end.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        if file.read(len(_MAGIC)) != _MAGIC:
+            return None
+        size = file.seek(0, 2)
+        if size < len(_MAGIC) + _DATA_END.size + _FOOTER.size:
+            return None
+        footer_at = file.seek(size - _FOOTER.size)
+        kind, length, summary_at, _, _, magic = _FOOTER.unpack(file.read(_FOOTER.size))
+        if (kind, length, magic) != (_FOOTER_KIND, _FOOTER_LENGTH, _MAGIC):
+            return None
+        # The summary follows the end of the data; without one the footer does.
+        end = (summary_at or footer_at) - _DATA_END.size
+        if not len(_MAGIC) <= end <= footer_at - _DATA_END.size:
+            return None
+        file.seek(end)
+        kind, length, crc = _DATA_END.unpack(file.read(_DATA_END.size))
+    if (kind, length) != (_DATA_END_KIND, _DATA_END_LENGTH) or not crc:
+        return None
+    return StatedChecksum(crc, end)
