@@ -14,7 +14,7 @@ from pipelines.session.stages import locked
 from tests.commands.runner import MOCAP, content, mocap_process, refusal, succeeds
 from tests.synthetic.flights import write_flight
 
-KILLS = 12
+KILLS = 4  # fifty moments of every stage: `python -m tests.kills`
 
 
 def killed_after(seconds: float, *arguments: str | Path) -> None:
