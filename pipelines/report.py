@@ -11,13 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.formats.flights.pictures import Picture, Pictures, open_pictures
+from pipelines.planning.hidden import hidden_shares
+from pipelines.planning.loading import load_flight
 from pipelines.reporting.comparison import compare, labels_of
 from pipelines.reporting.comparison_figures import draw_comparison
 from pipelines.reporting.comparison_page import GENERATOR, render_comparison
 from pipelines.reporting.content import ReplanContent, SessionContent, section
 from pipelines.reporting.figure_files import MARK, refuse_foreign, write_figures
 from pipelines.reporting.page import draw_session, render_page
-from pipelines.session.description import read_description
+from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
 from pipelines.session.stages import (
@@ -27,6 +29,7 @@ from pipelines.session.stages import (
     locked,
     open_session,
     session_name,
+    versions_of,
 )
 from pipelines.session.storage import as_data_error, canonical_json, read_json
 from pipelines.session.tables import (
@@ -46,7 +49,7 @@ from pipelines.session.whole_folders import is_made, whole_folder
 if TYPE_CHECKING:
     import pandas as pd
 
-REPORT = Stage("report", revision=4)
+REPORT = Stage("report", revision=5)
 _FIGURES_REVISION = 1
 
 
@@ -272,12 +275,27 @@ def _load(folder: Path, records: dict[str, StageRecord]) -> SessionContent:
         keypoints=keypoints,
         stages={name: asdict(record) for name, record in records.items()},
         replan=_load_replan(folder, records["replan"]) if "replan" in records else None,
-        refined=_load_refined(folder) if reconstructed else {},
+        refined=_by_camera(folder / "reconstruct" / "cameras.parquet") if reconstructed else {},
+        true_poses=_by_camera(folder / "truth_poses.parquet"),
+        hidden=_load_hidden(folder, description, records),
+        made_by=versions_of(folder),
     )
 
 
-def _load_refined(folder: Path) -> dict[str, pd.DataFrame]:
-    path = folder / "reconstruct" / "cameras.parquet"
+def _load_hidden(folder: Path, description: Description, records: dict[str, StageRecord]) -> dict[str, float]:
+    """For how much of the flight the map hides the actor; empty without a map, or without an actor."""
+    maps = load_maps(folder)
+    if not maps:
+        return {}
+    try:
+        flight = load_flight(folder, description, records.get("reconstruct"), pose_noise=None)
+    except DataError:
+        return {}
+    return hidden_shares(flight, description, maps)
+
+
+def _by_camera(path: Path) -> dict[str, pd.DataFrame]:
+    """The poses of a table of all cameras; empty where it is not there."""
     if not path.exists():
         return {}
     table = read_table(path, CAMERA_POSES).sort_values(["camera", "t_ns"])

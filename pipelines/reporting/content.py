@@ -38,6 +38,9 @@ class SessionContent:
     stages: dict[str, dict[str, object]]  # stage: its stage.json
     replan: ReplanContent | None = None
     refined: dict[str, pd.DataFrame] = field(default_factory=dict)  # camera: tables.POSES, where refined
+    true_poses: dict[str, pd.DataFrame] = field(default_factory=dict)  # camera: tables.POSES, where known
+    hidden: dict[str, float] = field(default_factory=dict)  # camera: share of moments, where a map is
+    made_by: dict[str, dict[str, str]] = field(default_factory=dict)  # stage: program or library, and version
 
 
 def section(mapping: Mapping[str, object], key: str) -> dict[str, object]:

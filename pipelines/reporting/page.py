@@ -18,6 +18,7 @@ from pipelines.reporting.overlays import Moment, ReadFrame, collect_moments
 from pipelines.reporting.panels import draw_panel, picture_width
 from pipelines.reporting.placing import as_reconstructed
 from pipelines.reporting.plates import Plate
+from pipelines.reporting.quality import quality
 from pipelines.reporting.replanned import Replan, summarise_replan
 from pipelines.reporting.summary import Summary, errors_per_camera, give_verdict, measures, summarise
 from pipelines.reporting.templating import environment
@@ -61,7 +62,7 @@ class Overlays:
 def render_page(content: SessionContent, read_frame: ReadFrame | None = None) -> str:
     """The complete HTML of a session's report.
 
-    The same content gives the same bytes: no dates of making, no versions, no paths of this machine.
+    The same content gives the same bytes: no dates of making, no paths of this machine.
     Whatever stands in the session's files is escaped. The page loads nothing; it runs the one script of
     its 3D viewer, which its policy names by hash, and nothing else.
 
@@ -91,7 +92,11 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
             errors_per_camera=errors_per_camera(summary),
             plates=plates,
             replan=replan,
-            scene=make_scene(summary, content.poses, replan),
+            scene=make_scene(summary, content.poses | content.refined, replan),
+            refined=bool(content.refined),
+            quality=quality(content, summary),
+            hidden=bool(content.hidden),
+            made_by=_made_by(content),
             viewer_script=Markup(script),  # noqa: S704 - our own file
             policy=_policy(script, pictures=overlays is not None and overlays.pictures > 0),
             overlays=overlays,
@@ -168,6 +173,16 @@ def _key_figures(summary: Summary) -> list[KeyFigure]:
     if reprojection is not None:
         figures.append(KeyFigure(wording.fixed(reprojection), "px", "median reprojection"))
     return figures
+
+
+def _made_by(content: SessionContent) -> list[tuple[str, str]]:
+    """The stages that the same versions made, and those."""
+    made: dict[str, list[str]] = {}
+    for stage in content.stages:
+        if told := content.made_by.get(stage):
+            versions = ", ".join(f"{name} {number}" for name, number in told.items())
+            made.setdefault(versions, []).append(stage)
+    return [(wording.listing(stages), versions) for versions, stages in made.items()]
 
 
 def _stage_note(stage: str, record: Mapping[str, object]) -> StageNote:

@@ -23,7 +23,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from importlib.metadata import version
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -274,9 +275,36 @@ class Run:
             "started": self._started.isoformat(timespec="seconds"),
             "seconds": round(time.monotonic() - self._started_s, 3),
             "version": version("mocap-pipeline"),
+            "libraries": _libraries(),
             "platform": platform.platform(),
         }
         write_json(path, {"schema": SCHEMA, "runs": [*runs.get("runs", []), entry]})
+
+
+_LIBRARIES = (
+    *("numpy", "scipy", "numba", "pandas", "pyarrow", "matplotlib"),
+    *("opencv-python-headless", "av", "ai-edge-litert", "onnxruntime", "pycolmap", "mcap", "rosbags"),
+)
+"""What results rest on, as far as it is installed."""
+
+
+@cache
+def _libraries() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in _LIBRARIES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
+
+
+def versions_of(folder: Path) -> dict[str, dict[str, str]]:
+    """With which mocap, Python and libraries each stage of a session last ran, as far as run.json says."""
+    path = folder / "run.json"
+    runs = read_json(path, "remove it: it holds only times of day") if path.exists() else {}
+    told: dict[str, dict[str, str]] = {}
+    for run in runs.get("runs", []):
+        told[str(run.get("stage"))] = {"mocap": str(run.get("version")), **run.get("libraries", {})}
+    return told
 
 
 def session_name(folder: Path) -> str:

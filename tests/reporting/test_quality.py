@@ -1,0 +1,104 @@
+"""The table of data quality, against errors that were put in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pipelines.reporting.content import SessionContent
+from pipelines.reporting.page import render_page
+from pipelines.reporting.quality import QualityRow, quality
+from pipelines.reporting.summary import summarise
+from pipelines.reporting.wording import THIN
+from pipelines.session.tables import COVARIANCE_COLUMNS
+
+from .conftest import make_poses, make_session
+from .test_page import _Outline
+
+
+def _rows(content: SessionContent) -> dict[str, QualityRow]:
+    return {row.name: row for row in quality(content, summarise(content))}
+
+
+def test_pose_noise_is_measured_per_axis(content: SessionContent) -> None:
+    true = make_poses()["drone1"]
+    off = true.assign(x=true["x"] + 0.03, z=true["z"] - 0.04)
+    turned = Rotation.from_quat(true[["qx", "qy", "qz", "qw"]].to_numpy()) * Rotation.from_rotvec(
+        [0.6, 0, 0], True
+    )
+    off[["qx", "qy", "qz", "qw"]] = turned.as_quat()
+    row = _rows(replace(content, poses=content.poses | {"drone1": off}, true_poses={"drone1": true}))[
+        "drone1"
+    ]
+    # 0.05 m and 0.6 deg in all: a root of three less per axis.
+    assert row.measured == f"{0.05 / np.sqrt(3):.3f}{THIN}m, {0.6 / np.sqrt(3):.2f}{THIN}deg"
+    assert _rows(content)["drone1"].measured == "–"
+
+
+def test_who_states_the_pose_noise_is_said(content: SessionContent) -> None:
+    session = make_session()
+    cameras = session["cameras"]
+    assert isinstance(cameras, dict)
+    noise = {"white": {"position_m": 0.1, "rotation_deg": 0.5}, "bias": {"frame": "body", "position_m": 0.2}}
+    cameras["drone1"]["pose_noise"] = noise
+    logged = make_poses()["drone2"]
+    logged[list(COVARIANCE_COLUMNS)] = np.eye(6)[np.triu_indices(6)] * 0.04
+    stated = _rows(replace(content, session=session, poses=content.poses | {"drone2": logged}))
+    assert stated["drone1"].stated == f"white 0.1{THIN}m, 0.5{THIN}deg; bias frame body, 0.2{THIN}m"
+    assert stated["drone2"].stated == f"by the log: 0.200{THIN}m, {np.degrees(0.2):.2f}{THIN}deg"
+    assert stated["mast"].stated == "stands still"
+    assert _rows(content)["drone1"].stated == "nothing"
+
+
+def test_clocks_detections_and_sight(content: SessionContent) -> None:
+    keypoints = content.keypoints["mast"].copy()
+    keypoints.loc[: len(keypoints) // 4 - 1, "confidence"] = 0.1
+    metrics = {**(content.metrics or {}), "clock_offsets_s": {"drone2": -0.05}}
+    rows = _rows(
+        replace(
+            content,
+            metrics=metrics,
+            keypoints=content.keypoints | {"mast": keypoints},
+            hidden={"drone1": 0.25},
+        )
+    )
+    assert rows["drone2"].offset == f"0.120{THIN}s −0.050{THIN}s"
+    assert rows["drone2"].sigma == f"±{THIN}0.200{THIN}s"
+    assert rows["mast"].detected == pytest.approx(1 - 30 / 600)
+    assert rows["mast"].confident == pytest.approx(0.75)
+    assert (rows["drone1"].hidden, rows["drone2"].hidden) == (0.25, None)
+
+
+def test_frames_that_the_detector_left_out_do_not_count(content: SessionContent) -> None:
+    session = make_session()
+    cameras = session["cameras"]
+    assert isinstance(cameras, dict)
+    cameras["drone1"]["keypoints"] = None
+    every_third = content.keypoints["drone1"]
+    every_third = every_third[(every_third["frame"] % 3 == 0) & (every_third["frame"] < 300)]
+    stages = content.stages | {"detect": {"counts": {"cameras": {"drone1": {"frames": 200}}}}}
+    found = replace(
+        content, session=session, keypoints=content.keypoints | {"drone1": every_third}, stages=stages
+    )
+    assert _rows(found)["drone1"].detected == pytest.approx(0.5)
+
+
+def test_the_page_says_what_made_it_and_where_cameras_stand(content: SessionContent) -> None:
+    made = {"mocap": "1.2.3", "numpy": "2.0"}
+    told = replace(
+        content,
+        made_by={"ingest": made, "reconstruct": made},
+        hidden={"drone1": 0.125},
+        refined={"drone1": make_poses()["drone1"].assign(x=lambda table: table["x"] + 1)},
+    )
+    page, plain = render_page(told), render_page(content)
+    text = _Outline(page).text
+    assert "ingest and reconstruct: mocap 1.2.3, numpy 2.0" in text
+    assert "12.5 %" in text
+    assert "Cameras stand where the reconstruction found them" in text
+    assert "Cameras stand" not in _Outline(plain).text
+    # The viewer's first camera stands a metre further east.
+    assert _Outline(page).data != _Outline(plain).data
