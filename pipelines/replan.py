@@ -25,6 +25,7 @@ from pipelines.planning.arm_flights import (
     flight_from,
     fly_arm,
     logged_arm,
+    seen_joints,
     trajectories,
 )
 from pipelines.planning.config import PlannerConfig, planner_config
@@ -40,7 +41,7 @@ from pipelines.session.records import Float, JointMotion
 from pipelines.session.registries import PLANNER_ARMS
 from pipelines.session.stages import Stage, StageRecord, WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, write_json
-from pipelines.session.tables import ACTOR, COST_MAP, REPLAN, TRUTH, read_table, write_table
+from pipelines.session.tables import ACTOR, COST_MAP, REPLAN, SEEN, TRUTH, read_table, write_table
 from pipelines.session.tabular import motion_table
 from pipelines.simulation.detector_errors import detect_keypoints, view_of
 from pipelines.simulation.scenario import DetectorErrors
@@ -257,6 +258,7 @@ def _fly(scene: Scene, arm: str, folder: Path) -> None:
         np.save(folder / "error_m.npy", measured.error_m)
         first = JointMotion(scene.t_ns[scene.pictures], joints, measured.first[:, None])
         write_table(folder / "skeleton.parquet", motion_table(first), TRUTH)
+        write_table(folder / "seen.parquet", seen_joints(scene, flown, measured), SEEN)
         facts |= {"seen_share": measured.seen_share, "joint_frames": measured.joint_frames}
     write_json(folder / "facts.json", facts)
     write_json(folder / "times.json", _percentiles({"central": flown.central_s, "local": flown.local_s}))

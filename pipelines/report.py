@@ -40,6 +40,7 @@ from pipelines.session.tables import (
     KEYPOINTS,
     POSES,
     REPLAN,
+    SEEN,
     SKELETON,
     TRUTH,
     read_table,
@@ -316,4 +317,9 @@ def _load_replan(folder: Path, record: StageRecord) -> ReplanContent:
         actor=read_table(place / "actor.parquet", ACTOR),
         cost_map=read_table(costs, COST_MAP) if costs.exists() else None,
         map=max(load_maps(folder), key=lambda one: one.from_ns, default=None),
+        seen={
+            arm: read_table(place / arm / "seen.parquet", SEEN)
+            for arm in section(metrics, "arms")
+            if f"replan/{arm}/seen.parquet" in record.outputs
+        },
     )

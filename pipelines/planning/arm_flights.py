@@ -33,6 +33,7 @@ PLANNED = "planned"
 """Nor this: where the log says that the planner on board sent the drones."""
 LOGGED = (FLOWN, PLANNED)
 
+_LOOK_EVERY_S = 1.0
 _POSITION = ["x", "y", "z"]
 _QUATERNION = ["qx", "qy", "qz", "qw"]
 _SLOT = ["slot_yaw_rad", "slot_tilt_rad", "slot_range_m"]
@@ -166,6 +167,31 @@ def trajectories(scene: Scene, flown: ArmFlight) -> pd.DataFrame:
     table["visible"] = seen.T.ravel()
     table["predicted_error_m"] = np.repeat(np.where(np.isfinite(error), error, np.nan), count)
     return table
+
+
+def seen_joints(scene: Scene, flown: ArmFlight, measured: Measured) -> pd.DataFrame:
+    """The rows of `tables.SEEN`: the skeleton once a second, as each camera would have seen it."""
+    import pandas as pd
+
+    if scene.joints is None or scene.flight.skeleton is None:
+        raise ValueError("nobody knows a skeleton")
+    t_s, t_ns = scene.t_s[scene.pictures], scene.t_ns[scene.pictures]
+    looks = np.unique(np.searchsorted(t_s, np.arange(0.0, t_s[-1] + 1e-9, _LOOK_EVERY_S) - 1e-9))
+    pixels, free = (values[:, looks].swapaxes(0, 1) for values in (measured.pixels, measured.free))
+    status = np.where(np.isnan(pixels[..., 0]), "outside", np.where(free, "seen", "hidden"))  # [K, N, J]
+    logged = flown.known[:, scene.pictures][:, looks].T
+    known = np.isfinite(scene.joints[looks, :, 0])[:, None] & logged[..., None]
+    time, camera, joint = np.nonzero(known)
+    return pd.DataFrame(
+        {
+            "t_ns": t_ns[looks][time],
+            "camera": np.array(flown.names, dtype=object)[camera],
+            "joint": np.array(scene.flight.skeleton.joints, dtype=object)[joint],
+            "x": pixels[known][:, 0],
+            "y": pixels[known][:, 1],
+            "status": status[known],
+        }
+    )
 
 
 def flight_from(table: pd.DataFrame, known: Bool, separation: dict[str, int]) -> ArmFlight:

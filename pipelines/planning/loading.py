@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -56,8 +56,9 @@ class LoggedFlight:
     cameras: tuple[SessionCamera, ...]
     poses_source: Source
     noise_source: str  # who states the noise of the poses
-    planned: dict[str, tuple[Int64, Float]]  # stamps [P] and [P, 3] m, world: where cameras were sent
     warnings: tuple[str, ...]
+    planned: dict[str, tuple[Int64, Float]] = field(default_factory=dict)
+    """Where cameras were sent: stamps [P] and [P, 3] m, world."""
 
     @property
     def moves(self) -> bool:
@@ -116,8 +117,8 @@ def load_flight(
         cameras=cameras,
         poses_source=poses_source,
         noise_source=noise_source,
-        planned=_planned(folder, description),
         warnings=tuple(warnings),
+        planned=_planned(folder, description),
     )
 
 

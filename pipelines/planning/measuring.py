@@ -77,6 +77,8 @@ class Measured:
     first: Float  # [T, J, 3] the measured joints of the first trial
     seen_share: float  # of known joints and cameras: in the picture and not hidden
     joint_frames: int  # with a truth
+    pixels: Float  # [N, T, J, 2] where the joints are in the pictures; NaN outside, or where nobody knows
+    free: Bool  # [N, T, J] nothing stands between camera and joint
 
 
 def film(
@@ -132,7 +134,8 @@ def film(
             first = points
     seen = np.isfinite(pixels[..., 0]) & free
     total = cameras * int(known.sum())
-    return Measured(error, first, float((seen & known).sum() / total) if total else 0.0, int(known.sum()))
+    seen_share = float((seen & known).sum() / total) if total else 0.0
+    return Measured(error, first, seen_share, int(known.sum()), pixels, free)
 
 
 def _pixels(filming: Filming, i: int) -> Float:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.reporting.arms_as_seen import draw_as_seen
 from pipelines.reporting.arms_from_above import SHADE, draw_from_above
 from pipelines.reporting.plates import LINE_STYLES, MOST_POINTS, Plate, every, quiet, stacked, table
 from pipelines.reporting.replanned import Arm, CostMap, Replan
@@ -37,8 +38,13 @@ def draw_arms(replan: Replan) -> dict[str, Plate]:
     """Every figure of a comparison, by its key; none where nothing flew."""
     if not replan.arms:
         return {}
-    plates = [draw_from_above(replan), _over_time(replan.arms), _yaw(replan.arms, replan.costs)]
-    return {plate.key: plate for plate in plates}
+    plates = [
+        draw_from_above(replan),
+        _over_time(replan.arms),
+        _yaw(replan.arms, replan.costs),
+        draw_as_seen(replan),
+    ]
+    return {plate.key: plate for plate in plates if plate is not None}
 
 
 # --- over time -----------------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ class ReplanContent:
     actor: pd.DataFrame  # tables.ACTOR at the same times: whom the arms were scored against
     cost_map: pd.DataFrame | None = None  # tables.COST_MAP
     map: Occupancy | None = None  # the session's last map
+    seen: dict[str, pd.DataFrame] = field(default_factory=dict)  # arm: tables.SEEN, where a skeleton is known
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,17 @@ _MARGIN_M = 12.0  # of the map that is shown around the flight
 
 
 @dataclass(frozen=True)
+class Seen:
+    """The skeleton in an arm's pictures, at K moments."""
+
+    t_s: Float  # [K] since the page's zero
+    cameras: tuple[str, ...]
+    joints: tuple[str, ...]
+    pixels: Float  # [C, K, J, 2]; NaN outside the picture
+    status: NDArray[np.str_]  # [C, K, J] seen, hidden or outside; empty where nobody knows the joint
+
+
+@dataclass(frozen=True)
 class Arm:
     """How one arm flew: T times, C cameras. Angles are continuous where they are drawn over time."""
 
@@ -39,6 +50,7 @@ class Arm:
     yaw_deg: Float  # [T] of the first camera around the actor, counterclockwise from east
     commanded_yaw_deg: Float  # [T] of the formation; NaN for what was flown
     predicted_error_m: Float  # [T] NaN where the cameras determine nothing
+    seen: Seen | None  # None where no skeleton was known
 
 
 @dataclass(frozen=True)
@@ -166,7 +178,24 @@ def _arm(name: str, table: pd.DataFrame, content: ReplanContent, *, origin_ns: i
         yaw_deg=_continuous_deg(np.arctan2(offset[0, :, 1], offset[0, :, 0]), start),
         commanded_yaw_deg=commanded,
         predicted_error_m=dense("predicted_error_m")[0, :, 0],
+        seen=_seen(content.seen.get(name), cameras, origin_ns),
     )
+
+
+def _seen(table: pd.DataFrame | None, cameras: tuple[str, ...], origin_ns: int) -> Seen | None:
+    if table is None or not len(table):
+        return None
+    t_ns, time = np.unique(table["t_ns"].to_numpy(np.int64), return_inverse=True)
+    joints = tuple(dict.fromkeys(table["joint"]))
+    camera, joint = (
+        table[column].map({name: k for k, name in enumerate(names)}).to_numpy(np.intp)
+        for column, names in (("camera", cameras), ("joint", joints))
+    )
+    shape = (len(cameras), len(t_ns), len(joints))
+    pixels, status = np.full((*shape, 2), np.nan), np.full(shape, "", dtype="<U7")
+    pixels[camera, time, joint] = table[["x", "y"]].to_numpy(np.float64)
+    status[camera, time, joint] = table["status"].to_numpy(str)
+    return Seen((t_ns - origin_ns) / 1e9, cameras, joints, pixels, status)
 
 
 def _at(actor: pd.DataFrame, t_ns: Int64) -> Float:

@@ -102,6 +102,18 @@ REPLAN = pa.schema(
 """replan/<arm>/trajectories.parquet, sorted by time, then camera: the pose (world_from_camera), what
 was commanded (yaw continuous, NaN for what was flown), the tilt above the actor, whether nothing stands in
 the sight line, and what all cameras together are expected to err by (NaN where they determine nothing)."""
+SEEN = pa.schema(
+    [
+        ("t_ns", pa.int64()),
+        ("camera", pa.string()),
+        ("joint", pa.string()),
+        ("x", pa.float64()),
+        ("y", pa.float64()),
+        ("status", pa.string()),
+    ]
+)
+"""replan/<arm>/seen.parquet, once a second: where each known joint is in the arm's pictures (exact px, NaN
+outside) and whether it is `seen`, `hidden` by what stands around, or `outside` the picture."""
 COST_MAP = pa.schema([("t_ns", pa.int64()), ("yaw_rad", pa.float64()), ("cost", pa.float64())])
 """replan/cost_map.parquet: what a formation whose first camera has that yaw would cost at that time."""
 

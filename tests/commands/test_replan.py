@@ -149,6 +149,15 @@ def test_what_is_stored(mound: Path) -> None:
         assert 1 - table["visible"].mean() == pytest.approx(arm["occluded_share"])
         skeleton = pd.read_parquet(folder / name / "skeleton.parquet")
         assert {"t_ns", "joint", "x", "y", "z"} <= set(skeleton.columns)
+        seen = pd.read_parquet(folder / name / "seen.parquet")
+        assert len(seen) == 2 * 17 * seen["t_ns"].nunique()
+        assert seen["t_ns"].nunique() in (26, 27)  # once a second, the first moment among them
+        assert seen["x"].isna().equals(seen["status"] == "outside")
+        # The ring goes through the mound; adaptive hides nobody, and looks at the middle of the hips.
+        assert (seen["status"] == "hidden").any() == (arm["occluded_share"] > 0)
+        if name == "adaptive":
+            hips = seen[seen["joint"].isin(["left_hip", "right_hip"])].groupby("t_ns")[["x", "y"]].mean()
+            assert np.abs(hips.to_numpy() - [639.5, 359.5]).max() < 60  # 0.6 m at 8 m, of 763 px
     costs = pd.read_parquet(folder / "cost_map.parquet")
     assert costs["cost"].max() > 0
     planning = json.loads((mound / "run.json").read_text())["runs"][-1]["planning"]

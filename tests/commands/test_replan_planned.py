@@ -114,7 +114,7 @@ def test_one_drone_alone_and_a_gap_in_its_commands(flown: Path, tmp_path: Path) 
     assert set(track["camera"]) == {"drone2"}
 
 
-REFUSED = {
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "nothing": ({"log": "planner.mcap"}, "plan: needs `topics` or `files` by camera"),
     "no camera": ({"files": {"drone3": "drone2.tum"}}, "'drone3' is no camera of this flight"),
     "both": (

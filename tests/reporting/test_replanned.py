@@ -99,7 +99,7 @@ def test_metrics_that_say_nothing_leave_dashes() -> None:
     assert bare.rows[0].hidden == "–"
     assert bare.level == "–"
     assert "no reconstruction error" in bare.setting
-    logged = {"arms": {name: {"simulated": False} for name in ("flown", "planned")}}
+    logged: dict[str, object] = {"arms": {name: {"simulated": False} for name in ("flown", "planned")}}
     two = summarise_replan(replace(content, metrics=logged), START_NS, 2)
     assert "flown and planned are what the log says" in two.setting
 

@@ -117,7 +117,7 @@ def test_what_is_no_plan_is_refused(tmp_path: Path) -> None:
         read(write_log(tmp_path, "route", "ros2-mcap", [route]))
     entry = trajectory_entry(plan(0, 0.0))
     point = dict(entry.fields["points"][0], transforms=[{}, {}])
-    both = Entry(entry.topic, entry.type, entry.stamp_ns, entry.fields | {"points": [point]})
+    both = Entry(entry.topic, entry.type, entry.stamp_ns, dict(entry.fields) | {"points": [point]})
     with pytest.raises(DataError, match="it moves 2 things, not one"):
         read(write_log(tmp_path, "both", "ros2-mcap", [both]))
     nothing = Entry("/sent", PATH, START, {"header": {"stamp": START}})

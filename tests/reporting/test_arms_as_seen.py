@@ -1,0 +1,67 @@
+"""The skeleton as arms see it: which moments are shown, what is hidden, and the numbers behind it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipelines.reporting.arm_figures import draw_arms
+from pipelines.reporting.arms_as_seen import draw_as_seen, moments
+from pipelines.reporting.replanned import Replan, summarise_replan
+
+from .comparisons import DRONES, HIDDEN_S, make_comparison
+from .conftest import START_NS
+
+JOINTS = {"left_shoulder": (40, 0), "right_shoulder": (0, 0), "left_hip": (40, 100), "right_hip": (0, 100)}
+LOOKS_S = np.arange(11)
+
+
+def make_seen(arm: str) -> pd.DataFrame:
+    """Once a second four joints; drone1 of `fixed` sees none in its hidden stretch, `flown` loses a hip."""
+    rows = []
+    for t_s in LOOKS_S.tolist():
+        for camera in DRONES:
+            for joint, (x, y) in JOINTS.items():
+                hidden = arm == "fixed" and camera == "drone1" and HIDDEN_S[0] <= t_s < HIDDEN_S[1]
+                lost = arm == "flown" and joint == "left_hip"
+                status = "outside" if lost else "hidden" if hidden else "seen"
+                place = (np.nan, np.nan) if lost else (600.0 + x, 300.0 + y)
+                rows.append((START_NS + t_s * 10**9, camera, joint, *place, status))
+    return pd.DataFrame(rows, columns=["t_ns", "camera", "joint", "x", "y", "status"])
+
+
+@pytest.fixture(scope="module")
+def compared() -> Replan:
+    content = make_comparison()
+    return summarise_replan(replace(content, seen={arm: make_seen(arm) for arm in content.arms}), START_NS, 2)
+
+
+def test_moments_are_the_worst_of_each_quarter(compared: Replan) -> None:
+    """Hidden at 2 and 3 s; where nothing is lost, the tilt of `fixed` and `flown` rises by 1 deg/s."""
+    looks = [(arm, arm.seen) for arm in compared.arms if arm.seen is not None]
+    assert moments(looks).tolist() == [2, 3, 8, 10]
+
+
+def test_the_figure_says_what_is_lost(compared: Replan) -> None:
+    plate = draw_arms(compared)["arms-seen"]
+    said = plate.description.replace("\u202f", " ")
+    assert "adaptive: of 88 in 11 looks, 88 joints seen, 0 joints hidden and 0 joints outside." in said
+    assert "fixed: of 88 in 11 looks, 80 joints seen, 8 joints hidden and 0 joints outside." in said
+    assert "flown: of 88 in 11 looks, 66 joints seen, 0 joints hidden and 22 joints outside." in said
+    # Two of the four moments, at drone1 of `fixed`; every panel of `flown` lacks a hip.
+    assert plate.svg.count(">0 of 4<") == 2
+    assert plate.svg.count(">3 of 4<") == 8
+    assert ">drone1, 17\u202fdeg<" in plate.svg  # fixed at 2 s: 15 + 2
+    numbers = plate.numbers[""]
+    assert len(numbers) == 3 * 88
+    hidden = numbers[numbers["status"] == "hidden"]
+    assert set(hidden["arm"]) == {"fixed"}
+    assert sorted(set(hidden["t_s"])) == [2, 3]
+    assert numbers.loc[numbers["status"] == "outside", "x_px"].isna().all()
+
+
+def test_without_a_skeleton_there_is_none(compared: Replan) -> None:
+    assert draw_as_seen(summarise_replan(make_comparison(), START_NS, 2)) is None
