@@ -447,7 +447,7 @@ class _Reader:
             keypoints=_keypoints_entry(camera, detections, data.detector_format, len(frames.t_ns)),
             clock=ClockEntry(
                 offset_s=camera.clock.offset_ns / 1e9 if camera.clock else 0.0,
-                sigma_s=camera.clock.sigma_s if camera.clock else 0.0,
+                sigma_s=camera.clock.sigma_s if camera.clock else frames.start_sigma_s,
             ),
             log_clock=_log_clock_entry(self._sources.log_clock(camera)),
             pose_noise=camera.pose_noise,
@@ -470,7 +470,7 @@ class _Reader:
         if camera.keypoints:
             detections, detector_format = sources.keypoints(camera.keypoints)
         intrinsics = sources.intrinsics(name, camera, video, detections)
-        frames = sources.frames(name, camera, video, detections)
+        frames = sources.frames(name, camera, video, detections, intrinsics)
         trajectory = sources.trajectory(name, camera, int(frames.t_ns[0]))
         if camera.pose_noise:
             noise_models(f"{self._flight_path}: cameras.{name}.pose_noise", camera.pose_noise)

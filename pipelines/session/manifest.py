@@ -117,7 +117,8 @@ class FrameTimes(Part):
     """When each frame was taken; container stamps from `start` on where nothing else is said."""
 
     start_ns: SecondsAsNs = Field(0, alias="start")
-    start_from: Literal["container"] | None = None  # the time of its creation that a video states
+    # The time of its creation that a video states, or that at which its pictures turn as the poses do.
+    start_from: Literal["container", "motion"] | None = None
     fps: Fps | None = None
     csv: str | None = None
     log: str | None = None

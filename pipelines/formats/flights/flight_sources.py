@@ -22,6 +22,7 @@ from pipelines.formats.flights.telemetry_poses import Origin, TelemetryPoses
 from pipelines.formats.logs.map_topics import LoggedMaps
 from pipelines.formats.maps.ros_map import FORMAT as ROS_MAP
 from pipelines.formats.videos.frame_times import read_frame_times, times_of_frames
+from pipelines.formats.videos.picture_motion import turning_of_pictures
 from pipelines.formats.videos.video import created_ns
 from pipelines.geometry.cameras import Intrinsics, fit_to_size
 from pipelines.geometry.clocks import ClockFit
@@ -33,6 +34,7 @@ from pipelines.geometry.mounting import (
 )
 from pipelines.geometry.pose_covariance import carried_covariance, mounted_covariance
 from pipelines.geometry.poses import enu_from_ned
+from pipelines.geometry.turning import fit_start
 from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import (
@@ -69,6 +71,7 @@ from pipelines.session.registries import (
 )
 
 _MOST_FRAMES = 20_000_000  # a week at 30 Hz: more is a frame number misread from a date
+_WATCHED_NS = 120 * 10**9  # of a video, to find out when it began
 _LARGEST_SHARE_OUTSIDE = 0.05  # of keypoints beyond the picture; detectors overshoot the border a little
 
 
@@ -81,6 +84,7 @@ class CameraFrames:
     pts_ns: Int64  # [F] since the first picture of the video
     topic: str | None = None  # the pictures themselves lie in this topic of a log
     dropped: dict[str, int] = field(default_factory=dict)  # pictures that are not among them, by cause
+    start_sigma_s: float = 0.0  # of all times together, where it was found out
 
 
 class FlightSources:
@@ -152,18 +156,26 @@ class FlightSources:
         return recognise(path, VideoFormat, "video").index(path)
 
     def frames(
-        self, name: str, camera: Camera, video: VideoIndex | None, detections: Detections | None
+        self,
+        name: str,
+        camera: Camera,
+        video: VideoIndex | None,
+        detections: Detections | None,
+        intrinsics: Intrinsics,
     ) -> CameraFrames:
         """When each picture was taken.
 
         By what the manifest states: `fps` from `start` on, a file or topic of frame times, the stamps of
-        pictures in a log, or the container's own stamps from `start` on.
+        pictures in a log, or the container's own stamps from `start` on. Where the start is to be found by
+        motion, it is the time at which the pictures turn as the poses do.
 
         Raises:
             DataError: nothing says when the pictures were taken, or what does is unusable.
         """
         offset_ns = camera.clock.offset_ns if camera.clock else 0
         unclocked = self._unclocked_frames(name, camera, video, detections)
+        if camera.frame_times and camera.frame_times.start_from == "motion":
+            unclocked = self._begun_by_motion(name, camera, unclocked, intrinsics)
         return replace(unclocked, t_ns=unclocked.t_ns + offset_ns)
 
     def _unclocked_frames(
@@ -253,6 +265,11 @@ class FlightSources:
 
     def _start_ns(self, name: str, camera: Camera, times: FrameTimes) -> int:
         """When a video begins that has stamps of its own."""
+        if times.start_from == "motion":
+            if times.start_ns:
+                place = f"{self._manifest}: cameras.{name}.frame_times"
+                raise DataError(place, "has a start and start_from: motion", "leave one of them out")
+            return 0  # found when the pictures and the poses are there
         if times.start_from is None:
             return times.start_ns
         path = self._base / (camera.video.path or "") if camera.video else None
@@ -269,6 +286,35 @@ class FlightSources:
                 " say clock: {sigma_s: 1}"
             )
         return times.start_ns + made_ns
+
+    def _begun_by_motion(
+        self, name: str, camera: Camera, frames: CameraFrames, intrinsics: Intrinsics
+    ) -> CameraFrames:
+        """Frames of a video at the times at which its pictures turn as the poses do."""
+        place = f"{self._manifest}: cameras.{name}.frame_times"
+        remedy = "say start: SECONDS instead, or give the stamps of a log"
+        if camera.video is None or camera.video.path is None or camera.pose.static:
+            raise DataError(place, "start_from: motion needs a video and poses that move", remedy)
+        poses = self.trajectory(name, camera, 0)
+        some = int(np.searchsorted(frames.pts_ns, frames.pts_ns[0] + _WATCHED_NS))
+        turned = turning_of_pictures(self._base / camera.video.path, intrinsics, some)
+        try:
+            fit = fit_start(
+                poses.t_ns,
+                poses.quaternion_xyzw,
+                frames.pts_ns[:some],
+                turned,
+                max_gap_ns=self._max_gap_ns,
+            )
+        except ValueError as error:
+            problem = f"its pictures do not say when the video began: {error}"
+            raise DataError(place, problem, remedy) from None
+        self._note(
+            f"{name}: its video begins at {fit.start_ns / 1e9:.3f} s +- {1e3 * fit.sigma_s:.1f} ms, by the"
+            f" turning of its pictures ({fit.turning_deg_s:.2g} deg/s, of which the poses explain"
+            f" {fit.explained:.0%})"
+        )
+        return replace(frames, t_ns=fit.start_ns + frames.pts_ns, start_sigma_s=fit.sigma_s)
 
     def _frames_by_stamps(
         self, t_ns: Int64, dropped: dict[str, int], pictures: CameraFrames | None

@@ -124,7 +124,8 @@ def _refuse_another_layout(layout: _Layout, raw: NDArray[np.uint8]) -> None:
 def _stamps(raw: NDArray[np.uint8]) -> Int64:
     """Stamps of headers [n] from their bytes [n, 8]: seconds, signed, then nanoseconds."""
     words = np.ascontiguousarray(raw).view("<u4")
-    return words[:, 0].view("<i4").astype(np.int64) * 1_000_000_000 + words[:, 1]
+    stamps: Int64 = words[:, 0].view("<i4").astype(np.int64) * 1_000_000_000 + words[:, 1]
+    return stamps
 
 
 def _layout(encoding: str, fields: _Fields, first: bytes) -> _Layout:
