@@ -79,7 +79,17 @@ def film_arms(session: Path, asked: Rendering, *, force: bool, progress: Progres
 def print_filmed(metrics: dict[str, Any]) -> None:
     """One row for each arm."""
     click.echo(f"\nfilmed (simulated) at {metrics['rate_hz']:g} Hz, keypoints by {metrics['detector']}:")
-    header = ["arm", "pictures", "tilt deg", "max", "in view %", "detected %", "PCK %", "keypoint px"]
+    header = [
+        "arm",
+        "pictures",
+        "tilt deg",
+        "max",
+        "within 5 deg %",
+        "in view %",
+        "detected %",
+        "PCK %",
+        "keypoint px",
+    ]
     header += ["reprojection px", "measured %", "MPJPE mm", "in common mm", "PCK150 %"]
     rows: list[list[object]] = [
         [
@@ -87,6 +97,7 @@ def print_filmed(metrics: dict[str, Any]) -> None:
             arm["pictures"],
             arm["tilt_deg"]["mean"],
             arm["tilt_deg"]["max"],
+            100 * arm["tilt_deg"]["within_5_share"],
             100 * arm["in_view_share"],
             100 * arm["detected_share"],
             _percent(arm["keypoint_pck"]),

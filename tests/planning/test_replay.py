@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.planning.arms import ADAPTIVE, COVARIANCE, FIXED, GREEDY, Arm, FormationPlanner
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.distance_field import DistanceField
+from pipelines.planning.distance_field import DistanceField, open_space
 from pipelines.planning.formation import FormationPath
 from pipelines.planning.pilot import Pilot
 from pipelines.planning.replay import ReplayResult, replay
@@ -97,9 +98,11 @@ def test_between_trees_the_adaptive_formation_stays_low_and_with_the_actor() -> 
 
 
 @pytest.mark.parametrize("arm", [FIXED, ADAPTIVE], ids=lambda arm: arm.name)
-@pytest.mark.parametrize("yaw_deg", [45.0, 17.3])
-def test_over_bare_ground_nothing_turns_or_climbs(arm: Arm, yaw_deg: float) -> None:
-    result = fly(arm, bare_ground(), seconds=12.0, yaw_deg=yaw_deg)
+@pytest.mark.parametrize(("world", "yaw_deg"), [(bare_ground, 45.0), (bare_ground, 17.3), (open_space, 45.0)])
+def test_over_bare_ground_and_in_the_open_nothing_turns_or_climbs(
+    arm: Arm, world: Callable[[], DistanceField], yaw_deg: float
+) -> None:
+    result = fly(arm, world(), seconds=12.0, yaw_deg=yaw_deg)
     assert np.abs(tilt_deg(result) - CONFIG.tilt_deg).max() < 3
     assert np.degrees(result.formation_yaw_rad) == pytest.approx(np.full(len(result.t_ns), yaw_deg))
 
