@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from pipelines.formats.flights.pictures import Picture, open_pictures
 from pipelines.formats.skeletons.even_frames import thinned
@@ -17,13 +18,13 @@ from pipelines.reporting.frame_drawing import caption_of, draw_frame
 from pipelines.reporting.motion import motion_from_skeleton
 from pipelines.reporting.overlays import status_at, views_of
 from pipelines.session.description import Description, read_description
-from pipelines.session.errors import DataError
+from pipelines.session.errors import BusyError, DataError
 from pipelines.session.maps import read_grid
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Int64, Occupancy, Recording
 from pipelines.session.registries import EXPORTS, ChoiceOfAxes, Export
 from pipelines.session.stages import StageRecord, open_session, session_name
-from pipelines.session.storage import as_data_error, read_json, sha256_of, write_json
+from pipelines.session.storage import as_data_error, read_json, remove_tree, sha256_of, write_json
 from pipelines.session.tables import FRAMES, POSES, SKELETON, read_table
 from pipelines.session.tabular import motion_from, trajectory_from
 
@@ -31,6 +32,7 @@ PICTURES_HZ = 2.0
 """How many pictures of a camera go into a recording each second, unless the user says otherwise."""
 
 _RECORD = "export.json"
+_WORK = ".writing"
 _SCHEMA = 1
 
 
@@ -57,7 +59,7 @@ def export(
     """Write a session in other formats, and `export.json`: what each file is, and what was noted on the way.
 
     Nothing appears under its own name before everything is written. Files of an earlier export that nobody
-    touched since are replaced.
+    touched since are replaced; what a killed one left half written goes.
 
     Args:
         folder: the session.
@@ -73,6 +75,7 @@ def export(
     Raises:
         DataError: no such format, none that has a choice of the unit or axes, nothing to export, or a file
             would be overwritten.
+        BusyError: another process exports to the same folder.
     """
     progress = progress or Silent()
     exports = [EXPORTS.get(name) for name in dict.fromkeys(name.lower() for name in formats)]
@@ -83,10 +86,10 @@ def export(
     is_new = not target.exists()
     try:
         target.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target, prefix=".writing-") as temporary:
+        with _work_in(target) as work:
             made: dict[Path, dict[str, Any]] = {}
             for format_ in exports:
-                own = Path(temporary) / format_.name
+                own = work / format_.name
                 own.mkdir()
                 notes = _Notes(progress)
                 unit_, axes_ = shapes[format_.name] or (None, None)
@@ -244,6 +247,39 @@ def _stills(
 
 
 # --- where it goes -------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _work_in(target: Path) -> Iterator[Path]:
+    """A folder of the target for what is half written: empty at first, gone in the end.
+
+    Raises:
+        BusyError: another process has it.
+    """
+    work = target / _WORK
+    work.mkdir(exist_ok=True)
+    try:
+        lock = FileLock(work / "lock").acquire(timeout=0)
+    except Timeout:
+        raise BusyError(f"{target} is being written by another process; wait for it to finish") from None
+
+    def clear() -> None:
+        for left in [path for path in work.iterdir() if path.name != "lock"]:
+            remove_tree(left)
+
+    try:
+        with lock:
+            for killed in target.glob(f"{_WORK}-*"):  # as they were called before they had a lock
+                remove_tree(killed)
+            clear()
+            try:
+                yield work
+            finally:
+                clear()
+    finally:
+        with suppress(OSError):
+            (work / "lock").unlink(missing_ok=True)
+            work.rmdir()
 
 
 def _move(made: Mapping[Path, dict[str, Any]], target: Path, overwrite: bool) -> Exported:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from filelock import FileLock
 from rosbags.highlevel import AnyReader
 
 from pipelines.export import export, load_recording
@@ -16,7 +17,7 @@ from pipelines.formats.skeletons import c3d
 from pipelines.formats.skeletons.even_frames import at_even_times
 from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion
-from tests.commands.runner import refused, succeeds
+from tests.commands.runner import content, mocap_process, refusal, refused, succeeds
 from tests.commands.test_overlay import filmed_flight, session_of
 from tests.synthetic.flights import START_NS, write_flight
 
@@ -89,6 +90,23 @@ def test_files_of_an_earlier_export_are_replaced_others_are_not(filmed: Path, tm
     assert set(record) == {path.name for path in first.written}
     (out / "export.json").write_text("{", encoding="utf-8")
     assert "add --overwrite" in refused("export", filmed, "--to", "trc", "--unit", "cm", "-o", out)
+
+
+def test_what_a_killed_export_left_goes_and_a_second_one_at_once_is_refused(
+    filmed: Path, tmp_path: Path
+) -> None:
+    target = tmp_path / "out"
+    for left in (".writing/csv", ".writing-k3j2"):
+        (target / left).mkdir(parents=True)
+        (target / left / "half.csv").write_text("1,2")
+    succeeds("export", filmed, "--to", "csv", "-o", target)
+    assert not [path.name for path in target.iterdir() if path.name.startswith(".")]
+    before = content(target)
+    (target / ".writing").mkdir()
+    with FileLock(target / ".writing" / "lock"):
+        line = refusal(mocap_process("export", filmed, "--to", "trc", "-o", target))
+    assert "is being written by another process" in line
+    assert content(target).items() >= before.items()
 
 
 def test_units_and_axes_only_where_there_is_a_choice(filmed: Path, tmp_path: Path) -> None:
