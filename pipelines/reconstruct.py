@@ -68,7 +68,7 @@ from pipelines.session.tables import CAMERA_POSES, FRAMES, SKELETON, read_table,
 if TYPE_CHECKING:
     import pandas as pd
 
-RECONSTRUCT = Stage("reconstruct", revision=6)
+RECONSTRUCT = Stage("reconstruct", revision=7)
 
 _LONGEST_FILL_S = 10.0
 

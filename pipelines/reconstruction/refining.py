@@ -32,6 +32,9 @@ from pipelines.session.skeletons import bones_of
 if TYPE_CHECKING:
     import pandas as pd
 
+_MOST_SHIFTS = 6  # of the clocks; offsets of 0.2 s took one to five
+_SETTLED_S = 0.002  # what is left of a clock's offset when nothing more is shifted
+_UNTOLD = 0.5  # share of its prior that a clock's standard deviation may keep; above, pictures do not tell it
 _HEAD = ("nose", "left_eye", "right_eye", "left_ear", "right_ear")  # as rigid as a bone
 
 
@@ -84,27 +87,51 @@ def refine_flight(
     begin_ns = int(observations.t_ns[0])
     t_s = (observations.t_ns - begin_ns) / 1e9
     limits = {"max_gap_ns": max_gap_ns, "max_extrapolation_ns": max_extrapolation_ns}
-    sightings = [
-        _sighting(camera, found, c, choice, observations.t_ns, sides[..., c], pixel_sigma, limits)
-        for c, camera in enumerate(cameras)
-    ]
-    start = result.points.reshape(times, people * joints, 3)
     bones = rigid_pairs(observations.joints, people)
-    refined = refine(t_s, sightings, start, bones, prior, clock_sigma_s)
-    metrics = _metrics(refined, cameras)
-    if refined.fallback is not None:
-        warnings = [*refined.warnings, f"refined: fell back to robust, because {refined.fallback}"]
-        return RefinedFlight(observations, views, result, None, metrics, warnings)
 
-    shifted = [
-        replace(camera, frame_t_ns=camera.frame_t_ns + round(1e9 * offset))
-        for camera, offset in zip(cameras, refined.clock_offset_s, strict=True)
-    ]
-    observed = observations
-    if refined.clock_offset_s.any():
+    def seen_from(shifted: list[Camera]) -> tuple[Observations, Views]:
         observed = observe(shifted, found, choice, observations.t_ns, **limits)
         xy, confidence = on_sides(observed.xy, observed.confidence, sides)
         observed = replace(observed, xy=xy, confidence=confidence)
+        return observed, replace(
+            views,
+            xy=xy.reshape(views.xy.shape),
+            weight=confidence.reshape(views.weight.shape),
+            position=observed.position,
+            rotation=observed.rotation,
+        )
+
+    # A picture is joined to the three times nearest to its stamp, from which motion cannot be told far away,
+    # and levels of pose noise that are found beside a large offset hold part of it. So the stamps follow the
+    # clocks until little is left to correct.
+    offset_s, shifted, started = np.zeros(len(cameras)), list(cameras), result
+    for _ in range(1 + _MOST_SHIFTS):
+        sightings = [
+            _sighting(camera, found, c, choice, observations.t_ns, sides[..., c], pixel_sigma, limits)
+            for c, camera in enumerate(shifted)
+        ]
+        start = started.points.reshape(times, people * joints, 3)
+        refined = refine(t_s, sightings, start, bones, prior, clock_sigma_s)
+        offset_s = offset_s + refined.clock_offset_s
+        shifted = [
+            replace(camera, frame_t_ns=camera.frame_t_ns + round(1e9 * offset))
+            for camera, offset in zip(cameras, offset_s, strict=True)
+        ]
+        if np.abs(refined.clock_offset_s).max() <= _SETTLED_S:
+            break
+        _, again = seen_from(shifted)
+        started = triangulate(
+            replace(again, pixel_sigma=estimate_noise(again, threads=threads)),
+            method="robust",
+            threads=threads,
+        )
+    warnings = [*refined.warnings, *_untold_clocks(refined, cameras, clock_sigma_s)]
+    metrics = _metrics(refined, cameras, offset_s)
+    if refined.fallback is not None:
+        warnings.append(f"refined: fell back to robust, because {refined.fallback}")
+        return RefinedFlight(observations, views, result, None, metrics, warnings)
+
+    observed, _ = seen_from(shifted) if offset_s.any() else (observations, views)
     position, rotation = observed.position.copy(), observed.rotation.copy()
     for c in range(len(cameras)):
         numbers = _numbers_at(refined.corrections[c], t_s - refined.clock_offset_s[c])
@@ -134,7 +161,7 @@ def refine_flight(
         replace(final, residual_px=residual),
         _camera_table(shifted, refined, begin_ns, limits),
         metrics,
-        list(refined.warnings),
+        warnings,
     )
 
 
@@ -184,14 +211,25 @@ def _numbers_at(correction: tuple[Float, Float], t_s: Float) -> Float:
     return np.stack([np.interp(t_s, when, column) for column in numbers.T], axis=1)
 
 
-def _metrics(refined: Refined, cameras: Sequence[Camera]) -> dict[str, Any]:
+def _untold_clocks(refined: Refined, cameras: Sequence[Camera], prior_s: Float) -> list[str]:
+    """Clocks that pictures hardly tell: nothing moved, or cameras that fly straight make up for it."""
+    return [
+        f"refined: the pictures do not tell the clock of {camera.name}: its offset is known to {sigma:.2g} s "
+        f"where {prior:.2g} s were stated"
+        for camera, sigma, prior in zip(cameras, refined.clock_sigma_s, prior_s, strict=True)
+        if refined.fallback is None and prior > 0 and sigma > _UNTOLD * prior
+    ]
+
+
+def _metrics(refined: Refined, cameras: Sequence[Camera], offset_s: Float) -> dict[str, Any]:
     used = refined.fallback is None
-    offsets = {
-        camera.name: float(offset) if used else 0.0
-        for camera, offset in zip(cameras, refined.clock_offset_s, strict=True)
-    }
+    offsets, sigmas = (
+        {camera.name: float(value) if used else 0.0 for camera, value in zip(cameras, values, strict=True)}
+        for values in (offset_s, refined.clock_sigma_s)
+    )
     return {
         "clock_offsets_s": offsets,
+        "clock_offset_sigmas_s": sigmas,
         "refinement": {
             "fallback": refined.fallback,
             "pose_noise": "estimated" if refined.learned else "stated",

@@ -70,7 +70,7 @@ def formation(
         still: the cameras hover around the walk instead of following it.
         variation: how far moving cameras leave the rigid ring.
         tilt_deg: elevation of the cameras.
-        late_s: how much later than stamped each camera's pictures were taken; none by default.
+        late_s: how much later than stamped each camera's pictures were taken; logs have the right time.
     """
     rng = np.random.default_rng([seed, cameras])
     t_s = np.arange(times) / FPS
@@ -80,22 +80,25 @@ def formation(
     for camera in range(cameras):
         taken_s = t_s + (late_s[camera] if late_s else 0.0)
         joints = walk(taken_s, radius_m=4.0)
-        target = joints.mean(axis=1)
-        if still:
-            target = np.tile(truth.mean(axis=(0, 1)), (times, 1))
-        position, quaternion = (
-            part[camera]
-            for part in orbit(
-                taken_s,
+        middle = truth.mean(axis=(0, 1))
+
+        def flown(at_s: Float, followed: Float, camera: int = camera, middle: Float = middle) -> list[Float]:
+            target = np.tile(middle, (times, 1)) if still else followed.mean(axis=1)
+            parts = orbit(
+                at_s,
                 target,
                 cameras=cameras,
                 tilt_deg=tilt_deg,
                 variation=0.0 if still else variation,
                 yaw_rate_deg_per_s=0.0 if still else 4.0,
             )
-        )
-        rotation = matrix_from_quaternion(quaternion)
-        seen = np.einsum("tij,tki->tkj", rotation, joints - position[:, None])
+            return [part[camera] for part in parts]
+
+        # Logs are right about the time, so a late picture shows what the log says of a later time.
+        position, quaternion = flown(t_s, truth)
+        taken_from, taken_quaternion = flown(taken_s, joints)
+        rotation = matrix_from_quaternion(taken_quaternion)
+        seen = np.einsum("tij,tki->tkj", rotation, joints - taken_from[:, None])
         xy = seen[..., :2] / seen[..., 2:]
         noise = rng.normal(0, pixel_px / FOCAL_PX, xy.shape)
         for k in range(1, len(noise) if memory else 0):
@@ -119,7 +122,7 @@ def formation(
                 STATED_PX,
             )
         )
-        positions.append(position)
+        positions.append(taken_from)
         rotations.append(rotation)
     return Formation(t_s, truth, sightings, triangulated(sightings), np.stack(positions), np.stack(rotations))
 

@@ -20,6 +20,7 @@ KNOT_S = 0.5
 _NEAR = (
     0.75  # steps of the skeleton: a picture further from its nearest time says nothing of the motion there
 )
+_RATE_S = 0.25  # to both sides
 _GAP = 3.5  # usual steps: three times further apart than this cannot be interpolated between
 
 
@@ -93,17 +94,20 @@ def _first_of_three(t_s: Float, at_s: Float, step: float) -> tuple[Int64, Bool]:
 
 
 def _rates(sighting: Sighting) -> tuple[Float, Float]:
-    """Speed [F, 3] in the world and turn rate [F, 3] in the camera, over three pictures; 0 where unknown."""
+    """Speed [F, 3] in the world and turn rate [F, 3] in the camera; 0 where unknown.
+
+    Over half a second: from picture to picture, noisy poses would seem to fly and turn faster than people
+    walk, and a clock's offset would be found too small.
+    """
     count = len(sighting.t_s)
-    speed, turn = np.zeros((count, 3)), np.zeros((count, 3))
     if count < 3:
-        return speed, turn
-    elapsed_s = (sighting.t_s[2:] - sighting.t_s[:-2])[:, None]
-    speed[1:-1] = (sighting.position[2:] - sighting.position[:-2]) / elapsed_s
-    turned = np.einsum("tji,tjk->tik", sighting.rotation[:-2], sighting.rotation[2:])
+        return np.zeros((count, 3)), np.zeros((count, 3))
+    reach = max(round(_RATE_S / float(np.median(np.diff(sighting.t_s)))), 1)
+    before, after = np.arange(count) - reach, np.arange(count) + reach
+    before, after = np.maximum(before, 0), np.minimum(after, count - 1)
+    elapsed_s = (sighting.t_s[after] - sighting.t_s[before])[:, None]
+    speed = (sighting.position[after] - sighting.position[before]) / elapsed_s
+    turned = np.einsum("tji,tjk->tik", sighting.rotation[before], sighting.rotation[after])
     antisymmetric = (turned - np.swapaxes(turned, 1, 2)) / 2
-    turn[1:-1] = (
-        np.stack([antisymmetric[:, 2, 1], antisymmetric[:, 0, 2], antisymmetric[:, 1, 0]], 1) / elapsed_s
-    )
-    speed[[0, -1]], turn[[0, -1]] = speed[[1, -2]], turn[[1, -2]]
-    return np.nan_to_num(speed), np.nan_to_num(turn)
+    axes = [antisymmetric[:, 2, 1], antisymmetric[:, 0, 2], antisymmetric[:, 1, 0]]
+    return np.nan_to_num(speed), np.nan_to_num(np.stack(axes, axis=1) / elapsed_s)

@@ -64,6 +64,7 @@ class Refined:
     covariance: Float  # [T, J, 3, 3] m^2
     corrections: tuple[tuple[Float, Float], ...]  # of each camera: times [F] and the ten numbers [F, 10]
     clock_offset_s: Float  # [C] to be added to the pictures' times
+    clock_sigma_s: Float  # [C] how well that is known, 0 for clocks that were
     levels: dict[str, float]
     bone_lengths_m: Float  # [B]
     learned: bool  # the levels of the pose errors were found from the pictures
@@ -115,7 +116,8 @@ def refine(
         position=position,
         covariance=whole,
         corrections=_corrections(system, state, len(sightings)),
-        clock_offset_s=_clocks(system, state),
+        clock_offset_s=_of_clocks(system, state.shared),
+        clock_sigma_s=_of_clocks(system, np.sqrt(np.diagonal(shared_covariance(system, at)))),
         levels=_levels(known),
         bone_lengths_m=state.shared[system.layout.bone_column :],
         learned=learned,
@@ -411,9 +413,9 @@ def _corrections(system: System, state: State, cameras: int) -> tuple[tuple[Floa
     return tuple(found)
 
 
-def _clocks(system: System, state: State) -> Float:
+def _of_clocks(system: System, shared: Float) -> Float:
     column = system.layout.clock_column
-    return np.where(column >= 0, state.shared[np.maximum(column, 0)], 0.0)
+    return np.where(column >= 0, shared[np.maximum(column, 0)], 0.0)
 
 
 def _levels(known: Knowledge) -> dict[str, float]:
@@ -445,6 +447,7 @@ def _none(sightings: Sequence[Sighting], start: Float, reason: str) -> Refined:
         covariance=np.full((*start.shape, 3), np.nan),
         corrections=tuple((np.empty(0), np.empty((0, 10))) for _ in sightings),
         clock_offset_s=np.zeros(len(sightings)),
+        clock_sigma_s=np.zeros(len(sightings)),
         levels={},
         bone_lengths_m=np.empty(0),
         learned=False,
