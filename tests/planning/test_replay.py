@@ -118,6 +118,25 @@ def test_a_slot_inside_the_mound_of_a_standing_actor_is_left(speed: float) -> No
     assert field.sample(result.position[0, -1])[0] > 0
 
 
+def test_who_starts_beside_the_mound_turns_away_in_time() -> None:
+    """A drone begins less than 3 m from the mound's western end, and the actor walks so that its slot goes in."""
+    field = mound()
+    stamps, hips = walker(20.0)
+    hips = hips + np.array([17.0, 0.0, 0.0])
+    results = [
+        replay(arm, stamps, hips, [field], config=CONFIG, drones=2, yaw_rad=np.pi / 2)
+        for arm in (ADAPTIVE, FIXED)
+    ]
+    adaptive, fixed = (tilt_deg(result) for result in results)
+    assert adaptive.max() < 20
+    assert fixed.max() > 30
+    for result in results:
+        figures = score(*positions_of(result), field, CONFIG)
+        assert 0 < field.sample(result.position[:, 0])[0].min() < 3
+        assert isinstance(figures["limit_violations"], dict)
+        assert figures["limit_violations"]["collision"] == figures["limit_violations"]["separation"] == 0
+
+
 @pytest.mark.parametrize("arm", [FIXED, ADAPTIVE, COVARIANCE, GREEDY], ids=lambda arm: arm.name)
 @pytest.mark.parametrize("world", [wall, trees], ids=["wall", "trees"])
 def test_no_collision_and_enough_distance_past_wall_and_trees(arm: Arm, world: object) -> None:
