@@ -241,10 +241,13 @@ def test_constant_errors_in_the_body_show_when_the_formation_changes() -> None:
     assert np.mean(after) < 0.3 * np.mean(before)
 
 
-def test_outliers_cost_at_most_a_fifth() -> None:
-    clean, dirty = (formation(60, 4, [], 2, bad_share=share) for share in (0.0, 0.05))
-    without, _, _ = refined(clean, [])
-    despite, _, _ = refined(dirty, [])
+@pytest.mark.parametrize("models", [[], [WHITE]], ids=["true poses", "white noise"])
+def test_outliers_cost_at_most_a_fifth(models: list[NoiseModel]) -> None:
+    clean, dirty = (formation(60, 4, models, 2, bad_share=share) for share in (0.0, 0.05))
+    without, _, none = refined(clean, models)
+    despite, _, neither = refined(dirty, models)
+    assert none is None
+    assert neither is None
     assert mean_mm(despite, dirty.truth) < 1.2 * mean_mm(without, clean.truth)
     assert mean_mm(without, clean.truth) < 0.6 * mean_mm(clean.start, clean.truth)
 
