@@ -74,7 +74,7 @@ def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Itera
     """
     target = target.absolute()
     _check(target, mark, overwrite)
-    work = target.parent / f".{target.name}.making"
+    work = _work_of(target)
     try:
         work.mkdir(parents=True, exist_ok=True)
         with _held(work / "lock", target):
@@ -101,10 +101,30 @@ def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Itera
 
 
 def is_made(target: Path, key: str, *, mark: str) -> bool:
-    """Whether the target is there already with this key, which its mark states."""
+    """Whether the target is there already with this key, which its mark states.
+
+    If so, what an attempt to make it once more left when it was killed is of no use, and goes.
+    """
+    made = False
     with suppress(DataError):
-        return read_json(target / mark).get("key") == key
-    return False
+        made = read_json(target / mark).get("key") == key
+    if made:
+        _clear(_work_of(target.absolute()), target)
+    return made
+
+
+def _work_of(target: Path) -> Path:
+    return target.parent / f".{target.name}.making"
+
+
+def _clear(work: Path, target: Path) -> None:
+    """Remove a place of work in which nobody works."""
+    with suppress(OSError, BusyError):
+        if work.is_dir():
+            with _held(work / "lock", target):
+                for left in [path for path in work.iterdir() if path.is_dir()]:
+                    remove_tree(left)
+            _tidy(work)
 
 
 def _check(target: Path, mark: str, overwrite: bool) -> None:
