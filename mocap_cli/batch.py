@@ -25,7 +25,11 @@ if TYPE_CHECKING:
     help="Where sessions and summary go [default: sessions beside their flights, the summary in ./batch].",
 )
 @click.option(
-    "--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes here [default: all cores]."
+    "--workers",
+    type=click.IntRange(1, 1024),
+    metavar="N",
+    help="How many work here: on a flight each, and on long videos where flights are fewer [default: all"
+    " cores].",
 )
 @click.option(
     "--scheduler",

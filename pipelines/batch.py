@@ -61,6 +61,7 @@ class Job:
     session: Path
     settings: Settings
     force: bool
+    threads: int = 1  # blocks of its pictures that are worked on side by side; results do not depend on them
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,7 @@ class Outcome:
     warnings: tuple[str, ...] = ()
     seconds: dict[str, dict[str, float]] = field(default_factory=dict)  # of every stage: wall and cpu
     peak_memory_mb: float | None = None  # of the worker, until then
+    worker: int | None = None  # the number of its process
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,8 @@ def batch(
         output: the folder of the sessions and the summary. By default sessions lie beside their manifests,
             and the summary in `batch/` where the command was given.
         settings: what decides the results.
-        workers: processes on this machine, by default one for each core; without `scheduler`.
+        workers: how many work on this machine, by default one for each core; without `scheduler`. Processes,
+            a flight each; where there are fewer flights, those left over work on their pictures as well.
         scheduler: the address of a Dask cluster, which reads and writes the same folders by the same paths.
         force: do everything again although nothing changed.
         overwrite: replace files that are called like the summary's and are not a batch's.
@@ -130,8 +133,10 @@ def batch(
     flights = list({path.resolve(): path for path in flights}.values())
     folder = output or Path(_FOLDER)
     _refuse_foreign(folder, overwrite)
+    workers = workers or os.cpu_count() or 1
+    threads = 1 if scheduler else max(1, workers // max(len(flights), 1))
     jobs = [
-        Job(_absolute(flight), _absolute(session), settings, force)
+        Job(_absolute(flight), _absolute(session), settings, force, threads)
         for flight, session in zip(flights, _sessions(flights, output), strict=True)
     ]
     outcomes = dict(_outcomes(jobs, workers, scheduler, progress))
@@ -195,7 +200,7 @@ class _Flight:
             case "reconstruct":
                 chosen = job.settings
                 settings = ReconstructSettings(chosen.method, detector=chosen.detector, every=chosen.every)
-                return reconstruct(job.session, settings, force=force).skipped
+                return reconstruct(job.session, settings, workers=job.threads, force=force).skipped
             case "replan-compare":
                 return replan(job.session, force=force).skipped
             case _:
@@ -223,6 +228,7 @@ class _Flight:
             warnings=warnings,
             seconds=self.seconds,
             peak_memory_mb=_peak_memory_mb(),
+            worker=os.getpid(),
         )
 
 
@@ -266,12 +272,12 @@ def _peak_memory_mb() -> float:
 
 
 def _outcomes(
-    jobs: Sequence[Job], workers: int | None, scheduler: str | None, progress: Progress
+    jobs: Sequence[Job], workers: int, scheduler: str | None, progress: Progress
 ) -> Iterator[tuple[int, Outcome]]:
     """The outcome of every job, with its number, as they end."""
     distributed = need("distributed", "batch")
     progress.start("Flights", len(jobs))
-    with _client(min(workers or os.cpu_count() or 1, len(jobs)), scheduler) as client:
+    with _client(min(workers, len(jobs)), scheduler) as client:
         futures = {client.submit(run_flight, job, pure=False): k for k, job in enumerate(jobs)}
         if scheduler and not client.scheduler_info()["workers"]:
             progress.note(f"{scheduler} has no workers yet: waiting for them")
@@ -396,7 +402,7 @@ def _store(folder: Path, rows: Sequence[FlightRow], outcomes: Sequence[Outcome])
         _write_text(folder / _TABLE, text.getvalue())
         _write_text(folder / _PAGE, render_flights(rows))
         times = [
-            {"flight": row.flight, **{k: asdict(outcome)[k] for k in ("seconds", "peak_memory_mb")}}
+            {"flight": row.flight, **{k: asdict(outcome)[k] for k in ("seconds", "peak_memory_mb", "worker")}}
             for row, outcome in zip(rows, outcomes, strict=True)
         ]
         write_json(folder / _TIMES, {"schema": 1, "flights": times})

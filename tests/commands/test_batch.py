@@ -8,8 +8,9 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import ANY
 
@@ -17,7 +18,7 @@ import pandas as pd
 import pytest
 
 from pipelines import batch
-from pipelines.batch import Job, Settings, run_flight
+from pipelines.batch import Job, Outcome, Settings, run_flight
 from pipelines.report import Reported
 from pipelines.reporting.flights import FlightRow, render_flights
 from pipelines.session.errors import BusyError
@@ -26,6 +27,13 @@ from tests.synthetic.flights import write_flight
 
 DASK = str(Path(sys.executable).with_name("dask"))
 FEW_STAGES = "ingest,reconstruct"
+
+
+@dataclass
+class Skipped:
+    """Of a stage's result all that a batch asks for."""
+
+    skipped: bool
 
 
 class Cluster:
@@ -138,6 +146,36 @@ def test_all_stages_of_a_flight_are_those_of_the_commands(tmp_path: Path) -> Non
     for command in ("reconstruct", "replan-compare", "report"):
         assert "unchanged" in succeeds(command, session)
     assert run_flight(Job(flight.manifest, session, Settings(), force=False)).unchanged
+
+
+def test_workers_that_are_left_over_split_the_videos_of_the_flights_there_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[Job] = []
+
+    def taken(jobs: Sequence[Job], *_: object) -> list[tuple[int, Outcome]]:
+        given.extend(jobs)
+        return [(k, Outcome()) for k in range(len(jobs))]
+
+    monkeypatch.setattr(batch, "_outcomes", taken)
+    flights = [write_flight(tmp_path / name).manifest for name in "ab"]
+    for workers, threads in ((1, 1), (2, 1), (3, 1), (4, 2), (9, 4)):
+        batch.batch(flights, tmp_path / "out", workers=workers)
+        assert [job.threads for job in given[-2:]] == [threads, threads]
+    batch.batch(flights, tmp_path / "out", scheduler="tcp://somewhere:1")
+    assert [job.threads for job in given[-2:]] == [1, 1]
+
+    given.clear()
+    used: list[int] = []
+
+    def reconstructed(*_: object, workers: int, **__: object) -> Skipped:
+        used.append(workers)
+        return Skipped(skipped=False)
+
+    monkeypatch.setattr(batch, "reconstruct", reconstructed)
+    job = Job(flights[0], tmp_path / "a.session", Settings(stages=("ingest", "reconstruct")), False, 3)
+    run_flight(job)
+    assert used == [3]
 
 
 def test_flight_that_fails_late_gets_its_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
