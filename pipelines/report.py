@@ -151,7 +151,7 @@ def write_figures_of(
     """Write the figures of a session's page, or of the page that compares several, as files.
 
     PNG, SVG and PDF 180 mm wide (90 mm where two stand side by side), the numbers behind each as CSV, and
-    figures.json with titles and captions. The 3D viewer and the overlays on pictures are not among them.
+    figures.json with titles and captions. The 3D viewer is not among them.
 
     Args:
         folders: the sessions; two or more are compared, every one with the first.
@@ -170,14 +170,24 @@ def write_figures_of(
     records = [_finished_stages(open_session(folder)) for folder in folders]
     labels = _labels([folder.resolve() for folder in folders])
     keys = [{name: record.key for name, record in own.items()} for own in records]
-    told = {"revision": _FIGURES_REVISION, "sessions": dict(zip(labels, keys, strict=True))}
+    pictures_there = [_pictures_there(folder) for folder in folders]
+    told = {
+        "revision": _FIGURES_REVISION,
+        "pictures": pictures_there,
+        "sessions": dict(zip(labels, keys, strict=True)),
+    }
     key = hashlib.sha256(canonical_json(told).encode()).hexdigest()
     if not force and is_made(target, key, mark=MARK):
         return Figures(target, skipped=True)
     contents = {
         label: _load(folder, own) for label, folder, own in zip(labels, folders, records, strict=True)
     }
-    plates = draw_session(contents[labels[0]]) if len(folders) == 1 else draw_comparison(compare(contents))
+    with ExitStack() as stack:
+        if len(folders) == 1:
+            pictures, _ = _open_pictures(folders[0], stack)
+            plates = draw_session(contents[labels[0]], partial(_read_frame, pictures))
+        else:
+            plates = draw_comparison(compare(contents))
     with whole_folder(target, key, mark=MARK, overwrite=True) as making:
         write_figures(making.folder, plates, contents, key)
         making.publish()

@@ -67,7 +67,7 @@ def _over_time(arms: tuple[Arm, ...]) -> Plate:
         tilt.set_ylabel("tilt (deg)")
         reach.set_ylabel("range (m)")
         sight.set_ylabel("hidden")
-        error.set_ylabel("predicted error (cm)")
+        error.set_ylabel("predicted\nerror (cm)")
         error.set_ylim(0, _top(arms))
         error.set_xlabel("time (s)")
         for axes in (tilt, reach, error):

@@ -85,7 +85,7 @@ def _over_time(comparison: Comparison, measure: Measure) -> Plate:
                 for one in there
                 if of.key in one.values
             ]
-            axes.set_ylabel(f"{of.name} ({of.unit})")
+            axes.set_ylabel(f"{of.name.replace(' ', chr(10))}\n({of.unit})")
             if of.unit == "%":
                 axes.set_ylim(0, 104)
             elif of.key != "tilt":

@@ -14,6 +14,7 @@ from pipelines.reporting import wording
 from pipelines.reporting.arm_figures import draw_arms
 from pipelines.reporting.content import SessionContent, number, section, text
 from pipelines.reporting.figures import draw_all
+from pipelines.reporting.overlay_figures import draw_overlays
 from pipelines.reporting.overlays import Moment, ReadFrame, collect_moments
 from pipelines.reporting.panels import draw_panel, picture_width
 from pipelines.reporting.placing import as_reconstructed
@@ -110,10 +111,16 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
     )
 
 
-def draw_session(content: SessionContent) -> dict[str, Plate]:
-    """Every figure of the page that matplotlib draws, by its key: not the 3D viewer, nor the overlays."""
+def draw_session(content: SessionContent, read_frame: ReadFrame | None = None) -> dict[str, Plate]:
+    """Every figure of the page but the 3D viewer, by its key; the overlays' moments are one figure each.
+
+    Args:
+        content: what the session holds.
+        read_frame: gives the pictures behind the overlays; without it they are drawn on plain ground.
+    """
     summary = summarise(content)
-    return _draw(summary, content, _replan(summary, content))
+    moments = collect_moments(as_reconstructed(content), summary, read_frame)
+    return _draw(summary, content, _replan(summary, content)) | draw_overlays(moments)
 
 
 def _draw(summary: Summary, content: SessionContent, replan: Replan | None) -> dict[str, Plate]:

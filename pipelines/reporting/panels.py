@@ -29,7 +29,7 @@ _MOST_PIXELS = 6_000_000
 _JPEG_QUALITY = 80
 
 
-class _Window(NamedTuple):
+class Window(NamedTuple):
     """A rectangle of the picture, in pixels; the centre of the top left pixel is (0, 0)."""
 
     left: float
@@ -53,7 +53,7 @@ def draw_panel(view: View, width_px: int) -> str:
         width_px: how wide the picture in it may be.
     """
     size = (view.intrinsics.width, view.intrinsics.height)
-    window = _window(view, size)
+    window = window_of(view, size)
     unit = window.width / _UNITS
     joints = view.found.shape[1]
     compared = np.isfinite(view.residual_px)
@@ -69,7 +69,7 @@ def draw_panel(view: View, width_px: int) -> str:
         _crosses("unmeasured", unit, view.found[view.unmeasured]),
     ]
     background = [
-        _rectangle("ground", _Window(-0.5, -0.5, *size), unit),
+        _rectangle("ground", Window(-0.5, -0.5, *size), unit),
         _picture(view.picture, size, window, width_px) if view.picture is not None else "",
         *_circles("other", 1.7 * unit, view.others.reshape(-1, 2)),
     ]
@@ -85,7 +85,7 @@ def draw_panel(view: View, width_px: int) -> str:
 # --- where to look -------------------------------------------------------------------------------------
 
 
-def _window(view: View, size: tuple[int, int]) -> _Window:
+def window_of(view: View, size: tuple[int, int]) -> Window:
     """What a panel shows: the people of the skeleton with a margin; without any, the whole picture."""
     width, height = size
     points = np.concatenate([view.found.reshape(-1, 2), view.reprojected.reshape(-1, 2)])
@@ -98,12 +98,12 @@ def _window(view: View, size: tuple[int, int]) -> _Window:
     return _centred((low + high) / 2, min(max(wanted, _LEAST_PX), whole), size)
 
 
-def _centred(middle: Float, width: float, size: tuple[int, int]) -> _Window:
+def _centred(middle: Float, width: float, size: tuple[int, int]) -> Window:
     """A square around a point, on whole pixels, moved into the picture as far as it fits."""
     extent = np.ceil([width, width])
     room = np.array(size) - extent
     corner = np.where(room >= 0, np.clip(np.round(middle - extent / 2), 0, np.maximum(room, 0)), room / 2)
-    return _Window(float(corner[0]) - 0.5, float(corner[1]) - 0.5, float(extent[0]), float(extent[1]))
+    return Window(float(corner[0]) - 0.5, float(corner[1]) - 0.5, float(extent[0]), float(extent[1]))
 
 
 # --- marks ---------------------------------------------------------------------------------------------
@@ -149,7 +149,7 @@ def _crosses(kind: str, unit: float, points: Float) -> str:
     return _lines("casing", unit, strokes) + _lines(kind, unit, strokes)
 
 
-def _rectangle(kind: str, window: _Window, unit: float) -> str:
+def _rectangle(kind: str, window: Window, unit: float) -> str:
     left, top, width, height = (f"{value:g}" for value in window)
     return (
         f'<rect class="{kind}" x="{left}" y="{top}" width="{width}" height="{height}" '
@@ -164,9 +164,9 @@ def _numbers(*values: float) -> str:
 # --- pictures ------------------------------------------------------------------------------------------
 
 
-def _map(view: View, size: tuple[int, int], window: _Window) -> str:
+def _map(view: View, size: tuple[int, int], window: Window) -> str:
     """The whole picture in the upper left corner, with a frame where the panel lies, and other people."""
-    everything = _Window(-0.5, -0.5, *size)
+    everything = Window(-0.5, -0.5, *size)
     width = _MAP * window.width
     unit = size[0] / (_MAP * _UNITS)
     gap = 0.02 * window.width
@@ -182,29 +182,39 @@ def _map(view: View, size: tuple[int, int], window: _Window) -> str:
     )
 
 
-def _picture(picture: Picture, size: tuple[int, int], window: _Window, width_px: int) -> str:
+def _picture(picture: Picture, size: tuple[int, int], window: Window, width_px: int) -> str:
     """The part of a picture in a window, as an `<image>` of at most `width_px` for the whole window.
 
     A picture of another size than the calibration's is the same view at another scale.
     """
     import cv2
 
+    part, (left, right, bottom, top) = cut_out(picture, size, window)
+    if not part.size:
+        return ""
+    shrink = min(1.0, width_px / (window.width * picture.shape[1] / size[0]))
+    if shrink < 1:
+        part = cv2.resize(part, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    _, jpeg = cv2.imencode(".jpg", part, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    data = base64.b64encode(jpeg.tobytes()).decode("ascii")
+    return (
+        f'<image x="{left:.2f}" y="{top:.2f}" width="{right - left:.2f}" height="{bottom - top:.2f}" '
+        f'preserveAspectRatio="none" href="data:image/jpeg;base64,{data}"/>'
+    )
+
+
+def cut_out(
+    picture: Picture, size: tuple[int, int], window: Window
+) -> tuple[Picture, tuple[float, float, float, float]]:
+    """The whole pixels of a picture in a window, and their left, right, bottom and top edge.
+
+    A picture of another size than the calibration's is the same view at another scale; edges are in pixels
+    of the calibration.
+    """
     scale = np.array([picture.shape[1] / size[0], picture.shape[0] / size[1]])
     corners = (
         np.array([[window.left, window.top], [window.left + window.width, window.top + window.height]]) + 0.5
     )
     low, high = np.clip(np.round(corners * scale), 0, picture.shape[1::-1]).astype(int)
-    part = picture[low[1] : high[1], low[0] : high[0]]
-    if not part.size:
-        return ""
-    shrink = min(1.0, width_px / (window.width * scale[0]))
-    if shrink < 1:
-        part = cv2.resize(part, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    _, jpeg = cv2.imencode(".jpg", part, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    data = base64.b64encode(jpeg.tobytes()).decode("ascii")
-    left, top = low / scale - 0.5
-    width, height = (high - low) / scale
-    return (
-        f'<image x="{left:.2f}" y="{top:.2f}" width="{width:.2f}" height="{height:.2f}" '
-        f'preserveAspectRatio="none" href="data:image/jpeg;base64,{data}"/>'
-    )
+    (left, top), (right, bottom) = low / scale - 0.5, high / scale - 0.5
+    return picture[low[1] : high[1], low[0] : high[0]], (float(left), float(right), float(bottom), float(top))

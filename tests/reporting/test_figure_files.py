@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -18,12 +19,14 @@ from pipelines.reporting.comparison import compare
 from pipelines.reporting.comparison_figures import draw_comparison
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.figure_files import MARK, refuse_foreign, write_figures
+from pipelines.reporting.figures import draw_all
 from pipelines.reporting.page import draw_session
 from pipelines.reporting.plates import Plate
+from pipelines.reporting.summary import summarise
 from pipelines.session.errors import DataError
 
 from .comparisons import TIMES, make_comparison, tilt_deg
-from .conftest import CAMERAS, JOINTS, OFFSET_M
+from .conftest import ASIDE_PX, CAMERAS, JOINTS, OFFSET_M
 from .test_comparison import OFF_MM, _moved
 
 WIDTH_PX = 180 / 25.4 * 300
@@ -31,7 +34,10 @@ WIDTH_PX = 180 / 25.4 * 300
 
 @pytest.fixture(scope="module")
 def plates(content: SessionContent) -> dict[str, Plate]:
-    return draw_session(replace(content, replan=make_comparison()))
+    picture = np.full((540, 960, 3), (200, 90, 30), dtype=np.uint8)  # half the calibration's size, blue
+    drawn = draw_session(replace(content, replan=make_comparison()), lambda _camera, _frame: picture)
+    assert [key for key in drawn if key.startswith("overlay")] == [f"overlay-{k}" for k in range(1, 7)]
+    return {key: plate for key, plate in drawn.items() if not re.fullmatch(r"overlay-[2-6]", key)}
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +106,21 @@ def test_numbers_of_arms_are_those_of_the_comparison(written: Path) -> None:
     np.testing.assert_allclose(costs["cost"], 1 - np.cos(np.radians(costs["yaw_deg"])), atol=1e-8)
 
 
+def test_the_skeleton_lies_over_the_pictures(written: Path) -> None:
+    joints = _read(written, "overlay-1.csv")
+    found, reprojected = (
+        joints[[f"{what}_x_px", f"{what}_y_px"]].to_numpy() for what in ("found", "reprojected")
+    )
+    aside = found - reprojected
+    known = aside[np.isfinite(aside).all(axis=1)]
+    assert len(known) > len(JOINTS)
+    np.testing.assert_allclose(known, np.tile(ASIDE_PX, (len(known), 1)), atol=1e-5)
+    drawn = cv2.imread(str(written / "overlay-1.png"))
+    assert drawn is not None
+    # Most of the figure is picture, in its own colour.
+    assert (drawn == (200, 90, 30)).all(axis=-1).mean() > 0.5
+
+
 def test_a_comparison_of_sessions_has_its_numbers(content: SessionContent, tmp_path: Path) -> None:
     contents = {"a": content, "b": _moved(content, 2)}
     write_figures(tmp_path, draw_comparison(compare(contents)), contents, "k")
@@ -115,13 +136,13 @@ def test_files_are_the_same_every_time_and_leave_the_page_as_it_is(
     content: SessionContent, tmp_path: Path
 ) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
-    plates = draw_session(content)
+    plates = draw_all(summarise(content), content.poses)
     chosen = {key: plates[key] for key in ("time", "bones")}
     with mpl.rc_context({"font.size": 20, "svg.fonttype": "path", "pdf.fonttype": 3}):
         for folder in (first, second):
             folder.mkdir()
             write_figures(folder, chosen, {"walk": content}, "k")
-            again = draw_session(content)
+            again = draw_all(summarise(content), content.poses)
             chosen = {key: again[key] for key in chosen}
             assert chosen["time"].svg  # the second time its page was drawn before its files
     for path in first.iterdir():
