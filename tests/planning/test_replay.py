@@ -119,7 +119,7 @@ def test_a_slot_inside_the_mound_of_a_standing_actor_is_left(speed: float) -> No
 
 
 def test_who_starts_beside_the_mound_turns_away_in_time() -> None:
-    """A drone begins less than 3 m from the mound's western end, and the actor walks so that its slot goes in."""
+    """A drone begins less than 3 m from the mound's western end, and its slot goes into the mound."""
     field = mound()
     stamps, hips = walker(20.0)
     hips = hips + np.array([17.0, 0.0, 0.0])
