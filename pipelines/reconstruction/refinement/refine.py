@@ -229,7 +229,9 @@ def _find_prior(
     free, state = learn(problem, begun, state, poses=True, rounds=_LEARNING_ROUNDS)
     candidates = {"estimated": (free, state)}
     others = {} if prior is None else {"stated": tuple(prior)}
-    others["exact"] = (PoseErrors((0.0, 0.0), ()),) * len(sightings)
+    exact = (PoseErrors((0.0, 0.0), ()),) * len(sightings)
+    if others.get("stated") != exact:
+        others["exact"] = exact
     for name, poses in others.items():
         known = replace(free, poses=poses)
         state = initial_state(problem, known, start[chosen])
