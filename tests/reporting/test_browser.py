@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -192,6 +193,20 @@ def test_paper_has_dark_lines_on_white_even_from_a_dark_screen(opened: Browser) 
     assert _limbs(opened, "body")[0] > 50  # counted by the colour that the page has now
     visible = "[...document.querySelectorAll('.moment')].every((m) => getComputedStyle(m).display !== 'none')"
     assert opened.evaluate(visible)
+
+
+def test_nothing_sticks_out_of_the_paper(opened: Browser) -> None:
+    opened.show_as(media="print", width=673)  # A4 without its margins of 16 mm, at 96 px an inch
+    assert opened.evaluate(_DRAWN)
+    assert opened.evaluate("document.documentElement.scrollWidth") <= 673
+    beyond = (
+        "[...document.querySelectorAll('table, figure, canvas, svg:not(svg svg), h1, p')]"
+        ".filter((e) => e.getBoundingClientRect().right > 674).map((e) => e.outerHTML.slice(0, 80))"
+    )
+    assert opened.evaluate(beyond) == []
+    printed = base64.b64decode(opened.send("Page.printToPDF", preferCSSPageSize=True)["data"])
+    assert printed.startswith(b"%PDF-")
+    assert printed.count(b"/Type /Page\n") > 5
 
 
 def test_a_foreign_script_does_not_run(chromium: Browser, page: Path, tmp_path: Path) -> None:
