@@ -16,7 +16,7 @@ from tests.commands.runner import MOCAP, content, mocap, mocap_process
 from tests.keypoints.spotted_flights import spot_detector, write_spotted_flight
 
 _ATTEMPTS, _QUICKER = 5, 0.7  # to hit a command before it ends
-_FRAMES = 30
+_FRAMES = 40  # replaying takes a second at the least
 _EXPORTED = "trc,c3d,bvh,csv,tum,mcap"
 SCENARIO = """\
 schema: 1
