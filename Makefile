@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO := demo
 
-.PHONY: setup demo test lint bench fuzz wheel docs sample lock clean
+.PHONY: setup demo test lint bench results fuzz wheel docs sample lock clean
 .DELETE_ON_ERROR:
 
 setup: $(STAMP)
@@ -49,9 +49,15 @@ bench: setup
 	$(BIN)/python -m benchmarks.detector_by_tilt
 	$(BIN)/python -m benchmarks.refine
 
-# Damaged files into every reader, for some minutes.
+# Every table and figure of docs/results.md again, in some ten minutes.
+results: setup
+	$(BIN)/mocap models fetch blazepose
+	$(BIN)/python -m benchmarks.results
+
+# Damaged files into every reader, and every stage killed at fifty moments, for some minutes each.
 fuzz: setup
 	$(BIN)/python -m tests.fuzz --inputs 2000
+	$(BIN)/python -m tests.kills --kills 50
 
 # The wheel in an empty environment.
 wheel:
