@@ -48,6 +48,8 @@ bench: setup
 	$(BIN)/python -m benchmarks.detection
 	$(BIN)/python -m benchmarks.detector_by_tilt
 	$(BIN)/python -m benchmarks.refine
+	$(BIN)/python -m benchmarks.refine_clocks
+	$(BIN)/python -m benchmarks.batch
 
 # Every table and figure of docs/results.md again, in some ten minutes.
 results: setup
