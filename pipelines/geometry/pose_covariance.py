@@ -52,21 +52,23 @@ def mounted_covariance(
     Args:
         covariance: [..., 6, 6] position in world, rotation vector in the body.
         world_from_body_xyzw: [..., 4] unit.
-        lever_arm: [3] m, the camera's position in the body.
+        lever_arm: [3] or [..., 3] m, the camera's position in the body.
         world_from_camera_xyzw: [..., 4] unit.
 
     Returns:
         [..., 6, 6] the camera's position in world, rotation vector in the camera.
     """
 
-    def mounted(covariance: Float, world_from_body_xyzw: Float, world_from_camera_xyzw: Float) -> Float:
+    def mounted(
+        covariance: Float, world_from_body_xyzw: Float, lever_arm: Float, world_from_camera_xyzw: Float
+    ) -> Float:
         world_from_body = matrix_from_quaternion(world_from_body_xyzw)
         camera_from_world = np.swapaxes(matrix_from_quaternion(world_from_camera_xyzw), -1, -2)
         jacobian = _block_diagonal(camera_from_world @ world_from_body)
         jacobian[..., :3, 3:] = -_cross_matrix(rotate(world_from_body_xyzw, lever_arm)) @ world_from_body
         return _propagated(jacobian, covariance)
 
-    return _by_blocks(mounted, covariance, world_from_body_xyzw, world_from_camera_xyzw)
+    return _by_blocks(mounted, covariance, world_from_body_xyzw, lever_arm, world_from_camera_xyzw)
 
 
 def carried_covariance(jacobian: Float, covariance: Float) -> Float:
@@ -74,15 +76,15 @@ def carried_covariance(jacobian: Float, covariance: Float) -> Float:
     return _by_blocks(lambda block: _propagated(jacobian, block), covariance)
 
 
-def _by_blocks(carry: Callable[..., Float], covariance: Float, *quaternions: Float) -> Float:
-    """`carry` of a covariance and quaternions, of so many poses at a time."""
+def _by_blocks(carry: Callable[..., Float], covariance: Float, *vectors: Float) -> Float:
+    """`carry` of covariances and vectors, each one for all poses or one for each, of so many at a time."""
     if covariance.ndim != 3 or len(covariance) <= _BLOCK:
-        return carry(covariance, *quaternions)
-    of_each = [np.broadcast_to(quaternion, (len(covariance), 4)) for quaternion in quaternions]
+        return carry(covariance, *vectors)
+    of_each = [np.broadcast_to(vector, (len(covariance), np.shape(vector)[-1])) for vector in vectors]
     carried = np.zeros(covariance.shape)
     for start in range(0, len(covariance), _BLOCK):
         block = slice(start, start + _BLOCK)
-        carried[block] = carry(covariance[block], *(quaternion[block] for quaternion in of_each))
+        carried[block] = carry(covariance[block], *(vector[block] for vector in of_each))
     return carried
 
 
