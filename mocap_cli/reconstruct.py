@@ -162,7 +162,7 @@ def reconstruct_command(
     verbose: int,
 ) -> dict[str, Any] | None:
     """Find the actor's joints in the pictures, triangulate them, and measure the errors."""
-    from pipelines.overlay import write_overlays
+    from pipelines.overlay import refuse_overlays, write_overlays
     from pipelines.reconstruct import Settings, reconstruct
 
     if start is not None and end is not None and start >= end:
@@ -185,11 +185,11 @@ def reconstruct_command(
         trials=trials,
         seed=seed,
     )
+    if overlay:
+        refuse_overlays(session, force=force)
     with watching(level(quiet, verbose)) as progress:
         result = reconstruct(session, settings, workers=workers, force=force, progress=progress)
-        videos = (
-            write_overlays(session, workers=workers, overwrite=force, progress=progress) if overlay else []
-        )
+        videos = write_overlays(session, workers=workers, force=force, progress=progress) if overlay else []
     say_warnings(result.record.warnings, quiet)
     if as_json:
         return result.metrics

@@ -1,13 +1,12 @@
-"""The skeleton over every picture of a camera, as a video: the eye's check of a reconstruction.
+"""Stage `overlay`: the skeleton over every picture of a camera, as a video for the eye to check.
 
 Read the skeleton, the cameras' poses and the keypoints of a session; draw them into picture after picture,
-block by block; join the blocks to one video for each camera, with the stamps of its pictures. The videos
-are no stage: nothing is made of them, and what a session's other stages write does not depend on them.
+block by block; join the blocks to one video for each camera, with the stamps of its pictures. Nothing is
+made of the videos, and they go with the skeleton that they show.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,13 +27,12 @@ from pipelines.session.description import Description, MediaEntry, read_descript
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Int64
-from pipelines.session.stages import StageRecord, locked
-from pipelines.session.storage import canonical_json, read_json, write_json
+from pipelines.session.stages import Run, Stage, StageRecord, WritableSession, locked, open_session
+from pipelines.session.storage import read_json, write_json
 from pipelines.session.tables import FRAMES, SKELETON, read_table
-from pipelines.session.whole_folders import Making, is_made, whole_folder
 
-_REVISION = 4
-_MARK = "overlay.json"
+OVERLAY = Stage("overlay", revision=5)
+
 _BLOCK = 300  # pictures that are drawn and encoded together, and kept when the work is interrupted
 _TICK_NS = int(TICK_S * 10**9) + 1
 
@@ -46,7 +44,7 @@ def write_overlays(
     start_s: float | None = None,
     end_s: float | None = None,
     workers: int = 1,
-    overwrite: bool = False,
+    force: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Write overlay/<camera>.mp4 of a reconstructed session.
@@ -60,7 +58,7 @@ def write_overlays(
         start_s: pictures from then on only, in seconds since the first frame of the flight's cameras.
         end_s: and those before then.
         workers: blocks of pictures drawn at once; what they show does not depend on them.
-        overwrite: do it again although nothing changed, and replace what is no overlay.
+        force: do it again although nothing changed, and replace what is no overlay.
         progress: who watches.
 
     Returns:
@@ -72,55 +70,63 @@ def write_overlays(
         BusyError: another process writes the session.
     """
     progress = progress or Silent()
-    target = folder / "overlay"
     with locked(folder) as session:
         record = session.record("reconstruct")
         if record is None:
             raise DataError(folder, "holds no skeleton to draw", "run `mocap reconstruct` first")
         description = read_description(folder)
-        span_s = (start_s, end_s)
         wanted = _with_pictures(folder, description, cameras)
-        if not overwrite and (videos := _made(target, _key(record, wanted, span_s))):
-            return videos
-        there = _still_there(folder, description, wanted, progress, all_of_them=cameras is not None)
-        key = _key(record, there, span_s)
-        if not overwrite and (videos := _made(target, key)):
-            return videos
-        _refuse_foreign(target, overwrite)
-        with whole_folder(target, key, mark=_MARK, overwrite=overwrite) as making:
-            films = _films(folder, description, record, there, span_s, progress)
-            counts = _draw(folder, films, _show(folder, description, record), making, workers, progress)
-            summary = {"schema": 1, "key": key, "method": record.settings["method"], "cameras": counts}
-            write_json(making.folder / _MARK, summary)
-            making.publish()
-    return [_video(target, film.camera.name) for film in films]
+        _refuse_foreign(folder, force)
+        begin = partial(_begin, session, record, (start_s, end_s), force)
+        run = begin(wanted)
+        if not run.finished:  # else pictures that are gone by now are not missed
+            wanted = _still_there(folder, description, wanted, progress, all_of_them=cameras is not None)
+            run = begin(wanted)
+        if run.finished:
+            return _videos(folder, run.record)
+        films = _films(folder, description, record, wanted, (start_s, end_s), progress)
+        counts = _draw(folder, films, _show(folder, description, record), run, workers, progress)
+        return _videos(folder, run.publish(counts={"method": record.settings["method"], "cameras": counts}))
+
+
+def refuse_overlays(folder: Path, *, force: bool = False) -> None:
+    """Say before hours of work that `write_overlays` would find no picture to draw on, or no place.
+
+    Raises:
+        DataError: as `write_overlays` does, but for the skeleton.
+    """
+    session = open_session(folder)
+    description = read_description(folder)
+    wanted = _with_pictures(folder, description, None)
+    _refuse_foreign(folder, force)
+    if session.record("overlay") is None:
+        _still_there(folder, description, wanted, Silent(), all_of_them=False)
+
+
+def _begin(
+    session: WritableSession,
+    record: StageRecord,
+    span_s: tuple[float | None, float | None],
+    force: bool,
+    cameras: Sequence[str],
+) -> Run:
+    """Begin the stage; the reconstruction's key stands for all that a session was made of."""
+    start_s, end_s = span_s
+    settings = {"cameras": list(cameras), "start_s": start_s, "end_s": end_s}
+    return session.begin(OVERLAY, settings=settings, inputs={"reconstruct": record.key}, force=force)
+
+
+def _videos(folder: Path, record: StageRecord) -> list[Path]:
+    return [_video(folder / "overlay", name) for name in record.counts["cameras"]]
 
 
 def _video(folder: Path, camera: str) -> Path:
     return folder / f"{camera}.mp4"
 
 
-def _key(record: StageRecord, cameras: Sequence[str], span_s: tuple[float | None, float | None]) -> str:
-    """Equal for equal videos: the reconstruction's key stands for all that a session was made of."""
-    ingredients = {
-        "revision": _REVISION,
-        "reconstruct": record.key,
-        "cameras": list(cameras),
-        "span_s": span_s,
-    }
-    return hashlib.sha256(canonical_json(ingredients).encode()).hexdigest()
-
-
-def _made(target: Path, key: str) -> list[Path]:
-    """The videos that are there with this key; none where one is missing."""
-    if not is_made(target, key, mark=_MARK):
-        return []
-    videos = [_video(target, name) for name in read_json(target / _MARK)["cameras"]]
-    return videos if all(path.is_file() for path in videos) else []
-
-
-def _refuse_foreign(target: Path, overwrite: bool) -> None:
-    if target.exists() and not (target / _MARK).is_file() and not overwrite:
+def _refuse_foreign(folder: Path, force: bool) -> None:
+    target = folder / "overlay"
+    if target.exists() and not (target / "stage.json").is_file() and not force:
         raise DataError(target, "is in the way, and no overlay of mocap's", "move it away, or use --force")
 
 
@@ -257,7 +263,7 @@ def _show(folder: Path, description: Description, record: StageRecord) -> _Show:
 
 
 def _draw(
-    folder: Path, films: Sequence[_Film], show: _Show, making: Making, workers: int, progress: Progress
+    folder: Path, films: Sequence[_Film], show: _Show, run: Run, workers: int, progress: Progress
 ) -> dict[str, dict[str, int]]:
     """Draw all blocks and join them to a video for each camera; how many pictures were what."""
     stopped = Event()
@@ -266,7 +272,7 @@ def _draw(
     def draw(item: tuple[_Film, range]) -> Path:
         film, block = item
         produce = partial(_draw_block, folder, film, block, show, stopped, progress)
-        return making.part(f"{film.camera.name}-{block.start}", produce)
+        return run.chunk(f"{film.camera.name}-{block.start}", produce)
 
     items = [(film, block) for film in films for block in film.blocks]
     with ThreadPoolExecutor(workers) as pool:
@@ -279,7 +285,7 @@ def _draw(
     for film in films:
         name = film.camera.name
         own = [part for (of, _), part in zip(items, parts, strict=True) if of is film]
-        join_videos(_video(making.folder, name), [part / "part.mp4" for part in own])
+        join_videos(_video(run.folder, name), [part / "part.mp4" for part in own])
         total: Counter[str] = Counter()
         for part in own:
             total.update(read_json(part / "counts.json"))

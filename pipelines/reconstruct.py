@@ -154,6 +154,8 @@ def reconstruct(
                 "every camera came with keypoints: no picture is looked at",
                 "leave --start and --end out",
             )
+        if detected is None and settings.every > 1:
+            progress.note("every camera came with keypoints: --every says nothing about them")
         inputs = dict(ingested.outputs) | (detected.outputs if detected else {})
         measured = measured_for(detected.settings["detector"]) if detected else None
         if measured is not None:
@@ -217,6 +219,8 @@ def reconstruct(
         )
         for name, (before, now) in run.replaces.items():
             progress.note(f"replaced the reconstruction made with {name} = {before} (now {now})")
+        for name in run.outdated:
+            progress.note(f"removed {name}/: it showed the reconstruction before")
     return Reconstructed(folder, record, metrics, skipped=False)
 
 

@@ -59,7 +59,10 @@ _AT_ROOT = {
 }
 """What a stage publishes beside its own folder instead of inside it; these names are its own."""
 
-_STAGES = ("ingest", "detect", "reconstruct", "replan", "film", "report")
+_STAGES = ("ingest", "detect", "reconstruct", "overlay", "replan", "film", "report")
+
+_SHOWN_BY = {"reconstruct": ("overlay",)}
+"""Stages that show a stage's result and nothing else: they go with the result that they show."""
 
 _LEFT_BY_KILLED_INGEST = {".lock", ".lock.pid", ".partial", "ingest.new", "run.json.new"}
 
@@ -174,6 +177,7 @@ class Run:
         finished: nothing is to be done, `record` says what there is.
         replaces: settings of the stage as it stands that differ from these: name to (before, now). None is
             what a setting is that was or is not there.
+        outdated: stages that showed what was replaced, and went with it.
     """
 
     def __init__(
@@ -204,6 +208,7 @@ class Run:
             for name in names
             if old.get(name) != self._settings.get(name)
         }
+        self.outdated: list[str] = []
 
     @property
     def record(self) -> StageRecord:
@@ -251,6 +256,7 @@ class Run:
         )
         write_json(self.folder / "stage.json", {"schema": SCHEMA, **asdict(self._record)})
         sync_folder(self._session)
+        self.outdated = _outdated(self._session, self._record)
         _roll_forward(self._session, self._stage.name)
         self._note_time()
         return self._record
@@ -511,7 +517,8 @@ def _roll_forward(folder: Path, stage: str) -> None:
     between any two steps is mended by doing it all once more.
     """
     new, old = _new(folder, stage), _old(folder, stage)
-    published = {name.partition("/")[0] for name in _read_record(new / "stage.json").outputs}
+    record = _read_record(new / "stage.json")
+    published = {name.partition("/")[0] for name in record.outputs}
     _remove_partials(folder, stage)
     old.mkdir(exist_ok=True)
     for entry in _AT_ROOT.get(stage, ()):
@@ -519,11 +526,24 @@ def _roll_forward(folder: Path, stage: str) -> None:
         if not is_in_place:
             _move(folder / entry, old / entry)
             _move(new / entry, folder / entry)
+    for shown in _outdated(folder, record):
+        _move(folder / shown, old / shown)
     _move(folder / stage, old / stage)
     new.rename(folder / stage)
     sync_folder(old)
     sync_folder(folder)
     remove_tree(old)
+
+
+def _outdated(folder: Path, record: StageRecord) -> list[str]:
+    """The stages that show another result than this one; those of a later version are not ours to judge."""
+    outdated = []
+    for name in _SHOWN_BY.get(record.stage, ()):
+        with suppress(NewerSchemaError):
+            shown = _usable_record(folder / name / "stage.json")
+            if shown is not None and shown.inputs.get(record.stage) != record.key:
+                outdated.append(name)
+    return outdated
 
 
 def _settle_old(folder: Path, stage: str) -> None:

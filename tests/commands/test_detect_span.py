@@ -12,7 +12,7 @@ from pipelines.formats.videos.video import VideoReader
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
 from pipelines.session.stages import StageRecord, locked
-from tests.commands.runner import refused, succeeds
+from tests.commands.runner import mocap, refused, succeeds
 from tests.keypoints.spotted_flights import CAMERAS, FPS, spot_detector, write_spotted_flight
 from tests.synthetic.flights import write_flight
 
@@ -70,4 +70,6 @@ def test_a_span_without_pictures_to_look_at_is_refused(tmp_path: Path) -> None:
     succeeds("ingest", flight.manifest)
     session = flight.manifest.with_suffix(".session")
     assert "every camera came with keypoints" in refused("reconstruct", session, "--start", "1")
-    succeeds("reconstruct", session)
+    done = mocap("reconstruct", session, "--every", "3")
+    assert done.returncode == 0
+    assert "every camera came with keypoints: --every says nothing about them" in done.stderr

@@ -25,6 +25,7 @@ from pipelines.reporting.frame_drawing import GREY as BLANK
 from pipelines.reporting.frame_drawing import SIDES
 from pipelines.session.errors import DataError
 from pipelines.session.storage import read_json, write_json
+from tests.commands.runner import refused, succeeds
 from tests.synthetic.flights import LENS, START_NS, SyntheticFlight, film_at, write_flight
 from tests.synthetic.logged_flights import write_logged_flight
 
@@ -91,7 +92,7 @@ def session(filmed: tuple[SyntheticFlight, Path], tmp_path: Path) -> Path:
 
 
 def summary(session: Path) -> dict[str, Any]:
-    return read_json(session / "overlay" / "overlay.json")
+    return read_json(session / "overlay" / "stage.json")["counts"]  # type: ignore[no-any-return]
 
 
 def is_near(picture: NDArray[np.uint8], pixel: NDArray[np.float64], colour: tuple[int, ...]) -> bool:
@@ -181,7 +182,10 @@ def test_unchanged_videos_are_not_made_again_and_another_skeleton_replaces_them(
     write_overlays(session, progress=watcher)
     assert watcher.steps == 2 * FRAMES
     assert summary(session)["method"] == "robust"
-    reconstruct(session, Settings(method="dlt"))
+    replacing = Watcher()
+    reconstruct(session, Settings(method="dlt"), progress=replacing)
+    assert "removed overlay/: it showed the reconstruction before" in replacing.notes
+    assert not (session / "overlay").exists()
     write_overlays(session)
     assert summary(session)["method"] == "dlt"
 
@@ -201,7 +205,7 @@ def test_blocks_that_were_drawn_outlive_an_interrupt(session: Path, monkeypatch:
         for one, other in zip(decoded(video), pictures, strict=True):
             # Other key frames, other losses; a skeleton at another place would differ by over 30 at once.
             assert np.abs(one.astype(int) - other).mean() < 0.5
-    assert not (session / ".overlay.making").exists()
+    assert not (session / ".partial").exists()
 
 
 def test_refined_poses_take_the_place_of_the_logs(
@@ -295,13 +299,29 @@ def test_what_has_no_pictures_or_no_skeleton_says_so(tmp_path: Path) -> None:
         write_overlays(session)
 
 
+def test_the_command_refuses_before_it_reconstructs(session: Path, tmp_path: Path) -> None:
+    flight = write_flight(tmp_path / "keypoints", seconds=0.3)
+    succeeds("ingest", flight.manifest)
+    unseen = flight.manifest.with_suffix(".session")
+    assert "has no pictures to draw on; state" in refused("reconstruct", unseen, "--overlay")
+    assert not (unseen / "reconstruct").exists()
+    shutil.rmtree(session / "reconstruct")
+    (session / "overlay").mkdir()
+    assert "overlay: is in the way" in refused("reconstruct", session, "--overlay")
+    (session / "overlay").rmdir()
+    for name in ("drone1", "drone2"):
+        (session.parent / f"{name}.mp4").unlink()
+    assert "drone1.mp4: the pictures of drone1 are not" in refused("reconstruct", session, "--overlay")
+    assert not (session / "reconstruct").exists()
+
+
 def test_somebody_elses_folder_is_not_replaced(session: Path) -> None:
     (session / "overlay").mkdir()
     (session / "overlay" / "mine.txt").write_text("mine")
     with pytest.raises(DataError, match="in the way"):
         write_overlays(session)
     assert (session / "overlay" / "mine.txt").exists()
-    write_overlays(session, overwrite=True)
+    write_overlays(session, force=True)
     assert not (session / "overlay" / "mine.txt").exists()
 
 

@@ -34,6 +34,7 @@ from pipelines.session.storage import read_json, sha256_of, write_json
 
 INGEST = Stage("ingest", 1)
 RECONSTRUCT = Stage("reconstruct", 1)
+OVERLAY = Stage("overlay", 1)
 
 
 def ingest(folder: Path, flight: str, files: dict[str, str], **options: bool) -> Run:
@@ -63,6 +64,17 @@ def reconstruct(folder: Path, method: str, *, force: bool = False) -> Run:
             (run.folder / "deep").mkdir()
             (run.folder / "deep" / "metrics").write_text(method)
             run.publish(counts={"parts": len(parts)}, warnings=[f"used {method}"])
+        return run
+
+
+def overlay(folder: Path) -> Run:
+    """A video of what is reconstructed."""
+    with locked(folder) as session:
+        record = session.record("reconstruct")
+        assert record is not None
+        run = session.begin(OVERLAY, settings={}, inputs={"reconstruct": record.key})
+        (run.folder / "video").write_text(str(record.settings["method"]))
+        run.publish(counts={})
         return run
 
 
@@ -99,11 +111,13 @@ def assert_every_stage_is_whole(folder: Path) -> None:
     """Each stage is the old one or the new one, never a mixture; what is not listed is not there."""
     session = open_session(folder)
     listed = set()
-    for stage in ("ingest", "reconstruct"):
+    for stage in ("ingest", "reconstruct", "overlay"):
         record = session.record(stage)
         if record is not None:
             assert {name: sha256_of(folder / name) for name in record.outputs} == record.outputs
             listed |= {*record.outputs, f"{stage}/stage.json"}
+    shown, showing = session.record("reconstruct"), session.record("overlay")
+    assert showing is None or (shown is not None and showing.inputs == {"reconstruct": shown.key})
     published = {
         path.relative_to(folder).as_posix()
         for path in folder.rglob("*")
@@ -131,7 +145,6 @@ def failing_at(step: int, failure: BaseException, *, for_good: bool) -> Iterator
                 return _original(*args, **kwargs)
 
             patch.setattr(os, name, guarded)
-        patch.setattr(os, "fsync", lambda _: None)  # a kill loses nothing that was written
         yield calls
 
 
@@ -143,6 +156,7 @@ def prepared(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     if request.param == "replacing":
         ingest(start, "old", OLD)
         reconstruct(start, "dlt")
+        overlay(start)
         shutil.copytree(start, end)
     work(end)
     return start, end
@@ -202,6 +216,24 @@ def test_a_full_disk_at_every_step_is_one_line(prepared: tuple[Path, Path], tmp_
         assert contents(folder) == expected, f"disk full at step {step}"
     assert len(lines) > 40, "the faults were not injected"
     assert all("No space left on device; free some space" in line for line in lines)
+
+
+def test_what_is_published_was_synced_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files and folders outlast a loss of power from the moment on at which they count."""
+    folder = tmp_path / "a.session"
+    synced: set[int] = set()
+    rename = Path.rename
+
+    def renamed(self: Path, target: Path) -> Path:
+        if self.name.endswith(".new"):
+            assert {path.stat().st_ino for path in [*self.rglob("*"), self]} <= synced
+            synced.clear()
+        return rename(self, target)
+
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.add(os.fstat(descriptor).st_ino))
+    monkeypatch.setattr(Path, "rename", renamed)
+    work(folder)
+    assert folder.stat().st_ino in synced  # and so does the last rename
 
 
 WRITER = """
@@ -293,6 +325,16 @@ def test_a_stage_whose_successor_was_removed_by_hand_comes_back(tmp_path: Path) 
     (folder / "reconstruct").rename(folder / ".reconstruct.old" / "reconstruct")
     open_session(folder)
     assert contents(folder) == expected
+
+
+def test_what_shows_a_result_stays_and_goes_with_it(tmp_path: Path) -> None:
+    folder = tmp_path / "a.session"
+    work(folder)
+    overlay(folder)
+    assert reconstruct(folder, "robust", force=True).outdated == []
+    assert (folder / "overlay" / "video").read_text() == "robust"
+    assert reconstruct(folder, "dlt").outdated == ["overlay"]
+    assert not (folder / "overlay").exists()
 
 
 def test_a_copy_kept_by_the_user_stays(tmp_path: Path) -> None:
