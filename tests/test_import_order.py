@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import statistics
+import resource
 import subprocess
 import sys
-import time
 
 from tests.commands.runner import MOCAP
 
@@ -58,13 +57,17 @@ def test_help_loads_nothing_heavy() -> None:
     run(LIGHT_HELP)
 
 
-def test_help_is_at_most_300_ms_slower_than_python_itself() -> None:
-    def median_s(command: list[str]) -> float:
-        times = []
-        for _ in range(5):
-            started = time.perf_counter()
-            subprocess.run(command, capture_output=True, check=True)
-            times.append(time.perf_counter() - started)
-        return statistics.median(times)
+def test_help_costs_at_most_300_ms_more_than_python_itself() -> None:
+    """In CPU seconds, and at best, since a busy machine makes everybody wait."""
 
-    assert median_s([MOCAP, "--help"]) - median_s([sys.executable, "-c", "pass"]) < 0.3
+    def least_s(command: list[str]) -> float:
+        return min(_cpu_s_of(command) for _ in range(5))
+
+    assert least_s([MOCAP, "--help"]) - least_s([sys.executable, "-c", "pass"]) < 0.3
+
+
+def _cpu_s_of(command: list[str]) -> float:
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(command, capture_output=True, check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
