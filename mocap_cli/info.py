@@ -17,7 +17,11 @@ _LONGEST_LIST = 12
 @click.argument("path", type=any_path)
 @json_option
 def info_command(path: Path, as_json: bool) -> None:
-    """Say what a log, video, map, calibration, keypoint file, trajectory, manifest or session holds."""
+    """Say what a path holds: anything that mocap reads, and what it writes.
+
+    Logs, videos, maps, calibrations, keypoint files and trajectories; manifests, scenarios and planner
+    settings; sessions, simulated flights and studies.
+    """
     from pipelines.session.storage import jsonable
     from pipelines.survey import survey
 

@@ -30,7 +30,7 @@ from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Float
 from pipelines.session.registries import Detector, find_detector
 from pipelines.session.storage import canonical_json, jsonable, read_json, sha256_of, write_json
-from pipelines.session.whole_folders import is_made, whole_folder
+from pipelines.session.whole_folders import STUDY_MARK, is_made, whole_folder
 from pipelines.simulation.detector_errors import MEASURED
 from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.scenario import World
@@ -48,7 +48,6 @@ from pipelines.simulation.study.settings import Noise, Settings, StudyMethod
 from pipelines.simulation.world.scene import build_world
 
 _REVISION = 2
-_MARK = "summary.json"
 _PER_JOINT = ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm")
 _HINT_SIGMA_M = 0.1  # of what the detector is told of the person's place: the camera looks straight there
 
@@ -105,11 +104,11 @@ def ablate(
     progress = progress or Silent()
     detector = None if settings.detector is None else find_detector(settings.detector)
     key = _key(settings, detector)
-    if not force and is_made(folder, key, mark=_MARK):
-        return Ablated(folder, read_json(folder / _MARK), skipped=True)
+    if not force and is_made(folder, key, mark=STUDY_MARK):
+        return Ablated(folder, read_json(folder / STUDY_MARK), skipped=True)
     if detector is not None:
         detector.load(threads=1)  # says at once what is missing
-    with whole_folder(folder, key, mark=_MARK, overwrite=overwrite) as making:
+    with whole_folder(folder, key, mark=STUDY_MARK, overwrite=overwrite) as making:
         filmed = walk(settings.seconds, settings.rate_hz, settings.seed)
         cells = list(_cells(settings))
         seen: dict[tuple[float, int], Sightings] = {}
@@ -127,7 +126,7 @@ def ablate(
         _refuse_nothing(folder, summary)
         (making.folder / "results.csv").write_text(results_csv(rows), encoding="utf-8", newline="\n")
         draw(making.folder, summary)
-        write_json(making.folder / _MARK, summary)
+        write_json(making.folder / STUDY_MARK, summary)
         making.publish()
     return Ablated(folder, summary, skipped=False)
 

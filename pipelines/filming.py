@@ -41,6 +41,7 @@ from pipelines.session.stages import Stage, StageRecord, locked
 from pipelines.session.storage import canonical_json, jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import REPLAN, TRUTH, read_table, write_table
 from pipelines.session.tabular import motion_table
+from pipelines.session.whole_folders import SIMULATION_MARK
 from pipelines.simulation.flight import Set, build_set
 from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.scenario import Scenario, read_scenario
@@ -192,7 +193,7 @@ def _scenario_of(folder: Path, description: Description) -> Path:
         if entry.media is not None:
             beside += [(folder / path).parent for path in entry.media.paths]
     for place in beside:
-        if (place / "simulation.json").is_file() and (place / "scenario.yaml").is_file():
+        if (place / SIMULATION_MARK).is_file() and (place / "scenario.yaml").is_file():
             return place / "scenario.yaml"
     raise DataError(
         folder,

@@ -34,7 +34,7 @@ from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Float, Int64, Occupancy, SkeletalMotion
 from pipelines.session.registries import PLANNER_ARMS, noise_models
 from pipelines.session.storage import canonical_json, read_json, sha256_of, write_json
-from pipelines.session.whole_folders import is_made, whole_folder
+from pipelines.session.whole_folders import SIMULATION_MARK, is_made, whole_folder
 from pipelines.simulation.flight import (
     SimulatedDrone,
     SimulatedFlight,
@@ -50,8 +50,7 @@ from pipelines.simulation.scenario import Scenario, read_scenario
 from pipelines.simulation.world.scene import World
 
 _REVISION = 5
-_MARK = "simulation.json"
-_OWN = ("drone*", "flight.yaml", "true_poses.yaml", "scenario.yaml", "site.*", "truth", _MARK)
+_OWN = ("drone*", "flight.yaml", "true_poses.yaml", "scenario.yaml", "site.*", "truth", SIMULATION_MARK)
 _BLOCK = 60  # pictures that are rendered and encoded together, and kept when the work is interrupted
 _RECEIVED_NS = 2_000_000  # after a message's own stamp, by the recorder on board
 _CAMERA_INFO_NS = 1_000_000_000
@@ -96,15 +95,15 @@ def simulate(
     progress = progress or Silent()
     scenario = read_scenario(scenario_path)
     key = _key(scenario, scenario_path, video)
-    if not force and is_made(folder, key, mark=_MARK):
-        return Simulated(folder, read_json(folder / _MARK), skipped=True)
+    if not force and is_made(folder, key, mark=SIMULATION_MARK):
+        return Simulated(folder, read_json(folder / SIMULATION_MARK), skipped=True)
     if not overwrite:
         _refuse_to_lose_others(folder)
     noise = noise_models(f"{scenario_path}: drones.pose_noise", scenario.drones.pose_noise)
     bvh = _bvh(scenario, scenario_path)
     planner = _planner(scenario, scenario_path)
 
-    with whole_folder(folder, key, mark=_MARK, overwrite=overwrite) as making:
+    with whole_folder(folder, key, mark=SIMULATION_MARK, overwrite=overwrite) as making:
         progress.start("Flying", 3 + scenario.drones.count)
         flight = fly_scenario(scenario, noise, bvh=bvh, planner=planner)
         progress.advance()
@@ -128,14 +127,14 @@ def simulate(
             text = manifest_text(flight, video=video, true_poses=true_poses)
             (making.folder / name).write_text(text, encoding="utf-8", newline="\n")
         summary = _summary(flight, key, video)
-        write_json(making.folder / _MARK, summary)
+        write_json(making.folder / SIMULATION_MARK, summary)
         making.publish()
     return Simulated(folder, summary, skipped=False)
 
 
 def _refuse_to_lose_others(folder: Path) -> None:
     """A session that was made beside its flight.yaml would go with the old flight."""
-    if not (folder / _MARK).is_file():
+    if not (folder / SIMULATION_MARK).is_file():
         return  # whole_folder looks at what is no simulation
     names = sorted(path.name for path in folder.iterdir())
     if others := [name for name in names if not any(fnmatch(name, own) for own in _OWN)]:

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from pipelines.formats.common.yaml_text import read_yaml
+from pipelines.planning.config import PlannerConfig, planner_config
 from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import read_flight
+from pipelines.session.manifest import Flight, read_flight
 from pipelines.session.registries import FORMATS, why_not
-from pipelines.session.stages import open_session
+from pipelines.session.stages import SCHEMA, STAGES, open_session
+from pipelines.session.storage import read_json
+from pipelines.session.whole_folders import SIMULATION_MARK, STUDY_MARK
+from pipelines.session.yaml_models import keys_of
+from pipelines.simulation.scenario import Scenario, read_scenario
 
 
 @dataclass(frozen=True)
@@ -23,7 +31,9 @@ class Survey:
 
 
 def survey(path: Path) -> list[Survey]:
-    """Look into a session, a manifest or a file of any registered format; one answer for each reading.
+    """Look into what mocap writes, what users write for it, or a file of any registered format.
+
+    One answer for each reading: a file may be of several formats.
 
     Raises:
         DataError: the path is missing, damaged, or of no known kind.
@@ -32,6 +42,8 @@ def survey(path: Path) -> list[Survey]:
         raise DataError(path, "does not exist", "check the path")
     if (path / "session.json").is_file():
         return [Survey(path, "session", _of_session(path))]
+    if made := _of_summary(path):
+        return [made]
     readings = [
         Survey(path, format_.title, format_.describe(path))
         for format_ in FORMATS.all()
@@ -39,11 +51,14 @@ def survey(path: Path) -> list[Survey]:
     ]
     if readings:
         return readings
-    if path.suffix in {".yaml", ".yml"}:
-        return [Survey(path, "flight manifest", _of_manifest(path))]
+    if path.suffix in {".yaml", ".yml"} and path.is_file():
+        return [_of_yaml(path)]
     raise DataError(
         path, f"is of no known kind{why_not(path)}", f"known formats: {', '.join(FORMATS.names())}"
     )
+
+
+# --- what mocap writes ---------------------------------------------------------------------------------
 
 
 def _of_session(path: Path) -> dict[str, Any]:
@@ -65,20 +80,107 @@ def _of_session(path: Path) -> dict[str, Any]:
         "truth": sorted(description.truth.joints) if description.truth else None,
         "warnings": description.warnings,
     }
-    for stage in ("detect", "reconstruct", "replan", "report"):
-        if record := session.record(stage):
-            facts[stage] = {"settings": record.settings, "counts": record.counts}
+    records = {stage: record for stage in STAGES if (record := session.record(stage))}
+    made = {stage: record.key for stage, record in records.items()}
+    for record in records.values():
+        made |= record.outputs
+    for stage, record in records.items():
+        if stage == "ingest":
+            continue
+        facts[stage] = {"settings": record.settings, "counts": record.counts}
+        if any(made.get(name, digest) != digest for name, digest in record.inputs.items()):
+            facts[stage]["out of date"] = "what it was made of has changed since: run it again"
     return facts
+
+
+def _of_summary(path: Path) -> Survey | None:
+    """A folder of `mocap simulate` or `mocap ablate`, or the summary in it; None where it is neither."""
+    for mark, title, reader in (
+        (SIMULATION_MARK, "simulated flight", _of_simulation),
+        (STUDY_MARK, "study of simulated flights", _of_study),
+    ):
+        file = path / mark if path.is_dir() else path
+        if file.name != mark or not file.is_file():
+            continue
+        summary: Mapping[str, Any] = {}
+        with suppress(DataError):  # damaged, or somebody else's of that name: told as any file is
+            summary = read_json(file)
+        if summary.get("simulated") is True:
+            return Survey(path, title, _told(file, summary, reader))
+    return None
+
+
+def _told(
+    file: Path, summary: Mapping[str, Any], reader: Callable[[Mapping[str, Any]], dict[str, Any]]
+) -> dict[str, Any]:
+    schema = summary.get("schema")
+    if isinstance(schema, int) and schema > SCHEMA:
+        raise DataError(file, f"has schema {schema}, newer than {SCHEMA}", "update mocap to read it")
+    try:
+        return reader(summary)
+    except (KeyError, TypeError, AttributeError):
+        raise DataError(file, "lacks what it should hold", "make the folder again") from None
+
+
+def _of_simulation(summary: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: summary[name] for name in ("name", "seed", "duration_s", "pictures", "frames", "poses")}
+
+
+def _of_study(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """What was asked, and the mean error of every condition and method."""
+    asked = summary["settings"]
+    names = ("tilts_deg", "drones", "noise", "methods", "seconds", "rate_hz", "trials", "seed")
+    errors: dict[str, dict[str, Any]] = {}
+    for cell in summary["cells"]:
+        condition = f"{cell['tilt_deg']:g} deg, {cell['drones']} drones, noise {cell['noise']}"
+        error = cell["metrics"]["mpjpe_mm"]
+        errors.setdefault(condition, {})[cell["method"]] = None if error is None else error["mean"]
+    return {
+        "study": summary["study"],
+        "keypoints": summary["keypoints"],
+        **{name: asked[name] for name in names},
+        "mpjpe_mm": errors,
+    }
+
+
+# --- what users write for it ---------------------------------------------------------------------------
+
+
+def _of_yaml(path: Path) -> Survey:
+    """A flight manifest, a scenario or planner settings, whichever most of its keys belong to."""
+    stated = read_yaml(path)
+    kinds = {
+        "flight manifest": (keys_of(Flight), _of_manifest),
+        "scenario": (keys_of(Scenario), _of_scenario),
+        "planner settings": ({field.name for field in fields(PlannerConfig)}, _of_planner),
+    }
+    known = {title: len(keys & stated.keys()) for title, (keys, _) in kinds.items()}
+    title, most = max(known.items(), key=lambda each: each[1])
+    if list(known.values()).count(most) > 1:  # `schema` and `name` say nothing
+        raise DataError(
+            path,
+            "is YAML, but of no known kind",
+            "a flight manifest has `cameras:`, a scenario `drones:`, planner settings `w_obs:` and the like",
+        )
+    return Survey(path, title, kinds[title][1](path))
 
 
 def _of_manifest(path: Path) -> dict[str, Any]:
     flight = read_flight(path)
-    return {
-        "name": flight.name,
-        "clock_reference": flight.reference_camera,
-        "cameras": {
-            name: camera.model_dump(mode="json", exclude_defaults=True)
-            for name, camera in flight.cameras.items()
-        },
-        "truth": flight.truth.model_dump(mode="json", exclude_defaults=True) if flight.truth else None,
-    }
+    stated = flight.model_dump(mode="json", exclude_defaults=True)
+    facts = {"name": flight.name, "clock_reference": flight.reference_camera, "cameras": stated["cameras"]}
+    return facts | {part: stated.get(part) for part in ("actor", "map", "truth", "plan")}
+
+
+def _of_scenario(path: Path) -> dict[str, Any]:
+    scenario = read_scenario(path)
+    stated = scenario.model_dump(mode="json", exclude_defaults=True)
+    facts = {"name": scenario.name, "seed": scenario.seed, "duration_s": scenario.duration_s}
+    facts |= {part: stated[part] for part in ("actor", "world", "keypoints") if part in stated}
+    return facts | {"drones": {"count": scenario.drones.count} | stated.get("drones", {})}
+
+
+def _of_planner(path: Path) -> dict[str, Any]:
+    stated = read_yaml(path)
+    planner_config(stated, path)
+    return stated

@@ -59,7 +59,8 @@ _AT_ROOT = {
 }
 """What a stage publishes beside its own folder instead of inside it; these names are its own."""
 
-_STAGES = ("ingest", "detect", "reconstruct", "overlay", "replan", "film", "report")
+STAGES = ("ingest", "detect", "reconstruct", "overlay", "replan", "film", "report")
+"""In the order in which they may run."""
 
 _SHOWN_BY = {"reconstruct": ("overlay",)}
 """Stages that show a stage's result and nothing else: they go with the result that they show."""
@@ -84,7 +85,7 @@ class Stage:
     revision: int
 
     def __post_init__(self) -> None:
-        if self.name not in _STAGES:
+        if self.name not in STAGES:
             raise ValueError(f"{self.name} is not a stage of a session")
 
 
@@ -496,13 +497,13 @@ def _old(folder: Path, stage: str) -> Path:
 
 def _is_interrupted(folder: Path) -> bool:
     return any(
-        (_new(folder, stage) / "stage.json").exists() or _old(folder, stage).exists() for stage in _STAGES
+        (_new(folder, stage) / "stage.json").exists() or _old(folder, stage).exists() for stage in STAGES
     )
 
 
 def _repair(folder: Path) -> None:
     """Finish what was published halfway, remove what was not."""
-    for stage in _STAGES:
+    for stage in STAGES:
         if _usable_record(_new(folder, stage) / "stage.json") is not None:
             _roll_forward(folder, stage)
         remove_tree(_new(folder, stage))

@@ -21,6 +21,12 @@ from filelock import FileLock, Timeout
 from pipelines.session.errors import BusyError, DataError
 from pipelines.session.storage import as_data_error, read_json, remove_tree, sync_folder, sync_tree
 
+SIMULATION_MARK = "simulation.json"
+"""The file that every folder of `mocap simulate` has."""
+
+STUDY_MARK = "summary.json"
+"""The file that every folder of `mocap ablate` has."""
+
 
 class Making:
     """A folder in the making.

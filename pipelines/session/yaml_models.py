@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from pipelines.session.errors import DataError
+from pipelines.session.yaml_reading import plain_yaml
 
 _LARGEST_FILE = 1_000_000  # bytes; a real one has a few thousand
 
@@ -38,6 +39,11 @@ class Part(BaseModel):
 
 
 M = TypeVar("M", bound=Part)
+
+
+def keys_of(model: type[Part]) -> set[str]:
+    """The keys that a mapping of this kind may have, as users write them."""
+    return {field.alias or name for name, field in model.model_fields.items()}
 
 
 def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape: str) -> M:
@@ -69,25 +75,15 @@ def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape
 
 
 def _read_yaml(path: Path, noun: str) -> object:
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import MarkedYAMLError, YAMLError
-
     try:
         if path.stat().st_size > _LARGEST_FILE:
             raise DataError(path, f"is larger than {_LARGEST_FILE} bytes", f"this is no {noun}")
         text = path.read_text(encoding="utf-8-sig")
-        value: object = YAML(typ="safe", pure=True).load(text)
     except OSError as error:
         raise DataError(path, f"cannot be read ({error.strerror})", f"give the path of a {noun}") from None
     except UnicodeDecodeError:
         raise DataError(path, "is no UTF-8 text", f"give the path of a {noun}") from None
-    except MarkedYAMLError as error:
-        line = f" in line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        problem = " ".join(str(error.problem or error.context).split())
-        raise DataError(path, f"is no valid YAML{line} ({problem})", "mend that line") from None
-    except (YAMLError, ValueError, RecursionError) as error:
-        problem = " ".join(str(error).split())[:200]
-        raise DataError(path, f"is no valid YAML ({problem})", "mend it") from None
+    value = plain_yaml(path, text)
     _refuse_impossible_text(path, value)
     return value
 

@@ -9,6 +9,7 @@ import numpy as np
 from pipelines.formats.common.text_tables import read_text
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float
+from pipelines.session.yaml_reading import plain_yaml
 
 _LARGEST = 1 << 20  # bytes; the parser is slow, and no calibration comes near
 
@@ -21,23 +22,12 @@ def read_yaml(path: Path) -> dict[str, object]:
     Raises:
         DataError: unreadable, larger than a megabyte, no valid YAML, or no mapping of names.
     """
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import MarkedYAMLError, YAMLError
-
     text = read_text(path)
     if len(text) > _LARGEST:
         raise DataError(path, f"has {len(text)} characters", f"a calibration has less than {_LARGEST}")
     if text.startswith("%YAML:"):
         text = "#" + text
-    try:
-        value: object = YAML(typ="safe", pure=True).load(text)
-    except MarkedYAMLError as error:
-        line = f" in line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        problem = " ".join(str(error.problem or error.context).split())
-        raise DataError(path, f"is no valid YAML{line} ({problem})", "it may be truncated") from error
-    except (YAMLError, ValueError, RecursionError) as error:
-        problem = " ".join(str(error).split())[:200]
-        raise DataError(path, f"is no valid YAML ({problem})", "write it again") from error
+    value = plain_yaml(path, text)
     if not isinstance(value, dict):
         raise DataError(path, "is no YAML mapping of names to values", "write it again")
     return {str(key): item for key, item in value.items()}

@@ -17,6 +17,7 @@ OTHER_CHECKSUM = "data section that differs from its checksum"
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER = struct.Struct("<BQQQI8s")  # kind, length; start of summary and of its offsets, checksum; magic
 _DATA_END = struct.Struct("<BQI")  # kind, length; checksum
+_BLOCK = 1 << 20  # bytes
 _FOOTER_KIND, _FOOTER_LENGTH, _DATA_END_KIND, _DATA_END_LENGTH = 2, 20, 15, 4
 
 
@@ -53,6 +54,23 @@ class CheckedHash:
     def digest(self) -> bytes:
         """The SHA-256 of all bytes."""
         return self._sha256.digest()
+
+
+def checksum_is_right(path: Path) -> bool | None:
+    """Whether the data section is what its checksum says, which reads it all; None where none is stated.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    stated = stated_checksum(path)
+    if stated is None:
+        return None
+    crc, left = 0, stated.size
+    with path.open("rb") as file:
+        while left and (data := file.read(min(left, _BLOCK))):
+            crc = zlib.crc32(data, crc)
+            left -= len(data)
+    return crc == stated.crc
 
 
 def stated_checksum(path: Path) -> StatedChecksum | None:

@@ -18,6 +18,7 @@ from mcap.exceptions import McapError
 from numpy.typing import NDArray
 
 from pipelines.formats.logs.chunked_logs import CHUNK_LIMIT, Chunk, ChunkedPart, Content, RecordShape
+from pipelines.formats.logs.mcap_checksums import OTHER_CHECKSUM, checksum_is_right
 from pipelines.formats.logs.message_decoders import Schema, ros2_name
 from pipelines.formats.logs.recordings import Channel, OpenLog, describe_log, open_file, open_parts
 from pipelines.session.errors import DataError
@@ -38,8 +39,8 @@ _STAMP_LIMIT = 1 << 63  # our stamps are int64
 class McapLog:
     """MCAP files with messages in ros1, cdr, json or protobuf.
 
-    Checksums of chunks are verified; that of the whole data section is where the whole file is read
-    (`mcap_checksums`).
+    Checksums of chunks are verified; that of the whole data section is where the whole file is hashed or
+    described (`mcap_checksums`).
     """
 
     name = "mcap"
@@ -56,9 +57,13 @@ class McapLog:
         return head == _MAGIC or (not head and path.suffix.lower() in self.suffixes)
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Messages, times, storage, topics, and what was lost."""
+        """Messages, times, storage, topics, what was lost, and whether its bytes are those written."""
         with self.open_log([path]) as log:
-            return describe_log(log)
+            facts = describe_log(log)
+        right = checksum_is_right(path)
+        if right is None:
+            return facts | {"checksum": "not stated"}
+        return facts | ({"checksum": "right"} if right else {"damage": f"a {OTHER_CHECKSUM}: copy it again"})
 
     def open_log(self, paths: Sequence[Path]) -> OpenLog:
         """Open one file, or the parts of a split one.

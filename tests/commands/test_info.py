@@ -1,0 +1,111 @@
+"""`mocap info`: what each of mocap's own files and folders is, and what is wrong with others'."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipelines.session.storage import read_json, write_json
+from tests.commands.runner import refused, succeeds
+from tests.synthetic.flights import write_flight
+from tests.synthetic.logged_flights import write_logged_flight
+
+SCENARIO = """
+schema: 1
+name: A short one
+seed: 5
+duration_s: 0.5
+actor: {start: [0, 0], motion: [{stand: {seconds: 1}}]}
+drones: {count: 3}
+"""
+
+
+def reading(path: Path) -> dict[str, Any]:
+    told = json.loads(succeeds("info", path, "--json"))["readings"]
+    assert len(told) == 1
+    return dict(told[0])
+
+
+def test_yaml_is_what_its_keys_say(tmp_path: Path) -> None:
+    scenario = tmp_path / "a.yaml"
+    scenario.write_text(SCENARIO)
+    told = reading(scenario)
+    assert (told["kind"], told["seed"], told["drones"]["count"]) == ("scenario", 5, 3)
+    scenario.write_text(SCENARIO.replace("seed: 5", "sead: 5"))
+    assert "sead: unknown key, did you mean 'seed'?" in refused("info", scenario)
+    planner = tmp_path / "planner.yaml"
+    planner.write_text("radius_m: 12\nw_obs: 2\n")
+    assert reading(planner) == {"kind": "planner settings", "radius_m": 12, "w_obs": 2}
+    planner.write_text("radius_m: 12\nw_obs: -2\n")
+    assert "w_obs" in refused("info", planner)
+    for text in ("schema: 1\nname: of what?\n", "services: {web: {image: nginx}}\n"):
+        planner.write_text(text)
+        assert "planner.yaml: is YAML, but of no known kind; a flight manifest has" in refused(
+            "info", planner
+        )
+
+
+def test_a_simulated_flight_and_its_summary(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text(SCENARIO)
+    folder = tmp_path / "flight"
+    succeeds("simulate", tmp_path / "a.yaml", "-o", folder, "--no-video")
+    for path in (folder, folder / "simulation.json"):
+        told = reading(path)
+        assert (told["kind"], told["name"], told["seed"]) == ("simulated flight", "A short one", 5)
+        assert set(told["frames"]) == {"drone1", "drone2", "drone3"}
+    write_json(folder / "simulation.json", {"schema": 2, "simulated": True})
+    assert "simulation.json: has schema 2, newer than 1; update mocap" in refused("info", folder)
+    write_json(folder / "simulation.json", {"schema": 1, "simulated": True})
+    assert "simulation.json: lacks what it should hold" in refused("info", folder)
+    (folder / "simulation.json").write_text('{"schema": 1,')
+    assert "simulation.json: is of no known kind: it is no valid JSON" in refused(
+        "info", folder / "simulation.json"
+    )
+
+
+def test_a_study_tells_the_error_of_every_condition(tmp_path: Path) -> None:
+    asked = ("--tilts", "0,30", "--levels", "low", "--methods", "dlt", "--seconds", "4", "--rate", "5")
+    succeeds("ablate", "tilt", *asked, "--trials", "1", "--keypoints", "exact", "-o", tmp_path / "study")
+    told = reading(tmp_path / "study")
+    cells = read_json(tmp_path / "study" / "summary.json")["cells"]
+    assert told["kind"] == "study of simulated flights"
+    assert told["study"] == "tilt"
+    assert [list(errors.values()) for errors in told["mpjpe_mm"].values()] == [
+        [cell["metrics"]["mpjpe_mm"]["mean"]] for cell in cells
+    ]
+    assert list(told["mpjpe_mm"]) == [f"{tilt} deg, 2 drones, noise low" for tilt in (0, 30)]
+    (tmp_path / "summary.json").write_text("[1, 2]")  # somebody else's
+    assert "is of no known kind" in refused("info", tmp_path / "summary.json")
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_the_data_section_of_an_mcap_file_is_checked(tmp_path: Path, right: bool) -> None:
+    flight = write_logged_flight(tmp_path, "mcap-cdr")
+    log = tmp_path / flight.settings["cameras"]["drone1"]["pose"]["log"]
+    assert reading(log)["checksum"] == "not stated"
+    whole = log.read_bytes()
+    # The summary begins where the footer says; before it the end of the data states 0, no checksum.
+    end = int.from_bytes(whole[-28:-20], "little") - 13
+    crc = zlib.crc32(whole[:end]) if right else 1
+    log.write_bytes(whole[: end + 9] + crc.to_bytes(4, "little") + whole[end + 13 :])
+    told = reading(log)
+    assert told.get("checksum") == ("right" if right else None)
+    assert ("differs from its checksum: copy it again" in told.get("damage", "")) != right
+
+
+def test_a_stage_whose_data_changed_is_out_of_date(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, seconds=0.4)
+    session = flight.manifest.with_suffix(".session")
+    succeeds("ingest", flight.manifest)
+    succeeds("reconstruct", session)
+    assert "out of date" not in reading(session)["reconstruct"]
+    flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": 0.01}
+    flight.save()
+    succeeds("ingest", flight.manifest)
+    assert "run it again" in reading(session)["reconstruct"]["out of date"]
+    succeeds("reconstruct", session)
+    assert "out of date" not in reading(session)["reconstruct"]
