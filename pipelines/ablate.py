@@ -7,13 +7,10 @@ is simulated.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from threading import Event
 from typing import Any
 
 import numpy as np
@@ -28,8 +25,9 @@ from pipelines.reporting.ablation import Row, draw, estimates, results_csv
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Float
-from pipelines.session.registries import Detector, find_detector
-from pipelines.session.storage import canonical_json, jsonable, read_json, sha256_of, write_json
+from pipelines.session.registries import Detector, find_detector, hashes_of_models
+from pipelines.session.side_by_side import Halt, side_by_side
+from pipelines.session.storage import hash_of, jsonable, read_json, sha256_of, write_json
 from pipelines.session.whole_folders import STUDY_MARK, is_made, whole_folder
 from pipelines.simulation.detector_errors import MEASURED
 from pipelines.simulation.rendering.renderer import Renderer
@@ -115,12 +113,12 @@ def ablate(
         if detector is not None:
             seen = _detect_all(filmed, cells, detector, settings.seed, workers, making.part, progress)
         progress.start("Measuring", len(cells) * settings.trials)
-        stopped = Event()
+        halt = Halt()
         work = [
-            (f"cell-{k:04d}", partial(_measure_cell, settings, filmed, cell, seen, stopped, progress))
+            (f"cell-{k:04d}", partial(_measure_cell, settings, filmed, cell, seen, halt, progress))
             for k, cell in enumerate(cells)
         ]
-        parts = _side_by_side(work, making.part, workers, stopped)
+        parts = _parts(work, making.part, workers, halt)
         rows = [row for part in parts for row in read_json(part / "rows.json")["rows"]]
         summary = jsonable(_summary(settings, key, rows))
         _refuse_nothing(folder, summary)
@@ -137,10 +135,9 @@ def _key(settings: Settings, detector: Detector | None) -> str:
     if detector is None:
         ingredients["errors"] = sha256_of(MEASURED)
     else:
-        models = {name: path for name, path in detector.models().items() if path is not None}
         ingredients["detector"] = detector.name
-        ingredients["models"] = {name: sha256_of(path) for name, path in models.items()}
-    return hashlib.sha256(canonical_json(ingredients).encode()).hexdigest()
+        ingredients["models"] = hashes_of_models(detector)
+    return hash_of(ingredients)
 
 
 def _cells(settings: Settings) -> Iterator[Cell]:
@@ -153,22 +150,11 @@ def _cells(settings: Settings) -> Iterator[Cell]:
 Part = Callable[[str, Callable[[Path], None]], Path]
 
 
-def _side_by_side(
-    work: Sequence[tuple[str, Callable[[Path], None]]], part: Part, workers: int, stopped: Event
+def _parts(
+    work: Sequence[tuple[str, Callable[[Path], None]]], part: Part, workers: int, halt: Halt
 ) -> list[Path]:
     """The folders of the finished parts, in the order of the work."""
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            return list(pool.map(lambda each: part(*each), work))
-        except BaseException:
-            stopped.set()  # or Ctrl-C would wait for what is under way
-            pool.shutdown(cancel_futures=True)
-            raise
-
-
-def _go_on(stopped: Event) -> None:
-    if stopped.is_set():
-        raise InterruptedError("another part failed, or the user stopped it")
+    return side_by_side(lambda each: part(*each), work, workers=workers, halt=halt)
 
 
 def _refuse_nothing(folder: Path, summary: Mapping[str, Any]) -> None:
@@ -185,7 +171,7 @@ def _measure_cell(
     filmed: Walk,
     cell: Cell,
     seen: Mapping[tuple[float, int], Sightings],
-    stopped: Event,
+    halt: Halt,
     progress: Progress,
     folder: Path,
 ) -> None:
@@ -195,7 +181,7 @@ def _measure_cell(
     models = cell.noise.models()
     rows: list[Row] = []
     for trial in range(settings.trials):
-        _go_on(stopped)
+        halt.check()
         if settings.detector is not None:
             sightings = seen[cell.filmed]
         elif settings.keypoints == "model":
@@ -289,7 +275,7 @@ def _detect_all(
     geometries = sorted({cell.filmed for cell in cells})
     cameras = [(tilt, drones, k) for tilt, drones in geometries for k in range(drones)]
     progress.start("Filming", len(cameras) * len(filmed.t_ns))
-    stopped = Event()
+    halt = Halt()
     world = World()
     surfaces = build_world(world, seed, keep_clear=filmed.motion.root[:, :2]).surfaces()
     lens = formation(filmed, cameras=2, tilt_deg=0.0).lens
@@ -297,11 +283,11 @@ def _detect_all(
 
     def film(tilt_deg: float, drones: int, camera: int) -> Callable[[Path], None]:
         seen_by = formation(filmed, cameras=drones, tilt_deg=tilt_deg)
-        return partial(_film, filmed, seen_by, camera, renderer, detector, stopped, progress)
+        return partial(_film, filmed, seen_by, camera, renderer, detector, halt, progress)
 
     work = [(f"pictures-{tilt:g}-{drones}-{k}", film(tilt, drones, k)) for tilt, drones, k in cameras]
     found: dict[tuple[float, int], list[tuple[Float, Float]]] = {}
-    for (tilt, drones, _), made in zip(cameras, _side_by_side(work, part, workers, stopped), strict=True):
+    for (tilt, drones, _), made in zip(cameras, _parts(work, part, workers, halt), strict=True):
         with np.load(made / "keypoints.npz") as stored:
             found.setdefault((tilt, drones), []).append((stored["xy"], stored["confidence"]))
     return {
@@ -316,7 +302,7 @@ def _film(
     camera: int,
     renderer: Renderer,
     detector: Detector,
-    stopped: Event,
+    halt: Halt,
     progress: Progress,
     folder: Path,
 ) -> None:
@@ -326,7 +312,7 @@ def _film(
     xy = np.empty((len(filmed.t_ns), len(names), 2))
     confidence = np.empty(xy.shape[:-1])
     for frame in range(len(filmed.t_ns)):
-        _go_on(stopped)
+        halt.check()
         pose = seen_by.position[camera, frame], seen_by.quaternion_xyzw[camera, frame]
         surface = filmed.person.surface(filmed.motion.root[frame], filmed.motion.rotation[frame])
         picture = renderer.picture(*pose, [surface], frame)

@@ -13,33 +13,32 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
-from threading import Event, local
+from threading import local
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipelines.formats.flights.pictures import Picture, Pictures, open_pictures
-from pipelines.geometry.poses import interpolate_poses
 from pipelines.keypoints.hints import Hint, project_actor
 from pipelines.keypoints.tracking import PeopleTracker
 from pipelines.reconstruction.loading import load_actor, stated_sigma
+from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import (
     CameraEntry,
     Description,
-    Interpolation,
     MediaEntry,
     read_description,
 )
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Detections, Float, Int64, Trajectory
-from pipelines.session.registries import Detector, KeypointNetworks, find_detector
+from pipelines.session.registries import Detector, KeypointNetworks, find_detector, hashes_of_models
+from pipelines.session.side_by_side import Halt, side_by_side
 from pipelines.session.stages import Stage, StageRecord, WritableSession
-from pipelines.session.storage import canonical_json, read_json, sha256_of, write_json
+from pipelines.session.storage import hash_of, read_json, write_json
 from pipelines.session.tables import FRAMES, KEYPOINTS, POSES, read_table, write_table
-from pipelines.session.tabular import keypoints_table, trajectory_from
+from pipelines.session.tabular import keypoints_table, rows_between, trajectory_from
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -111,7 +110,6 @@ def detect(
     if not media:
         return None
     chosen = find_detector(detector)
-    models = {name: path for name, path in chosen.models().items() if path is not None}
     settings = {
         "detector": chosen.name,
         "every": every,
@@ -119,7 +117,7 @@ def detect(
         "start_s": start_s,
         "end_s": end_s,
     }
-    inputs = {f"model {name}": sha256_of(path) for name, path in models.items()}
+    inputs = {f"model {name}": digest for name, digest in hashes_of_models(chosen).items()}
     inputs |= _inputs(session, description, media, in_span=(start_s, end_s) != (None, None))
     run = session.begin(DETECT, settings=settings, inputs=inputs, force=force)
     if run.finished:
@@ -135,13 +133,10 @@ def detect(
             "look at `mocap info`, or leave it out",
         )
     progress.start("Detecting keypoints", pictures)
-    with ThreadPoolExecutor(workers) as pool:
-        produce = partial(_produce, work, chosen, progress)
-        try:
-            folders = list(pool.map(lambda block: run.chunk(block.name, partial(produce, block)), blocks))
-        except BaseException:
-            work.stopped.set()  # or Ctrl-C would wait for the blocks under way
-            raise
+    produce = partial(_produce, work, chosen, progress)
+    folders = side_by_side(
+        lambda block: run.chunk(block.name, partial(produce, block)), blocks, workers=workers, halt=work.halt
+    )
     counts = _assemble(run.folder, media, blocks, folders)
     if not any(camera["detections"] for camera in counts.values()):
         lost = sum(camera["undecoded"] for camera in counts.values())
@@ -180,20 +175,16 @@ def _inputs(
     inputs = {}
     if description.actor is not None:
         tables |= {"actor.parquet", *(f"cameras/{name}/poses.parquet" for name in media)}
-        inputs["actor"] = _hash_of([description.actor.point, description.pose_interpolation.model_dump()])
+        inputs["actor"] = hash_of([description.actor.point, description.pose_interpolation.model_dump()])
     for name, of_pictures in media.items():
         files = [description.sources[source] for source in of_pictures.sources]
-        inputs[f"pictures of {name}"] = _hash_of([files, of_pictures.topic, of_pictures.stamps])
+        inputs[f"pictures of {name}"] = hash_of([files, of_pictures.topic, of_pictures.stamps])
         if description.actor is not None:
             entry = description.cameras[name]
-            inputs[f"camera {name}"] = _hash_of(
+            inputs[f"camera {name}"] = hash_of(
                 [entry.intrinsics.model_dump(), entry.poses.static, entry.pose_noise]
             )
     return inputs | {name: digest for name, digest in ingested.outputs.items() if name in tables}
-
-
-def _hash_of(values: list[object]) -> str:
-    return sha256(canonical_json(values).encode()).hexdigest()
 
 
 class _Work:
@@ -208,32 +199,28 @@ class _Work:
     ) -> None:
         self.folder = folder
         self.every = every
-        self.stopped = Event()
+        self.halt = Halt()
         self._of_thread = local()
         self.description = description
         self._frames = {
             name: read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
             for name in cameras_to_detect(description)
         }
-        first_ns = min(
-            int(read_table(folder / "cameras" / name / "frames.parquet", FRAMES)["t_ns"].iloc[0])
-            for name in description.cameras
-        )
         self._spans = {
-            name: _rows_between(frames["t_ns"].to_numpy(np.int64) - first_ns, *span_s)
+            name: rows_between(frames["t_ns"].to_numpy(np.int64) - description.start_ns, *span_s)
             for name, frames in self._frames.items()
         }
 
     def blocks(self, camera: str) -> list[Block]:
         """The blocks of a camera; a single one of nothing where no picture is in the span."""
-        start, stop = self._spans[camera]
-        firsts = range(start, stop, _BLOCK) or [start]
-        return [Block(camera, first, min(first + _BLOCK, stop)) for first in firsts]
+        rows = self._spans[camera]
+        firsts = rows[::_BLOCK] or [rows.start]
+        return [Block(camera, first, min(first + _BLOCK, rows.stop)) for first in firsts]
 
     def span(self, camera: str) -> tuple[int, int]:
         """First row of a camera's frame table that is looked at, and the one behind the last."""
-        start, stop = self._spans[camera]
-        return -(-start // self.every) * self.every, stop
+        rows = self._spans[camera]
+        return -(-rows.start // self.every) * self.every, rows.stop
 
     def pictures(self, block: Block) -> int:
         """How many pictures of a block are looked at."""
@@ -275,7 +262,9 @@ def actor_hints(folder: Path, description: Description, camera: str, t_ns: Int64
         return [None] * len(t_ns)
     entry = description.cameras[camera]
     trajectory = trajectory_from(read_table(folder / "cameras" / camera / "poses.parquet", POSES))
-    position, quaternion = _poses(entry, trajectory, t_ns, description.pose_interpolation)
+    position, quaternion = poses_at(
+        trajectory, t_ns, description.pose_interpolation, static=entry.poses.static
+    )
     sigma = hint_sigma(camera, entry, trajectory, t_ns)
     intrinsics = entry.intrinsics.intrinsics()
     return [
@@ -284,24 +273,6 @@ def actor_hints(folder: Path, description: Description, camera: str, t_ns: Int64
         else None
         for at, centre, turned, (off_m, off_rad) in zip(actor, position, quaternion, sigma, strict=True)
     ]
-
-
-def _poses(
-    entry: CameraEntry, trajectory: Trajectory, t_ns: Int64, bounds: Interpolation
-) -> tuple[Float, Float]:
-    if entry.poses.static:
-        position = np.repeat(trajectory.position, len(t_ns), axis=0)
-        quaternion = np.repeat(trajectory.quaternion_xyzw, len(t_ns), axis=0)
-    else:
-        position, quaternion = interpolate_poses(
-            trajectory.t_ns,
-            trajectory.position,
-            trajectory.quaternion_xyzw,
-            t_ns,
-            max_gap_ns=round(bounds.max_gap_s * 1e9),
-            max_extrapolation_ns=round(bounds.max_extrapolation_s * 1e9),
-        )
-    return position, quaternion
 
 
 def hint_sigma(name: str, entry: CameraEntry, trajectory: Trajectory, t_ns: Int64) -> Float:
@@ -332,13 +303,6 @@ def _span_words(start_s: float | None, end_s: float | None) -> str:
     return f"in the flight{start}{end}"
 
 
-def _rows_between(since_ns: Int64, start_s: float | None, end_s: float | None) -> tuple[int, int]:
-    """First row of sorted times [F] at or after `start_s`, and first one at or after `end_s`."""
-    first = 0 if start_s is None else int(np.searchsorted(since_ns, round(start_s * 1e9), side="left"))
-    stop = len(since_ns) if end_s is None else int(np.searchsorted(since_ns, round(end_s * 1e9), side="left"))
-    return first, max(first, stop)
-
-
 def _produce(work: _Work, detector: Detector, progress: Progress, block: Block, folder: Path) -> None:
     """Write what the detector finds in the pictures of one block."""
     networks = work.networks(detector)
@@ -357,8 +321,7 @@ def _produce(work: _Work, detector: Detector, progress: Progress, block: Block, 
         closing(_decoded_ahead(pictures, numbers)) as decoded,
     ):
         for number, picture, hint in zip(numbers, decoded, hints, strict=True):
-            if work.stopped.is_set():
-                raise InterruptedError("another block failed, or the user stopped it")
+            work.halt.check()
             progress.advance()
             if picture is None:
                 undecoded += 1

@@ -13,7 +13,7 @@ from filelock import FileLock, Timeout
 
 from pipelines.formats.flights.pictures import Picture, open_pictures
 from pipelines.formats.skeletons.even_frames import thinned
-from pipelines.reporting.filmed import origin_ns, read_filmed, refined_poses
+from pipelines.reporting.filmed import read_filmed, refined_poses
 from pipelines.reporting.frame_drawing import caption_of, draw_frame
 from pipelines.reporting.motion import motion_from_skeleton
 from pipelines.reporting.overlays import status_at, views_of
@@ -222,7 +222,7 @@ def _overlays(folder: Path, description: Description, record: StageRecord | None
         motion = motion_from_skeleton(read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON))
         rows = thinned(filmed.frame_t_ns, rate_hz)
         status = status_at(motion, filmed.frame_t_ns[rows])
-        views = views_of(filmed, rows, motion, status, origin_ns(description))
+        views = views_of(filmed, rows, motion, status, description.start_ns)
         place = {row: k for k, row in enumerate(rows.tolist())}
         for row, picture in _stills(folder, description, camera, filmed.frame, rows):
             view, of_joints = views[place[row]], status[place[row]]

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +35,9 @@ from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Float, Int64, JointMotion
-from pipelines.session.registries import Detector, find_detector
+from pipelines.session.registries import Detector, find_detector, hashes_of_models
 from pipelines.session.stages import Stage, StageRecord, locked
-from pipelines.session.storage import canonical_json, jsonable, read_json, sha256_of, write_json
+from pipelines.session.storage import hash_of, jsonable, read_json, write_json
 from pipelines.session.tables import REPLAN, TRUTH, read_table, write_table
 from pipelines.session.tabular import motion_table
 from pipelines.session.whole_folders import SIMULATION_MARK
@@ -117,9 +116,8 @@ def film(
         detector = find_detector(shooting.detector)
         detector.load(threads=1)  # says at once what is missing
         plan = read_scenario(path)
-        inputs = {"replan": compared.key, "scenario": _hash_of(plan.model_dump(mode="json"))}
-        models = {name: model for name, model in detector.models().items() if model is not None}
-        inputs |= {f"model {name}": sha256_of(model) for name, model in models.items()}
+        inputs = {"replan": compared.key, "scenario": hash_of(plan.model_dump(mode="json"))}
+        inputs |= {f"model {name}": digest for name, digest in hashes_of_models(detector).items()}
         run = session.begin(FILM, settings=asdict(shooting), inputs=inputs, force=force)
         if run.finished:
             return Filmed(folder, run.record, read_json(folder / "film" / "metrics.json"), skipped=True)
@@ -265,10 +263,6 @@ def _rows(t_ns: Int64, shooting: Shooting) -> Int64:
     return np.unique(
         np.clip(np.rint(np.interp(wanted, since_s, np.arange(len(t_ns)))), 0, None).astype(np.int64)
     )
-
-
-def _hash_of(value: object) -> str:
-    return sha256(canonical_json(value).encode()).hexdigest()
 
 
 # --- pictures ------------------------------------------------------------------------------------------

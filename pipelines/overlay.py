@@ -9,17 +9,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from threading import Event
 
 import numpy as np
 
 from pipelines.formats.flights.pictures import Picture, open_pictures
 from pipelines.formats.videos.video_writing import TICK_S, join_videos, write_h264
-from pipelines.reporting.filmed import origin_ns, read_filmed
+from pipelines.reporting.filmed import read_filmed
 from pipelines.reporting.frame_drawing import blank_frame, caption_of, draw_frame, padded_to_even
 from pipelines.reporting.motion import Motion, motion_from_skeleton
 from pipelines.reporting.overlays import FilmedCamera, status_at, views_of
@@ -27,9 +25,11 @@ from pipelines.session.description import Description, MediaEntry, read_descript
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Int64
+from pipelines.session.side_by_side import Halt, side_by_side
 from pipelines.session.stages import Run, Stage, StageRecord, WritableSession, locked, open_session
 from pipelines.session.storage import read_json, write_json
 from pipelines.session.tables import FRAMES, SKELETON, read_table
+from pipelines.session.tabular import rows_between
 
 OVERLAY = Stage("overlay", revision=5)
 
@@ -208,7 +208,7 @@ def _films(
     films = []
     for name, camera in filmed.items():
         frames = read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
-        rows = _rows_between(frames["t_ns"].to_numpy(np.int64) - origin_ns(description), *span_s)
+        rows = rows_between(frames["t_ns"].to_numpy(np.int64) - description.start_ns, *span_s)
         if not rows:
             progress.note(f"{name}: no overlay, none of its pictures lies in the span")
             continue
@@ -219,13 +219,6 @@ def _films(
     if not films:
         raise DataError(folder, "has no picture in that span", "look at `mocap info`, or leave the span out")
     return films
-
-
-def _rows_between(since_ns: Int64, start_s: float | None, end_s: float | None) -> range:
-    """The rows of sorted times [F] at or after `start_s` and before `end_s`."""
-    first = 0 if start_s is None else int(np.searchsorted(since_ns, round(start_s * 1e9)))
-    stop = len(since_ns) if end_s is None else int(np.searchsorted(since_ns, round(end_s * 1e9)))
-    return range(first, stop)
 
 
 def _apart(pts_ns: Int64) -> Int64:
@@ -259,28 +252,23 @@ class _Show:
 
 def _show(folder: Path, description: Description, record: StageRecord) -> _Show:
     skeleton = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON)
-    return _Show(motion_from_skeleton(skeleton), record.settings["method"], origin_ns(description))
+    return _Show(motion_from_skeleton(skeleton), record.settings["method"], description.start_ns)
 
 
 def _draw(
     folder: Path, films: Sequence[_Film], show: _Show, run: Run, workers: int, progress: Progress
 ) -> dict[str, dict[str, int]]:
     """Draw all blocks and join them to a video for each camera; how many pictures were what."""
-    stopped = Event()
+    halt = Halt()
     progress.start("Drawing overlays", sum(len(film.rows) for film in films))
 
     def draw(item: tuple[_Film, range]) -> Path:
         film, block = item
-        produce = partial(_draw_block, folder, film, block, show, stopped, progress)
+        produce = partial(_draw_block, folder, film, block, show, halt, progress)
         return run.chunk(f"{film.camera.name}-{block.start}", produce)
 
     items = [(film, block) for film in films for block in film.blocks]
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            parts = list(pool.map(draw, items))
-        except BaseException:
-            stopped.set()  # or Ctrl-C would wait for the blocks under way
-            raise
+    parts = side_by_side(draw, items, workers=workers, halt=halt)
     counts = {}
     for film in films:
         name = film.camera.name
@@ -302,7 +290,7 @@ def _draw_block(
     film: _Film,
     block: range,
     show: _Show,
-    stopped: Event,
+    halt: Halt,
     progress: Progress,
     part: Path,
 ) -> None:
@@ -319,8 +307,7 @@ def _draw_block(
     def pictures() -> Iterator[Picture]:
         with open_pictures(film.media, folder) as source:
             for view, of_joints in zip(views, status, strict=True):
-                if stopped.is_set():
-                    raise InterruptedError("another block failed, or the user stopped it")
+                halt.check()
                 picture = source.read(view.frame)
                 if picture is None:
                     counts["undecoded"] += 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -31,7 +30,7 @@ from pipelines.session.stages import (
     session_name,
     versions_of,
 )
-from pipelines.session.storage import as_data_error, canonical_json, read_json
+from pipelines.session.storage import as_data_error, hash_of, read_json
 from pipelines.session.tables import (
     ACTOR,
     CAMERA_POSES,
@@ -176,7 +175,7 @@ def write_figures_of(
         "pictures": pictures_there,
         "sessions": dict(zip(labels, keys, strict=True)),
     }
-    key = hashlib.sha256(canonical_json(told).encode()).hexdigest()
+    key = hash_of(told)
     if not force and is_made(target, key, mark=MARK):
         return Figures(target, skipped=True)
     contents = {

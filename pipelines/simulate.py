@@ -6,15 +6,12 @@ have found in the place of videos; tie all of it together with a flight.yaml.
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from functools import partial
 from pathlib import Path
-from threading import Event
 from typing import Any
 
 import numpy as np
@@ -33,7 +30,8 @@ from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Float, Int64, Occupancy, SkeletalMotion
 from pipelines.session.registries import PLANNER_ARMS, noise_models
-from pipelines.session.storage import canonical_json, read_json, sha256_of, write_json
+from pipelines.session.side_by_side import Halt, side_by_side
+from pipelines.session.storage import hash_of, read_json, sha256_of, write_json
 from pipelines.session.whole_folders import SIMULATION_MARK, is_made, whole_folder
 from pipelines.simulation.flight import (
     SimulatedDrone,
@@ -154,7 +152,7 @@ def _key(scenario: Scenario, path: Path, video: bool) -> str:
     }
     if scenario.actor.motion.bvh is not None:
         ingredients["bvh"] = sha256_of(path.parent / scenario.actor.motion.bvh)
-    return hashlib.sha256(canonical_json(ingredients).encode()).hexdigest()
+    return hash_of(ingredients)
 
 
 def _bvh(scenario: Scenario, path: Path) -> SkeletalMotion | None:
@@ -356,7 +354,7 @@ def _film(
 ) -> None:
     """Render and encode every drone's pictures, block by block, and join the blocks."""
     surfaces, world = flight.world.surfaces(), flight.scenario.world
-    stopped = Event()
+    halt = Halt()
     # All drones have the same lens, so they share what was prepared for it.
     renderer = Renderer(
         surfaces, flight.drones[0].intrinsics, sun=np.array(world.sun), seed=flight.scenario.seed
@@ -369,16 +367,11 @@ def _film(
     def film(block: tuple[SimulatedDrone, int]) -> Path:
         drone, first = block
         made = part(
-            f"{drone.name}-{first}", partial(_film_block, flight, renderer, drone, first, stopped, progress)
+            f"{drone.name}-{first}", partial(_film_block, flight, renderer, drone, first, halt, progress)
         )
         return made / "part.mp4"
 
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            parts = list(pool.map(film, blocks))
-        except BaseException:
-            stopped.set()  # or Ctrl-C would wait for the blocks under way
-            raise
+    parts = side_by_side(film, blocks, workers=workers, halt=halt)
     for drone in flight.drones:
         own = [made for (of, _), made in zip(blocks, parts, strict=True) if of is drone]
         join_videos(folder / f"{drone.name}.mp4", own)
@@ -389,7 +382,7 @@ def _film_block(
     renderer: Renderer,
     drone: SimulatedDrone,
     first: int,
-    stopped: Event,
+    halt: Halt,
     progress: Progress,
     folder: Path,
 ) -> None:
@@ -399,8 +392,7 @@ def _film_block(
 
     def pictures() -> Iterator[Picture]:
         for frame in frames:
-            if stopped.is_set():
-                raise InterruptedError("another block failed, or the user stopped it")
+            halt.check()
             person = flight.person.surface(motion.root[rows[frame]], motion.rotation[rows[frame]])
             yield renderer.picture(
                 truth.camera_position[frame], truth.camera_quaternion_xyzw[frame], [person], frame

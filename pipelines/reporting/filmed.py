@@ -16,11 +16,6 @@ from pipelines.session.tables import CAMERA_POSES, FRAMES, KEYPOINTS, POSES, rea
 from pipelines.session.tabular import trajectory_from
 
 
-def origin_ns(description: Description) -> int:
-    """The first frame of a flight's cameras."""
-    return min(entry.frames.first_t_ns for entry in description.cameras.values())
-
-
 def refined_poses(folder: Path) -> dict[str, Trajectory]:
     """The poses of the cameras that a session's reconstruction refined."""
     path = folder / "reconstruct" / "cameras.parquet"
@@ -42,7 +37,7 @@ def read_filmed(
         cameras: which ones.
     """
     offsets_s = read_json(folder / "reconstruct" / "metrics.json").get("clock_offsets_s", {})
-    refined, bounds = refined_poses(folder), description.pose_interpolation
+    refined = refined_poses(folder)
     filmed = {}
     for name in cameras:
         entry = description.cameras[name]
@@ -59,7 +54,6 @@ def read_filmed(
             keypoints=keypoints[keypoints["confidence"] >= record.settings["min_confidence"]],
             track=refined.get(name, logged),
             static=entry.poses.static,
-            max_gap_ns=round(bounds.max_gap_s * 1e9),
-            max_extrapolation_ns=round(bounds.max_extrapolation_s * 1e9),
+            between=description.pose_interpolation,
         )
     return filmed

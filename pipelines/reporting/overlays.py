@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics, project
-from pipelines.geometry.poses import interpolate_points, interpolate_poses, matrix_from_quaternion
+from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion
 from pipelines.reporting.content import SessionContent, number, section
 from pipelines.reporting.motion import Motion
 from pipelines.reporting.summary import CameraRow, Summary
+from pipelines.session.camera_poses import poses_at
+from pipelines.session.description import Interpolation
 from pipelines.session.records import Float, Int64, Trajectory
 from pipelines.session.skeletons import with_derived
 from pipelines.session.tables import STATUS
@@ -174,8 +176,7 @@ class FilmedCamera:
     keypoints: pd.DataFrame  # tables.KEYPOINTS
     track: Trajectory
     static: bool  # the first pose of the track holds all the time
-    max_gap_ns: int
-    max_extrapolation_ns: int
+    between: Interpolation  # how far the track is trusted
 
     def nearest_frame(self, t_ns: int) -> int | None:
         """Row of the frame nearest to a time; None where none lies within a frame period."""
@@ -191,17 +192,7 @@ class FilmedCamera:
 
     def poses_at(self, t_ns: Int64) -> tuple[Float, Float]:
         """world_from_camera at times [N]: position [N, 3] and rotation [N, 3, 3], NaN without a pose."""
-        position = np.repeat(self.track.position[:1], len(t_ns), axis=0)
-        quaternion = np.repeat(self.track.quaternion_xyzw[:1], len(t_ns), axis=0)
-        if not self.static:
-            position, quaternion = interpolate_poses(
-                self.track.t_ns,
-                self.track.position,
-                self.track.quaternion_xyzw,
-                t_ns,
-                max_gap_ns=self.max_gap_ns,
-                max_extrapolation_ns=self.max_extrapolation_ns,
-            )
+        position, quaternion = poses_at(self.track, t_ns, self.between, static=self.static)
         return position, matrix_from_quaternion(quaternion)
 
 
@@ -210,7 +201,6 @@ def _camera(camera: CameraRow, content: SessionContent, summary: Summary) -> Fil
     settings = section(content.stages.get("reconstruct", {}), "settings")
     # What the reconstruction did not use is no measure of it.
     used = keypoints["confidence"] >= (number(settings, "min_confidence") or 0.0)
-    between = summary.description.pose_interpolation
     return FilmedCamera(
         name=camera.name,
         intrinsics=camera.entry.intrinsics.intrinsics(),
@@ -219,8 +209,7 @@ def _camera(camera: CameraRow, content: SessionContent, summary: Summary) -> Fil
         keypoints=keypoints[used],
         track=trajectory_from(content.poses[camera.name]),
         static=camera.entry.poses.static,
-        max_gap_ns=round(between.max_gap_s * 1e9),
-        max_extrapolation_ns=round(between.max_extrapolation_s * 1e9),
+        between=summary.description.pose_interpolation,
     )
 
 

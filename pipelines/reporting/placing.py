@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.geometry.poses import interpolate_poses
 from pipelines.reporting.content import SessionContent, number, section
 from pipelines.reporting.summary import Summary
+from pipelines.session.camera_poses import poses_at
 from pipelines.session.records import Float, Int64
 from pipelines.session.tabular import trajectory_from
 
@@ -36,16 +36,6 @@ def camera_positions(content: SessionContent, summary: Summary, t_ns: Int64) -> 
         if camera.name not in poses:
             continue
         track = trajectory_from(poses[camera.name])
-        if camera.entry.poses.static:
-            positions.append(np.repeat(track.position[:1], len(t_ns), axis=0))
-            continue
-        position, _ = interpolate_poses(
-            track.t_ns,
-            track.position,
-            track.quaternion_xyzw,
-            t_ns,
-            max_gap_ns=round(between.max_gap_s * 1e9),
-            max_extrapolation_ns=round(between.max_extrapolation_s * 1e9),
-        )
+        position, _ = poses_at(track, t_ns, between, static=camera.entry.poses.static)
         positions.append(position)
     return np.stack(positions) if positions else np.full((1, len(t_ns), 3), np.nan)

@@ -132,7 +132,7 @@ class Summary:
 def summarise(content: SessionContent) -> Summary:
     """Every number that the page shows."""
     description = Description.model_validate(content.session)
-    origin_ns = min(camera.frames.first_t_ns for camera in description.cameras.values())
+    origin_ns = description.start_ns
     has_rows = content.skeleton is not None and len(content.skeleton) > 0
     motion = motion_from_skeleton(content.skeleton) if content.skeleton is not None and has_rows else None
     truth = truth_at(content.truth, motion) if motion is not None and content.truth is not None else None

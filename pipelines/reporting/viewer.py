@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.geometry.poses import interpolate_poses
 from pipelines.reporting.bones import side_of
 from pipelines.reporting.motion import Motion
 from pipelines.reporting.replanned import Arm, Replan
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.terrain import surface
 from pipelines.reporting.wording import joint_label, plural, quantity, whole
-from pipelines.session.records import Float, Int64
+from pipelines.session.camera_poses import poses_at
+from pipelines.session.records import Float, Int64, Trajectory
 from pipelines.session.skeletons import DERIVED, bones_of
 from pipelines.session.tabular import trajectory_from
 
@@ -237,32 +237,14 @@ def _square_root(covariance: Float) -> Float | None:
 
 def _placed(camera: CameraRow, table: pd.DataFrame, t_ns: Int64, summary: Summary) -> tuple[Float, Float]:
     """world_from_camera [T, 3] and [T, 4] at the viewer's times; NaN without a pose."""
-    track = trajectory_from(table)
-    if camera.entry.poses.static:
-        still = np.zeros(len(t_ns), dtype=np.intp)
-        return track.position[still], track.quaternion_xyzw[still]
     between = summary.description.pose_interpolation
-    return interpolate_poses(
-        track.t_ns,
-        track.position,
-        track.quaternion_xyzw,
-        t_ns,
-        max_gap_ns=round(between.max_gap_s * 1e9),
-        max_extrapolation_ns=round(between.max_extrapolation_s * 1e9),
-    )
+    return poses_at(trajectory_from(table), t_ns, between, static=camera.entry.poses.static)
 
 
 def _placed_again(arm: Arm, k: int, t_ns: Int64, summary: Summary) -> tuple[Float, Float]:
     """The same of camera `k` of an arm."""
-    between = summary.description.pose_interpolation
-    return interpolate_poses(
-        arm.t_ns,
-        arm.position[k],
-        arm.quaternion_xyzw[k],
-        t_ns,
-        max_gap_ns=round(between.max_gap_s * 1e9),
-        max_extrapolation_ns=round(between.max_extrapolation_s * 1e9),
-    )
+    track = Trajectory(arm.t_ns, arm.position[k], arm.quaternion_xyzw[k])
+    return poses_at(track, t_ns, summary.description.pose_interpolation)
 
 
 def _packed_camera(name: str, lens: CameraRow, position: Float, quaternion: Float) -> dict[str, object]:

@@ -203,6 +203,11 @@ class Description(Entry):
     damage: dict[str, dict[str, int]] = {}  # of sources as wholes: path -> how often, by cause
     warnings: list[str]
 
+    @property
+    def start_ns(self) -> int:
+        """The first frame of the flight's cameras: what users' seconds count from."""
+        return min(entry.frames.first_t_ns for entry in self.cameras.values())
+
 
 def read_description(session: Path) -> Description:
     """Read session.json of a session folder.

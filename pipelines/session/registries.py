@@ -31,6 +31,7 @@ from pipelines.session.records import (
     Trajectory,
     VideoIndex,
 )
+from pipelines.session.storage import sha256_of
 
 T = TypeVar("T")
 
@@ -315,6 +316,11 @@ def find_detector(text: str) -> Detector:
     if colon:
         raise DataError(text, f"{name} takes nothing behind its name", f"write {name}")
     return found
+
+
+def hashes_of_models(detector: Detector) -> dict[str, str]:
+    """The sha256 of the files of a detector that are there, by their names."""
+    return {name: sha256_of(path) for name, path in detector.models().items() if path is not None}
 
 
 def recognise(path: Path, protocol: type[F], noun: str, formats: Sequence[Format] | None = None) -> F:

@@ -15,7 +15,6 @@ session next. Stages read like this:
 
 from __future__ import annotations
 
-import hashlib
 import os
 import platform
 import time
@@ -33,7 +32,7 @@ from filelock import FileLock, Timeout
 from pipelines.session.errors import BusyError, DataError, MocapError
 from pipelines.session.storage import (
     as_data_error,
-    canonical_json,
+    hash_of,
     jsonable,
     read_json,
     remove_tree,
@@ -111,7 +110,7 @@ def key_of(stage: Stage, settings: Mapping[str, object], inputs: Mapping[str, st
         "settings": settings,
         "inputs": inputs,
     }
-    return hashlib.sha256(canonical_json(ingredients).encode()).hexdigest()
+    return hash_of(ingredients)
 
 
 class Session:

@@ -98,6 +98,11 @@ def canonical_json(value: object) -> str:
     return json.dumps(jsonable(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
+def hash_of(value: object) -> str:
+    """Sha256 of what `jsonable` knows: equal for equal values."""
+    return hashlib.sha256(canonical_json(value).encode()).hexdigest()
+
+
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write a JSON object in its own order; a kill leaves the old file or the new one, whole.
 

@@ -30,6 +30,13 @@ def frames_table(frame: Int64, t_ns: Int64, pts_ns: Int64) -> pd.DataFrame:
     return pd.DataFrame({"frame": frame, "t_ns": t_ns, "pts_ns": pts_ns})
 
 
+def rows_between(since_ns: Int64, start_s: float | None, end_s: float | None) -> range:
+    """The rows of sorted times [F] at or after `start_s` and before `end_s`; None is no bound."""
+    first = 0 if start_s is None else int(np.searchsorted(since_ns, round(start_s * 1e9), side="left"))
+    stop = len(since_ns) if end_s is None else int(np.searchsorted(since_ns, round(end_s * 1e9), side="left"))
+    return range(first, max(first, stop))
+
+
 def actor_table(trajectory: Trajectory) -> pd.DataFrame:
     """Where the actor was, as rows of `tables.ACTOR`; person 0."""
     import pandas as pd

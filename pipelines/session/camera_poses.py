@@ -1,0 +1,36 @@
+"""Where a session's cameras were at given times, as far as its logs are trusted between their stamps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipelines.geometry.poses import interpolate_poses
+from pipelines.session.description import Interpolation
+from pipelines.session.records import Float, Int64, Trajectory
+
+
+def poses_at(
+    track: Trajectory, t_ns: Int64, between: Interpolation, *, static: bool = False
+) -> tuple[Float, Float]:
+    """world_from_camera at given times.
+
+    Args:
+        track: the logged or refined poses.
+        t_ns: [T].
+        between: how far they are trusted.
+        static: the first pose holds all the time.
+
+    Returns:
+        Positions [T, 3] m and quaternions [T, 4] xyzw; NaN where there is no pose.
+    """
+    if static:
+        still = np.zeros(len(t_ns), dtype=np.intp)
+        return track.position[still], track.quaternion_xyzw[still]
+    return interpolate_poses(
+        track.t_ns,
+        track.position,
+        track.quaternion_xyzw,
+        t_ns,
+        max_gap_ns=round(between.max_gap_s * 1e9),
+        max_extrapolation_ns=round(between.max_extrapolation_s * 1e9),
+    )

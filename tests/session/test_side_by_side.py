@@ -1,0 +1,33 @@
+"""Parts at once: results in order, and one failure ends the others."""
+
+from __future__ import annotations
+
+from threading import Barrier
+
+import pytest
+
+from pipelines.session.side_by_side import Halt, side_by_side
+
+
+def test_results_come_in_the_order_of_the_parts() -> None:
+    assert side_by_side(lambda k: k * k, range(20), workers=4, halt=Halt()) == [k * k for k in range(20)]
+
+
+def test_a_failure_ends_the_others() -> None:
+    halt, together = Halt(), Barrier(2, timeout=10)
+    stopped: list[int] = []
+
+    def work(part: int) -> None:
+        together.wait()
+        if part == 0:
+            raise ValueError("the first")
+        while True:  # for good, unless it is told
+            try:
+                halt.check()
+            except InterruptedError:
+                stopped.append(part)
+                raise
+
+    with pytest.raises(ValueError, match="the first"):
+        side_by_side(work, range(2), workers=2, halt=halt)
+    assert stopped == [1]
