@@ -123,6 +123,26 @@ def transform(target_from_source: tuple[Float, Float], points: Float) -> Float:
     return position + rotate(quaternion, points)
 
 
+def look_at(position: Float, target: Float) -> Float:
+    """Orientation of upright cameras that look at a point.
+
+    Args:
+        position: [..., 3] metres, world.
+        target: [..., 3] metres, world; a camera straight above it has north up in its picture.
+
+    Returns:
+        [..., 4] unit quaternions xyzw, world_from_camera (x right, y down, z forward),
+        with w >= 0.
+    """
+    forward = target - position
+    forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
+    right = np.stack([forward[..., 1], -forward[..., 0], np.zeros(forward.shape[:-1])], axis=-1)
+    level = np.linalg.norm(right, axis=-1, keepdims=True)
+    right = np.where(level > 1e-9, right / np.maximum(level, 1e-9), [1.0, 0.0, 0.0])
+    down = np.cross(forward, right)
+    return quaternion_from_matrix(np.stack([right, down, forward], axis=-1))
+
+
 def enu_from_ned(position: Float, quaternion_xyzw: Float) -> tuple[Float, Float]:
     """Poses logged in a north-east-down world, in an east-north-up world of the same origin.
 

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel
+from pipelines.geometry.poses import look_at
 from pipelines.planning.arms import Arm
 from pipelines.planning.forecast import ActorFilter
-from pipelines.planning.formation import TILT, YAW, aim, slot_of
+from pipelines.planning.formation import TILT, YAW, slot_of
 from pipelines.planning.loading import planned_positions
 from pipelines.planning.measuring import Detect, Filming, Measured, film
 from pipelines.planning.replay import replay
@@ -67,7 +68,7 @@ def logged_arm(scene: Scene, name: str) -> ArmFlight:
     believed = _estimates(scene)
     slots = slot_of(position - believed)
     slots[..., YAW] = np.unwrap(slots[..., YAW], axis=1)
-    return ArmFlight(tuple(scene.flight.planned), position, aim(position, believed), slots, known, {})
+    return ArmFlight(tuple(scene.flight.planned), position, look_at(position, believed), slots, known, {})
 
 
 def _estimates(scene: Scene) -> Float:

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.compilation import cached
-from pipelines.geometry.poses import quaternion_from_matrix
 
 Float = NDArray[np.float64]
 
@@ -92,22 +91,3 @@ def _commanded(knot_s: Float, slots: Float, rates: Float, t_s: Float, found: Flo
                 way = slots[min(k + 1, last), i, axis] - start
                 most = rates[axis] * after_s
                 found[p, i, axis] = start + min(max(way, -most), most)
-
-
-def aim(camera: Float, target: Float) -> Float:
-    """Orientation of upright cameras that look at a point.
-
-    Args:
-        camera: [..., 3] metres, world.
-        target: [..., 3] metres, world; a camera straight above it has north up in its picture.
-
-    Returns:
-        [..., 4] unit quaternions xyzw, world_from_camera (x right, y down, z forward).
-    """
-    forward = target - camera
-    forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
-    right = np.stack([forward[..., 1], -forward[..., 0], np.zeros(forward.shape[:-1])], axis=-1)
-    level = np.linalg.norm(right, axis=-1, keepdims=True)
-    right = np.where(level > 1e-9, right / np.maximum(level, 1e-9), [1.0, 0.0, 0.0])
-    down = np.cross(forward, right)
-    return quaternion_from_matrix(np.stack([right, down, forward], axis=-1))

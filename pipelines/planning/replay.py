@@ -10,10 +10,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.poses import look_at
 from pipelines.planning.arms import Arm
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, open_space
-from pipelines.planning.formation import YAW, aim, slot_of
+from pipelines.planning.formation import YAW, slot_of
 from pipelines.planning.local import Separation
 from pipelines.planning.pilot import Pilot, PlanningTimes
 from pipelines.planning.sight import visible
@@ -124,7 +125,7 @@ def replay(
         t_ns=replay_ns,
         position=position,
         velocity=velocity,
-        quaternion_xyzw=aim(position, estimate),
+        quaternion_xyzw=look_at(position, estimate),
         slots=slots,
         tilt_rad=slot_of(position - truth)[..., 1],
         visible=visible(known[-1], position, truth, start_m=config.sight_start_m),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.poses import quaternion_from_matrix
+from pipelines.geometry.poses import look_at
 
 Float = NDArray[np.float64]
 
@@ -56,28 +56,7 @@ def orbit(
     return position, look_at(position, target)
 
 
-def look_at(position: Float, target: Float) -> Float:
-    """Orientation of upright cameras that look at a point.
-
-    Args:
-        position: [..., 3] metres, world.
-        target: [..., 3] metres, world, neither at the position nor straight above or below it.
-
-    Returns:
-        [..., 4] unit quaternions xyzw, world_from_camera (x right, y down, z forward), with w >= 0.
-    """
-    forward = _unit(target - position)
-    right = _unit(np.cross(forward, [0.0, 0.0, 1.0]))
-    down = np.cross(forward, right)
-    return quaternion_from_matrix(np.stack([right, down, forward], axis=-1))
-
-
 def _sway(t_s: Float, period_s: float, camera: NDArray[np.int64]) -> Float:
     """A sine for each camera, with a period and phase of its own: [N, T]."""
     sway: Float = np.sin(2 * np.pi * t_s / (period_s + 1.3 * camera) + 2.0 * camera)
     return sway
-
-
-def _unit(vectors: Float) -> Float:
-    unit: Float = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return unit

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics
-from pipelines.simulation.drone_paths import look_at
+from pipelines.geometry.poses import look_at
 from pipelines.simulation.flight_files import write_tum
 from pipelines.simulation.observe import see
 from tests.keypoints.onnx_graphs import constant_model, heatmap_model, spots

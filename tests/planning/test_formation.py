@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.geometry.poses import matrix_from_quaternion
+from pipelines.geometry.poses import look_at, matrix_from_quaternion
 from pipelines.planning.formation import (
     FormationPath,
-    aim,
     formation_slots,
     slot_of,
     slot_offsets,
@@ -68,7 +67,7 @@ def test_replanning_on_the_way_does_not_slow_a_turn() -> None:
 def test_cameras_look_at_the_target_and_stand_upright() -> None:
     rng = np.random.default_rng(1)
     camera, target = rng.normal(size=(50, 3)) * 10, rng.normal(size=(50, 3))
-    right, down, forward = np.moveaxis(matrix_from_quaternion(aim(camera, target)), -1, 0)
+    right, down, forward = np.moveaxis(matrix_from_quaternion(look_at(camera, target)), -1, 0)
     towards = (target - camera) / np.linalg.norm(target - camera, axis=-1, keepdims=True)
     assert forward == pytest.approx(towards, abs=1e-12)
     assert right[:, 2] == pytest.approx(np.zeros(50), abs=1e-12)
@@ -76,7 +75,7 @@ def test_cameras_look_at_the_target_and_stand_upright() -> None:
 
 
 def test_a_camera_straight_above_has_north_up() -> None:
-    right, down, forward = matrix_from_quaternion(aim(np.array([0, 0, 9.0]), np.zeros(3))).T
+    right, down, forward = matrix_from_quaternion(look_at(np.array([0, 0, 9.0]), np.zeros(3))).T
     assert forward.tolist() == pytest.approx([0, 0, -1])
     assert right.tolist() == pytest.approx([1, 0, 0])
     assert down.tolist() == pytest.approx([0, -1, 0])

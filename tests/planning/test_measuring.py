@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import White
+from pipelines.geometry.poses import look_at
 from pipelines.planning.distance_field import open_space
-from pipelines.planning.formation import aim
 from pipelines.planning.measuring import Filming, film
 from tests.planning.worlds import wall
 
@@ -46,7 +46,7 @@ def filming(*cameras: tuple[float, float, float]) -> Filming:
     return Filming(
         t_ns=np.arange(TIMES) * 40_000_000,
         position=position,
-        quaternion_xyzw=aim(position, middle),
+        quaternion_xyzw=look_at(position, middle),
         known=np.ones((count, TIMES), dtype=np.bool_),
         intrinsics=[LENS] * count,
         noise=[[]] * count,
@@ -77,7 +77,7 @@ def test_who_stands_behind_a_wall_measures_nothing() -> None:
 
 def test_outside_the_picture_and_without_a_pose_nothing_is_seen() -> None:
     shot = filming(SOUTH, EAST)
-    away = replace(shot, quaternion_xyzw=aim(shot.position, shot.position + np.array([0, 0, 1.0])))
+    away = replace(shot, quaternion_xyzw=look_at(shot.position, shot.position + np.array([0, 0, 1.0])))
     assert film(away, open_space(), exact, start_m=1.5, trials=1, seed=0).seen_share == 0.0
     known = shot.known.copy()
     known[1, : TIMES // 2] = False

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.geometry.poses import matrix_from_quaternion
-from pipelines.simulation.drone_paths import look_at, orbit
+from pipelines.geometry.poses import look_at, matrix_from_quaternion
+from pipelines.simulation.drone_paths import orbit
 from pipelines.simulation.observe import see
 from pipelines.simulation.walk import COCO17, walk
 from tests.synthetic.flights import LENS

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.cameras import camera_matrix
-from pipelines.geometry.poses import invert, rotation_vector_from_quaternion
-from pipelines.simulation.drone_paths import look_at, orbit
+from pipelines.geometry.poses import invert, look_at, rotation_vector_from_quaternion
+from pipelines.simulation.drone_paths import orbit
 from pipelines.simulation.observe import KeypointNoise, detect, see
 from pipelines.simulation.walk import walk
 from tests.synthetic.flights import LENS

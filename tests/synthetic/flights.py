@@ -14,9 +14,9 @@ from ruamel.yaml import YAML
 
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
 from pipelines.geometry.noise import disturb
-from pipelines.geometry.poses import invert, rotation_vector_from_quaternion
+from pipelines.geometry.poses import invert, look_at, rotation_vector_from_quaternion
 from pipelines.session.registries import noise_models
-from pipelines.simulation.drone_paths import look_at, orbit
+from pipelines.simulation.drone_paths import orbit
 from pipelines.simulation.flight_files import Sighting, write_alphapose, write_joints, write_tum
 from pipelines.simulation.observe import KeypointNoise, detect, see
 from pipelines.simulation.walk import COCO17, route, walk

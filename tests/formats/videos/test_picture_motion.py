@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.formats.videos.picture_motion import rotation_of_flow, turning_of_pictures
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
-from pipelines.simulation.drone_paths import look_at
+from pipelines.geometry.poses import look_at
 from pipelines.simulation.flight_files import write_tum
 from tests.commands.runner import refused, succeeds
 from tests.keypoints.spotted_flights import FPS, write_pictures
