@@ -23,15 +23,15 @@ from pipelines.formats.logs.map_topics import (
     MAP_TYPES,
     OCCUPANCY_GRID,
     LoggedMaps,
+    Losses,
     MapTopic,
     frame_of,
     map_messages,
-    nothing_usable,
 )
 from pipelines.formats.logs.maps import read_maps
 from pipelines.formats.logs.messages import Kind, all_samples, kind_of
 from pipelines.formats.logs.presets import NAV_SAT_FIX, read_pair, read_positions, read_preset
-from pipelines.formats.logs.recordings import OpenLog
+from pipelines.formats.logs.recordings import OpenLog, messages_alike
 from pipelines.formats.logs.trajectories import (
     Gathered,
     StampCheck,
@@ -276,7 +276,7 @@ class FlightLogs:
             type_ = next(each.type for each in recording.topics if each.name == topic)
             first = next(map_messages(recording, topic), None)
             if first is None:
-                raise nothing_usable(f"{source} {topic}", recording.dropped)
+                raise Losses(f"{source} {topic}", recording.dropped).nothing_usable()
             if stated.height_m is not None and type_ != OCCUPANCY_GRID:
                 problem = f"{topic} holds {type_}, which has heights of its own"
                 raise DataError(source, problem, "leave `height_m` out")
@@ -468,13 +468,8 @@ def _at_times(maps: Iterator[Occupancy], from_ns: Int64) -> Iterator[Occupancy]:
 
 def poses_at_once(recording: Log, topic: str) -> PoseArrays | None:
     """All poses of a topic, if one file format of ours holds it and its messages are alike."""
-    if not isinstance(recording, OpenLog):
-        return None
-    of_that_name = [known for known in recording.topics if known.name == topic]
-    schemas = {schema for known in of_that_name for schema in recording.schemas(known)}
-    if len(of_that_name) != 1 or len(schemas) != 1:
-        return None
-    return read_poses(schemas.pop(), recording.arrays(of_that_name[0]))
+    alike = messages_alike(recording, topic)
+    return None if alike is None else read_poses(alike.schema, alike.log.arrays(alike.topic))
 
 
 def in_world(trajectory: Trajectory, log: LogSource) -> Trajectory:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipelines.formats.logs.messages import all_samples
 from pipelines.formats.logs.picture_layouts import HEAD_LENGTH, picture_decoder, read_stamps
-from pipelines.formats.logs.recordings import OpenLog
+from pipelines.formats.logs.recordings import OpenLog, messages_alike
 from pipelines.formats.videos.video import VideoReader
 from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
@@ -153,13 +153,10 @@ def picture_stamps(recording: Log, topic: str, source: Path | str) -> tuple[Int6
 
 
 def _stamps_at_once(recording: Log, topic: str) -> tuple[Int64, Int64] | None:
-    if not isinstance(recording, OpenLog):
+    alike = messages_alike(recording, topic)
+    if alike is None:
         return None
-    of_that_name = [known for known in recording.topics if known.name == topic]
-    schemas = {schema for known in of_that_name for schema in recording.schemas(known)}
-    if len(of_that_name) != 1 or len(schemas) != 1:
-        return None
-    return read_stamps(schemas.pop(), recording.heads(of_that_name[0], HEAD_LENGTH))
+    return read_stamps(alike.schema, alike.log.heads(alike.topic, HEAD_LENGTH))
 
 
 def later_pictures(pictures: Iterator[_Stamped], stamps: str) -> Iterator[_Stamped]:

@@ -6,20 +6,18 @@ flight. What moves, the actor above all, leaves its trace in them.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from pipelines.formats.logs.map_topics import (
-    DAMAGED,
     PLACELESS,
     RECORD_AGAIN,
     LoggedMaps,
+    Losses,
     MapTopic,
     evenly,
-    nothing_usable,
     place_at,
     time_of,
 )
@@ -44,8 +42,7 @@ def accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:
     Raises:
         DataError: no point is usable, or their box is too large.
     """
-    lost: Counter[str] = Counter()
-    faults: list[DataError] = []
+    lost = Losses(about.source)
     voxels = VoxelSet(about.source, about.resolution_m)
     clouds = 0
     for message in messages:
@@ -54,35 +51,31 @@ def accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:
             pose = place_at(t_ns, about)
             points = cloud_points(message.value, about.source)
         except (AttributeError, TypeError, ValueError, OverflowError) as error:
-            lost[DAMAGED] += 1
-            faults.append(
+            lost.damaged(
                 DataError(about.source, f"a cloud cannot be read ({str(error)[:100]})", RECORD_AGAIN)
             )
-            del faults[1:]
             continue
         except DataError as fault:
-            lost[DAMAGED] += 1
-            faults.append(fault)
-            del faults[1:]
+            lost.damaged(fault)
             continue
         if pose is None:
-            lost[PLACELESS] += 1
+            lost.counts[PLACELESS] += 1
             continue
         with np.errstate(invalid="ignore", over="ignore"):  # what is not finite stays so, and is counted
             voxels.add(points if _is_the_world(pose) else transform(pose, points), t_ns)
         clouds += 1
-    lost.update(voxels.dropped)
+    lost.counts.update(voxels.dropped)
     grew_ns = voxels.grew_ns
     if not len(grew_ns):
-        raise nothing_usable(about.source, +lost, faults)
+        raise lost.nothing_usable()
     most = max(1, min(MOST_CLOUD_MAPS, MOST_VOXELS // int(np.prod(voxels.shape))))
     from_ns = grew_ns[evenly(len(grew_ns), most)]
-    notes = [f"{about.source}: {faults[0].problem} ({lost[DAMAGED]} such messages)"] if faults else []
+    notes = lost.notes()
     notes.append(
         f"{about.source}: {clouds} clouds make {len(from_ns)} maps, each of what had been seen by then;"
         " what moved, like the actor, stays in them"
     )
-    return LoggedMaps((voxels.occupancy(int(t_ns)) for t_ns in from_ns), from_ns, dict(+lost), notes)
+    return LoggedMaps((voxels.occupancy(int(t_ns)) for t_ns in from_ns), from_ns, dict(+lost.counts), notes)
 
 
 def cloud_points(value: Any, source: str) -> Float:

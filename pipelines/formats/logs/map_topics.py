@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -91,14 +92,39 @@ def frame_of(message: Message, source: str) -> str:
         raise DataError(source, f"its messages lack the field {error.name!r}", RECORD_AGAIN) from error
 
 
-def nothing_usable(source: str, lost: Mapping[str, int], faults: Sequence[DataError] = ()) -> DataError:
-    """What to say where a topic gives no map: the first fault, else what was lost."""
-    if faults:
-        return faults[0]
-    causes = ", ".join(f"{count} {cause}" for cause, count in lost.items())
-    return DataError(
-        source, f"holds no map ({causes or 'it is empty'})", "name another topic, or leave `map:` out"
-    )
+class Losses:
+    """What of a topic could not be used.
+
+    Attributes:
+        counts: how many messages, by cause.
+    """
+
+    def __init__(self, source: str, counts: Mapping[str, int] | None = None) -> None:
+        self.counts: Counter[str] = Counter(counts)
+        self._source = source
+        self._first: DataError | None = None
+
+    def damaged(self, fault: DataError) -> None:
+        """Count a message that cannot be read; the first one stands for all."""
+        self.counts[DAMAGED] += 1
+        self._first = self._first or fault
+
+    def notes(self) -> list[str]:
+        """What is to be said of the messages that cannot be read."""
+        if self._first is None:
+            return []
+        return [f"{self._source}: {self._first.problem} ({self.counts[DAMAGED]} such messages)"]
+
+    def nothing_usable(self) -> DataError:
+        """What to say where the topic gives no map: the first fault, else what was lost."""
+        if self._first is not None:
+            return self._first
+        causes = ", ".join(f"{count} {cause}" for cause, count in (+self.counts).items())
+        return DataError(
+            self._source,
+            f"holds no map ({causes or 'it is empty'})",
+            "name another topic, or leave `map:` out",
+        )
 
 
 def evenly(count: int, most: int) -> list[int]:

@@ -7,7 +7,6 @@ are read twice where there is more than one map.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from hashlib import sha256
@@ -17,15 +16,14 @@ import numpy as np
 
 from pipelines.formats.logs.clouds import accumulated
 from pipelines.formats.logs.map_topics import (
-    DAMAGED,
     OCTOMAP,
     PLACELESS,
     POINT_CLOUD,
     RECORD_AGAIN,
     LoggedMaps,
+    Losses,
     MapTopic,
     evenly,
-    nothing_usable,
     place_at,
     time_of,
 )
@@ -75,8 +73,7 @@ def read_maps(read: Callable[[], Iterator[Message]], type_: str, about: MapTopic
 
 
 def _changing(read: Callable[[], Iterator[Message]], about: MapTopic) -> LoggedMaps:
-    lost: Counter[str] = Counter()
-    faults: list[DataError] = []
+    lost = Losses(about.source)
     changes: list[_Change] = []
     only: Occupancy | None = None  # the first map, while there is no other
     last, newest_ns, repeated = b"", -(2**62), 0
@@ -84,36 +81,34 @@ def _changing(read: Callable[[], Iterator[Message]], about: MapTopic) -> LoggedM
         try:
             made = _made(message, about)
         except _EmptyMapError:
-            lost[_EMPTY] += 1
+            lost.counts[_EMPTY] += 1
             continue
         except DataError as fault:
-            lost[DAMAGED] += 1
-            faults.append(fault)
-            del faults[1:]
+            lost.damaged(fault)
             continue
         if made is None:
-            lost[PLACELESS] += 1
+            lost.counts[PLACELESS] += 1
             continue
         digest = _digest(made)
         if digest == last:
             repeated += 1
         elif made.from_ns <= newest_ns:
-            lost[_LATE] += 1
+            lost.counts[_LATE] += 1
         else:
             only = None if changes else made
             last, newest_ns = digest, made.from_ns
             changes.append(_Change(row, made.from_ns, made.probability.size))
     if not changes:
-        raise nothing_usable(about.source, lost, faults)
-    notes = [f"{about.source}: {faults[0].problem} ({lost[DAMAGED]} such messages)"] if faults else []
+        raise lost.nothing_usable()
+    notes = lost.notes()
     kept = _spread(changes)
     if len(kept) < len(changes):
-        lost[_NOT_KEPT] += len(changes) - len(kept)
+        lost.counts[_NOT_KEPT] += len(changes) - len(kept)
         notes.append(
             f"{about.source}: {len(kept)} of {len(changes)} changes of the map are kept, evenly over the"
             f" flight (at most {MOST_MAPS}, and {MOST_VOXELS / 1e6:g} million voxels together)"
         )
-    if lost[_LATE]:
+    if lost.counts[_LATE]:
         notes.append(
             f"{about.source}: maps whose stamp stands still or goes back; `stamps: receive` may be better"
         )
@@ -122,7 +117,7 @@ def _changing(read: Callable[[], Iterator[Message]], about: MapTopic) -> LoggedM
             f"{about.source}: {len(kept)} maps that follow each other ({repeated} repeat the one before)"
         )
     maps = iter([only]) if only is not None else _made_again(read, about, kept)
-    return LoggedMaps(maps, np.array([change.t_ns for change in kept], np.int64), dict(+lost), notes)
+    return LoggedMaps(maps, np.array([change.t_ns for change in kept], np.int64), dict(+lost.counts), notes)
 
 
 def _made(message: Message, about: MapTopic) -> Occupancy | None:

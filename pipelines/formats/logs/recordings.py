@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pipelines.formats.logs.message_decoders import Decoder, Schema, decoder
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, Message, Topic
+from pipelines.session.registries import Log
 
 UNDEFINED = "messages without a usable definition"
 UNDECODABLE = "messages that cannot be decoded"
@@ -344,6 +345,25 @@ def require_content(part: LogPart) -> None:
         raise DataError(
             part.path, f"holds no message that can be read ({causes})", "copy it again from the drone"
         )
+
+
+class Alike(NamedTuple):
+    """A topic whose messages can be read many at a time: they are all written alike."""
+
+    log: OpenLog
+    topic: Topic
+    schema: Schema
+
+
+def messages_alike(recording: Log, name: str) -> Alike | None:
+    """The topic of that name, if a file format of ours holds it and its messages are alike."""
+    if not isinstance(recording, OpenLog):
+        return None
+    of_that_name = [topic for topic in recording.topics if topic.name == name]
+    schemas = {schema for topic in of_that_name for schema in recording.schemas(topic)}
+    if len(of_that_name) != 1 or len(schemas) != 1:
+        return None
+    return Alike(recording, of_that_name[0], schemas.pop())
 
 
 def describe_log(log: OpenLog) -> dict[str, object]:
