@@ -21,37 +21,28 @@ from pipelines.formats.logs.ros2_recording import Ros2Recording
 from pipelines.formats.maps.octomap_writing import write_octomap
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video_writing import Picture, join_videos, write_h264
-from pipelines.geometry.pose_covariance import pose_covariance_in_body
-from pipelines.geometry.poses import conjugate
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import distance_field
 from pipelines.planning.pilot import Pilot
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Float, Int64, Occupancy, SkeletalMotion
+from pipelines.session.records import Float, Occupancy, SkeletalMotion
 from pipelines.session.registries import PLANNER_ARMS, noise_models
 from pipelines.session.side_by_side import Halt, side_by_side
 from pipelines.session.storage import hash_of, read_json, sha256_of, write_json
 from pipelines.session.whole_folders import SIMULATION_MARK, is_made, whole_folder
-from pipelines.simulation.flight import (
-    SimulatedDrone,
-    SimulatedFlight,
-    fly_scenario,
-    keypoints_of,
-    visible_joints,
-)
-from pipelines.simulation.flight_files import Sighting, write_alphapose, write_joints, write_tum
+from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, fly_scenario
 from pipelines.simulation.flying import Known, Planner
+from pipelines.simulation.log_messages import logged_messages
 from pipelines.simulation.manifest_text import manifest_text
 from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.scenario import Scenario, read_scenario
+from pipelines.simulation.truth_files import write_keypoints, write_truth
 from pipelines.simulation.world.scene import World
 
 _REVISION = 5
 _OWN = ("drone*", "flight.yaml", "true_poses.yaml", "scenario.yaml", "site.*", "truth", SIMULATION_MARK)
 _BLOCK = 60  # pictures that are rendered and encoded together, and kept when the work is interrupted
-_RECEIVED_NS = 2_000_000  # after a message's own stamp, by the recorder on board
-_CAMERA_INFO_NS = 1_000_000_000
 _RING = "ring"
 _LEAST_SIGMA_M = 0.01  # of the actor's estimate, for a filter that cannot take none
 
@@ -105,7 +96,7 @@ def simulate(
         progress.start("Flying", 3 + scenario.drones.count)
         flight = fly_scenario(scenario, noise, bvh=bvh, planner=planner)
         progress.advance()
-        _write_truth(making.folder, flight)
+        write_truth(making.folder, flight)
         progress.advance()
         occupancy = flight.world.occupancy(scenario.world.map.resolution_m, scenario.world.map.height_m)
         write_octomap(making.folder / "site.bt", occupancy)
@@ -119,7 +110,7 @@ def simulate(
             _film(flight, making.folder, making.part, workers, progress)
         else:
             for drone in flight.drones:
-                _write_keypoints(making.folder, flight, drone)
+                write_keypoints(making.folder, flight, drone)
         shutil.copyfile(scenario_path, making.folder / "scenario.yaml")
         for name, true_poses in (("flight.yaml", False), ("true_poses.yaml", True)):
             text = manifest_text(flight, video=video, true_poses=true_poses)
@@ -210,30 +201,7 @@ def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | Non
     return start
 
 
-# --- logs and truth ------------------------------------------------------------------------------------
-
-
-def _write_truth(folder: Path, flight: SimulatedFlight) -> None:
-    """What was really the case, at the times of pictures and logs."""
-    start_ns = flight.scenario.start_ns
-    truth = folder / "truth"
-    truth.mkdir()
-    write_joints(truth / "joints.csv", flight.t_ns + start_ns, flight.person.joints, flight.joints)
-    for drone in flight.drones:
-        poses = drone.at_log
-        write_tum(
-            truth / f"{drone.name}.tum",
-            poses.t_ns + start_ns,
-            poses.camera_position,
-            poses.camera_quaternion_xyzw,
-        )
-        _, visible = visible_joints(flight, drone)
-        lines = [",".join(["frame", *flight.person.joints])]
-        lines += [",".join([str(frame), *row]) for frame, row in enumerate(visible.astype(int).astype(str))]
-        path = truth / f"{drone.name}_visible.csv"
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
-    offsets = {drone.name: drone.clock_offset_s for drone in flight.drones}
-    write_json(truth / "clocks.json", {"clock_offsets_s": offsets})
+# --- logs and map ------------------------------------------------------------------------------------
 
 
 def _write_grid(path: Path, occupancy: Occupancy) -> None:
@@ -248,101 +216,12 @@ def _write_grid(path: Path, occupancy: Occupancy) -> None:
 
 def _write_log(path: Path, flight: SimulatedFlight, drone: SimulatedDrone) -> None:
     """What the recorder on one drone wrote, message by message in the order of receipt."""
-    messages = [*_odometry(flight, drone), *_gimbal(flight, drone), *_camera_infos(flight, drone)]
-    if drone is flight.drones[0]:
-        messages += _actor(flight)
     with Ros2Recording(path) as log:
-        for stamp_ns, topic, type_, fields in sorted(messages, key=lambda message: message[:2]):
-            log.write(topic, type_, stamp_ns + _RECEIVED_NS, fields)
-
-
-_Message = tuple[int, str, str, dict[str, Any]]
-
-
-def _odometry(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_Message]:
-    body = drone.log.body
-    covariance = np.zeros((len(body.t_ns), 6, 6))
-    if body.covariance is not None:  # ROS turns about fixed axes
-        covariance = pose_covariance_in_body(body.covariance, conjugate(body.quaternion_xyzw))
-    for k, stamp_ns in enumerate((body.t_ns + flight.scenario.start_ns).tolist()):
-        pose = {"position": _xyz(body.position[k]), "orientation": _xyzw(body.quaternion_xyzw[k])}
-        fields = {
-            "header": {"stamp": stamp_ns, "frame_id": "world"},
-            "child_frame_id": f"{drone.name}/body",
-            "pose": {"pose": pose, "covariance": covariance[k]},
-        }
-        yield stamp_ns, f"/{drone.name}/odometry", "nav_msgs/msg/Odometry", fields
-
-
-def _gimbal(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_Message]:
-    stamps = (drone.log.body.t_ns + flight.scenario.start_ns).tolist()
-    for stamp_ns, attitude in zip(stamps, drone.log.gimbal_xyzw, strict=True):
-        header = {"stamp": stamp_ns, "frame_id": "world"}
-        fields = {"header": header, "quaternion": _xyzw(attitude)}
-        yield stamp_ns, f"/{drone.name}/gimbal", "geometry_msgs/msg/QuaternionStamped", fields
-
-
-def _camera_infos(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_Message]:
-    lens = drone.intrinsics
-    fields = {
-        "width": lens.width,
-        "height": lens.height,
-        "distortion_model": "plumb_bob",
-        "d": [0.0] * 5,
-        "k": [lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0],
-        "r": np.eye(3),
-        "p": [lens.fx, 0.0, lens.cx, 0.0, 0.0, lens.fy, lens.cy, 0.0, 0.0, 0.0, 1.0, 0.0],
-    }
-    first, last = drone.log.body.t_ns[[0, -1]] + flight.scenario.start_ns
-    for stamp_ns in range(int(first), int(last), _CAMERA_INFO_NS):
-        header = {"stamp": stamp_ns, "frame_id": f"{drone.name}/camera"}
-        yield (
-            stamp_ns,
-            f"/{drone.name}/camera/camera_info",
-            "sensor_msgs/msg/CameraInfo",
-            {"header": header, **fields},
-        )
-
-
-def _actor(flight: SimulatedFlight) -> Iterator[_Message]:
-    sigma = flight.scenario.actor.estimate_sigma_m
-    covariance = np.diag([sigma**2] * 3 + [0.0] * 3)
-    for stamp_ns, place in zip(
-        (flight.actor_ns + flight.scenario.start_ns).tolist(), flight.actor, strict=True
-    ):
-        pose = {"position": _xyz(place), "orientation": {"w": 1.0}}
-        fields = {
-            "header": {"stamp": stamp_ns, "frame_id": "world"},
-            "pose": {"pose": pose, "covariance": covariance},
-        }
-        yield stamp_ns, "/actor", "geometry_msgs/msg/PoseWithCovarianceStamped", fields
-
-
-def _xyz(vector: np.ndarray[Any, Any]) -> dict[str, float]:
-    return dict(zip("xyz", vector.tolist(), strict=True))
-
-
-def _xyzw(quaternion: np.ndarray[Any, Any]) -> dict[str, float]:
-    return dict(zip("xyzw", quaternion.tolist(), strict=True))
+        for message in logged_messages(flight, drone):
+            log.write(message.topic, message.type, message.received_ns, message.fields)
 
 
 # --- pictures ------------------------------------------------------------------------------------------
-
-
-def _write_keypoints(folder: Path, flight: SimulatedFlight, drone: SimulatedDrone) -> None:
-    """What a detector would have found, as AlphaPose writes it, and when the pictures were taken."""
-    xy, confidence = keypoints_of(flight, drone)
-    write_alphapose(folder / f"{drone.name}_keypoints.json", [Sighting(1, xy, confidence)])
-    stamps = picture_stamps(flight, drone)
-    lines = ["frame,t_ns", *(f"{frame},{stamp}" for frame, stamp in enumerate(stamps.tolist()))]
-    (folder / f"{drone.name}_frames.csv").write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
-
-
-def picture_stamps(flight: SimulatedFlight, drone: SimulatedDrone) -> Int64:
-    """Stamps [F] of a drone's pictures by its own camera's clock, ns since the epoch."""
-    offset_ns = round(drone.clock_offset_s * 1e9)
-    stamps: Int64 = drone.at_frames.t_ns + flight.scenario.start_ns - offset_ns
-    return stamps
 
 
 def _film(

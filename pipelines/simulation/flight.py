@@ -145,6 +145,13 @@ def fly_scenario(
     )
 
 
+def picture_stamps(flight: SimulatedFlight, drone: SimulatedDrone) -> Int64:
+    """Stamps [F] of a drone's pictures by its own camera's clock, ns since the epoch."""
+    offset_ns = round(drone.clock_offset_s * 1e9)
+    stamps: Int64 = drone.at_frames.t_ns + flight.scenario.start_ns - offset_ns
+    return stamps
+
+
 def visible_joints(flight: SimulatedFlight, drone: SimulatedDrone) -> tuple[Float, Bool]:
     """Where a drone's pictures show the joints, and whether they do.
 

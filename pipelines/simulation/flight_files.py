@@ -34,7 +34,7 @@ def write_tum(path: Path, t_ns: Int64, position: Float, quaternion_xyzw: Float) 
         numbers = [*(f"{v:.6f}" for v in xyz), *(f"{v:.9f}" for v in xyzw)]
         seconds, rest = divmod(abs(stamp), 10**9)
         lines.append(" ".join([f"{'-' if stamp < 0 else ''}{seconds}.{rest:09d}", *numbers]))
-    _write_lines(path, lines)
+    write_lines(path, lines)
 
 
 def write_joints(path: Path, t_ns: Int64, names: tuple[str, ...], joints: Float) -> None:
@@ -42,7 +42,7 @@ def write_joints(path: Path, t_ns: Int64, names: tuple[str, ...], joints: Float)
     lines = ["t_ns,joint,x,y,z"]
     for stamp, points in zip(t_ns.tolist(), joints.tolist(), strict=True):
         lines += [f"{stamp},{n},{x:.6f},{y:.6f},{z:.6f}" for n, (x, y, z) in zip(names, points, strict=True)]
-    _write_lines(path, lines)
+    write_lines(path, lines)
 
 
 def write_alphapose(path: Path, people: Iterable[Sighting]) -> None:
@@ -55,7 +55,7 @@ def write_alphapose(path: Path, people: Iterable[Sighting]) -> None:
         (frame, _alphapose_entry(frame, person)) for person in people for frame in _frames_with(person)
     ]
     entries.sort(key=lambda pair: pair[0])
-    _write_lines(path, ["[", ",\n".join(json.dumps(e, separators=(",", ":")) for _, e in entries), "]"])
+    write_lines(path, ["[", ",\n".join(json.dumps(e, separators=(",", ":")) for _, e in entries), "]"])
 
 
 def _frames_with(person: Sighting) -> list[int]:
@@ -79,5 +79,6 @@ def _alphapose_entry(frame: int, person: Sighting) -> dict[str, object]:
     }
 
 
-def _write_lines(path: Path, lines: list[str]) -> None:
+def write_lines(path: Path, lines: list[str]) -> None:
+    """Lines of text that end as on Linux, everywhere."""
     path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")

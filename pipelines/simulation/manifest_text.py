@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight
+from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, picture_stamps
 from pipelines.simulation.flying import LEVER_ARM
 
 _UNKNOWN_CLOCK_SIGMA_S = 0.3
@@ -51,7 +51,7 @@ def _quoted(text: str) -> str:
 def _pictures(flight: SimulatedFlight, drone: SimulatedDrone, video: bool) -> list[str]:
     name = drone.name
     known = not any(other.clock_offset_s for other in flight.drones)
-    start_ns = int(drone.at_frames.t_ns[0]) + flight.scenario.start_ns - round(drone.clock_offset_s * 1e9)
+    start_ns = int(picture_stamps(flight, drone)[0])
     whole, fraction = divmod(start_ns, 10**9)
     if video:
         pictures = [f"    video: {name}.mp4", f"    frame_times: {{start: {whole}.{fraction:09d}}}"]
