@@ -64,7 +64,7 @@ def test_keypoints_do_not_depend_on_workers(flight: Path) -> None:
     results = []
     for workers in ("1", "2"):
         shutil.rmtree(session / "detect", ignore_errors=True)
-        succeeds("reconstruct", session, "--every", "25", "--workers", workers, "--force")
+        succeeds("reconstruct", session, "--every", "50", "--workers", workers, "--force")
         results.append(content(session))
     assert results[0] == results[1]
 

@@ -225,7 +225,7 @@ def _voxels_of_lidar(name: str, side: float) -> int:
     """Counted with the ordinary reader of bags."""
     from rosbags.highlevel import AnyReader
 
-    found: set[tuple[int, ...]] = set()
+    found = []
     with AnyReader([real_data(name)]) as reader:
         clouds = [each for each in reader.connections if each.topic == "/luminar_pointcloud"]
         for connection, _, data in reader.messages(clouds):
@@ -240,5 +240,5 @@ def _voxels_of_lidar(name: str, side: float) -> int:
                 columns.append(raw.view(f"<f{width}")[:, 0].astype(float))
             points = np.stack(columns, axis=1)
             points = points[np.isfinite(points).all(axis=1)]
-            found |= set(map(tuple, np.floor(points / side).astype(int).tolist()))
-    return len(found)
+            found.append(np.unique(np.floor(points / side), axis=0))
+    return len(np.unique(np.concatenate(found), axis=0))

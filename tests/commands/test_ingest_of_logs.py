@@ -117,13 +117,9 @@ def test_a_frozen_estimator_is_told_from_a_camera_at_rest() -> None:
 @pytest.mark.parametrize("container", CONTAINERS)
 def test_memory_is_bounded(tmp_path: Path, container: str) -> None:
     """60 MB more of pictures, which nothing holds, cost less than a quarter of that."""
-    peaks = []
-    for megabytes in (1, 20, 80):
-        folder = tmp_path / str(megabytes)
-        log = in_a_process(write, folder, container, RECORDER, 200_000, megabytes)
-        if megabytes == 1:
-            small = log
-        else:
-            peaks.append(in_a_process(timed, ingested, small, log)["peak_mb"])
+    tiny, small, large = (
+        write(tmp_path / str(megabytes), container, RECORDER, 200_000, megabytes) for megabytes in (1, 20, 80)
+    )
+    peaks = [in_a_process(timed, ingested, tiny, log)["peak_mb"] for log in (small, large)]
     assert max(peaks) < 400
     assert peaks[1] - peaks[0] < 15
