@@ -14,13 +14,14 @@ from pipelines.geometry.triangulation import Views, estimate_noise, triangulate
 from pipelines.reconstruction.refinement.building import Sighting
 from pipelines.session.skeletons import bones_of
 from pipelines.simulation.drone_paths import orbit
-from pipelines.simulation.walk import COCO17, walk
+from pipelines.simulation.walk import COCO17, route, walk
 
 Float = NDArray[np.float64]
 
 FPS = 30.0
 FOCAL_PX = 1500.0
 STATED_PX = 3.0
+SPEED_MPS, RADIUS_M = 1.2, 4.0
 _HEAD = range(5)  # nose, eyes and ears are as rigid as a bone
 PAIRS = sorted(
     {(COCO17.index(a), COCO17.index(b)) for a, b in bones_of(COCO17)}
@@ -74,16 +75,20 @@ def formation(
     """
     rng = np.random.default_rng([seed, cameras])
     t_s = np.arange(times) / FPS
-    truth = walk(t_s, radius_m=4.0)
+    truth = walk(t_s, speed_mps=SPEED_MPS, radius_m=RADIUS_M)
     t_ns = np.round(t_s * 1e9).astype(np.int64)
     sightings, positions, rotations = [], [], []
     for camera in range(cameras):
         taken_s = t_s + (late_s[camera] if late_s else 0.0)
-        joints = walk(taken_s, radius_m=4.0)
+        joints = walk(taken_s, speed_mps=SPEED_MPS, radius_m=RADIUS_M)
         middle = truth.mean(axis=(0, 1))
 
-        def flown(at_s: Float, followed: Float, camera: int = camera, middle: Float = middle) -> list[Float]:
-            target = np.tile(middle, (times, 1)) if still else followed.mean(axis=1)
+        def flown(at_s: Float, camera: int = camera, middle: Float = middle) -> list[Float]:
+            target = np.tile(middle, (times, 1))
+            if not still:
+                # The path, not the gait: cameras that bob with the person make a larger person, who stands
+                # still in the air, more likely.
+                target[:, :2] = route(SPEED_MPS * at_s, radius_m=RADIUS_M)[0]
             parts = orbit(
                 at_s,
                 target,
@@ -95,8 +100,8 @@ def formation(
             return [part[camera] for part in parts]
 
         # Logs are right about the time, so a late picture shows what the log says of a later time.
-        position, quaternion = flown(t_s, truth)
-        taken_from, taken_quaternion = flown(taken_s, joints)
+        position, quaternion = flown(t_s)
+        taken_from, taken_quaternion = flown(taken_s)
         rotation = matrix_from_quaternion(taken_quaternion)
         seen = np.einsum("tij,tki->tkj", rotation, joints - taken_from[:, None])
         xy = seen[..., :2] / seen[..., 2:]

@@ -13,13 +13,24 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pipelines.reconstruction.refinement.elimination import Eliminated, Moments, System, moments
-from pipelines.reconstruction.refinement.problem import ROTATION, Knowledge, PoseErrors, Process, State
+from pipelines.reconstruction.refinement.problem import (
+    ROTATION,
+    Knowledge,
+    PoseErrors,
+    Problem,
+    Process,
+    State,
+)
 
 Float = NDArray[np.float64]
 
+_GAP = 3.0  # usual steps: between stretches of a flight
 _EVERY = 3  # pictures of every third time are enough to judge image noise and white errors
+_BODY_ACCELERATION, _BODY_COUNT = 1.5, 3.0  # m/s^2 beyond what limbs tell; the simulated walk's is 1.1
 _LEAST_ACCELERATION = 0.1  # m/s^2, along any combination of joints
 _LEAST_BONE_M = 0.001
 _STRIDE = 1.5  # how far beyond its goal a step goes, on a logarithmic scale
@@ -55,21 +66,63 @@ def reestimated(system: System, state: State, at: Eliminated, *, poses: bool, mo
     scale = known.pixel_scale * float(np.sqrt(squares / max(told, 1.0)))
     return replace(
         known,
-        acceleration=_acceleration(known.acceleration * grown**2, found),
+        acceleration=_acceleration(known.acceleration * grown**2, found, _bodies(system.problem)),
         bone_sigma_m=np.maximum(bones, _LEAST_BONE_M),
         size_m=known.size_m * grown,
         pixel_scale=scale,
     )
 
 
-def _acceleration(before: Float, found: Moments) -> Float:
-    """The covariance of accelerations: in coordinates where the one before is the identity."""
+def shrunk(acceleration: Float, t_s: Float, position: Float) -> Float:
+    """A covariance of accelerations [J, J] with correlations as small as the length of the flight asks for.
+
+    Limbs repeat what they do, so a short flight shows few accelerations that are independent, and some
+    combination of joints seems to stay at rest by chance; refined with that, covariances came out a third
+    too small. Correlations are multiplied by 1 - sum var(r) / sum r^2 (Schafer & Strimmer, "A shrinkage
+    approach to large-scale covariance matrix estimation", 2005), where var(r) is (1 - r^2)^2 / (N - 1) and N
+    the number of accelerations over 1 + 2 sum rho^2 of their autocorrelation (Bartlett 1946).
+
+    Args:
+        acceleration: [J, J] (m/s^2)^2, as estimated.
+        t_s: [T] times, and
+        position: [T, J, 3] m, the estimate that it comes from.
+    """
+    joints = len(acceleration)
+    if joints < 2:
+        return acceleration
+    steps = np.diff(t_s)
+    velocity = np.diff(position, axis=0) / steps[:, None, None]
+    whole = np.maximum(steps[1:], steps[:-1]) < _GAP * np.median(steps)
+    change = (np.diff(velocity, axis=0) / (0.5 * (steps[1:] + steps[:-1]))[:, None, None])[whole]
+    unit = change / np.sqrt(np.maximum(np.mean(change**2, axis=(0, 2)), 1e-12))[:, None]
+    lags = range(1, len(unit) // 4)
+    repeated = 1 + 2 * sum(float(np.mean(unit[lag:] * unit[:-lag])) ** 2 for lag in lags)
+    independent = 3 * len(unit) / repeated
+    deviation = np.sqrt(np.diagonal(acceleration))
+    correlation2 = (acceleration / np.outer(deviation, deviation))[~np.eye(joints, dtype=bool)] ** 2
+    chance = float(np.sum((1 - correlation2) ** 2)) / max(independent - 1, 1.0)
+    share = min(chance / max(float(correlation2.sum()), 1e-12), 1.0)
+    return (1 - share) * acceleration + share * np.diag(deviation**2)
+
+
+def _acceleration(before: Float, found: Moments, bodies: Float) -> Float:
+    """The covariance of accelerations: in coordinates where the one before is the identity.
+
+    Of a body as a whole (`bodies` [J, P], one for its joints) noisy poses tell so little that a flight of
+    2 s holds less than one acceleration's worth; what walking bodies do counts `_BODY_COUNT` more.
+    """
     values, vectors = np.linalg.eigh(before)
     root, inverse = (vectors * values**power @ vectors.T for power in (0.5, -0.5))
     squares, variance = (inverse @ part @ inverse / found.times for part in found.acceleration)
     shares, axes = np.linalg.eigh(np.eye(len(before)) - (variance + variance.T) / 2)
     known = np.maximum(shares, _LEAST_TOLD)
     estimate = axes.T @ (squares - variance) @ axes + np.diag(known - shares)
+    for body in bodies.T:
+        along = axes.T @ inverse @ body
+        precision = float(along @ along)
+        shared = np.outer(along, along) / precision * _BODY_COUNT / found.times
+        estimate = estimate + shared * _BODY_ACCELERATION**2 * precision
+        known = known + np.diagonal(shared)
     goal = estimate / np.sqrt(known[:, None] * known)
     changes, turned = np.linalg.eigh((goal + goal.T) / 2)
     changes = np.clip(np.maximum(changes, _BOUNDS[0]) ** _STRIDE, *_BOUNDS)
@@ -78,6 +131,15 @@ def _acceleration(before: Float, found: Moments) -> Float:
     values, vectors = np.linalg.eigh((further + further.T) / 2)
     floored: Float = vectors * np.maximum(values, _LEAST_ACCELERATION**2) @ vectors.T
     return floored
+
+
+def _bodies(problem: Problem) -> Float:
+    """[J, P] one where a joint belongs to a body: what bones connect."""
+    joints = problem.joints
+    ends = problem.bones
+    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(joints, joints))
+    count, label = connected_components(graph, directed=False)
+    return np.eye(count)[label]
 
 
 def _change(squares: float, told: float, count: float) -> float:

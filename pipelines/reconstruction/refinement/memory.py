@@ -30,8 +30,10 @@ def memory_of(system: System, state: State) -> float:
     far = (residual**2).sum(axis=-1) > system.bound2
     residual = np.where(far[..., None], np.nan, residual)
     cameras = np.unique(pictures.camera)
-    with np.errstate(invalid="ignore"):
-        own = residual - np.nanmean(residual, axis=1, keepdims=True)
+    # Of a picture whose joints are all far off nothing is left.
+    own = residual - np.nansum(residual, axis=1, keepdims=True) / np.maximum(
+        np.sum(~np.isnan(residual), axis=1, keepdims=True), 1
+    )
     lags = max(int(_LONGEST_S / system.usual_step_s), 1)
     products, counts = np.zeros(lags + 1), np.zeros(lags + 1)
     for camera in cameras:

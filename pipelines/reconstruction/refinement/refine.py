@@ -25,6 +25,7 @@ from pipelines.reconstruction.refinement.estimate import (
     solve,
 )
 from pipelines.reconstruction.refinement.kernels import exponential
+from pipelines.reconstruction.refinement.levels import shrunk
 from pipelines.reconstruction.refinement.problem import (
     ROTATION,
     SHIFT_IN_CAMERA,
@@ -47,7 +48,9 @@ _BONE_SIGMA_M = 0.02
 _FEWEST_TIMES = 20
 _UNEXPLAINED = 1.15  # times the image noise that the pictures show between neighbours: the prior is wrong
 _SIGMAS = 4.0
+_SETTLING = 4  # rounds to see how well given levels explain the pictures
 _STATED = 10.0  # by how much its evidence, a logarithm, is raised
+_STATED_DRIFT = 0.5  # and for every picture, where errors change: between knots they are taken for white
 _SMALL_SCALE = 0.01  # standard deviation of the constellation's scale that is no matter
 _UNSEEN_SCALE = 0.85  # share of it that is left once the pictures were seen, from which they did not tell it
 _SLOW_SHARE = 0.2  # of the disagreement of views: slow errors where the search begins, at least
@@ -227,22 +230,26 @@ def _find_prior(
     begun = _unlearned(problem, start[chosen], (guess,) * len(sightings), clock_sigma_s)
     state = initial_state(problem, begun, start[chosen])
     free, state = learn(problem, begun, state, poses=True, rounds=_LEARNING_ROUNDS)
-    candidates = {"estimated": (free, state)}
-    others = {} if prior is None else {"stated": tuple(prior)}
+    # The others under the same motion, bones and image noise: what learning those is worth changes from round
+    # to round by more than levels that are right differ in.
+    found = {"estimated": (evidence(problem, free, state), free, state)}
     exact = (PoseErrors((0.0, 0.0), ()),) * len(sightings)
-    if others.get("stated") != exact:
-        others["exact"] = exact
+    others = {"exact": exact} if prior is None else {"stated": tuple(prior), "exact": exact}
     for name, poses in others.items():
         known = replace(free, poses=poses)
-        state = initial_state(problem, known, start[chosen])
         try:
-            candidates[name] = learn(problem, known, state, poses=False, rounds=_FEWER_ROUNDS)
+            _, settled, _ = solve(
+                problem, known, initial_state(problem, known, state.position), rounds=_SETTLING
+            )
+            found[name] = (evidence(problem, known, settled), known, settled)
         except np.linalg.LinAlgError:
             continue
-    found = {name: evidence(problem, *candidate) for name, candidate in candidates.items()}
     # What somebody knows is given up for a reason alone.
-    best = max(found, key=lambda name: found[name] + (_STATED if name == "stated" else 0.0))
-    known = candidates[best][0]
+    best = max(found, key=lambda name: found[name][0] + (_reason(problem, prior) if name == "stated" else 0))
+    _, known, state = found[best]
+    if best != "estimated":
+        known, state = learn(problem, known, state, poses=False, rounds=_FEWER_ROUNDS)
+    known = replace(known, acceleration=shrunk(known.acceleration, problem.t_s, state.position))
     if known.memory < REMEMBERED and known.pixel_scale > _UNEXPLAINED * image:
         raise np.linalg.LinAlgError("no level of pose noise explains the pictures")
     warnings: list[str] = []
@@ -252,6 +259,12 @@ def _find_prior(
         )
     expected_m = spread * max(disagreement_m, stated_m if best == "stated" else 0.0)
     return known, best != "stated", warnings, expected_m
+
+
+def _reason(problem: Problem, stated: Sequence[PoseErrors] | None) -> float:
+    """By how much the evidence of other levels must exceed that of the stated ones."""
+    changes = any(not process.constant for errors in stated or () for process in errors.processes)
+    return _STATED + (_STATED_DRIFT * len(problem.pictures.first) if changes else 0.0)
 
 
 def _stretches(times: int) -> Int64:
@@ -292,7 +305,7 @@ def _first_guess(problem: Problem, start: Float) -> tuple[PoseErrors, float, flo
         white.append(_spread(np.diff(common[mine], axis=0)) / np.sqrt(2))
         total.append(float(np.sqrt(np.nanmedian(np.sum(common[mine] ** 2, axis=1)) / _MEDIAN_OF_TWO)))
         image.append(_spread(np.diff(own[mine], axis=0)) / np.sqrt(2))
-    # Of 2 n residuals of a joint three are lost to its position.
+    # Of 2 n residuals of a joint three are lost to its position: of their sum, not of each camera's alike.
     lost = np.sqrt(2 * cameras / (2 * cameras - 3))
     quick, all_of_it = lost * float(np.median(white)), lost * float(np.median(total))
     slow = 1.5 * float(np.sqrt(max(all_of_it**2 - quick**2, (_SLOW_SHARE * all_of_it) ** 2)))
@@ -306,7 +319,7 @@ def _first_guess(problem: Problem, start: Float) -> tuple[PoseErrors, float, flo
             Process(SHIFT_IN_CAMERA, max(0.4 * slow * range_m, 0.02)),
         ),
     )
-    noise = lost * float(np.median(image))
+    noise = lost * float(np.sqrt(np.mean(np.square(image))))
     if cameras == 2:
         # Two views disagree across one line only: what they show is less than the stated noise of an image.
         noise = max(noise, 1.0)
