@@ -8,9 +8,8 @@ be measured is NaN with a status that says why.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,14 +18,11 @@ from numpy.typing import NDArray
 
 from pipelines.detect import detect
 from pipelines.formats.flights.pictures import Picture, open_pictures
-from pipelines.geometry.poses import interpolate_poses
 from pipelines.geometry.triangulation import (
     STATUS,
     Method,
     Triangulation,
     Views,
-    estimate_noise,
-    triangulate,
 )
 from pipelines.keypoints.association import Association, associate
 from pipelines.keypoints.calibration import measured_for, read_calibration
@@ -51,11 +47,18 @@ from pipelines.reconstruction.observations import (
     on_sides,
     time_base,
 )
-from pipelines.reconstruction.pose_weighting import triangulate_weighted
 from pipelines.reconstruction.quality import assess
 from pipelines.reconstruction.refining import RefinedFlight, refine_flight
-from pipelines.reconstruction.reweighting import triangulate_heavy_tailed
 from pipelines.reconstruction.smoothing import smoother
+from pipelines.reconstruction.solving import (
+    UNKNOWN_SIGMA,
+    ray_sigma,
+    refused_people,
+    said_noise,
+    solver_for,
+    views_with_noise,
+)
+from pipelines.reconstruction.tables import camera_poses_table, skeleton_table
 from pipelines.reconstruction.trials import disturbances, disturbed, told_together
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
@@ -71,9 +74,6 @@ if TYPE_CHECKING:
 RECONSTRUCT = Stage("reconstruct", revision=7)
 
 _LONGEST_FILL_S = 10.0
-
-_UNKNOWN_SIGMA = (0.3, np.radians(1.0))
-"""Camera pose noise (m, rad) taken for telling people apart where nobody states it: METHODS' medium level."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ def reconstruct(
             metrics = metrics | {"trials": told_together(every, settings.disturb_poses, settings.seed)}
             warnings.append(_said_disturbance(settings))
         metrics = jsonable(metrics)
-        skeleton = _skeleton_table(stored.observations, stored.result)
+        skeleton = skeleton_table(stored.observations, stored.result)
         write_table(run.folder / "skeleton.parquet", skeleton, SKELETON)
         if stored.poses is not None:
             write_table(run.folder / "cameras.parquet", stored.poses, CAMERA_POSES)
@@ -274,14 +274,14 @@ def _attempt(
             cameras, followed, description, settings
         )
     found, observations, association, seen = _observe(folder, cameras, description, settings)
-    sigma = _ray_sigma(cameras, observations.t_ns, observations.position, settings)
+    sigma = ray_sigma(cameras, observations.t_ns, observations.position, pixel_sigma=settings.pixel_sigma)
     sides, between_views = _agreeing_sides(observations, sigma)
     xy, confidence = on_sides(observations.xy, observations.confidence, sides)
     observations = replace(observations, xy=xy, confidence=confidence)
     progress.advance()
-    views = _views(cameras, observations, settings, workers)
-    solve = _solver(cameras, observations, settings, workers)
-    result = _refused_people(solve(views), observations, seen)
+    views = views_with_noise(cameras, observations, pixel_sigma=settings.pixel_sigma, threads=workers)
+    solve = solver_for(settings.method, cameras, observations, threads=workers)
+    result = refused_people(solve(views), observations, seen)
     progress.advance()
     refined = None
     if settings.method == "refined":
@@ -289,7 +289,7 @@ def _attempt(
             cameras, found, association, observations, sides, views, result, description, settings, workers
         )
         observations, views = refined.observations, refined.views
-        result = _refused_people(refined.result, observations, seen)
+        result = refused_people(refined.result, observations, seen)
     result, finished = finish(
         observations, views, result, fill_s=settings.fill_s, smoother=smoother(settings.smooth)
     )
@@ -310,7 +310,7 @@ def _attempt(
         association,
         between_views,
         metrics | finished | background | (refined.metrics if refined else {}),
-        _poses_used(cameras, refined, background["background"]),
+        _poses_stored(cameras, refined, background["background"]),
         [*warnings, *(refined.warnings if refined else []), *association.reasons],
     )
 
@@ -327,7 +327,7 @@ def _observe(
         found.confidence,
         found.position,
         found.rotation,
-        _ray_sigma(cameras, found.t_ns, found.position, settings),
+        ray_sigma(cameras, found.t_ns, found.position, pixel_sigma=settings.pixel_sigma),
         actor=load_actor(folder, description, found.t_ns),
         people=settings.people,
     )
@@ -388,7 +388,7 @@ def _refine_cameras(
 ) -> tuple[list[Camera], dict[str, Any], list[str]]:
     stated = load_pose_errors(description, cameras, settings.pose_noise)
     levels = [
-        np.array(_UNKNOWN_SIGMA) if camera.sigma is None else np.median(camera.sigma, axis=0)
+        np.array(UNKNOWN_SIGMA) if camera.sigma is None else np.median(camera.sigma, axis=0)
         for camera in cameras
     ]
     each = [None] * len(cameras) if stated is None else stated
@@ -401,34 +401,15 @@ def _refine_cameras(
     )
 
 
-def _poses_used(
+def _poses_stored(
     cameras: list[Camera], refined: RefinedFlight | None, background: Mapping[str, Any] | None
 ) -> pd.DataFrame | None:
     """The pose of every picture that has one, where anything but the log decided."""
-    import pandas as pd
-
     if refined is not None and refined.cameras is not None:
         return refined.cameras
     if background is None or not any(told["used"] for told in background.values()):
         return None
-    parts = []
-    for camera in cameras:
-        log = camera.trajectory
-        position, quaternion = log.position, log.quaternion_xyzw
-        if camera.static:
-            t_ns = camera.frame_t_ns
-            position, quaternion = (np.repeat(part, len(t_ns), axis=0) for part in (position, quaternion))
-        else:
-            t_ns = camera.frame_t_ns[(camera.frame_t_ns >= log.t_ns[0]) & (camera.frame_t_ns <= log.t_ns[-1])]
-            longest = int(np.diff(log.t_ns).max(initial=0))
-            position, quaternion = interpolate_poses(
-                log.t_ns, position, quaternion, t_ns, max_gap_ns=longest, max_extrapolation_ns=0
-            )
-        table = pd.DataFrame({"t_ns": t_ns, "camera": camera.name})
-        table[["x", "y", "z"]] = position
-        table[["qx", "qy", "qz", "qw"]] = quaternion
-        parts.append(table)
-    return pd.concat(parts, ignore_index=True)
+    return camera_poses_table(cameras)
 
 
 def _without_swaps(cameras: list[Camera]) -> tuple[list[Camera], dict[str, dict[str, int]]]:
@@ -493,82 +474,6 @@ def _refine(
     )
 
 
-def _ray_sigma(cameras: list[Camera], t_ns: Int64, position: Float, settings: Settings) -> Float:
-    """Standard deviation [T, C] in rad of a viewing ray, enough to tell people apart.
-
-    The distance to the actor is not known yet: the distance to the middle of the cameras, which
-    surround it, stands for it.
-    """
-    posed = ~np.isnan(position[..., 0])
-    if not posed.any():
-        raise DataError("the cameras", "have no pose at any picture", "check clocks and pose logs")
-    middle = position[posed].mean(axis=0)
-    columns = []
-    for c, camera in enumerate(cameras):
-        stated = camera.sigma_at(t_ns)
-        sigma = np.tile(_UNKNOWN_SIGMA, (len(t_ns), 1)) if stated is None else stated
-        away = position[posed[:, c], c] - middle
-        distance = float(np.median(np.linalg.norm(away, axis=-1))) if len(away) else 1.0
-        pixel = settings.pixel_sigma / camera.focal_px
-        columns.append(np.sqrt(pixel**2 + sigma[:, 1] ** 2 + (sigma[:, 0] / max(distance, 1.0)) ** 2))
-    return np.stack(columns, axis=1)
-
-
-def _views(cameras: list[Camera], observations: Observations, settings: Settings, workers: int) -> Views:
-    """All joint-frames in one row each, with the noise that the gates must know.
-
-    Whatever the stated noise leaves unexplained is added as pixel noise: gates that know too little
-    throw good views out.
-    """
-    times, people, joints, count = observations.confidence.shape
-    focal = np.array([camera.focal_px for camera in cameras])
-    stated = observations.pose_sigma
-    views = Views(
-        xy=observations.xy.reshape(-1, count, 2),
-        weight=observations.confidence.reshape(-1, count),
-        pose_index=np.repeat(np.arange(times), people * joints),
-        position=observations.position,
-        rotation=observations.rotation,
-        focal=focal,
-        pixel_sigma=np.full(count, settings.pixel_sigma),
-        pose_sigma=np.zeros((times, count, 2)) if stated is None else stated,
-    )
-    return replace(views, pixel_sigma=estimate_noise(views, threads=workers))
-
-
-def _solver(
-    cameras: list[Camera], observations: Observations, settings: Settings, workers: int
-) -> Callable[[Views], Triangulation]:
-    """How views become points; robust has a loss for calibrated cameras, weights for logged covariances."""
-    calibrated = observations.pose_sigma is None and all(camera.static for camera in cameras)
-    if settings.method == "robust" and calibrated:
-        return partial(triangulate_heavy_tailed, threads=workers)
-    method = "robust" if settings.method == "refined" else settings.method
-    if method == "robust" and observations.pose_covariance is not None:
-        return partial(triangulate_weighted, pose_covariance=observations.pose_covariance, threads=workers)
-    return partial(triangulate, method=method, threads=workers)
-
-
-def _refused_people(
-    result: Triangulation, observations: Observations, seen: NDArray[np.bool_]
-) -> Triangulation:
-    """Joints of a person for whom no view was taken, although somebody was seen, are rejected."""
-    shape = observations.confidence.shape[:3]
-    status = result.status.reshape(shape)
-    nobody = (status == STATUS.index("not_detected")).all(axis=2)
-    refused = nobody & seen[:, None]
-    marked = np.where(refused[:, :, None], STATUS.index("rejected"), status).astype(np.int8)
-    return replace(result, status=marked.ravel())
-
-
-def _said_noise(views: Views) -> str:
-    """The noise that the gates were told of."""
-    position_m, rotation_rad = np.median(views.pose_sigma, axis=(0, 1))
-    pixels = float(np.median(views.pixel_sigma))
-    rotation_deg = np.degrees(rotation_rad)
-    return f"noise taken for poses {position_m:.3g} m and {rotation_deg:.3g} deg, pixels {pixels:.3g}"
-
-
 def _refuse_nothing(folder: Path, attempt: _Attempt) -> None:
     """Where not a single joint came out, say which gate stopped them."""
     status = attempt.result.status
@@ -579,39 +484,10 @@ def _refuse_nothing(folder: Path, attempt: _Attempt) -> None:
     reasons = "; ".join(attempt.association.reasons)
     raise DataError(
         folder,
-        f"no joint could be reconstructed ({gates}; {_said_noise(attempt.views)})"
+        f"no joint could be reconstructed ({gates}; {said_noise(attempt.views)})"
         + (f"; {reasons}" if reasons else ""),
         "check calibration, clocks and poses, or state another pose noise with --pose-noise",
     )
-
-
-def _skeleton_table(observations: Observations, result: Triangulation) -> pd.DataFrame:
-    import pandas as pd
-
-    times, people, joints, _ = observations.confidence.shape
-    covariance = result.covariance
-    used = np.where(result.inlier, result.residual_px, np.nan)
-    table = pd.DataFrame(
-        {
-            "t_ns": np.repeat(observations.t_ns, people * joints),
-            "person": np.tile(np.repeat(np.arange(people), joints), times),
-            "joint": np.tile(np.array(observations.joints, dtype=object), times * people),
-        }
-    )
-    table[["x", "y", "z"]] = result.points
-    for i, j in zip(*np.triu_indices(3), strict=True):
-        table[f"c{'xyz'[i]}{'xyz'[j]}"] = covariance[:, i, j]
-    table["views"] = result.views
-    table["reprojection_px"] = _row_mean(used)
-    table["status"] = np.array(STATUS, dtype=object)[result.status]
-    return table
-
-
-def _row_mean(values: Float) -> Float:
-    """Mean of each row without its NaN; NaN for a row of nothing else."""
-    count = (~np.isnan(values)).sum(axis=1)
-    mean: Float = np.where(count > 0, np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)
-    return mean
 
 
 def _unused(cameras: list[Camera], result: Triangulation) -> list[str]:

@@ -1,0 +1,122 @@
+"""What the solvers of joint-frames are told: rays, noise, and which of them looks at what."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.triangulation import (
+    STATUS,
+    Method,
+    Triangulation,
+    Views,
+    estimate_noise,
+    triangulate,
+)
+from pipelines.reconstruction.observations import Camera, Observations
+from pipelines.reconstruction.pose_weighting import triangulate_weighted
+from pipelines.reconstruction.reweighting import triangulate_heavy_tailed
+from pipelines.session.errors import DataError
+from pipelines.session.records import Float, Int64
+
+UNKNOWN_SIGMA = (0.3, np.radians(1.0))
+"""Camera pose noise (m, rad) taken for telling people apart where nobody states it: METHODS' medium level."""
+
+
+def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float, *, pixel_sigma: float) -> Float:
+    """Standard deviation [T, C] in rad of a viewing ray, enough to tell people apart.
+
+    The distance to the actor is not known yet: the distance to the middle of the cameras, which
+    surround it, stands for it.
+
+    Args:
+        cameras: C of them.
+        t_ns: [T].
+        position: [T, C, 3] m of the cameras, NaN without a pose.
+        pixel_sigma: standard deviation of a good keypoint (px).
+
+    Raises:
+        DataError: no camera has a pose at any time.
+    """
+    posed = ~np.isnan(position[..., 0])
+    if not posed.any():
+        raise DataError("the cameras", "have no pose at any picture", "check clocks and pose logs")
+    middle = position[posed].mean(axis=0)
+    columns = []
+    for c, camera in enumerate(cameras):
+        stated = camera.sigma_at(t_ns)
+        sigma = np.tile(UNKNOWN_SIGMA, (len(t_ns), 1)) if stated is None else stated
+        away = position[posed[:, c], c] - middle
+        distance = float(np.median(np.linalg.norm(away, axis=-1))) if len(away) else 1.0
+        pixel = pixel_sigma / camera.focal_px
+        columns.append(np.sqrt(pixel**2 + sigma[:, 1] ** 2 + (sigma[:, 0] / max(distance, 1.0)) ** 2))
+    return np.stack(columns, axis=1)
+
+
+def views_with_noise(
+    cameras: Sequence[Camera], observations: Observations, *, pixel_sigma: float, threads: int
+) -> Views:
+    """All joint-frames in one row each, with the noise that the gates must know.
+
+    Whatever the stated noise leaves unexplained is added as pixel noise: gates that know too little
+    throw good views out.
+    """
+    times, people, joints, count = observations.confidence.shape
+    focal = np.array([camera.focal_px for camera in cameras])
+    stated = observations.pose_sigma
+    views = Views(
+        xy=observations.xy.reshape(-1, count, 2),
+        weight=observations.confidence.reshape(-1, count),
+        pose_index=np.repeat(np.arange(times), people * joints),
+        position=observations.position,
+        rotation=observations.rotation,
+        focal=focal,
+        pixel_sigma=np.full(count, pixel_sigma),
+        pose_sigma=np.zeros((times, count, 2)) if stated is None else stated,
+    )
+    return replace(views, pixel_sigma=estimate_noise(views, threads=threads))
+
+
+def solver_for(
+    method: Method | Literal["refined"],
+    cameras: Sequence[Camera],
+    observations: Observations,
+    *,
+    threads: int,
+) -> Callable[[Views], Triangulation]:
+    """How views become points, for `refined` at first.
+
+    `robust` has a loss of its own for calibrated cameras, and weights for logged covariances.
+    """
+    calibrated = observations.pose_sigma is None and all(camera.static for camera in cameras)
+    if method == "robust" and calibrated:
+        return partial(triangulate_heavy_tailed, threads=threads)
+    first: Method = "robust" if method == "refined" else method
+    if first == "robust" and observations.pose_covariance is not None:
+        return partial(triangulate_weighted, pose_covariance=observations.pose_covariance, threads=threads)
+    return partial(triangulate, method=first, threads=threads)
+
+
+def refused_people(
+    result: Triangulation, observations: Observations, seen: NDArray[np.bool_]
+) -> Triangulation:
+    """Joints of a person for whom no view was taken, although somebody was seen, are rejected."""
+    shape = observations.confidence.shape[:3]
+    status = result.status.reshape(shape)
+    nobody = (status == STATUS.index("not_detected")).all(axis=2)
+    refused = nobody & seen[:, None]
+    marked = np.where(refused[:, :, None], STATUS.index("rejected"), status).astype(np.int8)
+    return replace(result, status=marked.ravel())
+
+
+def said_noise(views: Views) -> str:
+    """The noise that the gates were told of."""
+    position_m, rotation_rad = np.median(views.pose_sigma, axis=(0, 1))
+    pixels = float(np.median(views.pixel_sigma))
+    rotation_deg = np.degrees(rotation_rad)
+    return f"noise taken for poses {position_m:.3g} m and {rotation_deg:.3g} deg, pixels {pixels:.3g}"

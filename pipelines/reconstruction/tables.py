@@ -1,0 +1,73 @@
+"""What is stored of a reconstruction, as rows of the session's tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines.geometry.poses import interpolate_poses
+from pipelines.geometry.triangulation import STATUS, Triangulation
+from pipelines.reconstruction.observations import Camera, Observations
+from pipelines.session.records import Float
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def skeleton_table(observations: Observations, result: Triangulation) -> pd.DataFrame:
+    """Every joint of every person at every time, as rows of `tables.SKELETON`."""
+    import pandas as pd
+
+    times, people, joints, _ = observations.confidence.shape
+    covariance = result.covariance
+    used = np.where(result.inlier, result.residual_px, np.nan)
+    table = pd.DataFrame(
+        {
+            "t_ns": np.repeat(observations.t_ns, people * joints),
+            "person": np.tile(np.repeat(np.arange(people), joints), times),
+            "joint": np.tile(np.array(observations.joints, dtype=object), times * people),
+        }
+    )
+    table[["x", "y", "z"]] = result.points
+    for i, j in zip(*np.triu_indices(3), strict=True):
+        table[f"c{'xyz'[i]}{'xyz'[j]}"] = covariance[:, i, j]
+    table["views"] = result.views
+    table["reprojection_px"] = _row_mean(used)
+    table["status"] = np.array(STATUS, dtype=object)[result.status]
+    return table
+
+
+def camera_poses_table(cameras: Sequence[Camera]) -> pd.DataFrame:
+    """The poses of cameras at their pictures, as rows of `tables.CAMERA_POSES`.
+
+    Pictures before the first pose of a moving camera and after its last have no row.
+    """
+    import pandas as pd
+
+    parts = []
+    for camera in cameras:
+        log = camera.trajectory
+        position, quaternion = log.position, log.quaternion_xyzw
+        if camera.static:
+            t_ns = camera.frame_t_ns
+            position, quaternion = (np.repeat(part, len(t_ns), axis=0) for part in (position, quaternion))
+        else:
+            t_ns = camera.frame_t_ns[(camera.frame_t_ns >= log.t_ns[0]) & (camera.frame_t_ns <= log.t_ns[-1])]
+            longest = int(np.diff(log.t_ns).max(initial=0))
+            position, quaternion = interpolate_poses(
+                log.t_ns, position, quaternion, t_ns, max_gap_ns=longest, max_extrapolation_ns=0
+            )
+        table = pd.DataFrame({"t_ns": t_ns, "camera": camera.name})
+        table[["x", "y", "z"]] = position
+        table[["qx", "qy", "qz", "qw"]] = quaternion
+        parts.append(table)
+    return pd.concat(parts, ignore_index=True)
+
+
+def _row_mean(values: Float) -> Float:
+    """Mean of each row without its NaN; NaN for a row of nothing else."""
+    count = (~np.isnan(values)).sum(axis=1)
+    mean: Float = np.where(count > 0, np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)
+    return mean
