@@ -15,7 +15,9 @@ from mocap_cli.options import (
     json_option,
     level,
     overwrite_option,
+    seed_option,
     verbosity_options,
+    workers_option,
 )
 from mocap_cli.terminal import print_json, print_table, watching
 
@@ -87,20 +89,8 @@ def _shared_options(command: Command) -> Command:
                 show_default=True,
                 help="Draws of all noise.",
             ),
-            click.option(
-                "--seed",
-                type=click.IntRange(0, 2**32 - 1),
-                default=0,
-                show_default=True,
-                help="Of all noise.",
-            ),
-            click.option(
-                "--workers",
-                type=click.IntRange(1, 256),
-                default=2,
-                show_default=True,
-                help="Conditions worked on at once; the results do not depend on them.",
-            ),
+            seed_option("Of all noise."),
+            workers_option("Conditions worked on at once; the results do not depend on them."),
             overwrite_option,
             force_option,
             json_option,

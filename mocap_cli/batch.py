@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from mocap_cli.options import any_path, force_option, json_option, level, overwrite_option, verbosity_options
+from mocap_cli.options import (
+    any_path,
+    every_option,
+    force_option,
+    json_option,
+    level,
+    overwrite_option,
+    verbosity_options,
+)
 from mocap_cli.several import expanded
 from mocap_cli.terminal import one_line, print_json, watching
 
@@ -51,14 +59,7 @@ if TYPE_CHECKING:
     help="Of `mocap reconstruct`, as the next two are.",
 )
 @click.option("--detector", default="blazepose", show_default=True, help="For flights without keypoints.")
-@click.option(
-    "--every",
-    type=click.IntRange(1, 1000),
-    default=1,
-    show_default=True,
-    metavar="N",
-    help="Let the detector look at every N-th picture only.",
-)
+@every_option
 @force_option
 @overwrite_option
 @json_option

@@ -25,6 +25,30 @@ json_option = click.option(
 )
 
 
+every_option = click.option(
+    "--every",
+    type=click.IntRange(1, 1000),
+    default=1,
+    show_default=True,
+    metavar="N",
+    help="Let the detector look at every N-th picture only.",
+)
+
+
+def workers_option(help_text: str) -> Callable[[Command], Command]:
+    """Threads of a simulation: two, unless the user says otherwise."""
+    return click.option(
+        "--workers", type=click.IntRange(1, 256), default=2, show_default=True, help=help_text
+    )
+
+
+def seed_option(help_text: str) -> Callable[[Command], Command]:
+    """Where random numbers come from."""
+    return click.option(
+        "--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help=help_text
+    )
+
+
 class FiniteRange(click.FloatRange):
     """A range of numbers without NaN and infinity, which click lets through."""
 

@@ -11,9 +11,11 @@ import click
 
 from mocap_cli.options import (
     FiniteRange,
+    every_option,
     force_option,
     json_option,
     level,
+    seed_option,
     verbosity_options,
 )
 from mocap_cli.several import each
@@ -84,9 +86,7 @@ if TYPE_CHECKING:
     help="Draws of --disturb-poses. metrics.json has the figures of each, their mean, spread and interval;"
     " the skeleton is that of the first.",
 )
-@click.option(
-    "--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help="Of --disturb-poses."
-)
+@seed_option("Of --disturb-poses.")
 @click.option(
     "--fill",
     type=FiniteRange(0, min_open=True),
@@ -106,14 +106,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Runs on the pictures of cameras that came without keypoints (see `mocap models`).",
 )
-@click.option(
-    "--every",
-    type=click.IntRange(1, 1000),
-    default=1,
-    show_default=True,
-    metavar="N",
-    help="Let the detector look at every N-th picture only.",
-)
+@every_option
 @click.option(
     "--start",
     type=FiniteRange(0, 1e9),

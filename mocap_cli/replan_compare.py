@@ -14,6 +14,7 @@ from mocap_cli.options import (
     force_option,
     json_option,
     level,
+    seed_option,
     verbosity_options,
 )
 from mocap_cli.several import each
@@ -64,7 +65,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Draws of detector and pose noise for the reconstruction error.",
 )
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help="Of all noise.")
+@seed_option("Of all noise.")
 @click.option(
     "--pose-noise",
     metavar="MODEL",

@@ -6,7 +6,15 @@ from pathlib import Path
 
 import click
 
-from mocap_cli.options import any_path, force_option, json_option, level, overwrite_option, verbosity_options
+from mocap_cli.options import (
+    any_path,
+    force_option,
+    json_option,
+    level,
+    overwrite_option,
+    verbosity_options,
+    workers_option,
+)
 from mocap_cli.terminal import print_json, print_table, watching
 
 
@@ -18,13 +26,7 @@ from mocap_cli.terminal import print_json, print_table, watching
     is_flag=True,
     help="Write keypoints with the errors of a detector in the place of videos: a thousand times faster.",
 )
-@click.option(
-    "--workers",
-    type=click.IntRange(1, 256),
-    default=2,
-    show_default=True,
-    help="Pictures rendered at once; the flight does not depend on them.",
-)
+@workers_option("Pictures rendered at once; the flight does not depend on them.")
 @overwrite_option
 @force_option
 @json_option
