@@ -20,10 +20,10 @@ from pipelines.planning.formation import (
     FormationPath,
     formation_slots,
     slot_offsets,
-    wrapped,
     yaw_set,
 )
 from pipelines.planning.information import log_determinant, ray_information
+from pipelines.planning.kernels import Formations, Lattice, cheapest_slots, turn_the_shorter_way
 from pipelines.planning.search import best_sequence, lattice
 
 Float = NDArray[np.float64]
@@ -126,14 +126,23 @@ class _Formation:
         self._slots = states[:, None] + first  # [S, n, 3]
         self._offsets = slot_offsets(self._slots)
         self._config, self._predicts_error = config, predicts_error
+        self._formations = Formations(self._lattice, self._slots, self._offsets)
+        self._weights = config.slot_weights()
+        self._rates = np.array(config.slot_rates)
 
     def plan(self, t_s: float, commanded: Float, actor: Float, field: DistanceField) -> FormationPath:
-        costs = costs_of_slots(field, _each(actor, self._every), self._offsets, self._config)
-        cost = cost_map(costs, self._config)
         if self._predicts_error:
+            costs = costs_of_slots(field, _each(actor, self._every), self._offsets, self._config)
+            cost = cost_map(costs, self._config)
             cost += self._config.w_error * error_map(costs, self._offsets, self._config)
-        sequence, _ = best_sequence(cost, self._lattice, commanded[0])
-        return _path(t_s, commanded, self._slots[sequence], self._lattice.knot_s, self._config)
+            sequence, _ = best_sequence(cost, self._lattice, commanded[0])
+            through = _through(commanded, self._slots[sequence])
+        else:  # the same in one call: between small parts, most of the time went
+            actor = np.ascontiguousarray(actor)
+            through = cheapest_slots(
+                field.grid, field.sight, actor, self._formations, self._weights, commanded
+            )
+        return FormationPath(_knots(t_s, through, self._lattice), through, self._rates)
 
 
 class _Greedy:
@@ -157,7 +166,7 @@ class _Greedy:
         ]
         self._offsets = [slot_offsets(each.states) for each in self._lattices]
         self._information = [ray_information(offsets, config) for offsets in self._offsets]
-        self._config = config
+        self._config, self._rates = config, np.array(config.slot_rates)
 
     def plan(self, t_s: float, commanded: Float, actor: Float, field: DistanceField) -> FormationPath:
         config = self._config
@@ -181,7 +190,8 @@ class _Greedy:
             known = known + gained[at, sequence][:, None]
             taken.append(offsets[sequence])
             slots[:, i] = grid.states[sequence]
-        return _path(t_s, commanded, slots, self._lattices[0].knot_s, config)
+        through = _through(commanded, slots)
+        return FormationPath(_knots(t_s, through, self._lattices[0]), through, self._rates)
 
 
 def _all_states(yaws: Float, tilts: Float, ranges: Float) -> Float:
@@ -194,10 +204,12 @@ def _each(actor: Float, every: int) -> Float:
     return actor[every - 1 :: every] if len(actor) >= every else actor[-1:]
 
 
-def _path(t_s: float, commanded: Float, slots: Float, knot_s: float, config: PlannerConfig) -> FormationPath:
-    """From the commanded slots [n, 3] through slots [T, n, 3], each turn the shorter way round."""
+def _through(commanded: Float, slots: Float) -> Float:
+    """The commanded slots [n, 3], then slots [T, n, 3], each turn the shorter way round."""
     through = np.concatenate([commanded[None], slots])
-    yaw = through[..., YAW]
-    yaw[1:] = commanded[:, YAW] + np.cumsum(wrapped(yaw[1:] - yaw[:-1]), axis=0)
-    knots = t_s + knot_s * np.arange(len(through), dtype=np.float64)
-    return FormationPath(knots, through, np.array(config.slot_rates))
+    turn_the_shorter_way(through)
+    return through
+
+
+def _knots(t_s: float, through: Float, grid: Lattice) -> Float:
+    return t_s + grid.knot_s * np.arange(len(through), dtype=np.float64)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from pipelines.planning.kernels import Weights
+from pipelines.planning.kernels import SlotWeights, Weights
 from pipelines.session.errors import DataError
 
 MOST_DRONES = 16
@@ -131,6 +131,10 @@ class PlannerConfig:
         """How fast yaw (rad/s), tilt (rad/s) and range (m/s) of a slot change."""
         yaw, tilt = math.radians(self.yaw_rate_deg_per_s), math.radians(self.tilt_rate_deg_per_s)
         return yaw, tilt, self.range_rate_mps
+
+    def slot_weights(self) -> SlotWeights:
+        """What the kernels of the formation search take."""
+        return SlotWeights(self.w_obs, self.w_occ, self.eps_obs_m, self.sight_start_m)
 
     def local_weights(self, resolution_m: float) -> Weights:
         """What the local planner's kernels take, sight lines sampled every half voxel of that side."""

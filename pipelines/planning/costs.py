@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField
 from pipelines.planning.information import predicted_error, ray_information
-from pipelines.planning.kernels import slot_costs
+from pipelines.planning.kernels import slot_costs, weighed
 
 Float = NDArray[np.float64]
 
@@ -34,15 +34,14 @@ def costs_of_slots(field: DistanceField, actor: Float, offsets: Float, config: P
         offsets: [S, n, 3] metres, the slots of each state from the actor.
         config: `eps_obs_m`, `sight_start_m`.
     """
-    return SlotCosts(*slot_costs(field.grid, actor, offsets, config.eps_obs_m, config.sight_start_m))
+    actor = np.ascontiguousarray(actor)
+    eps_m, start_m = config.eps_obs_m, config.sight_start_m
+    return SlotCosts(*slot_costs(field.grid, field.sight, actor, offsets, eps_m, start_m))
 
 
 def cost_map(costs: SlotCosts, config: PlannerConfig) -> Float:
     """C [T, S] = w_obs sum O + w_occ sum of occupied shares over the drones."""
-    weighted = config.w_obs * costs.obstacle
-    weighted += config.w_occ * costs.occluded
-    total: Float = weighted.sum(axis=2)
-    return total
+    return weighed(costs.obstacle, costs.occluded, config.w_obs, config.w_occ)
 
 
 def error_map(costs: SlotCosts, offsets: Float, config: PlannerConfig) -> Float:

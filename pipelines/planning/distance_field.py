@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.planning.kernels import Grid, sample
+from pipelines.planning.kernels import BRICK, Grid, Sight, fill_bricks, sample
 from pipelines.session.records import Occupancy
 
 Float = NDArray[np.float64]
@@ -28,6 +29,14 @@ class DistanceField:
 
     grid: Grid
     from_ns: int = 0  # the time from which the map holds
+
+    @cached_property
+    def sight(self) -> Sight:
+        """For the sight lines of the cost map; made when it is first asked for, a byte a voxel."""
+        wide, deep, high = self.grid.distance_m.shape
+        bricks = np.zeros((-(-wide // BRICK), -(-deep // BRICK), -(-high // BRICK), BRICK**3), np.uint8)
+        fill_bricks(self.grid, bricks)
+        return Sight(bricks, (wide, deep, high))
 
     @property
     def has_obstacles(self) -> bool:

@@ -1,8 +1,9 @@
-"""The compiled arithmetic that reads the distance field: interpolation, sight lines, the local planner.
+"""The compiled arithmetic: interpolation of the distance field, sight lines, formation search, local planner.
 
 All of it stands in this one module: numba's cache watches the file of the outermost function only, so a
 helper in another file could change without the cached code noticing. No threads and no fastmath: the same
-numbers give the same bytes. `distance_field`, `costs` and `local` are the users and explain the methods.
+numbers give the same bytes. `distance_field`, `costs`, `search`, `arms` and `local` are the users and explain
+the methods.
 """
 
 from __future__ import annotations
@@ -16,11 +17,17 @@ from numpy.typing import NDArray
 from pipelines.geometry.compilation import cached, helper
 
 Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
 Vector = tuple[float, float, float]
 
 # From a point to the centre of its voxel it is at most half a diagonal; to a corner of the cell in which it
 # is interpolated, and from the one to the other, at most a whole one. In voxels:
 _DIAGONAL = math.sqrt(3.0)
+_ROUNDING = 1e-4  # of single precision, by which a bound is drawn in
+BRICK = 4
+_YAW = 0  # of a slot: formation.YAW
+REACHED_S = 1e-9  # a cell exactly as far as the rates allow is a neighbour
+_LONGEST_LEAP = 127
 _SLOWEST_STEP, _FASTEST_STEP = (
     1e4,
     0.2,
@@ -33,6 +40,15 @@ class Grid(NamedTuple):
     distance_m: NDArray[np.float32]  # [X, Y, Z], at least two voxels along each axis
     origin: Float  # [3] m, the corner of voxel (0, 0, 0)
     resolution_m: float
+
+
+class Sight(NamedTuple):
+    """The field as sight lines are led through it: which voxels are occupied, and how far all is alike."""
+
+    bricks: NDArray[np.uint8]
+    """[X/4, Y/4, Z/4, 64] of 4 x 4 x 4 voxels, a line of the processor's memory each: twice the leap, and
+    one more where occupied. All points within as many half voxels of any of the voxel's are as it is."""
+    size: tuple[int, int, int]  # of the grid
 
 
 class Weights(NamedTuple):
@@ -52,6 +68,34 @@ class Weights(NamedTuple):
     speed_floor_mps: float
     step_s: float  # between waypoints
     samples: int  # along a sight line
+
+
+class Lattice(NamedTuple):
+    """States of a formation (or of one drone), and which of them follow which."""
+
+    states: Float  # [S, 3] yaw, tilt, range
+    rates: Float  # [3] per second
+    knot_s: float
+    w_turn: float
+    neighbours: Int64  # [S, K] nearest first, itself at the front; -1 fills up
+    move: Float  # [S, K] what going there costs
+
+
+class Formations(NamedTuple):
+    """The formations to choose from."""
+
+    lattice: Lattice
+    slots: Float  # [S, n, 3] of each state
+    offsets: Float  # [S, n, 3] m, the same from the actor
+
+
+class SlotWeights(NamedTuple):
+    """What the search weighs, by name; see `PlannerConfig`."""
+
+    w_obs: float
+    w_occ: float
+    eps_obs_m: float
+    sight_start_m: float
 
 
 # --- reading the field ---------------------------------------------------------------------------------
@@ -113,10 +157,10 @@ def _sampling(x: float, y: float, z: float, start_m: float, side_m: float, rule:
         start_m: where the line begins.
         side_m: of a voxel.
         rule: [11] is filled: the first sample from the actor, the step to the next, one over it by axis,
-            samples per metre, and how many the way from a point to the centres of its voxel and of another
-            one takes at most, less half a voxel.
+            all three in voxels; samples per metre; and the length of the line in m.
     """
     length = math.sqrt(x * x + y * y + z * z)
+    rule[10] = length
     if length <= start_m:
         return 0
     count = math.ceil((length - start_m) / (0.5 * side_m) - 1e-9)
@@ -125,7 +169,7 @@ def _sampling(x: float, y: float, z: float, start_m: float, side_m: float, rule:
         per_m = way / (length * side_m)
         rule[axis], rule[3 + axis] = per_m * (start_m + step_m / 2.0), per_m * step_m
         rule[6 + axis] = 1.0 / rule[3 + axis]
-    rule[9], rule[10] = 1.0 / step_m, (_DIAGONAL - 0.5) * side_m / step_m
+    rule[9] = 1.0 / step_m
     return count
 
 
@@ -139,40 +183,43 @@ def _samples_inside(first: float, per: float, size: int, low: float, high: float
 
 
 @helper
-def _look(d: NDArray[np.float32], x: float, y: float, z: float, rule: Float) -> tuple[bool, int]:
-    """Whether a voxel is occupied, and how many samples to either side are as it is, without a look."""
-    i = min(max(int(x), 0), d.shape[0] - 1)
-    j = min(max(int(y), 0), d.shape[1] - 1)
-    k = min(max(int(z), 0), d.shape[2] - 1)
-    distance = float(d[np.uintp(i), np.uintp(j), np.uintp(k)])
-    return distance < 0.0, max(int(abs(distance) * rule[9] - rule[10]), 0)
+def _look(sight: Sight, x: float, y: float, z: float) -> tuple[int, int]:
+    """Whether the voxel at a place (voxels) is occupied, and how far, in half voxels, all is as it is."""
+    size = sight.size
+    i = np.uintp(min(max(int(x), 0), size[0] - 1))
+    j = np.uintp(min(max(int(y), 0), size[1] - 1))
+    k = np.uintp(min(max(int(z), 0), size[2] - 1))
+    within = (i % BRICK * BRICK + j % BRICK) * BRICK + k % BRICK
+    byte = np.int64(sight.bricks[i // BRICK, j // BRICK, k // BRICK, within])  # signed, or sums become floats
+    return int(byte & 1), int(byte >> 1)
 
 
 @helper
-def _occupied_samples(grid: Grid, actor: Float, rule: Float, count: int) -> int:
-    """How many samples of a sight line from an actor [3] lie in occupied voxels.
+def _occupied_samples(
+    sight: Sight, x: float, y: float, z: float, rule: Float, first: float, end: float
+) -> int:
+    """How many of the samples `first` to `end` of a sight line lie in occupied voxels.
 
-    A voxel's distance says how far all is alike; that many samples need no look. Taken from both ends at
-    once, because the processor can follow two leaps that do not depend on each other.
+    The line begins at an actor, x, y, z in voxels from the grid's corner. Samples are at most half a voxel
+    apart, so that as many as a voxel's leap need no look.
     """
-    d = grid.distance_m
-    x = (actor[0] - grid.origin[0]) / grid.resolution_m + rule[0]
-    y = (actor[1] - grid.origin[1]) / grid.resolution_m + rule[1]
-    z = (actor[2] - grid.origin[2]) / grid.resolution_m + rule[2]
-    first, end = _samples_inside(x, rule[6], d.shape[0], 0.0, float(count))
-    first, end = _samples_inside(y, rule[7], d.shape[1], first, end)
-    first, end = _samples_inside(z, rule[8], d.shape[2], first, end)
+    x, y, z = x + rule[0], y + rule[1], z + rule[2]
+    first, end = _samples_inside(x, rule[6], sight.size[0], first, end)
+    first, end = _samples_inside(y, rule[7], sight.size[1], first, end)
+    first, end = _samples_inside(z, rule[8], sight.size[2], first, end)
     if not first < end:
         return 0
-    low, high = math.ceil(first), math.ceil(end)
+    k, stop = math.ceil(first), math.ceil(end)
     occupied = 0
-    while low < high:
-        top = high - 1
-        near_is, near = _look(d, x + low * rule[3], y + low * rule[4], z + low * rule[5], rule)
-        far_is, far = _look(d, x + top * rule[3], y + top * rule[4], z + top * rule[5], rule)
-        after, before = low + 1 + near, top - far
-        occupied += near_is * (min(after, high) - low) + far_is * max(high - max(before, after), 0)
-        low, high = after, before
+    while k < stop:
+        is_occupied, leap = _look(sight, x + k * rule[3], y + k * rule[4], z + k * rule[5])
+        if leap == 0:  # foreseen by the processor, which need not wait for this look to take the next
+            occupied += is_occupied
+            k += 1
+        else:
+            after = min(k + 1 + leap, stop)
+            occupied += is_occupied * (after - k)
+            k = after
     return occupied
 
 
@@ -186,49 +233,225 @@ def sample(grid: Grid, points: Float, distance: Float, gradient: Float) -> None:
 
 
 @cached
-def line_shares(grid: Grid, actor: Float, camera: Float, start_m: float, share: Float) -> None:
+def fill_bricks(grid: Grid, bricks: NDArray[np.uint8]) -> None:
+    """Fill zeros with what `Sight.bricks` holds.
+
+    A voxel's distance is M = D - h/2, D from its centre to the nearest one that is not as it is. From a
+    point of a voxel to its centre it is half a diagonal at most: within M + h/2 - sqrt(3) h of any of the
+    voxel's points all is alike.
+    """
+    d = grid.distance_m
+    wide, deep, high = d.shape
+    for i in range(wide):
+        for j in range(deep):
+            for k in range(high):
+                free_voxels = abs(d[i, j, k]) / grid.resolution_m - (_DIAGONAL - 0.5)
+                leap = min(max(int(2.0 * free_voxels - _ROUNDING), 0), _LONGEST_LEAP)
+                within = (i % BRICK * BRICK + j % BRICK) * BRICK + k % BRICK
+                bricks[i // BRICK, j // BRICK, k // BRICK, within] = 2 * leap + (d[i, j, k] < 0.0)
+
+
+@cached
+def line_shares(grid: Grid, sight: Sight, actor: Float, camera: Float, start_m: float, share: Float) -> None:
     """Occupied shares [P] of the sight lines between points [P, 3] and [P, 3], written into `share`."""
     rule = np.zeros(11)
     for p in range(actor.shape[0]):
         x, y, z = camera[p, 0] - actor[p, 0], camera[p, 1] - actor[p, 1], camera[p, 2] - actor[p, 2]
         count = _sampling(x, y, z, start_m, grid.resolution_m, rule)
-        share[p] = _occupied_samples(grid, actor[p], rule, count) / count if count else 0.0
+        share[p] = 0.0
+        if count:
+            x, y, z = (actor[p] - grid.origin) / grid.resolution_m
+            share[p] = _occupied_samples(sight, x, y, z, rule, 0.0, float(count)) / count
+
+
+@helper
+def _look_at_slots(
+    grid: Grid,
+    sight: Sight,
+    actor: Float,
+    offsets: Float,
+    eps_obs_m: float,
+    start_m: float,
+    obstacle: Float,
+    share: Float,
+) -> None:
+    """What `slot_costs` returns, written into arrays of zeros.
+
+    Most sight lines are known to be free from the distances of their two ends: the actor's, of which one
+    look tells for all of them, and the camera's, which the obstacle cost asks for anyway.
+    """
+    times, (states, cameras, _) = actor.shape[0], offsets.shape
+    side_m = grid.resolution_m
+    rules, counts = np.zeros((states, cameras, 11)), np.zeros((states, cameras), np.int64)
+    longest_m = 0.0
+    for s in range(states):
+        for i in range(cameras):
+            x, y, z = offsets[s, i]
+            counts[s, i] = _sampling(x, y, z, start_m, side_m, rules[s, i])
+            longest_m = max(longest_m, rules[s, i, 10])
+    clear = math.ceil(2.0 * eps_obs_m / side_m + 1.0)  # from this leap on the nearest obstacle costs nothing
+    for t in range(times):
+        spare_m = _nearest(grid, actor[t, 0], actor[t, 1], actor[t, 2]) - _DIAGONAL * side_m
+        if spare_m > longest_m + eps_obs_m + (_DIAGONAL + _ROUNDING) * side_m:
+            continue
+        free_m = spare_m + (0.5 - _ROUNDING) * side_m  # about the actor
+        ax = (actor[t, 0] - grid.origin[0]) / side_m
+        ay = (actor[t, 1] - grid.origin[1]) / side_m
+        az = (actor[t, 2] - grid.origin[2]) / side_m
+        # Neighbouring sight lines follow each other, and find what they look up near at hand.
+        for i in range(cameras):
+            for s in range(states):
+                rule, count = rules[s, i], counts[s, i]
+                x, y, z = offsets[s, i]
+                is_occupied, leap = _look(sight, ax + x / side_m, ay + y / side_m, az + z / side_m)
+                if is_occupied or leap < clear:
+                    distance = _interpolate(grid, actor[t, 0] + x, actor[t, 1] + y, actor[t, 2] + z)[0]
+                    obstacle[t, s, i] = min(max(1.0 - distance / eps_obs_m, 0.0), 1.0)
+                first = max(int((free_m - start_m) * rule[9] - 0.5), 0)
+                end = count if is_occupied else count - leap
+                if first < end:
+                    share[t, s, i] = (
+                        _occupied_samples(sight, ax, ay, az, rule, float(first), float(end)) / count
+                    )
 
 
 @cached
 def slot_costs(
-    grid: Grid, actor: Float, offsets: Float, eps_obs_m: float, start_m: float
+    grid: Grid, sight: Sight, actor: Float, offsets: Float, eps_obs_m: float, start_m: float
 ) -> tuple[Float, Float]:
     """Obstacle cost and occupied share of the sight line, both [T, S, n].
 
     Args:
         grid: the distance field.
+        sight: the same for sight lines.
         actor: [T, 3] forecast.
         offsets: [S, n, 3] slots of every state, from the actor.
         eps_obs_m: the distance from which obstacles count.
         start_m: how far off the actor sight lines begin.
     """
-    times, states, cameras = actor.shape[0], offsets.shape[0], offsets.shape[1]
-    obstacle, share = np.zeros((times, states, cameras)), np.zeros((times, states, cameras))
-    # Neighbouring sight lines follow each other, and find what they look up near at hand.
-    rules, counts = np.zeros((cameras, states, 11)), np.zeros((cameras, states), np.int64)
-    for i in range(cameras):
-        for s in range(states):
-            x, y, z = offsets[s, i]
-            counts[i, s] = _sampling(x, y, z, start_m, grid.resolution_m, rules[i, s])
-    for t in range(times):
-        for i in range(cameras):
-            for s in range(states):
-                x, y = actor[t, 0] + offsets[s, i, 0], actor[t, 1] + offsets[s, i, 1]
-                z = actor[t, 2] + offsets[s, i, 2]
-                spare = _nearest(grid, x, y, z) - eps_obs_m
-                if spare < _DIAGONAL * grid.resolution_m:
-                    distance = _interpolate(grid, x, y, z)[0]
-                    obstacle[t, s, i] = min(max(1.0 - distance / eps_obs_m, 0.0), 1.0)
-                count = counts[i, s]
-                if count:
-                    share[t, s, i] = _occupied_samples(grid, actor[t], rules[i, s], count) / count
+    shape = (actor.shape[0], offsets.shape[0], offsets.shape[1])
+    obstacle, share = np.zeros(shape), np.zeros(shape)
+    _look_at_slots(grid, sight, actor, offsets, eps_obs_m, start_m, obstacle, share)
     return obstacle, share
+
+
+# --- the formation search -------------------------------------------------------------------------------
+
+
+@helper
+def _weigh(obstacle: Float, share: Float, w_obs: float, w_occ: float) -> Float:
+    """The cost map [T, S] of what `slot_costs` returns: summed over the drones, the first one first."""
+    times, states, cameras = obstacle.shape
+    cost = np.zeros((times, states))
+    for t in range(times):
+        for s in range(states):
+            for i in range(cameras):
+                cost[t, s] += w_obs * obstacle[t, s, i] + w_occ * share[t, s, i]
+    return cost
+
+
+@helper
+def _search(cost: Float, lattice: Lattice, start: Float) -> tuple[Int64, float]:
+    """See `search.best_sequence`."""
+    times, states = cost.shape
+    value = cost.copy()
+    following = np.zeros((times, states), np.int64)
+    for t in range(times - 2, -1, -1):
+        for s in range(states):
+            best = math.inf
+            for k in range(lattice.neighbours.shape[1]):
+                j = lattice.neighbours[s, k]
+                if j >= 0 and value[t + 1, j] + lattice.move[s, k] < best:
+                    best = value[t + 1, j] + lattice.move[s, k]
+                    following[t, s] = j
+            value[t, s] = cost[t, s] + best
+
+    # The first step starts anywhere between the states.
+    reach_s, way_s = np.zeros(states), np.zeros(states)
+    for s in range(states):
+        for axis in range(3):
+            way = abs(lattice.states[s, axis] - start[axis])
+            if axis == _YAW:
+                way = abs(_wrapped(way))
+            reach_s[s] = max(reach_s[s], way / lattice.rates[axis])
+            way_s[s] += way / lattice.rates[axis]
+    within_s = max(lattice.knot_s, reach_s.min()) + REACHED_S
+    sequence = np.zeros(times, np.int64)
+    total = nearest = math.inf
+    for s in range(states):
+        through = value[0, s] + lattice.w_turn / 2.0 * way_s[s]
+        if reach_s[s] <= within_s and (through < total or (through == total and way_s[s] < nearest)):
+            total, nearest = through, way_s[s]
+            sequence[0] = s
+    for t in range(times - 1):
+        sequence[t + 1] = following[t, sequence[t]]
+    return sequence, total
+
+
+@helper
+def _wrapped(angle_rad: float) -> float:
+    return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@helper
+def _turn_the_shorter_way(slots: Float) -> None:
+    """Make the yaws of slots [T, n, 3] continuous, from knot to knot."""
+    for i in range(slots.shape[1]):
+        first, before, turned = slots[0, i, _YAW], slots[0, i, _YAW], 0.0
+        for t in range(1, slots.shape[0]):
+            yaw = slots[t, i, _YAW]
+            turned += _wrapped(yaw - before)
+            slots[t, i, _YAW] = first + turned
+            before = yaw
+
+
+@cached
+def weighed(obstacle: Float, share: Float, w_obs: float, w_occ: float) -> Float:
+    """C [T, S] of costs [T, S, n]; see `costs.cost_map`."""
+    return _weigh(obstacle, share, w_obs, w_occ)
+
+
+@cached
+def cheapest_sequence(cost: Float, lattice: Lattice, start: Float) -> tuple[Int64, float]:
+    """See `search.best_sequence`."""
+    return _search(cost, lattice, start)
+
+
+@cached
+def turn_the_shorter_way(slots: Float) -> None:
+    """Make the yaws of slots [T, n, 3] continuous, from knot to knot, in place."""
+    _turn_the_shorter_way(slots)
+
+
+@cached
+def cheapest_slots(
+    grid: Grid, sight: Sight, actor: Float, formations: Formations, w: SlotWeights, commanded: Float
+) -> Float:
+    """All of a formation's planning: look at the slots, weigh, search.
+
+    Args:
+        grid: the distance field.
+        sight: the same for sight lines.
+        actor: [T, 3] forecast.
+        formations: which there are.
+        w: what is weighed.
+        commanded: [n, 3] the slots that are commanded now.
+
+    Returns:
+        [T + 1, n, 3] slots at the knots, the first as commanded; yaw is continuous.
+    """
+    shape = (actor.shape[0], formations.slots.shape[0], formations.slots.shape[1])
+    obstacle, share = np.zeros(shape), np.zeros(shape)
+    _look_at_slots(grid, sight, actor, formations.offsets, w.eps_obs_m, w.sight_start_m, obstacle, share)
+    sequence, _ = _search(_weigh(obstacle, share, w.w_obs, w.w_occ), formations.lattice, commanded[0])
+    through = np.empty((shape[0] + 1, shape[2], 3))
+    for i in range(shape[2]):
+        for axis in range(3):
+            through[0, i, axis] = commanded[i, axis]
+            for t in range(shape[0]):
+                through[t + 1, i, axis] = formations.slots[sequence[t], i, axis]
+    _turn_the_shorter_way(through)
+    return through
 
 
 # --- the local planner's cost --------------------------------------------------------------------------

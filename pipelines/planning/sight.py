@@ -40,7 +40,7 @@ def occupied_share(field: DistanceField, camera: Float, actor: Float, *, start_m
     """
     camera, actor = np.broadcast_arrays(camera, actor)
     share = np.empty(camera.shape[:-1])
-    line_shares(field.grid, _flat(actor), _flat(camera), start_m, share.reshape(-1))
+    line_shares(field.grid, field.sight, _flat(actor), _flat(camera), start_m, share.reshape(-1))
     return share
 
 

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.costs import cost_map, costs_of_slots, error_map
-from pipelines.planning.distance_field import open_space
+from pipelines.planning.distance_field import distance_field, open_space
 from pipelines.planning.formation import formation_slots, slot_offsets
 from pipelines.planning.information import log_determinant, predicted_error, ray_information
 from pipelines.planning.sight import occupied_share
+from pipelines.session.records import Occupancy
 from tests.planning.worlds import wall
 
 CONFIG = PlannerConfig(w_obs=2.0, w_occ=3.0)
@@ -36,6 +37,23 @@ def test_obstacles_count_by_distance_and_sight_by_share() -> None:
     assert ((costs.obstacle > 0) & (costs.obstacle < 1)).any()
     total = cost_map(costs, CONFIG)
     assert total == pytest.approx((2 * costs.obstacle + 3 * costs.occluded).sum(axis=2), abs=1e-12)
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.002, 0.02, 0.4]), st.sampled_from([0.3, 3.0]))
+def test_what_the_ends_of_a_line_tell_changes_no_cost(seed: int, share: float, eps_m: float) -> None:
+    """As each slot and each line by itself: few obstacles and many, actors within and outside the map."""
+    rng = np.random.default_rng(seed)
+    occupied = (rng.random((20, 30, 10)) < share).astype(np.float32)
+    field = distance_field(Occupancy(occupied, np.array([-5.0, 0.0, 0.0]), 0.5))
+    config = replace(CONFIG, eps_obs_m=eps_m, sight_start_m=float(rng.choice([0.0, 1.5])))
+    actor = rng.uniform([-15, -10, -3], [15, 25, 8], (6, 3))
+    offsets = slot_offsets(formation_slots(rng.uniform(-3, 3, 7), 3, tilt_rad=0.2, range_m=6.0))
+    costs = costs_of_slots(field, actor, offsets, config)
+    cameras = actor[:, None, None] + offsets
+    distance, _ = field.sample(cameras)
+    assert costs.obstacle == pytest.approx(np.clip(1 - distance / eps_m, 0, 1), abs=1e-12)
+    expected = occupied_share(field, cameras, actor[:, None, None], start_m=config.sight_start_m)
+    assert np.array_equal(costs.occluded, expected)
 
 
 def test_hidden_views_cost_information() -> None:
