@@ -10,9 +10,10 @@ import pytest
 
 from benchmarks.ingest_log import CONTAINERS, RECORDER, in_a_process, ingested, timed, write
 from pipelines.formats.flights.flight_logs import FlightLogs
+from pipelines.formats.flights.pose_doubts import doubts_of_stillness
 from pipelines.formats.logs.mcap_log import McapLog
 from pipelines.formats.logs.recordings import OpenLog
-from pipelines.ingest import doubts_of_stillness, ingest
+from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
 from pipelines.session.records import Trajectory

@@ -1,0 +1,411 @@
+"""The parts of a flight as a session stores them: tables, what session.json says of each, what is doubted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from pipelines.formats.flights.flight_sources import CameraFrames, FlightSources, losses
+from pipelines.formats.flights.pose_doubts import doubts_of_speed, doubts_of_stillness
+from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.clocks import ClockFit
+from pipelines.geometry.poses import gaps
+from pipelines.session.camera_poses import poses_at
+from pipelines.session.description import (
+    ActorEntry,
+    CameraEntry,
+    ClockEntry,
+    FramesEntry,
+    Interpolation,
+    IntrinsicsEntry,
+    KeypointsEntry,
+    LogClockEntry,
+    MapEntry,
+    OriginEntry,
+    PlannedEntry,
+    PosesEntry,
+    TruthEntry,
+)
+from pipelines.session.errors import DataError, MocapError
+from pipelines.session.manifest import Camera, Flight, PoseSource
+from pipelines.session.maps import store_map
+from pipelines.session.records import Detections, Int64, Trajectory
+from pipelines.session.registries import noise_models
+from pipelines.session.storage import write_json
+from pipelines.session.tables import (
+    ACTOR,
+    CAMERA_POSES,
+    FRAMES,
+    KEYPOINTS,
+    PLAN,
+    POSES,
+    POSES_WITH_COVARIANCE,
+    TRUTH,
+    write_table,
+)
+from pipelines.session.tabular import actor_table, frames_table, keypoints_table, motion_table, pose_table
+
+_MUCH_SHORTER = 0.9  # a video that covers less than this share of its pose log is worth a word
+_SHORTER_S = 1.0
+_AHEAD_ROWS = 200_000  # of cameras read while their sources are hashed: some 70 MB
+
+
+@dataclass(frozen=True)
+class _CameraData:
+    """What was read of one camera."""
+
+    detections: Detections | None
+    detector_format: str
+    intrinsics: Intrinsics
+    frames: CameraFrames
+    trajectory: Trajectory
+    notes: list[str]
+
+    @property
+    def rows(self) -> int:
+        """About how many rows it will have in all tables."""
+        return (
+            len(self.frames.t_ns)
+            + len(self.trajectory.t_ns)
+            + (len(self.detections.frame) if self.detections else 0)
+        )
+
+
+class FlightReader:
+    """Reads and stores the parts of one flight; what is doubted is collected as notes.
+
+    A context manager that closes the logs.
+    """
+
+    def __init__(
+        self, flight: Flight, flight_path: Path, session: Path, interpolation: Interpolation
+    ) -> None:
+        self._flight = flight
+        self._flight_path = flight_path
+        self._session = session
+        self._interpolation = interpolation
+        self._max_gap_ns = round(interpolation.max_gap_s * 1e9)
+        self._notes: list[str] = []
+        self._sources = FlightSources(
+            flight, flight_path, max_gap_ns=self._max_gap_ns, note=self._notes.append
+        )
+        self._ahead: dict[str, _CameraData] = {}
+
+    def __enter__(self) -> Self:
+        """The reader itself."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Close the logs."""
+        self._sources.__exit__(*exception)
+
+    def read_ahead(self) -> Iterator[str]:
+        """Read one camera after the other for `store_camera` to take, up to some amount of memory.
+
+        A fault ends it, and shows again when that camera is stored.
+        """
+        for name in self._flight.cameras:
+            if sum(data.rows for data in self._ahead.values()) > _AHEAD_ROWS:
+                return
+            try:
+                self._ahead[name] = self._read_camera(name)
+            except (MocapError, OSError):
+                self._notes.clear()
+                return
+            yield name
+
+    def take_notes(self) -> list[str]:
+        """What was noted since the last time this was asked."""
+        taken = list(dict.fromkeys(self._notes))
+        self._notes.clear()
+        return taken
+
+    def store_camera(self, name: str, folder: Path) -> None:
+        """Write the tables of one camera and what is to be said of them."""
+        camera = self._flight.cameras[name]
+        data = self._ahead.pop(name, None) or self._read_camera(name)
+        detections, frames, trajectory = data.detections, data.frames, data.trajectory
+
+        tables = folder / "tables"
+        tables.mkdir()
+        write_table(tables / "frames.parquet", frames_table(frames.frame, frames.t_ns, frames.pts_ns), FRAMES)
+        write_table(
+            tables / "poses.parquet",
+            pose_table(trajectory),
+            POSES if trajectory.covariance is None else POSES_WITH_COVARIANCE,
+        )
+        if detections is not None:
+            keypoints = keypoints_table(detections, frames.frame, frames.t_ns)
+            write_table(tables / "keypoints.parquet", keypoints, KEYPOINTS)
+        entry = CameraEntry(
+            intrinsics=IntrinsicsEntry.of(data.intrinsics),
+            frames=FramesEntry(
+                count=len(frames.t_ns),
+                first_t_ns=int(frames.t_ns[0]),
+                last_t_ns=int(frames.t_ns[-1]),
+                rate_hz=_rate(frames.t_ns),
+                dropped=frames.dropped,
+            ),
+            poses=self._poses_entry(name, camera, trajectory, frames.t_ns),
+            keypoints=_keypoints_entry(camera, detections, data.detector_format, len(frames.t_ns)),
+            clock=ClockEntry(
+                offset_s=camera.clock.offset_ns / 1e9 if camera.clock else 0.0,
+                sigma_s=camera.clock.sigma_s if camera.clock else frames.start_sigma_s,
+            ),
+            log_clock=_log_clock_entry(self._sources.log_clock(camera)),
+            pose_noise=camera.pose_noise,
+            media=self._sources.media(camera, frames, self._session),
+        )
+        warnings = list(dict.fromkeys(data.notes + self.take_notes()))
+        for what, dropped in (
+            ("frames", entry.frames.dropped),
+            ("poses", entry.poses.dropped),
+            ("keypoints", entry.keypoints.dropped if entry.keypoints else {}),
+        ):
+            warnings += [f"{name}: {what} dropped: {losses(dropped)}"] if dropped else []
+        write_json(folder / "entry.json", {"entry": entry.model_dump(mode="json"), "warnings": warnings})
+
+    def _read_camera(self, name: str) -> _CameraData:
+        """Everything that is read of one camera, checked against each other."""
+        camera, sources = self._flight.cameras[name], self._sources
+        video = sources.video(camera)
+        detections, detector_format = None, ""
+        if camera.keypoints:
+            detections, detector_format = sources.keypoints(camera.keypoints)
+        intrinsics = sources.intrinsics(name, camera, video, detections)
+        frames = sources.frames(name, camera, video, detections, intrinsics)
+        trajectory = sources.trajectory(name, camera, int(frames.t_ns[0]))
+        if camera.pose_noise:
+            noise_models(f"{self._flight_path}: cameras.{name}.pose_noise", camera.pose_noise)
+        if detections is not None:
+            detections = _within(detections, frames)
+            if not len(detections.frame):
+                raise DataError(
+                    self._flight_path,
+                    f"cameras.{name}: no frame of its keypoints is one of its pictures",
+                    "check first_frame and frame_times",
+                )
+        return _CameraData(detections, detector_format, intrinsics, frames, trajectory, self.take_notes())
+
+    def origin(self) -> OriginEntry | None:
+        """Where on Earth the world lies, and what is doubtful about heights counted from there."""
+        found = self._sources.origin()
+        if found is None:
+            return None
+        place = found.place
+        return OriginEntry(
+            latitude_deg=place.latitude_deg,
+            longitude_deg=place.longitude_deg,
+            altitude_m=place.altitude_m,
+            source=found.source,
+        )
+
+    def store_truth(self, folder: Path, entries: Mapping[str, CameraEntry]) -> TruthEntry | None:
+        """Write what is known to be true and say what it spans."""
+        truth = self._flight.truth
+        if truth is None:
+            return None
+        motion = self._sources.true_joints(truth.joints) if truth.joints else None
+        if motion is not None and truth.joints is not None:
+            self._refuse_no_overlap(truth.joints.path, motion.t_ns, entries)
+            write_table(folder / "truth.parquet", motion_table(motion), TRUTH)
+        if truth.poses:
+            import pandas as pd
+
+            tables = [
+                pose_table(self._sources.true_poses(stated)).assign(camera=name)
+                for name, stated in truth.poses.items()
+            ]
+            write_table(folder / "truth_poses.parquet", pd.concat(tables, ignore_index=True), CAMERA_POSES)
+        return TruthEntry(
+            joints=list(motion.joints) if motion else [],
+            people=motion.position.shape[1] if motion else 0,
+            first_t_ns=int(motion.t_ns[0]) if motion else 0,
+            last_t_ns=int(motion.t_ns[-1]) if motion else 0,
+            cameras=list(truth.poses),
+        )
+
+    def store_actor(self, folder: Path, entries: Mapping[str, CameraEntry]) -> ActorEntry | None:
+        """Write where the actor was, as logged."""
+        actor = self._flight.actor
+        if actor is None:
+            return None
+        trajectory = self._sources.actor(actor.log, actor.topic)
+        self._refuse_no_overlap(actor.log, trajectory.t_ns, entries)
+        write_table(folder / "actor.parquet", actor_table(trajectory), ACTOR)
+        return ActorEntry(
+            source=actor.log, point=actor.point, count=len(trajectory.t_ns), dropped=trajectory.dropped
+        )
+
+    def store_map(self, folder: Path, entries: Mapping[str, CameraEntry]) -> MapEntry | None:
+        """Write what stands around: one map, or those of a log that replaced each other.
+
+        What is said of several is said of the last one.
+        """
+        stated = self._flight.map
+        if stated is None:
+            return None
+        if stated.log:
+            logged = self._sources.logged_maps(stated)
+            self._refuse_later_map(stated.log, int(logged.from_ns[0]), entries)
+            occupancy, dropped = store_map(folder, logged.maps), logged.dropped
+        else:
+            path = stated.path or ""
+            occupancy = store_map(folder, [self._sources.map(path, stated.resolution_m)])
+            dropped = occupancy.dropped
+            if self._flight.world.frame == "ned":
+                self._notes.append(f"{path}: the map is taken to be in ENU axes although the world is NED")
+        if dropped:
+            self._notes.append(f"map: dropped: {losses(dropped)}")
+        known = occupancy.probability[~np.isnan(occupancy.probability)]
+        return MapEntry(
+            source=stated.log or stated.path or "",
+            unknown=stated.unknown,
+            resolution_m=occupancy.resolution_m,
+            shape=list(occupancy.probability.shape),
+            occupied=int((known >= 0.5).sum()),
+            free=int((known < 0.5).sum()),
+            dropped=dropped,
+        )
+
+    def store_plan(self, folder: Path, entries: Mapping[str, CameraEntry]) -> dict[str, PlannedEntry] | None:
+        """Write where the on-board planner sent the drones."""
+        plan = self._flight.plan
+        if plan is None:
+            return None
+        import pandas as pd
+
+        tables, found = [], {}
+        for name in (camera for camera in self._flight.cameras if camera in plan.cameras):
+            stated = plan.files.get(name) or plan.log_of(name)
+            sent = self._sources.planned(name, plan)
+            self._refuse_no_overlap(stated, sent.t_ns, entries)
+            if sent.dropped:
+                self._notes.append(f"{name}: commands dropped: {losses(sent.dropped)}")
+            tables.append(pose_table(sent).assign(camera=name))
+            found[name] = PlannedEntry(source=stated, count=len(sent.t_ns), dropped=sent.dropped)
+        write_table(folder / "plan.parquet", pd.concat(tables, ignore_index=True), PLAN)
+        return found
+
+    def _refuse_later_map(self, log: str, from_ns: int, entries: Mapping[str, CameraEntry]) -> None:
+        first, last = _span_of_pictures(entries)
+        if from_ns > last:
+            raise DataError(
+                f"{self._flight_path}: map.log {log}",
+                f"has its first map at {from_ns / 1e9:.3f} s, after the pictures ({span_words(first, last)})",
+                "check its clock, or take `stamps: receive`",
+            )
+
+    def _poses_entry(
+        self, name: str, camera: Camera, trajectory: Trajectory, frames_t_ns: Int64
+    ) -> PosesEntry:
+        static = camera.pose.static is not None
+        poses_t_ns = trajectory.t_ns
+        without_pose = 0
+        if not static:
+            without_pose = self._frames_without_pose(name, camera, trajectory, frames_t_ns)
+            doubts = [*doubts_of_speed(trajectory), *doubts_of_stillness(trajectory)]
+            self._notes += [f"{name}: {doubt}" for doubt in doubts]
+            span, covered = int(np.ptp(poses_t_ns)) / 1e9, int(np.ptp(frames_t_ns)) / 1e9
+            if covered < _MUCH_SHORTER * span and span - covered > _SHORTER_S:
+                self._notes.append(f"{name}: its pictures cover {covered:.1f} s of {span:.1f} s of poses")
+        return PosesEntry(
+            source=_pose_source(camera.pose),
+            static=static,
+            count=len(poses_t_ns),
+            rate_hz=_rate(poses_t_ns),
+            gaps_ns=[] if static else gaps(poses_t_ns, self._max_gap_ns),
+            frames_without_pose=without_pose,
+            dropped=trajectory.dropped,
+            stamps=self._sources.stamps(camera.pose.log) if camera.pose.log else None,
+        )
+
+    def _frames_without_pose(
+        self, name: str, camera: Camera, trajectory: Trajectory, frames_t_ns: Int64
+    ) -> int:
+        position, _ = poses_at(trajectory, frames_t_ns, self._interpolation)
+        without = int(np.isnan(position[:, 0]).sum())
+        if without == len(frames_t_ns):
+            frames, poses = (span_words(*t_ns[[0, -1]]) for t_ns in (frames_t_ns, trajectory.t_ns))
+            raise DataError(
+                self._flight_path.parent / _pose_source(camera.pose),
+                f"has a pose for none of the {without} frames of camera {name}: frames span {frames}, poses"
+                f" {poses} at {_rate(trajectory.t_ns) or 0:.3g} Hz",
+                "check clocks and units, or raise --max-pose-gap",
+            )
+        if without:
+            self._notes.append(
+                f"{name}: {without} of {len(frames_t_ns)} frames have no pose (no logged pose within"
+                f" {self._interpolation.max_gap_s:g} s gaps and {self._interpolation.max_extrapolation_s:g} s"
+                " at the ends)"
+            )
+        return without
+
+    def _refuse_no_overlap(self, stated: str, t_ns: Int64, entries: Mapping[str, CameraEntry]) -> None:
+        first, last = _span_of_pictures(entries)
+        if t_ns[0] > last or t_ns[-1] < first:
+            raise DataError(
+                self._flight_path.parent / stated,
+                f"spans {span_words(t_ns[0], t_ns[-1])}, the pictures {span_words(first, last)}",
+                "check its time base: stamps are world times",
+            )
+
+
+def _keypoints_entry(
+    camera: Camera, detections: Detections | None, detector_format: str, frames: int
+) -> KeypointsEntry | None:
+    if camera.keypoints is None or detections is None:
+        return None
+    return KeypointsEntry(
+        source=camera.keypoints.path,
+        format=detector_format,
+        joints=list(detections.joints),
+        detections=len(detections.frame),
+        people_at_once=int(np.unique(detections.frame, return_counts=True)[1].max()),
+        frames_without_person=frames - len(np.unique(detections.frame)),
+        dropped=detections.dropped,
+    )
+
+
+def _within(detections: Detections, frames: CameraFrames) -> Detections:
+    """The detections of frames that there are; the others are counted."""
+    known = np.isin(detections.frame, frames.frame)
+    if known.all():
+        return detections
+    lost = {"detections in frames without a time": int((~known).sum())}
+    return replace(
+        detections,
+        frame=detections.frame[known],
+        person=detections.person[known],
+        xy=detections.xy[known],
+        confidence=detections.confidence[known],
+        dropped=detections.dropped | lost,
+    )
+
+
+def _log_clock_entry(fit: ClockFit | None) -> LogClockEntry | None:
+    return None if fit is None else LogClockEntry(**asdict(fit))
+
+
+def _pose_source(pose: PoseSource) -> str:
+    drones_own = pose.dji or pose.ulog or pose.ardupilot
+    return pose.tum or pose.csv or drones_own or (pose.static.path if pose.static else pose.log) or ""
+
+
+def _rate(t_ns: Int64) -> float | None:
+    return 1e9 * (len(t_ns) - 1) / float(t_ns[-1] - t_ns[0]) if len(t_ns) > 1 else None
+
+
+def _span_of_pictures(entries: Mapping[str, CameraEntry]) -> tuple[int, int]:
+    """The first and the last frame of all cameras, ns."""
+    frames = [entry.frames for entry in entries.values()]
+    return min(each.first_t_ns for each in frames), max(each.last_t_ns for each in frames)
+
+
+def span_words(first_ns: int, last_ns: int) -> str:
+    """A stretch of time as messages say it."""
+    return f"{first_ns / 1e9:.3f} to {last_ns / 1e9:.3f} s"

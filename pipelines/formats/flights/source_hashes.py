@@ -1,0 +1,96 @@
+"""The hashes of all files that a manifest names, and whether they are what their own checksums say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from hashlib import sha256
+from pathlib import Path
+
+from pipelines.formats.flights.flight_sources import source_files
+from pipelines.formats.logs.mcap_checksums import OTHER_CHECKSUM, CheckedHash, stated_checksum
+from pipelines.session.manifest import Flight
+from pipelines.session.progress import Progress
+from pipelines.session.storage import sha256_of
+
+_HASHERS = 4
+
+
+def hash_sources(
+    flight: Flight, base: Path, progress: Progress, meanwhile: Iterator[object]
+) -> tuple[dict[str, str], dict[str, dict[str, int]]]:
+    """The sha256 of every file that is read, by the path that the manifest states, and what is damaged.
+
+    Args:
+        flight: the manifest.
+        base: the folder that its paths are relative to.
+        progress: who watches.
+        meanwhile: steps to take until all is hashed.
+    """
+    stated: list[str] = []
+
+    def take(*paths: str | None) -> None:
+        stated.extend(path for path in paths if path)
+
+    def take_log(log: str | None) -> None:
+        if log:
+            take(*(flight.logs[log].path if log in flight.logs else [log]))
+
+    for camera in flight.cameras.values():
+        pose, times, video = camera.pose, camera.frame_times, camera.video
+        take(pose.tum, pose.csv, pose.static.path if pose.static else None, camera.intrinsics.path)
+        take(camera.keypoints.path if camera.keypoints else None)
+        gimbal_log = camera.gimbal.log if camera.gimbal else None
+        for log in (pose.log, pose.dji, pose.ulog, pose.ardupilot, camera.intrinsics.log, gimbal_log):
+            take_log(log)
+        if times:
+            take(times.csv, times.srt)
+            for log in (times.log, times.ulog, times.ardupilot):
+                take_log(log)
+        if video:
+            take(video.path)
+            take_log(video.log)
+    if flight.actor:
+        take_log(flight.actor.log)
+    if flight.map:
+        take(flight.map.path)
+        take_log(flight.map.log)
+    if flight.plan:
+        for name in flight.plan.topics:
+            take_log(flight.plan.log_of(name))
+        take(*flight.plan.files.values())
+    if flight.truth:
+        take(flight.truth.joints.path if flight.truth.joints else None, *flight.truth.poses.values())
+    unique = list(dict.fromkeys(stated))
+    progress.start("Hashing sources", len(unique))
+    hashes, damage = {}, {}
+    with ThreadPoolExecutor(_HASHERS) as pool:  # hashing releases the interpreter: long logs side by side
+        hashing = {path: pool.submit(_hash_of, base / path) for path in unique}
+        try:
+            while not all(digest.done() for digest in hashing.values()) and next(meanwhile, None):
+                pass
+            for path, digest in hashing.items():
+                hashes[path], differing = digest.result()
+                if differing:
+                    damage[path] = {OTHER_CHECKSUM: differing}
+                progress.advance()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return hashes, damage
+
+
+def _hash_of(path: Path) -> tuple[str, int]:
+    """The sha256 of a source, and how many of its files are not what their own checksum says.
+
+    A floor plan's YAML is hashed together with the picture that it names.
+    """
+    hashes: list[CheckedHash] = []
+
+    def hash_for(file: Path) -> CheckedHash:
+        hashes.append(CheckedHash(stated_checksum(file)))
+        return hashes[-1]
+
+    digests = [sha256_of(file, hash_for) for file in source_files(path)]
+    digest = digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
+    return digest, sum(each.differs for each in hashes)
