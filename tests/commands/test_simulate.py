@@ -110,10 +110,11 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(small: Path, tm
 
 @pytest.mark.slow
 def test_videos_have_the_frames_that_were_kept_and_workers_do_not_matter(tmp_path: Path) -> None:
+    text = SMALL.replace("duration_s: 2", "duration_s: 1")
     flights = []
     for workers in ("1", "2"):
         (tmp_path / workers).mkdir()
-        flights.append(simulated(tmp_path / workers, SMALL, "--workers", workers))
+        flights.append(simulated(tmp_path / workers, text, "--workers", workers))
     logs = [
         {name: digest for name, digest in content(flight.parent).items() if not name.endswith(".mp4")}
         for flight in flights
@@ -121,7 +122,7 @@ def test_videos_have_the_frames_that_were_kept_and_workers_do_not_matter(tmp_pat
     assert logs[0] == logs[1]
 
     summary = json.loads((flights[0].parent / "simulation.json").read_text())
-    assert summary["frames"]["drone1"] < 60  # some were dropped
+    assert summary["frames"]["drone1"] < 30  # some were dropped
     stated: dict[str, Any] = json.loads(succeeds("ingest", flights[0], "--json"))
     camera = stated["cameras"]["drone2"]
     assert camera["frames"]["count"] == summary["frames"]["drone2"]
@@ -252,7 +253,9 @@ def test_ways_to_where_the_actor_stands_are_no_ways(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_an_interrupted_rendering_goes_on_where_it_was(tmp_path: Path) -> None:
-    path = scenario(tmp_path, SMALL.replace("duration_s: 2", "duration_s: 5"))
+    text = SMALL.replace("duration_s: 2", "duration_s: 3")  # two parts
+    text = text.replace("count: 2", "count: 1").replace("[0, 0.12]", "[0]")
+    path = scenario(tmp_path, text)
     output, parts = tmp_path / "flight", tmp_path / ".flight.making"
     command = [MOCAP, "simulate", str(path), "-o", str(output), "--workers", "1"]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import pytest
+
 from tests.commands.runner import mocap_process
 from tests.kills.killing import Command, soak
 from tests.synthetic.flights import write_flight
@@ -12,6 +14,7 @@ from tests.synthetic.flights import write_flight
 SEED, KILLS = 7, 4
 
 
+@pytest.mark.slow
 def test_killed_and_run_again_the_bytes_are_those_of_an_undisturbed_run(tmp_path: Path) -> None:
     manifest = write_flight(tmp_path, seconds=0.5).manifest
     ingested, session, exported = tmp_path / "a.session", tmp_path / "b.session", tmp_path / "exported"
