@@ -28,7 +28,7 @@ from pipelines.session.progress import Progress, Silent
 from pipelines.session.stages import Stage, StageRecord, locked
 from pipelines.session.storage import read_json, write_json
 
-INGEST = Stage("ingest", revision=1)
+INGEST = Stage("ingest", revision=2)
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,12 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipelines.geometry.cameras import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
+from pipelines.session.records import Occupancy
 from pipelines.session.storage import read_json
 
 SCHEMA = 1
@@ -148,8 +150,30 @@ class ActorEntry(Entry):
         return _HIP_ABOVE_M[self.point]
 
 
+class HeldMap(Entry):
+    """One map, voxel counts included; unknown voxels count neither as occupied nor as free."""
+
+    from_ns: int  # it holds from then on, until the next one does
+    resolution_m: float
+    shape: list[int]
+    occupied: int
+    free: int
+
+    @classmethod
+    def of(cls, occupancy: Occupancy) -> HeldMap:
+        """The entry of a map."""
+        occupied, free = occupancy.probability >= 0.5, occupancy.probability < 0.5  # NaN is neither
+        return cls(
+            from_ns=occupancy.from_ns,
+            resolution_m=occupancy.resolution_m,
+            shape=list(occupancy.probability.shape),
+            occupied=int(np.count_nonzero(occupied)),
+            free=int(np.count_nonzero(free)),
+        )
+
+
 class MapEntry(Entry):
-    """What stands around; unknown voxels count neither as occupied nor as free."""
+    """What stands around; where maps replaced each other, the figures beside `maps` are the last one's."""
 
     source: str
     unknown: str  # what the planner takes unknown voxels for
@@ -158,6 +182,7 @@ class MapEntry(Entry):
     occupied: int
     free: int
     dropped: dict[str, int]
+    maps: list[HeldMap] = []  # every one, as in map/index.json; sessions of before do not say
 
 
 class PlannedEntry(Entry):

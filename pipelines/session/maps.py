@@ -26,6 +26,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.session.description import HeldMap
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Occupancy
 from pipelines.session.storage import as_data_error, jsonable, read_json, write_json
@@ -111,7 +112,7 @@ def describe_grid(
     }
 
 
-def store_map(folder: Path, occupancies: Iterable[Occupancy]) -> Occupancy:
+def store_map(folder: Path, occupancies: Iterable[Occupancy]) -> list[HeldMap]:
     """Write `map/` into an existing folder (a session, or a stage that is being written).
 
     The maps are taken one at a time, so that a log's many maps need not be in memory together.
@@ -121,13 +122,14 @@ def store_map(folder: Path, occupancies: Iterable[Occupancy]) -> Occupancy:
         occupancies: at least one, in the order of the times from which they hold.
 
     Returns:
-        The last of them.
+        What each of them holds.
     """
     place = folder / "map"
     place.mkdir()
-    index = []
+    index, held = [], []
     for k, occupancy in enumerate(occupancies):
         write_grid(place / f"{k}.npz", occupancy)
+        held.append(HeldMap.of(occupancy))
         index.append(
             {
                 "file": f"{k}.npz",
@@ -138,7 +140,7 @@ def store_map(folder: Path, occupancies: Iterable[Occupancy]) -> Occupancy:
             }
         )
     write_json(place / "index.json", jsonable({"maps": index}))
-    return occupancy
+    return held
 
 
 def load_maps(session: Path) -> list[Occupancy]:

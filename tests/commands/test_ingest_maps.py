@@ -65,6 +65,12 @@ def test_maps_of_a_log_are_stored_with_their_times(tmp_path: Path, container: Co
         np.testing.assert_allclose(one.origin, [-10, -10, 0], rtol=0, atol=1e-9)
     stored = json.loads((session / "session.json").read_text(encoding="utf-8"))
     assert stored["map"]["occupied"] == 48  # of the last one
+    assert [(one["from_ns"], one["occupied"], one["free"]) for one in stored["map"]["maps"]] == [
+        (start_ns, 24, 40 * 40 - 3),
+        (start_ns + 3 * SECOND // 5, 48, 40 * 40 - 6),
+    ]
+    for one, entry in zip(stored["map"]["maps"], index, strict=True):
+        assert (one["resolution_m"], one["shape"]) == (0.5, entry["shape"])
     assert stored["map"]["dropped"] == {}
     assert any(flight.settings["map"]["log"] in path for path in stored["sources"])
 

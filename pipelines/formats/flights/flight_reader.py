@@ -242,34 +242,31 @@ class FlightReader:
         )
 
     def store_map(self, folder: Path, entries: Mapping[str, CameraEntry]) -> MapEntry | None:
-        """Write what stands around: one map, or those of a log that replaced each other.
-
-        What is said of several is said of the last one.
-        """
+        """Write what stands around: one map, or those of a log that replaced each other."""
         stated = self._flight.map
         if stated is None:
             return None
         if stated.log:
             logged = self._sources.logged_maps(stated)
             self._refuse_later_map(stated.log, int(logged.from_ns[0]), entries)
-            occupancy, dropped = store_map(folder, logged.maps), logged.dropped
+            held, dropped = store_map(folder, logged.maps), logged.dropped
         else:
             path = stated.path or ""
-            occupancy = store_map(folder, [self._sources.map(path, stated.resolution_m)])
-            dropped = occupancy.dropped
+            occupancy = self._sources.map(path, stated.resolution_m)
+            held, dropped = store_map(folder, [occupancy]), occupancy.dropped
             if self._flight.world.frame == "ned":
                 self._notes.append(f"{path}: the map is taken to be in ENU axes although the world is NED")
         if dropped:
             self._notes.append(f"map: dropped: {losses(dropped)}")
-        known = occupancy.probability[~np.isnan(occupancy.probability)]
         return MapEntry(
             source=stated.log or stated.path or "",
             unknown=stated.unknown,
-            resolution_m=occupancy.resolution_m,
-            shape=list(occupancy.probability.shape),
-            occupied=int((known >= 0.5).sum()),
-            free=int((known < 0.5).sum()),
+            resolution_m=held[-1].resolution_m,
+            shape=held[-1].shape,
+            occupied=held[-1].occupied,
+            free=held[-1].free,
             dropped=dropped,
+            maps=held,
         )
 
     def store_plan(self, folder: Path, entries: Mapping[str, CameraEntry]) -> dict[str, PlannedEntry] | None:
