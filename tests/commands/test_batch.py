@@ -136,6 +136,7 @@ def test_cluster_makes_the_bytes_of_single_runs_and_a_killed_worker_loses_nothin
     assert (counts["flights"], counts["failed"], counts["unchanged"]) == (2, 0, 2)
 
 
+@pytest.mark.slow
 def test_all_stages_of_a_flight_are_those_of_the_commands(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, seconds=1.2)
     session = tmp_path / "flight.session"

@@ -26,7 +26,7 @@ def test_the_detector_and_true_poses_give_the_skeleton(tmp_path: Path) -> None:
     session = tmp_path / "flight" / "true_poses.session"
     succeeds("ingest", tmp_path / "flight" / "true_poses.yaml")
     metrics: dict[str, Any] = json.loads(
-        succeeds("reconstruct", session, "--every", "3", "--workers", "2", "--json")
+        succeeds("reconstruct", session, "--every", "6", "--workers", "2", "--json")
     )
     assert metrics["mpjpe_mm"] < 45
     assert metrics["reconstructed_share"] > 0.95
