@@ -17,6 +17,7 @@ from pipelines.reporting.filmed import read_filmed, refined_poses
 from pipelines.reporting.frame_drawing import caption_of, draw_frame
 from pipelines.reporting.motion import motion_from_skeleton
 from pipelines.reporting.overlays import status_at, views_of
+from pipelines.reporting.placing import estimated_clocks
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import BusyError, DataError
 from pipelines.session.maps import read_grid
@@ -202,8 +203,8 @@ def _pictures(folder: Path, description: Description, record: StageRecord | None
         frames = read_table(folder / "cameras" / camera / "frames.parquet", FRAMES)
         t_ns = frames["t_ns"].to_numpy(np.int64)
         if record is not None:
-            offsets = read_json(folder / "reconstruct" / "metrics.json").get("clock_offsets_s", {})
-            t_ns = t_ns + round((offsets.get(camera) or 0.0) * 1e9)
+            clocks = estimated_clocks(read_json(folder / "reconstruct" / "metrics.json"))
+            t_ns = t_ns + clocks.get(camera, 0)
         frame = frames["frame"].to_numpy(np.int64)
         for row, picture in _stills(folder, description, camera, frame, thinned(t_ns, rate_hz)):
             yield int(t_ns[row]), picture

@@ -79,14 +79,15 @@ def report(folder: Path, *, force: bool = False) -> Reported:
         inputs |= {
             f"key of {name}": record.key for name, record in records.items()
         }  # their settings are shown
-        settings = {"name": session_name(folder), "pictures": _pictures_there(folder)}
+        description = read_description(folder)
+        settings = {"name": session_name(folder), "pictures": _pictures_there(folder, description)}
         run = session.begin(REPORT, settings=settings, inputs=inputs, force=force)
         page = folder / "report" / "index.html"
         if run.finished:
             return Reported(page, run.record, skipped=True)
         with ExitStack() as stack:
-            pictures, warnings = _open_pictures(folder, stack)
-            html = render_page(_load(folder, records), read_frame=partial(_read_frame, pictures))
+            pictures, warnings = _open_pictures(folder, description, stack)
+            html = render_page(_load(folder, description, records), read_frame=partial(_read_frame, pictures))
         (run.folder / "index.html").write_text(html, encoding="utf-8")
         record = run.publish(counts={}, warnings=warnings)
     return Reported(page, record, skipped=False)
@@ -118,10 +119,7 @@ def compare_sessions(
     for folder, place in zip(folders, resolved, strict=True):
         if resolved.count(place) > 1:
             raise DataError(folder, "is stated twice", "state every session once")
-    contents = {
-        label: _load(folder, _finished_stages(open_session(folder)))
-        for label, folder in zip(_labels(resolved), folders, strict=True)
-    }
+    contents = {label: _content_of(folder) for label, folder in zip(_labels(resolved), folders, strict=True)}
     page = output or resolved[0].parent / "comparison" / "index.html"
     html, _ = render_comparison(contents)
     try:
@@ -169,7 +167,8 @@ def write_figures_of(
     records = [_finished_stages(open_session(folder)) for folder in folders]
     labels = _labels([folder.resolve() for folder in folders])
     keys = [{name: record.key for name, record in own.items()} for own in records]
-    pictures_there = [_pictures_there(folder) for folder in folders]
+    descriptions = [read_description(folder) for folder in folders]
+    pictures_there = [_pictures_there(*each) for each in zip(folders, descriptions, strict=True)]
     told = {
         "revision": _FIGURES_REVISION,
         "pictures": pictures_there,
@@ -179,11 +178,12 @@ def write_figures_of(
     if not force and is_made(target, key, mark=MARK):
         return Figures(target, skipped=True)
     contents = {
-        label: _load(folder, own) for label, folder, own in zip(labels, folders, records, strict=True)
+        label: _load(*each)
+        for label, each in zip(labels, zip(folders, descriptions, records, strict=True), strict=True)
     }
     with ExitStack() as stack:
         if len(folders) == 1:
-            pictures, _ = _open_pictures(folders[0], stack)
+            pictures, _ = _open_pictures(folders[0], descriptions[0], stack)
             plates = draw_session(contents[labels[0]], partial(_read_frame, pictures))
         else:
             plates = draw_comparison(compare(contents))
@@ -229,17 +229,18 @@ def _finished_stages(session: Session) -> dict[str, StageRecord]:
     return {name: record for name, record in records.items() if record is not None}
 
 
-def _pictures_there(folder: Path) -> list[str]:
+def _pictures_there(folder: Path, description: Description) -> list[str]:
     """The cameras whose pictures are still where they were."""
-    cameras = read_description(folder).cameras
-    media = {name: entry.media for name, entry in cameras.items() if entry.media}
+    media = {name: entry.media for name, entry in description.cameras.items() if entry.media}
     return [name for name, entry in media.items() if all((folder / path).exists() for path in entry.paths)]
 
 
-def _open_pictures(folder: Path, stack: ExitStack) -> tuple[dict[str, Pictures], list[str]]:
+def _open_pictures(
+    folder: Path, description: Description, stack: ExitStack
+) -> tuple[dict[str, Pictures], list[str]]:
     """The pictures of every camera that still has them; missing ones cost overlays only, and are said."""
     opened, warnings = {}, []
-    for name, entry in read_description(folder).cameras.items():
+    for name, entry in description.cameras.items():
         if entry.media is None:
             continue
         try:
@@ -253,8 +254,12 @@ def _read_frame(pictures: dict[str, Pictures], camera: str, frame: int) -> Pictu
     return pictures[camera].read(frame) if camera in pictures else None
 
 
-def _load(folder: Path, records: dict[str, StageRecord]) -> SessionContent:
-    description = read_description(folder)
+def _content_of(folder: Path) -> SessionContent:
+    records = _finished_stages(open_session(folder))
+    return _load(folder, read_description(folder), records)
+
+
+def _load(folder: Path, description: Description, records: dict[str, StageRecord]) -> SessionContent:
     reconstructed = "reconstruct" in records
     has_truth = description.truth is not None and bool(description.truth.joints)
     keypoints = {
@@ -270,7 +275,7 @@ def _load(folder: Path, records: dict[str, StageRecord]) -> SessionContent:
         }
     return SessionContent(
         name=session_name(folder),
-        session=description.model_dump(mode="json", by_alias=True),
+        session=description,
         skeleton=read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON) if reconstructed else None,
         metrics=read_json(folder / "reconstruct" / "metrics.json") if reconstructed else None,
         truth=read_table(folder / "truth.parquet", TRUTH) if has_truth else None,

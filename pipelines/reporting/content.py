@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from pipelines.session.description import Description
 from pipelines.session.records import Occupancy
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ class SessionContent:
     """Everything the page of one session needs; what a session does not hold is None or empty."""
 
     name: str
-    session: dict[str, object]  # session.json
+    session: Description
     skeleton: pd.DataFrame | None  # tables.SKELETON
     metrics: dict[str, object] | None  # reconstruct/metrics.json
     truth: pd.DataFrame | None  # tables.TRUTH

@@ -55,7 +55,7 @@ def write_figures(
         words = {"title": plate.title, "caption": plate.caption, "description": plate.description}
         told.append({"figure": plate.key, **words, "files": names})
     sessions = {
-        label: {"flight": content.session.get("flight"), "simulated": content.session.get("simulated", False)}
+        label: {"flight": content.session.flight, "simulated": content.session.simulated}
         for label, content in contents.items()
     }
     write_json(folder / MARK, {"schema": 1, "key": key, "sessions": sessions, "figures": told})

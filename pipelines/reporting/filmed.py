@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.reporting.overlays import FilmedCamera
+from pipelines.reporting.placing import estimated_clocks
 from pipelines.session.description import Description
 from pipelines.session.records import Trajectory
 from pipelines.session.stages import StageRecord
@@ -36,7 +37,7 @@ def read_filmed(
         record: of its reconstruction: keypoints less sure than it used are left out.
         cameras: which ones.
     """
-    offsets_s = read_json(folder / "reconstruct" / "metrics.json").get("clock_offsets_s", {})
+    offset_ns = estimated_clocks(read_json(folder / "reconstruct" / "metrics.json"))
     refined = refined_poses(folder)
     filmed = {}
     for name in cameras:
@@ -45,12 +46,11 @@ def read_filmed(
         keypoints = read_table(folder / stage / name / "keypoints.parquet", KEYPOINTS)
         frames = read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
         logged = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
-        offset_ns = round((offsets_s.get(name) or 0.0) * 1e9)
         filmed[name] = FilmedCamera(
             name=name,
             intrinsics=entry.intrinsics.intrinsics(),
             frame=frames["frame"].to_numpy(np.int64),
-            frame_t_ns=frames["t_ns"].to_numpy(np.int64) + offset_ns,
+            frame_t_ns=frames["t_ns"].to_numpy(np.int64) + offset_ns.get(name, 0),
             keypoints=keypoints[keypoints["confidence"] >= record.settings["min_confidence"]],
             track=refined.get(name, logged),
             static=entry.poses.static,

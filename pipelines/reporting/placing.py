@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -13,15 +14,25 @@ from pipelines.session.records import Float, Int64
 from pipelines.session.tabular import trajectory_from
 
 
+def estimated_clocks(metrics: Mapping[str, object]) -> dict[str, int]:
+    """How much later than ingested the frames of a camera are, ns, by what a reconstruction estimated.
+
+    Args:
+        metrics: reconstruct/metrics.json.
+    """
+    offsets = section(metrics, "clock_offsets_s")
+    return {name: round((number(offsets, name) or 0.0) * 1e9) for name in offsets}
+
+
 def as_reconstructed(content: SessionContent) -> SessionContent:
     """The session with the poses and the clocks that its skeleton was measured with.
 
     Refined poses take the place of the logged ones, and frames come at the times of the clocks that were
     estimated: only so are residuals those of the reconstruction.
     """
-    offsets = section(content.metrics or {}, "clock_offsets_s")
+    offset_ns = estimated_clocks(content.metrics or {})
     frames = {
-        name: table.assign(t_ns=table["t_ns"] + round((number(offsets, name) or 0.0) * 1e9))
+        name: table.assign(t_ns=table["t_ns"] + offset_ns.get(name, 0))
         for name, table in content.frames.items()
     }
     return replace(content, poses=content.poses | content.refined, frames=frames)

@@ -131,7 +131,7 @@ class Summary:
 
 def summarise(content: SessionContent) -> Summary:
     """Every number that the page shows."""
-    description = Description.model_validate(content.session)
+    description = content.session
     origin_ns = description.start_ns
     has_rows = content.skeleton is not None and len(content.skeleton) > 0
     motion = motion_from_skeleton(content.skeleton) if content.skeleton is not None and has_rows else None

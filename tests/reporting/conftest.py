@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from pipelines.reporting.content import SessionContent
+from pipelines.session.description import Description
 from pipelines.session.tables import KEYPOINTS, SKELETON, STATUS
 
 START_NS = 1_700_000_000_000_000_000
@@ -260,11 +261,15 @@ STAGES: dict[str, dict[str, object]] = {
 }
 
 
+def described(session: dict[str, object]) -> Description:
+    return Description.model_validate(session)
+
+
 @pytest.fixture(scope="session")
 def content() -> SessionContent:
     return SessionContent(
         name="Walk on a circle",
-        session=make_session(),
+        session=described(make_session()),
         skeleton=make_skeleton(),
         metrics=make_metrics(),
         truth=make_truth(),

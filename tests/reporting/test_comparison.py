@@ -183,7 +183,7 @@ def test_sessions_that_cannot_be_compared_are_said(content: SessionContent) -> N
 
 
 def test_unlike_sessions_are_doubted(content: SessionContent) -> None:
-    simulated = {**content.session, "simulated": True}
+    simulated = content.session.model_copy(update={"simulated": True})
     other = replace(content, session=simulated, metrics={"method": "dlt"})
     text = _told({"a": content, "b": other})
     assert "The sessions were reconstructed by different methods: “a” robust and “b” dlt." in text

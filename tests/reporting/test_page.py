@@ -27,6 +27,7 @@ from .conftest import (
     FRAMES,
     JOINTS,
     START_NS,
+    described,
     make_frames,
     make_keypoints,
     make_metrics,
@@ -239,7 +240,7 @@ def test_page_of_an_empty_skeleton(content: SessionContent) -> None:
 def test_page_of_a_single_frame(content: SessionContent) -> None:
     single = replace(
         content,
-        session=make_session(1),
+        session=described(make_session(1)),
         skeleton=make_skeleton(1).assign(status="ok", x=1.0, y=2.0, z=3.0, reprojection_px=1.0),
         truth=make_truth(1),
         poses={name: table[:1] for name, table in make_poses().items()},
@@ -293,7 +294,7 @@ def _named(content: SessionContent, name: str) -> SessionContent:
     return replace(
         content,
         name=f"s {name}",
-        session=session,
+        session=described(session),
         skeleton=skeleton,
         metrics=metrics,
         truth=make_truth(60),
@@ -366,7 +367,7 @@ def test_long_flight_stays_small_and_says_what_is_left_out(content: SessionConte
     frames = 10 * 60 * 30
     long_flight = replace(
         content,
-        session=make_session(frames),
+        session=described(make_session(frames)),
         skeleton=make_skeleton(frames),
         truth=make_truth(frames),
         poses=make_poses(frames),

@@ -15,7 +15,7 @@ from pipelines.reporting.summary import summarise
 from pipelines.reporting.wording import THIN
 from pipelines.session.tables import COVARIANCE_COLUMNS
 
-from .conftest import make_poses, make_session
+from .conftest import described, make_poses, make_session
 from .test_page import _Outline
 
 
@@ -46,7 +46,7 @@ def test_who_states_the_pose_noise_is_said(content: SessionContent) -> None:
     cameras["drone1"]["pose_noise"] = noise
     logged = make_poses()["drone2"]
     logged[list(COVARIANCE_COLUMNS)] = np.eye(6)[np.triu_indices(6)] * 0.04
-    stated = _rows(replace(content, session=session, poses=content.poses | {"drone2": logged}))
+    stated = _rows(replace(content, session=described(session), poses=content.poses | {"drone2": logged}))
     assert stated["drone1"].stated == f"white 0.1{THIN}m, 0.5{THIN}deg; bias frame body, 0.2{THIN}m"
     assert stated["drone2"].stated == f"by the log: 0.200{THIN}m, {np.degrees(0.2):.2f}{THIN}deg"
     assert stated["mast"].stated == "stands still"
@@ -81,7 +81,10 @@ def test_frames_that_the_detector_left_out_do_not_count(content: SessionContent)
     every_third = every_third[(every_third["frame"] % 3 == 0) & (every_third["frame"] < 300)]
     stages = content.stages | {"detect": {"counts": {"cameras": {"drone1": {"frames": 200}}}}}
     found = replace(
-        content, session=session, keypoints=content.keypoints | {"drone1": every_third}, stages=stages
+        content,
+        session=described(session),
+        keypoints=content.keypoints | {"drone1": every_third},
+        stages=stages,
     )
     assert _rows(found)["drone1"].detected == pytest.approx(0.5)
 

@@ -10,7 +10,7 @@ from pipelines.reporting.content import SessionContent
 from pipelines.reporting.summary import errors_per_camera, give_verdict, measures, summarise
 from pipelines.reporting.wording import THIN
 
-from .conftest import FRAMES, JOINTS, OFFSET_M, make_session, make_skeleton, statuses
+from .conftest import FRAMES, JOINTS, OFFSET_M, described, make_session, make_skeleton, statuses
 
 
 def _said(content: SessionContent) -> str:
@@ -181,7 +181,7 @@ def test_no_warnings_no_doubts(content: SessionContent) -> None:
     session["cameras"] = {"drone1": cameras["drone1"]}
     skeleton = make_skeleton(20)
     complete = skeleton.assign(status="ok", x=1.0, y=2.0, z=0.5)
-    quiet = replace(content, session=session, skeleton=complete, stages={})
+    quiet = replace(content, session=described(session), skeleton=complete, stages={})
     verdict = give_verdict(quiet, summarise(quiet))
     assert verdict.lead.startswith("All of the motion was reconstructed: 100")
     assert verdict.doubts == ()

@@ -20,6 +20,7 @@ from .conftest import (
     JOINTS,
     OFFSET_M,
     START_NS,
+    described,
     make_poses,
     make_session,
     make_skeleton,
@@ -127,7 +128,7 @@ def test_long_flight_is_thinned_and_says_so(content: SessionContent) -> None:
     frames = 12_000
     long_flight = replace(
         content,
-        session=make_session(frames),
+        session=described(make_session(frames)),
         skeleton=make_skeleton(frames),
         truth=make_truth(frames),
         poses=make_poses(frames),
