@@ -17,11 +17,7 @@ from pathlib import Path
 from pipelines.formats.flights.flight_reader import FlightReader, span_words
 from pipelines.formats.flights.flight_sources import losses
 from pipelines.formats.flights.source_hashes import hash_sources
-from pipelines.session.description import (
-    CameraEntry,
-    Description,
-    Interpolation,
-)
+from pipelines.session.description import CameraEntry, Description, Interpolation, read_description
 from pipelines.session.errors import DataError, NotYetReadError
 from pipelines.session.manifest import Flight, read_flight
 from pipelines.session.progress import Progress, Silent
@@ -88,7 +84,7 @@ def ingest(
         with locked(target, create=True, overwrite=overwrite) as writable:
             run = writable.begin(INGEST, settings=settings, inputs=sources, force=force)
             if run.finished:
-                stored_description = _stored_description(target)
+                stored_description = read_description(target)
                 if strict:
                     _refuse_losses(flight_path, stored_description)
                 return Ingested(target, run.record, stored_description, skipped=True)
@@ -133,10 +129,6 @@ def ingest(
             write_json(run.folder / "session.json", description.model_dump(mode="json", by_alias=True))
             record = run.publish(counts=_counts(entries), warnings=warnings)
     return Ingested(target, record, description, skipped=False)
-
-
-def _stored_description(folder: Path) -> Description:
-    return Description.model_validate(read_json(folder / "session.json"))
 
 
 def _refuse_losses(flight_path: Path, description: Description) -> None:
