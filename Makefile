@@ -31,7 +31,7 @@ demo: setup
 # The bytecode first: where Python is told to write none, every command under test would compile all modules.
 test: setup
 	$(BIN)/python -m compileall -qq mocap_cli pipelines
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 20 --durations-min 5
 
 lint: setup
 	$(BIN)/ruff format --check .

@@ -37,6 +37,8 @@ _COMPILING = (
     "planning/test_costs.py",
     "planning/test_local.py",
     "simulation/rendering/test_renderer.py",
+    "planning/test_search.py",
+    "simulation/test_flying.py",
 )
 
 

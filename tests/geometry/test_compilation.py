@@ -22,6 +22,12 @@ def quarter(x):
 """
 
 
+@pytest.fixture(autouse=True)
+def _cache_beside_the_source(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever the user keeps numba's cache."""
+    monkeypatch.setattr("numba.config.CACHE_DIR", "")
+
+
 @pytest.fixture
 def load_quarter(tmp_path: Path) -> Callable[[], Callable[[float], float]]:
     """Import the module anew, as the next process would."""
