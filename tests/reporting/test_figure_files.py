@@ -136,7 +136,7 @@ def test_a_comparison_of_sessions_has_its_numbers(content: SessionContent, tmp_p
 def test_files_are_the_same_every_time_and_leave_the_page_as_it_is(
     content: SessionContent, tmp_path: Path
 ) -> None:
-    drawn = []
+    drawn: list[str] = []
     for folder in (tmp_path / "first", tmp_path / "second"):
         folder.mkdir()
         with mpl.rc_context({"font.size": 20, "svg.fonttype": "path", "pdf.fonttype": 3}):
