@@ -256,8 +256,10 @@ def test_refined_is_one_of_the_methods_and_says_where_it_fell_back(tmp_path: Pat
 def test_workers_do_not_matter_and_a_study_that_is_there_is_not_made_again(tmp_path: Path) -> None:
     made = []
     for workers in ("1", "2"):
-        options = ("--seconds", "4", "--rate", "5", "--trials", "2", "--workers", workers)
-        options += ("--methods", "dlt,robust", "--robots", "2,3", "--levels", "none,low")
+        options = (
+            *("--seconds", "4", "--rate", "5", "--trials", "2", "--workers", workers),
+            *("--methods", "dlt,robust", "--robots", "2,3", "--levels", "none,low"),
+        )
         text = succeeds("robots", *options, "-o", tmp_path / workers)
         assert text.startswith("Simulated: ")
         made.append((text.replace(str(tmp_path / workers), ""), content(tmp_path / workers)))
