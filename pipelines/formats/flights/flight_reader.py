@@ -9,7 +9,8 @@ from typing import Self
 
 import numpy as np
 
-from pipelines.formats.flights.flight_sources import CameraFrames, FlightSources, losses
+from pipelines.formats.flights.flight_sources import FlightSources, losses
+from pipelines.formats.flights.frame_sources import CameraFrames
 from pipelines.formats.flights.pose_doubts import doubts_of_speed, doubts_of_stillness
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.clocks import ClockFit

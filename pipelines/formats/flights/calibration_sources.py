@@ -1,0 +1,118 @@
+"""The calibration of a camera, from whatever its manifest names, for pictures of their size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.formats.flights.flight_logs import FlightLogs
+from pipelines.geometry.cameras import Intrinsics, fit_to_size
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import Camera, IntrinsicsSource
+from pipelines.session.records import CalibratedCamera, Detections, VideoIndex
+from pipelines.session.registries import CalibrationFormat, recognise
+
+_LARGEST_SHARE_OUTSIDE = 0.05  # of keypoints beyond the picture; detectors overshoot the border a little
+
+
+class CalibrationSources:
+    """Reads the calibrations of one flight, each file once.
+
+    Args:
+        manifest: the path of the manifest.
+        logs: of the flight.
+        note: told what is doubtful, one line each.
+    """
+
+    def __init__(self, manifest: Path, logs: FlightLogs, note: Callable[[str], None]) -> None:
+        self._manifest = manifest
+        self._base = manifest.parent
+        self._logs = logs
+        self._note = note
+        self._read: dict[str, dict[str, CalibratedCamera]] = {}
+
+    def intrinsics(
+        self, name: str, camera: Camera, video: VideoIndex | None, detections: Detections | None
+    ) -> Intrinsics:
+        """The intrinsics of a camera, fitted to the size of its pictures.
+
+        Raises:
+            DataError: not there, of pictures of another shape, or too small for the keypoints.
+        """
+        source = camera.intrinsics
+        place = f"{self._manifest}: cameras.{name}.intrinsics"
+        if source.path:
+            calibrated = self.camera(name, source.path, source.camera)
+            if calibrated.intrinsics is None:
+                raise DataError(
+                    self._base / source.path, "holds poses but no intrinsics", "name one with both"
+                )
+            intrinsics = calibrated.intrinsics
+        elif source.log:
+            intrinsics = self._logs.intrinsics(source.log, source.topic).intrinsics
+        else:
+            intrinsics = _inline_intrinsics(source, place)
+        if source.readout_s:
+            intrinsics = replace(intrinsics, readout_s=source.readout_s)
+        size = (video.width, video.height) if video else (detections.image_size if detections else None)
+        if size:
+            try:
+                intrinsics, note = fit_to_size(intrinsics, *size)
+            except ValueError as error:
+                remedy = "give the calibration that belongs to these pictures"
+                raise DataError(place, str(error), remedy) from None
+            if note:
+                self._note(f"{name}: {note}")
+        if detections is not None:
+            _refuse_keypoints_outside(place, intrinsics, detections)
+        return intrinsics
+
+    def camera(self, name: str, path: str, camera: str | None) -> CalibratedCamera:
+        """The camera of a calibration file that is asked for, bears this name, or is the only one."""
+        if path not in self._read:
+            file = self._base / path
+            self._read[path] = recognise(file, CalibrationFormat, "calibration").read_calibration(file)
+        cameras = self._read[path]
+        if camera is None and name not in cameras and len(cameras) == 1:
+            return next(iter(cameras.values()))
+        if (camera or name) not in cameras:
+            listed = ", ".join(sorted(cameras)[:20])
+            raise DataError(
+                self._base / path,
+                f"holds no camera {camera or name!r} (there are {listed})",
+                "say which with {path: ..., camera: ...}",
+            )
+        return cameras[camera or name]
+
+
+def _inline_intrinsics(source: IntrinsicsSource, place: str) -> Intrinsics:
+    try:
+        return Intrinsics(
+            width=source.width or 0,
+            height=source.height or 0,
+            fx=source.fx or 0.0,
+            fy=source.fy or 0.0,
+            cx=source.cx or 0.0,
+            cy=source.cy or 0.0,
+            model=source.model if source.distortion else "none",
+            distortion=tuple(source.distortion),
+        )
+    except ValueError as error:
+        raise DataError(place, str(error), "mend the numbers") from None
+
+
+def _refuse_keypoints_outside(place: str, intrinsics: Intrinsics, detections: Detections) -> None:
+    """Refuse a calibration whose picture is too small for the keypoints: it is of another size."""
+    xy = detections.xy[~np.isnan(detections.xy[..., 0])]
+    outside = ((xy < -0.5) | (xy > [intrinsics.width - 0.5, intrinsics.height - 0.5])).any(axis=-1)
+    if len(xy) and outside.mean() > _LARGEST_SHARE_OUTSIDE:
+        reach = np.percentile(xy, 99, axis=0)
+        raise DataError(
+            place,
+            f"is for {intrinsics.width}x{intrinsics.height} pictures, but {outside.mean():.0%} of the"
+            f" keypoints lie outside (they reach to x = {reach[0]:.0f}, y = {reach[1]:.0f})",
+            "give the calibration of these pictures, or their size with keypoints: {image_size: [W, H]}",
+        )

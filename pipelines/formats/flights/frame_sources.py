@@ -1,0 +1,253 @@
+"""When the pictures of a camera were taken, by whatever its manifest says of it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pipelines.formats.flights.flight_logs import FlightLogs, Frames
+from pipelines.formats.flights.telemetry_poses import TelemetryPoses
+from pipelines.formats.videos.frame_times import read_frame_times, times_of_frames
+from pipelines.formats.videos.picture_motion import turning_of_pictures
+from pipelines.formats.videos.video import created_ns
+from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.turning import fit_start
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import Camera, FrameTimes
+from pipelines.session.records import Detections, Int64, Trajectory, VideoIndex
+
+_MOST_FRAMES = 20_000_000  # a week at 30 Hz: more is a frame number misread from a date
+_WATCHED_NS = 120 * 10**9  # of a video, to find out when it began
+
+
+@dataclass(frozen=True)
+class CameraFrames:
+    """The pictures of a camera in world time; numbers and times strictly increase."""
+
+    frame: Int64  # [F] numbers, as keypoints count them
+    t_ns: Int64  # [F]
+    pts_ns: Int64  # [F] since the first picture of the video
+    topic: str | None = None  # the pictures themselves lie in this topic of a log
+    dropped: dict[str, int] = field(default_factory=dict)  # pictures that are not among them, by cause
+    start_sigma_s: float = 0.0  # of all times together, where it was found out
+
+
+class FrameSources:
+    """Reads the frame times of one flight.
+
+    Args:
+        manifest: the path of the manifest.
+        logs: of the flight.
+        telemetry: of the flight.
+        trajectory: the poses of a camera, by name and manifest, for a video whose start is found by motion.
+        max_gap_ns: the longest stretch between two poses that is bridged.
+        note: told what was chosen and what is doubtful, one line each.
+    """
+
+    def __init__(
+        self,
+        manifest: Path,
+        logs: FlightLogs,
+        telemetry: TelemetryPoses,
+        trajectory: Callable[[str, Camera, int], Trajectory],
+        *,
+        max_gap_ns: int,
+        note: Callable[[str], None],
+    ) -> None:
+        self._manifest = manifest
+        self._base = manifest.parent
+        self._logs = logs
+        self._telemetry = telemetry
+        self._trajectory = trajectory
+        self._max_gap_ns = max_gap_ns
+        self._note = note
+
+    def frames(
+        self,
+        name: str,
+        camera: Camera,
+        video: VideoIndex | None,
+        detections: Detections | None,
+        intrinsics: Intrinsics,
+    ) -> CameraFrames:
+        """When each picture was taken.
+
+        By what the manifest states: `fps` from `start` on, a file or topic of frame times, the stamps of
+        pictures in a log, or the container's own stamps from `start` on. Where the start is to be found by
+        motion, it is the time at which the pictures turn as the poses do.
+
+        Raises:
+            DataError: nothing says when the pictures were taken, or what does is unusable.
+        """
+        offset_ns = camera.clock.offset_ns if camera.clock else 0
+        unclocked = self._unclocked_frames(name, camera, video, detections)
+        if camera.frame_times and camera.frame_times.start_from == "motion":
+            unclocked = self._begun_by_motion(name, camera, unclocked, intrinsics)
+        return replace(unclocked, t_ns=unclocked.t_ns + offset_ns)
+
+    def _unclocked_frames(
+        self, name: str, camera: Camera, video: VideoIndex | None, detections: Detections | None
+    ) -> CameraFrames:
+        times = camera.frame_times or FrameTimes()
+        logged = None
+        if camera.video is not None and camera.video.log is not None:
+            logged = self._logs.frames(camera.video.log, camera.video.topic)
+        pictures = _pictures(video, logged)
+        if times.fps is not None:
+            count = len(pictures.t_ns) if pictures else self._listed_frames(camera, detections)
+            since_start = _ticks_ns(count, times.fps)
+            topic, lost = (pictures.topic, pictures.dropped) if pictures else (None, {})
+            start_ns = self._start_ns(name, camera, times)
+            return CameraFrames(np.arange(count), start_ns + since_start, since_start, topic, lost)
+        if times.csv or times.srt:
+            return self._frames_of_file(self._base / (times.csv or times.srt or ""), pictures)
+        if times.log is not None:
+            triggers = self._logs.triggers(times.log, times.topic)
+            stamped = triggers or self._logs.frames(times.log, times.topic)
+            return self._frames_by_stamps(stamped.t_ns, stamped.dropped, pictures)
+        if times.ulog or times.ardupilot:
+            kind: Literal["ulog", "ardupilot"] = "ulog" if times.ulog else "ardupilot"
+            triggered = self._telemetry.triggers(kind, times.ulog or times.ardupilot or "")
+            return self._frames_by_stamps(triggered, {}, pictures)
+        if pictures is None:
+            raise DataError(
+                self._manifest,
+                f"cameras.{name}: nothing says when its frames were taken",
+                "write frame_times: {start: SECONDS, fps: 30}",
+            )
+        if logged is None:
+            return replace(pictures, t_ns=self._start_ns(name, camera, times) + pictures.pts_ns)
+        if times.start_ns:
+            raise DataError(
+                self._manifest,
+                f"cameras.{name}.frame_times: start has no use, the log stamps its pictures",
+                "leave it out, or correct the log's clock with logs: {...: {clock: ...}}",
+            )
+        return pictures
+
+    def _listed_frames(self, camera: Camera, detections: Detections | None) -> int:
+        if detections is None or camera.keypoints is None:
+            raise DataError(
+                self._manifest, "a camera without video and keypoints has no frames", "give it one of them"
+            )
+        count = int(detections.frames_listed[-1]) + 1
+        if count > _MOST_FRAMES:
+            raise DataError(
+                self._base / camera.keypoints.path,
+                f"numbers its frames up to {count - 1}",
+                "say with first_frame which number the first frame bears",
+            )
+        return count
+
+    def _frames_of_file(self, path: Path, pictures: CameraFrames | None) -> CameraFrames:
+        stamps = read_frame_times(path)
+        if pictures is None:
+            since_start = stamps.t_ns - stamps.t_ns[0]
+            return CameraFrames(stamps.frame, stamps.t_ns, since_start, dropped=stamps.dropped)
+        t_ns, known = times_of_frames(stamps, pictures.pts_ns)
+        if not known.any():
+            raise DataError(path, "has a time for none of the pictures", "check that they belong together")
+        lost = Counter(pictures.dropped) + Counter(stamps.dropped)
+        lost["without a time"] += int((~known).sum())
+        return replace(
+            pictures,
+            frame=pictures.frame[known],
+            t_ns=t_ns[known],
+            pts_ns=pictures.pts_ns[known],
+            dropped=dict(+lost),
+        )
+
+    def _start_ns(self, name: str, camera: Camera, times: FrameTimes) -> int:
+        """When a video begins that has stamps of its own."""
+        if times.start_from == "motion":
+            if times.start_ns:
+                place = f"{self._manifest}: cameras.{name}.frame_times"
+                raise DataError(place, "has a start and start_from: motion", "leave one of them out")
+            return 0  # found when the pictures and the poses are there
+        if times.start_from is None:
+            return times.start_ns
+        path = self._base / (camera.video.path or "") if camera.video else None
+        made_ns = created_ns(path) if path is not None and camera.video and camera.video.path else None
+        if made_ns is None:
+            raise DataError(
+                path or self._manifest,
+                "does not say when it was made",
+                f"write frame_times: {{start: SECONDS}} for camera {name}",
+            )
+        if camera.clock is None:
+            self._note(
+                f"{name}: its video says that it was made at {made_ns / 1e9:.0f} s, to a second at best:"
+                " say clock: {sigma_s: 1}"
+            )
+        return times.start_ns + made_ns
+
+    def _begun_by_motion(
+        self, name: str, camera: Camera, frames: CameraFrames, intrinsics: Intrinsics
+    ) -> CameraFrames:
+        """Frames of a video at the times at which its pictures turn as the poses do."""
+        place = f"{self._manifest}: cameras.{name}.frame_times"
+        remedy = "say start: SECONDS instead, or give the stamps of a log"
+        if camera.video is None or camera.video.path is None or camera.pose.static:
+            raise DataError(place, "start_from: motion needs a video and poses that move", remedy)
+        poses = self._trajectory(name, camera, 0)
+        some = int(np.searchsorted(frames.pts_ns, frames.pts_ns[0] + _WATCHED_NS))
+        turned = turning_of_pictures(self._base / camera.video.path, intrinsics, some)
+        try:
+            fit = fit_start(
+                poses.t_ns,
+                poses.quaternion_xyzw,
+                frames.pts_ns[:some],
+                turned,
+                max_gap_ns=self._max_gap_ns,
+            )
+        except ValueError as error:
+            problem = f"its pictures do not say when the video began: {error}"
+            raise DataError(place, problem, remedy) from None
+        self._note(
+            f"{name}: its video begins at {fit.start_ns / 1e9:.3f} s +- {1e3 * fit.sigma_s:.1f} ms, by the"
+            f" turning of its pictures ({fit.turning_deg_s:.2g} deg/s, of which the poses explain"
+            f" {fit.explained:.0%})"
+        )
+        return replace(frames, t_ns=fit.start_ns + frames.pts_ns, start_sigma_s=fit.sigma_s)
+
+    def _frames_by_stamps(
+        self, t_ns: Int64, dropped: dict[str, int], pictures: CameraFrames | None
+    ) -> CameraFrames:
+        """Frame times that a log states, for the frames of a video in the same order."""
+        if pictures is None:
+            since_start = t_ns - t_ns[0]
+            return CameraFrames(np.arange(len(since_start)), t_ns, since_start, dropped=dropped)
+        count = min(len(pictures.t_ns), len(t_ns))
+        lost = Counter(pictures.dropped) + Counter(dropped)
+        lost["without a stamp in the log"] += len(pictures.t_ns) - count
+        lost["stamp in the log without a picture"] += len(t_ns) - count
+        return replace(
+            pictures,
+            frame=pictures.frame[:count],
+            t_ns=t_ns[:count],
+            pts_ns=pictures.pts_ns[:count],
+            dropped=dict(+lost),
+        )
+
+
+def _pictures(video: VideoIndex | None, logged: Frames | None) -> CameraFrames | None:
+    """The pictures of a video or a topic, by their own stamps; None where there are none."""
+    if video is not None:
+        return CameraFrames(np.arange(video.count), video.pts_ns, video.pts_ns, dropped=video.dropped)
+    if logged is not None:
+        since_start = logged.t_ns - logged.t_ns[0]
+        count = np.arange(len(since_start))
+        return CameraFrames(count, logged.t_ns, since_start, logged.topic, logged.dropped)
+    return None
+
+
+def _ticks_ns(count: int, fps: Fraction) -> Int64:
+    """Exact times of `count` frames from 0, each rounded to a ns; Python's integers cannot overflow here."""
+    period = Fraction(1_000_000_000) / fps
+    return np.array([round(k * period) for k in range(count)], dtype=np.int64)
