@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.results_page import ARM_COLUMNS, arm_figures, markdown_table
 from pipelines.ingest import ingest
 from pipelines.planning.arm_flights import fly_arm
 from pipelines.planning.config import PlannerConfig
@@ -65,40 +66,25 @@ def _session(name: str, folder: Path) -> Path:
 
 
 def _print_comparisons(sessions: Mapping[str, Path], trials: int) -> None:
-    header = (
-        "scenario",
-        "arm",
-        "tilt mean deg",
-        "max",
-        "near obstacle",
-        "hidden %",
-        "MPJPE mm",
-        "measured %",
-    )
-    print("|".join(["", *(f" {name} " for name in header), ""]))
-    print("|" + " --- |" * len(header))
     settings = Settings(arms=ARMS, trials=trials, planner=planner_settings(SCENARIOS / "planner.yaml", {}))
     found = {name: replan(session, settings).metrics for name, session in sessions.items()}
-    for name, metrics in found.items():
-        for arm in ARMS:
-            scores = metrics["arms"][arm]
-            tilt, error = scores["tilt_deg"], scores["reconstruction_error"]
-            print(
-                f"| {name} | {arm} | {tilt['mean']:.1f} | {tilt['max']:.1f} | {tilt['near_obstacle']:.1f} |"
-                f" {100 * scores['occluded_share']:.1f} | {scores['mpjpe_mm']:.1f} |"
-                f" {100 * error['coverage']['mean']:.1f} |"
-            )
-    print("\n| adaptive minus fixed | tilt deg | near obstacle | hidden, points of % | MPJPE mm |")
-    print("|" + " --- |" * 5)
+    scores = {(name, arm): metrics["arms"][arm] for name, metrics in found.items() for arm in ARMS}
+    rows = [[*of, *arm_figures(told, f"{told['mpjpe_mm']:.1f}")] for of, told in scores.items()]
+    print("\n".join(markdown_table(["scenario", "arm", *ARM_COLUMNS], rows)))
+    rows = []
     for name, metrics in found.items():
         (difference,) = metrics["differences"]
-        figures = [
-            _with_interval(difference["tilt_deg"], 1),
-            _with_interval(difference["tilt_near_obstacle_deg"], 1),
-            _with_interval(difference["occluded_share"], 100),
-            _with_interval(difference["mpjpe_mm"], 1),
-        ]
-        print(f"| {name} | {' | '.join(figures)} |")
+        rows.append(
+            [
+                name,
+                _with_interval(difference["tilt_deg"], 1),
+                _with_interval(difference["tilt_near_obstacle_deg"], 1),
+                _with_interval(difference["occluded_share"], 100),
+                _with_interval(difference["mpjpe_mm"], 1),
+            ]
+        )
+    header = ["adaptive minus fixed", "tilt deg", "near obstacle", "hidden, points of %", "MPJPE mm"]
+    print("\n".join(markdown_table(header, rows)[:-1]))
 
 
 def _with_interval(estimate: Mapping[str, Any], scale: float) -> str:

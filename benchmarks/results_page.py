@@ -55,6 +55,7 @@ POSES = PosesSection(
     figures=("compare-time", "compare-joints"),
     measures=("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm", "pck150", "reconstructed_share_of_truth"),
 )
+ARM_COLUMNS = ("tilt mean deg", "max", "near obstacle", "hidden %", "MPJPE mm", "measured %")
 _QUICK = "--methods dlt,midpoint,robust --seconds 20 --trials 5"
 STUDIES = {
     "tilt": f"mocap ablate tilt {_QUICK} -o {PLACE}/tilt",
@@ -126,7 +127,7 @@ def _poses(numbers: Numbers) -> list[str]:
             "`robust`. The poses' errors are one draw of those that `sample_data/README.md` states."
         ),
         *_code([*commands, POSES.compare]),
-        *_table(header, rows),
+        *markdown_table(header, rows),
         *_figure("poses-time", "Distance from truth over time; predicted error, tilt and share below"),
         *_figure("poses-joints", "Error of every joint, and how often it was measured"),
     ]
@@ -148,7 +149,7 @@ def _studies(numbers: Numbers) -> list[str]:
         lines += [f"### {titles[name]}", "", *_code([STUDIES[name]])]
         for table in tables(summary):
             if table.title in wanted or table.title.startswith("MPJPE relative to"):
-                lines += [f"{table.title}:", "", *_table(table.header, table.rows)]
+                lines += [f"{table.title}:", "", *markdown_table(table.header, table.rows)]
         lines += _figure(f"study-{name}", f"{titles[name]}, for every method and level of pose noise")
     return lines
 
@@ -157,31 +158,10 @@ def _arms(numbers: Numbers) -> list[str]:
     rows, verdicts = [], []
     for scenario, told in numbers["arms"].items():
         for arm, scores in told["arms"].items():
-            tilt, errors = scores["tilt_deg"], scores["reconstruction_error"]
-            rows.append(
-                [
-                    scenario,
-                    arm,
-                    _fixed(tilt["mean"], 1),
-                    _fixed(tilt["max"], 1),
-                    _fixed(tilt["near_obstacle"], 1),
-                    _fixed(100 * scores["occluded_share"], 1),
-                    _estimate(errors["mpjpe_mm"]),
-                    _fixed(100 * errors["coverage"]["mean"], 1),
-                ]
-            )
+            error = _estimate(scores["reconstruction_error"]["mpjpe_mm"])
+            rows.append([scenario, arm, *arm_figures(scores, error)])
         verdicts.append(f"- **{scenario}**: {told['verdict']}")
     commands = [command for own in SCENARIOS.values() for command in own]
-    header = [
-        "flight",
-        "arm",
-        "tilt mean deg",
-        "max",
-        "near obstacle",
-        "hidden %",
-        "MPJPE mm",
-        "measured %",
-    ]
     lines = [
         "## Planners: adaptive against fixed",
         "",
@@ -190,7 +170,7 @@ def _arms(numbers: Numbers) -> list[str]:
             "is what the log of the sample says. Errors are on joint-frames that all arms measured."
         ),
         *_code([*commands, *(command for command, _ in ARM_FIGURES.values())]),
-        *_table(header, rows),
+        *markdown_table(["flight", "arm", *ARM_COLUMNS], rows),
         *verdicts,
         "",
     ]
@@ -209,7 +189,21 @@ def _code(commands: Sequence[str]) -> list[str]:
     return [*(f"    {command}" for command in commands), ""]
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def arm_figures(scores: Mapping[str, Any], error: str) -> list[str]:
+    """What `ARM_COLUMNS` name of the scores in replan/metrics.json; `error` as it is to be said."""
+    tilt, coverage = scores["tilt_deg"], scores["reconstruction_error"]["coverage"]
+    return [
+        _fixed(tilt["mean"], 1),
+        _fixed(tilt["max"], 1),
+        _fixed(tilt["near_obstacle"], 1),
+        _fixed(100 * scores["occluded_share"], 1),
+        error,
+        _fixed(100 * coverage["mean"], 1),
+    ]
+
+
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """A table, and an empty line behind it."""
     lines = [header, ["---"] * len(header), *rows]
     return [*(f"| {' | '.join(line)} |" for line in lines), ""]
 
