@@ -1,7 +1,8 @@
 """Processor time of the planners beside the 1.3 ms of Ho et al.: `python -m benchmarks.planning`.
 
 The mound of tests/planning/worlds.py (sigma 7 x 3 m, 6 m high), an actor who walks past it at 1.2 m/s.
-Warm code, one thread, its own processor time: other work on the machine still slows memory and caches.
+Warm code, one thread, its own processor time. Other work on the machine still slows memory and caches: of
+several turns of the same central plans, each plan counts as in the fastest.
 """
 
 from __future__ import annotations
@@ -41,10 +42,11 @@ def main() -> None:
     """Print the tables of docs/planner.md, and which aims are met."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=200, help="central plans per figure (default 200)")
+    parser.add_argument("--turns", type=int, default=5, help="of all these plans (default 5)")
     parser.add_argument("--central", action="store_true", help="the central planner's table alone")
     parser.add_argument("--separation", action="store_true", help="also weigh the distances (minutes)")
     arguments = parser.parse_args()
-    met = print_central(arguments.repeats)
+    met = print_central(arguments.repeats, arguments.turns)
     if not arguments.central:
         met += print_replays()
     print("\n| aim | measured | |\n| --- | --- | --- |")
@@ -55,38 +57,43 @@ def main() -> None:
         print_separations()
 
 
-def print_central(repeats: int) -> list[tuple[str, float, float]]:
+def print_central(repeats: int, turns: int) -> list[tuple[str, float, float]]:
     """The formation search, cost map included, by its size; what is asked for."""
     field = mound(resolution_m=0.2)
     aims = []
     print("| arm | D | T | n | median ms | best ms |")
     print("| --- | --- | --- | --- | --- | --- |")
     for size in GROWTH:
-        median = _print_central(ADAPTIVE, size, field, repeats)
+        median = _print_central(ADAPTIVE, size, field, repeats, turns)
         if size in CENTRAL_AIMS_MS:
             name = "central plan, D {}, T {}, n {}, median ms".format(*size)
             aims.append((name, median, CENTRAL_AIMS_MS[size]))
     for arm, drones in ((COVARIANCE, 2), (GREEDY, 2), (GREEDY, 3)):
-        _print_central(arm, (8, 10, drones), field, repeats)  # their lattice decides at every other knot
+        _print_central(
+            arm, (8, 10, drones), field, repeats, turns
+        )  # their lattice decides at every other knot
     return aims
 
 
-def _print_central(arm: Arm, size: tuple[int, int, int], field: DistanceField, repeats: int) -> float:
+def _print_central(
+    arm: Arm, size: tuple[int, int, int], field: DistanceField, repeats: int, turns: int
+) -> float:
     """Plans along the way past the mound; the median in ms."""
     yaws, knots, drones = size
     config = replace(PlannerConfig(), yaws=yaws, horizon_knots=knots, knot_s=10.0 / knots)
     planner = arm.start(config, drones=drones, yaw_rad=0.7)
     commanded = formation_slots(np.array([0.7]), drones, tilt_rad=config.tilt_rad, range_m=config.radius_m)[0]
     planner.plan(0.0, commanded, np.zeros((knots, 3)), field)  # compiles, and reads the map
-    times = []
-    for k in range(repeats):
+    took_ms = np.empty((turns, repeats))
+    for turn, k in np.ndindex(turns, repeats):
         walked = 40.0 * k / repeats + 1.2 * config.knot_s * np.arange(1, knots + 1)
         actor: NDArray[np.float64] = np.stack([walked, 0 * walked, 0 * walked + 1], axis=1)
         started = time.thread_time()
         planner.plan(0.0, commanded, actor, field)
-        times.append(1e3 * (time.thread_time() - started))
-    median = float(np.median(times))
-    print(f"| {arm.name} | {yaws} | {knots} | {drones} | {median:.3f} | {min(times):.3f} |")
+        took_ms[turn, k] = 1e3 * (time.thread_time() - started)
+    fastest_ms = took_ms.min(axis=0)
+    median = float(np.median(fastest_ms))
+    print(f"| {arm.name} | {yaws} | {knots} | {drones} | {median:.3f} | {fastest_ms.min():.3f} |")
     return median
 
 
