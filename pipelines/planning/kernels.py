@@ -23,11 +23,11 @@ Vector = tuple[float, float, float]
 # From a point to the centre of its voxel it is at most half a diagonal; to a corner of the cell in which it
 # is interpolated, and from the one to the other, at most a whole one. In voxels:
 _DIAGONAL = math.sqrt(3.0)
-_ROUNDING = 1e-4  # of single precision, by which a bound is drawn in
-BRICK = 4
-_YAW = 0  # of a slot: formation.YAW
+_ROUNDING = 1e-4  # of single precision, by which such bounds are drawn in
+BRICK = 4  # voxels along the side of one of `Sight.bricks`
+_LONGEST_LEAP = 127  # seven bits
 REACHED_S = 1e-9  # a cell exactly as far as the rates allow is a neighbour
-_LONGEST_LEAP = 127
+_YAW = 0  # of a slot: formation.YAW
 _SLOWEST_STEP, _FASTEST_STEP = (
     1e4,
     0.2,
