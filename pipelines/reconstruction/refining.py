@@ -24,7 +24,7 @@ from pipelines.reconstruction.observations import (
 )
 from pipelines.reconstruction.refinement.building import Sighting
 from pipelines.reconstruction.refinement.problem import PoseErrors
-from pipelines.reconstruction.refinement.refine import Refined, corrected, refine
+from pipelines.reconstruction.refinement.refine import SETTLED_S, Refined, corrected, refine
 from pipelines.reconstruction.reweighting import reprojection_px
 from pipelines.session.records import Float, Int64
 from pipelines.session.skeletons import bones_of
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _MOST_SHIFTS = 6  # of the clocks; offsets of 0.2 s took one to five
-_SETTLED_S = 0.002  # what is left of a clock's offset when nothing more is shifted
 _UNTOLD = 0.5  # share of its prior that a clock's standard deviation may keep; above, pictures do not tell it
 _HEAD = ("nose", "left_eye", "right_eye", "left_ear", "right_ear")  # as rigid as a bone
 
@@ -117,7 +116,7 @@ def refine_flight(
             replace(camera, frame_t_ns=camera.frame_t_ns + round(1e9 * offset))
             for camera, offset in zip(cameras, offset_s, strict=True)
         ]
-        if np.abs(refined.clock_offset_s).max() <= _SETTLED_S:
+        if np.abs(refined.clock_offset_s).max() <= SETTLED_S:
             break
         _, again = seen_from(shifted)
         started = triangulate(

@@ -46,6 +46,9 @@ _ROUNDS = 8
 _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2 where the search begins: a walking body, its limbs
 _BONE_SIGMA_M = 0.02
 _FEWEST_TIMES = 20
+_ABRUPT = 3.0  # times the accelerations of the body, where clocks are told
+SETTLED_S = 2e-3
+"""Offset of a clock that may stay in the pictures' stamps."""
 _UNEXPLAINED = 1.15  # times the image noise that the pictures show between neighbours: the prior is wrong
 _SIGMAS = 4.0
 _SETTLING = 4  # rounds to see how well given levels explain the pictures
@@ -103,6 +106,9 @@ def refine(
         known, learned, warnings, expected_m = _find_prior(t_s, sightings, begun, bones, prior, clock_sigma_s)
         problem = build(t_s, sightings, bones)
         state = initial_state(problem, known, begun)
+        clock_s, clock_left_s = _clocks(problem, known, state)
+        if np.abs(clock_s).max() <= SETTLED_S:
+            known = replace(known, clock_sigma_s=clock_left_s)
         system, state, at = solve(problem, known, state, rounds=_ROUNDS)
         covariance = covariances(system, at)
         quick = state.position
@@ -119,14 +125,29 @@ def refine(
         position=position,
         covariance=whole,
         corrections=_corrections(system, state, len(sightings)),
-        clock_offset_s=_of_clocks(system, state.shared),
-        clock_sigma_s=_of_clocks(system, np.sqrt(np.diagonal(shared_covariance(system, at)))),
+        clock_offset_s=clock_s,
+        clock_sigma_s=clock_left_s,
         levels=_levels(known),
         bone_lengths_m=state.shared[system.layout.bone_column :],
         learned=learned,
         warnings=tuple(warnings),
         fallback=fallback,
     )
+
+
+def _clocks(problem: Problem, known: Knowledge, state: State) -> tuple[Float, Float]:
+    """Offset of each clock and its standard deviation [C], 0 where it was known.
+
+    Motion is taken for three times as abrupt: held to be as smooth as it is, limbs come out with smaller
+    swings, which bones of constant length turn into offsets, of five standard deviations in flights of 4 s.
+    Were it free, any picture between two times of the skeleton would fit, and some offsets would stay there.
+    """
+    if not (known.clock_sigma_s > 0).any():
+        return np.zeros(len(known.poses)), np.zeros(len(known.poses))
+    abrupt = replace(known, acceleration=_ABRUPT**2 * known.acceleration)
+    system, state, at = solve(problem, abrupt, state, rounds=_ROUNDS)
+    left = np.sqrt(np.diagonal(shared_covariance(system, at)))
+    return _of_clocks(system, state.shared), _of_clocks(system, left)
 
 
 def _quickly(system: System, state: State) -> Float:
