@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pipelines.planning.arms import ADAPTIVE, COVARIANCE, FIXED, GREEDY, Arm
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField
+from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import formation_slots
 from pipelines.planning.replay import replay
 from pipelines.planning.scores import score
@@ -83,13 +84,14 @@ def _print_central(
     config = replace(PlannerConfig(), yaws=yaws, horizon_knots=knots, knot_s=10.0 / knots)
     planner = arm.start(config, drones=drones, yaw_rad=0.7)
     commanded = formation_slots(np.array([0.7]), drones, tilt_rad=config.tilt_rad, range_m=config.radius_m)[0]
-    planner.plan(0.0, commanded, np.zeros((knots, 3)), field)  # compiles, and reads the map
+    east = np.zeros(knots)
+    planner.plan(0.0, commanded, Forecast(np.zeros((knots, 3)), east), field)  # compiles, and reads the map
     took_ms = np.empty((turns, repeats))
     for turn, k in np.ndindex(turns, repeats):
         walked = 40.0 * k / repeats + 1.2 * config.knot_s * np.arange(1, knots + 1)
         actor: NDArray[np.float64] = np.stack([walked, 0 * walked, 0 * walked + 1], axis=1)
         started = time.thread_time()
-        planner.plan(0.0, commanded, actor, field)
+        planner.plan(0.0, commanded, Forecast(actor, east), field)
         took_ms[turn, k] = 1e3 * (time.thread_time() - started)
     fastest_ms = took_ms.min(axis=0)
     median = float(np.median(fastest_ms))

@@ -43,7 +43,14 @@ if TYPE_CHECKING:
     "--yaw",
     type=FiniteRange(-360, 360),
     metavar="DEG",
-    help="Of the first camera at the start, counterclockwise from east [default: where it was].",
+    help="Of the first camera at the start, counterclockwise from east, or from --yaw-frame"
+    " [default: where it was].",
+)
+@click.option(
+    "--yaw-frame",
+    type=click.Choice(["world", "heading"]),
+    help="What yaws count from: east, or where the actor heads, so that formations turn with them"
+    " [default: world].",
 )
 @click.option(
     "--config",
@@ -85,6 +92,7 @@ def replan_compare_command(
     yaws: int | None,
     horizon: float | None,
     yaw: float | None,
+    yaw_frame: str | None,
     config: Path | None,
     mode: Mode,
     trials: int,
@@ -103,7 +111,7 @@ def replan_compare_command(
     """
     from pipelines.replan import Settings, planner_settings, replan
 
-    stated = {"radius_m": radius, "tilt_deg": tilt, "yaws": yaws}
+    stated = {"radius_m": radius, "tilt_deg": tilt, "yaws": yaws, "yaw_frame": yaw_frame}
     settings = Settings(
         arms=None if arms is None else tuple(name.strip() for name in arms.split(",")),
         drones=drones,

@@ -97,6 +97,7 @@ def fly_arm(scene: Scene, arm: Arm) -> ArmFlight:
         config=scene.config,
         drones=scene.drones,
         yaw_rad=scene.yaw_rad,
+        heading_rad=scene.heading_rad,
         mode=rules.mode,
         seed=rules.seed,
     )

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.costs import cost_map, costs_of_slots, error_map
+from pipelines.planning.costs import SlotCosts, cost_map, costs_in_frame, costs_of_slots, error_map
 from pipelines.planning.distance_field import DistanceField
+from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import (
     YAW,
     FormationPath,
@@ -34,13 +35,16 @@ _TOO_NEAR = 100.0  # cost of a slot within the separation of another drone's: mo
 class FormationPlanner(Protocol):
     """Decides for one flight which slots the cameras take."""
 
-    def plan(self, t_s: float, commanded: Float, actor: Float, field: DistanceField) -> FormationPath:
+    def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
         """Decide anew.
+
+        All yaws, those of the path as well, count from `actor.heading_rad`: 0, which is east, unless
+        `yaw_frame` is `heading`. Whoever looks at the field adds it; others need not know of it.
 
         Args:
             t_s: now.
             commanded: [n, 3] the slots that are commanded now (yaw rad, tilt rad, range m).
-            actor: [T, 3] forecast at the knots t_s + knot_s, t_s + 2 knot_s, ...
+            actor: forecast at the knots t_s + knot_s, t_s + 2 knot_s, ...
             field: what stands around.
         """
 
@@ -103,7 +107,7 @@ class _Fixed:
         )
         self._rates = np.array(config.slot_rates)
 
-    def plan(self, t_s: float, commanded: Float, actor: Float, field: DistanceField) -> FormationPath:  # noqa: ARG002
+    def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:  # noqa: ARG002
         return FormationPath(np.array([t_s]), self._slots, self._rates)
 
 
@@ -130,17 +134,19 @@ class _Formation:
         self._weights = config.slot_weights()
         self._rates = np.array(config.slot_rates)
 
-    def plan(self, t_s: float, commanded: Float, actor: Float, field: DistanceField) -> FormationPath:
-        if self._predicts_error:
-            costs = costs_of_slots(field, _each(actor, self._every), self._offsets, self._config)
-            cost = cost_map(costs, self._config)
-            cost += self._config.w_error * error_map(costs, self._offsets, self._config)
+    def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
+        config = self._config
+        if self._predicts_error or config.yaw_frame == "heading":
+            costs = _look(field, actor.each(self._every), self._slots, self._offsets, config)
+            cost = cost_map(costs, config)
+            if self._predicts_error:  # which does not depend on where yaws count from
+                cost += config.w_error * error_map(costs, self._offsets, config)
             sequence, _ = best_sequence(cost, self._lattice, commanded[0])
             through = _through(commanded, self._slots[sequence])
         else:  # the same in one call: between small parts, most of the time went
-            actor = np.ascontiguousarray(actor)
+            position = np.ascontiguousarray(actor.position)
             through = cheapest_slots(
-                field.grid, field.sight, actor, self._formations, self._weights, commanded
+                field.grid, field.sight, position, self._formations, self._weights, commanded
             )
         return FormationPath(_knots(t_s, through, self._lattice), through, self._rates)
 
@@ -168,16 +174,17 @@ class _Greedy:
         self._information = [ray_information(offsets, config) for offsets in self._offsets]
         self._config, self._rates = config, np.array(config.slot_rates)
 
-    def plan(self, t_s: float, commanded: Float, actor: Float, field: DistanceField) -> FormationPath:
+    def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
         config = self._config
-        actor = _each(actor, config.lattice_knots)
-        known = np.zeros((len(actor), 1, 3, 3)) + np.eye(3) / config.prior_sigma_m**2
+        actor = actor.each(config.lattice_knots)
+        knots = len(actor.position)
+        known = np.zeros((knots, 1, 3, 3)) + np.eye(3) / config.prior_sigma_m**2
         taken: list[Float] = []
-        slots = np.empty((len(actor), len(self._lattices), 3))
+        slots = np.empty((knots, len(self._lattices), 3))
         for i, (grid, offsets, information) in enumerate(
             zip(self._lattices, self._offsets, self._information, strict=True)
         ):
-            costs = costs_of_slots(field, actor, offsets[:, None], config)
+            costs = _look(field, actor, grid.states[:, None], offsets[:, None], config)
             free = (costs.occluded == 0.0)[..., None]  # [T, S, 1, 1] once more below
             gained = free[..., None].reshape(*free.shape[:2], 1, 1) * information
             gain = log_determinant(known + gained) - log_determinant(known)
@@ -186,7 +193,7 @@ class _Greedy:
                 apart = np.linalg.norm(offsets - other[:, None], axis=-1)
                 cost += np.where(apart < config.soft_separation_m, _TOO_NEAR, 0.0)
             sequence, _ = best_sequence(cost, grid, commanded[i])
-            at = np.arange(len(actor))
+            at = np.arange(knots)
             known = known + gained[at, sequence][:, None]
             taken.append(offsets[sequence])
             slots[:, i] = grid.states[sequence]
@@ -199,9 +206,13 @@ def _all_states(yaws: Float, tilts: Float, ranges: Float) -> Float:
     return np.stack(np.meshgrid(yaws, tilts, ranges, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def _each(actor: Float, every: int) -> Float:
-    """Every so many knots of a forecast, at least the last one."""
-    return actor[every - 1 :: every] if len(actor) >= every else actor[-1:]
+def _look(
+    field: DistanceField, actor: Forecast, slots: Float, offsets: Float, config: PlannerConfig
+) -> SlotCosts:
+    """Look at slots [S, n, 3], whose offsets from the actor are known where yaws count from east."""
+    if config.yaw_frame == "heading":
+        return costs_in_frame(field, actor, slots, config)
+    return costs_of_slots(field, actor.position, offsets, config)
 
 
 def _through(commanded: Float, slots: Float) -> Float:

@@ -7,11 +7,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Literal, get_args
 
 from pipelines.planning.kernels import SlotWeights, Weights
 from pipelines.session.errors import DataError
 
 MOST_DRONES = 16
+Frame = Literal["world", "heading"]
+_WORDS: dict[str, tuple[str, ...]] = {"yaw_frame": get_args(Frame)}
 _SIGNED = ("tilt_deg",)
 _MAY_BE_ZERO = (
     *("w_obs", "w_occ", "w_turn", "w_error", "l_obs", "l_occ", "l_sep", "a_velocity", "a_acceleration"),
@@ -43,6 +46,8 @@ class PlannerConfig:
     knot_s: float = 1.0
     horizon_knots: int = 10  # T
     yaw_rate_deg_per_s: float = 22.5
+    yaw_frame: Frame = "world"  # or yaws count from where the actor heads (heading.py)
+    heading_speed_mps: float = 0.5  # who is slower stands, and keeps the last heading
     tilt_rate_deg_per_s: float = 5.0  # tilt and range are searched by `covariance` and `greedy` alone
     range_rate_mps: float = 1.0
     tilts_deg: tuple[float, ...] = (5.0, 15.0, 25.0, 35.0)
@@ -101,6 +106,10 @@ class PlannerConfig:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
+            if words := _WORDS.get(field.name):
+                if value not in words:
+                    raise ValueError(f"{field.name}: {value!r} is none of {', '.join(words)}")
+                continue
             for number in value if isinstance(value, tuple) else (value,):
                 least = -10.0 if field.name in _SIGNED else 0.0
                 if (
@@ -185,6 +194,8 @@ def planner_config(values: Mapping[str, object], source: Path | str = "planner s
 
 def _like(default: object, value: object) -> object:
     """A value of the default's type; numbers are not read out of text, nor counts out of fractions."""
+    if isinstance(default, str):
+        return value  # one of `_WORDS`, as is looked at where it is taken
     if isinstance(default, tuple):
         if not isinstance(value, list | tuple):
             raise TypeError("must be a list of numbers")

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField
+from pipelines.planning.forecast import Forecast
+from pipelines.planning.formation import slot_offsets, turned
 from pipelines.planning.information import predicted_error, ray_information
 from pipelines.planning.kernels import slot_costs, weighed
 
@@ -37,6 +39,17 @@ def costs_of_slots(field: DistanceField, actor: Float, offsets: Float, config: P
     actor = np.ascontiguousarray(actor)
     eps_m, start_m = config.eps_obs_m, config.sight_start_m
     return SlotCosts(*slot_costs(field.grid, field.sight, actor, offsets, eps_m, start_m))
+
+
+def costs_in_frame(field: DistanceField, actor: Forecast, slots: Float, config: PlannerConfig) -> SlotCosts:
+    """Look at slots [S, n, 3] whose yaws count from the actor's heading, which differs from time to time."""
+    looks = [
+        costs_of_slots(
+            field, position[None], slot_offsets(turned(slots, np.full(slots.shape[:-2], heading))), config
+        )
+        for position, heading in zip(*actor, strict=True)
+    ]
+    return SlotCosts(*(np.concatenate(parts) for parts in zip(*looks, strict=True)))
 
 
 def cost_map(costs: SlotCosts, config: PlannerConfig) -> Float:

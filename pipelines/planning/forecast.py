@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
 _FIRST_SPEED_MPS = 3.0  # standard deviation per axis before a second measurement: people run
+
+
+class Forecast(NamedTuple):
+    """The actor at the T knots of a plan."""
+
+    position: Float  # [T, 3] metres, world
+    heading_rad: Float  # [T] what yaws count from, counterclockwise from east: 0 in the world frame
+
+    def each(self, every: int) -> Forecast:
+        """Every so many knots, at least the last one."""
+        rows = slice(every - 1, None, every) if len(self.position) >= every else slice(-1, None)
+        return Forecast(self.position[rows], self.heading_rad[rows])
 
 
 class ActorFilter:

@@ -36,6 +36,13 @@ def slot_offsets(slots: Float) -> Float:
     return np.stack([level * np.cos(yaw), level * np.sin(yaw), distance * np.sin(tilt)], axis=-1)
 
 
+def turned(slots: Float, angle_rad: Float) -> Float:
+    """Slots [..., n, 3] whose yaws count from angles [...], as yaws from east."""
+    result = np.array(slots)
+    result[..., YAW] += angle_rad[..., None]
+    return result
+
+
 def slot_of(offset: Float) -> Float:
     """The slot [..., 3] of an offset from the actor, yaw within -pi..pi."""
     x, y, z = np.moveaxis(offset, -1, 0)

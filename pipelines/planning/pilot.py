@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from pipelines.planning.arms import Arm
 from pipelines.planning.config import MOST_DRONES, PlannerConfig
 from pipelines.planning.distance_field import DistanceField
-from pipelines.planning.forecast import ActorFilter
-from pipelines.planning.formation import FormationPath, formation_slots, slot_offsets
+from pipelines.planning.forecast import ActorFilter, Forecast
+from pipelines.planning.formation import FormationPath, formation_slots, slot_offsets, turned
+from pipelines.planning.heading import YawZero
 from pipelines.planning.local import LocalPlanner, Separation
 from pipelines.planning.tracking import Plan
 
@@ -30,7 +31,7 @@ class Command:
     position: Float
     velocity: Float
     acceleration: Float
-    slots: Float  # [N, 3] yaw rad, tilt rad, range m
+    slots: Float  # [N, 3] yaw rad from east, tilt rad, range m
     actor: Float  # [3] the estimate that cameras aim at
 
 
@@ -53,6 +54,7 @@ class Pilot:
         config: weights and rates.
         drones: how many, 1 to 16.
         yaw_rad: of the first camera at the start, counterclockwise from east.
+        heading_rad: where the actor heads before walking, if `yaw_frame` is `heading`; likewise.
         clock: seconds, for `times`.
 
     Raises:
@@ -66,11 +68,14 @@ class Pilot:
         *,
         drones: int,
         yaw_rad: float,
+        heading_rad: float = 0.0,
         clock: Callable[[], float] = perf_counter,
     ) -> None:
         if not 1 <= drones <= MOST_DRONES:
             raise ValueError(f"{drones} drones: 1 to {MOST_DRONES} can be planned for")
         self._config, self._clock = config, clock
+        self._zero = YawZero(config, heading_rad)
+        yaw_rad -= float(self._zero.at(np.zeros(1))[0])
         self._formation_planner = arm.start(config, drones=drones, yaw_rad=yaw_rad)
         self._local_planner = LocalPlanner(config)
         self._filter = ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m)
@@ -89,7 +94,7 @@ class Pilot:
 
     def slots_now(self, t_s: float) -> tuple[Float, Float]:
         """Commanded slots [N, 3], and where they are by the actor's estimate, [N, 3] metres, world."""
-        slots = self._formation.at(np.array([t_s]))[0]
+        slots = self._slots_at(np.array([t_s]))[0]
         return slots, self._filter.forecast(np.array([t_s]))[0] + slot_offsets(slots)
 
     def step(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> Command:
@@ -109,7 +114,7 @@ class Pilot:
             self._next_local_s = max(self._next_local_s, t_s) + 1.0 / config.local_hz
             self._plan_locally(t_s, position, velocity, field)
         now = np.array([t_s])
-        return Command(*self.reference(t_s), self._formation.at(now)[0], self._filter.forecast(now)[0])
+        return Command(*self.reference(t_s), self._slots_at(now)[0], self._filter.forecast(now)[0])
 
     def reference(self, t_s: float) -> tuple[Float, Float, Float]:
         """Position, velocity and acceleration [N, 3] of the latest local plans, after the first step."""
@@ -117,12 +122,19 @@ class Pilot:
         where, speed, change = (np.concatenate(part) for part in zip(*asked, strict=True))
         return where, speed, change
 
+    def _slots_at(self, t_s: Float) -> Float:
+        """Commanded slots [T, N, 3], their yaws from east."""
+        slots = self._formation.at(t_s)
+        return turned(slots, self._zero.at(t_s)) if self._config.yaw_frame == "heading" else slots
+
     def _plan_formation(self, t_s: float, field: DistanceField) -> None:
         config = self._config
         started = self._clock()
         knots = t_s + config.knot_s * np.arange(1, config.horizon_knots + 1, dtype=np.float64)
         commanded = self._formation.at(np.array([t_s]))[0]
-        actor = self._filter.forecast(knots)
+        if config.yaw_frame == "heading":
+            self._zero.follow(t_s, *self._filter.at(t_s)[1:])
+        actor = Forecast(self._filter.forecast(knots), self._zero.at(knots))
         self._formation = self._formation_planner.plan(t_s, commanded, actor, field)
         self.times.central_s.append(self._clock() - started)
 
@@ -130,7 +142,7 @@ class Pilot:
         config = self._config
         times = t_s + config.waypoint_s * np.arange(1, config.waypoints + 1, dtype=np.float64)
         actor = self._filter.forecast(times)
-        slots = actor[:, None] + slot_offsets(self._formation.at(times))
+        slots = actor[:, None] + slot_offsets(self._slots_at(times))
         for i in range(len(self._plans)):
             started = self._clock()
             made = self._local_planner.plan(

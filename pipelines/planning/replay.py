@@ -35,7 +35,7 @@ class ReplayResult:
     position: Float  # [N, T, 3] metres, world
     velocity: Float  # [N, T, 3] m/s
     quaternion_xyzw: Float  # [N, T, 4] world_from_camera, aimed at the estimate
-    slots: Float  # [N, T, 3] commanded: yaw (rad, continuous), tilt (rad), range (m)
+    slots: Float  # [N, T, 3] commanded: yaw (rad from east, continuous), tilt (rad), range (m)
     tilt_rad: Float  # [N, T] flown, above the logged actor
     visible: Bool  # [N, T] nothing stands between camera and logged actor, by the last map
     actor: Float  # [T, 3] the log, interpolated
@@ -64,6 +64,7 @@ def replay(
     config: PlannerConfig,
     drones: int,
     yaw_rad: float = 0.0,
+    heading_rad: float = 0.0,
     mode: Mode = "closed-loop",
     seed: int = 0,
     clock: Callable[[], float] = perf_counter,
@@ -81,6 +82,7 @@ def replay(
         config: weights and rates, the same for all arms of a comparison.
         drones: how many cameras.
         yaw_rad: of the first camera at the start, counterclockwise from east.
+        heading_rad: where the actor heads before walking, if `yaw_frame` is `heading`; likewise.
         mode: `closed-loop` flies point masses with limited acceleration; `plan-only` puts the drones
             exactly where their local plans want them.
         seed: of the noise.
@@ -99,7 +101,7 @@ def replay(
     known = [open_space(), *maps]
     taken_in = np.searchsorted(t_ns, replay_ns, side="right")
 
-    pilot = Pilot(arm, config, drones=drones, yaw_rad=yaw_rad, clock=clock)
+    pilot = Pilot(arm, config, drones=drones, yaw_rad=yaw_rad, heading_rad=heading_rad, clock=clock)
     pilot.measure(0.0, noisy[0])
     start = pilot.slots_now(0.0)[1]
     tracker = Tracker(start, np.zeros_like(start), config)

@@ -14,6 +14,7 @@ from pipelines.planning.config import PlannerConfig
 from pipelines.planning.costs import cost_map, costs_of_slots
 from pipelines.planning.distance_field import DistanceField, Unknown, distance_field, open_space
 from pipelines.planning.formation import YAW, formation_slots, slot_of, slot_offsets, yaw_set
+from pipelines.planning.heading import first_heading
 from pipelines.planning.loading import LoggedFlight, SessionCamera, Source, flown_poses, points_at
 from pipelines.planning.replay import Mode, replay_times
 from pipelines.planning.scores import near_obstacle
@@ -34,7 +35,7 @@ class Rules:
 
     config: PlannerConfig
     drones: int | None = None
-    yaw_rad: float | None = None
+    yaw_rad: float | None = None  # from what yaws count from at the start
     mode: Mode = "closed-loop"
     trials: int = 20
     seed: int = 0
@@ -47,7 +48,8 @@ class Scene:
     flight: LoggedFlight
     rules: Rules
     drones: int
-    yaw_rad: float  # of the first camera at the start
+    yaw_rad: float  # of the first camera at the start, from east
+    heading_rad: float  # where the actor first walks, from east; 0 where yaws count from east
     t_ns: Int64  # [T]
     actor: Float  # [T, 3] what is scored against
     actor_source: Source
@@ -155,7 +157,11 @@ def build_scene(
     drones = rules.drones or min(max(len(flight.cameras), 2), MOST_DRONES)
     if rules.drones is None and drones != len(flight.cameras):
         notes.append(f"{drones} drones are replayed, the session has {len(flight.cameras)} cameras")
-    yaw_rad = rules.yaw_rad
+    heading_rad = 0.0
+    if rules.config.yaw_frame == "heading":
+        heading_rad = first_heading(flight.actor)
+        notes.append(f"yaws count from where the actor heads, {np.degrees(heading_rad):.1f} deg at first")
+    yaw_rad = None if rules.yaw_rad is None else rules.yaw_rad + heading_rad
     if yaw_rad is None:
         yaw_rad = float(slot_of(flown[0][0, 0] - actor[0])[YAW])
         first = flight.cameras[0].name
@@ -165,6 +171,7 @@ def build_scene(
         rules=rules,
         drones=drones,
         yaw_rad=yaw_rad,
+        heading_rad=heading_rad,
         t_ns=t_ns,
         actor=actor,
         actor_source=actor_source,

@@ -235,6 +235,21 @@ def test_the_options_reach_the_planner(calm: Path, tmp_path: Path) -> None:
     assert list(table["camera"][:4]) == ["drone1", "drone2", "drone3", "drone4"]
 
 
+def test_yaws_count_from_the_heading_of_who_walks_north(tmp_path: Path) -> None:
+    """Who looks east at first, and turns on the spot for two seconds."""
+    north = CALM.replace("walk: {distance_m: 5}", "walk: {to: [0, 5]}").replace("_s: 4", "_s: 6")
+    session = session_of(tmp_path, north)
+    asked = ("--arms", "fixed", "--yaw", "90", "--trials", "1", "--mode", "plan-only")
+    assert compared(session, *asked)["yaw_deg"] == pytest.approx(90)
+    turned = compared(session, *asked, "--yaw-frame", "heading")
+    assert turned["yaw_deg"] == pytest.approx(180, abs=10)  # from where the hips sway to in the first metre
+    assert any("yaws count from where the actor heads" in note for note in turned["notes"])
+    stated = json.loads((session / "replan" / "stage.json").read_text())["settings"]
+    assert stated["planner.yaw_frame"] == "heading"
+    yaw = pd.read_parquet(session / "replan" / "fixed" / "trajectories.parquet")["formation_yaw_rad"]
+    assert np.degrees(yaw.iloc[-1]) == pytest.approx(180, abs=10)
+
+
 def test_without_an_actor_the_reconstruction_says_where_he_was(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, seconds=3.0)
     session = tmp_path / "flight.session"

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from pipelines.planning.arms import ADAPTIVE
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.costs import cost_map, costs_of_slots
+from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import formation_slots, slot_offsets, wrapped, yaw_set
 from pipelines.planning.search import best_sequence, lattice
 from tests.planning.worlds import trees
@@ -27,7 +28,9 @@ def test_a_plan_is_the_cheapest_sequence_through_the_cost_map(seed: int, drones:
     form = {"tilt_rad": config.tilt_rad, "range_m": config.radius_m}
     commanded = formation_slots(np.array([start + rng.uniform(-20, 20)]), drones, **form)[0]
 
-    path = ADAPTIVE.start(config, drones=drones, yaw_rad=start).plan(7.0, commanded, actor, WORLD)
+    path = ADAPTIVE.start(config, drones=drones, yaw_rad=start).plan(
+        7.0, commanded, Forecast(actor, np.zeros(len(actor))), WORLD
+    )
 
     yaws = yaw_set(config.yaws, start)
     states = np.stack([yaws, 0 * yaws + config.tilt_rad, 0 * yaws + config.radius_m], axis=1)

@@ -29,6 +29,8 @@ def test_what_is_not_mentioned_keeps_its_default() -> None:
         ({"l_occ": -1}, "l_occ: -1 is out of range"),
         ({"tilt_deg": 88}, "at most 85"),
         ({"soft_separation_m": 2.0}, "soft_separation_m"),
+        ({"yaw_frame": "body"}, "yaw_frame: 'body' is none of world, heading"),
+        ({"yaw_frame": 1}, "yaw_frame: 1 is none of world, heading"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(values: dict[str, object], said: str) -> None:

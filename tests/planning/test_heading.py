@@ -1,0 +1,151 @@
+"""Yaws that count from the actor's heading: where that is, and formations that turn with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.planning.arms import ADAPTIVE, COVARIANCE, FIXED, GREEDY, Arm
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.costs import cost_map, costs_of_slots
+from pipelines.planning.distance_field import open_space
+from pipelines.planning.forecast import Forecast
+from pipelines.planning.formation import YAW, formation_slots, slot_of, slot_offsets, wrapped, yaw_set
+from pipelines.planning.heading import YawZero, first_heading
+from pipelines.planning.replay import replay
+from tests.planning.worlds import trees, walker
+
+Float = NDArray[np.float64]
+WORLD_FRAME = PlannerConfig()
+HEADING_FRAME = replace(WORLD_FRAME, yaw_frame="heading")
+WORLD = trees()
+SURE = np.diag([0.01, 0.01**2])  # of position and velocity
+
+
+def towards(deg: float, speed_mps: float = 1.2) -> Float:
+    angle = np.radians(deg)
+    return speed_mps * np.array([np.cos(angle), np.sin(angle), 0.0])
+
+
+def zero_deg(zero: YawZero, *t_s: float) -> list[float]:
+    return [float(angle) for angle in np.degrees(zero.at(np.array(t_s)))]
+
+
+def test_in_the_world_frame_yaws_count_from_east() -> None:
+    zero = YawZero(WORLD_FRAME, heading_rad=1.0)
+    assert zero_deg(zero, 0.0, 9.0) == [0.0, 0.0]
+
+
+def test_the_zero_follows_the_heading_as_fast_as_a_formation_turns_and_no_faster() -> None:
+    zero = YawZero(HEADING_FRAME)
+    zero.follow(10.0, towards(45.0), SURE)
+    assert zero_deg(zero, 10.0, 11.0, 12.0, 20.0) == pytest.approx([0.0, 22.5, 45.0, 45.0])
+    zero.follow(11.0, towards(45.0), SURE)  # asked anew on the way: no jump
+    assert zero_deg(zero, 11.0, 12.0, 13.0) == pytest.approx([22.5, 45.0, 45.0])
+
+
+def test_it_turns_the_shorter_way_and_goes_on_counting() -> None:
+    zero = YawZero(HEADING_FRAME, heading_rad=np.radians(170.0))
+    zero.follow(0.0, towards(-170.0), SURE)
+    assert zero_deg(zero, 9.0) == pytest.approx([190.0])
+    zero.follow(9.0, towards(-60.0), SURE)
+    assert zero_deg(zero, 20.0) == pytest.approx([300.0])
+
+
+@pytest.mark.parametrize(
+    ("speed_mps", "sigma_mps", "taken"),
+    [(0.49, 0.01, False), (0.51, 0.01, True), (0.89, 0.3, False), (0.91, 0.3, True), (0.0, 0.0, False)],
+)
+def test_who_stands_keeps_the_last_heading(speed_mps: float, sigma_mps: float, taken: bool) -> None:
+    zero = YawZero(HEADING_FRAME)
+    zero.follow(0.0, towards(30.0), SURE)
+    zero.follow(2.0, towards(90.0, speed_mps), np.diag([0.01, sigma_mps**2]))
+    assert zero_deg(zero, 60.0) == pytest.approx([90.0 if taken else 30.0])
+    up = YawZero(HEADING_FRAME, heading_rad=0.5)
+    up.follow(0.0, np.array([0.0, 0.0, 3.0]), SURE)  # who climbs a ladder heads nowhere
+    assert up.at(np.array([9.0])) == 0.5
+
+
+def test_the_first_heading_of_a_log_is_where_the_actor_leaves_to() -> None:
+    standing = np.tile([3.0, 4.0, 1.0], (5, 1))
+    walked = standing[0] + np.outer(np.arange(4), [0.0, -0.5, 0.1])
+    assert first_heading(np.concatenate([standing, walked])) == pytest.approx(-np.pi / 2)
+    assert first_heading(np.concatenate([[[np.nan] * 3], standing])) == 0.0
+
+
+@pytest.mark.parametrize("arm", [FIXED, ADAPTIVE, COVARIANCE, GREEDY], ids=lambda arm: arm.name)
+def test_who_walks_straight_east_is_filmed_alike_in_both_frames(arm: Arm) -> None:
+    flights = [
+        replay(arm, *walker(8.0), [WORLD], config=config, drones=2, yaw_rad=0.7)
+        for config in (WORLD_FRAME, HEADING_FRAME)
+    ]
+    for name in ("position", "slots"):
+        assert np.array_equal(getattr(flights[0], name), getattr(flights[1], name))
+    assert np.ptp(flights[0].position[0], axis=0).max() > 5
+
+
+def on_a_circle(seconds: float) -> tuple[NDArray[np.int64], Float, Float]:
+    """Stamps, hips and headings (rad, continuous) of who walks round 12 m at 1.2 m/s, north at first."""
+    t_s = np.arange(0, seconds, 0.1)
+    angle = 0.1 * t_s
+    hips = np.stack([12 * np.cos(angle), 12 * np.sin(angle), 0 * angle + 1], axis=1)
+    return (t_s * 1e9).astype(np.int64), hips, angle + np.pi / 2
+
+
+@pytest.mark.parametrize("arm", [FIXED, ADAPTIVE], ids=lambda arm: arm.name)
+def test_a_formation_in_the_heading_frame_turns_with_the_actor(arm: Arm) -> None:
+    """The filter's velocity lags behind a turn of w by w/k rad, k = (q / (sigma^2 dt))^(1/4) = 2.2 Hz its
+    bandwidth, times sqrt(2) for its damping: 3.6 deg at 0.1 rad/s; as much again is allowed."""
+    stamps, hips, heading = on_a_circle(25.0)
+    flown = {
+        config.yaw_frame: replay(
+            arm, stamps, hips, [open_space()], config=config, drones=2, yaw_rad=np.pi, heading_rad=np.pi / 2
+        )
+        for config in (WORLD_FRAME, HEADING_FRAME)
+    }
+    assert np.ptp(flown["world"].formation_yaw_rad) == 0
+    turning = flown["heading"]
+    settled = turning.t_s > 5
+    wanted = np.interp(turning.t_s, stamps / 1e9, heading) + np.pi / 2  # left of the actor, all the way
+    behind_deg = np.degrees(wanted - turning.formation_yaw_rad)[settled]
+    assert 0 < behind_deg.min() < behind_deg.max() < 7.2
+    assert np.ptp(behind_deg) < 1
+    # Drones, whose forecast goes straight on, stay behind slots that come round at 1 m/s.
+    off_deg = np.degrees(wrapped(wanted - slot_of(turning.position - turning.actor)[0, :, YAW]))[settled]
+    assert np.ptp(off_deg) < 1
+    assert 0 < off_deg.mean() < 20
+
+
+def test_no_sequence_of_yaws_from_the_heading_is_cheaper() -> None:
+    """All sequences of 8 yaws at 3 knots between trees; the actor turns by 40 deg from knot to knot."""
+    config = replace(HEADING_FRAME, yaws=8, knot_s=2.0, horizon_knots=3)
+    form = {"tilt_rad": config.tilt_rad, "range_m": config.radius_m}
+    yaws = yaw_set(8, 0.0)
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        actor = rng.uniform([0, -6, 0.8], [40, 6, 1.2], (3, 3))
+        heading = rng.uniform(-np.pi, np.pi) + np.radians(40) * np.arange(3)
+        start = yaws[rng.integers(8)]
+        commanded = formation_slots(np.array([start]), 2, **form)[0]
+        path = ADAPTIVE.start(config, drones=2, yaw_rad=0.0).plan(
+            0.0, commanded, Forecast(actor, heading), WORLD
+        )
+
+        offsets = [slot_offsets(formation_slots(yaws + turn, 2, **form)) for turn in heading]
+        looks = zip(actor[:, None], offsets, strict=True)
+        cost = np.stack([cost_map(costs_of_slots(WORLD, at, of, config), config)[0] for at, of in looks])
+
+        def price(sequence: tuple[int, ...], cost: Float = cost, start: float = start) -> float:
+            turns = np.abs(wrapped(np.diff([start, *yaws[list(sequence)]])))
+            if (turns > np.radians(45.001)).any():
+                return np.inf
+            return float(cost[np.arange(3), list(sequence)].sum() + 0.05 * turns.sum() / np.radians(45))
+
+        chosen = np.abs(wrapped(path.slots[1:, 0, YAW, None] - yaws)).argmin(axis=1)
+        cheapest = min(price(sequence) for sequence in product(range(8), repeat=3))
+        assert price(tuple(chosen)) == pytest.approx(cheapest, abs=1e-12)
+        assert np.ptp(cost) > 0
