@@ -46,7 +46,7 @@ _ROUNDS = 8
 _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2 where the search begins: a walking body, its limbs
 _BONE_SIGMA_M = 0.02
 _FEWEST_TIMES = 20
-_ABRUPT = 3.0  # times the accelerations of the body, where clocks are told
+_ABRUPT = 3.0  # times the accelerations of the body, where clocks and slow pose errors are told
 SETTLED_S = 2e-3
 """Offset of a clock that may stay in the pictures' stamps."""
 _UNEXPLAINED = 1.15  # times the image noise that the pictures show between neighbours: the prior is wrong
@@ -60,6 +60,9 @@ _SLOW_SHARE = 0.2  # of the disagreement of views: slow errors where the search 
 _MEDIAN_OF_TWO = 2 * np.log(2)  # of the chi-square distribution with two degrees of freedom
 _FARTHEST = 1.8
 """Times what the disagreement of the views lets expect; good estimates moved by up to 1.6 of it."""
+_FARTHEST_STATED = 2.65
+"""The same of stated levels, of which a constant error is one draw: sqrt(21.1 / 3), which the root of a
+chi-square variable with three degrees of freedom over three passes once in 10,000 times."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,7 @@ class Refined:
     clock_sigma_s: Float  # [C] how well that is known, 0 for clocks that were
     levels: dict[str, float]
     bone_lengths_m: Float  # [B]
+    acceleration: Float  # [P, P] (m/s^2)^2, covariance of the P joints' accelerations that was estimated
     learned: bool  # the levels of the pose errors were found from the pictures
     warnings: tuple[str, ...]
     fallback: str | None  # why the result must not be used
@@ -111,9 +115,12 @@ def refine(
             known = replace(known, clock_sigma_s=clock_left_s)
         system, state, at = solve(problem, known, state, rounds=_ROUNDS)
         covariance = covariances(system, at)
-        quick = state.position
         if known.memory > REMEMBERED:
-            quick = _quickly(system, state)
+            quick = _quickly(system, state, known)
+        elif any(errors.processes for errors in known.poses):
+            quick = _quickly(*_abruptly(problem, known, state)[:2], known)
+        else:
+            quick = state.position
     except np.linalg.LinAlgError as error:
         return _none(sightings, start, str(error))
     fallback = _doubts(system, state, at, learned=learned) or _too_far(quick, begun, expected_m)
@@ -129,6 +136,7 @@ def refine(
         clock_sigma_s=clock_left_s,
         levels=_levels(known),
         bone_lengths_m=state.shared[system.layout.bone_column :],
+        acceleration=known.acceleration,
         learned=learned,
         warnings=tuple(warnings),
         fallback=fallback,
@@ -136,27 +144,33 @@ def refine(
 
 
 def _clocks(problem: Problem, known: Knowledge, state: State) -> tuple[Float, Float]:
-    """Offset of each clock and its standard deviation [C], 0 where it was known.
-
-    Motion is taken for three times as abrupt: held to be as smooth as it is, limbs come out with smaller
-    swings, which bones of constant length turn into offsets, of five standard deviations in flights of 4 s.
-    Were it free, any picture between two times of the skeleton would fit, and some offsets would stay there.
-    """
+    """Offset of each clock and its standard deviation [C], 0 where it was known."""
     if not (known.clock_sigma_s > 0).any():
         return np.zeros(len(known.poses)), np.zeros(len(known.poses))
-    abrupt = replace(known, acceleration=_ABRUPT**2 * known.acceleration)
-    system, state, at = solve(problem, abrupt, state, rounds=_ROUNDS)
+    system, state, at = _abruptly(problem, known, state)
     left = np.sqrt(np.diagonal(shared_covariance(system, at)))
     return _of_clocks(system, state.shared), _of_clocks(system, left)
 
 
-def _quickly(system: System, state: State) -> Float:
+def _abruptly(problem: Problem, known: Knowledge, state: State) -> tuple[System, State, Eliminated]:
+    """What lasts, told with motion that is taken for three times as abrupt.
+
+    Nobody moves as by chance: the accelerations of a gait repeat. Held to be as smooth as it is, limbs come
+    out with smaller swings, which bones of constant length turn into offsets of clocks, of five standard
+    deviations in flights of 4 s, and which constant pose errors make room for. Were motion free, any picture
+    between two times of the skeleton would fit, and some clocks would stay there.
+    """
+    abrupt = replace(known, acceleration=_ABRUPT**2 * known.acceleration)
+    return solve(problem, abrupt, state, rounds=_ROUNDS)
+
+
+def _quickly(system: System, state: State, known: Knowledge) -> Float:
     """The joints [T, J, 3] once slow pose errors are taken away, every keypoint counting in full.
 
-    Keypoints that err for long were made to count less, which is right for slow pose errors and wrong for
-    limbs: those would be smoothed away.
+    Slow errors were found with keypoints that err for long made to count less, or with motion that is more
+    abrupt. That is right for them and wrong for limbs, which would be smoothed away, or tremble.
     """
-    pictures, known = system.problem.pictures, system.knowledge
+    pictures = system.problem.pictures
     slow = replace(state, white=np.zeros_like(state.white))
     _, _, numbers = misfit(system, slow)
     position, rotation = corrected(pictures.position, pictures.rotation, numbers)
@@ -247,7 +261,7 @@ def _find_prior(
     guess, image, disagreement_m, range_m = _first_guess(problem, start[chosen])
     # n rays from all around, each off by s on two axes, leave a point off by s sqrt(9 / 2n) in space.
     stated_m = 0.0 if prior is None else float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
-    spread = _FARTHEST * float(np.sqrt(4.5 / len(sightings)))
+    spread = float(np.sqrt(4.5 / len(sightings)))
     begun = _unlearned(problem, start[chosen], (guess,) * len(sightings), clock_sigma_s)
     state = initial_state(problem, begun, start[chosen])
     free, state = learn(problem, begun, state, poses=True, rounds=_LEARNING_ROUNDS)
@@ -278,7 +292,8 @@ def _find_prior(
         warnings.append(
             "refined: the stated pose noise does not explain the pictures; it was estimated instead"
         )
-    expected_m = spread * max(disagreement_m, stated_m if best == "stated" else 0.0)
+    of_stated = _FARTHEST_STATED * stated_m if best == "stated" else 0.0
+    expected_m = spread * max(_FARTHEST * disagreement_m, of_stated)
     return known, best != "stated", warnings, expected_m
 
 
@@ -486,6 +501,7 @@ def _none(sightings: Sequence[Sighting], start: Float, reason: str) -> Refined:
         clock_sigma_s=np.zeros(len(sightings)),
         levels={},
         bone_lengths_m=np.empty(0),
+        acceleration=np.empty((0, 0)),
         learned=False,
         warnings=(),
         fallback=reason,
