@@ -290,8 +290,7 @@ class OpenLog:
 
 def joined_heads(heads: Sequence[bytes], length: int) -> NDArray[np.uint8]:
     """The first bytes of messages as one array [n, length], zeros behind those that are shorter."""
-    whole = b"".join(head.ljust(length, b"\0") for head in heads)
-    return np.frombuffer(whole, np.uint8).reshape(-1, length)
+    return np.array(heads, f"S{length}").view(np.uint8).reshape(-1, length)
 
 
 def open_file(path: Path) -> tuple[IO[bytes], int]:

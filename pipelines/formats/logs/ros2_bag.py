@@ -6,48 +6,28 @@ read to its end, so sqlite is asked here.
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
-import sqlite3
-from array import array
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain, islice
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pipelines.formats.logs.mcap_log import open_mcap
-from pipelines.formats.logs.message_decoders import Schema, ros2_name
 from pipelines.formats.logs.recordings import (
-    DAMAGED,
     TRUNCATED,
-    Channel,
     LogPart,
-    MessageTable,
     OpenLog,
-    UnlikeError,
     describe_log,
-    joined_heads,
     open_file,
     open_parts,
-    require_content,
 )
+from pipelines.formats.logs.ros2_sqlite3 import MAGIC, Sqlite3Part, has_bag_tables
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64
 
-_MAGIC = b"SQLite format 3\0"
 _INFORMATION = "rosbag2_bagfile_information"
 _METADATA_LIMIT = 16 << 20  # bytes of a metadata.yaml
-_LARGEST_ROWID = 1 << 48
-_BATCH = 4096  # rows at a time
-_LISTED = 1 << 14  # rows that are listed at a time
-_SMALLEST_ROW = 6  # bytes a row takes in a file at the least: its length, its number, a header of four
-_MOST_ATTEMPTS = 10_000  # to go on behind damage
 _SUFFIXES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 
 
@@ -64,12 +44,12 @@ class Ros2Bag:
             if path.is_dir():
                 return _states_a_bag(path / "metadata.yaml") or _is_one_bag(_storage_files(path))
             with path.open("rb") as file:
-                head = file.read(len(_MAGIC))
+                head = file.read(len(MAGIC))
         except OSError:
             return False
-        if head != _MAGIC:
+        if head != MAGIC:
             return not head and path.suffix.lower() in self.suffixes
-        return _has_tables(path)
+        return has_bag_tables(path)
 
     def describe(self, path: Path) -> dict[str, object]:
         """Messages, times, storage, topics, what was lost, and where metadata.yaml says something else."""
@@ -112,233 +92,13 @@ class _Contents:
     stated: _Metadata | None = None
 
 
-class _Sqlite3Part(LogPart):
-    """One sqlite3 file; its table `messages` is read row by row, so that damage costs only what it hits."""
-
-    def __init__(self, path: Path, database: Path, file_size: int) -> None:
-        super().__init__(path, file_size)
-        self.storage = ["sqlite3"]
-        self.database = _connect(database)
-        try:
-            self._read_topics()
-            self.take(self._list_messages())
-            self._check_length(database)
-            self._count_unmerged()
-            require_content(self)
-        except sqlite3.Error as error:
-            self.close()
-            raise DataError(
-                path, f"cannot be read by sqlite3 ({error})", "try `sqlite3 FILE .recover`, or copy it again"
-            ) from None
-        except BaseException:
-            self.close()
-            raise
-
-    def close(self) -> None:
-        """Close the database."""
-        self.database.close()
-
-    def read(self, rows: Int64) -> Iterator[tuple[int, bytes]]:
-        """The bytes of messages: by one query where they lie in the order of receipt, else one by one."""
-        places = self.table.place[rows].tolist()
-        done = 0
-        if places and np.all(np.diff(places) > 0):
-            for k, data in self._in_one_query(rows, places):
-                yield k, data
-                done = k + 1
-        for k in range(done, len(places)):
-            message = self._message(places[k])
-            if message is None:
-                self.lose(int(rows[k]), DAMAGED)
-            else:
-                yield k, message
-
-    def read_alike(self, rows: Int64) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
-        """Joined from the rows of one query; where a row cannot be read, the messages count as unlike."""
-        if not len(rows):
-            return
-        places = self.table.place[rows]
-        length = int(self.table.size[rows[0]])
-        try:
-            found = self._query(rows, places.tolist())
-            for start in range(0, len(rows), _BATCH):
-                batch = found.fetchmany(min(_BATCH, len(rows) - start))
-                found_places, data = zip(*batch, strict=True) if batch else ((), ())
-                if not np.array_equal(found_places, places[start : start + _BATCH]):
-                    raise UnlikeError
-                if set(map(type, data)) != {bytes} or set(map(len, data)) != {length} or not length:
-                    raise UnlikeError
-                joined = np.frombuffer(b"".join(data), np.uint8)
-                yield rows[start : start + _BATCH], joined.reshape(-1, length)
-        except sqlite3.Error as error:
-            raise UnlikeError from error
-
-    def read_heads(self, rows: Int64, length: int) -> Iterator[tuple[Int64, Int64, NDArray[np.uint8]]]:
-        """By queries that name the rows; from the first damage on, one by one."""
-        # sqlite reads the messages to their ends all the same, so that damage behind a head shows.
-        query = (
-            "SELECT messages.rowid, length(data), substr(data, 1, ?) "
-            "FROM json_each(?) AS wanted CROSS JOIN messages ON messages.rowid = wanted.value"
-        )
-        done = 0
-        try:
-            while done < len(rows):
-                batch = rows[done : done + _BATCH]
-                places = self.table.place[batch].tolist()
-                found = self.database.execute(query, (length, json.dumps(places))).fetchall()
-                found_places, sizes, heads = zip(*found, strict=True) if found else ((), (), ())
-                if found_places != tuple(places) or set(map(type, heads)) != {bytes}:
-                    break
-                yield batch, np.array(sizes, np.int64), joined_heads(heads, length)
-                done += len(batch)
-        except sqlite3.Error:
-            pass
-        yield from super().read_heads(rows[done:], length)
-
-    def _query(self, rows: Int64, places: Sequence[int]) -> sqlite3.Cursor:
-        """The rows of the table from the first place to the last, of the topics of some messages."""
-        query = (
-            "SELECT rowid, data FROM messages WHERE rowid BETWEEN ? AND ? "
-            "AND topic_id IN (SELECT value FROM json_each(?)) ORDER BY rowid"
-        )
-        topics = json.dumps(np.unique(self.table.channel[rows]).tolist())
-        return self.database.execute(query, (places[0], places[-1], topics))
-
-    def _in_one_query(self, rows: Int64, places: Sequence[int]) -> Iterator[tuple[int, bytes]]:
-        """The messages up to the first that is damaged."""
-        try:
-            found = self._query(rows, places)
-            for k, (place, (found_place, data)) in enumerate(zip(places, found, strict=False)):
-                if found_place != place or not isinstance(data, bytes):
-                    return
-                yield k, data
-        except sqlite3.Error:
-            return
-
-    def _message(self, place: int) -> bytes | None:
-        try:
-            row = self.database.execute("SELECT data FROM messages WHERE rowid = ?", (place,)).fetchone()
-        except sqlite3.Error:
-            return None
-        return row[0] if row and isinstance(row[0], bytes) else None
-
-    def _read_topics(self) -> None:
-        definitions = self._definitions()
-        query = "SELECT CAST(id AS INTEGER), name, type, serialization_format FROM topics"
-        for number, name, type_, encoding in self.database.execute(query):
-            type_name = ros2_name(str(type_))
-            schema = Schema(type_name, str(encoding), *definitions.get(type_name, ()))
-            self.channels[number] = Channel(str(name), schema)
-
-    def _definitions(self) -> dict[str, tuple[str, bytes]]:
-        """The definitions of types, which bags have since ROS 2 Iron."""
-        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-        try:
-            return {
-                ros2_name(str(type_)): (str(encoding), str(text).encode())
-                for type_, encoding, text in self.database.execute(query)
-                if text
-            }
-        except sqlite3.Error:
-            return {}
-
-    def _list_messages(self) -> MessageTable:
-        # A row without a stamp gets a topic that no bag has, and is counted with those of unknown topics.
-        query = (
-            "SELECT rowid AS place, CASE typeof(timestamp) WHEN 'integer' "
-            "THEN ifnull(CAST(topic_id AS INTEGER), -1) ELSE -1 END AS topic, "
-            "ifnull(CAST(timestamp AS INTEGER), 0) AS stamp, ifnull(length(data), 0) AS size "
-            "FROM messages WHERE rowid > ? ORDER BY rowid"
-        )
-        numbers = array("q")
-        # Pages of a damaged file can lead in circles and show rows without end.
-        most = 4 * (self.file_size // _SMALLEST_ROW)
-        whole = self._take_joined(query, numbers, most)
-        attempts = 0
-        last, step = numbers[-4] if numbers else -1, 1
-        while not whole and last < _LARGEST_ROWID and attempts < _MOST_ATTEMPTS:
-            attempts += 1
-            begin = len(numbers)
-            whole = self._take_rows(query, last, numbers, most)
-            if len(numbers) > begin:
-                last, step = numbers[-4], 1
-            if not whole:
-                # A page is missing or damaged: go on behind it, in growing steps.
-                self.lost["gaps in the table of messages"] += step == 1
-                last, step = last + step, 2 * step
-        rows = np.array(numbers, np.int64).reshape(-1, 4)
-        return MessageTable(rows[:, 1], rows[:, 2], np.zeros(len(rows), np.int64), rows[:, 0], rows[:, 3])
-
-    def _take_joined(self, query: str, numbers: array[int], most: int) -> bool:
-        """Append rows as `_take_rows` does, in half its time; up to the first damage. Whether that was all.
-
-        sqlite makes one text of each column of many rows, which is less work than an object for each number.
-        """
-        columns = (
-            "count(*), group_concat(place), group_concat(topic), group_concat(stamp), group_concat(size)"
-        )
-        joined = f"SELECT {columns} FROM ({query} LIMIT {_LISTED})"  # noqa: S608  # of constants
-        last = -1
-        while len(numbers) < most:
-            try:
-                count, *texts = self.database.execute(joined, (last,)).fetchone()
-            except sqlite3.Error:
-                return False
-            if not count:
-                return True
-            rows = np.stack([np.fromstring(text, np.int64, sep=",") for text in texts], axis=1)
-            if len(rows) != count or (np.diff(rows[:, 0], prepend=last) <= 0).any():
-                return False
-            numbers.frombytes(rows.tobytes())
-            if count < _LISTED:
-                return True
-            last = int(rows[-1, 0])
-        return False
-
-    def _take_rows(self, query: str, last: int, numbers: array[int], most: int) -> bool:
-        """Append rows of four numbers, the first of which must rise from `last` on; whether that was all."""
-        try:
-            found = self.database.execute(query, (last,))
-            while len(numbers) < most:
-                begin = len(numbers)
-                try:
-                    # What was taken before an error stays.
-                    numbers.extend(chain.from_iterable(islice(found, _BATCH)))
-                finally:
-                    risen = np.diff(np.array(numbers[begin::4], np.int64), prepend=last) > 0
-                    taken = len(risen) if risen.all() else int(np.argmin(risen))
-                    del numbers[begin + 4 * taken :]
-                if taken < len(risen):
-                    return False
-                if not taken:
-                    return True
-                last = numbers[-4]
-        except sqlite3.DatabaseError:
-            pass
-        return False
-
-    def _check_length(self, database: Path) -> None:
-        """Compare the file with the size its header states (sqlite.org/fileformat2.html, section 1.3)."""
-        with database.open("rb") as file:
-            header = file.read(100)
-        page_size = int.from_bytes(header[16:18], "big")
-        pages = int.from_bytes(header[28:32], "big")
-        if pages * (65536 if page_size == 1 else page_size) > self.file_size:
-            self.lost[TRUNCATED] = 1
-
-    def _count_unmerged(self) -> None:
-        log = self.path.with_name(self.path.name + "-wal")
-        if log.is_file() and (size := log.stat().st_size):
-            self.lost["bytes of its write-ahead log, not merged"] += size
-
-
 def _open_part(path: Path) -> LogPart:
     if path.suffix.lower() == ".zstd":
         return _open_compressed(path)
     file, size = open_file(path)
     with file:
-        head = file.read(len(_MAGIC))
-    return _Sqlite3Part(path, path, size) if head == _MAGIC else open_mcap(path)
+        head = file.read(len(MAGIC))
+    return Sqlite3Part(path, path, size) if head == MAGIC else open_mcap(path)
 
 
 def _open_compressed(path: Path) -> LogPart:
@@ -437,26 +197,6 @@ def _is_one_bag(files: Sequence[Path]) -> bool:
 def _numbered(file: Path) -> tuple[str, int] | None:
     match = re.fullmatch(r"(.*)_(\d{1,9})\.(db3|mcap)(\.zstd)?", file.name, re.IGNORECASE)
     return (match[1], int(match[2])) if match else None
-
-
-def _connect(path: Path) -> sqlite3.Connection:
-    # Immutable: sqlite neither locks nor writes beside the user's file.
-    database = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
-    # Read only all the same; but now sqlite opens a file that is shorter than its header says.
-    database.execute("PRAGMA writable_schema = ON")
-    return database
-
-
-def _has_tables(path: Path) -> bool:
-    """Whether a sqlite3 file has the tables of a bag; one that cannot be asked goes by its name."""
-    query = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('messages', 'topics')"
-    database = _connect(path)
-    try:
-        return bool(database.execute(query).fetchone()[0] == 2)
-    except sqlite3.Error:
-        return path.suffix.lower() == ".db3"
-    finally:
-        database.close()
 
 
 FORMAT = Ros2Bag()
