@@ -28,6 +28,14 @@ from pipelines.session.errors import MocapError
     help="Page that compares the sessions [default: comparison/index.html beside the first].",
 )
 @click.option(
+    "--study",
+    "studies",
+    type=any_path,
+    multiple=True,
+    metavar="FOLDER",
+    help="Show a study of `mocap ablate` on each session's page, too; repeat it for several.",
+)
+@click.option(
     "--figures",
     type=any_path,
     metavar="FOLDER",
@@ -41,6 +49,7 @@ from pipelines.session.errors import MocapError
 def report_command(
     sessions: tuple[Path, ...],
     output: Path | None,
+    studies: tuple[Path, ...],
     figures: Path | None,
     force: bool,
     overwrite: bool,
@@ -65,7 +74,7 @@ def report_command(
         progress.start("Writing pages", len(ones) + (len(ones) > 1) + (figures is not None))
         for session in ones:
             try:
-                results.append(report(session, force=force))
+                results.append(report(session, studies=studies, force=force))
             except MocapError as error:
                 if len(ones) == 1:
                     raise
@@ -75,7 +84,7 @@ def report_command(
             compared = compare_sessions(ones, output, overwrite=overwrite)
             progress.advance()
         if figures is not None and not failed:
-            drawn = write_figures_of(ones, figures, overwrite=overwrite, force=force)
+            drawn = write_figures_of(ones, figures, studies=studies, overwrite=overwrite, force=force)
             progress.advance()
     for result in results:
         say_warnings(result.record.warnings, quiet)

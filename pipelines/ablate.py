@@ -96,10 +96,12 @@ def ablate(
         progress: who watches.
 
     Raises:
-        DataError: the folder cannot be written, the detector is not there, nothing was reconstructed.
+        DataError: the folder cannot be written or is a session's, the detector is not there, nothing was
+            reconstructed.
         BusyError: another process makes the same folder.
     """
     progress = progress or Silent()
+    _refuse_sessions(folder)
     detector = None if settings.detector is None else find_detector(settings.detector)
     key = _key(settings, detector)
     if not force and is_made(folder, key, mark=STUDY_MARK):
@@ -155,6 +157,13 @@ def _parts(
 ) -> list[Path]:
     """The folders of the finished parts, in the order of the work."""
     return side_by_side(lambda each: part(*each), work, workers=workers, halt=halt)
+
+
+def _refuse_sessions(folder: Path) -> None:
+    """What is of a session is not replaced, whatever was asked for."""
+    for mark, what in (("session.json", "a session"), ("stage.json", "a stage of a session")):
+        if (folder / mark).exists():
+            raise DataError(folder, f"is {what}", "choose another place with --output")
 
 
 def _refuse_nothing(folder: Path, summary: Mapping[str, Any]) -> None:

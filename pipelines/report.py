@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,9 +15,10 @@ from pipelines.planning.loading import load_flight
 from pipelines.reporting.comparison import compare, labels_of
 from pipelines.reporting.comparison_figures import draw_comparison
 from pipelines.reporting.comparison_page import GENERATOR, render_comparison
-from pipelines.reporting.content import ReplanContent, SessionContent, section
+from pipelines.reporting.content import ReplanContent, SessionContent, StudyContent, section
 from pipelines.reporting.figure_files import MARK, refuse_foreign, write_figures
 from pipelines.reporting.page import draw_session, render_page
+from pipelines.reporting.studies import summarise_studies
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
@@ -30,7 +31,7 @@ from pipelines.session.stages import (
     session_name,
     versions_of,
 )
-from pipelines.session.storage import as_data_error, hash_of, read_json
+from pipelines.session.storage import as_data_error, hash_of, read_json, sha256_of
 from pipelines.session.tables import (
     ACTOR,
     CAMERA_POSES,
@@ -44,13 +45,14 @@ from pipelines.session.tables import (
     TRUTH,
     read_table,
 )
-from pipelines.session.whole_folders import is_made, whole_folder
+from pipelines.session.whole_folders import STUDY_MARK, is_made, whole_folder
+from pipelines.simulation.study.settings import command_of
 
 if TYPE_CHECKING:
     import pandas as pd
 
-REPORT = Stage("report", revision=5)
-_FIGURES_REVISION = 1
+REPORT = Stage("report", revision=6)
+_FIGURES_REVISION = 2
 
 
 @dataclass(frozen=True)
@@ -62,17 +64,19 @@ class Reported:
     skipped: bool  # nothing had changed
 
 
-def report(folder: Path, *, force: bool = False) -> Reported:
+def report(folder: Path, *, studies: Sequence[Path] = (), force: bool = False) -> Reported:
     """Write report/index.html of a session.
 
     Args:
         folder: the session.
+        studies: folders of `mocap ablate` that the page shows, too.
         force: do it again although nothing changed.
 
     Raises:
-        DataError: not a session, or damaged.
+        DataError: not a session, or damaged; a folder that holds no study.
         BusyError: another process writes the session.
     """
+    studied = [read_study(study) for study in studies]
     with locked(folder) as session:
         records = _finished_stages(session)
         inputs = {name: digest for record in records.values() for name, digest in record.outputs.items()}
@@ -80,14 +84,19 @@ def report(folder: Path, *, force: bool = False) -> Reported:
             f"key of {name}": record.key for name, record in records.items()
         }  # their settings are shown
         description = read_description(folder)
-        settings = {"name": session_name(folder), "pictures": _pictures_there(folder, description)}
+        settings = {
+            "name": session_name(folder),
+            "pictures": _pictures_there(folder, description),
+            "studies": _named(studied),
+        }
         run = session.begin(REPORT, settings=settings, inputs=inputs, force=force)
         page = folder / "report" / "index.html"
         if run.finished:
             return Reported(page, run.record, skipped=True)
         with ExitStack() as stack:
             pictures, warnings = _open_pictures(folder, description, stack)
-            html = render_page(_load(folder, description, records), read_frame=partial(_read_frame, pictures))
+            content = replace(_load(folder, description, records), studies=tuple(studied))
+            html = render_page(content, read_frame=partial(_read_frame, pictures))
         (run.folder / "index.html").write_text(html, encoding="utf-8")
         record = run.publish(counts={}, warnings=warnings)
     return Reported(page, record, skipped=False)
@@ -143,7 +152,12 @@ class Figures:
 
 
 def write_figures_of(
-    folders: Sequence[Path], target: Path, *, overwrite: bool = False, force: bool = False
+    folders: Sequence[Path],
+    target: Path,
+    *,
+    studies: Sequence[Path] = (),
+    overwrite: bool = False,
+    force: bool = False,
 ) -> Figures:
     """Write the figures of a session's page, or of the page that compares several, as files.
 
@@ -153,6 +167,7 @@ def write_figures_of(
     Args:
         folders: the sessions; two or more are compared, every one with the first.
         target: the folder; figures that an earlier run wrote there are replaced.
+        studies: folders of `mocap ablate` that the page of a single session shows, too.
         overwrite: replace a folder with other things in it, too; never a session.
         force: do it again although nothing changed.
 
@@ -164,6 +179,7 @@ def write_figures_of(
         refuse_foreign(target, overwrite=overwrite)
     except OSError as error:
         raise as_data_error(error, target) from error
+    studied = [read_study(study) for study in studies]
     records = [_finished_stages(open_session(folder)) for folder in folders]
     labels = _labels([folder.resolve() for folder in folders])
     keys = [{name: record.key for name, record in own.items()} for own in records]
@@ -173,6 +189,7 @@ def write_figures_of(
         "revision": _FIGURES_REVISION,
         "pictures": pictures_there,
         "sessions": dict(zip(labels, keys, strict=True)),
+        "studies": _named(studied),
     }
     key = hash_of(told)
     if not force and is_made(target, key, mark=MARK):
@@ -184,13 +201,38 @@ def write_figures_of(
     with ExitStack() as stack:
         if len(folders) == 1:
             pictures, _ = _open_pictures(folders[0], descriptions[0], stack)
-            plates = draw_session(contents[labels[0]], partial(_read_frame, pictures))
+            content = replace(contents[labels[0]], studies=tuple(studied))
+            plates = draw_session(content, partial(_read_frame, pictures))
         else:
             plates = draw_comparison(compare(contents))
     with whole_folder(target, key, mark=MARK, overwrite=True) as making:
         write_figures(making.folder, plates, contents, key)
         making.publish()
     return Figures(target, skipped=False)
+
+
+def read_study(folder: Path) -> StudyContent:
+    """What `mocap ablate` left in a folder.
+
+    Raises:
+        DataError: it holds no study, or a damaged one.
+    """
+    remedy = "name a folder that `mocap ablate ... -o FOLDER` wrote"
+    if not (folder / STUDY_MARK).is_file():
+        raise DataError(folder, f"holds no study (no {STUDY_MARK})", remedy)
+    summary = read_json(folder / STUDY_MARK, remedy)
+    try:
+        command = command_of(summary["settings"], folder.resolve().name)
+        study = StudyContent(summary, command, sha256_of(folder / STUDY_MARK))
+        summarise_studies([study])
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise DataError(folder / STUDY_MARK, "is not the summary of a study", remedy) from error
+    return study
+
+
+def _named(studies: Sequence[StudyContent]) -> list[dict[str, object]]:
+    """Studies as settings: what made them, and the hash of what they found."""
+    return [{"command": each.command, STUDY_MARK: each.digest} for each in studies]
 
 
 def _labels(resolved: Sequence[Path]) -> list[str]:

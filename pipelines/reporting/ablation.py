@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.reporting.ablation_figure import Curve, Panel, draw_study
+from pipelines.reporting.ablation_figure import Curve, Panel, StudyDrawing, save_study
 from pipelines.session.records import Float, Int64
 
 Row = dict[str, Any]
@@ -205,6 +205,22 @@ def _text(cell: Mapping[str, Any], name: str) -> str:
 
 def draw(folder: Path, summary: Mapping[str, Any]) -> None:
     """Write the study's figure as SVG, PNG and PDF."""
+    save_study(folder, drawing(summary), f"Simulated: {setting(summary)}")
+
+
+def setting(summary: Mapping[str, Any]) -> str:
+    """What was filmed, and how often."""
+    settings = summary["settings"]
+    drones, tilt = f"{settings['drones'][0]} drones", f"tilt {settings['tilts_deg'][0]:g} deg"
+    fixed = {"tilt": drones, "robots": tilt}.get(summary["study"], f"{drones}, {tilt}")
+    return (
+        f"{fixed}, {settings['seconds']:g} s of walking, keypoints: {summary['keypoints']};"
+        f" mean and 95 % interval, trials: {settings['trials']}"
+    )
+
+
+def drawing(summary: Mapping[str, Any]) -> StudyDrawing:
+    """The study's figure: a row for each of the first two metrics."""
     study, settings = summary["study"], summary["settings"]
     lines = _lines(summary)
     rows = []
@@ -217,25 +233,12 @@ def draw(folder: Path, summary: Mapping[str, Any]) -> None:
                 for method in settings["methods"]
             ]
         rows.append((METRICS[name], panels))
-    drones, tilt = f"{settings['drones'][0]} drones", f"tilt {settings['tilts_deg'][0]:g} deg"
-    at: Sequence[float] | Sequence[str]
     match study:
         case "tilt":
-            at, axis, fixed = settings["tilts_deg"], "tilt of the formation, deg", drones
+            return StudyDrawing(rows, settings["tilts_deg"], "tilt of the formation, deg", "pose noise", True)
         case "robots":
-            at, axis, fixed = settings["drones"], "drones", tilt
-        case _:
-            at, axis, fixed = list(settings["noise"]), "pose noise", f"{drones}, {tilt}"
-    draw_study(
-        folder,
-        rows,
-        at=at,
-        axis=axis,
-        legend="method" if study == "noise" else "pose noise",
-        title=f"Simulated: {fixed}, {settings['seconds']:g} s of walking, keypoints: {summary['keypoints']};"
-        f" mean and 95 % interval, trials: {settings['trials']}",
-        ordered=study != "noise",
-    )
+            return StudyDrawing(rows, settings["drones"], "drones", "pose noise", True)
+    return StudyDrawing(rows, list(settings["noise"]), "pose noise", "method", False)
 
 
 def _curve(label: str, cells: Sequence[Mapping[str, Any]], name: str) -> Curve:

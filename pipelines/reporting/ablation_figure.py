@@ -8,13 +8,13 @@ from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
-from pipelines.reporting.svg import CAMERAS, GRID, INK, MUTED, page_style
+from pipelines.reporting.svg import CAMERAS, GRID, INK, LEVELS, MUTED, page_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _PANEL_IN, _ROW_IN, _SMALLEST_IN = 2.7, 2.0, 5.4
-_ORDERED = ("#9db8c9", "#5f97bd", "#1f6da5", "#123f66")  # light to dark: levels have an order
 _MARKERS = "osD^vPX*"
 _BESIDE = 0.012  # of the axis, between the error bars of neighbouring curves above words
 _LETTERS_PER_IN = 16  # of the title
@@ -39,55 +39,60 @@ class Panel:
     curves: Sequence[Curve]
 
 
-def draw_study(
-    folder: Path,
-    rows: Sequence[tuple[str, Sequence[Panel]]],
-    *,
-    at: Sequence[float] | Sequence[str],
-    axis: str,
-    legend: str,
-    title: str,
-    ordered: bool,
-) -> None:
-    """Write `figure.svg`, `.png` and `.pdf`; equal arguments give equal bytes.
+@dataclass(frozen=True)
+class StudyDrawing:
+    """What a study's figure shows."""
 
-    Args:
-        folder: where to.
-        rows: name of what is measured, and its panels, the same number in every row.
-        at: the values along the horizontal axis; words are put side by side.
-        axis: what they are.
-        legend: what the curves are.
-        title: above everything.
-        ordered: whether the curves have an order, which their colours then show.
-    """
-    from matplotlib.figure import Figure
+    rows: Sequence[tuple[str, Sequence[Panel]]]
+    """Name of what is measured, and its panels, the same number in every row."""
+    at: Sequence[float] | Sequence[str]
+    """The values along the horizontal axis; words are put side by side."""
+    axis: str
+    """What they are."""
+    legend: str
+    """What the curves are."""
+    ordered: bool
+    """Whether the curves have an order, which their colours then show."""
 
-    columns = len(rows[0][1])
+
+def save_study(folder: Path, drawing: StudyDrawing, title: str) -> None:
+    """Write `figure.svg`, `.png` and `.pdf`; equal arguments give equal bytes."""
+    width_in = max(0.6 + _PANEL_IN * len(drawing.rows[0][1]), _SMALLEST_IN)
+    figure = draw_study(drawing, width_in, title)
     with page_style():
-        width = max(0.6 + _PANEL_IN * columns, _SMALLEST_IN)
-        figure = Figure((width, 0.9 + _ROW_IN * len(rows)), layout="constrained")
-        grid = figure.subplots(len(rows), columns, sharex=True, sharey="row", squeeze=False)
-        for (measured, panels), line in zip(rows, grid, strict=True):
-            for panel, axes in zip(panels, line, strict=True):
-                _draw(axes, panel, at, ordered=ordered)
-            line[0].set_ylabel(measured)
-            line[0].set_ylim(0, _HEADROOM * max(line[0].get_ylim()[1], _LEAST_TOP))
-        for panel, axes in zip(rows[0][1], grid[0], strict=True):
-            axes.set_title(panel.title, color=INK, fontsize=8.4)
-        for axes in grid[-1]:
-            axes.set_xlabel(axis)
-        handles, labels = grid[0][0].get_legend_handles_labels()
-        figure.legend(
-            handles, labels, title=legend, loc="outside lower center", ncols=min(len(labels), 3 * columns)
-        )
-        lines = wrap(title, int(_LETTERS_PER_IN * width))
-        figure.suptitle("\n".join(lines), color=MUTED, fontsize=8.0)
         # Neither dates nor versions: the same study gives the same files.
         figure.savefig(folder / "figure.svg", metadata={"Date": None, "Creator": None})
         figure.savefig(folder / "figure.png", dpi=_DPI, metadata={"Software": None})
         figure.savefig(
             folder / "figure.pdf", metadata={"CreationDate": None, "Creator": None, "Producer": None}
         )
+
+
+def draw_study(drawing: StudyDrawing, width_in: float, title: str = "") -> Figure:
+    """Draw a study, with a title above everything if there is one."""
+    from matplotlib.figure import Figure
+
+    rows, at = drawing.rows, drawing.at
+    columns = len(rows[0][1])
+    with page_style():
+        figure = Figure((width_in, 0.9 + _ROW_IN * len(rows)), layout="constrained")
+        grid = figure.subplots(len(rows), columns, sharex=True, sharey="row", squeeze=False)
+        for (measured, panels), line in zip(rows, grid, strict=True):
+            for panel, axes in zip(panels, line, strict=True):
+                _draw(axes, panel, at, ordered=drawing.ordered)
+            line[0].set_ylabel(measured)
+            line[0].set_ylim(0, _HEADROOM * max(line[0].get_ylim()[1], _LEAST_TOP))
+        for panel, axes in zip(rows[0][1], grid[0], strict=True):
+            axes.set_title(panel.title, color=INK, fontsize=8.4)
+        for axes in grid[-1]:
+            axes.set_xlabel(drawing.axis)
+        handles, labels = grid[0][0].get_legend_handles_labels()
+        below = min(len(labels), 3 * columns)
+        figure.legend(handles, labels, title=drawing.legend, loc="outside lower center", ncols=below)
+        if title:
+            lines = wrap(title, int(_LETTERS_PER_IN * width_in))
+            figure.suptitle("\n".join(lines), color=MUTED, fontsize=8.0)
+    return figure
 
 
 def _draw(axes: Axes, panel: Panel, at: Sequence[float] | Sequence[str], *, ordered: bool) -> None:
@@ -120,8 +125,8 @@ def _draw(axes: Axes, panel: Panel, at: Sequence[float] | Sequence[str], *, orde
 
 
 def _colour(k: int, count: int, ordered: bool) -> Any:
-    if ordered and count <= len(_ORDERED):
-        return _ORDERED[k + len(_ORDERED) - count]
+    if ordered and count <= len(LEVELS):
+        return LEVELS[k + len(LEVELS) - count]
     return CAMERAS[k % len(CAMERAS)]
 
 

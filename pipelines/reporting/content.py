@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipelines.session.description import Description
 from pipelines.session.records import Occupancy
@@ -26,6 +26,15 @@ class ReplanContent:
 
 
 @dataclass(frozen=True)
+class StudyContent:
+    """What `mocap ablate` left in a folder."""
+
+    summary: dict[str, Any]  # its summary.json
+    command: str  # that makes it again
+    digest: str  # SHA-256 of that file
+
+
+@dataclass(frozen=True)
 class SessionContent:
     """Everything the page of one session needs; what a session does not hold is None or empty."""
 
@@ -43,6 +52,7 @@ class SessionContent:
     true_poses: dict[str, pd.DataFrame] = field(default_factory=dict)  # camera: tables.POSES, where known
     hidden: dict[str, float] = field(default_factory=dict)  # camera: share of moments, where a map is
     made_by: dict[str, dict[str, str]] = field(default_factory=dict)  # stage: program or library, and version
+    studies: tuple[StudyContent, ...] = ()  # that stand beside the flight
 
 
 def section(mapping: Mapping[str, object], key: str) -> dict[str, object]:

@@ -21,6 +21,7 @@ from pipelines.reporting.placing import as_reconstructed
 from pipelines.reporting.plates import Plate
 from pipelines.reporting.quality import quality
 from pipelines.reporting.replanned import Replan, summarise_replan
+from pipelines.reporting.studies import draw_studies, summarise_studies
 from pipelines.reporting.summary import Summary, errors_per_camera, give_verdict, measures, summarise
 from pipelines.reporting.templating import environment
 from pipelines.reporting.viewer import make_scene
@@ -93,6 +94,7 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
             errors_per_camera=errors_per_camera(summary),
             plates=plates,
             replan=replan,
+            studies=summarise_studies(content.studies),
             scene=make_scene(summary, content.poses | content.refined, replan),
             refined=bool(content.refined),
             quality=quality(content, summary),
@@ -124,7 +126,8 @@ def draw_session(content: SessionContent, read_frame: ReadFrame | None = None) -
 
 
 def _draw(summary: Summary, content: SessionContent, replan: Replan | None) -> dict[str, Plate]:
-    return draw_all(summary, content.poses) | (draw_arms(replan) if replan is not None else {})
+    of_arms = draw_arms(replan) if replan is not None else {}
+    return draw_all(summary, content.poses) | of_arms | draw_studies(content.studies)
 
 
 def _replan(summary: Summary, content: SessionContent) -> Replan | None:

@@ -23,6 +23,8 @@ INK, MUTED, GRID, PAPER = "#22262a", "#666d74", "#dddcd6", "#fefdfb"
 LEFT, RIGHT, MIDDLE = "#1f78b5", "#c8561b", "#4a4f55"
 CAMERAS = ("#0072b2", "#d55e00", "#009e73", "#b0528f", "#a87900", "#4f8fc4")
 """After Okabe and Ito's colours for every kind of sight, darkened to be seen as thin lines on paper."""
+LEVELS = ("#9db8c9", "#5f97bd", "#1f6da5", "#123f66")
+"""For what has an order, from the least to the most: light to dark, on dark paper dark to light."""
 STATUS_COLOURS = {
     "ok": "#2f6f92",
     "filled": "#9fc6d8",
@@ -41,6 +43,7 @@ PALETTE = {
     RIGHT: "--right",
     MIDDLE: "--middle",
     **{colour: f"--camera-{k}" for k, colour in enumerate(CAMERAS)},
+    **{colour: f"--level-{k}" for k, colour in enumerate(LEVELS)},
     **{colour: f"--status-{word.replace('_', '-')}" for word, colour in STATUS_COLOURS.items()},
 }
 

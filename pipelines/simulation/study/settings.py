@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import shlex
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.triangulation import Method
@@ -140,6 +141,48 @@ def settings_for(
         trials,
         seed,
     )
+
+
+def command_of(settings: Mapping[str, Any], output: str) -> str:
+    """The `mocap ablate ...` that makes a study again; what it has by default is not said.
+
+    Args:
+        settings: as summary.json holds them, the noise as models by label.
+        output: the folder.
+
+    Raises:
+        KeyError, TypeError, ValueError: they are none of a study.
+    """
+    study, drones, tilts = settings["study"], settings["drones"], settings["tilts_deg"]
+    seconds, detector, noise = settings["seconds"], settings["detector"], settings["noise"]
+    plain = settings_for(study, methods=METHODS[:1], seconds=seconds)
+    said: list[str] = []
+    if tilts != list(plain.tilts_deg):
+        said += ["--tilts" if study == "tilt" else "--tilt", ",".join(f"{tilt:g}" for tilt in tilts)]
+    if drones != list(plain.drones):
+        said += ["--robots" if study == "robots" else "--drones", ",".join(map(str, drones))]
+    if noise != {each.label: each.model for each in plain.noise}:
+        said += _noise_words(study, noise, seconds)
+    if settings["methods"] != list(METHODS):
+        said += ["--methods", ",".join(settings["methods"])]
+    if detector is not None:
+        said += ["--detector", detector]
+    elif settings["keypoints"] != "model":
+        said += ["--keypoints", settings["keypoints"]]
+    numbers = {"seconds": 75.0, "rate_hz": 30.0 if detector is None else 1.0, "trials": 10, "seed": 0}
+    for name, default in numbers.items():
+        if settings[name] != default:
+            said += [f"--{name.removesuffix('_hz')}", f"{settings[name]:g}"]
+    return shlex.join(["mocap", "ablate", study, *said, "-o", output])
+
+
+def _noise_words(study: Study, noise: Mapping[str, str], seconds: float) -> list[str]:
+    """The options that ask for this noise."""
+    levels = [level for level in LEVELS if any(level in label.split() for label in noise)]
+    for asked in (levels, *([level] for level in LEVELS)):
+        if asked and dict(noise) == {each.label: each.model for each in _levels(study, asked, seconds)}:
+            return ["--levels", ",".join(asked)]
+    return [word for model in noise.values() for word in ("--noise", model)]
 
 
 def _levels(study: Study, levels: Sequence[str], seconds: float) -> list[Noise]:
