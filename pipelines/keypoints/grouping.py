@@ -22,14 +22,12 @@ numba's cache watches the file of the outermost function only.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.compilation import cached
+from pipelines.geometry.compilation import cached, helper
 
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -49,15 +47,6 @@ _HOLD_S = 0.5  # how long a picture is worth comparing with a later one
 _PACE_M_PER_S = 0.7  # random part of a walk, for taking up a track again
 _BODY_RADIUS_M = 0.3  # the middle of a body depends on which joints are seen
 _SPARE = 16  # tracks remembered beyond one for each possible detection
-
-F = TypeVar("F", bound=Callable[..., object])
-
-
-def helper(function: F) -> F:
-    """Compile a function into those that call it."""
-    # Nobody calls these from Python, and leaving the wrappers out saves a quarter of the compile time.
-    compiled: F = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
-    return compiled
 
 
 class Followed(NamedTuple):

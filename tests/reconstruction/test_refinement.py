@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -39,6 +40,10 @@ BODY_BIAS = Bias(position_m=0.3, rotation_deg=1.0, frame="body")
 # --- derivatives ---------------------------------------------------------------------------------------
 
 
+# Helpers can be called by compiled functions alone.
+linearise = numba.njit(lambda *arguments: kernels.linearise(*arguments))  # noqa: PLW0108
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-5, 0.3])
 def test_derivatives_are_those_of_finite_differences(angle: float) -> None:
     rng = np.random.default_rng(3)
@@ -53,7 +58,7 @@ def test_derivatives_are_those_of_finite_differences(angle: float) -> None:
         residual, by_joint, by_number = np.empty((3, 2)), np.zeros((3, 2, 3)), np.zeros((3, 2, 10))
         # A joint moves on while the clock runs.
         moved = at + velocity * (numbers[9] - number[9])
-        kernels.linearise(
+        linearise(
             moved, velocity, numbers, xy, sharpness, position, np.eye(3), speed, turn,
             residual, by_joint, by_number,
         )  # fmt: skip

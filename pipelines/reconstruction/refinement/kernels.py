@@ -48,6 +48,15 @@ def exponential(rotation_vector: Float, rotation: Float, jacobian: Float) -> Non
         jacobian[j, i] += b * rotation_vector[k]
 
 
+@cached
+def turned(rotation_vectors: Float) -> Float:
+    """exp(r) [N, 3, 3] of rotation vectors [N, 3]."""
+    rotations, unused = np.empty((len(rotation_vectors), 3, 3)), np.empty((3, 3))
+    for n in range(len(rotation_vectors)):
+        exponential(rotation_vectors[n], rotations[n], unused)
+    return rotations
+
+
 @helper
 def weights_between(t0: float, t1: float, t2: float, t: float, weight: Float, slope: Float) -> None:
     """Lagrange's quadratic through three times: weights of the values, and of the derivative, at t."""

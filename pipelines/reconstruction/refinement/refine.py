@@ -24,7 +24,7 @@ from pipelines.reconstruction.refinement.estimate import (
     learn,
     solve,
 )
-from pipelines.reconstruction.refinement.kernels import exponential
+from pipelines.reconstruction.refinement.kernels import turned
 from pipelines.reconstruction.refinement.levels import shrunk
 from pipelines.reconstruction.refinement.problem import (
     ROTATION,
@@ -195,11 +195,8 @@ def corrected(position: Float, rotation: Float, numbers: Float) -> tuple[Float, 
         rotation: [N, 3, 3] as logged.
         numbers: [N, 10] the corrections at the same times; the clock's is left to the caller.
     """
-    turned = np.empty_like(rotation)
-    unused = np.empty((3, 3))
-    for n in range(len(numbers)):
-        exponential(numbers[n, ROTATION : ROTATION + 3], turned[n], unused)
-    true_rotation = np.einsum("nij,nkj->nik", rotation, turned)
+    turns = np.ascontiguousarray(numbers[:, ROTATION : ROTATION + 3])
+    true_rotation = np.einsum("nij,nkj->nik", rotation, turned(turns))
     shift = numbers[:, :3] + np.einsum("nij,nj->ni", true_rotation, numbers[:, 6:9])
     return position - shift, true_rotation
 
