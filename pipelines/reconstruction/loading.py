@@ -13,6 +13,7 @@ from pipelines.geometry.noise import sum_sigma
 from pipelines.geometry.poses import interpolate_points, rates
 from pipelines.reconstruction.observations import Camera
 from pipelines.reconstruction.refinement.problem import (
+    NEW_SHARE,
     ROTATION,
     SHIFT_IN_WORLD,
     PoseErrors,
@@ -182,8 +183,9 @@ def load_pose_errors(
 ) -> list[PoseErrors] | None:
     """What is known of each camera's pose errors over time; None where nobody stated it for all that move.
 
-    A logged covariance says how large errors are, not how long they last (`errors_of_level`). A still camera
-    of which nothing is said was calibrated, and counts as exact beside others that are stated.
+    A logged covariance says how large errors are, not how long they last (`errors_of_level`): what is new in
+    a pose has its own covariance, what lasts the median. A still camera of which nothing is said was
+    calibrated, and counts as exact beside others that are stated.
     """
     stated: list[PoseErrors | None] = []
     for camera in cameras:
@@ -195,7 +197,8 @@ def load_pose_errors(
         elif entry.pose_noise:
             stated.append(pose_errors(noise_models(f"pose_noise of {camera.name}", entry.pose_noise)))
         elif camera.covariance is not None and camera.sigma is not None:
-            stated.append(errors_of_level(np.median(camera.sigma, axis=0)))
+            level = errors_of_level(np.median(camera.sigma, axis=0))
+            stated.append(replace(level, logged=True))
         else:
             stated.append(PoseErrors((0.0, 0.0), ()) if camera.static else None)
     known = [errors for errors in stated if errors is not None]
@@ -204,8 +207,9 @@ def load_pose_errors(
 
 def errors_of_level(level: Float) -> PoseErrors:
     """Pose errors of which only the level [2] (m, rad) is known: half of the variance new, half lasting."""
-    shift, turn = (float(sigma) for sigma in level / np.sqrt(2))
-    return PoseErrors((shift, turn), (Process(SHIFT_IN_WORLD, shift), Process(ROTATION, turn)))
+    new, lasting = np.sqrt(NEW_SHARE) * level, np.sqrt(1 - NEW_SHARE) * level
+    processes = (Process(SHIFT_IN_WORLD, float(lasting[0])), Process(ROTATION, float(lasting[1])))
+    return PoseErrors((float(new[0]), float(new[1])), processes)
 
 
 def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> Float:

@@ -23,7 +23,7 @@ from pipelines.reconstruction.observations import (
     sightings_of,
 )
 from pipelines.reconstruction.refinement.building import Sighting
-from pipelines.reconstruction.refinement.problem import PoseErrors
+from pipelines.reconstruction.refinement.problem import NEW_SHARE, PoseErrors
 from pipelines.reconstruction.refinement.refine import SETTLED_S, Refined, corrected, refine
 from pipelines.reconstruction.reweighting import reprojection_px
 from pipelines.session.records import Float, Int64
@@ -106,7 +106,10 @@ def refine_flight(
     offset_s, shifted, started = np.zeros(len(cameras)), list(cameras), result
     for _ in range(1 + _MOST_SHIFTS):
         sightings = [
-            _sighting(camera, found, c, choice, observations.t_ns, sides[..., c], pixel_sigma, limits)
+            replace(
+                _sighting(camera, found, c, choice, observations.t_ns, sides[..., c], pixel_sigma, limits),
+                pose_covariance=None if prior is None else white_covariance(camera, prior[c]),
+            )
             for c, camera in enumerate(shifted)
         ]
         start = started.points.reshape(times, people * joints, 3)
@@ -191,6 +194,12 @@ def _sighting(
         focal_px=camera.focal_px,
         pixel_sigma=pixel_sigma,
     )
+
+
+def white_covariance(camera: Camera, prior: PoseErrors) -> Float | None:
+    """Covariances [F, 6, 6] of what is new in each picture's pose, where the log states them pose by pose."""
+    logged = camera.covariance_at(camera.frame_t_ns) if prior.logged else None
+    return None if logged is None else NEW_SHARE * logged
 
 
 def rigid_pairs(joints: tuple[str, ...], people: int) -> Int64:

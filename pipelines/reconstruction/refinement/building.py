@@ -35,6 +35,7 @@ class Sighting:
     rotation: Float  # [F, 3, 3]
     focal_px: float
     pixel_sigma: float  # px per axis of a view of confidence 1
+    pose_covariance: Float | None = None  # [F, 6, 6] of white pose errors, see `Problem`
 
     @property
     def range_of(self) -> Bool:
@@ -50,15 +51,21 @@ def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64) -> Problem:
         sightings: what each camera saw.
         bones: [B, 2] joints whose distance hardly changes.
     """
-    parts = [_pictures(t_s, sighting, camera) for camera, sighting in enumerate(sightings)]
+    parts, covariances, logged = [], [np.empty((0, 6, 6))], 0
+    for camera, sighting in enumerate(sightings):
+        parts.append(_pictures(t_s, sighting, camera, logged))
+        if sighting.pose_covariance is not None:
+            covariances.append(sighting.pose_covariance)
+            logged += len(sighting.t_s)
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     order = np.lexsort((columns[2], columns[1], columns[0]))
     pictures = Pictures(*(np.ascontiguousarray(column[order]) for column in columns))
     knots = max(int(np.ceil((t_s[-1] - t_s[0]) / KNOT_S)) + 1, 2)
-    return Problem(t_s, pictures, bones, np.linspace(t_s[0], t_s[-1], knots))
+    knot_t_s = np.linspace(t_s[0], t_s[-1], knots)
+    return Problem(t_s, pictures, bones, knot_t_s, np.concatenate(covariances))
 
 
-def _pictures(t_s: Float, sighting: Sighting, camera: int) -> tuple[NDArray[np.generic], ...]:
+def _pictures(t_s: Float, sighting: Sighting, camera: int, logged: int) -> tuple[NDArray[np.generic], ...]:
     step = float(np.median(np.diff(t_s)))
     first, near = _first_of_three(t_s, sighting.t_s, step)
     (kept,) = np.nonzero(near & sighting.range_of)
@@ -69,6 +76,7 @@ def _pictures(t_s: Float, sighting: Sighting, camera: int) -> tuple[NDArray[np.g
     return (
         first[kept],
         np.full(len(kept), camera, dtype=np.int64),
+        np.full(len(kept), -1) if sighting.pose_covariance is None else logged + kept,
         sighting.t_s[kept],
         xy,
         sharpness,

@@ -11,7 +11,7 @@ a segment is factorised again when the way back reaches it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.reconstruction.refinement import kernels, sweeps
-from pipelines.reconstruction.refinement.problem import Knowledge, Layout, Problem, State
+from pipelines.reconstruction.refinement.problem import EXACT, Knowledge, Layout, PoseErrors, Problem, State
 
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -46,7 +46,8 @@ class System:
     bound2: float  # of the robust loss
     held: bool = False  # bone lengths stay as they are
     sharpness: Float = field(init=False)
-    white_precision: Float = field(init=False)  # [C, 6], inf without
+    white_row: Int64 = field(init=False)  # [G] where the next has the picture's
+    white_precision: Float = field(init=False)  # [., 6, 6] of each camera, then of logged poses; inf without
     inverse_acceleration: Float = field(init=False)  # [J, J]
     of_time: Int64 = field(init=False)  # [T - 2]
     fraction: Float = field(init=False)  # [G]
@@ -61,14 +62,14 @@ class System:
         """Derive what every linearisation needs."""
         problem, known = self.problem, self.knowledge
         of_time, fraction = problem.intervals()
-        knot_s = float(problem.knot_t_s[1] - problem.knot_t_s[0])
-        white = np.array([np.repeat(errors.white_with_stray(knot_s), 3) for errors in known.poses])
+        white_row, white_precision = _white_errors(problem, known.poses)
         before, after = np.diff(problem.t_s)[:-1], np.diff(problem.t_s)[1:]
         usual = float(np.median(np.diff(problem.t_s)))
         kept, variance = _ties(self.layout)
         derived = {
             "sharpness": problem.pictures.sharpness / (known.pixel_scale * np.sqrt(known.memory)),
-            "white_precision": np.where(white > 0, 1 / np.where(white > 0, white, 1.0) ** 2, np.inf),
+            "white_row": white_row,
+            "white_precision": white_precision,
             "inverse_acceleration": np.linalg.inv(known.acceleration),
             "of_time": of_time,
             "fraction": fraction,
@@ -135,12 +136,32 @@ class System:
             self.of_time,
             *self.picture_arguments(),
             self.bound2,
+            self.white_row,
             self.white_precision,
             *self.entries(),
             self.layout.knot_count,
             self.curvature,
             self.spread,
         )
+
+
+def _white_errors(problem: Problem, poses: Sequence[PoseErrors]) -> tuple[Int64, Float]:
+    """Where the inverse covariance of each picture's white error stands [G], and all of them [., 6, 6]."""
+    knot_s = float(problem.knot_t_s[1] - problem.knot_t_s[0])
+    pictures, logged = problem.pictures, problem.pose_covariance
+    level = np.array([np.repeat(errors.white_with_stray(knot_s), 3) for errors in poses])
+    usual = np.full((len(poses), 6, 6), np.inf)
+    has = level[:, 0] > 0
+    usual[has] = level[has, :, None] ** -2.0 * np.eye(6)
+    own = np.array([errors.logged for errors in poses])[pictures.camera] & (pictures.logged >= 0)
+    if not own.any():
+        return pictures.camera, usual
+    stray2 = level**2 - np.repeat(np.square([errors.white for errors in poses]), 3, axis=1)
+    of_camera = np.zeros(len(logged), dtype=np.int64)
+    of_camera[pictures.logged[own]] = pictures.camera[own]
+    added = np.maximum(stray2, EXACT**2)[of_camera]
+    precision = np.linalg.inv(logged + added[:, :, None] * np.eye(6))
+    return np.where(own, len(poses) + pictures.logged, pictures.camera), np.concatenate([usual, precision])
 
 
 def _ties(layout: Layout) -> tuple[Float, Float]:
@@ -271,10 +292,10 @@ def prior_cost(system: System, state: State) -> float:
     lengths = state.shared[layout.bone_column :]
     cost += np.sum(((_bone_lengths(problem, state.position) - lengths) / known.bone_sigma_m) ** 2)
     cost /= system.grown(state) ** 2
-    finite = np.isfinite(system.white_precision[:, 0])
-    of_picture = finite[problem.pictures.camera]
-    precision = system.white_precision[problem.pictures.camera[of_picture]]
-    cost += np.sum(precision * state.white[of_picture] ** 2)
+    precision = system.white_precision[system.white_row]
+    there = np.isfinite(precision[:, 0, 0])
+    white = state.white[there]
+    cost += np.sum((precision[there] @ white[..., None])[..., 0] * white)
     for (_, process), (at_knots, column) in zip(layout.processes, layout.place, strict=True):
         value = state.knots[:, column : column + 3] if at_knots else state.shared[None, column : column + 3]
         cost += np.sum(value[0] ** 2) / process.sigma0**2
@@ -510,6 +531,7 @@ def _solve_back(
         system.of_time[pictures.first],
         *system.picture_arguments(),
         system.bound2,
+        system.white_row,
         system.white_precision,
         *system.entries(),
         moved.white,

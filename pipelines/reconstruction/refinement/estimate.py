@@ -113,8 +113,10 @@ def evidence(problem: Problem, known: Knowledge, state: State) -> float:
     value -= 1.5 * (times - 2) * float(log_determinant)
     value -= times * float(np.log(known.bone_sigma_m / known.size_m).sum())
     value -= (state.position.size + len(problem.bones)) * float(np.log(known.size_m * grown))
-    white = system.white_precision[problem.pictures.camera]
-    value += 0.5 * float(np.log(white[np.isfinite(white)]).sum())
+    there = np.isfinite(system.white_precision[:, 0, 0])
+    certainty = np.zeros(len(there))
+    certainty[there] = np.linalg.slogdet(system.white_precision[there])[1]
+    value += 0.5 * float(certainty[system.white_row].sum())
     for (_, process), (at_knots, column) in zip(system.layout.processes, system.layout.place, strict=True):
         value -= 3 * float(np.log(process.sigma0))
         if at_knots:

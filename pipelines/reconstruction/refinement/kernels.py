@@ -316,6 +316,7 @@ def assemble(
     turn: Float,
     trust: Float,
     bound2: float,
+    white_row: Int64,
     white_precision: Float,
     entry_start: Int64,
     entry_number: Int64,
@@ -331,7 +332,8 @@ def assemble(
     Returns half the logarithm of the determinant of the white errors' equations, which are eliminated.
 
     The front's unknowns are the joints at three times, the knots on both sides of the interval, what all
-    share; only its lower triangle is kept. A `white_precision` [C, 6] of inf means no white part.
+    share; only its lower triangle is kept. Of a picture's white error `white_precision` [., 6, 6] at its
+    `white_row` [G] is the inverse covariance, of inf where there is none.
     """
     J = position.shape[1]
     n = 3 * J
@@ -366,13 +368,13 @@ def assemble(
             residual, by_joint, by_number, believed, of_joints, across, of_numbers, joint_gradient,
             number_gradient,
         )  # fmt: skip
-        eliminated = np.isfinite(white_precision[c, 0])
+        eliminated = np.isfinite(white_precision[white_row[g], 0, 0])
         if eliminated:
             for a in range(WHITE):
+                z[a] = number_gradient[a]
                 for b in range(WHITE):
-                    factor[a, b] = of_numbers[a, b]
-                factor[a, a] += white_precision[c, a]
-                z[a] = number_gradient[a] + white_precision[c, a] * white[g, a]
+                    factor[a, b] = of_numbers[a, b] + white_precision[white_row[g], a, b]
+                    z[a] += white_precision[white_row[g], a, b] * white[g, b]
                 for p in range(n):
                     by_white[p, a] = across[p // 3, p % 3, a]
                 for b in range(NUMBERS):
@@ -472,6 +474,7 @@ def whiten(
     turn: Float,
     trust: Float,
     bound2: float,
+    white_row: Int64,
     white_precision: Float,
     entry_start: Int64,
     entry_number: Int64,
@@ -490,7 +493,7 @@ def whiten(
         c = camera[g]
         z = step_white[g]
         z[:] = 0.0
-        if not np.isfinite(white_precision[c, 0]):
+        if not np.isfinite(white_precision[white_row[g], 0, 0]):
             continue
         moved = when[g] + (shared[clock_column[c]] if clock_column[c] >= 0 else 0.0)
         at_picture(first[g], t_s, moved, position, weight, slope, out, rate)
@@ -506,10 +509,10 @@ def whiten(
             out, rate, number, xy[g], sharpness[g], pose_position[g], pose_rotation[g], speed[g], turn[g],
             residual, by_joint, by_number,
         )  # fmt: skip
-        factor[:] = 0.0
         for a in range(WHITE):
-            factor[a, a] = white_precision[c, a]
-            z[a] = -white_precision[c, a] * white[g, a]
+            for b in range(WHITE):
+                factor[a, b] = white_precision[white_row[g], a, b]
+                z[a] -= factor[a, b] * white[g, b]
         for joint in range(J):
             if np.isnan(residual[joint, 0]):
                 continue
@@ -605,6 +608,7 @@ def rows_of_picture(
     turn: Float,
     trust: Float,
     bound2: float,
+    white_row: Int64,
     white_precision: Float,
     entry_start: Int64,
     entry_number: Int64,
@@ -652,13 +656,12 @@ def rows_of_picture(
     )  # fmt: skip
     rows[:] = 0.0
     own[:] = 0.0
-    has_white = np.isfinite(white_precision[c, 0])
+    has_white = np.isfinite(white_precision[white_row[g], 0, 0])
     white_rows = rows[2 * J :]
     if has_white:
         for a in range(WHITE):
             for b in range(WHITE):
-                factor[a, b] = of_numbers[a, b]
-            factor[a, a] += white_precision[c, a]
+                factor[a, b] = of_numbers[a, b] + white_precision[white_row[g], a, b]
         factorise(factor)
         for a in range(WHITE):
             variance[a, a] = 1.0

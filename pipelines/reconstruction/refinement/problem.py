@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,11 @@ Int64 = NDArray[np.int64]
 SHIFT_IN_WORLD, ROTATION, SHIFT_IN_CAMERA, CLOCK = 0, 3, 6, 9
 """Where the parts of a picture's ten numbers begin (see `kernels`)."""
 
-_EXACT = 1e-5
+EXACT = 1e-5
 """m and rad: a constant error of this size stands for none; the equations stay well posed."""
+
+NEW_SHARE = 0.5
+"""Of a logged variance, which says how large an error is and not how long it lasts: new in every pose."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,7 @@ class Pictures:
 
     first: Int64  # [G]
     camera: Int64  # [G]
+    logged: Int64  # [G] row of its pose's covariance in `Problem.pose_covariance`, -1 for none
     when_s: Float  # [G] on the skeleton's clock
     xy: Float  # [G, J, 2]
     sharpness: Float  # [G, J] 1 / standard deviation of an image point
@@ -82,6 +86,8 @@ class PoseErrors:
 
     white: tuple[float, float]  # m, rad per axis; 0, 0 for none
     processes: tuple[Process, ...]
+    logged: bool = False
+    """White errors have the covariance of each pose, where the log states it; `white` is its level."""
 
     def white_with_stray(self, knot_s: float) -> Float:
         """Standard deviation [2] (m, rad) of what is white, with what slow errors do between knots."""
@@ -89,7 +95,7 @@ class PoseErrors:
         for process in self.processes:
             variance[1 if process.number == ROTATION else 0] += process.stray(knot_s)
         if variance.any():
-            variance = np.maximum(variance, _EXACT**2)
+            variance = np.maximum(variance, EXACT**2)
         return np.sqrt(variance)
 
 
@@ -129,14 +135,14 @@ def pose_errors(models: Sequence[NoiseModel]) -> PoseErrors:
             case _:
                 raise ValueError(f"{type(model).__name__} cannot be a prior of the refinement")
     processes += [
-        Process(number, max(sigma0, _EXACT), rate)
+        Process(number, max(sigma0, EXACT), rate)
         for number, (sigma0, rate) in sorted(merged.items())
         if sigma0 > 0 or rate > 0
     ]
     # A position without noise beside a rotation with noise (or the reverse) is a very small noise.
     known = np.sqrt(white)
     if known.any():
-        known = np.maximum(known, _EXACT)
+        known = np.maximum(known, EXACT)
     return PoseErrors((float(known[0]), float(known[1])), tuple(processes))
 
 
@@ -230,6 +236,8 @@ class Problem:
     pictures: Pictures
     bones: Int64  # [B, 2]
     knot_t_s: Float  # [K]
+    pose_covariance: Float = field(default_factory=lambda: np.empty((0, 6, 6)))
+    """[L, 6, 6] of logged white pose errors: shift in the world (m), rotation vector in the camera (rad)."""
 
     @property
     def joints(self) -> int:

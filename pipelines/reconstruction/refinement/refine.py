@@ -180,7 +180,7 @@ def _quickly(system: System, state: State, known: Knowledge) -> Float:
     poses = []
     for errors in known.poses:
         white = errors.white_with_stray(knot_s)
-        poses.append(PoseErrors((float(white[0]), float(white[1])), ()))
+        poses.append(PoseErrors((float(white[0]), float(white[1])), (), errors.logged))
     known = replace(known, poses=tuple(poses), memory=1.0)
     begun = initial_state(problem, known, state.position)
     _, found, _ = solve(problem, known, begun, rounds=4, bounds=(BOUND,))

@@ -83,6 +83,7 @@ def forwards(
     turn: Float,
     trust: Float,
     bound2: float,
+    white_row: Int64,
     white_precision: Float,
     entry_start: Int64,
     entry_number: Int64,
@@ -136,8 +137,8 @@ def forwards(
         half += assemble(
             starts[time], starts[time + 1], time, t_s, position, knots, shared, white, camera, when, fraction,
             interval, xy, sharpness, pose_position, pose_rotation, speed, turn, trust, bound2,
-            white_precision, entry_start, entry_number, entry_knot, entry_column, clock_column, knot_count,
-            front, gradient,
+            white_row, white_precision, entry_start, entry_number, entry_knot, entry_column, clock_column,
+            knot_count, front, gradient,
         )  # fmt: skip
         add_motion(
             position[time : time + 3], curvature[time], precision, 1.0 / (spread[time] * grown**2), hold,
@@ -391,6 +392,7 @@ def visit(
     turn: Float,
     trust: Float,
     bound2: float,
+    white_row: Int64,
     white_precision: Float,
     entry_start: Int64,
     entry_number: Int64,
@@ -474,12 +476,12 @@ def visit(
                 for g in range(starts[time], starts[time + 1]):
                     rows_of_picture(
                         g, time, t_s, position, knots, shared, white, camera, when, fraction, interval, xy,
-                        sharpness, pose_position, pose_rotation, speed, turn, trust, bound2, white_precision,
-                        entry_start, entry_number, entry_knot, entry_column, clock_column, knot_count,
-                        believed, residual, rows, added,
+                        sharpness, pose_position, pose_rotation, speed, turn, trust, bound2, white_row,
+                        white_precision, entry_start, entry_number, entry_knot, entry_column, clock_column,
+                        knot_count, believed, residual, rows, added,
                     )  # fmt: skip
                     picture_of(rows, np.dot(rows, whole), added, believed, residual, white[g],
-                               white_precision[camera[g]], image, white_sums)  # fmt: skip
+                               white_precision[white_row[g]], image, white_sums)  # fmt: skip
             if time == 0:
                 for i in range(c):
                     starting[i, 0] = knots[0, i] ** 2 + whole[3 * n + i, 3 * n + i]
@@ -628,13 +630,13 @@ def picture_of(
             image[joint, 0] += believed[joint] * residual[joint, axis] ** 2
             image[joint, 1] += believed[joint] * (1 - variance)
     for i in range(WHITE):
-        if not np.isfinite(precision[i]):
+        if not np.isfinite(precision[i, i]):
             continue
         r = 2 * J + i
         variance = added[r]
         for k in range(rows.shape[1]):
             variance += rows[r, k] * followed[r, k]
-        told = 1 - variance * precision[i]
+        told = 1 - variance * precision[i, i]
         part = i // 3
         sums[part, 0] += white[i] ** 2 + variance
         sums[part, 1] += 1
