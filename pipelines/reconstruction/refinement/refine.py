@@ -266,7 +266,9 @@ def _find_prior(
     # to round by more than levels that are right differ in.
     found = {"estimated": (evidence(problem, free, state), free, state)}
     exact = (PoseErrors((0.0, 0.0), ()),) * len(sightings)
-    others = {"exact": exact} if prior is None else {"stated": tuple(prior), "exact": exact}
+    others = {} if prior is None else {"stated": tuple(prior)}
+    if exact not in others.values():
+        others["exact"] = exact
     for name, poses in others.items():
         known = replace(free, poses=poses)
         try:
