@@ -39,8 +39,8 @@ STATUS_REMEDIES = {
 
 
 def fixed(value: float | None, digits: int = 1) -> str:
-    """A number with fixed decimals and grouped thousands; a dash for None."""
-    return ABSENT if value is None else f"{value:,.{digits}f}".replace(",", THIN).replace("-", "−")
+    """A number with fixed decimals and grouped thousands, no sign before zero; a dash for None."""
+    return ABSENT if value is None else f"{value:z,.{digits}f}".replace(",", THIN).replace("-", "−")
 
 
 def whole(value: float | None) -> str:

@@ -48,6 +48,7 @@ def test_shortened_fits_a_label(name: str) -> None:
 def test_numbers() -> None:
     assert fixed(1234567.89) == f"1{THIN}234{THIN}567.9"
     assert fixed(-0.5) == "−0.5"
+    assert fixed(-0.04) == "0.0"
     assert fixed(None) == "–"
     assert significant(12345.6) == f"12{THIN}346"
     assert significant(0.0123) == "0.01"
