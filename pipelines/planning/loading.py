@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel, White
-from pipelines.geometry.poses import gaps, interpolate_points, interpolate_poses
-from pipelines.session.description import CameraEntry, Description
+from pipelines.geometry.poses import gaps, interpolate_points
+from pipelines.session.camera_poses import poses_at
+from pipelines.session.description import CameraEntry, Description, Interpolation
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Int64, JointMotion, Trajectory
 from pipelines.session.registries import noise_models, parsed_noise_models
@@ -139,32 +140,17 @@ def flown_poses(flight: LoggedFlight, description: Description, t_ns: Int64) -> 
 
     Across gaps of the log positions go straight on, so that a flight can be scored as a whole.
     """
-    limits = description.pose_interpolation
+    trusted = description.pose_interpolation
     shape = (len(flight.cameras), len(t_ns))
     position, quaternion = np.empty((*shape, 3)), np.empty((*shape, 4))
-    known = np.ones(shape, dtype=np.bool_)
+    known = np.empty(shape, dtype=np.bool_)
     for i, camera in enumerate(flight.cameras):
-        log = camera.trajectory
-        if camera.static:
-            position[i], quaternion[i] = log.position[0], log.quaternion_xyzw[0]
-            continue
-        found, _ = interpolate_poses(
-            log.t_ns,
-            log.position,
-            log.quaternion_xyzw,
-            t_ns,
-            max_gap_ns=round(limits.max_gap_s * 1e9),
-            max_extrapolation_ns=round(limits.max_extrapolation_s * 1e9),
+        log, static = camera.trajectory, camera.static
+        known[i] = np.isfinite(poses_at(log, t_ns, trusted, static=static)[0][:, 0])
+        everywhere = Interpolation(
+            max_gap_s=float(np.ptp(log.t_ns)) / 1e9, max_extrapolation_s=float(np.ptp(t_ns)) / 1e9
         )
-        known[i] = np.isfinite(found[:, 0])
-        position[i], quaternion[i] = interpolate_poses(
-            log.t_ns,
-            log.position,
-            log.quaternion_xyzw,
-            t_ns,
-            max_gap_ns=int(np.ptp(log.t_ns)),
-            max_extrapolation_ns=int(np.ptp(t_ns)),
-        )
+        position[i], quaternion[i] = poses_at(log, t_ns, everywhere, static=static)
     return position, quaternion, known
 
 

@@ -162,6 +162,7 @@ ACROSS = straight((0.5, -3.0), (0.0, 1.1))  # and this one crosses both paths
 NONE, MEDIUM = (0.0, 0.0), (0.3, 1.0)
 
 
+@pytest.mark.slow  # compiles much
 def test_three_people_who_cross_keep_their_identities() -> None:
     """Without pose noise a wrong pair is tens of sigma off, so every detection goes where it belongs."""
     scene = film([ACTOR, CROSSING, ACROSS], missing=0.1, outliers=0.05)

@@ -21,6 +21,7 @@ from tests.planning.worlds import wall
 CONFIG = PlannerConfig(w_obs=2.0, w_occ=3.0)
 
 
+@pytest.mark.slow  # compiles much
 def test_obstacles_count_by_distance_and_sight_by_share() -> None:
     """Slot for slot what the field and the sight line say, at two places beside the wall."""
     field = wall()

@@ -25,6 +25,7 @@ def boulders() -> DistanceField:
     return distance_field(Occupancy(occupied.astype(np.float32), np.array([-7.5, -7.5, -2.0]), 0.5))
 
 
+@pytest.mark.slow  # compiles much
 @pytest.mark.parametrize("speed_floor", [0.0, 1.0])
 @pytest.mark.parametrize("seed", range(4))
 def test_the_gradient_is_the_derivative_of_the_cost(seed: int, speed_floor: float) -> None:

@@ -129,6 +129,7 @@ def cost_of(system: System, like: State) -> Callable[[Float], float]:
     return cost
 
 
+@pytest.mark.slow  # compiles much
 def test_solution_is_where_the_cost_is_least() -> None:
     system, state = small_system(exact=False)
     system, solved, _ = solve(system.problem, system.knowledge, state, rounds=30)
@@ -139,6 +140,7 @@ def test_solution_is_where_the_cost_is_least() -> None:
     assert after < 1e-3 * before
 
 
+@pytest.mark.slow  # compiles much
 def test_covariances_are_those_of_the_whole_inverse() -> None:
     system, state = small_system(exact=True)
     # Bones are as long as the lengths say and accelerations small: Gauss-Newton's matrix is the Hessian.

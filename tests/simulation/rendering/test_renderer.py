@@ -96,6 +96,7 @@ def renderer(*static: Surface, intrinsics: Intrinsics = CAMERA) -> Renderer:
 coordinates = st.floats(-3.0, 3.0)
 
 
+@pytest.mark.slow  # compiles much
 @settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
 def test_a_silhouette_is_the_pixels_whose_centres_project_into_a_triangle(seed: int) -> None:
@@ -161,6 +162,7 @@ def test_depth_of_a_plane(height: float, tilt_deg: float) -> None:
     assert hit.any() or tilt_deg < 0
 
 
+@pytest.mark.slow  # compiles much
 def test_nothing_behind_the_camera_is_seen() -> None:
     pose = looking((0.0, 0.0, 1.0), (0.0, 1.0, 1.0))
     behind = sphere(np.array([0.0, -3.0, 1.0]), 1.0)
