@@ -35,7 +35,8 @@ from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Detections, Float, Int64, Trajectory
 from pipelines.session.registries import Detector, KeypointNetworks, find_detector, hashes_of_models
 from pipelines.session.side_by_side import Halt, side_by_side
-from pipelines.session.stages import Stage, StageRecord, WritableSession
+from pipelines.session.stage_records import Stage, StageRecord
+from pipelines.session.stages import WritableSession
 from pipelines.session.storage import hash_of, read_json, write_json
 from pipelines.session.tables import FRAMES, KEYPOINTS, POSES, read_table, write_table
 from pipelines.session.tabular import keypoints_table, rows_between, trajectory_from

@@ -24,7 +24,8 @@ from pipelines.session.maps import read_grid
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Int64, Occupancy, Recording
 from pipelines.session.registries import EXPORTS, ChoiceOfAxes, Export
-from pipelines.session.stages import StageRecord, open_session, session_name
+from pipelines.session.stage_records import StageRecord
+from pipelines.session.stages import open_session, session_name
 from pipelines.session.storage import as_data_error, read_json, remove_tree, sha256_of, write_json
 from pipelines.session.tables import FRAMES, POSES, SKELETON, read_table
 from pipelines.session.tabular import motion_from, trajectory_from

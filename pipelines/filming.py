@@ -36,7 +36,8 @@ from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Float, Int64, JointMotion
 from pipelines.session.registries import Detector, find_detector, hashes_of_models
-from pipelines.session.stages import Stage, StageRecord, locked
+from pipelines.session.stage_records import Stage, StageRecord
+from pipelines.session.stages import locked
 from pipelines.session.storage import hash_of, jsonable, read_json, write_json
 from pipelines.session.tables import REPLAN, TRUTH, read_table, write_table
 from pipelines.session.tabular import motion_table

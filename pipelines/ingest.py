@@ -21,7 +21,8 @@ from pipelines.session.description import CameraEntry, Description, Interpolatio
 from pipelines.session.errors import DataError, NotYetReadError
 from pipelines.session.manifest import Flight, read_flight
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.stages import Stage, StageRecord, locked
+from pipelines.session.stage_records import Stage, StageRecord
+from pipelines.session.stages import locked
 from pipelines.session.storage import read_json, write_json
 
 INGEST = Stage("ingest", revision=2)

@@ -26,7 +26,8 @@ from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Int64
 from pipelines.session.side_by_side import Halt, side_by_side
-from pipelines.session.stages import Run, Stage, StageRecord, WritableSession, locked, open_session
+from pipelines.session.stage_records import Stage, StageRecord
+from pipelines.session.stages import Run, WritableSession, locked, open_session
 from pipelines.session.storage import read_json, write_json
 from pipelines.session.tables import FRAMES, SKELETON, read_table
 from pipelines.session.tabular import rows_between

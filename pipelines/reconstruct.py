@@ -64,7 +64,8 @@ from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Float, Int64
-from pipelines.session.stages import Stage, StageRecord, locked
+from pipelines.session.stage_records import Stage, StageRecord
+from pipelines.session.stages import locked
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import CAMERA_POSES, FRAMES, SKELETON, read_table, write_table
 

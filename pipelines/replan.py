@@ -39,7 +39,8 @@ from pipelines.session.maps import load_maps
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Float, JointMotion
 from pipelines.session.registries import PLANNER_ARMS
-from pipelines.session.stages import Stage, StageRecord, WritableSession, locked
+from pipelines.session.stage_records import Stage, StageRecord
+from pipelines.session.stages import WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, write_json
 from pipelines.session.tables import ACTOR, COST_MAP, REPLAN, SEEN, TRUTH, read_table, write_table
 from pipelines.session.tabular import motion_table

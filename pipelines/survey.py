@@ -14,7 +14,8 @@ from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight, read_flight
 from pipelines.session.registries import FORMATS, why_not
-from pipelines.session.stages import SCHEMA, STAGES, open_session
+from pipelines.session.stage_records import SCHEMA, STAGES
+from pipelines.session.stages import open_session
 from pipelines.session.storage import read_json
 from pipelines.session.whole_folders import SIMULATION_MARK, STUDY_MARK
 from pipelines.session.yaml_models import keys_of

@@ -17,7 +17,7 @@ from pipelines.session.description import CameraEntry, Description, Interpolatio
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Int64, JointMotion, Trajectory
 from pipelines.session.registries import noise_models, parsed_noise_models
-from pipelines.session.stages import StageRecord
+from pipelines.session.stage_records import StageRecord
 from pipelines.session.tables import ACTOR, CAMERA_POSES, PLAN, POSES, SKELETON, TRUTH, read_table
 from pipelines.session.tabular import motion_from, trajectory_from
 

@@ -24,7 +24,7 @@ from pipelines.session.description import CameraEntry, Description
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Int64, Trajectory
 from pipelines.session.registries import noise_models, parsed_noise_models
-from pipelines.session.stages import StageRecord
+from pipelines.session.stage_records import StageRecord
 from pipelines.session.tables import ACTOR, FRAMES, KEYPOINTS, POSES, TRUTH, read_table
 from pipelines.session.tabular import detections_from, most_confident, motion_from, trajectory_from
 

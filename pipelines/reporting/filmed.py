@@ -11,7 +11,7 @@ from pipelines.reporting.overlays import FilmedCamera
 from pipelines.reporting.placing import estimated_clocks
 from pipelines.session.description import Description
 from pipelines.session.records import Trajectory
-from pipelines.session.stages import StageRecord
+from pipelines.session.stage_records import StageRecord
 from pipelines.session.storage import read_json
 from pipelines.session.tables import CAMERA_POSES, FRAMES, KEYPOINTS, POSES, read_table
 from pipelines.session.tabular import trajectory_from

@@ -1,38 +1,50 @@
-"""The life of a stage: begun under a lock, resumed, published in one piece, mended after a kill.
+"""The life of a stage: begun under a lock, resumed, published in one piece.
 
-A stage writes into `<stage>.new/`. Its `stage.json`, written last and synced, is the point of no return:
-without it the folder is thrown away, with it publication is carried to its end, by whoever opens the
-session next. Stages read like this:
+Stages read like this:
 
-    with locked(folder) as session:
-        run = session.begin(RECONSTRUCT, settings=settings, inputs=hashes)
-        if run.finished:
-            return run.record
-        rays = run.chunk("rays", produce_rays)
-        write_table(run.folder / "skeleton.parquet", skeleton, SKELETON)
-        return run.publish(counts=counts, warnings=warnings)
+with locked(folder) as session:
+    run = session.begin(RECONSTRUCT, settings=settings, inputs=hashes)
+    if run.finished:
+        return run.record
+    rays = run.chunk("rays", produce_rays)
+    write_table(run.folder / "skeleton.parquet", skeleton, SKELETON)
+    return run.publish(counts=counts, warnings=warnings)
 """
 
 from __future__ import annotations
 
 import os
-import platform
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
 from pipelines.session.errors import BusyError, DataError, MocapError
+from pipelines.session.publishing import (
+    AT_ROOT,
+    is_interrupted,
+    new_folder,
+    outdated,
+    remove_partials,
+    repair,
+    roll_forward,
+)
+from pipelines.session.run_notes import Stopwatch
+from pipelines.session.stage_records import (
+    SCHEMA,
+    NewerSchemaError,
+    Stage,
+    StageRecord,
+    key_of,
+    read_record,
+    refuse_newer,
+    usable_record,
+)
 from pipelines.session.storage import (
     as_data_error,
-    hash_of,
     jsonable,
     read_json,
     remove_tree,
@@ -42,75 +54,7 @@ from pipelines.session.storage import (
     write_json,
 )
 
-SCHEMA = 1
-"""Version of session.json and stage.json. Older ones are read, newer ones refused."""
-
-_AT_ROOT = {
-    "ingest": (
-        "cameras",
-        "actor.parquet",
-        "map",
-        "plan.parquet",
-        "truth.parquet",
-        "truth_poses.parquet",
-        "session.json",
-    )
-}
-"""What a stage publishes beside its own folder instead of inside it; these names are its own."""
-
-STAGES = ("ingest", "detect", "reconstruct", "overlay", "replan", "film", "report")
-"""In the order in which they may run."""
-
-_SHOWN_BY = {"reconstruct": ("overlay",)}
-"""Stages that show a stage's result and nothing else: they go with the result that they show."""
-
 _LEFT_BY_KILLED_INGEST = {".lock", ".lock.pid", ".partial", "ingest.new", "run.json.new"}
-
-
-class NewerSchemaError(DataError):
-    """A file of a later version of this program."""
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One of the stages of a session.
-
-    Args:
-        name: its folder in the session.
-        revision: raised when the same input and settings give other results than before.
-    """
-
-    name: str
-    revision: int
-
-    def __post_init__(self) -> None:
-        if self.name not in STAGES:
-            raise ValueError(f"{self.name} is not a stage of a session")
-
-
-@dataclass(frozen=True)
-class StageRecord:
-    """What `stage.json` says of a finished stage."""
-
-    stage: str
-    revision: int
-    key: str
-    settings: dict[str, Any]
-    inputs: dict[str, str]  # name to sha256
-    outputs: dict[str, str]  # path relative to the session, to sha256
-    counts: dict[str, Any]
-    warnings: list[str]
-
-
-def key_of(stage: Stage, settings: Mapping[str, object], inputs: Mapping[str, str]) -> str:
-    """Sha256 of all that decides a stage's result: equal keys, equal bytes."""
-    ingredients = {
-        "stage": stage.name,
-        "revision": stage.revision,
-        "settings": settings,
-        "inputs": inputs,
-    }
-    return hash_of(ingredients)
 
 
 class Session:
@@ -126,7 +70,7 @@ class Session:
             DataError: its record is damaged or of a later version.
         """
         path = self.folder / stage / "stage.json"
-        return _read_record(path) if path.exists() else None
+        return read_record(path) if path.exists() else None
 
 
 class WritableSession(Session):
@@ -152,13 +96,13 @@ class WritableSession(Session):
             DataError: the stage was written by a later version.
         """
         key = key_of(stage, settings, inputs)
-        before = _usable_record(self.folder / stage.name / "stage.json")
+        before = usable_record(self.folder / stage.name / "stage.json")
         if force:
-            _remove_partials(self.folder, stage.name)
+            remove_partials(self.folder, stage.name)
         elif before is not None and before.key == key and self._intact(before):
-            _remove_partials(self.folder, stage.name)  # of a --force that was interrupted
+            remove_partials(self.folder, stage.name)  # of a --force that was interrupted
             return Run(self.folder, stage, key, settings, inputs, before=before, finished=True)
-        new = _new(self.folder, stage.name)
+        new = new_folder(self.folder, stage.name)
         remove_tree(new)
         new.mkdir()
         return Run(self.folder, stage, key, settings, inputs, before=before, finished=False)
@@ -191,7 +135,7 @@ class Run:
         before: StageRecord | None,
         finished: bool,
     ) -> None:
-        self.folder = _new(session, stage.name)
+        self.folder = new_folder(session, stage.name)
         self.finished = finished
         self._session = session
         self._stage = stage
@@ -199,8 +143,7 @@ class Run:
         self._settings: dict[str, Any] = jsonable(settings)
         self._inputs = dict(inputs)
         self._record = before if finished else None
-        self._started = datetime.now(UTC)
-        self._started_s = time.monotonic()
+        self._stopwatch = Stopwatch()
         old = {} if before is None else before.settings
         names = () if before is None else sorted({*old, *self._settings})
         self.replaces = {
@@ -256,13 +199,13 @@ class Run:
         )
         write_json(self.folder / "stage.json", {"schema": SCHEMA, **asdict(self._record)})
         sync_folder(self._session)
-        self.outdated = _outdated(self._session, self._record)
-        _roll_forward(self._session, self._stage.name)
-        self._note_time()
+        self.outdated = outdated(self._session, self._record)
+        roll_forward(self._session, self._stage.name)
+        self._stopwatch.note(self._session, self._stage.name)
         return self._record
 
     def _outputs(self) -> dict[str, str]:
-        at_root = _AT_ROOT.get(self._stage.name)
+        at_root = AT_ROOT.get(self._stage.name)
         outputs = {}
         for path in sorted(path for path in self.folder.rglob("*") if path.is_file()):
             name = path.relative_to(self.folder)
@@ -272,45 +215,6 @@ class Run:
                 raise ValueError(f"{self._stage.name} does not own {name}")
             outputs[name.as_posix()] = sha256_of(path)
         return outputs
-
-    def _note_time(self) -> None:
-        path = self._session / "run.json"
-        runs = read_json(path, "remove it: it holds only times of day") if path.exists() else {}
-        entry = {
-            "stage": self._stage.name,
-            "started": self._started.isoformat(timespec="seconds"),
-            "seconds": round(time.monotonic() - self._started_s, 3),
-            "version": version("mocap-pipeline"),
-            "libraries": _libraries(),
-            "platform": platform.platform(),
-        }
-        write_json(path, {"schema": SCHEMA, "runs": [*runs.get("runs", []), entry]})
-
-
-_LIBRARIES = (
-    *("numpy", "scipy", "numba", "pandas", "pyarrow", "matplotlib"),
-    *("opencv-python-headless", "av", "ai-edge-litert", "onnxruntime", "pycolmap", "mcap", "rosbags"),
-)
-"""What results rest on, as far as it is installed."""
-
-
-@cache
-def _libraries() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for name in _LIBRARIES:
-        with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
-
-
-def versions_of(folder: Path) -> dict[str, dict[str, str]]:
-    """With which mocap, Python and libraries each stage of a session last ran, as far as run.json says."""
-    path = folder / "run.json"
-    runs = read_json(path, "remove it: it holds only times of day") if path.exists() else {}
-    told: dict[str, dict[str, str]] = {}
-    for run in runs.get("runs", []):
-        told[str(run.get("stage"))] = {"mocap": str(run.get("version")), **run.get("libraries", {})}
-    return told
 
 
 def session_name(folder: Path) -> str:
@@ -326,7 +230,7 @@ def open_session(folder: Path) -> Session:
         BusyError: it is being published right now.
     """
     try:
-        if not _is_interrupted(folder):
+        if not is_interrupted(folder):
             _check_session(folder)
             return Session(folder)
     except OSError as error:
@@ -357,18 +261,18 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
         if create:
             _check_target(folder, overwrite=overwrite)
             folder.mkdir(parents=True, exist_ok=True)
-        elif not _is_interrupted(folder):
+        elif not is_interrupted(folder):
             _check_session(folder)
         with _lock(folder):
             try:
-                _repair(folder)
+                repair(folder)
                 if not create:
                     _check_session(folder)
                 yield WritableSession(folder)
             except BaseException as error:
                 # What cannot be tidied now is tidied by whoever opens the session next.
                 with suppress(OSError):
-                    _repair(folder)
+                    repair(folder)
                     if is_new and isinstance(error, MocapError):
                         # The user will change something, and then nothing of this is of use; after an
                         # interrupt it is.
@@ -386,7 +290,7 @@ def _check_session(folder: Path) -> None:
     if not path.is_file():
         raise DataError(folder, "is not a session", "make one with `mocap ingest FLIGHT.yaml`")
     remedy = "run `mocap ingest` again"
-    _refuse_newer(path, read_json(path, remedy), remedy)
+    refuse_newer(path, read_json(path, remedy), remedy)
 
 
 def _check_target(folder: Path, *, overwrite: bool) -> None:
@@ -413,16 +317,6 @@ def _refuse_newer_session(folder: Path) -> None:
         raise
     except DataError:
         pass  # missing or damaged: whoever needs it says so, and ingest writes it anew
-
-
-def _refuse_newer(path: Path, document: Mapping[str, Any], remedy: str) -> None:
-    schema = document.get("schema")
-    if not isinstance(schema, int):
-        raise DataError(path, f"states no schema number (schema: {schema!r})", remedy)
-    if schema > SCHEMA:
-        raise NewerSchemaError(
-            path, f"has schema {schema}, this version reads up to {SCHEMA}", "update mocap to read it"
-        )
 
 
 @contextmanager
@@ -454,116 +348,3 @@ def _leave_no_trace(folder: Path) -> None:
         (folder / ".lock").unlink()
         (folder / ".lock.pid").unlink()
         folder.rmdir()
-
-
-def _read_record(path: Path) -> StageRecord:
-    remedy = "run the stage again with --force"
-    document = read_json(path, remedy)
-    _refuse_newer(path, document, remedy)
-    kinds = {
-        "stage": str,
-        "revision": int,
-        "key": str,
-        "settings": dict,
-        "inputs": dict,
-        "outputs": dict,
-        "counts": dict,
-        "warnings": list,
-    }
-    wrong = [name for name, kind in kinds.items() if not isinstance(document.get(name), kind)]
-    if wrong:
-        raise DataError(path, f"has no usable {', '.join(wrong)}", remedy)
-    return StageRecord(**{name: document[name] for name in kinds})
-
-
-def _usable_record(path: Path) -> StageRecord | None:
-    try:
-        return _read_record(path) if path.exists() else None
-    except NewerSchemaError:
-        raise
-    except DataError:
-        return None
-
-
-def _new(folder: Path, stage: str) -> Path:
-    return folder / f"{stage}.new"
-
-
-def _old(folder: Path, stage: str) -> Path:
-    # Hidden: a user may well keep a copy of a result as `reconstruct.old`, and that is not ours to remove.
-    return folder / f".{stage}.old"
-
-
-def _is_interrupted(folder: Path) -> bool:
-    return any(
-        (_new(folder, stage) / "stage.json").exists() or _old(folder, stage).exists() for stage in STAGES
-    )
-
-
-def _repair(folder: Path) -> None:
-    """Finish what was published halfway, remove what was not."""
-    for stage in STAGES:
-        if _usable_record(_new(folder, stage) / "stage.json") is not None:
-            _roll_forward(folder, stage)
-        remove_tree(_new(folder, stage))
-        _settle_old(folder, stage)
-    remove_tree(folder / "run.json.new")
-
-
-def _roll_forward(folder: Path, stage: str) -> None:
-    """Publish a complete `<stage>.new`.
-
-    Every step can be taken again, and the renaming of the stage's folder, with its record, comes last: a kill
-    between any two steps is mended by doing it all once more.
-    """
-    new, old = _new(folder, stage), _old(folder, stage)
-    record = _read_record(new / "stage.json")
-    published = {name.partition("/")[0] for name in record.outputs}
-    _remove_partials(folder, stage)
-    old.mkdir(exist_ok=True)
-    for entry in _AT_ROOT.get(stage, ()):
-        is_in_place = entry in published and not (new / entry).exists()
-        if not is_in_place:
-            _move(folder / entry, old / entry)
-            _move(new / entry, folder / entry)
-    for shown in _outdated(folder, record):
-        _move(folder / shown, old / shown)
-    _move(folder / stage, old / stage)
-    new.rename(folder / stage)
-    sync_folder(old)
-    sync_folder(folder)
-    remove_tree(old)
-
-
-def _outdated(folder: Path, record: StageRecord) -> list[str]:
-    """The stages that show another result than this one; those of a later version are not ours to judge."""
-    outdated = []
-    for name in _SHOWN_BY.get(record.stage, ()):
-        with suppress(NewerSchemaError):
-            shown = _usable_record(folder / name / "stage.json")
-            if shown is not None and shown.inputs.get(record.stage) != record.key:
-                outdated.append(name)
-    return outdated
-
-
-def _settle_old(folder: Path, stage: str) -> None:
-    """Remove what was replaced, or put it back where its successor has been removed by hand meanwhile."""
-    old = _old(folder, stage)
-    if old.exists() and not (folder / stage).exists():
-        for entry in sorted(old.iterdir()):
-            if not (folder / entry.name).exists():
-                entry.rename(folder / entry.name)
-    remove_tree(old)
-
-
-def _move(source: Path, target: Path) -> None:
-    if source.exists():
-        source.rename(target)
-
-
-def _remove_partials(folder: Path, stage: str) -> None:
-    partial = folder / ".partial"
-    for chunks in sorted(partial.glob(f"{stage}-*")):
-        remove_tree(chunks)
-    if partial.is_dir() and not any(partial.iterdir()):
-        partial.rmdir()

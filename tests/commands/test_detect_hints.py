@@ -16,7 +16,8 @@ from pipelines.keypoints.hints import Hint
 from pipelines.reconstruction.loading import load_actor
 from pipelines.session.description import read_description
 from pipelines.session.records import Trajectory
-from pipelines.session.stages import StageRecord, locked
+from pipelines.session.stage_records import StageRecord
+from pipelines.session.stages import locked
 from tests.keypoints.spotted_flights import CAMERAS, FPS, LENS, START_S, spot_detector, write_spotted_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log

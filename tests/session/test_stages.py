@@ -21,15 +21,8 @@ import numpy as np
 import pytest
 
 from pipelines.session.errors import BusyError, DataError
-from pipelines.session.stages import (
-    SCHEMA,
-    NewerSchemaError,
-    Run,
-    Stage,
-    key_of,
-    locked,
-    open_session,
-)
+from pipelines.session.stage_records import SCHEMA, NewerSchemaError, Stage, key_of
+from pipelines.session.stages import Run, locked, open_session
 from pipelines.session.storage import read_json, sha256_of, write_json
 
 INGEST = Stage("ingest", 1)

@@ -1,0 +1,113 @@
+"""What a stage is, and what its `stage.json` says of a finished one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipelines.session.errors import DataError
+from pipelines.session.storage import hash_of, read_json
+
+SCHEMA = 1
+"""Version of session.json and stage.json. Older ones are read, newer ones refused."""
+
+STAGES = ("ingest", "detect", "reconstruct", "overlay", "replan", "film", "report")
+"""In the order in which they may run."""
+
+
+class NewerSchemaError(DataError):
+    """A file of a later version of this program."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One of the stages of a session.
+
+    Args:
+        name: its folder in the session.
+        revision: raised when the same input and settings give other results than before.
+    """
+
+    name: str
+    revision: int
+
+    def __post_init__(self) -> None:
+        if self.name not in STAGES:
+            raise ValueError(f"{self.name} is not a stage of a session")
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """What `stage.json` says of a finished stage."""
+
+    stage: str
+    revision: int
+    key: str
+    settings: dict[str, Any]
+    inputs: dict[str, str]  # name to sha256
+    outputs: dict[str, str]  # path relative to the session, to sha256
+    counts: dict[str, Any]
+    warnings: list[str]
+
+
+def key_of(stage: Stage, settings: Mapping[str, object], inputs: Mapping[str, str]) -> str:
+    """Sha256 of all that decides a stage's result: equal keys, equal bytes."""
+    ingredients = {
+        "stage": stage.name,
+        "revision": stage.revision,
+        "settings": settings,
+        "inputs": inputs,
+    }
+    return hash_of(ingredients)
+
+
+def read_record(path: Path) -> StageRecord:
+    """What a `stage.json` says.
+
+    Raises:
+        DataError: it is damaged or of a later version.
+    """
+    remedy = "run the stage again with --force"
+    document = read_json(path, remedy)
+    refuse_newer(path, document, remedy)
+    kinds = {
+        "stage": str,
+        "revision": int,
+        "key": str,
+        "settings": dict,
+        "inputs": dict,
+        "outputs": dict,
+        "counts": dict,
+        "warnings": list,
+    }
+    wrong = [name for name, kind in kinds.items() if not isinstance(document.get(name), kind)]
+    if wrong:
+        raise DataError(path, f"has no usable {', '.join(wrong)}", remedy)
+    return StageRecord(**{name: document[name] for name in kinds})
+
+
+def usable_record(path: Path) -> StageRecord | None:
+    """What a `stage.json` says; None where it is missing or damaged.
+
+    Raises:
+        NewerSchemaError: it is of a later version.
+    """
+    try:
+        return read_record(path) if path.exists() else None
+    except NewerSchemaError:
+        raise
+    except DataError:
+        return None
+
+
+def refuse_newer(path: Path, document: Mapping[str, Any], remedy: str) -> None:
+    """Raise DataError for a file of a later version, or of none."""
+    schema = document.get("schema")
+    if not isinstance(schema, int):
+        raise DataError(path, f"states no schema number (schema: {schema!r})", remedy)
+    if schema > SCHEMA:
+        raise NewerSchemaError(
+            path, f"has schema {schema}, this version reads up to {SCHEMA}", "update mocap to read it"
+        )
