@@ -14,10 +14,10 @@ import numpy as np
 from pipelines.formats.flights.flight_logs import FlightLogs, Frames
 from pipelines.formats.flights.telemetry_poses import TelemetryPoses
 from pipelines.formats.videos.frame_times import read_frame_times, times_of_frames
-from pipelines.formats.videos.picture_motion import turning_of_pictures
+from pipelines.formats.videos.picture_motion import followed_points
 from pipelines.formats.videos.video import created_ns
 from pipelines.geometry.cameras import Intrinsics
-from pipelines.geometry.turning import fit_start
+from pipelines.geometry.film_start import fit_start
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Camera, FrameTimes
 from pipelines.session.records import Detections, Int64, Trajectory, VideoIndex
@@ -80,7 +80,7 @@ class FrameSources:
 
         By what the manifest states: `fps` from `start` on, a file or topic of frame times, the stamps of
         pictures in a log, or the container's own stamps from `start` on. Where the start is to be found by
-        motion, it is the time at which the pictures turn as the poses do.
+        motion, it is the time at which the pictures move as the poses do.
 
         Raises:
             DataError: nothing says when the pictures were taken, or what does is unusable.
@@ -166,9 +166,6 @@ class FrameSources:
     def _start_ns(self, name: str, camera: Camera, times: FrameTimes) -> int:
         """When a video begins that has stamps of its own."""
         if times.start_from == "motion":
-            if times.start_ns:
-                place = f"{self._manifest}: cameras.{name}.frame_times"
-                raise DataError(place, "has a start and start_from: motion", "leave one of them out")
             return 0  # found when the pictures and the poses are there
         if times.start_from is None:
             return times.start_ns
@@ -197,22 +194,23 @@ class FrameSources:
             raise DataError(place, "start_from: motion needs a video and poses that move", remedy)
         poses = self._trajectory(name, camera, 0)
         some = int(np.searchsorted(frames.pts_ns, frames.pts_ns[0] + _WATCHED_NS))
-        turned = turning_of_pictures(self._base / camera.video.path, intrinsics, some)
+        about_ns = camera.frame_times.start_ns if camera.frame_times else 0
         try:
             fit = fit_start(
                 poses.t_ns,
+                poses.position,
                 poses.quaternion_xyzw,
-                frames.pts_ns[:some],
-                turned,
+                followed_points(self._base / camera.video.path, intrinsics, frames.pts_ns[:some]),
                 max_gap_ns=self._max_gap_ns,
+                near_ns=about_ns or None,
             )
         except ValueError as error:
             problem = f"its pictures do not say when the video began: {error}"
             raise DataError(place, problem, remedy) from None
         self._note(
             f"{name}: its video begins at {fit.start_ns / 1e9:.3f} s +- {1e3 * fit.sigma_s:.1f} ms, by the"
-            f" turning of its pictures ({fit.turning_deg_s:.2g} deg/s, of which the poses explain"
-            f" {fit.explained:.0%})"
+            f" motion in its pictures (points move by {1e3 * fit.moved:.2g} mrad in a fifth of a second, and"
+            f" end {1e3 * fit.beside:.2g} mrad from where the poses lead them)"
         )
         return replace(frames, t_ns=fit.start_ns + frames.pts_ns, start_sigma_s=fit.sigma_s)
 

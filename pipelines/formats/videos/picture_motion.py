@@ -1,4 +1,4 @@
-"""How a camera turned from picture to picture, by what moves through the pictures."""
+"""Points that are followed through the pictures of a video: what the motion of its camera shows by."""
 
 from __future__ import annotations
 
@@ -9,48 +9,59 @@ from numpy.typing import NDArray
 
 from pipelines.formats.videos.video import VideoReader
 from pipelines.geometry.cameras import Intrinsics, rescaled, undistort
-from pipelines.session.records import Float
+from pipelines.geometry.film_start import Followed
+from pipelines.session.records import Float, Int64
 
-_WIDTH_PX = 320  # pictures are made so wide: turning shows as well
-_CORNERS = 200
+_WIDTH_PX = 320  # pictures are made so wide: motion shows as well
+_STRETCH_NS = 200_000_000
+_CORNERS = 100
 _LEAST_CORNERS = 12
 _CORNER_QUALITY, _CORNERS_APART_PX = 0.01, 8
-_ROUNDS = 10
-_LEAST_SCATTER = 1e-4  # of normalised coordinates: what following a corner errs by at the least
+
+_Grey = NDArray[np.uint8]
+_Pixels = NDArray[np.float32]  # [C, 1, 2], as OpenCV has them
 
 
-def turning_of_pictures(path: Path, intrinsics: Intrinsics, frames: int) -> Float:
-    """The camera's rotation from each of the first pictures to the next, about its own axes.
+def followed_points(path: Path, intrinsics: Intrinsics, pts_ns: Int64) -> Followed:
+    """Corners of the first pictures, each followed for a fifth of a second.
 
-    Corners are followed with pyramids (Lucas and Kanade 1981; Bouguet 2000); of their flow the part that a
-    rotation makes is fitted, with little weight to what moves otherwise (the person, what is near).
+    From picture to picture, with pyramids (Lucas and Kanade 1981; Bouguet 2000). A stretch that misses a
+    picture, or loses all but a few corners, is left out.
 
     Args:
         path: the video.
         intrinsics: of its pictures.
-        frames: how many pictures.
-
-    Returns:
-        [frames - 1, 3] rad; NaN where a picture is missing or shows too few corners.
+        pts_ns: [F] strictly increasing stamps of as many pictures as are to be looked at.
 
     Raises:
         DataError: the video cannot be read.
     """
-    turned = np.full((max(frames - 1, 0), 3), np.nan)
+    begins: list[Float] = []
+    ends: list[Float] = []
+    spans: list[tuple[int, int]] = []
     with VideoReader(path) as reader:
-        before: NDArray[np.uint8] | None = None
-        last = -2
-        small: Intrinsics | None = None
-        for number, picture in reader.frames(0, frames):
+        before: _Grey | None = None
+        first = last = 0
+        begin = end = np.zeros((0, 1, 2), np.float32)
+        for number, picture in reader.frames(0, len(pts_ns)):
             grey = _small_grey(picture)
-            small = small or rescaled(intrinsics, grey.shape[1], grey.shape[0])
             if before is not None and number == last + 1:
-                turned[last] = _rotation(before, grey, small)
+                begin, end = _followed(before, grey, begin, end)
+            else:
+                begin, end = begin[:0], end[:0]
+            if len(end) < _LEAST_CORNERS or pts_ns[number] - pts_ns[first] >= _STRETCH_NS:
+                if len(end) >= _LEAST_CORNERS:
+                    small = rescaled(intrinsics, grey.shape[1], grey.shape[0])
+                    begins.append(undistort(begin[:, 0].astype(np.float64), small))
+                    ends.append(undistort(end[:, 0].astype(np.float64), small))
+                    spans.append((first, number))
+                first, begin = number, _corners(grey)
+                end = begin
             before, last = grey, number
-    return turned
+    return _joined(pts_ns, spans, begins, ends)
 
 
-def _small_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _small_grey(picture: _Grey) -> _Grey:
     import cv2
 
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
@@ -60,45 +71,28 @@ def _small_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(grey, np.uint8)
 
 
-def _rotation(before: NDArray[np.uint8], after: NDArray[np.uint8], lens: Intrinsics) -> Float:
+def _corners(grey: _Grey) -> _Pixels:
     import cv2
 
-    nothing = np.full(3, np.nan)
-    corners = cv2.goodFeaturesToTrack(before, _CORNERS, _CORNER_QUALITY, _CORNERS_APART_PX)
-    if corners is None or len(corners) < _LEAST_CORNERS:
-        return nothing
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, np.zeros_like(corners))
+    found = cv2.goodFeaturesToTrack(grey, _CORNERS, _CORNER_QUALITY, _CORNERS_APART_PX)
+    return np.zeros((0, 1, 2), np.float32) if found is None else np.asarray(found, np.float32)
+
+
+def _followed(before: _Grey, after: _Grey, begin: _Pixels, here: _Pixels) -> tuple[_Pixels, _Pixels]:
+    """Where corners began, and where they are one picture later; without those that were lost."""
+    import cv2
+
+    if not len(here):
+        return begin, here
+    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, here, np.zeros_like(here))
     follows = found[:, 0] == 1
-    begin = undistort(corners[follows, 0].astype(np.float64), lens)
-    end = undistort(there[follows, 0].astype(np.float64), lens)
-    known = np.isfinite(begin).all(axis=1) & np.isfinite(end).all(axis=1)
-    if known.sum() < _LEAST_CORNERS:
-        return nothing
-    return rotation_of_flow(begin[known], end[known])
+    return begin[follows], np.asarray(there[follows], np.float32)
 
 
-def rotation_of_flow(begin: Float, end: Float) -> Float:
-    """The camera's rotation [3] rad that best moves points of the picture, most of them far away.
-
-    Longuet-Higgins and Prazdny 1980, eq. 2.13 without translation, at the middle of each path: right to the
-    second order of the angle. Weights are Cauchy's, on the scatter of the residuals.
-
-    Args:
-        begin: [P, 2] normalised coordinates.
-        end: [P, 2] of the same points, one picture later.
-    """
-    x, y = ((begin + end) / 2).T
-    one = np.ones_like(x)
-    of_x = np.stack([x * y, -(one + x**2), y], axis=1)
-    of_y = np.stack([one + y**2, -x * y, -x], axis=1)
-    lines = np.stack([of_x, of_y], axis=1)  # [P, 2, 3]
-    flow = end - begin
-    weight = np.ones(len(x))
-    rotation = np.zeros(3)
-    for _ in range(_ROUNDS):
-        normal = np.einsum("p,pij,pik->jk", weight, lines, lines)
-        rotation = np.linalg.solve(normal, np.einsum("p,pij,pi->j", weight, lines, flow))
-        residual = np.linalg.norm(flow - lines @ rotation, axis=1)
-        scatter = max(float(np.median(residual)), _LEAST_SCATTER)
-        weight = 1 / (1 + (residual / scatter) ** 2)
-    return rotation
+def _joined(pts_ns: Int64, spans: list[tuple[int, int]], begins: list[Float], ends: list[Float]) -> Followed:
+    nothing = np.zeros((0, 2))
+    begin, end = np.concatenate([nothing, *begins]), np.concatenate([nothing, *ends])
+    stretch = np.repeat(np.arange(len(begins)), [len(points) for points in begins])
+    known = np.isfinite(begin).all(axis=1) & np.isfinite(end).all(axis=1)  # a lens need not reach all pixels
+    pictures = np.array(spans, np.int64).reshape(-1, 2)
+    return Followed(pts_ns[pictures[:, 0]], pts_ns[pictures[:, 1]], stretch[known], begin[known], end[known])

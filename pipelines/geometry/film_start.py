@@ -1,0 +1,279 @@
+"""When a video began, from how points move through its pictures and how a log says that its camera moved.
+
+Between two pictures a point moves along a line of which the camera's motion says everything but how far: its
+depth (epipolar geometry, Hartley and Zisserman 2004, section 9.1). So a start is judged without knowing the
+scene, by how far points end beside the stretch of that line from infinity to the nearest that anything is.
+Where the camera only turns, the stretch is a point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.poses import conjugate, interpolate_poses, matrix_from_quaternion, multiply, rotate
+
+Int64 = NDArray[np.int64]
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+_STEP_S = 0.02
+_SMOOTHED_S = 0.1  # standard deviation of the window: a log's poses are noisy from row to row
+_LEAST_WEIGHT = 0.9  # of a window: beside gaps and ends its mean is not that of its middle
+_NEAREST_M = 2.0  # what a drone films is no nearer
+_LEAST_DEPTH = 0.1  # of a direction, per its length: no picture shows what lies beside the camera
+_SCATTER = 2e-3  # rad: 0.4 px of pictures 320 px wide; what following errs by, and the poses between pictures
+_SEARCHED_S = 0.08  # a step from start to start
+_SEARCHED_SHARE = 0.25  # of how far points move: what a step may be off by
+_MOST_SEARCHED = 500  # points, while all starts are tried
+_LEAST_COVERED = 0.5  # of the stretches, that the log must cover
+_ELSEWHERE_S = 0.5  # a start this far from the best is another one
+_CLEAR = 4.0  # standard deviations of a difference of log-likelihoods
+_REFINED_S = 0.01  # a step of the differences that refine a start
+_BLOCK_S = 1.0  # errors within a second resemble each other
+_LARGEST_SIGMA_S = 0.1
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Points that were followed through stretches of a video, in normalised coordinates (x/z, y/z)."""
+
+    begin_ns: Int64  # [S] of the video's own stamps, rising
+    end_ns: Int64  # [S]
+    stretch: Int64  # [P] which one a point belongs to, rising
+    begin: Float  # [P, 2]
+    end: Float  # [P, 2]
+
+
+@dataclass(frozen=True)
+class StartFit:
+    """When the video's stamps begin to count."""
+
+    start_ns: int
+    sigma_s: float
+    moved: float  # how far points move in a stretch, median; rad
+    beside: float  # how far from where the poses may put them they end, median; rad
+
+
+@dataclass(frozen=True)
+class _Path:
+    """A camera's poses on a grid, smoothed."""
+
+    position: Float  # [G, 3]
+    quaternion: Float  # [G, 4]
+    known: Bool  # [G]
+
+
+def fit_start(
+    t_ns: Int64,
+    position: Float,
+    quaternion_xyzw: Float,
+    followed: Followed,
+    *,
+    max_gap_ns: int,
+    near_ns: int | None = None,
+    within_s: float = 1.0,
+) -> StartFit:
+    """The time at which the video's stamps are 0, such that points move as the poses let them.
+
+    All starts on a grid are compared by the likelihood of the points' distances (Cauchy's: the filmed
+    person and lost points count little) against a camera that stands still. The best must be better than
+    that, and than the best start elsewhere, by four standard deviations of the difference (Vuong 1989,
+    stretches being independent). It is refined by Newton's method; its standard deviation lets errors within
+    a second be of any correlation (sums over blocks: Liang and Zeger 1986).
+
+    Args:
+        t_ns: [N] strictly increasing stamps of the poses.
+        position: [N, 3] m, of the camera in the world.
+        quaternion_xyzw: [N, 4] world_from_camera.
+        followed: the points.
+        max_gap_ns: poses further apart than this say nothing in between.
+        near_ns: about when it was; None for any time that the poses cover.
+        within_s: how far from there at most.
+
+    Raises:
+        ValueError: they agree nowhere, or at several times; what the matter is, in words.
+    """
+    if not len(followed.stretch):
+        raise ValueError("nothing in them can be followed")
+    path = _path(t_ns, position, quaternion_xyzw, max_gap_ns)
+    last_s, length_s = float(followed.end_ns[-1]) / 1e9, _STEP_S * (len(path.known) - 1)
+    starts_s = np.arange(-last_s, length_s, _SEARCHED_S)
+    moved = float(np.median(np.linalg.norm(followed.end - followed.begin, axis=1)))
+    scatter = max(_SCATTER, _SEARCHED_SHARE * moved)
+    gain = _gains(path, _thinned(followed), starts_s, scatter)
+    if not np.isfinite(gain).any():
+        raise ValueError("the poses cover less than half of them")
+    near_s = None if near_ns is None else (near_ns - int(t_ns[0])) / 1e9
+    possible = np.isfinite(gain) & (near_s is None or np.abs(starts_s - near_s) <= within_s)
+    if not possible.any():
+        raise ValueError(f"the poses cover less than half of them within {within_s:g} s of the stated start")
+
+    def peak(among: Bool) -> tuple[float, float]:
+        """The likeliest start of some, with its standard deviation."""
+        return _refined(path, followed, float(starts_s[np.argmax(np.where(among, gain, -np.inf))]), scatter)
+
+    still = _still(followed, _SCATTER)
+
+    def explained(start_s: float) -> Float:
+        """[S] what a start explains; nothing of what the log does not cover."""
+        return np.nan_to_num(still - _misfits(path, followed, start_s, _SCATTER))
+
+    start_s, sigma_s = peak(possible)
+    if near_s is not None:
+        likeliest_s, _ = peak(np.ones(len(starts_s), np.bool_))
+        apart_s = likeliest_s - near_s
+        if abs(apart_s) > within_s and _is_clear(explained(likeliest_s) - explained(start_s)):
+            raise ValueError(
+                f"they move as the poses do {apart_s:+.2f} s from the stated start, which must be right to"
+                f" {within_s:g} s"
+            )
+    if not _is_clear(explained(start_s)):
+        raise ValueError("they do not move as the poses do")
+    elsewhere = possible & (np.abs(starts_s - start_s) > _ELSEWHERE_S)
+    if elsewhere.any():
+        other_s, _ = peak(elsewhere)
+        apart_s = abs(other_s - start_s)
+        if apart_s > _ELSEWHERE_S / 2 and not _is_clear(explained(start_s) - explained(other_s)):
+            raise ValueError(
+                f"they move as the poses do at several times, {apart_s:.2f} s apart: too little, too evenly,"
+                " or again and again"
+            )
+    if not sigma_s < _LARGEST_SIGMA_S:
+        raise ValueError(f"their motion says when to {sigma_s:.2g} s only, not to {_LARGEST_SIGMA_S:g} s")
+    return StartFit(
+        start_ns=int(t_ns[0]) + round(start_s * 1e9),
+        sigma_s=sigma_s,
+        moved=moved,
+        beside=float(np.nanmedian(_distances(path, followed, start_s))),
+    )
+
+
+def _path(t_ns: Int64, position: Float, quaternion_xyzw: Float, max_gap_ns: int) -> _Path:
+    from scipy.ndimage import gaussian_filter1d
+
+    at_ns = t_ns[0] + np.arange(0, int(t_ns[-1] - t_ns[0]) + 1, round(_STEP_S * 1e9))
+    moved, turned = interpolate_poses(
+        t_ns, position, quaternion_xyzw, at_ns, max_gap_ns=max_gap_ns, max_extrapolation_ns=0
+    )
+    there: Bool = np.asarray(np.isfinite(moved).all(axis=1))
+    width = _SMOOTHED_S / _STEP_S
+    weight = gaussian_filter1d(there.astype(np.float64), width, mode="constant")
+
+    def smoothed(values: Float) -> Float:
+        held = np.where(there[:, None], values, 0.0)
+        return gaussian_filter1d(held, width, axis=0, mode="constant") / np.maximum(weight, 1e-9)[:, None]
+
+    centre = np.where(there[:, None], moved, 0.0).sum(axis=0) / max(int(there.sum()), 1)
+    quaternion = smoothed(turned)
+    norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    return _Path(
+        position=smoothed(moved - centre),
+        quaternion=quaternion / np.maximum(norm, 1e-9),
+        known=there & np.asarray(weight > _LEAST_WEIGHT),
+    )
+
+
+def _thinned(followed: Followed) -> Followed:
+    """Every n-th point, so that many starts can be tried."""
+    every = slice(None, None, max(1, len(followed.stretch) // _MOST_SEARCHED))
+    return Followed(
+        followed.begin_ns,
+        followed.end_ns,
+        followed.stretch[every],
+        followed.begin[every],
+        followed.end[every],
+    )
+
+
+def _gains(path: _Path, followed: Followed, starts_s: Float, scatter: float) -> Float:
+    """What each start explains more than a camera that stands still; -inf where the log covers too little."""
+    still = _still(followed, scatter)
+    gain = np.full(len(starts_s), -np.inf)
+    for k, start_s in enumerate(starts_s.tolist()):
+        better = still - _misfits(path, followed, start_s, scatter)
+        known = np.isfinite(better)
+        if known.mean() >= _LEAST_COVERED:
+            gain[k] = better[known].sum()
+    return gain
+
+
+def _still(followed: Followed, scatter: float) -> Float:
+    """[S] misfits where the camera stands still."""
+    return _summed(followed, np.linalg.norm(followed.end - followed.begin, axis=1), scatter)
+
+
+def _misfits(path: _Path, followed: Followed, start_s: float, scatter: float) -> Float:
+    """[S] misfits of a start, in s after the first pose; NaN where the log says nothing."""
+    return _summed(followed, _distances(path, followed, start_s), scatter)
+
+
+def _summed(followed: Followed, distance: Float, scatter: float) -> Float:
+    """Negative log-likelihoods of points, but for a constant, summed for each stretch."""
+    each = np.log1p((distance / scatter) ** 2)
+    return np.bincount(followed.stretch, each, len(followed.begin_ns)).astype(np.float64)
+
+
+def _distances(path: _Path, followed: Followed, start_s: float) -> Float:
+    """[P] how far points end beside where a start lets them; NaN where the log says nothing."""
+    from_position, from_quaternion = _at(path, start_s + followed.begin_ns / 1e9)
+    to_position, to_quaternion = _at(path, start_s + followed.end_ns / 1e9)
+    turn = matrix_from_quaternion(multiply(conjugate(to_quaternion), from_quaternion))
+    shift = rotate(conjugate(to_quaternion), from_position - to_position) / _NEAREST_M
+    ray = np.einsum(
+        "pij,pj->pi", turn[followed.stretch], np.column_stack([followed.begin, np.ones(len(followed.begin))])
+    )
+    infinite, nearest = _in_picture(ray), _in_picture(ray + shift[followed.stretch])
+    line, beside = nearest - infinite, followed.end - infinite
+    length2 = np.maximum((line**2).sum(axis=1), 1e-18)
+    along = np.clip((beside * line).sum(axis=1) / length2, 0.0, 1.0)
+    return np.asarray(np.linalg.norm(beside - along[:, None] * line, axis=1))
+
+
+def _in_picture(ray: Float) -> Float:
+    return ray[:, :2] / np.maximum(ray[:, 2:], _LEAST_DEPTH)
+
+
+def _at(path: _Path, at_s: Float) -> tuple[Float, Float]:
+    """Positions [S, 3] and quaternions [S, 4] at times after the first pose; NaN where they are not known."""
+    place = at_s / _STEP_S
+    before = np.clip(np.floor(place).astype(np.int64), 0, max(len(path.known) - 2, 0))
+    after = np.minimum(before + 1, len(path.known) - 1)
+    share = (place - before)[:, None]
+    inside = (place >= 0) & (place <= len(path.known) - 1) & path.known[before] & path.known[after]
+    position = (1 - share) * path.position[before] + share * path.position[after]
+    quaternion = (1 - share) * path.quaternion[before] + share * path.quaternion[after]
+    quaternion /= np.maximum(np.linalg.norm(quaternion, axis=1, keepdims=True), 1e-9)
+    return np.where(inside[:, None], position, np.nan), np.where(inside[:, None], quaternion, np.nan)
+
+
+def _is_clear(differences: Float) -> bool:
+    """Whether a sum of differences of log-likelihoods is beyond what scatter makes of nothing."""
+    known = differences[np.isfinite(differences)]
+    sigma = float(np.std(known, ddof=1)) * np.sqrt(len(known)) if len(known) > 1 else np.inf
+    return float(known.sum()) > max(_CLEAR * sigma, _CLEAR**2 / 2)
+
+
+def _refined(path: _Path, followed: Followed, start_s: float, scatter: float) -> tuple[float, float]:
+    """The start to a fraction of a step, and its standard deviation in s; with ever less scatter."""
+    block = (followed.begin_ns / 1e9 / _BLOCK_S).astype(np.int64)
+    sigma_s = np.inf
+    while True:
+        for _ in range(10):
+            less, here, more = (
+                _misfits(path, followed, start_s + k * _REFINED_S, scatter) for k in (-1, 0, 1)
+            )
+            slope = np.nan_to_num((more - less) / (2 * _REFINED_S))
+            bend = float(np.nansum(more - 2 * here + less)) / _REFINED_S**2
+            if bend <= 0:
+                return start_s, np.inf
+            sigma_s = float(np.sqrt((np.bincount(block, slope) ** 2).sum())) / bend
+            step_s = float(np.clip(-slope.sum() / bend, -_SEARCHED_S, _SEARCHED_S))
+            start_s += step_s
+            if abs(step_s) < 1e-5:
+                break
+        if scatter <= _SCATTER:
+            return start_s, sigma_s
+        scatter = max(scatter / 2, _SCATTER)
