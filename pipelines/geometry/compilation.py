@@ -1,6 +1,7 @@
 """Compiling numerical functions with numba, with a cache on disk that can be lost but never in the way.
 
-numba puts its cache beside the source, else in the user's cache folder, or where NUMBA_CACHE_DIR says.
+numba puts its cache beside the source, else in the user's cache folder, or where NUMBA_CACHE_DIR says. It
+compiles again where the file of the outermost function changed; here, where a helper's file did, too.
 """
 
 from __future__ import annotations
@@ -8,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
+from pathlib import Path
 from pickle import UnpicklingError
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numba
 
@@ -42,6 +44,7 @@ def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
     options = {"nogil": True, **_OPTIONS}
     try:
         compiled = numba.njit(function, cache=True, **options)
+        _watch_helpers(compiled, function)
     except RuntimeError:
         uncached: Callable[Arguments, Result] = numba.njit(function, **options)
         return uncached
@@ -58,3 +61,17 @@ def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
         return result
 
     return call
+
+
+def _watch_helpers(compiled: Any, function: Callable[..., object]) -> None:
+    """Make the age and size of the files that hold helpers part of what the cache is compared by."""
+    files = {function.__code__.co_filename}
+    waiting = [function]
+    while waiting:
+        for value in waiting.pop().__globals__.values():
+            source = getattr(value, "py_func", None)
+            if source is not None and source.__code__.co_filename not in files:
+                files.add(source.__code__.co_filename)
+                waiting.append(source)
+    states = [Path(name).stat() for name in sorted(files)]
+    compiled._cache._cache_file._source_stamp = tuple((state.st_mtime, state.st_size) for state in states)

@@ -1,5 +1,6 @@
 """The compiled code's cache: found again, damaged, or without a place."""
 
+import importlib
 import importlib.util
 import sys
 from collections.abc import Callable
@@ -64,6 +65,33 @@ def test_a_cache_file_cut_short_is_compiled_again(
     assert load_quarter()(2.0) == 0.5  # compiled for this process, the damaged cache emptied
     assert load_quarter()(2.0) == 0.5  # compiled and kept
     assert victim.stat().st_size > len(whole) / 2
+
+
+def test_a_change_of_a_helper_in_another_file_is_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two files away, and as long as before."""
+    helper = "from pipelines.geometry.compilation import helper\n\n@helper\ndef "
+    (tmp_path / "doubting.py").write_text(f"{helper}doubt(x):\n    return 2.0 * x\n")
+    (tmp_path / "passing.py").write_text(
+        f"from doubting import doubt\n{helper}pass_on(x):\n    return doubt(x)\n"
+    )
+    outermost = "from passing import pass_on\nfrom pipelines.geometry.compilation import cached\n"
+    (tmp_path / "asking.py").write_text(f"{outermost}@cached\ndef ask(x):\n    return pass_on(x)\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def ask() -> float:
+        for name in ("doubting", "passing", "asking"):
+            sys.modules.pop(name, None)
+        answer: float = importlib.import_module("asking").ask(1.0)
+        return answer
+
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    assert ask() == 2.0
+    helpers = tmp_path / "doubting.py"
+    helpers.write_text(helpers.read_text().replace("2.0", "3.0"))
+    importlib.invalidate_caches()
+    assert ask() == 3.0
 
 
 def test_a_function_without_a_place_for_its_cache_still_runs() -> None:
