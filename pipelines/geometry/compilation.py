@@ -64,7 +64,10 @@ def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
 
 
 def _watch_helpers(compiled: Any, function: Callable[..., object]) -> None:
-    """Make the age and size of the files that hold helpers part of what the cache is compared by."""
+    """Make the age and size of the files that hold helpers part of what the cache is compared by.
+
+    numba has no way to say so: where its inside is another, its cache watches the outermost file, as always.
+    """
     files = {function.__code__.co_filename}
     waiting = [function]
     while waiting:
@@ -73,5 +76,6 @@ def _watch_helpers(compiled: Any, function: Callable[..., object]) -> None:
             if source is not None and source.__code__.co_filename not in files:
                 files.add(source.__code__.co_filename)
                 waiting.append(source)
-    states = [Path(name).stat() for name in sorted(files)]
-    compiled._cache._cache_file._source_stamp = tuple((state.st_mtime, state.st_size) for state in states)
+    with suppress(AttributeError, OSError):
+        states = [Path(name).stat() for name in sorted(files)]
+        compiled._cache._cache_file._source_stamp = tuple((state.st_mtime, state.st_size) for state in states)
