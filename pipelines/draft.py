@@ -137,14 +137,10 @@ def _absolute(path: Path) -> Path:
 
 
 def _stated(path: Path, folder: Path) -> str:
-    """A path as a manifest in a folder states it: relative, with slashes."""
-    if path.is_relative_to(_absolute(folder)):
-        return path.relative_to(_absolute(folder)).as_posix()
-    try:
-        # Links are followed first: `..` of a linked folder is not where it seems to be.
-        return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
-    except ValueError:  # on another drive
-        return path.resolve().as_posix()
+    """A path as a manifest in a folder states it, with slashes: relative if it lies there, else in full."""
+    return (
+        path.relative_to(_absolute(folder)) if path.is_relative_to(_absolute(folder)) else path
+    ).as_posix()
 
 
 def _write(target: Path, text: str) -> str:

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from pipelines.formats.common.stated_paths import leads_out
 from pipelines.formats.flights.flight_reader import FlightReader, span_words
 from pipelines.formats.flights.flight_sources import losses
-from pipelines.formats.flights.source_hashes import hash_sources
+from pipelines.formats.flights.source_hashes import hash_sources, stated_paths
 from pipelines.session.description import CameraEntry, Description, Interpolation, read_description
 from pipelines.session.errors import DataError, NotYetReadError
 from pipelines.session.manifest import Flight, read_flight
@@ -68,6 +69,7 @@ def ingest(
     progress = progress or Silent()
     flight = read_flight(flight_path)
     _refuse_unread_parts(flight, flight_path)
+    _refuse_ways_out(flight, flight_path)
     target = session or flight_path.with_suffix(".session")
     _refuse_other_flight(target, flight, overwrite)
     interpolation = Interpolation(max_gap_s=max_pose_gap_s, max_extrapolation_s=max_extrapolation_s)
@@ -163,6 +165,17 @@ def _refuse_unread_parts(flight: Flight, path: Path) -> None:
             path,
             "actors: this version has no reader for it yet",
             "leave it out, or give the same data in a format of `mocap info --help`",
+        )
+
+
+def _refuse_ways_out(flight: Flight, path: Path) -> None:
+    """Refuse relative paths out of the manifest's folder: a flight that was sent reads its own files."""
+    ways_out = [stated for stated in stated_paths(flight) if leads_out(stated)]
+    if ways_out:
+        raise DataError(
+            path,
+            f"leads out of its folder ({', '.join(ways_out)})",
+            "write such paths in full, from the root on, or put the files beside the manifest",
         )
 
 

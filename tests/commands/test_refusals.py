@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pandas as pd
@@ -40,6 +41,19 @@ def test_file_that_is_not_there(flight: SyntheticFlight, change: dict[str, objec
     line = refused("ingest", flight.manifest)
     assert "No such file" in line
     assert "check the path" in line
+
+
+@pytest.mark.parametrize("stated", ["../drone1.tum", "poses/../../drone1.tum"])
+def test_a_relative_path_does_not_leave_the_folder(flight: SyntheticFlight, stated: str) -> None:
+    outside = flight.manifest.parent.parent / f"{flight.manifest.parent.name}.tum"
+    shutil.copy(flight.manifest.parent / "drone1.tum", outside)
+    stated = stated.replace("drone1.tum", outside.name)
+    flight.settings["cameras"]["drone1"]["pose"]["tum"] = stated
+    flight.save()
+    assert f"leads out of its folder ({stated})" in refused("ingest", flight.manifest)
+    flight.settings["cameras"]["drone1"]["pose"]["tum"] = str(outside)
+    flight.save()
+    succeeds("ingest", flight.manifest)
 
 
 def test_nan_poses_are_counted_and_the_rest_is_used(flight: SyntheticFlight, tmp_path: Path) -> None:

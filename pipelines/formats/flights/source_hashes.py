@@ -27,6 +27,27 @@ def hash_sources(
         progress: who watches.
         meanwhile: steps to take until all is hashed.
     """
+    unique = stated_paths(flight)
+    progress.start("Hashing sources", len(unique))
+    hashes, damage = {}, {}
+    with ThreadPoolExecutor(_HASHERS) as pool:  # hashing releases the interpreter: long logs side by side
+        hashing = {path: pool.submit(_hash_of, base / path) for path in unique}
+        try:
+            while not all(digest.done() for digest in hashing.values()) and next(meanwhile, None):
+                pass
+            for path, digest in hashing.items():
+                hashes[path], differing = digest.result()
+                if differing:
+                    damage[path] = {OTHER_CHECKSUM: differing}
+                progress.advance()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return hashes, damage
+
+
+def stated_paths(flight: Flight) -> list[str]:
+    """Every path that a manifest states, each once, as it states it."""
     stated: list[str] = []
 
     def take(*paths: str | None) -> None:
@@ -61,23 +82,7 @@ def hash_sources(
         take(*flight.plan.files.values())
     if flight.truth:
         take(flight.truth.joints.path if flight.truth.joints else None, *flight.truth.poses.values())
-    unique = list(dict.fromkeys(stated))
-    progress.start("Hashing sources", len(unique))
-    hashes, damage = {}, {}
-    with ThreadPoolExecutor(_HASHERS) as pool:  # hashing releases the interpreter: long logs side by side
-        hashing = {path: pool.submit(_hash_of, base / path) for path in unique}
-        try:
-            while not all(digest.done() for digest in hashing.values()) and next(meanwhile, None):
-                pass
-            for path, digest in hashing.items():
-                hashes[path], differing = digest.result()
-                if differing:
-                    damage[path] = {OTHER_CHECKSUM: differing}
-                progress.advance()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    return hashes, damage
+    return list(dict.fromkeys(stated))
 
 
 def _hash_of(path: Path) -> tuple[str, int]:

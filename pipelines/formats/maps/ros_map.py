@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.common.binary_files import first_bytes, read_bytes
+from pipelines.formats.common.stated_paths import leads_out
 from pipelines.formats.common.text_tables import read_head
 from pipelines.formats.common.yaml_text import numbers, read_yaml
 from pipelines.session.errors import DataError
@@ -161,7 +162,8 @@ def _read_plan(path: Path) -> _Plan:
 
 def _find_image(path: Path, image: str) -> Path:
     """The picture that is named, or else the one beside the YAML with its name: both are often renamed."""
-    candidates = [path.parent / image, *(path.with_suffix(suffix) for suffix in _SUFFIXES)]
+    named = [] if leads_out(image) else [path.parent / image]
+    candidates = [*named, *(path.with_suffix(suffix) for suffix in _SUFFIXES)]
     try:
         return next(candidate for candidate in candidates if candidate.is_file())
     except (StopIteration, OSError, ValueError):  # too long a name, or one that no file can have

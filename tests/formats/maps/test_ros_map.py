@@ -162,6 +162,17 @@ def test_a_renamed_picture_is_found_beside_its_plan(tmp_path: Path) -> None:
     assert (said["image"], said["image named (absent)"]) == ("map.pgm", "lost.png")
 
 
+def test_a_picture_outside_of_the_folder_is_named_in_full_or_not_at_all(tmp_path: Path) -> None:
+    (tmp_path / "plan").mkdir()
+    (tmp_path / "outside.pgm").write_bytes(pgm(PICTURE))
+    path = write(tmp_path / "plan", image="../outside.pgm", name="plan.pgm")
+    (tmp_path / "plan" / "plan.pgm").unlink()
+    with pytest.raises(DataError, match=r"its picture \.\./outside\.pgm is not there"):
+        READER.read_map(path)
+    path.write_text(path.read_text(encoding="utf-8").replace("../outside.pgm", f"{tmp_path}/outside.pgm"))
+    assert READER.describe(path)["image"] == "outside.pgm"
+
+
 @pytest.mark.parametrize(
     ("keys", "problem"),
     [
