@@ -24,8 +24,8 @@ from pipelines.planning.formation import (
     yaw_set,
 )
 from pipelines.planning.information import log_determinant, ray_information
-from pipelines.planning.kernels import Formations, Lattice, cheapest_slots, turn_the_shorter_way
 from pipelines.planning.search import best_sequence, lattice
+from pipelines.planning.search_kernels import Formations, Lattice, cheapest_slots, turn_the_shorter_way
 
 Float = NDArray[np.float64]
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal, get_args
 
-from pipelines.planning.kernels import SlotWeights, Weights
+from pipelines.planning.local_kernels import Weights
+from pipelines.planning.search_kernels import SlotWeights
 from pipelines.session.errors import DataError
 
 MOST_DRONES = 16

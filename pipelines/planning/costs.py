@@ -12,7 +12,7 @@ from pipelines.planning.distance_field import DistanceField
 from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import slot_offsets, turned
 from pipelines.planning.information import predicted_error, ray_information
-from pipelines.planning.kernels import slot_costs, weighed
+from pipelines.planning.search_kernels import slot_costs, weighed
 
 Float = NDArray[np.float64]
 

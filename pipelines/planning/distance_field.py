@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.planning.kernels import BRICK, Grid, Sight, fill_bricks, sample
+from pipelines.planning.field_kernels import BRICK, Grid, Sight, fill_bricks, sample
 from pipelines.session.records import Occupancy
 
 Float = NDArray[np.float64]

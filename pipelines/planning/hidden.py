@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import OCCUPIED, DistanceField
-from pipelines.planning.kernels import Grid
+from pipelines.planning.field_kernels import Grid
 from pipelines.planning.loading import LoggedFlight, flown_poses
 from pipelines.planning.sight import visible
 from pipelines.session.description import Description

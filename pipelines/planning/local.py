@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField
-from pipelines.planning.kernels import Weights, descend, evaluate, factorise
+from pipelines.planning.local_kernels import Weights, descend, evaluate, factorise
 from pipelines.planning.tracking import Plan
 
 Float = NDArray[np.float64]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.planning.formation import YAW, wrapped
-from pipelines.planning.kernels import REACHED_S, Lattice, cheapest_sequence
+from pipelines.planning.search_kernels import REACHED_S, Lattice, cheapest_sequence
 
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.compilation import cached
 from pipelines.planning.distance_field import DistanceField
-from pipelines.planning.kernels import Grid, line_shares
+from pipelines.planning.field_kernels import Grid, line_shares
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

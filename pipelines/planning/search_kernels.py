@@ -1,0 +1,248 @@
+"""The formation search, compiled: what slots cost, and the cheapest sequence of them.
+
+No threads and no fastmath: the same numbers give the same bytes.
+`costs`, `search` and `arms` are the users and explain the methods.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.compilation import cached, helper
+from pipelines.planning.field_kernels import (
+    DIAGONAL,
+    ROUNDING,
+    Grid,
+    Sight,
+    interpolate,
+    look,
+    nearest,
+    occupied_samples,
+    sampling,
+)
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+REACHED_S = 1e-9  # a cell exactly as far as the rates allow is a neighbour
+_YAW = 0  # of a slot: formation.YAW
+
+
+class Lattice(NamedTuple):
+    """States of a formation (or of one drone), and which of them follow which."""
+
+    states: Float  # [S, 3] yaw, tilt, range
+    rates: Float  # [3] per second
+    knot_s: float
+    w_turn: float
+    neighbours: Int64  # [S, K] nearest first, itself at the front; -1 fills up
+    move: Float  # [S, K] what going there costs
+
+
+class Formations(NamedTuple):
+    """The formations to choose from."""
+
+    lattice: Lattice
+    slots: Float  # [S, n, 3] of each state
+    offsets: Float  # [S, n, 3] m, the same from the actor
+
+
+class SlotWeights(NamedTuple):
+    """What the search weighs, by name; see `PlannerConfig`."""
+
+    w_obs: float
+    w_occ: float
+    eps_obs_m: float
+    sight_start_m: float
+
+
+@helper
+def _look_at_slots(
+    grid: Grid,
+    sight: Sight,
+    actor: Float,
+    offsets: Float,
+    eps_obs_m: float,
+    start_m: float,
+    obstacle: Float,
+    share: Float,
+) -> None:
+    """What `slot_costs` returns, written into arrays of zeros.
+
+    Most sight lines are known to be free from the distances of their two ends: the actor's, of which one
+    look tells for all of them, and the camera's, which the obstacle cost asks for anyway.
+    """
+    times, (states, cameras, _) = actor.shape[0], offsets.shape
+    side_m = grid.resolution_m
+    rules, counts = np.zeros((states, cameras, 11)), np.zeros((states, cameras), np.int64)
+    longest_m = 0.0
+    for s in range(states):
+        for i in range(cameras):
+            x, y, z = offsets[s, i]
+            counts[s, i] = sampling(x, y, z, start_m, side_m, rules[s, i])
+            longest_m = max(longest_m, rules[s, i, 10])
+    clear = math.ceil(2.0 * eps_obs_m / side_m + 1.0)  # from this leap on the nearest obstacle costs nothing
+    per_m = 1.0 / side_m
+    for t in range(times):
+        spare_m = nearest(grid, actor[t, 0], actor[t, 1], actor[t, 2]) - DIAGONAL * side_m
+        if spare_m > longest_m + eps_obs_m + (DIAGONAL + ROUNDING) * side_m:
+            continue
+        free_m = spare_m + (0.5 - ROUNDING) * side_m  # about the actor
+        ax = (actor[t, 0] - grid.origin[0]) / side_m
+        ay = (actor[t, 1] - grid.origin[1]) / side_m
+        az = (actor[t, 2] - grid.origin[2]) / side_m
+        # Neighbouring sight lines follow each other, and find what they look up near at hand.
+        for i in range(cameras):
+            for s in range(states):
+                rule, count = rules[s, i], counts[s, i]
+                x, y, z = offsets[s, i]
+                is_occupied, leap = look(sight, ax + x * per_m, ay + y * per_m, az + z * per_m)
+                if is_occupied or leap < clear:
+                    distance = interpolate(grid, actor[t, 0] + x, actor[t, 1] + y, actor[t, 2] + z)[0]
+                    obstacle[t, s, i] = min(max(1.0 - distance / eps_obs_m, 0.0), 1.0)
+                first = max(int((free_m - start_m) * rule[9] - 0.5), 0)
+                end = count if is_occupied else count - leap
+                if first < end:
+                    share[t, s, i] = (
+                        occupied_samples(sight, ax, ay, az, rule, float(first), float(end)) / count
+                    )
+
+
+@cached
+def slot_costs(
+    grid: Grid, sight: Sight, actor: Float, offsets: Float, eps_obs_m: float, start_m: float
+) -> tuple[Float, Float]:
+    """Obstacle cost and occupied share of the sight line, both [T, S, n].
+
+    Args:
+        grid: the distance field.
+        sight: the same for sight lines.
+        actor: [T, 3] forecast.
+        offsets: [S, n, 3] slots of every state, from the actor.
+        eps_obs_m: the distance from which obstacles count.
+        start_m: how far off the actor sight lines begin.
+    """
+    shape = (actor.shape[0], offsets.shape[0], offsets.shape[1])
+    obstacle, share = np.zeros(shape), np.zeros(shape)
+    _look_at_slots(grid, sight, actor, offsets, eps_obs_m, start_m, obstacle, share)
+    return obstacle, share
+
+
+@helper
+def _weigh(obstacle: Float, share: Float, w_obs: float, w_occ: float) -> Float:
+    """The cost map [T, S] of what `slot_costs` returns: summed over the drones, the first one first."""
+    times, states, cameras = obstacle.shape
+    cost = np.zeros((times, states))
+    for t in range(times):
+        for s in range(states):
+            for i in range(cameras):
+                cost[t, s] += w_obs * obstacle[t, s, i] + w_occ * share[t, s, i]
+    return cost
+
+
+@helper
+def _search(cost: Float, lattice: Lattice, start: Float) -> tuple[Int64, float]:
+    """See `search.best_sequence`."""
+    times, states = cost.shape
+    value = cost.copy()
+    following = np.zeros((times, states), np.int64)
+    for t in range(times - 2, -1, -1):
+        for s in range(states):
+            best = math.inf
+            for k in range(lattice.neighbours.shape[1]):
+                j = lattice.neighbours[s, k]
+                if j >= 0 and value[t + 1, j] + lattice.move[s, k] < best:
+                    best = value[t + 1, j] + lattice.move[s, k]
+                    following[t, s] = j
+            value[t, s] = cost[t, s] + best
+
+    # The first step starts anywhere between the states.
+    reach_s, way_s = np.zeros(states), np.zeros(states)
+    for s in range(states):
+        for axis in range(3):
+            way = abs(lattice.states[s, axis] - start[axis])
+            if axis == _YAW:
+                way = abs(_wrapped(way))
+            reach_s[s] = max(reach_s[s], way / lattice.rates[axis])
+            way_s[s] += way / lattice.rates[axis]
+    within_s = max(lattice.knot_s, reach_s.min()) + REACHED_S
+    sequence = np.zeros(times, np.int64)
+    total = nearest = math.inf
+    for s in range(states):
+        through = value[0, s] + lattice.w_turn / 2.0 * way_s[s]
+        if reach_s[s] <= within_s and (through < total or (through == total and way_s[s] < nearest)):
+            total, nearest = through, way_s[s]
+            sequence[0] = s
+    for t in range(times - 1):
+        sequence[t + 1] = following[t, sequence[t]]
+    return sequence, total
+
+
+@helper
+def _wrapped(angle_rad: float) -> float:
+    return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@helper
+def _turn_the_shorter_way(slots: Float) -> None:
+    """Make the yaws of slots [T, n, 3] continuous, from knot to knot."""
+    for i in range(slots.shape[1]):
+        first, before, turned = slots[0, i, _YAW], slots[0, i, _YAW], 0.0
+        for t in range(1, slots.shape[0]):
+            yaw = slots[t, i, _YAW]
+            turned += _wrapped(yaw - before)
+            slots[t, i, _YAW] = first + turned
+            before = yaw
+
+
+@cached
+def weighed(obstacle: Float, share: Float, w_obs: float, w_occ: float) -> Float:
+    """C [T, S] of costs [T, S, n]; see `costs.cost_map`."""
+    return _weigh(obstacle, share, w_obs, w_occ)
+
+
+@cached
+def cheapest_sequence(cost: Float, lattice: Lattice, start: Float) -> tuple[Int64, float]:
+    """See `search.best_sequence`."""
+    return _search(cost, lattice, start)
+
+
+@cached
+def turn_the_shorter_way(slots: Float) -> None:
+    """Make the yaws of slots [T, n, 3] continuous, from knot to knot, in place."""
+    _turn_the_shorter_way(slots)
+
+
+@cached
+def cheapest_slots(
+    grid: Grid, sight: Sight, actor: Float, formations: Formations, w: SlotWeights, commanded: Float
+) -> Float:
+    """All of a formation's planning: look at the slots, weigh, search.
+
+    Args:
+        grid: the distance field.
+        sight: the same for sight lines.
+        actor: [T, 3] forecast.
+        formations: which there are.
+        w: what is weighed.
+        commanded: [n, 3] the slots that are commanded now.
+
+    Returns:
+        [T + 1, n, 3] slots at the knots, the first as commanded; yaw is continuous.
+    """
+    shape = (actor.shape[0], formations.slots.shape[0], formations.slots.shape[1])
+    obstacle, share = np.zeros(shape), np.zeros(shape)
+    _look_at_slots(grid, sight, actor, formations.offsets, w.eps_obs_m, w.sight_start_m, obstacle, share)
+    sequence, _ = _search(_weigh(obstacle, share, w.w_obs, w.w_occ), formations.lattice, commanded[0])
+    through = np.empty((shape[0] + 1, shape[2], 3))
+    for i in range(shape[2]):
+        for axis in range(3):
+            through[0, i, axis] = commanded[i, axis]
+            for t in range(shape[0]):
+                through[t + 1, i, axis] = formations.slots[sequence[t], i, axis]
+    _turn_the_shorter_way(through)
+    return through
