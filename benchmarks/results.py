@@ -2,7 +2,8 @@
 
 Runs the commands that the page names, one after the other, keeps their numbers in docs/results.json and their
 figures in docs/figures/, and writes the page from them. Needs the detector (`mocap models fetch blazepose`).
-`--resume` goes on with what an interrupted run left, `--page` writes the page alone.
+`--resume` goes on with what an interrupted run left, `--only SECTION` measures one section again and keeps
+the others, `--page` writes the page alone.
 """
 
 from __future__ import annotations
@@ -15,11 +16,28 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from benchmarks.results_page import ARM_FIGURES, PLACE, POSES, SCENARIOS, STUDIES, Numbers, render
+import av
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from benchmarks.results_page import (
+    ARM_FIGURES,
+    FILMED,
+    PLACE,
+    POSES,
+    SCENARIOS,
+    STILL,
+    STUDIES,
+    Numbers,
+    render,
+)
 from pipelines.reporting.ablation import METRICS
 
 ROOT = Path(__file__).parents[1]
@@ -28,6 +46,7 @@ _CELL = ("tilt_deg", "drones", "noise", "noise_model", "method", "ratio")
 _ARM = ("simulated", "tilt_deg", "occluded_share", "reconstruction_error")
 _TIMES = f"{PLACE}/times.json"
 _DIGITS = 6  # of a number that is kept
+_STILL_PX = (640, 360)  # of each picture in the still
 
 
 def main() -> None:
@@ -35,44 +54,84 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--page", action="store_true", help="only write the page, from docs/results.json")
     parser.add_argument("--resume", action="store_true", help="go on where an interrupted run stopped")
+    parser.add_argument("--only", choices=SECTIONS, help="measure one section again, keep the others")
     arguments = parser.parse_args()
     if not arguments.page:
-        numbers = _rounded(measured(resume=arguments.resume))
+        numbers: Numbers = {}
+        if arguments.only:
+            numbers = json.loads((DOCS / "results.json").read_text(encoding="utf-8"))
+        elif not arguments.resume:
+            shutil.rmtree(ROOT / PLACE, ignore_errors=True)
+        numbers |= _rounded(measured([arguments.only] if arguments.only else list(SECTIONS)))
         (DOCS / "results.json").write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
     numbers = json.loads((DOCS / "results.json").read_text(encoding="utf-8"))
-    (DOCS / "results.md").write_text(render(numbers), encoding="utf-8")
+    page = render(numbers)
+    (DOCS / "results.md").write_text(page, encoding="utf-8")
+    for old in {path.name for path in (DOCS / "figures").iterdir()} - set(figures_of(page)):
+        (DOCS / "figures" / old).unlink()
     print(f"written: {DOCS / 'results.md'}")
 
 
-def measured(*, resume: bool = False) -> Numbers:
-    """The numbers of all sections; their figures are copied beside the page."""
-    if not resume:
-        shutil.rmtree(ROOT / PLACE, ignore_errors=True)
+def measured(sections: Sequence[str]) -> Numbers:
+    """The numbers of these sections; their figures are copied beside the page."""
     (ROOT / PLACE).mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(DOCS / "figures", ignore_errors=True)
-    (DOCS / "figures").mkdir()
-    numbers: Numbers = {
-        "poses": {name: _poses(name, commands) for name, commands in POSES.commands.items()},
-        "studies": {},
-        "arms": {},
-    }
+    (DOCS / "figures").mkdir(exist_ok=True)
+    numbers: Numbers = {section: SECTIONS[section]() for section in sections}
+    numbers["cpu_minutes"] = math.ceil(sum(_spent().values()) / 60)
+    return numbers
+
+
+def _poses() -> Numbers:
+    numbers = {}
+    for name, commands in POSES.commands.items():
+        for command in commands:
+            _run(command)
+        told = _read(f"{PLACE}/{name}.session/reconstruct/metrics.json")
+        numbers[name] = {key: told[key] for key in POSES.measures}
     _run(POSES.compare)
     for key in POSES.figures:
         _keep(f"{PLACE}/compared/{key}.svg", f"poses-{key.removeprefix('compare-')}")
+    return numbers
+
+
+def _studies() -> Numbers:
+    numbers = {}
     for name, command in STUDIES.items():
         _run(command)
-        numbers["studies"][name] = _study(_read(f"{PLACE}/{name}/summary.json"))
+        numbers[name] = _study(_read(f"{PLACE}/{name}/summary.json"))
         _keep(f"{PLACE}/{name}/figure.svg", f"study-{name}")
+    return numbers
+
+
+def _planners() -> Numbers:
+    numbers = {}
     for name, commands in SCENARIOS.items():
         for command in commands:
             _run(command)
-        numbers["arms"][name] = _arms(_read(f"{PLACE}/{name}.session/replan/metrics.json"))
+        numbers[name] = _arms(_read(f"{PLACE}/{name}.session/replan/metrics.json"))
     for name, (command, keys) in ARM_FIGURES.items():
         _run(command)
         for key in keys:
             _keep(f"{PLACE}/{name}-figures/{key}.svg", f"{name}-{key}")
-    numbers["cpu_minutes"] = math.ceil(sum(_spent().values()) / 60)
     return numbers
+
+
+def _filmed() -> Numbers:
+    numbers = {}
+    for name, commands in FILMED.items():
+        for command in commands:
+            _run(command)
+        numbers[name] = _read(f"{PLACE}/{name}.session/film/metrics.json")["arms"]
+    _keep_still(ROOT / PLACE / "e2.session" / "film")
+    return numbers
+
+
+SECTIONS: dict[str, Callable[[], Numbers]] = {
+    "poses": _poses,
+    "studies": _studies,
+    "arms": _planners,
+    "filmed": _filmed,
+}
 
 
 def _run(command: str) -> None:
@@ -111,11 +170,21 @@ def _keep(figure: str, name: str) -> None:
     shutil.copyfile(ROOT / figure, DOCS / "figures" / f"{name}.svg")
 
 
-def _poses(name: str, commands: tuple[str, ...]) -> dict[str, Any]:
-    for command in commands:
-        _run(command)
-    told = _read(f"{PLACE}/{name}.session/reconstruct/metrics.json")
-    return {key: told[key] for key in POSES.measures}
+def _keep_still(film: Path) -> None:
+    """What both cameras of both arms saw when the fixed formation measured the fewest joints."""
+    skeleton = pd.read_parquet(film / "fixed" / "skeleton.parquet")
+    picture = int(skeleton.groupby("t_ns")["x"].count().to_numpy().argmin())
+    rows = [
+        np.hstack([_picture(film / arm / f"drone{k}.mp4", picture) for k in (1, 2)])
+        for arm in ("adaptive", "fixed")
+    ]
+    cv2.imwrite(str(DOCS / "figures" / STILL), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 85])
+
+
+def _picture(video: Path, number: int) -> NDArray[np.uint8]:
+    with av.open(str(video)) as opened:
+        frame = next(islice(opened.decode(video=0), number, None))
+    return np.asarray(cv2.resize(frame.to_ndarray(format="bgr24"), _STILL_PX, interpolation=cv2.INTER_AREA))
 
 
 def _study(summary: Mapping[str, Any]) -> dict[str, Any]:
