@@ -269,6 +269,7 @@ def test_workers_do_not_matter_and_a_study_that_is_there_is_not_made_again(tmp_p
     assert again == f"unchanged: {tmp_path / '2'}\n"
 
 
+@pytest.mark.slow
 def test_what_an_interrupted_study_finished_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = ("tilt", *SMALL, "--tilts", "0,15,30", "--levels", "low", "-o", tmp_path / "out", "-q")
     measured: list[float] = []

@@ -201,6 +201,7 @@ def test_real_octomap_in_a_log(tmp_path: Path, name: str) -> None:
     np.testing.assert_array_equal(logged.probability, filed.probability)
 
 
+@pytest.mark.slow
 def test_real_lidar(tmp_path: Path) -> None:
     """Five clouds of a car's lidar; the log does not say where the sensor is."""
     name = "logs/ros1/embag_pointcloud2_lidar.bag"
