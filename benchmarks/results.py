@@ -172,12 +172,13 @@ def _keep(figure: str, name: str) -> None:
 
 def _keep_still(film: Path) -> None:
     """What both cameras of both arms saw when the fixed formation measured the fewest joints."""
-    skeleton = pd.read_parquet(film / "fixed" / "skeleton.parquet")
-    picture = int(skeleton.groupby("t_ns")["x"].count().to_numpy().argmin())
-    rows = [
-        np.hstack([_picture(film / arm / f"drone{k}.mp4", picture) for k in (1, 2)])
+    measured = {
+        arm: pd.read_parquet(film / arm / "skeleton.parquet").groupby("t_ns")["x"].count()
         for arm in ("adaptive", "fixed")
-    ]
+    }
+    pictures = measured["adaptive"].index.union(measured["fixed"].index)  # one at least measures anything
+    picture = int(measured["fixed"].reindex(pictures, fill_value=0).to_numpy().argmin())
+    rows = [np.hstack([_picture(film / arm / f"drone{k}.mp4", picture) for k in (1, 2)]) for arm in measured]
     cv2.imwrite(str(DOCS / "figures" / STILL), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 
