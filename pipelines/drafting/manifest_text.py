@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipelines.drafting.camera_text import CameraText, Remarks, flowing, spanned, stated, told
-from pipelines.drafting.found import Joints, Span
+from pipelines.drafting.found import Found, Joints, Recording, Span
 from pipelines.drafting.matching import Draft
 from pipelines.drafting.yaml_text import commented, entry, one_line, scalar
 from pipelines.session.manifest import SCHEMA
@@ -96,7 +96,7 @@ def _logs(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) -> li
 
 def _cameras(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) -> list[str]:
     if not draft.cameras:
-        remarks.missing["cameras: nothing was found that has pictures, keypoints or poses"] = []
+        remarks.missing["cameras: nothing was found that has pictures, keypoints or poses of a drone"] = []
         return [_NO_CAMERA]
     lines = ["", "cameras:"]
     for camera in draft.cameras:
@@ -156,5 +156,11 @@ def _unused(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
     lines = ["", "# Recognised, but not used:"]
     for found in draft.unused:
         hint = "; if known to be true: truth: {joints: FILE}" if isinstance(found, Joints) else ""
-        lines.append(f"#   {scalar(relative(found.path))}  ({one_line(found.title)}{hint})")
+        lines.append(f"#   {scalar(relative(found.path))}  ({one_line(found.title)}{hint or _held(found)})")
     return lines
+
+
+def _held(found: Found) -> str:
+    """The topics of a log that could be named all the same."""
+    topics = [topic.name for topic in found.topics if topic.count] if isinstance(found, Recording) else []
+    return f" with {one_line(', '.join(topics[:_NAMES_TOLD]))}" if topics else ""

@@ -133,8 +133,16 @@ def test_one_map_is_stated_and_the_others_are_told() -> None:
 def test_without_a_camera_a_template_stands_in_a_comment() -> None:
     text, stated = written(Findings(maps=[Map(*about("a.bt"))]))
     assert "cameras" not in stated
-    assert text.missing == ["cameras: nothing was found that has pictures, keypoints or poses"]
+    assert text.missing == ["cameras: nothing was found that has pictures, keypoints or poses of a drone"]
     assert "#     pose: {tum: drone1.tum}" in text.text
+
+
+def test_topics_of_a_log_that_has_no_place_are_named() -> None:
+    truth = TopicFound("/ground_truth", "nav_msgs/msg/Odometry", "poses", 5, Span(0, SECOND))
+    empty = TopicFound("/odometry", "nav_msgs/msg/Odometry", "poses", 0, Span(0, 0))
+    log = Recording(*about("site.bag"), (Path("/flight/site.bag"),), (truth, empty))
+    text, _ = written(Findings(recordings=[log]))
+    assert "#   site.bag  (title of x with /ground_truth)" in text.text
 
 
 def test_many_cameras_are_told_in_short() -> None:
