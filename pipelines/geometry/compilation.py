@@ -38,8 +38,8 @@ def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
     """Compile at the first call, release the interpreter while running, keep the code for the next process.
 
     numba's cache raises where it cannot be written (`RuntimeError` when decorating) or read (a file cut
-    short by a full disk). Here the function is compiled for this process alone instead, and a damaged
-    cache is emptied for the next one.
+    short by a full disk, or of an earlier version, whose types stood in other modules). Here the function is
+    compiled for this process alone instead, and such a cache is emptied for the next one.
     """
     options = {"nogil": True, **_OPTIONS}
     try:
@@ -53,7 +53,7 @@ def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
     def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         try:
             result: Result = compiled(*args, **kwargs)
-        except (EOFError, UnpicklingError, OSError):
+        except (EOFError, UnpicklingError, OSError, ImportError, AttributeError):
             with suppress(OSError):
                 compiled._cache.flush()
             compiled._cache.disable()
