@@ -1,0 +1,335 @@
+"""The detections of one frame as rays: how far two pass each other, and where a group of them is."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.compilation import helper
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+_AGREE = 9.0  # a pair of detections without history is one person within 3 sigma
+_CAP = 100.0  # beyond 10 sigma further is no more wrong
+FEW_JOINTS = 3.0  # common joints at which a pair has half the weight of a complete one
+_BODY_M = 0.05  # rays that pass this near are one body: joint definitions, left/right swaps, blur
+_SIZE_M = (0.03, 1.5)  # median distance of joints from their middle: 0.4 m for an adult, 0.06 for a face
+_LOGGED_POINT_M = 0.5  # the log's point (a tag, a phone, the hip) against the joints of a body
+
+
+class Nodes(NamedTuple):
+    """The detections of one frame, cameras in order, left to right within a camera: arrays of room N."""
+
+    camera: Int64  # [N]
+    detection: Int64  # [N] index into D
+    points: Float  # [N, J, 2] normalised picture, NaN where not seen
+    rays: Float  # [N, J, 3] unit, world
+    size: Float  # [N] median distance of joints from their middle, normalised picture
+    whole: Bool  # [N] enough joints for `size` to mean something
+    weight: Float  # [N, N] 3^2 - s^2, 0 where nothing can be said
+    known: Float  # [N, S] how well the node continues each track's last picture, 0..1
+    bond: Float  # [N, S + N] the same relative to the best other track, -1..1
+    barred: Bool  # [N, S] the node continues somebody else than the track
+    label: Int64  # [N] track slot, or S + i for a group without a track
+    member: Int64  # [S + N, C] node of each label in each camera, -1 none
+
+
+@helper
+def median_of(values: Float, count: int) -> float:
+    """Median of the first `count` values, which are sorted in place."""
+    for i in range(1, count):
+        value = values[i]
+        j = i - 1
+        while j >= 0 and values[j] > value:
+            values[j + 1] = values[j]
+            j -= 1
+        values[j + 1] = value
+    half = count // 2
+    return float(values[half] if count % 2 else 0.5 * (values[half - 1] + values[half]))
+
+
+@helper
+def _seen(xy: Float, confidence: float) -> bool:
+    return confidence > 0.0 and math.isfinite(xy[0]) and math.isfinite(xy[1])
+
+
+@helper
+def collect_nodes(
+    nodes: Nodes,
+    xy: Float,
+    confidence: Float,
+    rotation: Float,
+    sigma: Float,
+    needed: int,
+    scratch: Float,
+) -> int:
+    """Fill in the detections that can be used; their number.
+
+    Their order depends on where they are in the picture and not on the order they came in, and with it
+    every tie and every rounding below.
+    """
+    cameras, detections, joints = confidence.shape
+    key = np.empty((detections, 2))
+    n = 0
+    for c in range(cameras):
+        if math.isnan(sigma[c]):
+            continue
+        for d in range(detections):
+            count = 0
+            key[d, 0] = key[d, 1] = 0.0
+            for j in range(joints):
+                if _seen(xy[c, d, j], confidence[c, d, j]):
+                    count += 1
+                    key[d, 0] += xy[c, d, j, 0]
+                    key[d, 1] += xy[c, d, j, 1]
+            key[d, 0] = key[d, 0] / count if count >= needed else np.inf
+            key[d, 1] = key[d, 1] / max(count, 1)
+        for _ in range(detections):
+            first = 0
+            for d in range(1, detections):
+                if key[d, 0] < key[first, 0] or (key[d, 0] == key[first, 0] and key[d, 1] < key[first, 1]):
+                    first = d
+            if key[first, 0] == np.inf:
+                break
+            key[first, 0] = np.inf
+            nodes.camera[n] = c
+            nodes.detection[n] = first
+            _describe(nodes, n, xy[c, first], confidence[c, first], rotation[c], scratch)
+            n += 1
+    return n
+
+
+@helper
+def _describe(nodes: Nodes, n: int, xy: Float, confidence: Float, rotation: Float, scratch: Float) -> None:
+    """Points, rays and size of one detection."""
+    middle = np.empty(2)
+    for axis in range(2):
+        count = 0
+        for j in range(len(confidence)):
+            if _seen(xy[j], confidence[j]):
+                scratch[count] = xy[j, axis]
+                count += 1
+        middle[axis] = median_of(scratch, count)
+    count = 0
+    for j in range(len(confidence)):
+        if not _seen(xy[j], confidence[j]):
+            nodes.points[n, j] = np.nan
+            continue
+        u, v = xy[j, 0], xy[j, 1]
+        nodes.points[n, j, 0] = u
+        nodes.points[n, j, 1] = v
+        length = math.sqrt(u * u + v * v + 1.0)
+        for axis in range(3):
+            nodes.rays[n, j, axis] = (
+                rotation[axis, 0] * u + rotation[axis, 1] * v + rotation[axis, 2]
+            ) / length
+        scratch[count] = math.hypot(u - middle[0], v - middle[1])
+        count += 1
+    nodes.whole[n] = count >= 5
+    nodes.size[n] = median_of(scratch, count)
+
+
+@helper
+def add_logged_node(nodes: Nodes, n: int, cameras: int) -> int:
+    """Let the logged actor take part as the only detection of one more camera, without a picture."""
+    nodes.camera[n] = cameras
+    for j in range(nodes.points.shape[1]):
+        nodes.points[n, j, 0] = nodes.points[n, j, 1] = np.nan
+    return n + 1
+
+
+@helper
+def compare_nodes(
+    nodes: Nodes, n: int, position: Float, sigma: Float, log: Float, needed: int, scratch: Float
+) -> float:
+    """Weigh every pair of detections of different cameras; the smallest s (NaN without a pair).
+
+    A pair with few common joints says less: where a detector takes one person for two, the body wins
+    over the loose leg.
+    """
+    nearest = np.inf
+    for a in range(n):
+        for b in range(a):
+            weight = 0.0
+            if nodes.camera[a] == len(sigma):
+                weight = _AGREE - _distance_from_log(nodes, b, position, sigma, log, scratch)
+            elif nodes.camera[a] != nodes.camera[b]:
+                square, joints = _disagreement(nodes, a, b, position, sigma, scratch)
+                if joints >= needed:
+                    weight = (_AGREE - square) * joints / (joints + FEW_JOINTS)
+                    nearest = min(nearest, square)
+            nodes.weight[a, b] = weight
+            nodes.weight[b, a] = weight
+    return math.sqrt(nearest) if nearest < np.inf else math.nan
+
+
+@helper
+def _disagreement(
+    nodes: Nodes, a: int, b: int, position: Float, sigma: Float, squares: Float
+) -> tuple[float, int]:
+    """Mean over the better three quarters of the common joints of the squared, whitened ray distance.
+
+    Two rays o + z d pass each other along n = d_a x d_b, at depths that follow from n (Hartley & Zisserman
+    12.1, the midpoint's); an angular error sigma moves a ray by sigma z along n. Joints whose rays are too
+    parallel for the depths to mean anything do not count. With it the number of joints.
+    """
+    ca, cb = nodes.camera[a], nodes.camera[b]
+    bx = position[cb, 0] - position[ca, 0]
+    by = position[cb, 1] - position[ca, 1]
+    bz = position[cb, 2] - position[ca, 2]
+    least = 4.0 * (sigma[ca] ** 2 + sigma[cb] ** 2)
+    check_size = nodes.whole[a] and nodes.whole[b]
+    count = 0
+    for j in range(nodes.points.shape[1]):
+        if math.isnan(nodes.points[a, j, 0]) or math.isnan(nodes.points[b, j, 0]):
+            continue
+        px, py, pz = nodes.rays[a, j, 0], nodes.rays[a, j, 1], nodes.rays[a, j, 2]
+        qx, qy, qz = nodes.rays[b, j, 0], nodes.rays[b, j, 1], nodes.rays[b, j, 2]
+        nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
+        sine2 = nx * nx + ny * ny + nz * nz
+        if sine2 <= max(least, 1e-12):
+            continue
+        za = ((by * qz - bz * qy) * nx + (bz * qx - bx * qz) * ny + (bx * qy - by * qx) * nz) / sine2
+        zb = ((by * pz - bz * py) * nx + (bz * px - bx * pz) * ny + (bx * py - by * px) * nz) / sine2
+        possible = za > 0.0 and zb > 0.0
+        if possible and check_size:
+            small, large = za * nodes.size[a], zb * nodes.size[b]
+            possible = min(small, large) > _SIZE_M[0] and max(small, large) < _SIZE_M[1]
+        square = _CAP
+        if possible:
+            distance2 = (bx * nx + by * ny + bz * nz) ** 2 / sine2
+            variance = (sigma[ca] * za) ** 2 + (sigma[cb] * zb) ** 2 + _BODY_M**2
+            square = min(distance2 / variance, _CAP)
+        squares[count] = square
+        count += 1
+    if count == 0:
+        return _CAP, 0
+    median_of(squares, count)
+    kept = max(1, (3 * count) // 4)
+    total = 0.0
+    for i in range(kept):
+        total += squares[i]
+    return total / kept, count
+
+
+@helper
+def _distance_from_log(
+    nodes: Nodes, a: int, position: Float, sigma: Float, log: Float, squares: Float
+) -> float:
+    """Median over the joints of the squared, whitened distance of the logged actor from the joint's ray."""
+    c = nodes.camera[a]
+    count = 0
+    for j in range(nodes.points.shape[1]):
+        if math.isnan(nodes.points[a, j, 0]):
+            continue
+        depth = range2 = 0.0
+        for axis in range(3):
+            sight = log[axis] - position[c, axis]
+            depth += sight * nodes.rays[a, j, axis]
+            range2 += sight * sight
+        squares[count] = _CAP
+        if depth > 0.0:
+            square = (range2 - depth * depth) / ((sigma[c] * depth) ** 2 + log[3] ** 2 + _LOGGED_POINT_M**2)
+            squares[count] = min(square, _CAP)
+        count += 1
+    return median_of(squares, count)
+
+
+@helper
+def size_of_group(nodes: Nodes, label: int) -> int:
+    """How many detections a group has, the logged actor among them."""
+    size = 0
+    for c in range(nodes.member.shape[1]):
+        if nodes.member[label, c] >= 0:
+            size += 1
+    return size
+
+
+@helper
+def views_of_group(nodes: Nodes, label: int) -> int:
+    """Cameras in a group; the log, in the last column, is none."""
+    return size_of_group(nodes, label) - (1 if nodes.member[label, -1] >= 0 else 0)
+
+
+@helper
+def put_into_group(nodes: Nodes, a: int, label: int) -> None:
+    """Make a detection one of a group."""
+    nodes.label[a] = label
+    nodes.member[label, nodes.camera[a]] = a
+
+
+@helper
+def place_group(
+    nodes: Nodes, label: int, position: Float, sigma: Float, middle: Float, scratch: Float
+) -> float:
+    """Middle of a group's joints and its standard deviation (m); NaN where no joint has two views.
+
+    Least squares closest point to each joint's rays, then the median over joints, axis by axis, so that
+    stray joints do not move it.
+    """
+    cameras, joints = len(sigma), nodes.points.shape[1]
+    found = np.empty((joints, 3))
+    normal, target, sight = np.empty(6), np.empty(3), np.empty(3)
+    count = 0
+    for j in range(joints):
+        normal[:] = 0.0
+        target[:] = 0.0
+        views = 0
+        for c in range(cameras):
+            a = nodes.member[label, c]
+            if a >= 0 and not math.isnan(nodes.points[a, j, 0]):
+                views += 1
+                _add_ray(normal, target, nodes.rays[a, j], position[c], 1.0 / sigma[c] ** 2)
+        if views > 1 and _solve(normal, target, found[count]) >= 0.0:
+            count += 1
+    if count == 0:
+        return math.nan
+    for axis in range(3):
+        for i in range(count):
+            scratch[i] = found[i, axis]
+        middle[axis] = median_of(scratch, count)
+    normal[:] = 0.0
+    for c in range(cameras):
+        if nodes.member[label, c] >= 0:
+            range2 = 0.0
+            for axis in range(3):
+                sight[axis] = middle[axis] - position[c, axis]
+                range2 += sight[axis] ** 2
+            reach = max(math.sqrt(range2), 1e-6)
+            for axis in range(3):
+                sight[axis] /= reach
+            _add_ray(normal, target, sight, position[c], 1.0 / (sigma[c] * reach) ** 2)
+    variance = _solve(normal, target, found[0])
+    return math.sqrt(variance / 3.0) if variance >= 0.0 else math.nan
+
+
+@helper
+def _add_ray(normal: Float, target: Float, ray: Float, origin: Float, weight: float) -> None:
+    """Add w (I - r r') to the upper triangle of the normal matrix and w (I - r r') o to its right side."""
+    along = ray[0] * origin[0] + ray[1] * origin[1] + ray[2] * origin[2]
+    i = 0
+    for row in range(3):
+        target[row] += weight * (origin[row] - along * ray[row])
+        for column in range(row, 3):
+            normal[i] += weight * ((1.0 if row == column else 0.0) - ray[row] * ray[column])
+            i += 1
+
+
+@helper
+def _solve(normal: Float, target: Float, solution: Float) -> float:
+    """Solve the 3x3 system by its adjugate; the trace of the inverse, -1 where it is singular."""
+    xx, xy, xz, yy, yz, zz = normal[0], normal[1], normal[2], normal[3], normal[4], normal[5]
+    ax, ay, az = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    by, bz, cz = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    determinant = xx * ax + xy * ay + xz * az
+    if determinant <= 1e-9 * ((xx + yy + zz) / 3.0) ** 3:
+        return -1.0
+    solution[0] = (ax * target[0] + ay * target[1] + az * target[2]) / determinant
+    solution[1] = (ay * target[0] + by * target[1] + bz * target[2]) / determinant
+    solution[2] = (az * target[0] + bz * target[1] + cz * target[2]) / determinant
+    return float((ax + by + cz) / determinant)
