@@ -1,8 +1,10 @@
-"""The arms past a mound, a wall and trees: `python -m benchmarks.arms [--weights]`.
+"""The arms past a mound, a wall and trees: `python -m benchmarks.arms [--weights | --seeds N]`.
 
 Each scenario of sample_data/planning is simulated without video, ingested, and flown again by the fixed and
 the adaptive formation with the weights of its planner.yaml, as `mocap replan-compare` does. All simulated.
 `--weights` flies them with other weights and resolutions too, and counts what each makes of the arms.
+`--seeds` flies them, and the sample flight, many times with different noise of the actor's log, detector and
+poses, and pairs the arms seed by seed.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ import numpy as np
 from benchmarks.results_page import ARM_COLUMNS, arm_figures, markdown_table
 from pipelines.ingest import ingest
 from pipelines.planning.arm_flights import fly_arm
+from pipelines.planning.comparison import mean_of_trials
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.loading import load_flight
 from pipelines.planning.scene import Rules, Scene, build_scene
@@ -32,6 +35,10 @@ from pipelines.simulate import simulate
 SCENARIOS = Path(__file__).parents[1] / "sample_data" / "planning"
 NAMES = ("mound", "wall", "trees")
 ARMS = ("adaptive", "fixed")
+YAW_DEG = 210.0
+"""From where the mound of the sample flight is in the way; the flight itself began elsewhere."""
+ACTOR_NOISE_M = 0.2
+"""Per axis and measurement: what the planners are told that the log errs by."""
 
 VARIANTS: tuple[Mapping[str, float], ...] = (
     {},
@@ -49,10 +56,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trials", type=int, default=20, help="draws of noise (default 20)")
     parser.add_argument("--weights", action="store_true", help="other weights instead (minutes)")
+    parser.add_argument("--seeds", type=int, help="flights with noise of their own instead (minutes)")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         sessions = {name: _session(name, Path(temporary)) for name in NAMES}
-        if arguments.weights:
+        if arguments.seeds:
+            sample = Path(temporary) / "sample.session"
+            ingest(SCENARIOS.parent / "mound_walk" / "flight.yaml", session=sample)
+            _print_seeds(
+                {"sample": sample, f"sample, --yaw {YAW_DEG:g}": sample, **sessions}, arguments.seeds
+            )
+        elif arguments.weights:
             _print_weights({name: _scene(session) for name, session in sessions.items()})
         else:
             _print_comparisons(sessions, arguments.trials)
@@ -85,6 +99,33 @@ def _print_comparisons(sessions: Mapping[str, Path], trials: int) -> None:
         )
     header = ["adaptive minus fixed", "tilt deg", "near obstacle", "hidden, points of %", "MPJPE mm"]
     print("\n".join(markdown_table(header, rows)[:-1]))
+
+
+def _print_seeds(sessions: Mapping[str, Path], seeds: int) -> None:
+    """Differences of whole flights, and the largest tilt of any."""
+    columns = ("adaptive minus fixed", "tilt deg", "near obstacle", "hidden, points of %", "MPJPE mm")
+    print("| " + " | ".join([*columns, "largest tilt deg: adaptive", "fixed"]) + " |")
+    print("|" + " --- |" * 7)
+    kinds = ("tilt_deg", "tilt_near_obstacle_deg", "occluded_share", "mpjpe_mm")
+    for name, session in sessions.items():
+        yaw_deg = YAW_DEG if "--yaw" in name else None
+        flown = [_flown(session, seed, yaw_deg) for seed in range(seeds)]
+        differences = [metrics["differences"][0] for metrics in flown]
+        cells = []
+        for kind in kinds:
+            values = np.array([each[kind]["mean"] for each in differences if each[kind]])
+            told = mean_of_trials(values, 0)
+            scale = 100 if kind == "occluded_share" else 1
+            cells.append("-" if told is None else _with_interval(told.as_json(), scale))
+        largest = [f"{max(each['arms'][arm]['tilt_deg']['max'] for each in flown):.1f}" for arm in ARMS]
+        print(f"| {' | '.join([name, *cells, *largest])} |", flush=True)
+
+
+def _flown(session: Path, seed: int, yaw_deg: float | None) -> dict[str, Any]:
+    """Both arms with noise of this seed: one draw of all that errs."""
+    planner = replace(PlannerConfig(), actor_noise_m=ACTOR_NOISE_M)
+    settings = Settings(arms=ARMS, trials=1, seed=seed, planner=planner, yaw_deg=yaw_deg)
+    return replan(session, settings).metrics
 
 
 def _with_interval(estimate: Mapping[str, Any], scale: float) -> str:
