@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import click
 
-from mocap_cli.options import any_path, json_option
-from mocap_cli.terminal import one_line, print_json
+from mocap_cli.options import json_option
+from mocap_cli.several import each
+from mocap_cli.terminal import one_line
 
 _LONGEST_LIST = 12
 
 
 @click.command("info", short_help="Say what a file or session holds.")
-@click.argument("path", type=any_path)
+@each("path", "PATH", titled=False)
 @json_option
-def info_command(path: Path, as_json: bool) -> None:
+def info_command(path: Path, as_json: bool) -> dict[str, Any] | None:
     """Say what a path holds: anything that mocap reads, and what it writes.
 
     Logs, videos, maps, calibrations, keypoint files and trajectories; manifests, scenarios and planner
@@ -27,13 +29,11 @@ def info_command(path: Path, as_json: bool) -> None:
 
     readings = survey(path)
     if as_json:
-        print_json(
-            {"path": str(path), "readings": [{"kind": r.title, **jsonable(r.facts)} for r in readings]}
-        )
-        return
+        return {"path": str(path), "readings": [{"kind": r.title, **jsonable(r.facts)} for r in readings]}
     for reading in readings:
         click.echo(f"{reading.path}: {reading.title}")
         _print_facts(reading.facts, indent=2)
+    return None
 
 
 def _print_facts(facts: Mapping[str, object], indent: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import glob
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,9 @@ def expanded(paths: Iterable[str | Path]) -> list[Path]:
     return list(found)
 
 
-def each(argument: str, metavar: str, suffix: str = "") -> Callable[[Command], Callable[..., None]]:
+def each(
+    argument: str, metavar: str, suffix: str = "", *, titled: bool = True
+) -> Callable[[Command], Callable[..., None]]:
     """Let a command of one flight or session take several, or patterns.
 
     The command returns what --json prints; it must print that not itself.
@@ -45,6 +47,7 @@ def each(argument: str, metavar: str, suffix: str = "") -> Callable[[Command], C
         argument: its name there.
         metavar: as it is shown.
         suffix: of the folders that are made below --output for several.
+        titled: of several, each path is printed before what the command prints.
     """
 
     def decorated(command: Command) -> Callable[..., None]:
@@ -61,7 +64,9 @@ def each(argument: str, metavar: str, suffix: str = "") -> Callable[[Command], C
             if "output" in options:
                 for mine, output in zip(own, _outputs(ones, options["output"], suffix), strict=True):
                     mine["output"] = output
-            _run_all([functools.partial(command, **options | mine) for mine in own], ones, options)
+            show = titled and not (options.get("as_json") or options.get("quiet"))
+            calls = [functools.partial(command, **options | mine) for mine in own]
+            _run_all(calls, ones, as_json=bool(options.get("as_json")), titled=show)
 
         return run
 
@@ -81,18 +86,18 @@ def _outputs(paths: list[Path], folder: Path | None, suffix: str) -> list[Path |
 
 
 def _run_all(
-    calls: list[Callable[[], dict[str, Any] | None]], paths: list[Path], options: dict[str, Any]
+    calls: Sequence[Callable[[], dict[str, Any] | None]], paths: list[Path], *, as_json: bool, titled: bool
 ) -> None:
     results: dict[str, Any] = {}
     failed: dict[str, str] = {}
     for path, call in zip(paths, calls, strict=True):
-        if not (options.get("as_json") or options.get("quiet")):
+        if titled:
             click.echo(f"{one_line(str(path))}:")
         try:
             results[str(path)] = call()
         except MocapError as error:
             failed[str(path)] = tell(error)
-    if options.get("as_json"):
+    if as_json:
         print_json({"results": results, "failed": failed})
     end(failed, paths)
 

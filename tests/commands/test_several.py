@@ -72,3 +72,11 @@ def test_output_of_several_is_a_folder_around_them(folder: Path, tmp_path: Path)
 def test_what_sessions_of_several_are_called() -> None:
     assert names_of([Path("/a/flight.yaml"), Path("/b/tuesday.yaml")]) == ["a", "tuesday"]
     assert names_of([Path("/a/flight.session"), Path("/b/c.session")]) == ["a", "c"]
+
+
+def test_info_says_what_each_of_several_is(folder: Path) -> None:
+    done = mocap("info", folder / "*" / "flight.yaml")
+    assert done.returncode == 1
+    titles = [line for line in done.stdout.splitlines() if not line.startswith(" ")]
+    assert titles == [f"{folder}/{name}/flight.yaml: flight manifest" for name in ("friday", "monday")]
+    assert f"{folder}/lost/flight.yaml" in done.stderr
