@@ -53,7 +53,7 @@ bench: setup
 	$(BIN)/python -m benchmarks.refine_clocks
 	$(BIN)/python -m benchmarks.batch
 
-# Every table and figure of docs/results.md again, in some ten minutes.
+# Every table and figure of docs/results.md again, in some fifteen minutes.
 results: setup
 	$(BIN)/mocap models fetch blazepose
 	$(BIN)/python -m benchmarks.results
