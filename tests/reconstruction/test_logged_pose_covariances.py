@@ -59,9 +59,9 @@ def test_the_same_covariance_for_all_poses_is_a_level() -> None:
 def test_good_poses_hold_up_the_poor_ones(seed: int) -> None:
     """Half of the poses are twenty times better, by turns: told as much, the skeleton is nearly as good.
 
-    The mean of N poses that count alike errs by 1 / sqrt(2 N) of the poor level, by those that count as they
-    are by 1 / sqrt(N / 2) of the good one: by a tenth of that. The motion that is sought beside blurs it, so a
-    factor of two is asked for.
+    The mean of N poses that count alike errs by 1 / sqrt(2 N) of the poor level, by those that count as
+    they are by 1 / sqrt(N / 2) of the good one: by a tenth of that. The motion that is sought beside blurs
+    it, so a factor of two is asked for.
     """
     poor = (np.arange(TIMES) // 10 + np.arange(CAMERAS)[:, None]) % 2 == 1
     root = np.where(poor[..., None], POOR, GOOD)[..., None] * np.eye(6)

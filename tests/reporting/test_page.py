@@ -342,7 +342,7 @@ def test_a_comparison_of_planners_is_a_section(page: str, compared: str) -> None
     before, after = _Outline(page), _Outline(compared)
     assert after.count("figure") == before.count("figure") + 3
     assert after.count("table") == before.count("table") + 2
-    assert "adaptive is better." in after.text
+    assert "Adaptive is better." in after.text
     assert "Simulated: adaptive and fixed; flown is what the log says." in after.text
     assert "adaptive simulated 17.2 23.5 – 12.5 % 9.2 to 10.8" in after.text
     assert "61.0 58.5 to 63.5 87.5 81.2 to 93.8 collision 3" in after.text

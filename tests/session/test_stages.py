@@ -162,6 +162,7 @@ def put(start: Path, folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_kill_at_every_step_and_again_while_mending(prepared: tuple[Path, Path], tmp_path: Path) -> None:
     start, end = prepared
     expected = contents(end)
