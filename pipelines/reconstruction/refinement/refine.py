@@ -117,7 +117,7 @@ def refine(
         covariance = covariances(system, at)
         if known.memory > REMEMBERED:
             quick = _quickly(system, state, known)
-        elif any(errors.processes for errors in known.poses):
+        elif _all_lasts(problem, known, state):
             quick = _quickly(*_abruptly(problem, known, state)[:2], known)
         else:
             quick = state.position
@@ -150,6 +150,19 @@ def _clocks(problem: Problem, known: Knowledge, state: State) -> tuple[Float, Fl
     system, state, at = _abruptly(problem, known, state)
     left = np.sqrt(np.diagonal(shared_covariance(system, at)))
     return _of_clocks(system, state.shared), _of_clocks(system, left)
+
+
+def _all_lasts(problem: Problem, known: Knowledge, state: State) -> bool:
+    """Whether pose errors last: new ones move a joint in the pictures by less than its keypoints err.
+
+    Larger ones are told from motion by how smooth it is, and that must not be given up for the others.
+    """
+    pictures = problem.pictures
+    _, distance = _residuals(problem, state.position)
+    range_m = float(np.nanmedian(distance))
+    blur = known.pixel_scale / float(np.median(pictures.sharpness[pictures.sharpness > 0]))
+    new_m = max(float(np.hypot(shift, range_m * turn)) for shift, turn in (e.white for e in known.poses))
+    return any(errors.processes for errors in known.poses) and new_m < range_m * blur
 
 
 def _abruptly(problem: Problem, known: Knowledge, state: State) -> tuple[System, State, Eliminated]:
