@@ -10,7 +10,7 @@ import numpy as np
 from pipelines.geometry.poses import interpolate_poses
 from pipelines.geometry.triangulation import STATUS, Triangulation
 from pipelines.reconstruction.observations import Camera, Observations
-from pipelines.session.records import Float
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Float
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -21,7 +21,6 @@ def skeleton_table(observations: Observations, result: Triangulation) -> pd.Data
     import pandas as pd
 
     times, people, joints, _ = observations.confidence.shape
-    covariance = result.covariance
     used = np.where(result.inlier, result.residual_px, np.nan)
     table = pd.DataFrame(
         {
@@ -31,8 +30,7 @@ def skeleton_table(observations: Observations, result: Triangulation) -> pd.Data
         }
     )
     table[["x", "y", "z"]] = result.points
-    for i, j in zip(*np.triu_indices(3), strict=True):
-        table[f"c{'xyz'[i]}{'xyz'[j]}"] = covariance[:, i, j]
+    table[list(POINT_COVARIANCE_COLUMNS)] = result.covariance[:, *np.triu_indices(3)]
     table["views"] = result.views
     table["reprojection_px"] = _row_mean(used)
     table["status"] = np.array(STATUS, dtype=object)[result.status]

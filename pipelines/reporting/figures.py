@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.geometry.poses import rotate
+from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.bones import side_of
 from pipelines.reporting.motion import Motion
 from pipelines.reporting.plates import (
@@ -52,7 +53,6 @@ from pipelines.reporting.wording import (
 )
 from pipelines.session.records import Float, Int64
 from pipelines.session.skeletons import bones_of, with_derived
-from pipelines.session.tables import STATUS
 from pipelines.session.tabular import trajectory_from
 
 if TYPE_CHECKING:

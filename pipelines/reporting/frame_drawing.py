@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.bones import side_of
 from pipelines.reporting.overlays import Picture, View
 from pipelines.session.records import Float
 from pipelines.session.skeletons import bones_of
-from pipelines.session.tables import STATUS
 
 Colour = tuple[int, int, int]
 
@@ -85,7 +85,7 @@ def caption_of(view: View, status: NDArray[np.int8], method: str) -> tuple[str, 
 
     Args:
         view: the frame.
-        status: [P, J] index into tables.STATUS, -1 where the skeleton says nothing.
+        status: [P, J] index into triangulation.STATUS, -1 where the skeleton says nothing.
         method: of the reconstruction.
     """
     counts = np.bincount(status[status >= 0].ravel(), minlength=len(STATUS))

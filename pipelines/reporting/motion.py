@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.poses import interpolate_points
-from pipelines.session.records import Float, Int64
-from pipelines.session.tables import STATUS
+from pipelines.geometry.triangulation import STATUS
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Float, Int64
 from pipelines.session.tabular import motion_from
 
 if TYPE_CHECKING:
     import pandas as pd
-
-COVARIANCE = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
 
 # A hole in the truth of more than this many usual steps is not interpolated across.
 LONGEST_TRUTH_STEP = 2.5
@@ -30,9 +28,9 @@ class Motion:
     t_ns: Int64  # [T], strictly increasing
     joints: tuple[str, ...]
     position: Float  # [T, P, J, 3] m
-    covariance: Float  # [T, P, J, 6] m^2, upper triangle as in COVARIANCE
+    covariance: Float  # [T, P, J, 6] m^2, upper triangle: POINT_COVARIANCE_COLUMNS
     reprojection_px: Float  # [T, P, J]
-    status: NDArray[np.int8]  # [T, P, J] index into tables.STATUS, -1 where the table has no row
+    status: NDArray[np.int8]  # [T, P, J] index into triangulation.STATUS, -1 where the table has no row
     views: Int64  # [T, P, J] how many cameras the joint was taken from
 
     @property
@@ -74,7 +72,7 @@ def motion_from_skeleton(table: pd.DataFrame) -> Motion:
         t_ns=t_ns,
         joints=tuple(str(name) for name in joints),
         position=dense("x", "y", "z"),
-        covariance=dense(*COVARIANCE),
+        covariance=dense(*POINT_COVARIANCE_COLUMNS),
         reprojection_px=dense("reprojection_px")[..., 0],
         status=status,
         views=np.nan_to_num(dense("views")[..., 0]).astype(np.int64),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics, project
 from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion
+from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.content import SessionContent, number, section
 from pipelines.reporting.motion import Motion
 from pipelines.reporting.summary import CameraRow, Summary
@@ -23,7 +24,6 @@ from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Float, Int64, Trajectory
 from pipelines.session.skeletons import with_derived
-from pipelines.session.tables import STATUS
 from pipelines.session.tabular import detections_from, trajectory_from
 
 if TYPE_CHECKING:
@@ -244,7 +244,7 @@ def views_of(
         camera: the camera.
         at: [N] rows of its frames.
         motion: the skeleton; interpolated to the frames' times, never across a gap or a missing joint.
-        status: [N, P, J] of the joints at these frames, index into tables.STATUS.
+        status: [N, P, J] of the joints at these frames, index into triangulation.STATUS.
         origin_ns: the zero of the views' times.
     """
     frame, t_ns = camera.frame[at], camera.frame_t_ns[at]

@@ -10,6 +10,7 @@ from importlib.resources import files
 
 from markupsafe import Markup
 
+from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting import wording
 from pipelines.reporting.arm_figures import draw_arms
 from pipelines.reporting.content import SessionContent, number, section, text
@@ -25,7 +26,6 @@ from pipelines.reporting.studies import draw_studies, summarise_studies
 from pipelines.reporting.summary import Summary, errors_per_camera, give_verdict, measures, summarise
 from pipelines.reporting.templating import environment
 from pipelines.reporting.viewer import make_scene
-from pipelines.session.tables import STATUS
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.bones import Bone, watched_bones
 from pipelines.reporting.content import SessionContent, items, number, section
 from pipelines.reporting.motion import Motion, errors_mm, motion_from_skeleton, share_inside_95, truth_at
@@ -24,7 +25,6 @@ from pipelines.reporting.wording import (
 )
 from pipelines.session.description import CameraEntry, Description
 from pipelines.session.records import Float
-from pipelines.session.tables import STATUS
 
 # Below this share of measured times a joint is named among the doubts.
 DOUBTFUL_COVERAGE = 0.8

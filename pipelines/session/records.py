@@ -75,7 +75,7 @@ class JointMotion:
     t_ns: Int64  # [T]
     joints: tuple[str, ...]
     position: Float  # [T, P, J, 3] m, world
-    status: NDArray[np.str_] | None = None  # [T, P, J] words of tables.STATUS, where they are known
+    status: NDArray[np.str_] | None = None  # [T, P, J] words of triangulation.STATUS, where they are known
     reprojection_px: Float | None = None  # [T, P, J]
     views: Int64 | None = None  # [T, P, J] cameras that measured the joint
     covariance: Float | None = None  # [T, P, J, 6] m^2: xx, xy, xz, yy, yz, zz

@@ -17,8 +17,6 @@ from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 if TYPE_CHECKING:
     import pandas as pd
 
-STATUS = ("ok", "filled", "few_views", "low_parallax", "rejected", "not_detected", "no_pose")
-
 _POSE = [(name, pa.float64()) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
 COVARIANCE_COLUMNS = tuple(f"c{i}{j}" for i in range(6) for j in range(i, 6))
 """Upper triangle of a pose covariance: position in world, rotation vector in camera."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
+from pipelines.geometry.triangulation import STATUS
 from pipelines.session.records import JointMotion
 from pipelines.session.skeletons import SKELETONS
-from pipelines.session.tables import STATUS
 
 NAMES = sorted({joint for skeleton in SKELETONS.values() for joint in skeleton.joints} | {"C7", "RASI"})
 

@@ -18,7 +18,6 @@ from pipelines.geometry.triangulation import (
     locate,
     triangulate,
 )
-from pipelines.session import tables
 from tests.geometry.rings import (
     FOCAL,
     LEVELS,
@@ -378,10 +377,6 @@ def test_shapes_and_settings_are_checked() -> None:
         replace(views, pose_index=views.pose_index + 1)
     with pytest.raises(ValueError, match="min_views=1"):
         triangulate(views, method="dlt", min_views=1)
-
-
-def test_statuses_are_the_sessions_words() -> None:
-    assert tables.STATUS == STATUS
 
 
 @settings(deadline=None, max_examples=25)

@@ -6,9 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.content import SessionContent
 from pipelines.session.description import Description
-from pipelines.session.tables import KEYPOINTS, SKELETON, STATUS
+from pipelines.session.tables import KEYPOINTS, SKELETON
 
 START_NS = 1_700_000_000_000_000_000
 FRAMES = 600

@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting import figures
 from pipelines.reporting.motion import motion_from_skeleton
 from pipelines.reporting.plates import MOST_POINTS
-from pipelines.session.tables import STATUS
 
 from .conftest import FRAMES, JOINTS, RATE_HZ, make_skeleton, statuses, true_positions
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.motion import motion_from_skeleton
 from pipelines.reporting.overlays import (
@@ -22,7 +23,6 @@ from pipelines.reporting.overlays import (
     status_at,
 )
 from pipelines.reporting.summary import summarise
-from pipelines.session.tables import STATUS
 
 from .conftest import ASIDE_PX, CAMERAS, FRAMES, JOINTS, START_NS, make_skeleton, true_pixels
 
