@@ -297,11 +297,10 @@ def prior_cost(system: System, state: State) -> float:
     white = state.white[there]
     cost += np.sum((precision[there] @ white[..., None])[..., 0] * white)
     for (_, process), (at_knots, column) in zip(layout.processes, layout.place, strict=True):
-        value = state.knots[:, column : column + 3] if at_knots else state.shared[None, column : column + 3]
-        cost += np.sum(value[0] ** 2) / process.sigma0**2
-        for k in range(len(value) - 1):
-            kept, variance = process.step(layout.knot_t_s[k + 1] - layout.knot_t_s[k])
-            cost += np.sum((value[k + 1] - kept * value[k]) ** 2) / variance
+        begins = state.knots[0] if at_knots else state.shared
+        cost += np.sum(begins[column : column + 3] ** 2) / process.sigma0**2
+    changes = state.knots[1:] - system.tie_kept * state.knots[:-1]
+    cost += np.sum(changes**2 / system.tie_variance)
     clocks = layout.clock_column >= 0
     cost += np.sum((state.shared[layout.clock_column[clocks]] / layout.clock_sigma_s[clocks]) ** 2)
     return float(cost)

@@ -295,6 +295,39 @@ def numbers_of(
 
 
 @helper
+def entries_of(
+    camera: int,
+    fraction: float,
+    n: int,
+    knot_count: int,
+    entry_start: Int64,
+    entry_number: Int64,
+    entry_knot: Int64,
+    entry_column: Int64,
+    column: Int64,
+    of_number: Int64,
+    share: Float,
+) -> int:
+    """Which of the front's unknowns a picture's numbers are made of, and by which share; how many."""
+    entries = 0
+    for e in range(entry_start[camera], entry_start[camera + 1]):
+        if entry_knot[e]:
+            column[entries] = 3 * n + entry_column[e]
+            of_number[entries] = entry_number[e]
+            share[entries] = 1 - fraction
+            entries += 1
+            column[entries] = 3 * n + knot_count + entry_column[e]
+            of_number[entries] = entry_number[e]
+            share[entries] = fraction
+        else:
+            column[entries] = 3 * n + 2 * knot_count + entry_column[e]
+            of_number[entries] = entry_number[e]
+            share[entries] = 1.0
+        entries += 1
+    return entries
+
+
+@helper
 def assemble(
     first_picture: int,
     last_picture: int,
@@ -387,21 +420,10 @@ def assemble(
         else:
             by_white[:] = 0.0
 
-        entries = 0
-        for e in range(entry_start[c], entry_start[c + 1]):
-            if entry_knot[e]:
-                column[entries] = 3 * n + entry_column[e]
-                of_number[entries] = entry_number[e]
-                share[entries] = 1 - fraction[g]
-                entries += 1
-                column[entries] = 3 * n + knot_count + entry_column[e]
-                of_number[entries] = entry_number[e]
-                share[entries] = fraction[g]
-            else:
-                column[entries] = 3 * n + 2 * knot_count + entry_column[e]
-                of_number[entries] = entry_number[e]
-                share[entries] = 1.0
-            entries += 1
+        entries = entries_of(
+            c, fraction[g], n, knot_count, entry_start, entry_number, entry_knot, entry_column, column,
+            of_number, share,
+        )  # fmt: skip
 
         for k in range(3):
             if weight[k] == 0.0:
@@ -588,7 +610,7 @@ def misfit(
 
 
 @helper
-def rows_of_picture(
+def posterior_of_picture(
     g: int,
     first: int,
     t_s: Float,
@@ -616,26 +638,30 @@ def rows_of_picture(
     entry_column: Int64,
     clock_column: Int64,
     knot_count: int,
-    believed: Float,
     residual: Float,
-    rows: Float,
-    own: Float,
+    believed: Float,
+    by_joint: Float,
+    by_number: Float,
+    whole: Float,
+    of_joints: Float,
+    across: Float,
+    of_numbers: Float,
+    of_white: Float,
 ) -> None:
-    """How a picture's residuals and white error follow the front: for their posterior variances.
+    """Residuals of a picture with their weights and derivatives, and the posterior of what they follow.
 
-    Out come `believed` [J], the weight of each view, 0 where nothing was seen; `residual` [J, 2], whitened;
-    `rows` [2J + 6, N], derivatives of the residuals, then of the white error, by the front, the white error
-    following it; `own` [2J + 6], the variance that the white error's own posterior adds to each.
+    Out come `residual` [J, 2], whitened, `believed` [J], the weight of each view, 0 where nothing was seen,
+    `by_joint` [J, 2, 3] and `by_number` [J, 2, 10] as in `linearise`; from the covariance of the front,
+    `whole` [N, N], those of the joints at the picture's time, `of_joints` [J, 3, 3], with the picture's
+    numbers, `across` [J, 3, 10], and of these, `of_numbers` [10, 10], their white part among them; of that
+    part alone the variances, `of_white` [6].
     """
     J = position.shape[1]
     n = 3 * J
     out, rate = np.empty((J, 3)), np.empty((J, 3))
     weight, slope, number = np.empty(3), np.empty(3), np.empty(NUMBERS)
-    by_joint, by_number = np.zeros((J, 2, 3)), np.zeros((J, 2, NUMBERS))
-    of_joints, across = np.empty((J, 3, 3)), np.empty((J, 3, NUMBERS))
-    of_numbers = np.empty((NUMBERS, NUMBERS))
     joint_gradient, number_gradient = np.empty((J, 3)), np.empty(NUMBERS)
-    factor, variance = np.zeros((WHITE, WHITE)), np.zeros((WHITE, WHITE))
+    factor, own = np.zeros((WHITE, WHITE)), np.zeros((WHITE, WHITE))
     c = camera[g]
     moved = when[g] + (shared[clock_column[c]] if clock_column[c] >= 0 else 0.0)
     at_picture(first, t_s, moved, position, weight, slope, out, rate)
@@ -650,62 +676,71 @@ def rows_of_picture(
     for joint in range(J):
         squared = residual[joint, 0] ** 2 + residual[joint, 1] ** 2
         believed[joint] = 0.0 if np.isnan(squared) else trust[g, joint] * confidence_of(squared, bound2)
-    normal_equations(
-        residual, by_joint, by_number, believed, of_joints, across, of_numbers, joint_gradient,
-        number_gradient,
+    most = 2 * (entry_column.size + 1)
+    column, of_number, share = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
+    entries = entries_of(
+        c, fraction[g], n, knot_count, entry_start, entry_number, entry_knot, entry_column, column, of_number,
+        share,
     )  # fmt: skip
-    rows[:] = 0.0
-    own[:] = 0.0
+    # The white error follows the front, by `follows` [6, N], and has a posterior of its own beside.
+    follows = np.zeros((WHITE, len(whole)))
     has_white = np.isfinite(white_precision[white_row[g], 0, 0])
-    white_rows = rows[2 * J :]
     if has_white:
+        normal_equations(
+            residual, by_joint, by_number, believed, of_joints, across, of_numbers, joint_gradient,
+            number_gradient,
+        )  # fmt: skip
         for a in range(WHITE):
             for b in range(WHITE):
                 factor[a, b] = of_numbers[a, b] + white_precision[white_row[g], a, b]
         factorise(factor)
         for a in range(WHITE):
-            variance[a, a] = 1.0
-            forward(factor, variance[a])
-            backward(factor, variance[a])
-            own[2 * J + a] = variance[a, a]
+            own[a, a] = 1.0
+            forward(factor, own[a])
+            backward(factor, own[a])
             for p in range(n):
                 total = 0.0
                 for b in range(WHITE):
-                    total += variance[a, b] * across[p // 3, p % 3, b]
+                    total += own[a, b] * across[p // 3, p % 3, b]
                 for k in range(3):
-                    white_rows[a, k * n + p] -= weight[k] * total
-    for e in range(entry_start[c], entry_start[c + 1]):
-        d = entry_number[e]
-        sides = 2 if entry_knot[e] else 1
-        for side in range(sides):
-            if entry_knot[e]:
-                column = 3 * n + side * knot_count + entry_column[e]
-                share = fraction[g] if side else 1 - fraction[g]
-            else:
-                column = 3 * n + 2 * knot_count + entry_column[e]
-                share = 1.0
-            for a in range(WHITE):
+                    follows[a, k * n + p] -= weight[k] * total
+            for e in range(entries):
                 for b in range(WHITE):
-                    white_rows[a, column] -= share * variance[a, b] * of_numbers[d, b]
-            for joint in range(J):
-                if believed[joint] > 0:
-                    for axis in range(2):
-                        rows[2 * joint + axis, column] += share * by_number[joint, axis, d]
+                    follows[a, column[e]] -= share[e] * own[a, b] * of_numbers[of_number[e], b]
+    of_joints[:] = 0.0
+    across[:] = 0.0
+    of_numbers[:] = 0.0
+    of_white[:] = 0.0
     for joint in range(J):
-        if believed[joint] == 0:
-            continue
-        for axis in range(2):
-            row = rows[2 * joint + axis]
+        for k in range(3):
+            for i in range(3):
+                p = k * n + 3 * joint + i
+                for m in range(3):
+                    for j in range(3):
+                        q = m * n + 3 * joint + j
+                        of_joints[joint, i, j] += weight[k] * weight[m] * whole[p, q]
+                for e in range(entries):
+                    across[joint, i, of_number[e]] += weight[k] * share[e] * whole[p, column[e]]
+    for e in range(entries):
+        for f in range(entries):
+            both = share[e] * share[f] * whole[column[e], column[f]]
+            of_numbers[of_number[e], of_number[f]] += both
+    if not has_white:
+        return
+    with_front = np.dot(follows, whole)  # [6, N]
+    whole_white = np.dot(with_front, follows.T)
+    for a in range(WHITE):
+        for joint in range(J):
             for k in range(3):
                 for i in range(3):
-                    row[k * n + 3 * joint + i] += weight[k] * by_joint[joint, axis, i]
-            if has_white:
-                for a in range(WHITE):
-                    by = by_number[joint, axis, a]
-                    for column in range(rows.shape[1]):
-                        row[column] += by * white_rows[a, column]
-                    for b in range(WHITE):
-                        own[2 * joint + axis] += by * variance[a, b] * by_number[joint, axis, b]
+                    across[joint, i, a] += weight[k] * with_front[a, k * n + 3 * joint + i]
+        for e in range(entries):
+            both = share[e] * with_front[a, column[e]]
+            of_numbers[a, of_number[e]] += both
+            of_numbers[of_number[e], a] += both
+        for b in range(WHITE):
+            of_numbers[a, b] += own[a, b] + whole_white[a, b]
+        of_white[a] = own[a, a] + whole_white[a, a]
 
 
 @helper

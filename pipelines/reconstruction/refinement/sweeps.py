@@ -12,15 +12,18 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.compilation import cached, helper
 from pipelines.reconstruction.refinement.kernels import (
+    NUMBERS,
     WHITE,
     add_bones,
     add_motion,
     assemble,
-    rows_of_picture,
+    posterior_of_picture,
 )
 
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+
+_STRIP = 48  # rows; with fewer, products are too small to be quick
 
 
 @helper
@@ -32,10 +35,24 @@ def copy_block(source: Float, row: int, column: int, out: Float) -> None:
 
 
 @helper
+def lower_square(rows: Float) -> Float:
+    """Lower triangle of W W', in strips; what stands above it means nothing."""
+    size = len(rows)
+    square = np.empty((size, size))
+    for begin in range(0, size, _STRIP):
+        end = min(begin + _STRIP, size)
+        strip = np.dot(rows[begin:end], rows[:end].T)
+        for i in range(end - begin):
+            for j in range(end):
+                square[begin + i, j] = strip[i, j]
+    return square
+
+
+@helper
 def eliminate(
     own: Float, beside: Float, gradient: Float, inverse: Float, across: Float, y: Float
 ) -> tuple[Float, float]:
-    """R = L^-1, W = B R' and y = -R g in place; W W' and half the logarithm of the determinant of `own`."""
+    """R = L^-1, W = B R', y = -R g in place; W W' (lower) and half the log of the determinant of `own`."""
     n = len(own)
     lower = np.linalg.cholesky(own)
     half = 0.0
@@ -58,7 +75,7 @@ def eliminate(
             total -= inverse[i, j] * gradient[j]
         y[i] = total
     np.dot(beside, inverse.T, across)
-    return np.dot(across, across.T), half
+    return lower_square(across), half
 
 
 @cached
@@ -437,7 +454,9 @@ def visit(
     whole = np.empty((size, size))
     alive = others.copy()
     believed, residual = np.empty(J), np.empty((J, 2))
-    rows, added = np.empty((2 * J + WHITE, size)), np.empty(2 * J + WHITE)
+    by_joint, by_number = np.zeros((J, 2, 3)), np.zeros((J, 2, NUMBERS))
+    of_joints, beside = np.empty((J, 3, 3)), np.empty((J, 3, NUMBERS))
+    of_numbers, of_white = np.empty((NUMBERS, NUMBERS)), np.empty(WHITE)
     joints_time = len(t_s) - 3
     for time in range(last - 1, first - 2, -1):
         # As on the way forwards; at the end, the knots before the stretch.
@@ -474,14 +493,15 @@ def visit(
             bones_of(whole, position, shared, bones, time, bone_sums)
             if time % every == 0:
                 for g in range(starts[time], starts[time + 1]):
-                    rows_of_picture(
+                    posterior_of_picture(
                         g, time, t_s, position, knots, shared, white, camera, when, fraction, interval, xy,
                         sharpness, pose_position, pose_rotation, speed, turn, trust, bound2, white_row,
                         white_precision, entry_start, entry_number, entry_knot, entry_column, clock_column,
-                        knot_count, believed, residual, rows, added,
+                        knot_count, residual, believed, by_joint, by_number, whole, of_joints, beside,
+                        of_numbers, of_white,
                     )  # fmt: skip
-                    picture_of(rows, np.dot(rows, whole), added, believed, residual, white[g],
-                               white_precision[white_row[g]], image, white_sums)  # fmt: skip
+                    noise_of(residual, believed, by_joint, by_number, of_joints, beside, of_numbers, image)
+                    white_of(white[g], white_precision[white_row[g]], of_white, white_sums)
             if time == 0:
                 for i in range(c):
                     starting[i, 0] = knots[0, i] ** 2 + whole[3 * n + i, 3 * n + i]
@@ -606,39 +626,47 @@ def bones_of(whole: Float, position: Float, shared: Float, bones: Int64, time: i
 
 
 @helper
-def picture_of(
-    rows: Float,
-    followed: Float,
-    added: Float,
-    believed: Float,
+def noise_of(
     residual: Float,
-    white: Float,
-    precision: Float,
-    image: Float,
+    believed: Float,
+    by_joint: Float,
+    by_number: Float,
+    of_joints: Float,
+    across: Float,
+    of_numbers: Float,
     sums: Float,
 ) -> None:
-    """Add what a picture says of image noise and of white errors."""
-    J = len(believed)
-    for joint in range(J):
+    """Add what a picture says of image noise [J, 2]; the arguments are those of `posterior_of_picture`."""
+    for joint in range(len(believed)):
         if believed[joint] == 0.0:
             continue
         for axis in range(2):
-            r = 2 * joint + axis
-            variance = added[r]
-            for k in range(rows.shape[1]):
-                variance += rows[r, k] * followed[r, k]
-            image[joint, 0] += believed[joint] * residual[joint, axis] ** 2
-            image[joint, 1] += believed[joint] * (1 - variance)
+            variance = 0.0
+            for i in range(3):
+                follows = 0.0
+                for j in range(3):
+                    follows += of_joints[joint, i, j] * by_joint[joint, axis, j]
+                for a in range(NUMBERS):
+                    follows += 2 * across[joint, i, a] * by_number[joint, axis, a]
+                variance += by_joint[joint, axis, i] * follows
+            for a in range(NUMBERS):
+                follows = 0.0
+                for b in range(NUMBERS):
+                    follows += of_numbers[a, b] * by_number[joint, axis, b]
+                variance += by_number[joint, axis, a] * follows
+            sums[joint, 0] += believed[joint] * residual[joint, axis] ** 2
+            sums[joint, 1] += believed[joint] * (1 - variance)
+
+
+@helper
+def white_of(white: Float, precision: Float, variance: Float, sums: Float) -> None:
+    """Add what a picture's white error [6] says of its level [2, 4], given its posterior `variance` [6]."""
     for i in range(WHITE):
         if not np.isfinite(precision[i, i]):
             continue
-        r = 2 * J + i
-        variance = added[r]
-        for k in range(rows.shape[1]):
-            variance += rows[r, k] * followed[r, k]
-        told = 1 - variance * precision[i, i]
+        told = 1 - variance[i] * precision[i, i]
         part = i // 3
-        sums[part, 0] += white[i] ** 2 + variance
+        sums[part, 0] += white[i] ** 2 + variance[i]
         sums[part, 1] += 1
         sums[part, 2] += told
         sums[part, 3] += told**2
