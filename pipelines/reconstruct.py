@@ -320,8 +320,8 @@ def _observe(
     folder: Path, cameras: list[Camera], description: Description, settings: Settings
 ) -> tuple[Candidates, Observations, Association, NDArray[np.bool_]]:
     """All that was seen, what of each person, how people were told apart, when [T] anybody was seen."""
-    limits = _pose_limits(description)
-    found = candidates(cameras, **limits)
+    between = description.pose_interpolation
+    found = candidates(cameras, between)
     association = associate(
         (found.t_ns - found.t_ns[0]) / 1e9,
         found.xy,
@@ -332,13 +332,8 @@ def _observe(
         actor=load_actor(folder, description, found.t_ns),
         people=settings.people,
     )
-    observations = observe(
-        cameras,
-        found,
-        association.choice,
-        time_base(cameras, settings.rate_hz),
-        **limits,
-    )
+    base = time_base(cameras, settings.rate_hz)
+    observations = observe(cameras, found, association.choice, base, between)
     nearest = np.clip(np.searchsorted(found.t_ns, observations.t_ns), 0, len(found.t_ns) - 1)
     seen = np.asarray((found.confidence > 0).any(axis=(1, 2, 3)), dtype=np.bool_)[nearest]
     return found, observations, association, seen
@@ -398,7 +393,7 @@ def _refine_cameras(
         followed,
         [prior_of(errors, level) for errors, level in zip(each, levels, strict=True)],
         stated=stated is not None,
-        **_pose_limits(description),
+        between=description.pose_interpolation,
     )
 
 
@@ -438,15 +433,6 @@ def _agreeing_sides(observations: Observations, sigma: Float) -> tuple[Int64, di
     return sides, dict(sorted(total.items()))
 
 
-def _pose_limits(description: Description) -> dict[str, int]:
-    """How far poses are trusted between and beyond the stamps of their log, ns."""
-    stated = description.pose_interpolation
-    return {
-        "max_gap_ns": round(stated.max_gap_s * 1e9),
-        "max_extrapolation_ns": round(stated.max_extrapolation_s * 1e9),
-    }
-
-
 def _refine(
     cameras: list[Camera],
     found: Candidates,
@@ -470,8 +456,8 @@ def _refine(
         prior=load_pose_errors(description, cameras, settings.pose_noise),
         clock_sigma_s=load_clock_sigma(description, cameras),
         pixel_sigma=settings.pixel_sigma,
+        between=description.pose_interpolation,
         threads=workers,
-        **_pose_limits(description),
     )
 
 

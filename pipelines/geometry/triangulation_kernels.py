@@ -26,7 +26,7 @@ Vector = tuple[float, float, float]
 Symmetric = tuple[float, float, float, float, float, float]
 
 DLT, MIDPOINT, ROBUST = 0, 1, 2
-OK, FILLED, FEW_VIEWS, LOW_PARALLAX, REJECTED, NOT_DETECTED, NO_POSE = range(7)  # order of tables.STATUS
+OK, FILLED, FEW_VIEWS, LOW_PARALLAX, REJECTED, NOT_DETECTED, NO_POSE = range(7)  # by STATUS
 
 # Squared length, in standard deviations of the point, of the Gauss-Newton step that is taken as the last.
 # Measured on the walk at 5 views, what is left after it is at most 3e-4 standard deviations for pixel noise

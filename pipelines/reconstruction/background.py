@@ -19,6 +19,7 @@ from pipelines.reconstruction.background_poses import Adjusted, PosePrior, adjus
 from pipelines.reconstruction.background_tracks import Tracks
 from pipelines.reconstruction.observations import Camera
 from pipelines.reconstruction.refinement.problem import ROTATION, SHIFT_IN_WORLD, PoseErrors, Process
+from pipelines.session.description import Interpolation
 from pipelines.session.records import Float, Int64, Trajectory
 
 _RATE_HZ = 15.0  # of the pictures that are looked at: between them poses are interpolated
@@ -65,9 +66,8 @@ def refine_cameras(
     followed: Mapping[str, Followed | str],
     priors: Sequence[PosePrior],
     *,
+    between: Interpolation,
     stated: bool,
-    max_gap_ns: int,
-    max_extrapolation_ns: int,
 ) -> tuple[list[Camera], dict[str, Any], list[str]]:
     """Cameras with the poses that their backgrounds tell.
 
@@ -75,9 +75,8 @@ def refine_cameras(
         cameras: all of them.
         followed: of each by its name, or why nothing was followed.
         priors: how far each log may be off.
-        stated: whether somebody stated that: `refined` then takes what is left as its prior.
-        max_gap_ns: the longest stretch between two logged poses that is bridged.
-        max_extrapolation_ns: how far outside its log a pose is trusted.
+        between: how far logged poses are trusted.
+        stated: whether somebody stated the priors: `refined` then takes what is left as its own.
 
     Returns:
         The cameras; what metrics.json says of each; a line for each whose logged poses stay.
@@ -92,7 +91,7 @@ def refine_cameras(
             told[camera.name] = {"used": False, "reason": seen}
         else:
             t_ns = camera.frame_t_ns[seen.rows]
-            logged = camera.poses_at(t_ns, max_gap_ns=max_gap_ns, max_extrapolation_ns=max_extrapolation_ns)
+            logged = camera.poses_at(t_ns, between)
             found = adjust(
                 seen.tracks.picture,
                 seen.tracks.point,

@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics, undistort
-from pipelines.geometry.poses import interpolate_points, interpolate_poses, matrix_from_quaternion
+from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion
 from pipelines.reconstruction.refinement.problem import PoseErrors
+from pipelines.session.camera_poses import poses_at
+from pipelines.session.description import Interpolation
 from pipelines.session.records import Detections, Float, Int64, Trajectory
 
 _FRAME_GAP_NS = 500_000_000  # consecutive frames further apart than this, and than usual, are not bridged
@@ -74,20 +76,9 @@ class Camera:
     def _most_people(self) -> int:
         return int(self._rank.max(initial=0)) + 1
 
-    def poses_at(self, t_ns: Int64, *, max_gap_ns: int, max_extrapolation_ns: int) -> tuple[Float, Float]:
+    def poses_at(self, t_ns: Int64, between: Interpolation) -> tuple[Float, Float]:
         """world_from_camera at given times: position [T, 3] and rotation [T, 3, 3], NaN without a pose."""
-        if self.static:
-            position = np.repeat(self.trajectory.position, len(t_ns), axis=0)
-            quaternion = np.repeat(self.trajectory.quaternion_xyzw, len(t_ns), axis=0)
-        else:
-            position, quaternion = interpolate_poses(
-                self.trajectory.t_ns,
-                self.trajectory.position,
-                self.trajectory.quaternion_xyzw,
-                t_ns,
-                max_gap_ns=max_gap_ns,
-                max_extrapolation_ns=max_extrapolation_ns,
-            )
+        position, quaternion = poses_at(self.trajectory, t_ns, between, static=self.static)
         return position, matrix_from_quaternion(quaternion)
 
     def sigma_at(self, t_ns: Int64) -> Float | None:
@@ -142,7 +133,7 @@ def time_base(cameras: list[Camera], rate_hz: float | None) -> Int64:
     return first + np.round(np.arange(steps) * (1e9 / rate_hz)).astype(np.int64)
 
 
-def candidates(cameras: list[Camera], *, max_gap_ns: int, max_extrapolation_ns: int) -> Candidates:
+def candidates(cameras: list[Camera], between: Interpolation) -> Candidates:
     """All detections of all cameras on one timeline on which every frame of every camera appears."""
     t_ns = _timeline(cameras)
     frame = np.stack([_nearest_frame(camera.frame_t_ns, t_ns) for camera in cameras], axis=1)
@@ -156,7 +147,7 @@ def candidates(cameras: list[Camera], *, max_gap_ns: int, max_extrapolation_ns: 
         seen = camera.rays.shape[1]
         xy[near, c, :seen] = camera.rays[frame[near, c]]
         confidence[near, c, :seen] = camera.confidence[frame[near, c]]
-        poses.append(camera.poses_at(t_ns, max_gap_ns=max_gap_ns, max_extrapolation_ns=max_extrapolation_ns))
+        poses.append(camera.poses_at(t_ns, between))
     position, rotation = (np.stack(part, axis=1) for part in zip(*poses, strict=True))
     return Candidates(t_ns, frame, xy, confidence, position, rotation)
 
@@ -166,9 +157,7 @@ def observe(
     found: Candidates,
     choice: Int64,
     t_ns: Int64,
-    *,
-    max_gap_ns: int,
-    max_extrapolation_ns: int,
+    between: Interpolation,
 ) -> Observations:
     """The chosen people's keypoints, interpolated to the common times together with the cameras' poses.
 
@@ -177,15 +166,14 @@ def observe(
         found: where `choice` was made.
         choice: [T', C, P] index of each person's detection in the camera's frame, -1 for none.
         t_ns: [T] the common times.
-        max_gap_ns: the longest stretch between two logged poses that is bridged.
-        max_extrapolation_ns: how far outside its log a pose is trusted.
+        between: how far logged poses are trusted.
     """
     views, weights, poses, sigmas = [], [], [], []
     for c, camera in enumerate(cameras):
         xy, confidence = sightings_of(camera, found, c, choice[:, c])
         views.append(_at(camera, xy, t_ns))
         weights.append(_at(camera, confidence, t_ns))
-        poses.append(camera.poses_at(t_ns, max_gap_ns=max_gap_ns, max_extrapolation_ns=max_extrapolation_ns))
+        poses.append(camera.poses_at(t_ns, between))
         sigmas.append(camera.sigma_at(t_ns))
     position, rotation = (np.stack(part, axis=1) for part in zip(*poses, strict=True))
     stated = [sigma for sigma in sigmas if sigma is not None]

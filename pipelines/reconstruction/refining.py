@@ -26,6 +26,7 @@ from pipelines.reconstruction.refinement.building import Sighting
 from pipelines.reconstruction.refinement.problem import NEW_SHARE, PoseErrors
 from pipelines.reconstruction.refinement.refine import SETTLED_S, Refined, corrected, refine
 from pipelines.reconstruction.reweighting import reprojection_px
+from pipelines.session.description import Interpolation
 from pipelines.session.records import Float, Int64
 from pipelines.session.skeletons import bones_of
 
@@ -61,8 +62,7 @@ def refine_flight(
     prior: Sequence[PoseErrors] | None,
     clock_sigma_s: Float,
     pixel_sigma: float,
-    max_gap_ns: int,
-    max_extrapolation_ns: int,
+    between: Interpolation,
     threads: int,
 ) -> RefinedFlight:
     """Refine what `robust` made of a flight.
@@ -78,18 +78,16 @@ def refine_flight(
         prior: what is known of each camera's pose errors, None when nobody stated anything.
         clock_sigma_s: [C] how far each clock may be off, 0 for one that is known.
         pixel_sigma: px, of a good keypoint.
-        max_gap_ns: the longest stretch between two logged poses that is bridged.
-        max_extrapolation_ns: how far outside its log a pose is trusted.
+        between: how far logged poses are trusted.
         threads: see `triangulate`.
     """
     times, people, joints, _ = observations.confidence.shape
     begin_ns = int(observations.t_ns[0])
     t_s = (observations.t_ns - begin_ns) / 1e9
-    limits = {"max_gap_ns": max_gap_ns, "max_extrapolation_ns": max_extrapolation_ns}
     bones = rigid_pairs(observations.joints, people)
 
     def seen_from(shifted: list[Camera]) -> tuple[Observations, Views]:
-        observed = observe(shifted, found, choice, observations.t_ns, **limits)
+        observed = observe(shifted, found, choice, observations.t_ns, between)
         xy, confidence = on_sides(observed.xy, observed.confidence, sides)
         observed = replace(observed, xy=xy, confidence=confidence)
         return observed, replace(
@@ -107,7 +105,7 @@ def refine_flight(
     for _ in range(1 + _MOST_SHIFTS):
         sightings = [
             replace(
-                _sighting(camera, found, c, choice, observations.t_ns, sides[..., c], pixel_sigma, limits),
+                _sighting(camera, found, c, choice, observations.t_ns, sides[..., c], pixel_sigma, between),
                 pose_covariance=None if prior is None else white_covariance(camera, prior[c]),
             )
             for c, camera in enumerate(shifted)
@@ -161,7 +159,7 @@ def refine_flight(
         observed,
         moved,
         replace(final, residual_px=residual),
-        _camera_table(shifted, refined, begin_ns, limits),
+        _camera_table(shifted, refined, begin_ns, between),
         metrics,
         warnings,
     )
@@ -175,7 +173,7 @@ def _sighting(
     t_ns: Int64,
     sides: Int64,
     pixel_sigma: float,
-    limits: dict[str, int],
+    between: Interpolation,
 ) -> Sighting:
     """What a camera saw in its own pictures, all people side by side.
 
@@ -184,7 +182,7 @@ def _sighting(
     nearest = np.searchsorted((t_ns[:-1] + t_ns[1:]) // 2, camera.frame_t_ns)
     xy, confidence = on_sides(*sightings_of(camera, found, c, choice[:, c]), sides[nearest])
     frames = len(camera.frame_t_ns)
-    position, rotation = camera.poses_at(camera.frame_t_ns, **limits)
+    position, rotation = camera.poses_at(camera.frame_t_ns, between)
     return Sighting(
         t_s=(camera.frame_t_ns - t_ns[0]) / 1e9,
         xy=xy.reshape(frames, -1, 2),
@@ -248,14 +246,14 @@ def _metrics(refined: Refined, cameras: Sequence[Camera], offset_s: Float) -> di
 
 
 def _camera_table(
-    cameras: Sequence[Camera], refined: Refined, begin_ns: int, limits: dict[str, int]
+    cameras: Sequence[Camera], refined: Refined, begin_ns: int, between: Interpolation
 ) -> pd.DataFrame:
     """The corrected pose of every picture that has one."""
     import pandas as pd
 
     parts = []
     for c, camera in enumerate(cameras):
-        position, rotation = camera.poses_at(camera.frame_t_ns, **limits)
+        position, rotation = camera.poses_at(camera.frame_t_ns, between)
         (posed,) = np.nonzero(~np.isnan(position[:, 0]))
         stamped_s = (camera.frame_t_ns[posed] - begin_ns) / 1e9 - refined.clock_offset_s[c]
         numbers = _numbers_at(refined.corrections[c], stamped_s)

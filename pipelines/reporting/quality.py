@@ -105,7 +105,7 @@ def _measured(logged: pd.DataFrame, true: pd.DataFrame, summary: Summary) -> str
         truth.position,
         truth.quaternion_xyzw,
         log.t_ns,
-        max_gap_ns=round(between.max_gap_s * 1e9),
+        max_gap_ns=between.max_gap_ns,
         max_extrapolation_ns=0,
     )
     there = np.isfinite(position).all(axis=1)

@@ -31,6 +31,6 @@ def poses_at(
         track.position,
         track.quaternion_xyzw,
         t_ns,
-        max_gap_ns=round(between.max_gap_s * 1e9),
-        max_extrapolation_ns=round(between.max_extrapolation_s * 1e9),
+        max_gap_ns=between.max_gap_ns,
+        max_extrapolation_ns=between.max_extrapolation_ns,
     )

@@ -209,6 +209,16 @@ class Interpolation(Entry):
     max_gap_s: float
     max_extrapolation_s: float
 
+    @property
+    def max_gap_ns(self) -> int:
+        """The longest stretch between two logged poses that is bridged."""
+        return round(self.max_gap_s * 1e9)
+
+    @property
+    def max_extrapolation_ns(self) -> int:
+        """How far before its log begins, and after it ends, a pose is held."""
+        return round(self.max_extrapolation_s * 1e9)
+
 
 class Description(Entry):
     """The whole of session.json."""

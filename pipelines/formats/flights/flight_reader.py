@@ -89,10 +89,9 @@ class FlightReader:
         self._flight_path = flight_path
         self._session = session
         self._interpolation = interpolation
-        self._max_gap_ns = round(interpolation.max_gap_s * 1e9)
         self._notes: list[str] = []
         self._sources = FlightSources(
-            flight, flight_path, max_gap_ns=self._max_gap_ns, note=self._notes.append
+            flight, flight_path, max_gap_ns=interpolation.max_gap_ns, note=self._notes.append
         )
         self._ahead: dict[str, _CameraData] = {}
 
@@ -316,7 +315,7 @@ class FlightReader:
             static=static,
             count=len(poses_t_ns),
             rate_hz=_rate(poses_t_ns),
-            gaps_ns=[] if static else gaps(poses_t_ns, self._max_gap_ns),
+            gaps_ns=[] if static else gaps(poses_t_ns, self._interpolation.max_gap_ns),
             frames_without_pose=without_pose,
             dropped=trajectory.dropped,
             stamps=self._sources.stamps(camera.pose.log) if camera.pose.log else None,
