@@ -20,10 +20,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.formats.flights.pictures import Picture, Pictures, open_pictures
-from pipelines.keypoints.hints import Hint, project_actor
+from pipelines.keypoints.actor_hints import actor_hints
+from pipelines.keypoints.hints import Hint
 from pipelines.keypoints.tracking import PeopleTracker
-from pipelines.reconstruction.loading import load_actor, stated_sigma
-from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import (
     CameraEntry,
     Description,
@@ -31,8 +30,9 @@ from pipelines.session.description import (
     read_description,
 )
 from pipelines.session.errors import DataError
+from pipelines.session.logged_actor import logged_actor
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Detections, Float, Int64, Trajectory
+from pipelines.session.records import Detections, Float, Int64
 from pipelines.session.registries import Detector, KeypointNetworks, find_detector, hashes_of_models
 from pipelines.session.side_by_side import Halt, side_by_side
 from pipelines.session.stage_records import Stage, StageRecord
@@ -47,9 +47,6 @@ if TYPE_CHECKING:
 DETECT = Stage("detect", revision=2)
 
 _BLOCK = 300  # pictures; ten seconds are worth little when lost, and a search at each start costs little
-_ACTOR_SIGMA_M = 1.0  # of the actor's log, as it is taken for telling people apart
-_UNKNOWN_SIGMA = (0.0, np.radians(1.0))
-"""Camera pose noise (m, rad) behind the hints where nobody states it: the position's is in the actor's."""
 
 
 @dataclass(frozen=True)
@@ -211,6 +208,11 @@ class _Work:
             name: rows_between(frames["t_ns"].to_numpy(np.int64) - description.start_ns, *span_s)
             for name, frames in self._frames.items()
         }
+        self._actor = logged_actor(folder, description)
+        self._tracks = {
+            name: trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
+            for name in (self._frames if self._actor is not None else ())
+        }
 
     def blocks(self, camera: str) -> list[Block]:
         """The blocks of a camera; a single one of nothing where no picture is in the span."""
@@ -237,6 +239,13 @@ class _Work:
         rows = self._frames[block.camera].iloc[list(self.rows(block))]
         return rows["frame"].to_numpy(np.int64), rows["t_ns"].to_numpy(np.int64)
 
+    def hints(self, block: Block, t_ns: Int64) -> list[Hint | None]:
+        """Where the logged actor should be in the pictures of these times [T]."""
+        if self._actor is None:
+            return [None] * len(t_ns)
+        name, between = block.camera, self.description.pose_interpolation
+        return actor_hints(self._actor, name, self.entry(block), self._tracks[name], between, t_ns)
+
     def networks(self, detector: Detector) -> KeypointNetworks:
         """The detector, loaded once by each thread: its networks may be used by one at a time."""
         if not hasattr(self._of_thread, "networks"):
@@ -247,55 +256,6 @@ class _Work:
     def entry(self, block: Block) -> CameraEntry:
         """The camera as it was ingested."""
         return self.description.cameras[block.camera]
-
-
-def actor_hints(folder: Path, description: Description, camera: str, t_ns: Int64) -> list[Hint | None]:
-    """Where the hips of the logged actor should be in a camera's pictures; None without a log or a pose.
-
-    Args:
-        folder: the session.
-        description: its session.json.
-        camera: one of its cameras.
-        t_ns: [T] when the pictures were taken.
-    """
-    actor = load_actor(folder, description, t_ns)
-    if actor is None:
-        return [None] * len(t_ns)
-    entry = description.cameras[camera]
-    trajectory = trajectory_from(read_table(folder / "cameras" / camera / "poses.parquet", POSES))
-    position, quaternion = poses_at(
-        trajectory, t_ns, description.pose_interpolation, static=entry.poses.static
-    )
-    sigma = hint_sigma(camera, entry, trajectory, t_ns)
-    intrinsics = entry.intrinsics.intrinsics()
-    return [
-        project_actor(at, (centre, turned), intrinsics, sigma_m=float(off_m), sigma_rad=float(off_rad))
-        if np.isfinite(at).all() and np.isfinite(centre).all()
-        else None
-        for at, centre, turned, (off_m, off_rad) in zip(actor, position, quaternion, sigma, strict=True)
-    ]
-
-
-def hint_sigma(name: str, entry: CameraEntry, trajectory: Trajectory, t_ns: Int64) -> Float:
-    """How far the logged actor may be from where a camera's logged pose has them.
-
-    Args:
-        name: of the camera.
-        entry: what session.json says of it; its pose noise, else the log's covariances, are taken.
-        trajectory: its logged poses.
-        t_ns: [T] when pictures were taken.
-
-    Returns:
-        Standard deviation per axis [T, 2]: of the actor's position relative to the camera's (m), the errors
-        of both together, and of the camera's rotation (rad); of the logged pose before each picture.
-    """
-    stated = stated_sigma(name, entry, trajectory)
-    if stated is None:
-        at_pictures = np.tile(_UNKNOWN_SIGMA, (len(t_ns), 1))
-    else:
-        before = np.searchsorted(trajectory.t_ns, t_ns, side="right") - 1
-        at_pictures = stated[np.clip(before, 0, len(stated) - 1)]
-    return np.column_stack([np.hypot(_ACTOR_SIGMA_M, at_pictures[:, 0]), at_pictures[:, 1]])
 
 
 def _span_words(start_s: float | None, end_s: float | None) -> str:
@@ -315,7 +275,7 @@ def _produce(work: _Work, detector: Detector, progress: Progress, block: Block, 
     found: list[tuple[int, int, Float, Float]] = []
     undecoded = 0
     numbers = frame.tolist()
-    hints = actor_hints(work.folder, work.description, block.camera, t_ns)
+    hints = work.hints(block, t_ns)
     # Left early, the pictures must not be closed while the next one is being decoded.
     with (
         open_pictures(media, work.folder) as pictures,

@@ -24,15 +24,16 @@ from pipelines.geometry.metrics import common, measure
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.poses import invert, transform
 from pipelines.geometry.triangulation import Views, estimate_noise, locate
+from pipelines.keypoints.actor_hints import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD
 from pipelines.keypoints.alone import FollowedAlone
 from pipelines.keypoints.hints import project_actor
 from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.loading import LoggedFlight, load_flight
-from pipelines.reconstruction.loading import load_actor
 from pipelines.reporting.frame_drawing import draw_frame
 from pipelines.reporting.overlays import View
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
+from pipelines.session.logged_actor import LoggedActor, logged_actor
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Float, Int64, JointMotion
 from pipelines.session.registries import Detector, find_detector, hashes_of_models
@@ -54,7 +55,6 @@ FILM = Stage("film", revision=1)
 NEAR_SHARE = 0.1
 """A keypoint is right within this share of the height in pixels of somebody who stands where the actor is."""
 
-_ACTOR_SIGMA_M, _HINT_SIGMA_RAD = 1.0, float(np.radians(1.0))  # as stage `detect` takes the actor's log
 _SAME_M = 0.05  # between the scenario's hips and the session's truth, which is interpolated
 _HIPS = ("left_hip", "right_hip")
 _QUALITY = 20  # of the videos that are drawn on
@@ -125,8 +125,9 @@ def film(
 
         flight = load_flight(folder, description, None, pose_noise=compared.settings["pose_noise"])
         setting = _set(plan, path, flight)
+        actor = logged_actor(folder, description)
         arms = {
-            arm: _arm(folder, description, flight, plan, setting, arm, shooting)
+            arm: _arm(folder, actor, flight, plan, setting, arm, shooting)
             for arm in read_json(folder / "replan" / "metrics.json")["arms"]
         }
         progress.start(
@@ -227,7 +228,7 @@ def _set(plan: Scenario, path: Path, flight: LoggedFlight) -> Set:
 
 def _arm(
     folder: Path,
-    description: Description,
+    actor: LoggedActor | None,
     flight: LoggedFlight,
     plan: Scenario,
     setting: Set,
@@ -251,8 +252,8 @@ def _arm(
     joints = person.keypoints(motion)
     walked = Walk(moments, person, plan.actor.body.height_m, motion, joints, motion.root)
     seen_by = Formation(dense("x", "y", "z"), dense("qx", "qy", "qz", "qw"), flight.cameras[0].intrinsics)
-    actor = load_actor(folder, description, moments)
-    return _Arm(cameras, walked, seen_by, actor, flight.cameras[0].noise)
+    hips = None if actor is None else actor.hips_at(moments)
+    return _Arm(cameras, walked, seen_by, hips, flight.cameras[0].noise)
 
 
 def _rows(t_ns: Int64, shooting: Shooting) -> Int64:
@@ -285,7 +286,7 @@ def _shoot(
             hint = None
             if arm.actor is not None and np.isfinite(arm.actor[k]).all():
                 hint = project_actor(
-                    arm.actor[k], pose, lens, sigma_m=_ACTOR_SIGMA_M, sigma_rad=_HINT_SIGMA_RAD
+                    arm.actor[k], pose, lens, sigma_m=ACTOR_SIGMA_M, sigma_rad=UNKNOWN_SIGMA_RAD
                 )
             found.append(follower.step(picture, hint=hint))
             yield picture

@@ -32,11 +32,11 @@ from pipelines.reconstruction.background import Followed, prior_of, refine_camer
 from pipelines.reconstruction.background_tracks import follow, people_boxes
 from pipelines.reconstruction.finishing import finish
 from pipelines.reconstruction.loading import (
-    load_actor,
     load_cameras,
     load_clock_sigma,
     load_pose_errors,
     load_truth,
+    truth_at,
 )
 from pipelines.reconstruction.observations import (
     Camera,
@@ -62,12 +62,13 @@ from pipelines.reconstruction.tables import camera_poses_table, skeleton_table
 from pipelines.reconstruction.trials import disturbances, disturbed, told_together
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
+from pipelines.session.logged_actor import LoggedActor, logged_actor
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Float, Int64, JointMotion
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import locked
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
-from pipelines.session.tables import CAMERA_POSES, FRAMES, SKELETON, read_table, write_table
+from pipelines.session.tables import CAMERA_POSES, SKELETON, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -183,12 +184,16 @@ def reconstruct(
         followed = {}
         if settings.refine_cameras == "background":
             followed = _follow_backgrounds(folder, description, cameras, progress)
+        flight = _Flight(
+            description,
+            followed,
+            logged_actor(folder, description),
+            load_truth(folder, description, cameras[0].detections.joints),
+        )
         attempts = (
             _attempt(
-                folder,
-                description,
+                flight,
                 disturbed(cameras, errors, settings.seed, trial) if errors else cameras,
-                followed,
                 settings,
                 workers,
                 progress,
@@ -246,6 +251,16 @@ def _said_disturbance(settings: Settings) -> str:
 
 
 @dataclass(frozen=True)
+class _Flight:
+    """What is the same for every trial."""
+
+    description: Description
+    followed: Mapping[str, Followed | str]  # the backgrounds of the cameras that are refined by them
+    actor: LoggedActor | None
+    truth: JointMotion | None
+
+
+@dataclass(frozen=True)
 class _Attempt:
     """One reconstruction of the flight, from its cameras to its figures."""
 
@@ -260,21 +275,16 @@ class _Attempt:
 
 
 def _attempt(
-    folder: Path,
-    description: Description,
-    cameras: list[Camera],
-    followed: Mapping[str, Followed | str],
-    settings: Settings,
-    workers: int,
-    progress: Progress,
+    flight: _Flight, cameras: list[Camera], settings: Settings, workers: int, progress: Progress
 ) -> _Attempt:
+    description = flight.description
     background: dict[str, Any] = {"background": None}
     warnings: list[str] = []
-    if followed:
+    if flight.followed:
         cameras, background["background"], warnings = _refine_cameras(
-            cameras, followed, description, settings
+            cameras, flight.followed, description, settings
         )
-    found, observations, association, seen = _observe(folder, cameras, description, settings)
+    found, observations, association, seen = _observe(flight, cameras, settings)
     sigma = ray_sigma(cameras, observations.t_ns, observations.position, pixel_sigma=settings.pixel_sigma)
     sides, between_views = _agreeing_sides(observations, sigma)
     xy, confidence = on_sides(observations.xy, observations.confidence, sides)
@@ -300,7 +310,7 @@ def _attempt(
         result,
         cameras=[camera.name for camera in cameras],
         method=settings.method,
-        truth=load_truth(folder, description, observations.joints, observations.t_ns),
+        truth=None if flight.truth is None else truth_at(flight.truth, observations.t_ns),
         solve=solve,
     )
     progress.advance()
@@ -317,10 +327,10 @@ def _attempt(
 
 
 def _observe(
-    folder: Path, cameras: list[Camera], description: Description, settings: Settings
+    flight: _Flight, cameras: list[Camera], settings: Settings
 ) -> tuple[Candidates, Observations, Association, NDArray[np.bool_]]:
     """All that was seen, what of each person, how people were told apart, when [T] anybody was seen."""
-    between = description.pose_interpolation
+    between = flight.description.pose_interpolation
     found = candidates(cameras, between)
     association = associate(
         (found.t_ns - found.t_ns[0]) / 1e9,
@@ -329,7 +339,7 @@ def _observe(
         found.position,
         found.rotation,
         ray_sigma(cameras, found.t_ns, found.position, pixel_sigma=settings.pixel_sigma),
-        actor=load_actor(folder, description, found.t_ns),
+        actor=None if flight.actor is None else flight.actor.hips_at(found.t_ns),
         people=settings.people,
     )
     base = time_base(cameras, settings.rate_hz)
@@ -352,9 +362,7 @@ def _follow_backgrounds(
             followed[camera.name] = "it came without pictures"
         else:
             rows = rows_to_follow(camera)
-            frames = read_table(folder / "cameras" / camera.name / "frames.parquet", FRAMES)
-            at = np.searchsorted(frames["t_ns"].to_numpy(np.int64), camera.frame_t_ns[rows])
-            numbers = frames["frame"].to_numpy(np.int64)[at].tolist()
+            numbers = camera.frame_number[rows].tolist()
             progress.start(f"Following the background of {camera.name}", len(rows))
             with open_pictures(media, folder) as pictures:
                 grey = (_grey(pictures.read(number), progress) for number in numbers)

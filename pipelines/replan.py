@@ -30,7 +30,7 @@ from pipelines.planning.arm_flights import (
 )
 from pipelines.planning.config import PlannerConfig, planner_config
 from pipelines.planning.contest import Entrant, compare
-from pipelines.planning.loading import LoggedFlight, has_true_joints, load_flight
+from pipelines.planning.loading import LoggedFlight, load_flight
 from pipelines.planning.replay import Mode
 from pipelines.planning.scene import Rules, Scene, build_scene
 from pipelines.session.description import Description, read_description
@@ -175,7 +175,7 @@ def _inputs(session: WritableSession) -> tuple[Description, StageRecord | None, 
         raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
     description = read_description(session.folder)
     inputs = dict(ingested.outputs)
-    needs_it = description.actor is None or not has_true_joints(description)
+    needs_it = description.actor is None or not description.has_true_joints
     reconstructed = session.record("reconstruct") if needs_it else None
     if reconstructed is not None:
         inputs[_SKELETON] = reconstructed.outputs[_SKELETON]

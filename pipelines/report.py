@@ -297,7 +297,6 @@ def _content_of(folder: Path) -> SessionContent:
 
 def _load(folder: Path, description: Description, records: dict[str, StageRecord]) -> SessionContent:
     reconstructed = "reconstruct" in records
-    has_truth = description.truth is not None and bool(description.truth.joints)
     keypoints = {
         name: read_table(folder / "cameras" / name / "keypoints.parquet", KEYPOINTS)
         for name, entry in description.cameras.items()
@@ -314,7 +313,7 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
         session=description,
         skeleton=read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON) if reconstructed else None,
         metrics=read_json(folder / "reconstruct" / "metrics.json") if reconstructed else None,
-        truth=read_table(folder / "truth.parquet", TRUTH) if has_truth else None,
+        truth=read_table(folder / "truth.parquet", TRUTH) if description.has_true_joints else None,
         poses={
             name: read_table(folder / "cameras" / name / "poses.parquet", POSES)
             for name in description.cameras

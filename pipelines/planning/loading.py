@@ -15,10 +15,11 @@ from pipelines.geometry.poses import gaps, interpolate_points
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import CameraEntry, Description, Interpolation
 from pipelines.session.errors import DataError
+from pipelines.session.logged_actor import logged_actor
+from pipelines.session.pose_noise import COMMAND_LINE, known_variances, stated_models
 from pipelines.session.records import Float, Int64, JointMotion, Trajectory
-from pipelines.session.registries import noise_models, parsed_noise_models
 from pipelines.session.stage_records import StageRecord
-from pipelines.session.tables import ACTOR, CAMERA_POSES, PLAN, POSES, SKELETON, TRUTH, read_table
+from pipelines.session.tables import CAMERA_POSES, PLAN, POSES, SKELETON, TRUTH, read_table
 from pipelines.session.tabular import motion_from, trajectory_from
 
 Bool = NDArray[np.bool_]
@@ -30,7 +31,6 @@ _GAP_NS = 1_000_000_000  # an actor who is not measured for longer is spoken of
 _COMMAND_HOLDS_NS = 2_000_000_000  # planners send something new several times a second
 _SHORTEST_S = 1.0
 _HIPS = ("left_hip", "right_hip")
-_SANE_VARIANCE = (100.0, np.pi**2)  # m^2, rad^2: what ROS means by 1e6 is "unknown"
 
 
 @dataclass(frozen=True)
@@ -123,11 +123,6 @@ def load_flight(
     )
 
 
-def has_true_joints(description: Description) -> bool:
-    """Whether the session knows where the joints really were."""
-    return description.truth is not None and bool(description.truth.joints)
-
-
 def points_at(motion: JointMotion, t_ns: Int64) -> Float:
     """The first person's joints [T, J, 3] at given times, NaN where they are not known nearby."""
     step_ns = float(np.median(np.diff(motion.t_ns))) if len(motion.t_ns) > 1 else 0.0
@@ -176,9 +171,9 @@ def _skeleton(
     folder: Path, description: Description, reconstructed: StageRecord | None
 ) -> tuple[JointMotion | None, Source | None]:
     """The truth, or else what was reconstructed."""
-    if has_true_joints(description):
-        joints = tuple(description.truth.joints) if description.truth else ()
-        return motion_from(read_table(folder / "truth.parquet", TRUTH), joints), "truth"
+    if description.truth is not None and description.has_true_joints:
+        table = read_table(folder / "truth.parquet", TRUTH)
+        return motion_from(table, tuple(description.truth.joints)), "truth"
     return (None, None) if reconstructed is None else (_reconstruction(folder), "reconstruction")
 
 
@@ -211,17 +206,14 @@ def _actor(
     warnings: list[str],
 ) -> tuple[Int64, Float, Source]:
     """What planners are told of the actor: the log, or where there is none the reconstructed hips."""
-    if description.actor is not None:
-        table = read_table(folder / "actor.parquet", ACTOR)
-        table = table[table["person"] == table["person"].min()]
-        position = table[["x", "y", "z"]].to_numpy(np.float64)
-        above_m = description.actor.hip_above_m
+    logged = logged_actor(folder, description)
+    if logged is not None and description.actor is not None:
         if description.actor.point in ("feet", "head"):
             warnings.append(
-                f"the actor's {description.actor.point} were logged: hips taken {above_m:+.2f} m above"
+                f"the actor's {description.actor.point} were logged: hips taken"
+                f" {description.actor.hip_above_m:+.2f} m above"
             )
-        t_ns = table["t_ns"].to_numpy(np.int64)
-        return *_measured(folder, t_ns, position + np.array([0.0, 0.0, above_m]), "the actor's log"), "log"
+        return *_measured(folder, logged.t_ns, logged.hips, "the actor's log"), "log"
     if reconstructed is None:
         raise DataError(
             folder,
@@ -314,10 +306,9 @@ def _noise(
     name: str, entry: CameraEntry, logged: Trajectory, pose_noise: str | None
 ) -> tuple[tuple[NoiseModel, ...], str]:
     """What is wrong with a camera's poses, and who says so."""
-    if pose_noise:
-        return tuple(parsed_noise_models("--pose-noise", pose_noise)), "--pose-noise"
-    if entry.pose_noise:
-        return tuple(noise_models(f"pose_noise of {name}", entry.pose_noise)), "flight.yaml"
+    models = stated_models(name, entry, pose_noise)
+    if models is not None:
+        return tuple(models), COMMAND_LINE if pose_noise else "flight.yaml"
     sigma = _logged_sigma(logged)
     if sigma is not None:
         white = White(position_m=sigma[0], rotation_deg=float(np.degrees(sigma[1])))
@@ -333,10 +324,8 @@ def _logged_sigma(trajectory: Trajectory) -> tuple[float, float] | None:
     """Median standard deviation per axis (m, rad) of the logged covariances; None where they say nothing."""
     if trajectory.covariance is None:
         return None
-    variances = np.diagonal(trajectory.covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
-    known = [
-        v[(v > 0) & (v < most)] for v, most in zip(np.moveaxis(variances, 1, 0), _SANE_VARIANCE, strict=True)
-    ]
+    variances, known_axes = known_variances(trajectory.covariance)
+    known = [variances[:, block][known_axes[:, block]] for block in range(2)]
     if not all(values.size for values in known):
         return None
     position, rotation = (float(np.sqrt(np.median(values))) for values in known)

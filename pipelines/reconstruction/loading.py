@@ -1,4 +1,4 @@
-"""What a reconstruction needs of a session: its cameras, the logged actor, the truth."""
+"""What a reconstruction needs of a session: its cameras, what is known of their errors, the truth."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.noise import sum_sigma
-from pipelines.geometry.poses import interpolate_points, rates
+from pipelines.geometry.poses import interpolate_points
 from pipelines.reconstruction.observations import Camera
 from pipelines.reconstruction.refinement.problem import (
     NEW_SHARE,
@@ -22,17 +21,14 @@ from pipelines.reconstruction.refinement.problem import (
 )
 from pipelines.session.description import CameraEntry, Description
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, Int64, Trajectory
-from pipelines.session.registries import noise_models, parsed_noise_models
+from pipelines.session.pose_noise import stated_models, stated_noise
+from pipelines.session.records import Float, Int64, JointMotion
 from pipelines.session.stage_records import StageRecord
-from pipelines.session.tables import ACTOR, FRAMES, KEYPOINTS, POSES, TRUTH, read_table
+from pipelines.session.tables import FRAMES, KEYPOINTS, POSES, TRUTH, read_table
 from pipelines.session.tabular import detections_from, most_confident, motion_from, trajectory_from
 
 _TRUTH_GAP = 1.5  # median steps: truth is never bridged across a missing sample
-_ACTOR_GAP_NS = 2_000_000_000
 _MOST_PEOPLE = 12  # in one picture; more are mistakes of a detector, and memory goes with their number
-_SANE_VARIANCE = (100.0, np.pi**2)  # m^2, rad^2: what ROS means by 1e6 is "unknown"
-_ROUNDED = 1e-6  # of an eigenvalue of correlations that logs have rounded
 
 Calibrated = Callable[[Float, NDArray[np.str_]], Float]
 
@@ -96,9 +92,8 @@ def load_cameras(
     for name, source in sources.items():
         entry = description.cameras[name]
         camera = _load_camera(folder, name, entry, source, joints, min_confidence, calibrated, warnings)
-        sigma = stated_sigma(name, entry, camera.trajectory, pose_noise)
-        covariance = None if pose_noise or entry.pose_noise else logged_covariance(camera.trajectory)
-        cameras.append(replace(camera, sigma=sigma, covariance=covariance))
+        noise = stated_noise(name, entry, camera.trajectory, pose_noise)
+        cameras.append(replace(camera, sigma=noise.sigma, covariance=noise.covariance))
     return cameras, warnings
 
 
@@ -139,6 +134,7 @@ def _load_camera(
     return Camera(
         name=name,
         intrinsics=entry.intrinsics.intrinsics(),
+        frame_number=frame,
         frame_t_ns=frames["t_ns"].to_numpy(np.int64),
         follows=np.diff(frame, prepend=frame[0] - every) == every,
         trajectory=trajectory,
@@ -146,35 +142,6 @@ def _load_camera(
         sigma=None,
         # From here on frames count the rows of the table: pictures without a time are not in it.
         detections=replace(detections, frame=np.searchsorted(frame, detections.frame)),
-    )
-
-
-def stated_sigma(
-    name: str, entry: CameraEntry, trajectory: Trajectory, pose_noise: str | None = None
-) -> Float | None:
-    """The pose noise of a camera as somebody states it: the command line, flight.yaml, or the log itself.
-
-    Args:
-        name: of the camera.
-        entry: what session.json says of it.
-        trajectory: its N logged poses.
-        pose_noise: what the command line says.
-
-    Returns:
-        Standard deviation per axis [N, 2] of position (m) and rotation (rad); None where nobody states it.
-
-    Raises:
-        DataError: the models are none that are known.
-    """
-    if pose_noise:
-        models = parsed_noise_models("--pose-noise", pose_noise)
-    elif entry.pose_noise:
-        models = noise_models(f"pose_noise of {name}", entry.pose_noise)
-    else:
-        return _logged_sigma(trajectory)
-    elapsed_s = (trajectory.t_ns - trajectory.t_ns[0]) / 1e9
-    return sum_sigma(
-        models, elapsed_s, *rates(trajectory.t_ns, trajectory.position, trajectory.quaternion_xyzw)
     )
 
 
@@ -189,13 +156,11 @@ def load_pose_errors(
     """
     stated: list[PoseErrors | None] = []
     for camera in cameras:
-        entry = description.cameras[camera.name]
+        models = stated_models(camera.name, description.cameras[camera.name], pose_noise)
         if camera.errors is not None:
             stated.append(camera.errors)
-        elif pose_noise:
-            stated.append(pose_errors(parsed_noise_models("--pose-noise", pose_noise)))
-        elif entry.pose_noise:
-            stated.append(pose_errors(noise_models(f"pose_noise of {camera.name}", entry.pose_noise)))
+        elif models is not None:
+            stated.append(pose_errors(models))
         elif camera.covariance is not None and camera.sigma is not None:
             level = errors_of_level(np.median(camera.sigma, axis=0))
             stated.append(replace(level, logged=True))
@@ -222,64 +187,14 @@ def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> Flo
     )
 
 
-def logged_covariance(trajectory: Trajectory) -> Float | None:
-    """The logged covariances [N, 6, 6] as they are, where they say something of positions and of rotations.
-
-    Zero, negative, NaN and absurdly large variances are what logs write for "unknown". An axis that is
-    unknown has the mean of the known ones of its kind, and goes with no other; a pose with none known has the
-    median of the other poses. None where there is no other. A matrix that is none of a covariance (its
-    correlations contradict each other) keeps its variances alone.
-    """
-    if trajectory.covariance is None:
+def load_truth(folder: Path, description: Description, joints: tuple[str, ...]) -> JointMotion | None:
+    """The true joints; NaN for those that only the skeleton has. None where nothing is known to be true."""
+    if not description.has_true_joints:
         return None
-    logged = trajectory.covariance
-    variances = np.diagonal(logged, axis1=1, axis2=2).reshape(-1, 2, 3)
-    known = (variances > 0) & (variances < np.array(_SANE_VARIANCE)[:, None])
-    count = known.sum(axis=2)
-    mean = np.where(known, variances, 0.0).sum(axis=2) / np.maximum(count, 1)
-    if not (count > 0).any(axis=0).all():
-        return None
-    for block in range(2):
-        unknown = count[:, block] == 0
-        mean[unknown, block] = np.median(mean[~unknown, block])
-    axes = np.where(known, variances, mean[..., None]).reshape(-1, 6)
-    both = known.reshape(-1, 6)[:, :, None] & known.reshape(-1, 6)[:, None, :]
-    covariance = np.where(both & np.isfinite(logged), logged, 0.0)
-    covariance[:, np.arange(6), np.arange(6)] = axes
-    scale = np.sqrt(axes)
-    correlation = covariance / (scale[:, :, None] * scale[:, None, :])
-    contradictory = np.linalg.eigvalsh(correlation)[:, 0] < -_ROUNDED
-    covariance[contradictory] = axes[contradictory, :, None] * np.eye(6)
-    return covariance
+    return motion_from(read_table(folder / "truth.parquet", TRUTH), joints)
 
 
-def _logged_sigma(trajectory: Trajectory) -> Float | None:
-    """Standard deviation per axis [N, 2] of position and rotation: the root of the mean logged variance."""
-    covariance = logged_covariance(trajectory)
-    if covariance is None:
-        return None
-    variances = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
-    sigma: Float = np.sqrt(variances.mean(axis=2))
-    return sigma
-
-
-def load_truth(folder: Path, description: Description, joints: tuple[str, ...], t_ns: Int64) -> Float | None:
-    """The true joints [T, P, J, 3] at the skeleton's times; NaN for joints that only the skeleton has."""
-    if description.truth is None or not description.truth.joints:
-        return None
-    truth = motion_from(read_table(folder / "truth.parquet", TRUTH), joints)
+def truth_at(truth: JointMotion, t_ns: Int64) -> Float:
+    """The true joints [T, P, J, 3] at the skeleton's times."""
     step_ns = int(np.median(np.diff(truth.t_ns))) if len(truth.t_ns) > 1 else 0
-    gap_ns = int(_TRUTH_GAP * step_ns)
-    return interpolate_points(truth.t_ns, truth.position, t_ns, max_gap_ns=gap_ns)
-
-
-def load_actor(folder: Path, description: Description, t_ns: Int64) -> Float | None:
-    """The hips [T, 3] of the logged actor at given times, NaN where the log says nothing.
-
-    Of an actor whose head or feet were logged, the hips of somebody 1.75 m tall who stands there.
-    """
-    if description.actor is None:
-        return None
-    table = read_table(folder / "actor.parquet", ACTOR)
-    hips = table[["x", "y", "z"]].to_numpy(np.float64) + np.array([0.0, 0.0, description.actor.hip_above_m])
-    return interpolate_points(table["t_ns"].to_numpy(np.int64), hips, t_ns, max_gap_ns=_ACTOR_GAP_NS)
+    return interpolate_points(truth.t_ns, truth.position, t_ns, max_gap_ns=int(_TRUTH_GAP * step_ns))

@@ -35,6 +35,7 @@ class Camera:
 
     name: str
     intrinsics: Intrinsics
+    frame_number: Int64  # [F] as the pictures count them
     frame_t_ns: Int64  # [F]
     follows: NDArray[np.bool_]  # [F] whether the frame is the next picture after the row before
     trajectory: Trajectory

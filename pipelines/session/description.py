@@ -239,6 +239,11 @@ class Description(Entry):
     warnings: list[str]
 
     @property
+    def has_true_joints(self) -> bool:
+        """Whether it is known where the joints really were."""
+        return self.truth is not None and bool(self.truth.joints)
+
+    @property
     def start_ns(self) -> int:
         """The first frame of the flight's cameras: what users' seconds count from."""
         return min(entry.frames.first_t_ns for entry in self.cameras.values())

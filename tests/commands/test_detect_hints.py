@@ -7,17 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from ruamel.yaml import YAML
 
-from pipelines.detect import actor_hints, detect, hint_sigma
+from pipelines.detect import detect
 from pipelines.ingest import ingest
+from pipelines.keypoints.actor_hints import actor_hints, hint_sigma
 from pipelines.keypoints.hints import Hint
-from pipelines.reconstruction.loading import load_actor
 from pipelines.session.description import read_description
+from pipelines.session.logged_actor import logged_actor
 from pipelines.session.records import Trajectory
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.stages import locked
+from pipelines.session.tabular import trajectory_from
 from tests.keypoints.spotted_flights import CAMERAS, FPS, LENS, START_S, spot_detector, write_spotted_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log
@@ -54,7 +57,12 @@ class Flight:
     def hints(self) -> list[Hint | None]:
         self.ingest()
         stamps = START_S * 10**9 + np.round(np.arange(FRAMES) * 1e9 / FPS).astype(np.int64)
-        return actor_hints(self.session, read_description(self.session), "left", stamps)
+        description = read_description(self.session)
+        actor = logged_actor(self.session, description)
+        assert actor is not None
+        track = trajectory_from(pd.read_parquet(self.session / "cameras" / "left" / "poses.parquet"))
+        entry, between = description.cameras["left"], description.pose_interpolation
+        return actor_hints(actor, "left", entry, track, between, stamps)
 
     def key(self, detector: str, start_s: float | None = None) -> str:
         """The key of the stage, which is run where that is not there yet."""
@@ -83,8 +91,9 @@ def test_the_hint_is_at_the_hips_whatever_point_was_logged(
         assert hint is not None
         assert hint.centre == pytest.approx((LENS.cx, LENS.cy), abs=1e-3)
         assert hint.height_px == pytest.approx(LENS.fx * 1.75 / DISTANCE_M, rel=1e-3)
-    hips = load_actor(flight.session, read_description(flight.session), np.array([START_S * 10**9]))
-    assert hips == pytest.approx(np.array([[0.0, 0.0, 1.0]]))
+    actor = logged_actor(flight.session, read_description(flight.session))
+    assert actor is not None
+    assert actor.hips_at(np.array([START_S * 10**9])) == pytest.approx(np.array([[0.0, 0.0, 1.0]]))
 
 
 def test_the_margin_is_what_is_stated_of_the_poses(tmp_path: Path) -> None:

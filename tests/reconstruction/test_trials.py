@@ -20,6 +20,7 @@ def camera(name: str) -> Camera:
     return Camera(
         name=name,
         intrinsics=Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0, "none", ()),
+        frame_number=np.arange(5),
         frame_t_ns=log.t_ns,
         follows=np.ones(5, dtype=np.bool_),
         trajectory=log,

@@ -1,0 +1,114 @@
+"""How far the poses of a camera err, as somebody says: the command line, flight.yaml, or the log itself.
+
+The first of these that says anything is believed; nobody may, too.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.noise import NoiseModel, sum_sigma
+from pipelines.geometry.poses import rates
+from pipelines.session.description import CameraEntry
+from pipelines.session.records import Float, Trajectory
+from pipelines.session.registries import noise_models, parsed_noise_models
+
+COMMAND_LINE = "--pose-noise"
+_SANE_VARIANCE = (100.0, np.pi**2)  # m^2, rad^2: what ROS means by 1e6 is "unknown"
+_ROUNDED = 1e-6  # of an eigenvalue of correlations that logs have rounded
+
+
+class StatedNoise(NamedTuple):
+    """The errors of N logged poses, None where nobody states them."""
+
+    sigma: Float | None  # [N, 2] standard deviation per axis of position (m) and rotation (rad)
+    covariance: Float | None  # [N, 6, 6] the log's own, where `sigma` is its level
+
+
+def stated_models(name: str, entry: CameraEntry, pose_noise: str | None) -> list[NoiseModel] | None:
+    """The models of a camera's pose errors; None where neither command line nor flight.yaml names any.
+
+    Args:
+        name: of the camera.
+        entry: what session.json says of it.
+        pose_noise: what the command line says.
+
+    Raises:
+        DataError: the models are none that are known.
+    """
+    if pose_noise:
+        return parsed_noise_models(COMMAND_LINE, pose_noise)
+    if entry.pose_noise:
+        return noise_models(f"pose_noise of {name}", entry.pose_noise)
+    return None
+
+
+def stated_noise(
+    name: str, entry: CameraEntry, trajectory: Trajectory, pose_noise: str | None = None
+) -> StatedNoise:
+    """How far each pose of a camera's log errs, by its models or else by its covariances.
+
+    Args:
+        name: of the camera.
+        entry: what session.json says of it.
+        trajectory: its N logged poses.
+        pose_noise: what the command line says.
+
+    Raises:
+        DataError: the models are none that are known.
+    """
+    models = stated_models(name, entry, pose_noise)
+    if models is None:
+        covariance = logged_covariance(trajectory)
+        return StatedNoise(None if covariance is None else _level(covariance), covariance)
+    elapsed_s = (trajectory.t_ns - trajectory.t_ns[0]) / 1e9
+    moved = rates(trajectory.t_ns, trajectory.position, trajectory.quaternion_xyzw)
+    return StatedNoise(sum_sigma(models, elapsed_s, *moved), None)
+
+
+def logged_covariance(trajectory: Trajectory) -> Float | None:
+    """The logged covariances [N, 6, 6] as they are, where they say something of positions and of rotations.
+
+    An axis that is unknown (`known_variances`) has the mean of the known ones of its kind, and goes with no
+    other; a pose with none known has the median of the other poses. None where there is no other. A matrix
+    that is none of a covariance (its correlations contradict each other) keeps its variances alone.
+    """
+    if trajectory.covariance is None:
+        return None
+    logged = trajectory.covariance
+    variances, known = known_variances(logged)
+    count = known.sum(axis=2)
+    mean = np.where(known, variances, 0.0).sum(axis=2) / np.maximum(count, 1)
+    if not (count > 0).any(axis=0).all():
+        return None
+    for block in range(2):
+        unknown = count[:, block] == 0
+        mean[unknown, block] = np.median(mean[~unknown, block])
+    axes = np.where(known, variances, mean[..., None]).reshape(-1, 6)
+    both = known.reshape(-1, 6)[:, :, None] & known.reshape(-1, 6)[:, None, :]
+    covariance = np.where(both & np.isfinite(logged), logged, 0.0)
+    covariance[:, np.arange(6), np.arange(6)] = axes
+    scale = np.sqrt(axes)
+    correlation = covariance / (scale[:, :, None] * scale[:, None, :])
+    contradictory = np.linalg.eigvalsh(correlation)[:, 0] < -_ROUNDED
+    covariance[contradictory] = axes[contradictory, :, None] * np.eye(6)
+    return covariance
+
+
+def known_variances(covariance: Float) -> tuple[Float, NDArray[np.bool_]]:
+    """Variances [N, 2, 3] of position (m^2) and rotation (rad^2) in covariances [N, 6, 6], and whether known.
+
+    Zero, negative, NaN and absurdly large variances are what logs write for "unknown".
+    """
+    variances = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
+    return variances, (variances > 0) & (variances < np.array(_SANE_VARIANCE)[:, None])
+
+
+def _level(covariance: Float) -> Float:
+    """Standard deviation per axis [N, 2] of position and rotation: the root of the mean variance."""
+    variances = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
+    sigma: Float = np.sqrt(variances.mean(axis=2))
+    return sigma
