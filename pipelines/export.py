@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -15,8 +16,8 @@ from pipelines.formats.flights.pictures import Picture, open_pictures
 from pipelines.formats.skeletons.even_frames import thinned
 from pipelines.reporting.filmed import read_filmed, refined_poses
 from pipelines.reporting.frame_drawing import caption_of, draw_frame
-from pipelines.reporting.motion import motion_from_skeleton
-from pipelines.reporting.overlays import status_at, views_of
+from pipelines.reporting.motion import Motion, motion_from_skeleton
+from pipelines.reporting.overlays import FilmedCamera, status_at, views_of
 from pipelines.reporting.placing import estimated_clocks
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import BusyError, DataError
@@ -29,6 +30,9 @@ from pipelines.session.stages import open_session, session_name
 from pipelines.session.storage import as_data_error, read_json, remove_tree, sha256_of, write_json
 from pipelines.session.tables import FRAMES, POSES, SKELETON, read_table
 from pipelines.session.tabular import motion_from, trajectory_from
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 PICTURES_HZ = 2.0
 """How many pictures of a camera go into a recording each second, unless the user says otherwise."""
@@ -167,10 +171,10 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
     session = open_session(folder)
     description = read_description(folder)
     record = session.record("reconstruct")
-    motion = None
+    skeleton, motion = None, None
     if record is not None:
-        table = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON)
-        motion = motion_from(table, tuple(dict.fromkeys(table["joint"])))
+        skeleton = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON)
+        motion = motion_from(skeleton, tuple(dict.fromkeys(skeleton["joint"])))
     cameras = {
         name: trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
         for name in description.cameras
@@ -183,7 +187,7 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         lenses={name: camera.intrinsics.intrinsics() for name, camera in description.cameras.items()},
         maps=lambda: _maps(folder),
         pictures=_pictures(folder, description, record, pictures_hz),
-        overlays=_overlays(folder, description, record, pictures_hz),
+        overlays=_overlays(folder, description, record, skeleton, pictures_hz),
     )
 
 
@@ -213,15 +217,32 @@ def _pictures(folder: Path, description: Description, record: StageRecord | None
     return of
 
 
-def _overlays(folder: Path, description: Description, record: StageRecord | None, rate_hz: float) -> Stills:
+def _overlays(
+    folder: Path,
+    description: Description,
+    record: StageRecord | None,
+    skeleton: pd.DataFrame | None,
+    rate_hz: float,
+) -> Stills:
     """The same with the skeleton drawn over them."""
+    if record is None or skeleton is None or not rate_hz:
+        return lambda _: ()
+
+    @cache
+    def drawn() -> tuple[Motion, dict[str, FilmedCamera]]:
+        """What is drawn, and the cameras; made for the first picture that is asked for."""
+        frames = {
+            name: read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
+            for name, entry in description.cameras.items()
+            if entry.media is not None
+        }
+        return motion_from_skeleton(skeleton), read_filmed(folder, description, record, frames)
 
     def of(camera: str) -> Iterator[tuple[int, Picture]]:
-        entry = description.cameras[camera]
-        if record is None or entry.media is None or not rate_hz:
+        if description.cameras[camera].media is None:
             return
-        filmed = read_filmed(folder, description, record, [camera])[camera]
-        motion = motion_from_skeleton(read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON))
+        motion, cameras = drawn()
+        filmed = cameras[camera]
         rows = thinned(filmed.frame_t_ns, rate_hz)
         status = status_at(motion, filmed.frame_t_ns[rows])
         views = views_of(filmed, rows, motion, status, description.start_ns)

@@ -205,10 +205,10 @@ def _films(
     span_s: tuple[float | None, float | None],
     progress: Progress,
 ) -> list[_Film]:
-    filmed = read_filmed(folder, description, record, cameras)
+    tables = {name: read_table(folder / "cameras" / name / "frames.parquet", FRAMES) for name in cameras}
     films = []
-    for name, camera in filmed.items():
-        frames = read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
+    for name, camera in read_filmed(folder, description, record, tables).items():
+        frames = tables[name]
         rows = rows_between(frames["t_ns"].to_numpy(np.int64) - description.start_ns, *span_s)
         if not rows:
             progress.note(f"{name}: no overlay, none of its pictures lies in the span")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,8 +14,11 @@ from pipelines.session.description import Description
 from pipelines.session.records import Trajectory
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.storage import read_json
-from pipelines.session.tables import CAMERA_POSES, FRAMES, KEYPOINTS, POSES, read_table
+from pipelines.session.tables import CAMERA_POSES, KEYPOINTS, POSES, read_table
 from pipelines.session.tabular import trajectory_from
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def refined_poses(folder: Path) -> dict[str, Trajectory]:
@@ -27,7 +31,7 @@ def refined_poses(folder: Path) -> dict[str, Trajectory]:
 
 
 def read_filmed(
-    folder: Path, description: Description, record: StageRecord, cameras: Iterable[str]
+    folder: Path, description: Description, record: StageRecord, frames: Mapping[str, pd.DataFrame]
 ) -> dict[str, FilmedCamera]:
     """Cameras as the reconstruction took them, or as it refined them; frames by the clock that it estimated.
 
@@ -35,22 +39,21 @@ def read_filmed(
         folder: the session.
         description: its session.json.
         record: of its reconstruction: keypoints less sure than it used are left out.
-        cameras: which ones.
+        frames: the frame tables of the cameras that are wanted.
     """
     offset_ns = estimated_clocks(read_json(folder / "reconstruct" / "metrics.json"))
     refined = refined_poses(folder)
     filmed = {}
-    for name in cameras:
+    for name, table in frames.items():
         entry = description.cameras[name]
         stage = "cameras" if entry.keypoints is not None else "detect"
         keypoints = read_table(folder / stage / name / "keypoints.parquet", KEYPOINTS)
-        frames = read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
         logged = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
         filmed[name] = FilmedCamera(
             name=name,
             intrinsics=entry.intrinsics.intrinsics(),
-            frame=frames["frame"].to_numpy(np.int64),
-            frame_t_ns=frames["t_ns"].to_numpy(np.int64) + offset_ns.get(name, 0),
+            frame=table["frame"].to_numpy(np.int64),
+            frame_t_ns=table["t_ns"].to_numpy(np.int64) + offset_ns.get(name, 0),
             keypoints=keypoints[keypoints["confidence"] >= record.settings["min_confidence"]],
             track=refined.get(name, logged),
             static=entry.poses.static,
