@@ -13,7 +13,7 @@ from mocap_cli.options import any_path, json_option, level, overwrite_option, ve
 from mocap_cli.terminal import one_line, print_json, watching
 
 if TYPE_CHECKING:
-    from pipelines.draft import LeftOut
+    from pipelines.drafting.searching import LeftOut
 
 _MANY = 5  # files of one kind in one folder that are told one by one
 

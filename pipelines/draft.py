@@ -29,6 +29,7 @@ from pipelines.drafting.found import (
 )
 from pipelines.drafting.manifest_text import write_manifest
 from pipelines.drafting.matching import match
+from pipelines.drafting.searching import LeftOut, Search, Thing, kind_of_format
 from pipelines.formats.common.summaries import median_step_ns
 from pipelines.formats.drone_logs.dji_srt import read_subtitles
 from pipelines.formats.logs.messages import kind_of, samples
@@ -49,22 +50,12 @@ from pipelines.session.registries import (
     MapFormat,
     TrajectoryFormat,
     VideoFormat,
-    why_not,
 )
 from pipelines.session.storage import as_data_error
 from pipelines.session.telemetry import TelemetryChoice, TelemetryFormat
 
 _FRAME_TIMES = "frame_times"  # the one format that no protocol tells apart
 _TRANSFORMS_ASKED = 2000  # messages of a topic, for the names of its frames
-_FILES_ASKED = 16  # of a folder of keypoints, for their format
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """What was looked at in vain."""
-
-    path: Path
-    reason: str
 
 
 @dataclass(frozen=True)
@@ -100,13 +91,13 @@ def draft(
     Raises:
         DataError: nothing was recognised, a path is missing, or the output is there or cannot be written.
     """
-    search = _Search(progress or Silent())
+    search = Search()
     things, home = search.look([_absolute(path) for path in paths])
     target = output or home / "flight.yaml"
     if target.exists() and not overwrite:
         raise DataError(target, "exists", "choose another with --output, or replace it with --overwrite")
-    findings = search.read(things, home)
-    left_out = [left for left in search.left_out if left.path != _absolute(target)]
+    findings, unread = _read_all(things, home, progress or Silent())
+    left_out = [left for left in [*search.left_out, *unread] if left.path != _absolute(target)]
     if not findings.all():
         raise DataError(*_nothing(home, left_out))
 
@@ -160,166 +151,53 @@ def _write(target: Path, text: str) -> str:
     return problem
 
 
-# --- looking -------------------------------------------------------------------------------------------
-
-Thing = tuple[Path, list[Format]]
-"""A file or folder, and the formats that recognise it."""
+# --- reading -------------------------------------------------------------------------------------------
 
 
-class _Search:
-    """Goes through files and folders, and notes what it had to leave out."""
+def _read_all(things: Sequence[Thing], home: Path, progress: Progress) -> tuple[Findings, list[LeftOut]]:
+    """What is in them, as far as it helps to tell what belongs together, and what says nothing."""
+    progress.start("Reading", len(things))
+    found: list[Found] = []
+    unread: list[LeftOut] = []
+    for path, formats in things:
+        known, problem = _read(path, formats, home)
+        found += known
+        if not known:
+            unread.append(LeftOut(path, problem))
+        progress.advance()
+    return Findings(
+        keypoints=[thing for thing in found if isinstance(thing, Keypoints)],
+        poses=[thing for thing in found if isinstance(thing, Poses)],
+        calibrations=[thing for thing in found if isinstance(thing, Calibration)],
+        joints=[thing for thing in found if isinstance(thing, Joints)],
+        frame_times=[thing for thing in found if isinstance(thing, FrameTimes)],
+        videos=[thing for thing in found if isinstance(thing, Video)],
+        maps=[thing for thing in found if isinstance(thing, Map)],
+        recordings=[thing for thing in found if isinstance(thing, Recording)],
+        drone_logs=[thing for thing in found if isinstance(thing, DroneLog)],
+    ), unread
 
-    def __init__(self, progress: Progress) -> None:
-        self.left_out: list[LeftOut] = []
-        self._formats = FORMATS.all()
-        self._progress = progress
-        self._seen: set[Path] = set()
 
-    def look(self, paths: Sequence[Path]) -> tuple[list[Thing], Path]:
-        """Everything that is recognised, each thing once, and the folder that all paths have in common.
+def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Found], str]:
+    """A thing as every kind that it is, of several formats of a kind as the first that can read it.
 
-        Raises:
-            DataError: a path does not exist.
-        """
-        things: list[Thing] = []
-        bases: list[Path] = []
-        for path in paths:
-            if not path.exists():
-                raise DataError(path, "does not exist", "check the path")
-            found = list(self._under(path))
-            alone = not path.is_dir() or [thing for thing, _ in found] == [path]
-            bases.append(path.parent if alone else path)
-            things += found
-        return sorted(things, key=lambda thing: thing[0]), Path(os.path.commonpath(bases))
-
-    def read(self, things: Sequence[Thing], home: Path) -> Findings:
-        """What is in them, as far as it helps to tell what belongs together."""
-        self._progress.start("Reading", len(things))
-        found: list[Found] = []
-        for path, formats in things:
-            found += self._read(path, formats, home)
-            self._progress.advance()
-        return Findings(
-            keypoints=[thing for thing in found if isinstance(thing, Keypoints)],
-            poses=[thing for thing in found if isinstance(thing, Poses)],
-            calibrations=[thing for thing in found if isinstance(thing, Calibration)],
-            joints=[thing for thing in found if isinstance(thing, Joints)],
-            frame_times=[thing for thing in found if isinstance(thing, FrameTimes)],
-            videos=[thing for thing in found if isinstance(thing, Video)],
-            maps=[thing for thing in found if isinstance(thing, Map)],
-            recordings=[thing for thing in found if isinstance(thing, Recording)],
-            drone_logs=[thing for thing in found if isinstance(thing, DroneLog)],
-        )
-
-    def _under(self, path: Path) -> Iterator[Thing]:
-        """The things at a path and below it."""
-        if path.resolve() in self._seen:  # named twice, or a link that leads back
-            return
-        self._seen.add(path.resolve())
-        if not _is_text(path):
-            self.left_out.append(LeftOut(path, "its name is no text that a manifest could state, left out"))
-        elif path.is_dir():
-            yield from self._under_folder(path)
-        elif formats := self._recognising(path):
-            yield path, formats
-        else:
-            self.left_out.append(LeftOut(path, _why_left_out(path)))
-
-    def _under_folder(self, folder: Path) -> Iterator[Thing]:
-        """The folder itself where it is one thing, and what lies in it but is no part of that."""
-        children = self._children(folder)
-        formats = [f for f in self._recognising(folder) if self._is_whole(folder, children, f)]
-        if not formats:
-            for child in children:
-                yield from self._under(child)
-            return
-        yield folder, formats
-        kinds = {_kind(format_) for format_ in formats}
-        for child in children:
-            if child.is_dir():
-                yield from self._under(child)
-            elif KeypointFormat not in kinds or child.suffix.lower() != ".json":
-                others = [f for f in self._recognising(child) if _kind(f) not in kinds]
-                if others:
-                    yield child, others
-
-    def _is_whole(self, folder: Path, children: Sequence[Path], format_: Format) -> bool:
-        """Whether a folder that a format recognises is one thing, and not a place where such things lie.
-
-        Files of keypoints, one for each camera, are recognised as a folder too, and so are a log that lies
-        alone in a folder and the files of a bag beside the videos of its flight.
-        """
-        if isinstance(format_, LogFormat):
-            inside = [_kind(f) for child in children for f in self._recognising(child)]
-            alone = len(inside) == 1 and not (folder / "metadata.yaml").exists()
-            return not alone and all(kind is LogFormat for kind in inside)
-        if not isinstance(format_, KeypointFormat):
-            return True
-        files = [child for child in children if child.suffix.lower() == ".json"]
-        asked = files[:: max(1, len(files) // _FILES_ASKED)]
-        if len(files) < 2 or any(f is not format_ for file in asked for f in self._recognising(file)):
-            return False
+    Also what to say where it is none.
+    """
+    found: dict[type[Found], Found] = {}
+    problems: list[str] = []
+    *folders, name = path.relative_to(home).parts or (path.name,)
+    place = (*folders, name if path.is_dir() else Path(name).stem)
+    for format_ in formats:
+        ambiguous = sum(kind_of_format(other) is kind_of_format(format_) for other in formats) > 1
+        head = Found(path, place, format_.name, format_.title)
         try:
-            format_.read_keypoints(folder, skeleton=None, first_frame=0)
-        except DataError:  # two files of one frame: they are of several cameras
-            return False
-        return True
-
-    def _children(self, folder: Path) -> list[Path]:
-        try:
-            children = sorted(folder.iterdir())
-        except OSError as error:
-            self.left_out.append(LeftOut(folder, f"cannot be read ({error.strerror}), left out"))
-            return []
-        return [c for c in children if not c.name.startswith(".") and c.suffix != ".session" and c.exists()]
-
-    def _recognising(self, path: Path) -> list[Format]:
-        return [format_ for format_ in self._formats if format_.recognises(path)]
-
-    # --- reading -----------------------------------------------------------------------------------------
-
-    def _read(self, path: Path, formats: Sequence[Format], home: Path) -> list[Found]:
-        """A thing as every kind that it is; of several formats of a kind as the first that can read it."""
-        found: dict[type[Found], Found] = {}
-        problems: list[str] = []
-        *folders, name = path.relative_to(home).parts or (path.name,)
-        place = (*folders, name if path.is_dir() else Path(name).stem)
-        for format_ in formats:
-            ambiguous = sum(_kind(other) is _kind(format_) for other in formats) > 1
-            head = Found(path, place, format_.name, format_.title)
-            try:
-                thing = _described(head, format_, ambiguous)
-            except DataError as error:
-                problems.append(f"{error.problem}, left out")
-                continue
-            if thing is not None:
-                found.setdefault(type(thing), thing)
-        if not found:
-            self.left_out.append(LeftOut(path, problems[0] if problems else "of no use here, left out"))
-        return list(found.values())
-
-
-def _is_text(path: Path) -> bool:
-    try:
-        str(path).encode()
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
-def _kind(format_: Format) -> type | None:
-    """The protocol that a format keeps to."""
-    kinds = (
-        KeypointFormat,
-        TrajectoryFormat,
-        CalibrationFormat,
-        JointFormat,
-        LogFormat,
-        VideoFormat,
-        MapFormat,
-        TelemetryFormat,
-    )
-    return next((kind for kind in kinds if isinstance(format_, kind)), None)
+            thing = _described(head, format_, ambiguous)
+        except DataError as error:
+            problems.append(f"{error.problem}, left out")
+            continue
+        if thing is not None:
+            found.setdefault(type(thing), thing)
+    return list(found.values()), problems[0] if problems else "of no use here, left out"
 
 
 def _described(head: Found, format_: Format, ambiguous: bool) -> Found | None:
@@ -458,15 +336,3 @@ def _pose_samples(log: Log, topic: str, messages: int, source: Path) -> Iterator
             yield from (sample for sample in samples(message, source) if isinstance(sample, PoseSample))
         except DataError:
             continue
-
-
-def _why_left_out(path: Path) -> str:
-    """What to say of a file that no format knows."""
-    if path.suffix.lower() in {".yaml", ".yml"}:
-        try:
-            read_flight(path)
-        except DataError:
-            pass
-        else:
-            return "is a flight manifest already (run `mocap ingest` on it), left out"
-    return f"not recognised{why_not(path)}, left out"

@@ -1,0 +1,164 @@
+"""What lies in files and folders that any format knows, each thing once, and what does not."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import read_flight
+from pipelines.session.registries import (
+    FORMATS,
+    CalibrationFormat,
+    Format,
+    JointFormat,
+    KeypointFormat,
+    LogFormat,
+    MapFormat,
+    TrajectoryFormat,
+    VideoFormat,
+    why_not,
+)
+from pipelines.session.telemetry import TelemetryFormat
+
+_FILES_ASKED = 16  # of a folder of keypoints, for their format
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What was looked at in vain."""
+
+    path: Path
+    reason: str
+
+
+Thing = tuple[Path, list[Format]]
+"""A file or folder, and the formats that recognise it."""
+
+
+class Search:
+    """Goes through files and folders, and notes what it had to leave out."""
+
+    def __init__(self) -> None:
+        self.left_out: list[LeftOut] = []
+        self._formats = FORMATS.all()
+        self._seen: set[Path] = set()
+
+    def look(self, paths: Sequence[Path]) -> tuple[list[Thing], Path]:
+        """Everything that is recognised, each thing once, and the folder that all paths have in common.
+
+        Raises:
+            DataError: a path does not exist.
+        """
+        things: list[Thing] = []
+        bases: list[Path] = []
+        for path in paths:
+            if not path.exists():
+                raise DataError(path, "does not exist", "check the path")
+            found = list(self._under(path))
+            alone = not path.is_dir() or [thing for thing, _ in found] == [path]
+            bases.append(path.parent if alone else path)
+            things += found
+        return sorted(things, key=lambda thing: thing[0]), Path(os.path.commonpath(bases))
+
+    def _under(self, path: Path) -> Iterator[Thing]:
+        """The things at a path and below it."""
+        if path.resolve() in self._seen:  # named twice, or a link that leads back
+            return
+        self._seen.add(path.resolve())
+        if not _is_text(path):
+            self.left_out.append(LeftOut(path, "its name is no text that a manifest could state, left out"))
+        elif path.is_dir():
+            yield from self._under_folder(path)
+        elif formats := self._recognising(path):
+            yield path, formats
+        else:
+            self.left_out.append(LeftOut(path, _why_left_out(path)))
+
+    def _under_folder(self, folder: Path) -> Iterator[Thing]:
+        """The folder itself where it is one thing, and what lies in it but is no part of that."""
+        children = self._children(folder)
+        formats = [f for f in self._recognising(folder) if self._is_whole(folder, children, f)]
+        if not formats:
+            for child in children:
+                yield from self._under(child)
+            return
+        yield folder, formats
+        kinds = {kind_of_format(format_) for format_ in formats}
+        for child in children:
+            if child.is_dir():
+                yield from self._under(child)
+            elif KeypointFormat not in kinds or child.suffix.lower() != ".json":
+                others = [f for f in self._recognising(child) if kind_of_format(f) not in kinds]
+                if others:
+                    yield child, others
+
+    def _is_whole(self, folder: Path, children: Sequence[Path], format_: Format) -> bool:
+        """Whether a folder that a format recognises is one thing, and not a place where such things lie.
+
+        Files of keypoints, one for each camera, are recognised as a folder too, and so are a log that lies
+        alone in a folder and the files of a bag beside the videos of its flight.
+        """
+        if isinstance(format_, LogFormat):
+            inside = [kind_of_format(f) for child in children for f in self._recognising(child)]
+            alone = len(inside) == 1 and not (folder / "metadata.yaml").exists()
+            return not alone and all(kind is LogFormat for kind in inside)
+        if not isinstance(format_, KeypointFormat):
+            return True
+        files = [child for child in children if child.suffix.lower() == ".json"]
+        asked = files[:: max(1, len(files) // _FILES_ASKED)]
+        if len(files) < 2 or any(f is not format_ for file in asked for f in self._recognising(file)):
+            return False
+        try:
+            format_.read_keypoints(folder, skeleton=None, first_frame=0)
+        except DataError:  # two files of one frame: they are of several cameras
+            return False
+        return True
+
+    def _children(self, folder: Path) -> list[Path]:
+        try:
+            children = sorted(folder.iterdir())
+        except OSError as error:
+            self.left_out.append(LeftOut(folder, f"cannot be read ({error.strerror}), left out"))
+            return []
+        return [c for c in children if not c.name.startswith(".") and c.suffix != ".session" and c.exists()]
+
+    def _recognising(self, path: Path) -> list[Format]:
+        return [format_ for format_ in self._formats if format_.recognises(path)]
+
+
+def kind_of_format(format_: Format) -> type | None:
+    """The protocol that a format keeps to."""
+    kinds = (
+        KeypointFormat,
+        TrajectoryFormat,
+        CalibrationFormat,
+        JointFormat,
+        LogFormat,
+        VideoFormat,
+        MapFormat,
+        TelemetryFormat,
+    )
+    return next((kind for kind in kinds if isinstance(format_, kind)), None)
+
+
+def _is_text(path: Path) -> bool:
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _why_left_out(path: Path) -> str:
+    """What to say of a file that no format knows."""
+    if path.suffix.lower() in {".yaml", ".yml"}:
+        try:
+            read_flight(path)
+        except DataError:
+            pass
+        else:
+            return "is a flight manifest already (run `mocap ingest` on it), left out"
+    return f"not recognised{why_not(path)}, left out"
