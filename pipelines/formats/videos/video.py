@@ -19,23 +19,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.common.summaries import describe_times
+from pipelines.formats.videos.containers import container_format, open_container, packets
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, VideoIndex
 
 if TYPE_CHECKING:
-    from av import Packet, VideoFrame
+    from av import VideoFrame
     from av.container import InputContainer
     from av.video.stream import VideoStream
 
 Picture = NDArray[np.uint8]  # [height, width, 3] blue, green, red
 
-_MOST_PIXELS = 1 << 27  # 16384 x 8192; a header that states more is damaged, and memory is finite
 _LATEST_S = 4 * 10**9  # after the year 2096, counted from the epoch; int64 ns hold 292 years
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _NO_DATE_BEFORE = timedelta(days=365 * 15)  # 1985: there were no drones
 _MOST_KEY_FRAMES = 3  # to seek before a frame counts as undecodable
-_MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
-_PACKET_TS, _PACKET_M2TS = 188, 192
 
 
 class VideoContainer:
@@ -51,7 +49,7 @@ class VideoContainer:
             if not path.is_file():
                 return False
             empty = path.suffix.lower() in self.suffixes and path.stat().st_size == 0
-            return empty or _container_format(path) is not None
+            return empty or container_format(path) is not None
         except OSError:
             return False
 
@@ -106,7 +104,7 @@ def created_ns(path: Path) -> int | None:
     Raises:
         DataError: it cannot be opened as a video.
     """
-    container, stream = _open(path)
+    container, stream = open_container(path)
     with container:
         texts = [{**container.metadata}.get("creation_time"), {**stream.metadata}.get("creation_time")]
     for text in texts:
@@ -234,7 +232,7 @@ class VideoReader:
 
     def _begin(self) -> None:
         """Open the file and decode from the beginning."""
-        self._container, self._stream = _open(self._path)
+        self._container, self._stream = open_container(self._path)
         self._coming = _numbered(self._container, self._stream, self._scan.ticks, sought=False)
         self._next = next(self._coming, None)
 
@@ -285,18 +283,18 @@ class _Packet(NamedTuple):
 
 def _scan(path: Path) -> _Scan:
     """The stamps of all packets, in the order of showing."""
-    container, stream = _open(path)
+    container, stream = open_container(path)
     with container:
         size = path.stat().st_size
-        packets = [
+        stored = [
             _Packet(packet.pos, packet.pts, packet.is_keyframe)
-            for packet in _packets(container, stream)
+            for packet in packets(container, stream)
             if not packet.is_discard
         ]
         # Only a whole table, as of MP4, lists frames beyond the file's end.
         lost = {e.pos: e.timestamp for e in stream.index_entries if e.size > 0 and e.pos + e.size > size}
         tick_s = Fraction(stream.time_base or 0)
-    whole = [packet for packet in packets if packet.position not in lost]
+    whole = [packet for packet in stored if packet.position not in lost]
     stamped = [(packet.pts, packet.key) for packet in whole if packet.pts is not None]
     first_lost = min(lost.values(), default=0)
     # No frame is shown before it is decoded: what is shown before the first lost one's decoding is complete.
@@ -355,118 +353,7 @@ def _is_variable(ticks: Int64) -> bool:
     return bool(np.abs(ticks - ticks[0] - even).max() > max(1.0, 0.01 * even[1]))
 
 
-# --- FFmpeg ---------------------------------------------------------------------------------------------
-
-
-def _open(path: Path) -> tuple[InputContainer, VideoStream]:
-    """A container and its largest video stream, ready to decode."""
-    import av
-    from av.error import FFmpegError
-    from av.stream import Disposition
-
-    container_format = _sniff(path)
-    try:
-        # Named format and protocol: a playlist under this name must not make FFmpeg open other files.
-        container = av.open(f"file:{path.absolute()}", format=container_format, metadata_errors="replace")
-    except FFmpegError as error:
-        raise _unreadable(path, container_format, "cannot be opened as a video") from error
-    streams = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
-    if not streams:
-        container.close()
-        raise _unreadable(path, container_format, "holds no video stream")
-    known = [s for s in streams if _has_decoder(s)]
-    if not known:
-        container.close()
-        raise DataError(path, "is coded in a way that FFmpeg cannot decode", "export it again, as H.264")
-    stream = max(known, key=lambda s: s.width * s.height)
-    if stream.width * stream.height > _MOST_PIXELS:
-        container.close()
-        raise DataError(
-            path,
-            f"states pictures of {stream.width} x {stream.height} px",
-            "its header is damaged: copy it again",
-        )
-    stream.codec_context.options = {"max_pixels": str(_MOST_PIXELS)}
-    # Not frame by frame: then what is made of a damaged frame depends on the number of processors.
-    stream.thread_type = "SLICE"
-    return container, stream
-
-
-def _has_decoder(stream: VideoStream) -> bool:
-    context: object = stream.codec_context  # None for an unknown codec, whatever its annotation says
-    return context is not None
-
-
-def _unreadable(path: Path, container_format: str, problem: str) -> DataError:
-    if container_format == "mov" and not _has_table(path):
-        return DataError(
-            path,
-            "has no table of its frames (moov): the recording was not closed, or the file is cut off",
-            "copy it again, or repair it with a whole recording of the same camera",
-        )
-    return DataError(path, problem, "check that it is a video, and copy it again")
-
-
-def _sniff(path: Path) -> str:
-    """FFmpeg's name of the container, by its first bytes."""
-    try:
-        size = path.stat().st_size
-        container_format = _container_format(path)
-    except OSError as error:
-        raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
-    if not size:
-        raise DataError(path, "is empty", "copy it from the camera again")
-    if container_format is None:
-        raise DataError(
-            path, "is no video container that is known here", "known are MP4, MOV, MKV, WebM, AVI, MPEG-TS"
-        )
-    return container_format
-
-
-def _container_format(path: Path) -> str | None:
-    with path.open("rb") as file:
-        head = file.read(2 * _PACKET_M2TS)
-    if head[4:8] in _MP4_BOXES:
-        return "mov"
-    if head.startswith(b"\x1a\x45\xdf\xa3"):
-        return "matroska"
-    if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
-        return "avi"
-    for first, step in ((0, _PACKET_TS), (4, _PACKET_M2TS)):
-        if head[first : first + 1] == b"G" == head[first + step : first + step + 1]:
-            return "mpegts"
-    return None
-
-
-def _has_table(path: Path) -> bool:
-    """Whether an MP4 has its `moov` box, whole."""
-    size = path.stat().st_size
-    start = 0
-    with path.open("rb") as file:
-        while start + 8 <= size:
-            file.seek(start)
-            head = file.read(16)
-            length = int.from_bytes(head[:4], "big")
-            if length == 1:
-                length = int.from_bytes(head[8:], "big")
-            if head[4:8] == b"moov":
-                return length >= 8 and start + length <= size
-            if length < 8:
-                return False
-            start += length
-    return False
-
-
-def _packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
-    """The coded frames as they are stored, as far as the container can be read."""
-    from av.error import FFmpegError
-
-    try:
-        for packet in container.demux(stream):
-            if packet.size:  # the last, empty one only tells the decoder that it is the last
-                yield packet
-    except FFmpegError:
-        return
+# --- decoding -----------------------------------------------------------------------------------------
 
 
 def _numbered(
@@ -481,7 +368,7 @@ def _numbered(
 
     first = None if sought else int(ticks[0])
     last = -1
-    for packet in chain(_packets(container, stream), (None,)):
+    for packet in chain(packets(container, stream), (None,)):
         if first is None:
             if packet is None or packet.pts is None or not packet.is_keyframe:
                 continue

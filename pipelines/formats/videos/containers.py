@@ -1,0 +1,139 @@
+"""The containers that videos come in: which one a file is, its largest stream, the coded frames in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipelines.session.errors import DataError
+
+if TYPE_CHECKING:
+    from av import Packet
+    from av.container import InputContainer
+    from av.video.stream import VideoStream
+
+_MOST_PIXELS = 1 << 27  # 16384 x 8192; a header that states more is damaged, and memory is finite
+_MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
+_PACKET_TS, _PACKET_M2TS = 188, 192
+
+
+def open_container(path: Path) -> tuple[InputContainer, VideoStream]:
+    """A container and its largest video stream, ready to decode; cover pictures are none.
+
+    Raises:
+        DataError: missing, empty, no container that is known here, without its table or a video stream, a
+            codec that cannot be decoded, or a picture size beyond reason.
+    """
+    import av
+    from av.error import FFmpegError
+    from av.stream import Disposition
+
+    kind = _kind(path)
+    try:
+        # Named format and protocol: a playlist under this name must not make FFmpeg open other files.
+        container = av.open(f"file:{path.absolute()}", format=kind, metadata_errors="replace")
+    except FFmpegError as error:
+        raise _unreadable(path, kind, "cannot be opened as a video") from error
+    streams = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
+    if not streams:
+        container.close()
+        raise _unreadable(path, kind, "holds no video stream")
+    known = [s for s in streams if _has_decoder(s)]
+    if not known:
+        container.close()
+        raise DataError(path, "is coded in a way that FFmpeg cannot decode", "export it again, as H.264")
+    stream = max(known, key=lambda s: s.width * s.height)
+    if stream.width * stream.height > _MOST_PIXELS:
+        container.close()
+        raise DataError(
+            path,
+            f"states pictures of {stream.width} x {stream.height} px",
+            "its header is damaged: copy it again",
+        )
+    stream.codec_context.options = {"max_pixels": str(_MOST_PIXELS)}
+    # Not frame by frame: then what is made of a damaged frame depends on the number of processors.
+    stream.thread_type = "SLICE"
+    return container, stream
+
+
+def _has_decoder(stream: VideoStream) -> bool:
+    context: object = stream.codec_context  # None for an unknown codec, whatever its annotation says
+    return context is not None
+
+
+def _unreadable(path: Path, kind: str, problem: str) -> DataError:
+    if kind == "mov" and not _has_table(path):
+        return DataError(
+            path,
+            "has no table of its frames (moov): the recording was not closed, or the file is cut off",
+            "copy it again, or repair it with a whole recording of the same camera",
+        )
+    return DataError(path, problem, "check that it is a video, and copy it again")
+
+
+def _kind(path: Path) -> str:
+    """FFmpeg's name of the container, by its first bytes."""
+    try:
+        size = path.stat().st_size
+        kind = container_format(path)
+    except OSError as error:
+        raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
+    if not size:
+        raise DataError(path, "is empty", "copy it from the camera again")
+    if kind is None:
+        raise DataError(
+            path, "is no video container that is known here", "known are MP4, MOV, MKV, WebM, AVI, MPEG-TS"
+        )
+    return kind
+
+
+def container_format(path: Path) -> str | None:
+    """FFmpeg's name of the container that a file begins as; None for one that is not known here.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        head = file.read(2 * _PACKET_M2TS)
+    if head[4:8] in _MP4_BOXES:
+        return "mov"
+    if head.startswith(b"\x1a\x45\xdf\xa3"):
+        return "matroska"
+    if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
+        return "avi"
+    for first, step in ((0, _PACKET_TS), (4, _PACKET_M2TS)):
+        if head[first : first + 1] == b"G" == head[first + step : first + step + 1]:
+            return "mpegts"
+    return None
+
+
+def _has_table(path: Path) -> bool:
+    """Whether an MP4 has its `moov` box, whole."""
+    size = path.stat().st_size
+    start = 0
+    with path.open("rb") as file:
+        while start + 8 <= size:
+            file.seek(start)
+            head = file.read(16)
+            length = int.from_bytes(head[:4], "big")
+            if length == 1:
+                length = int.from_bytes(head[8:], "big")
+            if head[4:8] == b"moov":
+                return length >= 8 and start + length <= size
+            if length < 8:
+                return False
+            start += length
+    return False
+
+
+def packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
+    """The coded frames as they are stored, as far as the container can be read."""
+    from av.error import FFmpegError
+
+    try:
+        for packet in container.demux(stream):
+            if packet.size:  # the last, empty one only tells the decoder that it is the last
+                yield packet
+    except FFmpegError:
+        return
