@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.reporting.comparison import MEASURES, Comparison, Judged, Measure
-from pipelines.reporting.figures import percentiles, time_bins
+from pipelines.reporting.over_time import percentiles, time_bins
 from pipelines.reporting.plates import LINE_STYLES, Plate, quiet, stacked, table, tabled
 from pipelines.reporting.svg import CAMERAS, MUTED, WIDTH_IN, page_style
 from pipelines.reporting.wording import fixed, joint_label, listing, quantity, shortened

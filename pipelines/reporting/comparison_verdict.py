@@ -9,7 +9,7 @@ import numpy as np
 from pipelines.geometry.bootstrap import LEVEL, RESAMPLES, STRETCH_S
 from pipelines.reporting.comparison import Comparison, Difference, Estimate, Judged, Measure, Pair
 from pipelines.reporting.content import text
-from pipelines.reporting.summary import Verdict
+from pipelines.reporting.verdict import Verdict
 from pipelines.reporting.wording import THIN, fixed, listing, percent, plural, quantity
 
 _WHAT = {"mpjpe": "from the truth", "reprojection": "from the keypoints in the pictures"}

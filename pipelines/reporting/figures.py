@@ -1,4 +1,4 @@
-"""The figures of a page: where everybody was, how the errors went, what each joint is worth.
+"""The figures of a session's page: those of its cameras, joints and bones, and the list of all.
 
 Each function draws one figure from the summary and says in its description what is to be seen.
 Long recordings are drawn with at most `MOST_POINTS` points a path and `MOST_BINS` stretches of time;
@@ -12,29 +12,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.geometry.poses import rotate
-from pipelines.geometry.triangulation import STATUS
-from pipelines.reporting.bones import side_of
-from pipelines.reporting.motion import Motion
+from pipelines.reporting.over_time import draw_over_time
+from pipelines.reporting.paths_from_above import draw_paths
 from pipelines.reporting.plates import (
-    LINE_STYLES,
-    MOST_POINTS,
     Plate,
-    axis_label,
-    every,
-    near_zero,
     quiet,
-    stacked,
     table,
     tabled,
 )
+from pipelines.reporting.snapshots import draw_snapshots
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.svg import (
     CAMERAS,
-    INK,
     LEFT,
     MIDDLE,
-    MUTED,
     PAPER,
     RIGHT,
     STATUS_COLOURS,
@@ -42,7 +33,6 @@ from pipelines.reporting.svg import (
     page_style,
 )
 from pipelines.reporting.wording import (
-    STATUS_LABELS,
     fixed,
     joint_label,
     listing,
@@ -51,19 +41,9 @@ from pipelines.reporting.wording import (
     quantity,
     shortened,
 )
-from pipelines.session.records import Float, Int64
-from pipelines.session.skeletons import bones_of, with_derived
-from pipelines.session.tabular import trajectory_from
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.axes import Axes
-
-MOST_BINS = 300
-SNAPSHOTS = 7
-_STRIDE_M = 1.3  # between two snapshots of the body
-# Above a raised hand, and below the ground by more than errors explain: what lies beyond is cut off.
-_TALLEST_M, _DEEPEST_M = 2.6, 0.5
 
 
 def draw_all(summary: Summary, poses: Mapping[str, pd.DataFrame]) -> dict[str, Plate]:
@@ -71,12 +51,12 @@ def draw_all(summary: Summary, poses: Mapping[str, pd.DataFrame]) -> dict[str, P
     motion = summary.motion
     plates = [_timeline(summary.cameras)]
     measured = motion is not None and bool(motion.measured.any())
-    plates.append(_top_view(summary.cameras, poses, motion if measured else None))
+    plates.append(draw_paths(summary.cameras, poses, motion if measured else None))
     if motion is not None:
-        plates.append(_over_time(summary, motion))
+        plates.append(draw_over_time(summary, motion))
         plates.append(_joint_bars(summary))
     if motion is not None and measured:
-        plates.append(_snapshots(summary, motion))
+        plates.append(draw_snapshots(summary, motion))
         if summary.bones:
             plates.append(_bone_lengths(summary))
     return {plate.key: plate for plate in plates}
@@ -120,219 +100,6 @@ def _spoken(camera: CameraRow) -> str:
     return f"{camera.name}: {fixed(camera.first_s)} s to {fixed(camera.last_s)} s, {gaps}."
 
 
-# --- where everybody was -------------------------------------------------------------------------------
-
-
-def _top_view(
-    cameras: tuple[CameraRow, ...], poses: Mapping[str, pd.DataFrame], motion: Motion | None
-) -> Plate:
-    from matplotlib.figure import Figure
-
-    tracks = {camera.name: trajectory_from(poses[camera.name]) for camera in cameras if camera.name in poses}
-    people = _middles(motion) if motion is not None else []
-    everything = np.concatenate(
-        [np.full((1, 2), np.nan), *people, *(track.position[:, :2] for track in tracks.values())]
-    )
-    everything = everything[np.isfinite(everything).all(axis=1)]
-    low, high = (everything.min(axis=0), everything.max(axis=0)) if len(everything) else (np.zeros(2),) * 2
-    origin = near_zero(low)
-    extent = np.maximum(high - low, 2.0)
-    height_in = float(np.clip(0.75 * WIDTH_IN * extent[1] / extent[0], 3.2, 6.2))
-
-    with page_style():
-        figure = Figure((WIDTH_IN, height_in), layout="constrained")
-        axes = figure.subplots()
-        axes.grid(visible=True)
-        step, drawn = 1, []
-        for k, camera in enumerate(cameras):
-            if camera.name in tracks:
-                track = tracks[camera.name]
-                look = rotate(track.quaternion_xyzw, np.array([0.0, 0.0, 1.0]))[:, :2]
-                style = (CAMERAS[k % len(CAMERAS)], LINE_STYLES[k // len(CAMERAS) % len(LINE_STYLES)])
-                gaps_ns = camera.entry.poses.gaps_ns
-                ground = track.position[:, :2] - origin
-                path, stride = _drawn_path(track.t_ns, ground, [start for start, _ in gaps_ns])
-                step = max(step, stride)
-                drawn.append(_numbers_of_path(camera.name, path + origin))
-                _draw_camera(axes, shortened(camera.name), path, ground, look, style, float(extent.max()))
-        for k, person in enumerate(people):
-            stride = every(len(person), MOST_POINTS)
-            path = person[::stride] - origin
-            step = max(step, stride)
-            label = "actor" if len(people) == 1 else f"person {k}"
-            drawn.append(_numbers_of_path(label, path + origin))
-            line = LINE_STYLES[k % len(LINE_STYLES)]
-            axes.plot(*path.T, color=INK, linewidth=2.0, linestyle=line, label=label, zorder=4)
-            start = path[np.isfinite(path[:, 0])][:1]
-            axes.plot(*start.T, "o", color=INK, markerfacecolor=PAPER, markersize=5, zorder=5)
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.margins(0.06)
-        axes.set_xlabel(axis_label("east", origin[0]))
-        axes.set_ylabel(axis_label("north", origin[1]))
-        figure.legend(loc="outside right upper")
-        quiet(axes, grid=False)
-        title = "Seen from above"
-        paths = [f"{name} over {quantity(_length_m(t.position), 'm')}" for name, t in tracks.items()]
-        paths += [f"the actor over {quantity(_length_m(person), 'm')}" for person in people]
-        told = f"Paths on the ground plane: {listing(paths)}."
-    caption = "Paths of the cameras" + (" and of the actor (middle of the measured joints)" if people else "")
-    caption += "; an open circle marks the start, short strokes the direction of view."
-    return Plate("top", title, caption + _decimation(step, "pose"), told, figure, {"": stacked(drawn)})
-
-
-def _numbers_of_path(who: str, path: Float) -> pd.DataFrame:
-    """A drawn path [N, 2]; empty where it is broken."""
-    return table(who=who, east_m=path[:, 0], north_m=path[:, 1])
-
-
-def _draw_camera(
-    axes: Axes,
-    label: str,
-    path: Float,
-    ground: Float,
-    look: Float,
-    style: tuple[str, object],
-    extent_m: float,
-) -> None:
-    """A path with strokes in the direction of view; a camera that stands still is a square."""
-    colour, line = style
-    still = bool(np.nanmax(np.ptp(ground, axis=0), initial=0.0) < 0.005 * extent_m)
-    if still:
-        axes.plot(*ground[:1].T, "s", color=colour, markersize=5, label=label)
-    else:
-        axes.plot(*path.T, color=colour, linestyle=line, label=label)
-        axes.plot(*ground[:1].T, "o", color=colour, markerfacecolor=PAPER, markersize=4)
-    at = np.unique(np.linspace(0, len(ground) - 1, 1 if still else 12).astype(int))
-    tip = ground[at] + look[at] * 0.035 * extent_m
-    strokes = np.full((3 * len(at), 2), np.nan)
-    strokes[0::3], strokes[1::3] = ground[at], tip
-    axes.plot(*strokes.T, color=colour, linewidth=0.8)
-
-
-def _drawn_path(t_ns: Int64, path: Float, gap_starts_ns: list[int]) -> tuple[Float, int]:
-    """A decimated path, broken where the poses have a gap, and every how many poses were drawn."""
-    stride = every(len(path), MOST_POINTS)
-    breaks = np.unique(np.searchsorted(t_ns, gap_starts_ns, side="right"))
-    pieces = []
-    for rows in np.split(np.arange(len(path)), breaks):
-        if rows.size:
-            kept = np.unique([*rows[::stride], rows[-1]])
-            pieces += [path[kept], np.full((1, 2), np.nan)]
-    return (np.concatenate(pieces), stride) if pieces else (path, stride)
-
-
-def _middles(motion: Motion) -> list[Float]:
-    """The middle of each person's measured joints, seen from above, [T, 2]; NaN where there are none.
-
-    Coordinate-wise median: one joint that went astray does not bend the path.
-    """
-    middles = []
-    for position in np.moveaxis(motion.measured_position[..., :2], 1, 0):
-        seen = np.isfinite(position[..., 0]).any(axis=1)
-        middle = np.full((len(position), 2), np.nan)
-        middle[seen] = np.nanmedian(position[seen], axis=1)
-        middles.append(middle)
-    return middles
-
-
-def _length_m(path: Float) -> float:
-    steps = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1)
-    return float(steps[np.isfinite(steps)].sum())
-
-
-# --- errors over time ----------------------------------------------------------------------------------
-
-
-def _over_time(summary: Summary, motion: Motion) -> Plate:
-    from matplotlib.figure import Figure
-
-    seconds = (motion.t_ns - summary.origin_ns) / 1e9
-    values = motion.reprojection_px if summary.errors_mm is None else summary.errors_mm
-    unit = "px" if summary.errors_mm is None else "mm"
-    what = "reprojection error" if summary.errors_mm is None else "distance from truth"
-    bins = time_bins(seconds)
-    centres, shares = _status_shares(seconds, motion, bins)
-    middle, low, high = percentiles(np.where(motion.measured, values, np.nan), seconds, bins)
-    with page_style():
-        figure = Figure((WIDTH_IN, 3.5), layout="constrained")
-        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
-        upper.grid(visible=True, axis="y")
-        upper.fill_between(centres, low, high, color=STATUS_COLOURS["ok"], alpha=0.22, linewidth=0)
-        upper.plot(centres, middle, color=STATUS_COLOURS["ok"])
-        upper.set_ylim(0, 1.08 * np.nanmax(high, initial=0.0) or 1.0)
-        upper.set_ylabel(f"{what} ({unit})")
-        quiet(upper, grid=False)
-        base = np.zeros(len(centres))
-        for word in _present(summary):
-            top = base + 100 * shares[STATUS.index(word)]
-            lower.fill_between(
-                *_steps(bins, base, top), color=STATUS_COLOURS[word], linewidth=0, label=STATUS_LABELS[word]
-            )
-            base = top
-        lower.set_ylim(0, 100)
-        lower.set_xlim(bins[0], bins[-1])
-        lower.set_ylabel("joints (%)")
-        lower.set_xlabel("time (s)")
-        quiet(lower)
-        figure.legend(loc="outside upper left", ncols=len(STATUS))
-        title = f"{what.capitalize()} over time, and what became of the joints"
-        worst = int(np.nanargmax(middle)) if np.isfinite(middle).any() else None
-        told = (
-            "No joint was measured."
-            if worst is None
-            else f"The median over joints lies between {quantity(float(np.nanmin(middle)), unit)} and "
-            f"{quantity(float(middle[worst]), unit)}, the largest at {quantity(float(centres[worst]), 's')}."
-        )
-    caption = (
-        f"Above: {what} of the measured joints, median and the range from the 10th to the 90th percentile. "
-        "Below: the share of joints measured, and why the others were not."
-    )
-    if len(centres) < len(motion.t_ns):
-        caption += f" Each point stands for {bins[1] - bins[0]:.2g} s."
-    shown = {word: 100 * shares[STATUS.index(word)] for word in _present(summary)}
-    numbers = table(
-        t_s=centres,
-        **{f"median_{unit}": middle, f"p10_{unit}": low, f"p90_{unit}": high},
-        **{f"{word}_percent": share for word, share in shown.items()},
-    )
-    return Plate("time", title, caption, told, figure, {"": numbers})
-
-
-def time_bins(seconds: Float, most: int = MOST_BINS) -> Float:
-    """Edges of at most so many bins; one per stamp if there are fewer stamps."""
-    count = min(len(seconds), most)
-    step = (seconds[-1] - seconds[0]) / max(len(seconds) - 1, 1) or 1.0
-    edges: Float = np.linspace(seconds[0] - step / 2, seconds[-1] + step / 2, count + 1)
-    return edges
-
-
-def percentiles(values: Float, seconds: Float, bins: Float) -> tuple[Float, Float, Float]:
-    """Median, 10th and 90th percentile of the finite values in each bin; NaN in an empty one."""
-    edges = np.searchsorted(seconds, bins)
-    result = np.full((3, len(bins) - 1), np.nan)
-    for k in range(len(bins) - 1):
-        inside = values[edges[k] : edges[k + 1]]
-        finite = inside[np.isfinite(inside)]
-        if finite.size:
-            result[:, k] = np.percentile(finite, [50, 10, 90])
-    return result[0], result[1], result[2]
-
-
-def _status_shares(seconds: Float, motion: Motion, bins: Float) -> tuple[Float, Float]:
-    """Centres of the bins, and the share of every status in each, [S, bins]; 0 where there are no rows."""
-    edges = np.searchsorted(seconds, bins)
-    per_time = np.stack([(motion.status == s).sum(axis=(1, 2)) for s in range(len(STATUS))])
-    running = np.concatenate([np.zeros((len(STATUS), 1)), np.cumsum(per_time, axis=1)], axis=1)
-    counts = np.diff(running[:, edges], axis=1)
-    return (bins[:-1] + bins[1:]) / 2, counts / np.maximum(counts.sum(axis=0), 1)
-
-
-def _steps(bins: Float, low: Float, high: Float) -> tuple[Float, Float, Float]:
-    """The corners of a step line: a share holds for the whole of its bin."""
-    corners = np.repeat(bins, 2)[1:-1]
-    return corners, np.repeat(low, 2), np.repeat(high, 2)
-
-
 # --- joint by joint ------------------------------------------------------------------------------------
 
 
@@ -344,7 +111,7 @@ def _joint_bars(summary: Summary) -> Plate:
         figure = Figure((WIDTH_IN / 2, _joint_height_in(summary)), layout="constrained")
         axes = figure.subplots()
         left = np.zeros(len(rows))
-        for word in _present(summary):
+        for word in summary.statuses:
             share = np.array([100 * row.counts[word] / max(sum(row.counts.values()), 1) for row in rows])
             axes.barh(range(len(rows)), share, 0.72, left, color=STATUS_COLOURS[word])
             left += share
@@ -360,7 +127,7 @@ def _joint_bars(summary: Summary) -> Plate:
         joint=[row.name for row in rows],
         **{
             f"{word}_percent": [100 * row.counts[word] / max(sum(row.counts.values()), 1) for row in rows]
-            for word in _present(summary)
+            for word in summary.statuses
         },
     )
     caption = "Colours as in the figure of errors over time."
@@ -410,103 +177,3 @@ def _bone_lengths(summary: Summary) -> Plate:
         relative_spread=[b.spread for b in bones],
     )
     return Plate("bones", title, caption, f"Median and relative spread: {told}.", figure, {"": numbers})
-
-
-# --- the body ------------------------------------------------------------------------------------------
-
-
-def _snapshots(summary: Summary, motion: Motion) -> Plate:
-    from matplotlib.figure import Figure
-
-    chosen = _fullest_times(motion)
-    joints, position = with_derived(motion.joints, motion.measured_position[chosen, 0])
-    # The median over the snapshots: a joint far below the ground must not lift every body.
-    ground = float(np.median(np.nanmin(position[..., 2], axis=1)))
-    top = float(np.clip(np.nanmax(position[..., 2]) - ground + 0.1, 1.0, _TALLEST_M))
-    bottom = float(np.clip(np.nanmin(position[..., 2]) - ground, -_DEEPEST_M, 0.0)) - 0.05
-    width = _STRIDE_M * SNAPSHOTS
-    with page_style():
-        figure = Figure((WIDTH_IN, 0.5 + (WIDTH_IN - 0.6) * (top - bottom) / width), layout="constrained")
-        axes = figure.subplots()
-        seconds = [(int(motion.t_ns[k]) - summary.origin_ns) / 1e9 for k in chosen]
-        labels = [f"{fixed(t_s)} s" for t_s in seconds]
-        drawn = []
-        for k, body in enumerate(position):
-            aside, up = _three_quarter_view(body, joints)
-            _draw_body(axes, aside + _STRIDE_M * k, up - ground, joints)
-            drawn.append(np.stack([aside, up - ground], axis=-1))
-        axes.set_xlim(-_STRIDE_M / 2, width - _STRIDE_M / 2)
-        axes.set_ylim(bottom, top)
-        axes.set_yticks(np.arange(0.0, top, 0.5))
-        axes.set_aspect("equal")
-        axes.set_xticks(_STRIDE_M * np.arange(len(chosen)), labels)
-        axes.set_ylabel("height (m)")
-        axes.grid(visible=True, axis="y")
-        quiet(axes, grid=False)
-        axes.spines["bottom"].set_visible(False)
-        axes.tick_params(axis="x", length=0)
-        title = "The body at a few moments"
-        told = f"{plural(len(chosen), 'snapshot')} at {listing(labels)}."
-    whose = "" if motion.position.shape[1] == 1 else " of the first person"
-    caption = (
-        f"The fullest skeleton{whose} in each stretch of time, facing right and seen from its right, "
-        "half from the front; left limbs in blue, right limbs in orange. "
-        "Heights count from where the feet stand."
-    )
-    places = np.concatenate(drawn)
-    numbers = table(
-        t_s=np.repeat(seconds, len(joints)),
-        joint=list(joints) * len(chosen),
-        right_m=places[:, 0],
-        above_ground_m=places[:, 1],
-    )
-    return Plate("body", title, caption, told, figure, {"": numbers})
-
-
-def _fullest_times(motion: Motion) -> list[int]:
-    """Of each of `SNAPSHOTS` equal stretches the time with most measured joints, nearest its middle."""
-    count = motion.measured[:, 0].sum(axis=1)
-    chosen = []
-    for rows in np.array_split(np.arange(len(count)), min(SNAPSHOTS, len(count))):
-        best = rows[count[rows] == count[rows].max()]
-        middle = best[np.argmin(np.abs(best - rows.mean()))]
-        if count[middle] >= 2:
-            chosen.append(int(middle))
-    return chosen or [int(np.argmax(count))]
-
-
-def _three_quarter_view(body: Float, joints: tuple[str, ...]) -> tuple[Float, Float]:
-    """Horizontal and vertical picture coordinates in metres of one body [J, 3].
-
-    The picture's right is where the body faces, turned 35 degrees towards its left, so that both sides show.
-    """
-    facing = np.array([1.0, 0.0])
-    for left, right in (("left_hip", "right_hip"), ("left_shoulder", "right_shoulder")):
-        if left in joints and right in joints:
-            across = (body[joints.index(left)] - body[joints.index(right)])[:2]
-            if np.isfinite(across).all() and np.linalg.norm(across) > 0:
-                facing = np.array([across[1], -across[0]]) / np.linalg.norm(across)
-                break
-    leftward = np.array([-facing[1], facing[0]])
-    right_of_picture = np.cos(np.radians(35)) * facing + np.sin(np.radians(35)) * leftward
-    ground = body[:, :2] - np.nanmedian(body[:, :2], axis=0)
-    return ground @ right_of_picture, body[:, 2]
-
-
-def _draw_body(axes: Axes, aside: Float, up: Float, joints: tuple[str, ...]) -> None:
-    place = {name: (aside[j], up[j]) for j, name in enumerate(joints)}
-    for start, end in bones_of(joints):
-        colour, order = {"left": (LEFT, 2), "right": (RIGHT, 4), "": (MIDDLE, 3)}[side_of(start, end)]
-        axes.plot(*zip(place[start], place[end], strict=True), color=colour, linewidth=1.7, zorder=order)
-    axes.plot(aside, up, "o", color=MUTED, markersize=1.6, zorder=5)
-
-
-# --- shared --------------------------------------------------------------------------------------------
-
-
-def _present(summary: Summary) -> list[str]:
-    return [word for word in STATUS if summary.counts.get(word)]
-
-
-def _decimation(step: int, noun: str) -> str:
-    return f" One {noun} in {step} is drawn." if step > 1 else ""

@@ -23,8 +23,9 @@ from pipelines.reporting.plates import Plate
 from pipelines.reporting.quality import quality
 from pipelines.reporting.replanned import Replan, summarise_replan
 from pipelines.reporting.studies import draw_studies, summarise_studies
-from pipelines.reporting.summary import Summary, errors_per_camera, give_verdict, measures, summarise
+from pipelines.reporting.summary import Summary, errors_per_camera, measures, summarise
 from pipelines.reporting.templating import environment
+from pipelines.reporting.verdict import give_verdict
 from pipelines.reporting.viewer import make_scene
 
 

@@ -1,0 +1,185 @@
+"""What is to be thought of a session: how good, how sure and what is doubtful, in plain sentences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.reporting.content import SessionContent, items, number, section
+from pipelines.reporting.summary import Summary, errors_per_camera, finite_median
+from pipelines.reporting.wording import (
+    STATUS_LABELS,
+    STATUS_REASONS,
+    STATUS_REMEDIES,
+    joint_label,
+    listing,
+    percent,
+    plural,
+    quantity,
+    whole,
+)
+
+# Below this share of measured times a joint is named among the doubts.
+DOUBTFUL_COVERAGE = 0.8
+# A status is named among the doubts from this share of joint-frames on.
+NOTABLE_LOSS = 0.01
+# A camera is named among the doubts when its reprojection error is this many times the usual one.
+ODD_CAMERA = 2.0
+# A calibrated 95 % ellipsoid holds 95 % of the truths; outside these shares the page says so.
+BELIEVABLE_SHARES = (0.90, 0.99)
+# Root-relative error below this part of the absolute one: the cameras' poses carry most of the error.
+MOSTLY_SHARED = 0.6
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The page's first words."""
+
+    lead: str
+    quality: tuple[str, ...] = ()
+    certainty: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+
+
+def give_verdict(content: SessionContent, summary: Summary) -> Verdict:
+    """How good, how sure, and what is doubtful, in sentences that state their numbers."""
+    if content.skeleton is None:
+        lead = "This session was ingested, but not reconstructed yet: run mocap reconstruct on it."
+        return Verdict(lead, doubts=tuple(_doubts(content, summary)))
+    if summary.motion is None or summary.nothing_measured:
+        return Verdict(_why_nothing(summary), doubts=tuple(_doubts(content, summary)))
+    return Verdict(
+        _lead(summary),
+        quality=tuple(_quality(summary)),
+        certainty=tuple(_certainty(summary)),
+        doubts=tuple(_doubts(content, summary)),
+    )
+
+
+def _why_nothing(summary: Summary) -> str:
+    if not summary.counts:
+        return "Nothing was reconstructed: the skeleton has no rows."
+    word, count = max(summary.counts.items(), key=lambda item: item[1])
+    reason = STATUS_REASONS.get(word, STATUS_LABELS[word])
+    where = "In all of them" if count == summary.total else f"In {percent(count / summary.total)} of them"
+    return (
+        f"Nothing was reconstructed: none of {plural(summary.total, 'joint-frame')} passed. "
+        f"{where} {reason} ({word}). {STATUS_REMEDIES.get(word, '')}".rstrip()
+    )
+
+
+def _lead(summary: Summary) -> str:
+    share = summary.share or 0.0
+    amount = next(
+        words
+        for least, words in (
+            (1.0, "All of the motion was"),
+            (0.95, "Nearly all of the motion was"),
+            (0.7, "Most of the motion was"),
+            (0.4, "About half of the motion was"),
+            (0.0, "Only a small part of the motion was"),
+        )
+        if share >= least
+    )
+    return f"{amount} reconstructed: {percent(share)} of {plural(summary.total, 'joint-frame')}."
+
+
+def _quality(summary: Summary) -> list[str]:
+    absolute, root, aligned = (
+        number(summary.metrics, k) for k in ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm")
+    )
+    reprojection = number(section(summary.metrics, "reprojection_px"), "median")
+    sentences = []
+    if absolute is not None:
+        finer = [f"{quantity(root, 'mm')} relative to the hips"] if root is not None else []
+        finer += (
+            [f"{quantity(aligned, 'mm')} after aligning each frame with truth"] if aligned is not None else []
+        )
+        sentences.append(
+            f"Compared with truth, the joints are off by {quantity(absolute, 'mm')} on average"
+            + (f"; by {listing(finer)}." if finer else ".")
+        )
+        if root is not None and root < MOSTLY_SHARED * absolute:
+            sentences.append(
+                "Most of that is a shift common to all joints, as wrong camera poses make it, "
+                "rather than a wrong shape of the body."
+            )
+    else:
+        sentences.append("There is no truth to compare with, so the error in the world is not known.")
+    if reprojection is not None:
+        sentences.append(
+            f"The joints fall {quantity(reprojection, 'px')} from the keypoints (median over all views)."
+        )
+    if absolute is None and summary.bones:
+        worst = max(summary.bones, key=lambda bone: bone.spread)
+        typical = float(np.median([bone.spread for bone in summary.bones]))
+        sentences.append(
+            f"Bone lengths, which should not change, vary by {percent(typical)} (median over the bones), "
+            f"most of all the {f'{worst.side} {worst.name}'.strip()} with {percent(worst.spread)}."
+        )
+    return sentences
+
+
+def _certainty(summary: Summary) -> list[str]:
+    motion = summary.motion
+    sigma = finite_median(motion.sigma_m[motion.measured]) if motion is not None else None
+    if sigma is None:
+        return ["The method states no uncertainty for its positions."]
+    sentences = [f"The stated uncertainty of a joint is {quantity(1000 * sigma, 'mm')} per axis (median)."]
+    if summary.inside_95 is not None:
+        low, high = BELIEVABLE_SHARES
+        judgement = (
+            "too small: do not rely on it"
+            if summary.inside_95 < low
+            else "larger than need be"
+            if summary.inside_95 > high
+            else "about right"
+        )
+        sentences.append(
+            f"{percent(summary.inside_95)} of the true positions lie inside the stated 95{chr(0x202F)}% "
+            f"ellipsoids, so it is {judgement}."
+        )
+    return sentences
+
+
+def _odd_cameras(summary: Summary) -> list[str]:
+    """Cameras that agree far worse with the skeleton than the others do; three at least can tell."""
+    medians = {row.name: row.median_px for row in errors_per_camera(summary) if row.median_px is not None}
+    if len(medians) < 3:
+        return []
+    usual = float(np.median(list(medians.values())))
+    return [
+        f"{name}: its keypoints lie {quantity(median, 'px')} from the joints, those of the usual camera "
+        f"{quantity(usual, 'px')}; its calibration, poses or clock may be wrong."
+        for name, median in medians.items()
+        if median > ODD_CAMERA * usual
+    ]
+
+
+def _doubts(content: SessionContent, summary: Summary) -> list[str]:
+    doubts = []
+    losses = sorted(((n, word) for word, n in summary.counts.items() if word != "ok"), reverse=True)
+    if not summary.nothing_measured:
+        doubts += [
+            f"{percent(n / summary.total)} of the joint-frames: {STATUS_REASONS[word]} ({word})."
+            for n, word in losses
+            if n / summary.total >= NOTABLE_LOSS
+        ]
+        thin = sorted((row.share, row.name) for row in summary.joints if row.share < DOUBTFUL_COVERAGE)
+        if thin:
+            named = listing(f"{joint_label(name)} ({percent(share)})" for share, name in thin[:5])
+            more = f", and {len(thin) - 5} more" if len(thin) > 5 else ""
+            doubts.append(f"Seldom measured: {named}{more}.")
+    doubts += [
+        f"{camera.name}: no person was detected in {whole(missed)} of {plural(count, 'frame')}."
+        for camera in summary.cameras
+        if camera.entry.keypoints
+        and (missed := camera.entry.keypoints.frames_without_person)
+        >= NOTABLE_LOSS * (count := camera.entry.frames.count)
+    ]
+    doubts += _odd_cameras(summary)
+    doubts += summary.description.warnings
+    for record in content.stages.values():
+        doubts += [str(warning) for warning in items(record, "warnings")]
+    return list(dict.fromkeys(doubts))  # a stage repeats what ingest said
