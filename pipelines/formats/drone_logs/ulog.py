@@ -5,18 +5,12 @@ PX4 has its world in NED and its body in FRD, and stamps in microseconds since b
 
 from __future__ import annotations
 
-import contextlib
-import io
-import re
-import struct
-from collections.abc import Collection, Mapping, MutableMapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, MutableMapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from pipelines.formats.common.extras import need
 from pipelines.formats.common.stamps import Bool
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
@@ -27,6 +21,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     turned_as_stated,
     world_from_heading,
 )
+from pipelines.formats.drone_logs.ulog_file import MAGIC, Topic, open_ulog, topics_of
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.geodesy import Place, enu_from_enu
 from pipelines.geometry.mounting import attitude_in_enu
@@ -34,46 +29,10 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Int64
 from pipelines.session.telemetry import AttitudeTrack, PositionTrack, Telemetry, TelemetryChoice
 
-_MAGIC = b"ULog\x01\x12\x35"
-_MOST_FIELDS = 20_000  # of one message, with what is nested in it; PX4's largest has some hundreds
 _FAR_OFF_NS = 5_000_000_000  # a stamp this far from most others is wrong
 _3D_FIX = 3
 _GPS = ("vehicle_gps_position", "sensor_gps")
 _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64  # GIMBAL_DEVICE_FLAGS of MAVLink
-
-Columns = Mapping[str, Any]  # by field name, arrays [N] of whatever type the log has
-
-
-@dataclass(frozen=True)
-class _Topic:
-    """One instance of a topic."""
-
-    name: str
-    instance: int
-    columns: Columns
-
-    def __len__(self) -> int:
-        return len(self.columns["timestamp"])
-
-    def __contains__(self, field: str) -> bool:
-        return field in self.columns
-
-    def numbers(self, *fields: str) -> Float:
-        """[N] of one field, [N, F] of several, NaN throughout where the log has no such field."""
-        missing = np.full(len(self), np.nan)
-        columns = [np.asarray(self.columns.get(field, missing), dtype=np.float64) for field in fields]
-        return columns[0] if len(columns) == 1 else np.stack(columns, axis=1)
-
-    def flags(self, field: str) -> Bool:
-        """[N] whether a field is set; True throughout where the log has no such field."""
-        return np.asarray(self.columns.get(field, np.ones(len(self))) != 0, dtype=np.bool_)
-
-    def t_ns(self) -> Int64:
-        """[N] since boot: when it was sampled where the log says so, else when it was published."""
-        published = np.asarray(self.columns["timestamp"]).astype(np.int64)
-        sampled = np.asarray(self.columns.get("timestamp_sample", published)).astype(np.int64)
-        stamps: Int64 = np.where(sampled > 0, sampled, published) * 1000
-        return stamps
 
 
 class UlogFormat:
@@ -89,14 +48,14 @@ class UlogFormat:
             return False
         try:
             with path.open("rb") as file:
-                return file.read(len(_MAGIC)) == _MAGIC
+                return file.read(len(MAGIC)) == MAGIC
         except OSError:
             return False
 
     def describe(self, path: Path) -> dict[str, object]:
         """Topics and their messages, times, GPS, what of the estimates is valid, and damage."""
-        log = _open(path, None)
-        topics = _topics(log)
+        log = open_ulog(path, None)
+        topics = topics_of(log)
         stamps = [np.asarray(topic.columns["timestamp"]).astype(np.int64) for topic in topics]
         every = np.concatenate([np.zeros(0, dtype=np.int64), *stamps]) * 1000
         begun = every >= log.start_timestamp * 1000
@@ -136,7 +95,7 @@ class UlogFormat:
         Raises:
             DataError: no ULog, pyulog is missing, or no position in it.
         """
-        topics = _topics(_open(path, _WANTED))
+        topics = topics_of(open_ulog(path, _WANTED))
         dropped: dict[str, int] = {}
         notes: list[str] = []
         fit = on_gps_time(path, _gps_time(topics), choice.time, notes)
@@ -151,7 +110,7 @@ class UlogFormat:
         Raises:
             DataError: no ULog, pyulog is missing, or nothing was triggered.
         """
-        topics = _topics(_open(path, {"camera_capture", "camera_trigger", *_GPS}))
+        topics = topics_of(open_ulog(path, {"camera_capture", "camera_trigger", *_GPS}))
         for name in ("camera_capture", "camera_trigger"):
             if found := [topic for topic in topics if topic.name == name and len(topic)]:
                 t_ns = np.unique(found[0].t_ns())
@@ -179,7 +138,7 @@ _WANTED = {
 
 def _position(
     path: Path,
-    topics: Sequence[_Topic],
+    topics: Sequence[Topic],
     choice: TelemetryChoice,
     dropped: MutableMapping[str, int],
     notes: list[str],
@@ -220,7 +179,7 @@ def _position(
     return replace(track, accuracy_m=_accuracy(topic, usable))
 
 
-def _likeliest(found: Mapping[str, _Topic]) -> str:
+def _likeliest(found: Mapping[str, Topic]) -> str:
     """The estimator's own where it is ever valid, else what is on Earth."""
     if "local" in found and _local_is_valid(found["local"]).any():
         return "local"
@@ -231,7 +190,7 @@ def _likeliest(found: Mapping[str, _Topic]) -> str:
     return next(iter(found))
 
 
-def _local(path: Path, topic: _Topic, dropped: MutableMapping[str, int], notes: list[str]) -> PositionTrack:
+def _local(path: Path, topic: Topic, dropped: MutableMapping[str, int], notes: list[str]) -> PositionTrack:
     """The estimator's metres, and where on Earth they count from: it may move that in flight."""
     enu = topic.numbers("y", "x", "z") * [1, 1, -1]
     valid = _local_is_valid(topic)
@@ -264,18 +223,18 @@ def _local(path: Path, topic: _Topic, dropped: MutableMapping[str, int], notes: 
     return replace(track, accuracy_m=_accuracy(topic, valid))
 
 
-def _local_is_valid(topic: _Topic) -> Bool:
+def _local_is_valid(topic: Topic) -> Bool:
     return topic.flags("xy_valid") & topic.flags("z_valid")
 
 
-def _resets(topic: _Topic, valid: Bool) -> int:
+def _resets(topic: Topic, valid: Bool) -> int:
     if "xy_reset_counter" not in topic:
         return 0
     counter = topic.numbers("xy_reset_counter")[valid]
     return int(np.count_nonzero(np.diff(counter)))
 
 
-def _fixes(topic: _Topic) -> tuple[Float, Bool]:
+def _fixes(topic: Topic) -> tuple[Float, Bool]:
     """Latitude, longitude and height [N, 3], and whether there was a fix in 3D."""
     if "latitude_deg" in topic:
         values = topic.numbers("latitude_deg", "longitude_deg", "altitude_msl_m")
@@ -284,7 +243,7 @@ def _fixes(topic: _Topic) -> tuple[Float, Bool]:
     return values, np.asarray(topic.numbers("fix_type") >= _3D_FIX)
 
 
-def _accuracy(topic: _Topic, usable: Bool) -> tuple[float, float] | None:
+def _accuracy(topic: Topic, usable: Bool) -> tuple[float, float] | None:
     stated = topic.numbers("eph", "epv")[usable]
     stated = stated[np.isfinite(stated).all(axis=1) & (stated > 0).all(axis=1)]
     if not len(stated):
@@ -294,7 +253,7 @@ def _accuracy(topic: _Topic, usable: Bool) -> tuple[float, float] | None:
 
 
 def _body(
-    topics: Sequence[_Topic], instance: int | None, dropped: MutableMapping[str, int]
+    topics: Sequence[Topic], instance: int | None, dropped: MutableMapping[str, int]
 ) -> AttitudeTrack | None:
     found = [topic for topic in topics if topic.name == "vehicle_attitude"]
     if instance:
@@ -308,7 +267,7 @@ def _body(
 
 
 def _gimbal(
-    topics: Sequence[_Topic],
+    topics: Sequence[Topic],
     body: AttitudeTrack | None,
     dropped: MutableMapping[str, int],
     notes: list[str],
@@ -330,7 +289,7 @@ def _gimbal(
 
 
 def _gimbal_device(
-    topic: _Topic, body: AttitudeTrack | None, dropped: MutableMapping[str, int]
+    topic: Topic, body: AttitudeTrack | None, dropped: MutableMapping[str, int]
 ) -> AttitudeTrack | None:
     """MAVLink's GIMBAL_DEVICE_ATTITUDE_STATUS: pitch and roll against the horizon, yaw as its flags say."""
     stated = topic.numbers("q[1]", "q[2]", "q[3]", "q[0]")
@@ -346,7 +305,7 @@ def _gimbal_device(
     return attitude_track(topic.name, topic.t_ns(), turned, dropped)
 
 
-def _gps_time(topics: Sequence[_Topic]) -> ClockFit | None:
+def _gps_time(topics: Sequence[Topic]) -> ClockFit | None:
     """From time since boot to UTC, by what the receiver says; None without a time of it."""
     for topic in sorted(topics, key=lambda topic: (topic.name not in _GPS[:1], topic.instance)):
         if topic.name in _GPS and "time_utc_usec" in topic:
@@ -358,8 +317,8 @@ def _gps_time(topics: Sequence[_Topic]) -> ClockFit | None:
 
 
 def _instance(
-    path: Path, topics: Sequence[_Topic], names: Sequence[str], choice: TelemetryChoice
-) -> _Topic | None:
+    path: Path, topics: Sequence[Topic], names: Sequence[str], choice: TelemetryChoice
+) -> Topic | None:
     """The topic of the instance asked for, the first by default; None where there is none of these names.
 
     vehicle_* is what the autopilot flew by, estimator_* what each of several estimators thought.
@@ -374,88 +333,12 @@ def _instance(
     return found[-1] if found else of_kind[0]
 
 
-# --- reading -------------------------------------------------------------------------------------------
-
-
-def _open(path: Path, wanted: Collection[str] | None) -> Any:
-    """A log with some topics, or all of them.
-
-    Raises:
-        DataError: pyulog is missing, or cannot read the file.
-    """
-    core = need("pyulog", "drones")
-    _refuse_bombs(path)
-    try:
-        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):  # it prints its doubts
-            return core.ULog(file, None if wanted is None else sorted(wanted))
-    except DataError:
-        raise
-    except OSError as error:
-        raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
-    except Exception as error:  # whatever damage makes of a parser that expects none
-        problem = " ".join(str(error).split())[:100] or type(error).__name__
-        raise DataError(path, f"is damaged ({problem})", "download it from the autopilot again") from error
-
-
-def _topics(log: Any) -> list[_Topic]:
-    """By name and instance; those without a stamp say nothing."""
-    found = [_Topic(str(d.name), int(d.multi_id), d.data) for d in log.data_list if "timestamp" in d.data]
-    return sorted(found, key=lambda topic: (topic.name, topic.instance))
-
-
 def _far_off(t_ns: Int64, among: Bool) -> Bool:
     """Which stamps lie behind nearly all of some by more than a tenth of their span and some seconds."""
     if not among.any():
         return np.zeros(len(t_ns), dtype=np.bool_)
     first, last = np.percentile(t_ns[among], [0, 99.5])
     return np.asarray(t_ns > last + (last - first) / 10 + _FAR_OFF_NS)
-
-
-def _refuse_bombs(path: Path) -> None:
-    """Refuse definitions that unfold without end: nested arrays may stand for billions of fields.
-
-    Raises:
-        DataError: no ULog, or a definition beyond reason.
-    """
-    try:
-        formats = dict(_definitions(path))
-    except OSError as error:
-        raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
-    sizes: dict[str, int] = {}
-
-    def size(name: str, depth: int) -> int:
-        if depth > 20:
-            raise DataError(path, f"defines {name} by itself", "download it from the autopilot again")
-        if name not in formats:
-            return 1  # a plain type
-        if name not in sizes:
-            sizes[name] = sum(count * size(inner, depth + 1) for inner, count in formats[name])
-        if sizes[name] > _MOST_FIELDS:
-            raise DataError(
-                path, f"defines {name} with {sizes[name]} fields", "download it from the autopilot again"
-            )
-        return sizes[name]
-
-    for name in formats:
-        size(name, 0)
-
-
-def _definitions(path: Path) -> list[tuple[str, list[tuple[str, int]]]]:
-    """What messages consist of: (type, how many), by name; up to where the data begin."""
-    found: list[tuple[str, list[tuple[str, int]]]] = []
-    with path.open("rb") as file:
-        if file.read(16)[: len(_MAGIC)] != _MAGIC:
-            raise DataError(path, "is no PX4 log", "give the .ulg that the autopilot wrote")
-        while len(head := file.read(3)) == 3:
-            size, kind = struct.unpack("<HB", head)
-            body = file.read(size)
-            if kind in {ord("A"), ord("D"), ord("L")} or len(body) < size:
-                break
-            if kind == ord("F"):
-                name, _, fields = body.decode("utf-8", errors="replace").partition(":")
-                parts = re.findall(r"([^\s;\[]+)(?:\[(\d{1,9})\])?\s+[^;]+;?", fields)
-                found.append((name, [(inner, int(count or 1)) for inner, count in parts]))
-    return found
 
 
 FORMAT = UlogFormat()
