@@ -7,7 +7,7 @@ simulated, the detector is the real one. `replan` is read and left as it is.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,17 +19,15 @@ from numpy.typing import NDArray
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video import VideoReader
 from pipelines.formats.videos.video_writing import Picture, write_h264
-from pipelines.geometry.cameras import Intrinsics, project
-from pipelines.geometry.metrics import common, measure
+from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel
-from pipelines.geometry.poses import invert, transform
 from pipelines.geometry.triangulation import Views, estimate_noise, locate
 from pipelines.keypoints.actor_hints import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD
 from pipelines.keypoints.alone import FollowedAlone
 from pipelines.keypoints.hints import project_actor
 from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.loading import LoggedFlight, load_flight
-from pipelines.reporting.frame_drawing import draw_frame
+from pipelines.reporting.frame_drawing import draw_frame, with_inlet
 from pipelines.reporting.overlays import View
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
@@ -44,22 +42,20 @@ from pipelines.session.tables import REPLAN, TRUTH, read_table, write_table
 from pipelines.session.tabular import motion_table
 from pipelines.session.whole_folders import SIMULATION_MARK
 from pipelines.simulation.flight import Set, build_set
+from pipelines.simulation.observe import see
 from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.scenario import Scenario, read_scenario
 from pipelines.simulation.study.filming import Formation, Sightings, Walk, views_of
+from pipelines.simulation.study.measuring import errors_in_common, measure_arm
 
 Bool = NDArray[np.bool_]
 
 FILM = Stage("film", revision=1)
 
-NEAR_SHARE = 0.1
-"""A keypoint is right within this share of the height in pixels of somebody who stands where the actor is."""
-
 _SAME_M = 0.05  # between the scenario's hips and the session's truth, which is interpolated
 _HIPS = ("left_hip", "right_hip")
 _QUALITY = 20  # of the videos that are drawn on
-_INLET_HEIGHTS, _INLET_SHARE = 1.3, 0.42  # of the person, and of the picture's height
-_ERRORS = ("reconstructed_share", "mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm", "pck150")
+_INLET_HEIGHTS = 1.3  # of the person
 
 
 @dataclass(frozen=True)
@@ -156,7 +152,9 @@ def film(
             write_table(run.folder / name / "skeleton.parquet", motion_table(motion), TRUTH)
             for k, part in enumerate(parts):
                 _draw(arm, k, sightings, points, part / "pictures.mp4", run.folder / name)
-        _compare(metrics, reconstructed, arms)
+        true_joints = {name: arm.of.joints for name, arm in arms.items()}
+        for name, error_mm in errors_in_common(reconstructed, true_joints).items():
+            metrics[name]["common_mpjpe_mm"] = error_mm
         told = jsonable(
             {
                 "schema": 1,
@@ -322,60 +320,17 @@ def _views(arm: _Arm, sightings: Sightings, seed: int) -> Views:
 def _measured(
     arm: _Arm, sightings: Sightings, views: Views, points: Float, *, desired_tilt_deg: float
 ) -> dict[str, Any]:
-    """One arm's figures; shares are of pictures, of joints in them, and of moments."""
-    of, seen_by = arm.of, arm.seen_by
-    exact = np.stack([_pixels(seen_by, k, of.joints) for k in range(len(arm.names))])
-    inside = np.isfinite(exact[..., 0])
-    slots = slot_of(seen_by.position - of.motion.root)
-    tilt_deg, range_m = np.degrees(slots[..., TILT]), slots[..., 2]
-    off_px = np.linalg.norm(sightings.xy - exact, axis=-1)
-    near = off_px <= NEAR_SHARE * (seen_by.lens.fx * of.height_m / range_m)[..., None]
-    measured = off_px[np.isfinite(off_px)]
-    errors = measure(points[:, None], of.joints[:, None], of.person.joints, of.t_ns)
-    return {
-        "pictures": int(np.prod(inside.shape[:2])),
-        "in_view_share": float(inside.all(axis=-1).mean()),
-        "tilt_deg": {
-            "mean": float(tilt_deg.mean()),
-            "max": float(tilt_deg.max()),
-            "within_5_share": float((np.abs(tilt_deg - desired_tilt_deg) <= 5.0).mean()),
-        },
-        "detected_share": float((sightings.confidence > 0).any(axis=-1).mean()),
-        "keypoint_pck": float(near[inside].mean()) if inside.any() else None,
-        "keypoint_median_px": float(np.median(measured)) if measured.size else None,
-        "reprojection_px": _reprojection_px(views, points),
-        **{name: errors[name] for name in _ERRORS},
-    }
-
-
-def _pixels(seen_by: Formation, camera: int, points: Float) -> Float:
-    """Pixels [T, J, 2] of points [T, J, 3] in one camera; NaN outside its pictures."""
-    lens = seen_by.lens
-    camera_from_world = invert(seen_by.position[camera, :, None], seen_by.quaternion_xyzw[camera, :, None])
-    pixels = project(transform(camera_from_world, points), lens)
-    inside = (pixels >= -0.5) & (pixels <= np.array([lens.width, lens.height]) - 0.5)
-    return np.where(inside.all(axis=-1, keepdims=True), pixels, np.nan)
-
-
-def _reprojection_px(views: Views, points: Float) -> dict[str, float] | None:
-    """Between the keypoints that were used and the skeleton, by the poses that the log would state."""
-    rows = views.pose_index
-    offset = points.reshape(-1, 1, 3) - views.position[rows]
-    seen = np.einsum("ncji,ncj->nci", views.rotation[rows], offset)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        off_px = np.linalg.norm(seen[..., :2] / seen[..., 2:] - views.xy, axis=-1) * views.focal
-    used = off_px[(views.weight > 0) & np.isfinite(off_px)]
-    return {"mean": float(used.mean()), "median": float(np.median(used))} if used.size else None
-
-
-def _compare(
-    metrics: Mapping[str, dict[str, Any]], points: Mapping[str, Float], arms: Mapping[str, _Arm]
-) -> None:
-    """Add each arm's MPJPE on the joint-frames that all arms reconstructed."""
-    shared = common(*(own[:, None] for own in points.values()))[:, 0]
-    for name, own in points.items():
-        error_m = np.linalg.norm(own - arms[name].of.joints, axis=-1)[shared]
-        metrics[name]["common_mpjpe_mm"] = 1e3 * float(error_m.mean()) if error_m.size else None
+    slots = slot_of(arm.seen_by.position - arm.of.motion.root)
+    return measure_arm(
+        arm.of,
+        arm.seen_by,
+        sightings,
+        views,
+        points,
+        tilt_deg=np.degrees(slots[..., TILT]),
+        range_m=slots[..., 2],
+        desired_tilt_deg=desired_tilt_deg,
+    )
 
 
 # --- drawing -------------------------------------------------------------------------------------------
@@ -384,8 +339,9 @@ def _compare(
 def _draw(arm: _Arm, camera: int, sightings: Sightings, points: Float, pictures: Path, folder: Path) -> None:
     """Write <camera>.mp4: the skeleton over the pictures, and the person enlarged in a corner."""
     of, lens, name = arm.of, arm.seen_by.lens, arm.names[camera]
-    drawn_px = _pixels(arm.seen_by, camera, points)
-    middle_px = _pixels(arm.seen_by, camera, of.motion.root[:, None])[:, 0]
+    poses = arm.seen_by.position[camera], arm.seen_by.quaternion_xyzw[camera]
+    drawn_px = see(points, *poses, lens)
+    middle_px = see(of.motion.root[:, None], *poses, lens)[:, 0]
     slots = slot_of(arm.seen_by.position[camera] - of.motion.root)
 
     def drawn() -> Iterator[Picture]:
@@ -417,27 +373,6 @@ def _draw(arm: _Arm, camera: int, sightings: Sightings, points: Float, pictures:
                     f"{int(seen.sum())} joints found, {int(known.sum())} reconstructed, {said}",
                 )
                 side_px = _INLET_HEIGHTS * lens.fx * of.height_m / float(slots[k, 2])
-                yield _with_inlet(draw_frame(picture, view, caption), middle_px[k], side_px)
+                yield with_inlet(draw_frame(picture, view, caption), middle_px[k], side_px)
 
     _write_video(folder / f"{name}.mp4", drawn(), of.t_ns, lens)
-
-
-def _with_inlet(picture: Picture, middle_px: Float, side_px: float) -> Picture:
-    """The square about the middle once more, enlarged, at the lower right; the same without a middle."""
-    import cv2
-
-    height, width = picture.shape[:2]
-    side = int(min(side_px, height, width))
-    if side < 2 or not np.isfinite(middle_px).all():
-        return picture
-    left, upper = (
-        int(np.clip(round(float(centre)) - side // 2, 0, most - side))
-        for centre, most in zip(middle_px, (width, height), strict=True)
-    )
-    edge = round(_INLET_SHARE * min(height, width))
-    part = cv2.resize(
-        picture[upper : upper + side, left : left + side], (edge, edge), interpolation=cv2.INTER_CUBIC
-    )
-    picture[-edge:, -edge:] = part
-    cv2.rectangle(picture, (width - edge, height - edge), (width - 1, height - 1), (255, 255, 255), 1)
-    return picture

@@ -243,6 +243,22 @@ def _run(
     return found
 
 
+def reprojection_px(views: Views, points: Float) -> Float:
+    """Reprojection distance [N, C] in px of every view; NaN where nothing was seen, inf behind a camera.
+
+    Args:
+        views: what was seen.
+        points: [N, 3] m; NaN gives NaN.
+    """
+    rotation, position = views.rotation[views.pose_index], views.position[views.pose_index]
+    x, y, z = np.einsum("ncij,nci->jnc", rotation, points[:, None] - position)
+    depth = np.where(z > 0, z, 1.0)
+    distance = views.focal * np.hypot(x / depth - views.xy[..., 0], y / depth - views.xy[..., 1])
+    seen = (views.weight > 0) & np.isfinite(distance)
+    result: Float = np.where(seen, np.where(z > 0, distance, np.inf), np.nan)
+    return result
+
+
 def estimate_noise(
     views: Views,
     *,

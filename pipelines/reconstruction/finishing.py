@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.geometry.triangulation import STATUS, Triangulation, Views
+from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
 from pipelines.reconstruction.filling import fill_gaps
 from pipelines.reconstruction.observations import Observations
-from pipelines.reconstruction.reweighting import reprojection_px
 from pipelines.reconstruction.smoothing import Smoother
 
 

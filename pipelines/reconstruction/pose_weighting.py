@@ -12,8 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.geometry.triangulation import STATUS, Triangulation, Views, triangulate
-from pipelines.reconstruction.reweighting import reprojection_px
+from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px, triangulate
 from pipelines.session.records import Float, Int64
 
 _ROUNDS = 4  # the last moves the median joint by less than a thousandth of its standard deviation

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.bootstrap import LEVEL, RESAMPLES, Series, intervals, stretch_samples
 from pipelines.geometry.metrics import JointErrors, error_series, measure, measure_shape
-from pipelines.geometry.triangulation import STATUS, Triangulation, Views
+from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
 from pipelines.reconstruction.observations import Observations
-from pipelines.reconstruction.reweighting import reprojection_px
 from pipelines.session.records import Float, Int64
 from pipelines.session.skeletons import bones_of
 

@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.geometry.poses import quaternion_from_matrix
-from pipelines.geometry.triangulation import STATUS, Triangulation, Views, estimate_noise, triangulate
+from pipelines.geometry.triangulation import (
+    STATUS,
+    Triangulation,
+    Views,
+    estimate_noise,
+    reprojection_px,
+    triangulate,
+)
 from pipelines.reconstruction.observations import (
     Camera,
     Candidates,
@@ -25,7 +32,6 @@ from pipelines.reconstruction.observations import (
 from pipelines.reconstruction.refinement.building import Sighting
 from pipelines.reconstruction.refinement.problem import NEW_SHARE, PoseErrors
 from pipelines.reconstruction.refinement.refine import SETTLED_S, Refined, corrected, refine
-from pipelines.reconstruction.reweighting import reprojection_px
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Float, Int64
 from pipelines.session.skeletons import bones_of

@@ -12,8 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.geometry.triangulation import Triangulation, Views, triangulate
-from pipelines.session.records import Float
+from pipelines.geometry.triangulation import Triangulation, Views, reprojection_px, triangulate
 
 _ROUNDS = 12  # the median joint moves by less than 0.1 mm after that, on a real recording
 
@@ -45,19 +44,3 @@ def triangulate_heavy_tailed(views: Views, *, threads: int) -> Triangulation:
         residual_px=np.where(np.isnan(lost), first.residual_px, reprojection_px(views, result.points)),
         status=np.where(np.isnan(first.points[:, 0]), first.status, result.status),
     )
-
-
-def reprojection_px(views: Views, points: Float) -> Float:
-    """Reprojection distance [N, C] in px of every view; NaN where nothing was seen, inf behind a camera.
-
-    Args:
-        views: what was seen.
-        points: [N, 3] m; NaN gives NaN.
-    """
-    rotation, position = views.rotation[views.pose_index], views.position[views.pose_index]
-    x, y, z = np.einsum("ncij,nci->jnc", rotation, points[:, None] - position)
-    depth = np.where(z > 0, z, 1.0)
-    distance = views.focal * np.hypot(x / depth - views.xy[..., 0], y / depth - views.xy[..., 1])
-    seen = (views.weight > 0) & np.isfinite(distance)
-    result: Float = np.where(seen, np.where(z > 0, distance, np.inf), np.nan)
-    return result

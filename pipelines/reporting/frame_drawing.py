@@ -29,6 +29,7 @@ _TEXT = 1 / 2000  # of it, too: OpenCV's scale, 22 px high at 1
 _LEAST_TEXT = 0.3  # OpenCV's scale below which no letter can be read
 _SPARE, _CORNER = 0.1, 0.15  # of a person's box: to spare at each side, and how long its corners' arms are
 _WITH_ELLIPSE = {"nose", "head", "shoulder", "elbow", "wrist", "hip", "knee", "ankle"}  # others lie too close
+_INLET_SHARE = 0.42  # of the picture's height
 CHI2_95 = 5.991
 """Of a Gaussian in two dimensions 95 % lie within {x : x' S^-1 x = 5.991} (chi-square)."""
 _SHIFT = 4  # OpenCV takes coordinates in sixteenths of a pixel
@@ -190,6 +191,27 @@ def _drawable(points: Float) -> NDArray[np.bool_]:
 def _fixed(point: Float) -> tuple[int, int]:
     x, y = np.round(point * 2**_SHIFT).astype(int).tolist()
     return x, y
+
+
+def with_inlet(picture: Picture, middle_px: Float, side_px: float) -> Picture:
+    """The square about the middle once more, enlarged, at the lower right; the same without a middle."""
+    import cv2
+
+    height, width = picture.shape[:2]
+    side = int(min(side_px, height, width))
+    if side < 2 or not np.isfinite(middle_px).all():
+        return picture
+    left, upper = (
+        int(np.clip(round(float(centre)) - side // 2, 0, most - side))
+        for centre, most in zip(middle_px, (width, height), strict=True)
+    )
+    edge = round(_INLET_SHARE * min(height, width))
+    part = cv2.resize(
+        picture[upper : upper + side, left : left + side], (edge, edge), interpolation=cv2.INTER_CUBIC
+    )
+    picture[-edge:, -edge:] = part
+    cv2.rectangle(picture, (width - edge, height - edge), (width - 1, height - 1), (255, 255, 255), 1)
+    return picture
 
 
 def _write(picture: Picture, lines: Sequence[str], *, top: bool) -> None:
