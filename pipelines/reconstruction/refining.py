@@ -21,6 +21,7 @@ from pipelines.geometry.triangulation import (
     reprojection_px,
     triangulate,
 )
+from pipelines.reconstruction.clock_search import begun_offsets_s
 from pipelines.reconstruction.observations import (
     Camera,
     Candidates,
@@ -39,6 +40,7 @@ from pipelines.session.skeletons import bones_of
 if TYPE_CHECKING:
     import pandas as pd
 
+_SEARCHED = 300  # times of the skeleton at which the search for clocks looks
 _MOST_SHIFTS = 6  # of the clocks; offsets of 0.2 s took one to five
 _UNTOLD = 0.5  # share of its prior that a clock's standard deviation may keep; above, pictures do not tell it
 _HEAD = ("nose", "left_eye", "right_eye", "left_ear", "right_ear")  # as rigid as a bone
@@ -92,22 +94,38 @@ def refine_flight(
     t_s = (observations.t_ns - begin_ns) / 1e9
     bones = rigid_pairs(observations.joints, people)
 
-    def seen_from(shifted: list[Camera]) -> tuple[Observations, Views]:
-        observed = observe(shifted, found, choice, observations.t_ns, between)
-        xy, confidence = on_sides(observed.xy, observed.confidence, sides)
+    def seen_from(shifted: list[Camera], every: int = 1) -> tuple[Observations, Views]:
+        observed = observe(shifted, found, choice, observations.t_ns[::every], between)
+        xy, confidence = on_sides(observed.xy, observed.confidence, sides[::every])
         observed = replace(observed, xy=xy, confidence=confidence)
+        rows = len(observed.t_ns) * people * joints
         return observed, replace(
             views,
-            xy=xy.reshape(views.xy.shape),
-            weight=confidence.reshape(views.weight.shape),
+            xy=xy.reshape(rows, len(cameras), 2),
+            weight=confidence.reshape(rows, len(cameras)),
+            pose_index=views.pose_index[:rows],
             position=observed.position,
             rotation=observed.rotation,
+            pose_sigma=views.pose_sigma[::every],
         )
+
+    def robustly(shifted: list[Camera]) -> Triangulation:
+        _, again = seen_from(shifted)
+        again = replace(again, pixel_sigma=estimate_noise(again, threads=threads))
+        return triangulate(again, method="robust", threads=threads)
+
+    every = -(-times // _SEARCHED)
+    offset_s = begun_offsets_s(
+        lambda shift_s: seen_from(_shifted(cameras, np.where(clock_sigma_s > 0, shift_s, 0.0)), every)[1],
+        len(observations.t_ns[::every]),
+        clock_sigma_s,
+    )
 
     # A picture is joined to the three times nearest to its stamp, from which motion cannot be told far away,
     # and levels of pose noise that are found beside a large offset hold part of it. So the stamps follow the
     # clocks until little is left to correct.
-    offset_s, shifted, started = np.zeros(len(cameras)), list(cameras), result
+    shifted = _shifted(cameras, offset_s)
+    started = robustly(shifted) if offset_s.any() else result
     for _ in range(1 + _MOST_SHIFTS):
         sightings = [
             replace(
@@ -119,18 +137,10 @@ def refine_flight(
         start = started.points.reshape(times, people * joints, 3)
         refined = refine(t_s, sightings, start, bones, prior, clock_sigma_s)
         offset_s = offset_s + refined.clock_offset_s
-        shifted = [
-            replace(camera, frame_t_ns=camera.frame_t_ns + round(1e9 * offset))
-            for camera, offset in zip(cameras, offset_s, strict=True)
-        ]
+        shifted = _shifted(cameras, offset_s)
         if np.abs(refined.clock_offset_s).max() <= SETTLED_S:
             break
-        _, again = seen_from(shifted)
-        started = triangulate(
-            replace(again, pixel_sigma=estimate_noise(again, threads=threads)),
-            method="robust",
-            threads=threads,
-        )
+        started = robustly(shifted)
     warnings = [*refined.warnings, *_untold_clocks(refined, cameras, clock_sigma_s)]
     metrics = _metrics(refined, cameras, offset_s)
     if refined.fallback is not None:
@@ -169,6 +179,14 @@ def refine_flight(
         metrics,
         warnings,
     )
+
+
+def _shifted(cameras: Sequence[Camera], offset_s: Float) -> list[Camera]:
+    """The cameras, their clocks put forward."""
+    return [
+        replace(camera, frame_t_ns=camera.frame_t_ns + round(1e9 * offset))
+        for camera, offset in zip(cameras, offset_s, strict=True)
+    ]
 
 
 def _sighting(

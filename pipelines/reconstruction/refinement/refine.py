@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -63,6 +63,8 @@ _FARTHEST = 1.8
 _FARTHEST_STATED = 2.65
 """The same of stated levels, of which a constant error is one draw: sqrt(21.1 / 3), which the root of a
 chi-square variable with three degrees of freedom over three passes once in 10,000 times."""
+_REFUSED = 0.5  # for every picture: by how much stated levels may be less likely than those that are refused
+_UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; it was estimated instead"
 
 
 @dataclass(frozen=True)
@@ -106,24 +108,58 @@ def refine(
     sightings = [_take(sighting, part) for sighting in sightings]
     bones = _renumbered(bones, part)
     begun = _without_gaps(t_s, start[:, part])
+    refused = None
     try:
-        known, learned, warnings, expected_m = _find_prior(t_s, sightings, begun, bones, prior, clock_sigma_s)
-        problem = build(t_s, sightings, bones)
-        state = initial_state(problem, known, begun)
-        clock_s, clock_left_s = _clocks(problem, known, state)
-        if np.abs(clock_s).max() <= SETTLED_S:
-            known = replace(known, clock_sigma_s=clock_left_s)
-        system, state, at = solve(problem, known, state, rounds=_ROUNDS)
-        covariance = covariances(system, at)
-        if known.memory > REMEMBERED:
-            quick = _quickly(system, state, known)
-        elif _all_lasts(problem, known, state):
-            quick = _quickly(*_abruptly(problem, known, state)[:2], known)
-        else:
-            quick = state.position
+        for found in _priors(t_s, sightings, begun, bones, prior, clock_sigma_s):
+            refined = _refined(t_s, sightings, start, part, begun, bones, found)
+            if refined.fallback is None:
+                return refined
+            refused = refused or refined
     except np.linalg.LinAlgError as error:
-        return _none(sightings, start, str(error))
-    fallback = _doubts(system, state, at, learned=learned) or _too_far(quick, begun, expected_m)
+        refused = refused or _none(sightings, start, str(error))
+    return refused or _none(sightings, start, "no prior could be found")
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """Parameters of the prior that may explain the pictures."""
+
+    known: Knowledge
+    learned: bool  # pose errors are among what was estimated
+    warnings: tuple[str, ...]
+    expected_m: float  # by how far the skeleton may move
+
+
+def _refined(
+    t_s: Float,
+    sightings: Sequence[Sighting],
+    start: Float,
+    part: NDArray[np.bool_],
+    begun: Float,
+    bones: Int64,
+    prior: _Prior,
+) -> Refined:
+    """The estimate under a prior, and whether it may be believed.
+
+    Raises:
+        LinAlgError: its equations are singular.
+    """
+    known = prior.known
+    problem = build(t_s, sightings, bones)
+    state = initial_state(problem, known, begun)
+    clock_s, clock_left_s = _clocks(problem, known, state)
+    if np.abs(clock_s).max() <= SETTLED_S:
+        known = replace(known, clock_sigma_s=clock_left_s)
+    limber = replace(known, acceleration=_limber(known.acceleration, len(sightings)))
+    system, state, at = solve(problem, limber, state, rounds=_ROUNDS)
+    covariance = covariances(system, at)
+    if known.memory > REMEMBERED:
+        quick = _quickly(system, state, limber)
+    elif _all_lasts(problem, known, state):
+        quick = _quickly(*_abruptly(problem, known, state)[:2], limber)
+    else:
+        quick = state.position
+    fallback = _doubts(system, state, at, learned=prior.learned) or _too_far(quick, begun, prior.expected_m)
     position = np.full_like(start, np.nan)
     position[:, part] = quick
     whole = np.full((*start.shape, 3), np.nan)
@@ -136,9 +172,9 @@ def refine(
         clock_sigma_s=clock_left_s,
         levels=_levels(known),
         bone_lengths_m=state.shared[system.layout.bone_column :],
-        acceleration=known.acceleration,
-        learned=learned,
-        warnings=tuple(warnings),
+        acceleration=limber.acceleration,
+        learned=prior.learned,
+        warnings=prior.warnings,
         fallback=fallback,
     )
 
@@ -163,6 +199,23 @@ def _all_lasts(problem: Problem, known: Knowledge, state: State) -> bool:
     blur = known.pixel_scale / float(np.median(pictures.sharpness[pictures.sharpness > 0]))
     new_m = max(float(np.hypot(shift, range_m * turn)) for shift, turn in (e.white for e in known.poses))
     return any(errors.processes for errors in known.poses) and new_m < range_m * blur
+
+
+def _limber(acceleration: Float, cameras: int) -> Float:
+    """Accelerations [J, J] with which joints are estimated: larger beside those of the body, of few views.
+
+    The accelerations of limbs repeat in a gait, and are not the white ones of the prior. The less views tell,
+    the longer joints are averaged over time, and the more of their swings is lost. The standard deviation of
+    what joints do beside the body, whose acceleration is told best by A^-1, grows with that of triangulated
+    points.
+    """
+    body = np.full_like(acceleration, 1 / np.linalg.inv(acceleration).sum())
+    return body + max(_spread_of(cameras), 1.0) ** 2 * (acceleration - body)
+
+
+def _spread_of(cameras: int) -> float:
+    """How far off a point is in space whose rays, from all around, each miss it by 1 on two axes."""
+    return float(np.sqrt(4.5 / cameras))
 
 
 def _abruptly(problem: Problem, known: Knowledge, state: State) -> tuple[System, State, Eliminated]:
@@ -250,18 +303,19 @@ def _without_gaps(t_s: Float, start: Float) -> Float:
 # --- the prior -----------------------------------------------------------------------------------------
 
 
-def _find_prior(
+def _priors(
     t_s: Float,
     sightings: Sequence[Sighting],
     start: Float,
     bones: Int64,
     prior: Sequence[PoseErrors] | None,
     clock_sigma_s: Float,
-) -> tuple[Knowledge, bool, list[str], float]:
-    """The parameters of the prior from stretches of the flight; whether pose errors are among them.
+) -> Iterator[_Prior]:
+    """The parameters of the prior from stretches of the flight, and what else to try if they are doubted.
 
-    Pose errors of estimated levels, none at all, and what was stated compete by their evidence. At the end,
-    by how many metres the skeleton may move.
+    Pose errors of estimated levels, none at all, and what was stated compete by their evidence. Estimated
+    levels that the checks refuse give way to what was stated, if that was hardly less likely: learning can
+    run away with the scale, which pictures tell least of all.
 
     Raises:
         LinAlgError: none of them explains the pictures.
@@ -269,9 +323,8 @@ def _find_prior(
     chosen = _stretches(len(t_s))
     problem = build(t_s[chosen], sightings, bones)
     guess, image, disagreement_m, range_m = _first_guess(problem, start[chosen])
-    # n rays from all around, each off by s on two axes, leave a point off by s sqrt(9 / 2n) in space.
     stated_m = 0.0 if prior is None else float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
-    spread = float(np.sqrt(4.5 / len(sightings)))
+    spread = _spread_of(len(sightings))
     begun = _unlearned(problem, start[chosen], (guess,) * len(sightings), clock_sigma_s)
     state = initial_state(problem, begun, start[chosen])
     free, state = learn(problem, begun, state, poses=True, rounds=_LEARNING_ROUNDS)
@@ -292,21 +345,28 @@ def _find_prior(
         except np.linalg.LinAlgError:
             continue
     # What somebody knows is given up for a reason alone.
-    best = max(found, key=lambda name: found[name][0] + (_reason(problem, prior) if name == "stated" else 0))
-    _, known, state = found[best]
-    if best != "estimated":
-        known, state = learn(problem, known, state, poses=False, rounds=_FEWER_ROUNDS)
-    known = replace(known, acceleration=shrunk(known.acceleration, problem.t_s, state.position))
-    if known.memory < REMEMBERED and known.pixel_scale > _UNEXPLAINED * image:
-        raise np.linalg.LinAlgError("no level of pose noise explains the pictures")
-    warnings: list[str] = []
-    if prior is not None and best != "stated":
-        warnings.append(
-            "refined: the stated pose noise does not explain the pictures; it was estimated instead"
+    reason = {"stated": _reason(problem, prior)}
+    best = max(found, key=lambda name: found[name][0] + reason.get(name, 0.0))
+    tried = [best]
+    if best == "estimated" and "stated" in found:
+        behind = found[best][0] - found["stated"][0]
+        if behind < _STATED + _REFUSED * len(problem.pictures.first):
+            tried.append("stated")
+    for name in tried:
+        _, known, state = found[name]
+        if name != "estimated":
+            known, state = learn(problem, known, state, poses=False, rounds=_FEWER_ROUNDS)
+        known = replace(known, acceleration=shrunk(known.acceleration, problem.t_s, state.position))
+        if known.memory < REMEMBERED and known.pixel_scale > _UNEXPLAINED * image:
+            raise np.linalg.LinAlgError("no level of pose noise explains the pictures")
+        of_stated = _FARTHEST_STATED * stated_m if name == "stated" else 0.0
+        unlike = prior is not None and name != "stated"
+        yield _Prior(
+            known,
+            learned=name != "stated",
+            warnings=(_UNLIKE_STATED,) if unlike else (),
+            expected_m=spread * max(_FARTHEST * disagreement_m, of_stated),
         )
-    of_stated = _FARTHEST_STATED * stated_m if best == "stated" else 0.0
-    expected_m = spread * max(_FARTHEST * disagreement_m, of_stated)
-    return known, best != "stated", warnings, expected_m
 
 
 def _reason(problem: Problem, stated: Sequence[PoseErrors] | None) -> float:
