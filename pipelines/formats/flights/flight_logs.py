@@ -13,11 +13,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, Self
 
-import numpy as np
-
+from pipelines.formats.flights.log_times import doubts_of_stamps, world_times
+from pipelines.formats.flights.open_logs import OpenLogs
 from pipelines.formats.flights.pictures import later_times, picture_stamps
 from pipelines.formats.logs.commands import COMMAND_TYPES, read_commands
-from pipelines.formats.logs.fixed_layouts import PoseArrays, read_poses
+from pipelines.formats.logs.fixed_layouts import poses_at_once
 from pipelines.formats.logs.frames import frames_of_poses, place_of_frame, transforms_in
 from pipelines.formats.logs.map_topics import (
     MAP_TYPES,
@@ -31,18 +31,14 @@ from pipelines.formats.logs.map_topics import (
 from pipelines.formats.logs.maps import read_maps
 from pipelines.formats.logs.messages import Kind, all_samples, kind_of
 from pipelines.formats.logs.presets import NAV_SAT_FIX, read_pair, read_positions, read_preset
-from pipelines.formats.logs.recordings import OpenLog, messages_alike
 from pipelines.formats.logs.trajectories import (
     Gathered,
-    StampCheck,
     attitudes_of,
     chained,
     trajectory_of,
     trajectory_of_arrays,
 )
 from pipelines.formats.logs.triggers import TRIGGER_TYPES, read_triggers
-from pipelines.geometry.pose_covariance import carried_covariance
-from pipelines.geometry.poses import compose, matrix_from_quaternion, quaternion_from_rotation_vector
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight, PoseSource
 from pipelines.session.manifest import Log as LogSource
@@ -55,12 +51,10 @@ from pipelines.session.records import (
     Topic,
     Trajectory,
 )
-from pipelines.session.registries import Log, LogFormat, recognise
+from pipelines.session.registries import Log
 from pipelines.session.telemetry import PositionTrack, Telemetry, TelemetryChoice
 
 _MAY_DISAGREE_S = 0.5  # header and receive stamps: transport and decoding take less
-_KEPT_MESSAGES = 4_000_000  # of all logs that stay open: their tables have 160 MB
-_KEPT_FILES = 64
 _MAY_JUMP_S = 1.0  # from one message to the next, beyond what time itself passed
 
 _Wanted = Kind | Literal["maps"]
@@ -100,7 +94,7 @@ class FlightLogs:
         self._flight = flight
         self._base = base
         self._note = note
-        self._kept: dict[tuple[Path, ...], OpenLog] = {}  # the one that was used last comes last
+        self._logs = OpenLogs()
 
     def __enter__(self) -> Self:
         """The logs themselves."""
@@ -108,8 +102,7 @@ class FlightLogs:
 
     def __exit__(self, *exception: object) -> None:
         """Close the files."""
-        for paths in list(self._kept):
-            self._close(paths)
+        self._logs.close()
 
     def settings(self, log: str) -> LogSource:
         """What the manifest says of a log: one of its names, or a path."""
@@ -329,30 +322,10 @@ class FlightLogs:
 
     @contextmanager
     def _open(self, log: str) -> Iterator[tuple[Log, str]]:
-        """A recording for one reading; those of our own formats stay open for the next."""
-        paths = tuple(self.paths(log))
-        recording: Log | None = self._kept.pop(paths, None)
-        if recording is None:
-            recording = recognise(paths[0], LogFormat, "log").open_log(paths)
-        if not isinstance(recording, OpenLog):
-            with recording:
-                yield recording, str(paths[0])
-            return
-        self._kept[paths] = recording
-        self._close_all_beyond_bounds()
-        recording.forget()  # what was lost in reading another topic
-        yield recording, str(paths[0])
-
-    def _close_all_beyond_bounds(self) -> None:
-        while len(self._kept) > 1 and (
-            sum(topic.count for log in self._kept.values() for topic in log.topics) > _KEPT_MESSAGES
-            or sum(len(log.parts) for log in self._kept.values()) > _KEPT_FILES
-        ):
-            self._close(next(iter(self._kept)))
-
-    def _close(self, paths: tuple[Path, ...]) -> None:
-        with self._kept.pop(paths):
-            pass
+        """A recording for one reading, and what it is called."""
+        paths = self.paths(log)
+        with self._logs.reading(paths) as recording:
+            yield recording, str(paths[0])
 
     def _choose(self, recording: Log, source: str, kind: _Wanted, topic: str | None) -> str:
         """The topic that is named, or the only one of its kind."""
@@ -412,7 +385,8 @@ class FlightLogs:
     def _at_world_times(
         self, log: str, source: str, gathered: Gathered, lost: dict[str, int], started_ns: int
     ) -> Trajectory:
-        self._doubt(source, self.settings(log).stamps, gathered.stamps)
+        for doubt in doubts_of_stamps(gathered.stamps, self.settings(log).stamps):
+            self._note(f"{source}: {doubt}")
         trajectory = gathered.trajectory
         return replace(
             trajectory,
@@ -421,35 +395,7 @@ class FlightLogs:
         )
 
     def _world_times(self, log: str, t_ns: Int64, started_ns: int) -> Int64:
-        clock = self.settings(log).clock
-        since_start = t_ns - started_ns
-        drift_ns = np.round(since_start * (clock.drift_ppm * 1e-6)).astype(np.int64)
-        world_ns: Int64 = t_ns + drift_ns + round(clock.offset_s * 1e9)
-        return world_ns
-
-    def _doubt(self, source: str, stamps: str, check: StampCheck) -> None:
-        """Say how the stamps of a log disagree with each other."""
-        used = f"{stamps} stamps are used"
-        if check.without_header:
-            self._note(
-                f"{source}: {check.without_header} of {check.count} messages have no header stamp,"
-                " their time of receipt is taken"
-            )
-        if check.disagreeing:
-            self._note(
-                f"{source}: header and receive stamps disagree by up to {check.largest_disagreement_s:.3g} s"
-                f" in {check.disagreeing} of {check.count} messages; {used}"
-            )
-        drift = check.drift
-        if drift is not None and drift.drift_ppm and not check.jumps:
-            self._note(
-                f"{source}: header stamps drift {drift.drift_ppm:.1f} ppm (+- {drift.drift_sigma_ppm:.1g})"
-                f" against those of receipt; {used}, not corrected (logs: clock: drift_ppm does)"
-            )
-        for jump in check.jumps[:5]:
-            self._note(
-                f"{source}: the clock jumps by {jump.jump_s:.3g} s at {jump.header_ns / 1e9:.3f} s; {used}"
-            )
+        return world_times(self.settings(log).clock, t_ns, started_ns)
 
 
 def _kind_of(topic: Topic) -> _Wanted | None:
@@ -464,24 +410,3 @@ def _start_ns(recording: Log) -> int:
 def _at_times(maps: Iterator[Occupancy], from_ns: Int64) -> Iterator[Occupancy]:
     for occupancy, since_ns in zip(maps, from_ns.tolist(), strict=True):
         yield replace(occupancy, from_ns=since_ns)
-
-
-def poses_at_once(recording: Log, topic: str) -> PoseArrays | None:
-    """All poses of a topic, if one file format of ours holds it and its messages are alike."""
-    alike = messages_alike(recording, topic)
-    return None if alike is None else read_poses(alike.schema, alike.log.arrays(alike.topic))
-
-
-def in_world(trajectory: Trajectory, log: LogSource) -> Trajectory:
-    """A trajectory in the ENU axes of its log, moved to where the log's origin lies in the world."""
-    place = log.world_from_log
-    turn = quaternion_from_rotation_vector(np.array([0.0, 0.0, np.radians(place.yaw_deg)]))
-    position, quaternion = compose(
-        (np.array(place.translation), turn), (trajectory.position, trajectory.quaternion_xyzw)
-    )
-    covariance = trajectory.covariance
-    if covariance is not None and place.yaw_deg:
-        rotated = np.eye(6)
-        rotated[:3, :3] = matrix_from_quaternion(turn)  # the rotation part stays in the body
-        covariance = carried_covariance(rotated, covariance)
-    return replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)

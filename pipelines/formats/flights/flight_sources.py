@@ -15,11 +15,11 @@ from typing import Self
 import numpy as np
 
 from pipelines.formats.flights.calibration_sources import CalibrationSources
-from pipelines.formats.flights.flight_logs import FlightLogs, in_world
+from pipelines.formats.flights.flight_logs import FlightLogs
 from pipelines.formats.flights.frame_sources import CameraFrames, FrameSources
 from pipelines.formats.flights.gimbal_angles import attitudes_at, stated_angles
 from pipelines.formats.flights.telemetry_poses import Origin, TelemetryPoses
-from pipelines.formats.flights.world_axes import body_in_enu, in_enu
+from pipelines.formats.flights.world_axes import body_in_enu, in_enu, in_world
 from pipelines.formats.logs.map_topics import LoggedMaps
 from pipelines.formats.maps.ros_map import FORMAT as ROS_MAP
 from pipelines.geometry.cameras import Intrinsics

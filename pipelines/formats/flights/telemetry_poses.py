@@ -13,8 +13,10 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.formats.flights.flight_logs import FlightLogs, in_world
+from pipelines.formats.flights.flight_logs import FlightLogs
 from pipelines.formats.flights.gimbal_angles import attitudes_at, stated_angles
+from pipelines.formats.flights.log_times import world_times
+from pipelines.formats.flights.world_axes import in_world
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place, enu_from_enu, enu_from_geodetic
 from pipelines.geometry.mounting import compose_gimbal, compose_mount
@@ -122,10 +124,7 @@ class TelemetryPoses:
 
     def _world_times(self, stated: str, t_ns: Int64, since_ns: int) -> Int64:
         """Times of a log with its stated clock; `since_ns` is what the drift counts from."""
-        clock = self._logs.settings(stated).clock
-        drift_ns = np.round((t_ns - since_ns) * (clock.drift_ppm * 1e-6)).astype(np.int64)
-        moved: Int64 = t_ns + drift_ns + round(clock.offset_s * 1e9)
-        return moved
+        return world_times(self._logs.settings(stated).clock, t_ns, since_ns)
 
     # --- the origin ------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Poses of logs in the axes of the world: east-north-up."""
+"""Poses of logs in the world: in its axes, east-north-up, and from its origin."""
 
 from __future__ import annotations
 
@@ -8,8 +8,13 @@ import numpy as np
 
 from pipelines.geometry.mounting import flu_body_from_frd
 from pipelines.geometry.pose_covariance import carried_covariance
-from pipelines.geometry.poses import enu_from_ned
-from pipelines.session.manifest import Axes
+from pipelines.geometry.poses import (
+    compose,
+    enu_from_ned,
+    matrix_from_quaternion,
+    quaternion_from_rotation_vector,
+)
+from pipelines.session.manifest import Axes, Log
 from pipelines.session.records import Trajectory
 
 
@@ -33,3 +38,18 @@ def body_in_enu(trajectory: Trajectory, axes: Axes) -> Trajectory:
         return turned
     quaternion, covariance = flu_body_from_frd(turned.quaternion_xyzw, turned.covariance)
     return replace(turned, quaternion_xyzw=quaternion, covariance=covariance)
+
+
+def in_world(trajectory: Trajectory, log: Log) -> Trajectory:
+    """A trajectory in the ENU axes of its log, moved to where the log's origin lies in the world."""
+    place = log.world_from_log
+    turn = quaternion_from_rotation_vector(np.array([0.0, 0.0, np.radians(place.yaw_deg)]))
+    position, quaternion = compose(
+        (np.array(place.translation), turn), (trajectory.position, trajectory.quaternion_xyzw)
+    )
+    covariance = trajectory.covariance
+    if covariance is not None and place.yaw_deg:
+        rotated = np.eye(6)
+        rotated[:3, :3] = matrix_from_quaternion(turn)  # the rotation part stays in the body
+        covariance = carried_covariance(rotated, covariance)
+    return replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)

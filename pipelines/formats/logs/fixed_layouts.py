@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.logs.message_decoders import Schema, is_standard
-from pipelines.formats.logs.recordings import UnlikeError
+from pipelines.formats.logs.recordings import UnlikeError, messages_alike
 from pipelines.session.records import Float, Int64
+from pipelines.session.registries import Log
 
 Messages = tuple[Int64, NDArray[np.uint8]]
 """Stamps of receipt [n], and the bytes of messages of one length [n, length]."""
@@ -163,3 +164,9 @@ def _layout(encoding: str, fields: _Fields, first: bytes) -> _Layout:
         names=(names[0], names[1]),
         doubles=slice(doubles_at, doubles_at + 8 * (43 if fields.has_covariance else 7)),
     )
+
+
+def poses_at_once(recording: Log, topic: str) -> PoseArrays | None:
+    """All poses of a topic, if one file format of ours holds it and its messages are alike."""
+    alike = messages_alike(recording, topic)
+    return None if alike is None else read_poses(alike.schema, alike.log.arrays(alike.topic))

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.formats.flights.flight_logs import poses_at_once
-from pipelines.formats.logs.fixed_layouts import PoseArrays
+from pipelines.formats.logs.fixed_layouts import PoseArrays, poses_at_once
 from pipelines.formats.logs.messages import all_samples
 from pipelines.formats.logs.trajectories import trajectory_of, trajectory_of_arrays
 from pipelines.session.registries import LogFormat, recognise

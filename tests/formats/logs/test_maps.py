@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from numpy.typing import NDArray
 
-from pipelines.formats.flights.flight_logs import FlightLogs, in_world
+from pipelines.formats.flights.flight_logs import FlightLogs
+from pipelines.formats.flights.world_axes import in_world
 from pipelines.formats.logs import clouds as log_clouds
 from pipelines.formats.logs import maps as log_maps
 from pipelines.formats.logs.clouds import cloud_points
