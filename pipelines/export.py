@@ -21,9 +21,9 @@ from pipelines.reporting.overlays import FilmedCamera, status_at, views_of
 from pipelines.reporting.placing import estimated_clocks
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import BusyError, DataError
-from pipelines.session.maps import read_grid
+from pipelines.session.maps import each_map
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Int64, Occupancy, Recording
+from pipelines.session.records import Int64, Recording
 from pipelines.session.registries import EXPORTS, ChoiceOfAxes, Export
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.stages import open_session, session_name
@@ -185,17 +185,10 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         cameras,
         refined=refined_poses(folder) if record is not None else {},
         lenses={name: camera.intrinsics.intrinsics() for name, camera in description.cameras.items()},
-        maps=lambda: _maps(folder),
+        maps=lambda: each_map(folder),
         pictures=_pictures(folder, description, record, pictures_hz),
         overlays=_overlays(folder, description, record, skeleton, pictures_hz),
     )
-
-
-def _maps(folder: Path) -> Iterator[Occupancy]:
-    """The maps of a session, one in memory at a time."""
-    if (folder / "map").exists():
-        for k in range(len(read_json(folder / "map" / "index.json").get("maps", []))):
-            yield read_grid(folder / "map" / f"{k}.npz")
 
 
 Stills = Callable[[str], Iterable[tuple[int, Picture]]]

@@ -149,13 +149,23 @@ def load_maps(session: Path) -> list[Occupancy]:
     Raises:
         DataError: the index or a map is missing or damaged.
     """
+    return list(each_map(session))
+
+
+def each_map(session: Path) -> Iterator[Occupancy]:
+    """The same, one in memory at a time.
+
+    Raises:
+        DataError: the index or a map is missing or damaged.
+    """
     place = session / "map"
     if not place.exists():
-        return []
+        return
     maps = read_json(place / "index.json").get("maps")
     if not isinstance(maps, list):
         raise DataError(place / "index.json", "holds no list of maps", "ingest the flight again with --force")
-    return [read_grid(place / f"{k}.npz") for k in range(len(maps))]
+    for k in range(len(maps)):
+        yield read_grid(place / f"{k}.npz")
 
 
 def write_grid(path: Path, occupancy: Occupancy) -> None:
