@@ -105,6 +105,22 @@ def shrunk(acceleration: Float, t_s: Float, position: Float) -> Float:
     return (1 - share) * acceleration + share * np.diag(deviation**2)
 
 
+def limber(acceleration: Float, spread: float) -> Float:
+    """Accelerations with which joints are estimated: larger beside the body's, where views tell little.
+
+    The accelerations of limbs repeat in a gait, and are not the white ones of the prior. The less views tell,
+    the longer joints are averaged over time, and the more of their swings would be lost. Standard deviations
+    beside the body's grow with those of triangulated points. The body is what A tells best: the mean of all
+    joints with weights A^-1 1, whose variance stays 1 / (1' A^-1 1).
+
+    Args:
+        acceleration: [J, J] (m/s^2)^2, as found.
+        spread: of a triangulated point about the truth, by that of its rays; below 1 nothing changes.
+    """
+    body = np.full_like(acceleration, 1 / np.linalg.inv(acceleration).sum())
+    return body + max(spread, 1.0) ** 2 * (acceleration - body)
+
+
 def _acceleration(before: Float, found: Moments, bodies: Float) -> Float:
     """The covariance of accelerations: in coordinates where the one before is the identity.
 

@@ -25,7 +25,7 @@ from pipelines.reconstruction.refinement.estimate import (
     solve,
 )
 from pipelines.reconstruction.refinement.kernels import turned
-from pipelines.reconstruction.refinement.levels import shrunk
+from pipelines.reconstruction.refinement.levels import limber, shrunk
 from pipelines.reconstruction.refinement.problem import (
     ROTATION,
     SHIFT_IN_CAMERA,
@@ -150,13 +150,13 @@ def _refined(
     clock_s, clock_left_s = _clocks(problem, known, state)
     if np.abs(clock_s).max() <= SETTLED_S:
         known = replace(known, clock_sigma_s=clock_left_s)
-    limber = replace(known, acceleration=_limber(known.acceleration, len(sightings)))
-    system, state, at = solve(problem, limber, state, rounds=_ROUNDS)
+    freely = replace(known, acceleration=limber(known.acceleration, _spread_of(len(sightings))))
+    system, state, at = solve(problem, freely, state, rounds=_ROUNDS)
     covariance = covariances(system, at)
     if known.memory > REMEMBERED:
-        quick = _quickly(system, state, limber)
+        quick = _quickly(system, state, freely)
     elif _all_lasts(problem, known, state):
-        quick = _quickly(*_abruptly(problem, known, state)[:2], limber)
+        quick = _quickly(*_abruptly(problem, known, state)[:2], freely)
     else:
         quick = state.position
     fallback = _doubts(system, state, at, learned=prior.learned) or _too_far(quick, begun, prior.expected_m)
@@ -172,7 +172,7 @@ def _refined(
         clock_sigma_s=clock_left_s,
         levels=_levels(known),
         bone_lengths_m=state.shared[system.layout.bone_column :],
-        acceleration=limber.acceleration,
+        acceleration=freely.acceleration,
         learned=prior.learned,
         warnings=prior.warnings,
         fallback=fallback,
@@ -199,18 +199,6 @@ def _all_lasts(problem: Problem, known: Knowledge, state: State) -> bool:
     blur = known.pixel_scale / float(np.median(pictures.sharpness[pictures.sharpness > 0]))
     new_m = max(float(np.hypot(shift, range_m * turn)) for shift, turn in (e.white for e in known.poses))
     return any(errors.processes for errors in known.poses) and new_m < range_m * blur
-
-
-def _limber(acceleration: Float, cameras: int) -> Float:
-    """Accelerations [J, J] with which joints are estimated: larger beside those of the body, of few views.
-
-    The accelerations of limbs repeat in a gait, and are not the white ones of the prior. The less views tell,
-    the longer joints are averaged over time, and the more of their swings is lost. The standard deviation of
-    what joints do beside the body, whose acceleration is told best by A^-1, grows with that of triangulated
-    points.
-    """
-    body = np.full_like(acceleration, 1 / np.linalg.inv(acceleration).sum())
-    return body + max(_spread_of(cameras), 1.0) ** 2 * (acceleration - body)
 
 
 def _spread_of(cameras: int) -> float:

@@ -1,0 +1,68 @@
+"""The search for clocks begins within a step of the truth, whatever poses are like, or not at all."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.geometry.noise import Bias, NoiseModel, White
+from pipelines.geometry.triangulation import Views
+from pipelines.reconstruction.clock_search import begun_offsets_s
+from tests.reconstruction.formations import FOCAL_PX, Formation, formation
+
+Float = NDArray[np.float64]
+
+TIMES, LATE_S, SIGMA_S = 150, 0.45, 0.5
+STEP_S = 1 / 15
+ROUGH = [Bias(position_m=0.3, rotation_deg=1.0), White(position_m=0.1, rotation_deg=0.5)]
+
+
+def seen(flight: Formation, shift_s: float) -> Views:
+    """The flight's joint-frames with the stamps of all cameras but the first put forward."""
+    views: list[Float] = []
+    for camera, sighting in enumerate(flight.sightings):
+        at_s = flight.t_s - (shift_s if camera else 0.0)
+        xy = sighting.xy.reshape(len(flight.t_s), -1)
+        moved = [np.interp(at_s, flight.t_s, column, left=np.nan, right=np.nan) for column in xy.T]
+        views.append(np.stack(moved, axis=1).reshape(-1, 2))
+    times, joints = flight.sightings[0].confidence.shape
+    cameras = len(views)
+    rays = np.stack(views, axis=1)
+    return Views(
+        xy=rays,
+        weight=np.isfinite(rays[..., 0]).astype(np.float64),
+        pose_index=np.repeat(np.arange(times), joints),
+        position=np.stack([s.position for s in flight.sightings], axis=1),
+        rotation=np.stack([s.rotation for s in flight.sightings], axis=1),
+        focal=np.full(cameras, FOCAL_PX),
+        pixel_sigma=np.full(cameras, 2.0),
+        pose_sigma=np.zeros((times, cameras, 2)),
+    )
+
+
+def begun(flight: Formation, sigma_s: Float) -> Float:
+    return begun_offsets_s(lambda shift_s: seen(flight, shift_s), TIMES, sigma_s)
+
+
+@pytest.mark.parametrize("models", [[], ROUGH], ids=["exact", "rough"])
+@pytest.mark.parametrize("late_s", [LATE_S, -LATE_S])
+def test_half_a_second_is_found_to_a_step(models: list[NoiseModel], late_s: float) -> None:
+    flight = formation(TIMES, 3, models, 0, late_s=(0.0, late_s, 0.0))
+    found = begun(flight, np.array([0.0, SIGMA_S, SIGMA_S]))
+    assert found[0] == 0.0
+    np.testing.assert_allclose(found[1:], [late_s, 0.0], atol=STEP_S)
+
+
+def test_nothing_is_begun_where_all_clocks_are_known_or_none() -> None:
+    flight = formation(TIMES, 2, [], 0, late_s=(0.0, LATE_S))
+    assert not begun(flight, np.zeros(2)).any()
+    assert not begun(flight, np.full(2, SIGMA_S)).any()
+
+
+def test_who_stands_still_leaves_clocks_where_they_are() -> None:
+    flight = formation(TIMES, 2, [], 0, still=True)
+    rng = np.random.default_rng(0)
+    for sighting in flight.sightings:
+        sighting.xy[:] = sighting.xy[:1] + rng.normal(0, 2 / FOCAL_PX, sighting.xy.shape)
+    assert not begun(flight, np.array([0.0, SIGMA_S])).any()
