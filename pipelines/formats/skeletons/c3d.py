@@ -32,7 +32,6 @@ from pipelines.session.storage import as_data_error
 _BLOCK = 512
 _MAGIC = 0x50  # the second byte of every C3D
 _DEC, _MIPS = 85, 86  # processors, by which numbers are stored
-_MOST_COUNTED = 65535
 _LONGEST_LABEL = 30  # what the programs of laboratories show
 _LONGEST_TEXT = 255  # bytes
 _MOST_RESIDUAL = 255

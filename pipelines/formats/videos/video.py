@@ -128,12 +128,6 @@ def frames(
         yield from reader.frames(start, stop, step)
 
 
-def read_frame(path: Path, number: int) -> Picture | None:
-    """One frame; None where it cannot be decoded. A `VideoReader` does not index the file for each one."""
-    with VideoReader(path) as reader:
-        return reader.read(number)
-
-
 class VideoReader:
     """A video at hand: `index`, and its frames by number, in any order.
 

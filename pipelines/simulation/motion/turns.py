@@ -15,8 +15,6 @@ from pipelines.geometry.poses import (
 
 Float = NDArray[np.float64]
 
-IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
-
 
 def about(axis: int, angle: Float) -> Float:
     """[T, 4] rotations about x, y or z (0, 1, 2) by [T] rad; y turns forward (x) down, z to the left."""
