@@ -36,7 +36,6 @@ from pipelines.reconstruction.loading import (
     load_clock_sigma,
     load_pose_errors,
     load_truth,
-    truth_at,
 )
 from pipelines.reconstruction.observations import (
     Camera,
@@ -66,9 +65,10 @@ from pipelines.session.logged_actor import LoggedActor, logged_actor
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Float, Int64, JointMotion
 from pipelines.session.stage_records import Stage, StageRecord
-from pipelines.session.stages import locked
+from pipelines.session.stages import WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import CAMERA_POSES, SKELETON, write_table
+from pipelines.session.true_joints import true_joints_at
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -141,23 +141,7 @@ def reconstruct(
         ingested = session.record("ingest")
         if ingested is None:
             raise DataError(folder, "was never ingested completely", "run `mocap ingest` again")
-        detected = detect(
-            session,
-            detector=settings.detector,
-            every=settings.every,
-            start_s=settings.start_s,
-            end_s=settings.end_s,
-            workers=workers,
-            progress=progress,
-        )
-        if detected is None and (settings.start_s, settings.end_s) != (None, None):
-            raise DataError(
-                folder,
-                "every camera came with keypoints: no picture is looked at",
-                "leave --start and --end out",
-            )
-        if detected is None and settings.every > 1:
-            progress.note("every camera came with keypoints: --every says nothing about them")
+        detected = _detected(session, settings, workers, progress)
         inputs = dict(ingested.outputs) | (detected.outputs if detected else {})
         measured = measured_for(detected.settings["detector"]) if detected else None
         if measured is not None:
@@ -228,6 +212,30 @@ def reconstruct(
         for name in run.outdated:
             progress.note(f"removed {name}/: it showed the reconstruction before")
     return Reconstructed(folder, record, metrics, skipped=False)
+
+
+def _detected(
+    session: WritableSession, settings: Settings, workers: int, progress: Progress
+) -> StageRecord | None:
+    """The stage before this one; None where every camera came with keypoints."""
+    detected = detect(
+        session,
+        detector=settings.detector,
+        every=settings.every,
+        start_s=settings.start_s,
+        end_s=settings.end_s,
+        workers=workers,
+        progress=progress,
+    )
+    if detected is None and (settings.start_s, settings.end_s) != (None, None):
+        raise DataError(
+            session.folder,
+            "every camera came with keypoints: no picture is looked at",
+            "leave --start and --end out",
+        )
+    if detected is None and settings.every > 1:
+        progress.note("every camera came with keypoints: --every says nothing about them")
+    return detected
 
 
 def _check_fill(fill_s: float | None) -> None:
@@ -310,7 +318,7 @@ def _attempt(
         result,
         cameras=[camera.name for camera in cameras],
         method=settings.method,
-        truth=None if flight.truth is None else truth_at(flight.truth, observations.t_ns),
+        truth=None if flight.truth is None else true_joints_at(flight.truth, observations.t_ns),
         solve=solve,
     )
     progress.advance()

@@ -22,6 +22,7 @@ from pipelines.reporting.studies import summarise_studies
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
+from pipelines.session.records import Occupancy
 from pipelines.session.run_notes import versions_of
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Session, locked, open_session, session_name
@@ -45,8 +46,8 @@ from pipelines.simulation.study.settings import command_of
 if TYPE_CHECKING:
     import pandas as pd
 
-REPORT = Stage("report", revision=6)
-_FIGURES_REVISION = 2
+REPORT = Stage("report", revision=7)
+_FIGURES_REVISION = 3
 
 
 @dataclass(frozen=True)
@@ -308,6 +309,7 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
             for name in records["detect"].counts["cameras"]
             if name not in keypoints
         }
+    maps = load_maps(folder)
     return SessionContent(
         name=session_name(folder),
         session=description,
@@ -324,17 +326,18 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
         },
         keypoints=keypoints,
         stages={name: asdict(record) for name, record in records.items()},
-        replan=_load_replan(folder, records["replan"]) if "replan" in records else None,
+        replan=_load_replan(folder, records["replan"], maps) if "replan" in records else None,
         refined=_by_camera(folder / "reconstruct" / "cameras.parquet") if reconstructed else {},
         true_poses=_by_camera(folder / "truth_poses.parquet"),
-        hidden=_load_hidden(folder, description, records),
+        hidden=_load_hidden(folder, description, records, maps),
         made_by=versions_of(folder),
     )
 
 
-def _load_hidden(folder: Path, description: Description, records: dict[str, StageRecord]) -> dict[str, float]:
+def _load_hidden(
+    folder: Path, description: Description, records: dict[str, StageRecord], maps: list[Occupancy]
+) -> dict[str, float]:
     """For how much of the flight the map hides the actor; empty without a map, or without an actor."""
-    maps = load_maps(folder)
     if not maps:
         return {}
     try:
@@ -352,7 +355,7 @@ def _by_camera(path: Path) -> dict[str, pd.DataFrame]:
     return {str(name): own[POSES.names].reset_index(drop=True) for name, own in table.groupby("camera")}
 
 
-def _load_replan(folder: Path, record: StageRecord) -> ReplanContent:
+def _load_replan(folder: Path, record: StageRecord, maps: list[Occupancy]) -> ReplanContent:
     place = folder / "replan"
     metrics = read_json(place / "metrics.json")
     costs = place / "cost_map.parquet"
@@ -365,7 +368,7 @@ def _load_replan(folder: Path, record: StageRecord) -> ReplanContent:
         },
         actor=read_table(place / "actor.parquet", ACTOR),
         cost_map=read_table(costs, COST_MAP) if costs.exists() else None,
-        map=max(load_maps(folder), key=lambda one: one.from_ns, default=None),
+        map=max(maps, key=lambda one: one.from_ns, default=None),
         seen={
             arm: read_table(place / arm / "seen.parquet", SEEN)
             for arm in section(metrics, "arms")

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.poses import interpolate_points
 from pipelines.reconstruction.observations import Camera
 from pipelines.reconstruction.refinement.problem import (
     NEW_SHARE,
@@ -22,12 +21,11 @@ from pipelines.reconstruction.refinement.problem import (
 from pipelines.session.description import CameraEntry, Description
 from pipelines.session.errors import DataError
 from pipelines.session.pose_noise import stated_models, stated_noise
-from pipelines.session.records import Float, Int64, JointMotion
+from pipelines.session.records import Float, JointMotion
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.tables import FRAMES, KEYPOINTS, POSES, TRUTH, read_table
 from pipelines.session.tabular import detections_from, most_confident, motion_from, trajectory_from
 
-_TRUTH_GAP = 1.5  # median steps: truth is never bridged across a missing sample
 _MOST_PEOPLE = 12  # in one picture; more are mistakes of a detector, and memory goes with their number
 
 Calibrated = Callable[[Float, NDArray[np.str_]], Float]
@@ -192,9 +190,3 @@ def load_truth(folder: Path, description: Description, joints: tuple[str, ...]) 
     if not description.has_true_joints:
         return None
     return motion_from(read_table(folder / "truth.parquet", TRUTH), joints)
-
-
-def truth_at(truth: JointMotion, t_ns: Int64) -> Float:
-    """The true joints [T, P, J, 3] at the skeleton's times."""
-    step_ns = int(np.median(np.diff(truth.t_ns))) if len(truth.t_ns) > 1 else 0
-    return interpolate_points(truth.t_ns, truth.position, t_ns, max_gap_ns=int(_TRUTH_GAP * step_ns))

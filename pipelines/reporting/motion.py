@@ -8,16 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.poses import interpolate_points
 from pipelines.geometry.triangulation import STATUS
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Float, Int64
 from pipelines.session.tabular import motion_from
+from pipelines.session.true_joints import true_joints_at
 
 if TYPE_CHECKING:
     import pandas as pd
 
-# A hole in the truth of more than this many usual steps is not interpolated across.
-LONGEST_TRUTH_STEP = 2.5
 _NEVER_TOGETHER_M = 1e9  # people who share no time are matched last
 
 
@@ -82,16 +80,11 @@ def motion_from_skeleton(table: pd.DataFrame) -> Motion:
 def truth_at(truth: pd.DataFrame, motion: Motion) -> Float:
     """True positions at the motion's times and joints, [T, P, J, 3].
 
-    Each person is compared with the nearest true one. Interpolated linearly; NaN outside the stamps of
-    the truth, beside a missing sample, across a hole of more than `LONGEST_TRUTH_STEP` usual steps, and
-    for joints and people that truth does not hold.
+    Each person is compared with the nearest true one, as `true_joints_at` has them; NaN also for joints and
+    people that truth does not hold.
     """
     known = motion_from(truth, motion.joints)
-    usual_ns = float(np.median(np.diff(known.t_ns))) if len(known.t_ns) > 1 else 0.0
-    sampled = interpolate_points(
-        known.t_ns, known.position, motion.t_ns, max_gap_ns=round(LONGEST_TRUTH_STEP * usual_ns)
-    )
-    return _own_truth(motion.measured_position, sampled)
+    return _own_truth(motion.measured_position, true_joints_at(known, motion.t_ns))
 
 
 def _own_truth(position: Float, truth: Float) -> Float:

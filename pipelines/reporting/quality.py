@@ -11,6 +11,7 @@ from pipelines.geometry.poses import conjugate, interpolate_poses, multiply, rot
 from pipelines.reporting.content import SessionContent, number, section
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.wording import ABSENT, THIN, fixed, quantity
+from pipelines.session.pose_noise import logged_covariance
 from pipelines.session.tabular import trajectory_from
 
 if TYPE_CHECKING:
@@ -75,15 +76,13 @@ def _stated(camera: CameraRow, poses: pd.DataFrame | None) -> str:
     """Who says how far the poses err, and how far."""
     if camera.entry.pose_noise:
         return "; ".join(_model(name, told) for name, told in camera.entry.pose_noise.items())
-    covariance = trajectory_from(poses).covariance if poses is not None else None
+    covariance = logged_covariance(trajectory_from(poses)) if poses is not None else None
     if covariance is not None:
         variances = np.diagonal(covariance, axis1=1, axis2=2)
-        known = variances[np.isfinite(variances).all(axis=1) & (variances > 0).any(axis=1)]
-        if len(known):
-            position_m, rotation_rad = (
-                float(np.sqrt(np.median(known[:, k : k + 3].mean(axis=1)))) for k in (0, 3)
-            )
-            return f"by the log: {_pair(position_m, float(np.degrees(rotation_rad)))}"
+        position_m, rotation_rad = (
+            float(np.sqrt(np.median(variances[:, k : k + 3].mean(axis=1)))) for k in (0, 3)
+        )
+        return f"by the log: {_pair(position_m, float(np.degrees(rotation_rad)))}"
     return "stands still" if camera.entry.poses.static else "nothing"
 
 
