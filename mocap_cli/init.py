@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from mocap_cli.options import any_path, json_option, level, overwrite_option, verbosity_options
 from mocap_cli.terminal import one_line, print_json, watching
-
-if TYPE_CHECKING:
-    from pipelines.drafting.searching import LeftOut
 
 _MANY = 5  # files of one kind in one folder that are told one by one
 
@@ -56,7 +52,7 @@ def init_command(
             "cameras": result.cameras,
             "missing": result.missing,
             "assumed": result.assumed,
-            "left_out": {str(left.path): left.reason for left in result.left_out},
+            "left_out": {str(path): reason for path, reason in result.left_out.items()},
         }
         print_json(jsonable(summary))
     else:
@@ -69,13 +65,13 @@ def _from_here(path: Path) -> Path:
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
-def _left_out(left_out: Sequence[LeftOut]) -> Iterator[str]:
+def _left_out(left_out: Mapping[Path, str]) -> Iterator[str]:
     """A line for each file, or for all of one kind in a folder where they are many."""
-    alike: dict[tuple[Path, str, str], list[LeftOut]] = defaultdict(list)
-    for left in left_out:
-        alike[left.path.parent, left.path.suffix, left.reason].append(left)
+    alike: dict[tuple[Path, str, str], list[Path]] = defaultdict(list)
+    for path, reason in left_out.items():
+        alike[path.parent, path.suffix, reason].append(path)
     for (folder, suffix, reason), group in alike.items():
         if len(group) > _MANY:
             yield one_line(f"{_from_here(folder) / f'*{suffix}'}: {len(group)} files {reason}")
         else:
-            yield from (one_line(f"{_from_here(left.path)}: {left.reason}") for left in group)
+            yield from (one_line(f"{_from_here(path)}: {reason}") for path in group)

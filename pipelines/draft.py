@@ -67,7 +67,7 @@ class Drafted:
     cameras: list[str]
     missing: list[str]  # without it the flight cannot be ingested
     assumed: list[str]  # it can, but the result depends on it
-    left_out: list[LeftOut]
+    left_out: dict[Path, str]  # what was looked at in vain, and why
 
 
 def draft(
@@ -110,7 +110,7 @@ def draft(
         cameras=[camera.name for camera in flight.cameras],
         missing=manifest.missing or ([problem] if problem else []),
         assumed=manifest.assumed,
-        left_out=left_out,
+        left_out={left.path: left.reason for left in left_out},
     )
 
 

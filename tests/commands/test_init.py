@@ -180,7 +180,7 @@ def test_files_that_cannot_be_read_are_told_and_left_out(tmp_path: Path) -> None
     )
     result, _ = drafted(tmp_path)
     assert result.cameras == ["drone1"]
-    reasons = {left.path.name: left.reason for left in result.left_out}
+    reasons = {path.name: reason for path, reason in result.left_out.items()}
     assert "1 values are not x, y, confidence" in reasons["drone3.json"]
     assert reasons["drone2.json"].startswith("not recognised: it is no valid JSON (")
     assert reasons["drone2.json"].endswith("left out")
@@ -232,7 +232,7 @@ def test_a_name_that_is_no_text_is_left_out(tmp_path: Path) -> None:
     except OSError:
         pytest.skip("this file system takes only text for names")
     result, _ = drafted(tmp_path)
-    assert ["its name is no text" in left.reason for left in result.left_out] == [True]
+    assert ["its name is no text" in reason for reason in result.left_out.values()] == [True]
 
 
 # --- where things lie ----------------------------------------------------------------------------------
@@ -357,7 +357,7 @@ def test_a_real_recording_of_four_cameras_needs_nothing_more(tmp_path: Path) -> 
     assert result.cameras == ["cam01", "cam02", "cam03", "cam04"]
     assert not result.missing
     assert not result.assumed  # the videos have stamps
-    assert {left.path.name for left in result.left_out} == {"Config.toml", "LICENSE", "Calib.qca.txt"}
+    assert {path.name for path in result.left_out} == {"Config.toml", "LICENSE", "Calib.qca.txt"}
     done = ingest(result.path)
     assert [camera.frames.count for camera in done.description.cameras.values()] == [100] * 4
 
