@@ -7,11 +7,15 @@ stride, and limbs that are seen at the wrong end of their swing lead it astray.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.geometry.triangulation import Views, locate
 from pipelines.session.records import Float
+
+Bool = NDArray[np.bool_]
 
 _STEP_S = 1 / 15  # limbs swing for longer than that
 _REACH = 2.0  # standard deviations of what is stated of a clock
@@ -49,18 +53,18 @@ def begun_offsets_s(views_at: Callable[[float], Views], instants: int, clock_sig
     return begun
 
 
-def _disagreement(views: Views, instants: int, known: np.ndarray, camera: int) -> float:
+def _disagreement(views: Views, instants: int, known: Bool, camera: int) -> float:
     """How far joints miss what a camera and those of known clocks saw, beside the others of their view."""
     chosen = np.append(np.flatnonzero(known), camera)
-    views = Views(
-        xy=np.ascontiguousarray(views.xy[:, chosen]),
-        weight=np.ascontiguousarray(views.weight[:, chosen]),
-        pose_index=views.pose_index,
-        position=np.ascontiguousarray(views.position[:, chosen]),
-        rotation=np.ascontiguousarray(views.rotation[:, chosen]),
+    views = replace(
+        views,
+        xy=views.xy[:, chosen],
+        weight=views.weight[:, chosen],
+        position=views.position[:, chosen],
+        rotation=views.rotation[:, chosen],
         focal=views.focal[chosen],
         pixel_sigma=views.pixel_sigma[chosen],
-        pose_sigma=np.ascontiguousarray(views.pose_sigma[:, chosen]),
+        pose_sigma=views.pose_sigma[:, chosen],
     )
     points = locate(views, method="dlt").points
     away = points[:, None] - views.position[views.pose_index]
@@ -73,5 +77,7 @@ def _disagreement(views: Views, instants: int, known: np.ndarray, camera: int) -
     if not there.any():
         return np.inf
     missed = missed[there.any(axis=1)]
-    own = np.linalg.norm(missed - np.nanmedian(missed, axis=1, keepdims=True), axis=-1)
+    unseen = np.isnan(missed).all(axis=1, keepdims=True)  # by one of the others
+    of_view = np.nanmedian(np.where(unseen, 0.0, missed), axis=1, keepdims=True)
+    own = np.linalg.norm(missed - of_view, axis=-1)
     return float(np.nanpercentile(own, _LIMBS))

@@ -18,11 +18,11 @@ STEP_S = 1 / 15
 ROUGH = [Bias(position_m=0.3, rotation_deg=1.0), White(position_m=0.1, rotation_deg=0.5)]
 
 
-def seen(flight: Formation, shift_s: float) -> Views:
-    """The flight's joint-frames with the stamps of all cameras but the first put forward."""
+def seen(flight: Formation, shift_s: float, unknown: NDArray[np.bool_]) -> Views:
+    """The flight's joint-frames with the stamps of those cameras put forward."""
     views: list[Float] = []
     for camera, sighting in enumerate(flight.sightings):
-        at_s = flight.t_s - (shift_s if camera else 0.0)
+        at_s = flight.t_s - (shift_s if unknown[camera] else 0.0)
         xy = sighting.xy.reshape(len(flight.t_s), -1)
         moved = [np.interp(at_s, flight.t_s, column, left=np.nan, right=np.nan) for column in xy.T]
         views.append(np.stack(moved, axis=1).reshape(-1, 2))
@@ -42,7 +42,7 @@ def seen(flight: Formation, shift_s: float) -> Views:
 
 
 def begun(flight: Formation, sigma_s: Float) -> Float:
-    return begun_offsets_s(lambda shift_s: seen(flight, shift_s), TIMES, sigma_s)
+    return begun_offsets_s(lambda shift_s: seen(flight, shift_s, sigma_s > 0), TIMES, sigma_s)
 
 
 @pytest.mark.parametrize("models", [[], ROUGH], ids=["exact", "rough"])
@@ -52,6 +52,13 @@ def test_half_a_second_is_found_to_a_step(models: list[NoiseModel], late_s: floa
     found = begun(flight, np.array([0.0, SIGMA_S, SIGMA_S]))
     assert found[0] == 0.0
     np.testing.assert_allclose(found[1:], [late_s, 0.0], atol=STEP_S)
+
+
+def test_a_camera_that_sees_nothing_for_a_while_is_left_out_then() -> None:
+    flight = formation(TIMES, 3, [], 0, late_s=(0.0, 0.0, LATE_S))
+    flight.sightings[1].xy[40:80] = np.nan
+    found = begun(flight, np.array([0.0, 0.0, SIGMA_S]))
+    np.testing.assert_allclose(found, [0.0, 0.0, LATE_S], atol=STEP_S)
 
 
 def test_nothing_is_begun_where_all_clocks_are_known_or_none() -> None:
