@@ -16,7 +16,7 @@ from pipelines.reconstruction.refinement.elimination import (
     step,
 )
 from pipelines.reconstruction.refinement.levels import reestimated
-from pipelines.reconstruction.refinement.memory import memory_of
+from pipelines.reconstruction.refinement.memory import lasting, memory_of
 from pipelines.reconstruction.refinement.problem import (
     Knowledge,
     Problem,
@@ -92,7 +92,10 @@ def learn(
         system, state, at = solve(problem, known, state, rounds=3 if index == 0 else 1, bounds=bounds)
         known = reestimated(system, state, at, poses=poses, motion=known.memory < REMEMBERED)
         if poses and index == rounds // 2:
-            known = replace(known, memory=memory_of(system, state))
+            memory = memory_of(system, state)
+            if memory > REMEMBERED:
+                memory = lasting(memory, known.pixel_scale)
+            known = replace(known, memory=memory)
     return known, state
 
 

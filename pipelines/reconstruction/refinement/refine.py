@@ -54,6 +54,8 @@ _SIGMAS = 4.0
 _SETTLING = 4  # rounds to see how well given levels explain the pictures
 _STATED = 10.0  # by how much its evidence, a logarithm, is raised
 _STATED_DRIFT = 0.5  # and for every picture, where errors change: between knots they are taken for white
+_HARDLY_COUNTS = 30.0
+"""Image points that say as little as one: of slow pose errors they say too little to estimate levels."""
 _SMALL_SCALE = 0.01  # standard deviation of the constellation's scale that is no matter
 _UNSEEN_SCALE = 0.85  # share of it that is left once the pictures were seen, from which they did not tell it
 _SLOW_SHARE = 0.2  # of the disagreement of views: slow errors where the search begins, at least
@@ -318,7 +320,9 @@ def _priors(
     free, state = learn(problem, begun, state, poses=True, rounds=_LEARNING_ROUNDS)
     # The others under the same motion, bones and image noise: what learning those is worth changes from round
     # to round by more than levels that are right differ in.
-    found = {"estimated": (evidence(problem, free, state), free, state)}
+    found = {}
+    if free.memory < _HARDLY_COUNTS:
+        found["estimated"] = (evidence(problem, free, state), free, state)
     exact = (PoseErrors((0.0, 0.0), ()),) * len(sightings)
     others = {} if prior is None else {"stated": tuple(prior)}
     if exact not in others.values():
@@ -332,8 +336,10 @@ def _priors(
             found[name] = (evidence(problem, known, settled), known, settled)
         except np.linalg.LinAlgError:
             continue
+    if not found:
+        raise np.linalg.LinAlgError("the equations are singular whatever the pose noise")
     # What somebody knows is given up for a reason alone.
-    reason = {"stated": _reason(problem, prior)}
+    reason = {"stated": _reason(problem, prior, lasting=free.memory > REMEMBERED)}
     best = max(found, key=lambda name: found[name][0] + reason.get(name, 0.0))
     tried = [best]
     if best == "estimated" and "stated" in found:
@@ -357,10 +363,13 @@ def _priors(
         )
 
 
-def _reason(problem: Problem, stated: Sequence[PoseErrors] | None) -> float:
-    """By how much the evidence of other levels must exceed that of the stated ones."""
+def _reason(problem: Problem, stated: Sequence[PoseErrors] | None, *, lasting: bool) -> float:
+    """By how much the evidence of other levels must exceed that of the stated ones.
+
+    Where keypoint errors last, evidence is of what hardly counts any more.
+    """
     changes = any(not process.constant for errors in stated or () for process in errors.processes)
-    return _STATED + (_STATED_DRIFT * len(problem.pictures.first) if changes else 0.0)
+    return _STATED + (_STATED_DRIFT * len(problem.pictures.first) if changes or lasting else 0.0)
 
 
 def _stretches(times: int) -> Int64:

@@ -1,0 +1,32 @@
+"""How many image points say as much as one: the variance of their mean, where part of the error lasts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipelines.reconstruction.refinement.memory import lasting
+
+FRAMES, FLIGHTS = 1000, 2000
+
+
+@pytest.mark.parametrize(("kept", "scale"), [(0.8, 0.25), (0.9, 0.5)])
+def test_the_mean_of_errors_that_hardly_show_is_as_uncertain(kept: float, scale: float) -> None:
+    """First-order errors of tau = (1 + kept) / (1 - kept) beside white ones, a stated one being 1.
+
+    The variance of 2000 means is known to sqrt(2 / 2000) = 3 %; four of them, and tau / 1000 for the ends.
+    """
+    rng = np.random.default_rng(0)
+    tau = (1 + kept) / (1 - kept)
+    error = np.empty((FRAMES, FLIGHTS))
+    error[0] = rng.normal(size=FLIGHTS)
+    for k in range(1, FRAMES):
+        error[k] = kept * error[k - 1] + np.sqrt(1 - kept**2) * rng.normal(size=FLIGHTS)
+    seen = scale * rng.normal(size=error.shape) + np.sqrt(1 - scale**2) * error
+    of_one = scale**2 / FRAMES  # the variance that independent ones of what pictures show would have
+    assert lasting(tau, scale) == pytest.approx(seen.mean(axis=0).var() / of_one, rel=0.13 + tau / FRAMES)
+
+
+def test_points_better_than_stated_are_no_reason_to_count_them_less_than_their_memory_says() -> None:
+    assert lasting(3.0, 1.0) == 3.0
+    assert lasting(3.0, 2.0) == 3.0
