@@ -328,6 +328,7 @@ def test_what_was_stated_is_tried_where_learned_levels_are_refused() -> None:
     assert mean_mm(result.position, flight.truth) < 0.2 * mean_mm(flight.start, flight.truth)
 
 
+@pytest.mark.slow
 def test_a_hint_of_lasting_errors_does_not_make_limbs_tremble() -> None:
     """Beside white errors larger than the keypoints' own, motion stays smooth.
 
