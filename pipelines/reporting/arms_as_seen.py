@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.reporting.plates import LINE_STYLES, Plate, stacked, table
 from pipelines.reporting.replanned import Arm, Replan, Seen
@@ -93,27 +94,53 @@ def _largest_px(seen: Seen) -> float:
 
 
 def _draw(axes: Axes, arm: Arm, seen: Seen, camera: int, at: int, side_px: float) -> None:
+    _frame(axes)
+    if camera >= len(seen.cameras):
+        axes.set_visible(False)
+        return
+    pixels, status = seen.pixels[camera, at], seen.status[camera, at]
+    _enlarge(axes, pixels, side_px)
+    _draw_skeleton(axes, seen.joints, pixels, status, CAMERAS[arm.colour])
+    found, known = int((status == "seen").sum()), int((status != "").sum())
+    tilt_deg = float(arm.tilt_deg[camera, _nearest(arm.t_s, seen.t_s[at : at + 1])[0]])
+    told = f"{shortened(seen.cameras[camera])}, {quantity(tilt_deg, 'deg', 0)}"
+    axes.set_title(told, fontsize=6.4, loc="left", pad=2, color=MUTED)
+    axes.text(
+        0.97,
+        0.03,
+        f"{found} of {known}",
+        transform=axes.transAxes,
+        fontsize=6.4,
+        ha="right",
+        color=_HIDDEN if found < known else MUTED,
+    )
+
+
+def _frame(axes: Axes) -> None:
+    """A picture's edge in place of axes."""
     axes.set_xticks([])
     axes.set_yticks([])
     for spine in axes.spines.values():
         spine.set_visible(True)
         spine.set_color(GRID)
     axes.set_aspect("equal")
-    if camera >= len(seen.cameras):
-        axes.set_visible(False)
-        return
-    pixels, status = seen.pixels[camera, at], seen.status[camera, at]
-    inside = np.isfinite(pixels[:, 0])
-    middle = (
-        (np.nanmax(pixels[inside], axis=0) + np.nanmin(pixels[inside], axis=0)) / 2
-        if inside.any()
-        else np.zeros(2)
-    )
+
+
+def _enlarge(axes: Axes, pixels: Float, side_px: float) -> None:
+    """Show the part of the picture, so many pixels wide and high, around the joints [J, 2] inside it."""
+    inside = pixels[np.isfinite(pixels[:, 0])]
+    middle = (np.nanmax(inside, axis=0) + np.nanmin(inside, axis=0)) / 2 if len(inside) else np.zeros(2)
     axes.set_xlim(middle[0] - side_px / 2, middle[0] + side_px / 2)
     axes.set_ylim(middle[1] + side_px / 2, middle[1] - side_px / 2)  # rows count downwards
-    place = {joint: k for k, joint in enumerate(seen.joints)}
-    colour = CAMERAS[arm.colour]
-    for a, b in bones_of(seen.joints):
+
+
+def _draw_skeleton(
+    axes: Axes, joints: tuple[str, ...], pixels: Float, status: NDArray[np.str_], colour: str
+) -> None:
+    """Bones of which both joints are inside the picture, and the joints; open and dotted where hidden."""
+    inside = np.isfinite(pixels[:, 0])
+    place = {joint: k for k, joint in enumerate(joints)}
+    for a, b in bones_of(joints):
         ends = [place[a], place[b]]
         if inside[ends].all():
             free = (status[ends] == "seen").all()
@@ -128,19 +155,6 @@ def _draw(axes: Axes, arm: Arm, seen: Seen, camera: int, at: int, side_px: float
     hidden = pixels[status == "hidden"]
     axes.plot(
         *hidden.T, "o", color=_HIDDEN, markersize=2.2, markerfacecolor=PAPER, markeredgewidth=0.7, zorder=3
-    )
-    found, known = int((status == "seen").sum()), int((status != "").sum())
-    tilt_deg = float(arm.tilt_deg[camera, _nearest(arm.t_s, seen.t_s[at : at + 1])[0]])
-    told = f"{shortened(seen.cameras[camera])}, {quantity(tilt_deg, 'deg', 0)}"
-    axes.set_title(told, fontsize=6.4, loc="left", pad=2, color=MUTED)
-    axes.text(
-        0.97,
-        0.03,
-        f"{found} of {known}",
-        transform=axes.transAxes,
-        fontsize=6.4,
-        ha="right",
-        color=_HIDDEN if found < known else MUTED,
     )
 
 

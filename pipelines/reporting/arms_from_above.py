@@ -64,15 +64,7 @@ def draw_from_above(replan: Replan) -> Plate:
             if k >= len(arms):
                 axes.set_visible(False)
                 continue
-            arm = arms[k]
-            axes.set_xlim(low[0] - origin[0], high[0] - origin[0])
-            axes.set_ylim(low[1] - origin[1], high[1] - origin[1])
-            axes.set_aspect("equal")
-            axes.grid(visible=True)
-            if ground is not None:
-                _draw_heights(axes, ground, origin)
-            _draw_arm(axes, arm, origin)
-            axes.set_title(shortened(arm.name), fontsize=8.2, color=CAMERAS[arm.colour], loc="left")
+            _draw_panel(axes, arms[k], ground, low, high)
             if k + columns >= len(arms):
                 axes.set_xlabel(axis_label("east", origin[0]))
                 axes.tick_params(labelbottom=True)
@@ -83,27 +75,13 @@ def draw_from_above(replan: Replan) -> Plate:
         _legend(figure, arms, levels)
         title = "The arms from above"
         told = " ".join(_told_from_above(arm) for arm in arms)
-    caption = (
-        f"Paths of the drones and of the actor (thick); open circles mark the start. At {KEYFRAMES} moments, "
-        "whose seconds stand beside the first drone, a line leads from each drone to the actor: "
-        "red and dotted where something stands in the sight line."
-    )
-    if ground is not None and replan.terrain is not None:
-        caption += (
-            " Shades: how high the map's highest occupied voxel reaches above the ground, "
-            f"which is at {quantity(replan.terrain.ground_m, 'm', 2)}."
-            if levels
-            else f" Nothing in the map rises {quantity(LOWEST_M, 'm')} above the ground."
-        )
-    step = every(len(arms[0].t_s), MOST_POINTS)
-    caption += f" One pose in {step} is drawn." if step > 1 else ""
     numbers = {"": stacked([_numbers(arm) for arm in arms])}
     if ground is not None:
         east_m, north_m = np.meshgrid(ground.east_m, ground.north_m, indexing="ij")
         numbers["heights"] = table(
             east_m=east_m.ravel(), north_m=north_m.ravel(), above_ground_m=ground.above_m.ravel()
         )
-    return Plate("arms-top", title, caption, told, figure, numbers)
+    return Plate("arms-top", title, _caption(replan, levels), told, figure, numbers)
 
 
 def _numbers(arm: Arm) -> pd.DataFrame:
@@ -135,6 +113,19 @@ def keyframes(arm: Arm) -> NDArray[np.intp]:
     """Where in an arm's times its keyframes are: evenly spread, the first and the last among them."""
     chosen = np.round(np.linspace(0, len(arm.t_s) - 1, KEYFRAMES)).astype(np.intp)
     return np.unique(chosen)
+
+
+def _draw_panel(axes: Axes, arm: Arm, ground: Heights | None, low: Float, high: Float) -> None:
+    """An arm on its stretch of land, from corner to corner [2] in m."""
+    origin = near_zero(low)
+    axes.set_xlim(low[0] - origin[0], high[0] - origin[0])
+    axes.set_ylim(low[1] - origin[1], high[1] - origin[1])
+    axes.set_aspect("equal")
+    axes.grid(visible=True)
+    if ground is not None:
+        _draw_heights(axes, ground, origin)
+    _draw_arm(axes, arm, origin)
+    axes.set_title(shortened(arm.name), fontsize=8.2, color=CAMERAS[arm.colour], loc="left")
 
 
 def _draw_heights(axes: Axes, ground: Heights, origin: Float) -> None:
@@ -209,6 +200,23 @@ def _legend(figure: Figure, arms: tuple[Arm, ...], levels: list[float]) -> None:
         for k, level in enumerate(levels)
     ]
     figure.legend(handles=entries, loc="outside upper left", ncols=min(len(entries), 10))
+
+
+def _caption(replan: Replan, levels: list[float]) -> str:
+    caption = (
+        f"Paths of the drones and of the actor (thick); open circles mark the start. At {KEYFRAMES} moments, "
+        "whose seconds stand beside the first drone, a line leads from each drone to the actor: "
+        "red and dotted where something stands in the sight line."
+    )
+    if replan.terrain is not None:
+        caption += (
+            " Shades: how high the map's highest occupied voxel reaches above the ground, "
+            f"which is at {quantity(replan.terrain.ground_m, 'm', 2)}."
+            if levels
+            else f" Nothing in the map rises {quantity(LOWEST_M, 'm')} above the ground."
+        )
+    step = every(len(replan.arms[0].t_s), MOST_POINTS)
+    return caption + (f" One pose in {step} is drawn." if step > 1 else "")
 
 
 def _told_from_above(arm: Arm) -> str:

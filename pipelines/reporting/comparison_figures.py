@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.reporting.comparison import MEASURES, Comparison, Judged, Measure
+from pipelines.reporting.comparison import MEASURES, Comparison, Judged, Measure, Pair
 from pipelines.reporting.over_time import percentiles, time_bins
 from pipelines.reporting.plates import LINE_STYLES, Plate, quiet, stacked, table, tabled
 from pipelines.reporting.svg import CAMERAS, MUTED, WIDTH_IN, page_style
@@ -244,31 +244,15 @@ def _differences(comparison: Comparison) -> Plate:
     ]
     pairs = comparison.pairs
     step = 0.7 / len(pairs)
-    told, found_rows = [], []
+    drawn = []
     with page_style():
         rows = len(measures)
         figure = Figure((WIDTH_IN, 0.9 + rows * max(0.2, 0.1 * len(pairs))), layout="constrained")
         axes = figure.subplots()
         axes.axvline(0, color=MUTED, linewidth=0.8)
         for p, pair in enumerate(pairs):
-            colour = colour_of(comparison, pair.other)
-            for k, one in enumerate(measures):
-                found = pair.differences.get(one.key)
-                if found is None or found.first <= 0:
-                    continue
-                y = k + (p - (len(pairs) - 1) / 2) * step
-                scale = 100 / found.first
-                if found.estimate.interval is not None:
-                    axes.plot(
-                        [scale * end for end in found.estimate.interval], [y, y], color=colour, linewidth=1.4
-                    )
-                axes.plot(scale * found.estimate.value, y, "o", color=colour, markersize=4)
-                ends = found.estimate.interval or (np.nan, np.nan)
-                found_rows.append(
-                    (pair.other.label, one.label, *(scale * v for v in (found.estimate.value, *ends)))
-                )
-                told.append(f"{pair.other.label} {one.label} {fixed(scale * found.estimate.value)} %")
-            axes.plot([], [], "o-", color=colour, markersize=4, label=shortened(pair.other.label))
+            shift = (p - (len(pairs) - 1) / 2) * step
+            drawn += _draw_pair(axes, pair, measures, shift, colour_of(comparison, pair.other))
         axes.set_yticks(range(rows), [f"{one.label}{_ARROW[one.better]}" for one in measures])
         axes.set_ylim(rows - 0.5, -0.5)
         axes.grid(visible=True, axis="x")
@@ -283,8 +267,29 @@ def _differences(comparison: Comparison) -> Plate:
         "interval; a line across zero is within noise. Beside each measure stands which way is better."
     )
     columns = ("session", "measure", "difference_percent", "low_percent", "high_percent")
-    numbers = tabled(columns, found_rows)
-    return Plate("compare-differences", title, caption, f"{listing(told)}.", figure, {"": numbers})
+    told = listing(f"{session} {measure} {fixed(value)} %" for session, measure, value, _, _ in drawn)
+    numbers = tabled(columns, drawn)
+    return Plate("compare-differences", title, caption, f"{told}.", figure, {"": numbers})
+
+
+def _draw_pair(
+    axes: Axes, pair: Pair, measures: list[Measure], shift: float, colour: str
+) -> list[tuple[str, str, float, float, float]]:
+    """Draw what a session differs by, a row for each measure, and say what was drawn, in percent."""
+    drawn = []
+    for k, measure in enumerate(measures):
+        found = pair.differences.get(measure.key)
+        if found is None or found.first <= 0:
+            continue
+        y, scale = k + shift, 100 / found.first
+        value = scale * found.estimate.value
+        low, high = (scale * end for end in found.estimate.interval or (np.nan, np.nan))
+        if found.estimate.interval is not None:
+            axes.plot([low, high], [y, y], color=colour, linewidth=1.4)
+        axes.plot(value, y, "o", color=colour, markersize=4)
+        drawn.append((pair.other.label, measure.label, value, low, high))
+    axes.plot([], [], "o-", color=colour, markersize=4, label=shortened(pair.other.label))
+    return drawn
 
 
 _ARROW = {"less": " (less is better)", "more": " (more is better)", "": ""}

@@ -33,7 +33,7 @@ from pipelines.reporting.wording import (
     quantity,
     shortened,
 )
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Float, Int64, Trajectory
 from pipelines.session.tabular import trajectory_from
 
 if TYPE_CHECKING:
@@ -49,11 +49,7 @@ def draw_paths(
 
     tracks = {camera.name: trajectory_from(poses[camera.name]) for camera in cameras if camera.name in poses}
     people = _middles(motion) if motion is not None else []
-    everything = np.concatenate(
-        [np.full((1, 2), np.nan), *people, *(track.position[:, :2] for track in tracks.values())]
-    )
-    everything = everything[np.isfinite(everything).all(axis=1)]
-    low, high = (everything.min(axis=0), everything.max(axis=0)) if len(everything) else (np.zeros(2),) * 2
+    low, high = _bounds([*people, *(track.position[:, :2] for track in tracks.values())])
     origin = near_zero(low)
     extent = np.maximum(high - low, 2.0)
     height_in = float(np.clip(0.75 * WIDTH_IN * extent[1] / extent[0], 3.2, 6.2))
@@ -62,28 +58,18 @@ def draw_paths(
         figure = Figure((WIDTH_IN, height_in), layout="constrained")
         axes = figure.subplots()
         axes.grid(visible=True)
-        step, drawn = 1, []
+        drawn = []
         for k, camera in enumerate(cameras):
             if camera.name in tracks:
-                track = tracks[camera.name]
-                look = rotate(track.quaternion_xyzw, np.array([0.0, 0.0, 1.0]))[:, :2]
                 style = (CAMERAS[k % len(CAMERAS)], LINE_STYLES[k // len(CAMERAS) % len(LINE_STYLES)])
-                gaps_ns = camera.entry.poses.gaps_ns
-                ground = track.position[:, :2] - origin
-                path, stride = _drawn_path(track.t_ns, ground, [start for start, _ in gaps_ns])
-                step = max(step, stride)
-                drawn.append(_numbers_of_path(camera.name, path + origin))
-                _draw_camera(axes, shortened(camera.name), path, ground, look, style, float(extent.max()))
+                path, stride = _draw_camera(
+                    axes, camera, tracks[camera.name], origin, style, float(extent.max())
+                )
+                drawn.append((camera.name, path + origin, stride))
         for k, person in enumerate(people):
-            stride = every(len(person), MOST_POINTS)
-            path = person[::stride] - origin
-            step = max(step, stride)
             label = "actor" if len(people) == 1 else f"person {k}"
-            drawn.append(_numbers_of_path(label, path + origin))
-            line = LINE_STYLES[k % len(LINE_STYLES)]
-            axes.plot(*path.T, color=INK, linewidth=2.0, linestyle=line, label=label, zorder=4)
-            start = path[np.isfinite(path[:, 0])][:1]
-            axes.plot(*start.T, "o", color=INK, markerfacecolor=PAPER, markersize=5, zorder=5)
+            path, stride = _draw_person(axes, label, person - origin, LINE_STYLES[k % len(LINE_STYLES)])
+            drawn.append((label, path + origin, stride))
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.06)
         axes.set_xlabel(axis_label("east", origin[0]))
@@ -96,24 +82,34 @@ def draw_paths(
         told = f"Paths on the ground plane: {listing(paths)}."
     caption = "Paths of the cameras" + (" and of the actor (middle of the measured joints)" if people else "")
     caption += "; an open circle marks the start, short strokes the direction of view."
-    return Plate("top", title, caption + _decimation(step, "pose"), told, figure, {"": stacked(drawn)})
+    caption += _decimation(max((stride for _, _, stride in drawn), default=1), "pose")
+    numbers = [table(who=who, east_m=path[:, 0], north_m=path[:, 1]) for who, path, _ in drawn]
+    return Plate("top", title, caption, told, figure, {"": stacked(numbers)})
 
 
-def _numbers_of_path(who: str, path: Float) -> pd.DataFrame:
-    """A drawn path [N, 2]; empty where it is broken."""
-    return table(who=who, east_m=path[:, 0], north_m=path[:, 1])
+def _bounds(paths: list[Float]) -> tuple[Float, Float]:
+    """The corners [2] of the box that holds all paths [N, 2]; zero where there is none."""
+    everything = np.concatenate([np.full((1, 2), np.nan), *paths])
+    everything = everything[np.isfinite(everything).all(axis=1)]
+    return (everything.min(axis=0), everything.max(axis=0)) if len(everything) else (np.zeros(2),) * 2
 
 
 def _draw_camera(
     axes: Axes,
-    label: str,
-    path: Float,
-    ground: Float,
-    look: Float,
+    camera: CameraRow,
+    track: Trajectory,
+    origin: Float,
     style: tuple[str, object],
     extent_m: float,
-) -> None:
-    """A path with strokes in the direction of view; a camera that stands still is a square."""
+) -> tuple[Float, int]:
+    """A path with strokes in the direction of view; a camera that stands still is a square.
+
+    Returns the path as drawn, from the origin, and every how many poses were.
+    """
+    ground = track.position[:, :2] - origin
+    look = rotate(track.quaternion_xyzw, np.array([0.0, 0.0, 1.0]))[:, :2]
+    path, stride = _drawn_path(track.t_ns, ground, [start for start, _ in camera.entry.poses.gaps_ns])
+    label = shortened(camera.name)
     colour, line = style
     still = bool(np.nanmax(np.ptp(ground, axis=0), initial=0.0) < 0.005 * extent_m)
     if still:
@@ -126,6 +122,17 @@ def _draw_camera(
     strokes = np.full((3 * len(at), 2), np.nan)
     strokes[0::3], strokes[1::3] = ground[at], tip
     axes.plot(*strokes.T, color=colour, linewidth=0.8)
+    return path, stride
+
+
+def _draw_person(axes: Axes, label: str, person: Float, line: object) -> tuple[Float, int]:
+    """A person's path [T, 2] and its start; returns what was drawn of it, and every how many poses were."""
+    stride = every(len(person), MOST_POINTS)
+    path = person[::stride]
+    axes.plot(*path.T, color=INK, linewidth=2.0, linestyle=line, label=label, zorder=4)
+    start = path[np.isfinite(path[:, 0])][:1]
+    axes.plot(*start.T, "o", color=INK, markerfacecolor=PAPER, markersize=5, zorder=5)
+    return path, stride
 
 
 def _drawn_path(t_ns: Int64, path: Float, gap_starts_ns: list[int]) -> tuple[Float, int]:

@@ -143,6 +143,12 @@ def bounds_of(arms: tuple[Arm, ...]) -> tuple[Float, Float]:
     return everywhere.min(axis=0), everywhere.max(axis=0)
 
 
+def span_s(arms: tuple[Arm, ...]) -> tuple[float, float]:
+    """From the first to the last moment, or a tenth of a second around a single one."""
+    first, last = min(float(arm.t_s[0]) for arm in arms), max(float(arm.t_s[-1]) for arm in arms)
+    return (first, last) if last > first else (first - 0.05, last + 0.05)
+
+
 # --- tracks --------------------------------------------------------------------------------------------
 
 

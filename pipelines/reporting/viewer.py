@@ -18,7 +18,7 @@ from pipelines.reporting.bones import side_of
 from pipelines.reporting.motion import Motion
 from pipelines.reporting.replanned import Arm, Replan
 from pipelines.reporting.summary import CameraRow, Summary
-from pipelines.reporting.terrain import surface
+from pipelines.reporting.terrain import Surface, surface
 from pipelines.reporting.wording import joint_label, plural, quantity, whole
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.records import Float, Int64, Trajectory
@@ -74,15 +74,10 @@ def make_scene(
     kept = slice(None, None, every)
     t_ns = all_t_ns[kept]
     placed = [_placed(camera, poses[camera.name], t_ns, summary) for camera in cameras]
-    replanned = [
-        (arm, k, _placed_again(arm, k, t_ns, summary)) for arm in arms for k in range(len(arm.cameras))
-    ]
-    everywhere = np.concatenate(
-        [position for position, _ in placed]
-        + [position for _, _, (position, _) in replanned]
-        + ([body.middle[kept].reshape(-1, 3)] if body else [])
-    )
-    low, high = _bounds(everywhere)
+    for a, arm in enumerate(arms):
+        placed += [_placed_again(arm, a, k, t_ns, summary) for k in range(len(arm.cameras))]
+    paths = [camera.position for camera in placed]
+    low, high = _bounds(np.concatenate(paths + ([body.middle[kept].reshape(-1, 3)] if body else [])))
     origin = np.round((low + high) / 2)
     ground = body.ground_m if body is not None else float(low[2])
     data: dict[str, object] = {
@@ -90,42 +85,40 @@ def make_scene(
         "low": _rounded(low - origin),
         "high": _rounded(high - origin),
         "ground": round(ground - float(origin[2]), 3),
-        "cameras": [
-            _packed_camera(camera.name, camera, position - origin, quaternion)
-            for camera, (position, quaternion) in zip(cameras, placed, strict=True)
-        ]
-        + [
-            _packed_camera(arm.cameras[k], summary.cameras[k % len(summary.cameras)], position - origin, turn)
-            | {"arm": arms.index(arm), "colour": arm.colour}
-            for arm, k, (position, turn) in replanned
-        ],
+        "cameras": [camera.packed(origin) for camera in placed],
     }
-    notes = []
-    if every > 1:
-        notes.append(
-            f"The page holds one time in {every} of {whole(len(all_t_ns))}, "
-            "and draws straight lines between them."
-        )
     if body is not None:
         data["body"] = body.packed(kept, origin)
-        notes += body.notes()
     around = surface(replan.terrain) if replan is not None and replan.terrain is not None else None
     if around is not None and around.voxels:
         points = _packed(1000 * (around.points - origin), np.int32)
         data["surface"] = {"cube": around.cube_m, "points": points}
-        notes.append(
-            f"The map: {plural(around.voxels, 'voxel')} of the surface above the ground, drawn as "
-            f"{plural(len(around.points), 'cube')} of {quantity(around.cube_m, 'm', 2)}."
-        )
     return Scene(
         data=data,
         people=body.people if body is not None else 0,
         truth=body is not None and body.truth is not None,
         ellipsoids=body is not None and body.root is not None,
-        notes=tuple(notes),
+        notes=tuple(_notes(every, len(all_t_ns), body, around)),
         arms=tuple(arm.name for arm in arms),
         surface="surface" in data,
     )
+
+
+def _notes(every: int, times: int, body: _Body | None, around: Surface | None) -> list[str]:
+    """What is not as the tables have it, in whole sentences."""
+    notes = []
+    if every > 1:
+        notes.append(
+            f"The page holds one time in {every} of {whole(times)}, and draws straight lines between them."
+        )
+    if body is not None:
+        notes += body.notes()
+    if around is not None and around.voxels:
+        notes.append(
+            f"The map: {plural(around.voxels, 'voxel')} of the surface above the ground, drawn as "
+            f"{plural(len(around.points), 'cube')} of {quantity(around.cube_m, 'm', 2)}."
+        )
+    return notes
 
 
 # --- bodies --------------------------------------------------------------------------------------------
@@ -235,25 +228,39 @@ def _square_root(covariance: Float) -> Float | None:
 # --- cameras -------------------------------------------------------------------------------------------
 
 
-def _placed(camera: CameraRow, table: pd.DataFrame, t_ns: Int64, summary: Summary) -> tuple[Float, Float]:
-    """world_from_camera [T, 3] and [T, 4] at the viewer's times; NaN without a pose."""
+@dataclass(frozen=True)
+class _Placed:
+    """A camera at the viewer's times: of the session, or of an arm of a comparison."""
+
+    name: str
+    lens: CameraRow
+    position: Float  # [T, 3] m, world; NaN without a pose
+    quaternion_xyzw: Float  # [T, 4] world_from_camera
+    of_arm: Mapping[str, object]  # which arm, and its colour; nothing of the session's own
+
+    def packed(self, origin: Float) -> dict[str, object]:
+        """The camera as JSON."""
+        return {
+            "name": self.name,
+            "corners": _picture_corners(self.lens),
+            "position": _packed(1000 * (self.position - origin), np.int32),
+            "rotation": _packed(32767 * self.quaternion_xyzw, np.int16),
+            **self.of_arm,
+        }
+
+
+def _placed(camera: CameraRow, table: pd.DataFrame, t_ns: Int64, summary: Summary) -> _Placed:
     between = summary.description.pose_interpolation
-    return poses_at(trajectory_from(table), t_ns, between, static=camera.entry.poses.static)
+    poses = poses_at(trajectory_from(table), t_ns, between, static=camera.entry.poses.static)
+    return _Placed(camera.name, camera, *poses, {})
 
 
-def _placed_again(arm: Arm, k: int, t_ns: Int64, summary: Summary) -> tuple[Float, Float]:
-    """The same of camera `k` of an arm."""
+def _placed_again(arm: Arm, a: int, k: int, t_ns: Int64, summary: Summary) -> _Placed:
+    """Camera `k` of arm `a`, which carries what the session's cameras carry, in turn."""
     track = Trajectory(arm.t_ns, arm.position[k], arm.quaternion_xyzw[k])
-    return poses_at(track, t_ns, summary.description.pose_interpolation)
-
-
-def _packed_camera(name: str, lens: CameraRow, position: Float, quaternion: Float) -> dict[str, object]:
-    return {
-        "name": name,
-        "corners": _picture_corners(lens),
-        "position": _packed(1000 * position, np.int32),
-        "rotation": _packed(32767 * quaternion, np.int16),
-    }
+    poses = poses_at(track, t_ns, summary.description.pose_interpolation)
+    lens = summary.cameras[k % len(summary.cameras)]
+    return _Placed(arm.cameras[k], lens, *poses, {"arm": a, "colour": arm.colour})
 
 
 def _picture_corners(camera: CameraRow) -> list[float]:
