@@ -47,7 +47,7 @@ from pipelines.reconstruction.observations import (
     time_base,
 )
 from pipelines.reconstruction.quality import assess
-from pipelines.reconstruction.refining import RefinedFlight, refine_flight
+from pipelines.reconstruction.refining import RefinedFlight, RobustFlight, refine_flight
 from pipelines.reconstruction.smoothing import smoother
 from pipelines.reconstruction.solving import (
     UNKNOWN_SIGMA,
@@ -65,7 +65,7 @@ from pipelines.session.logged_actor import LoggedActor, logged_actor
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Float, Int64, JointMotion
 from pipelines.session.stage_records import Stage, StageRecord
-from pipelines.session.stages import WritableSession, locked
+from pipelines.session.stages import Run, WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import CAMERA_POSES, SKELETON, write_table
 from pipelines.session.true_joints import true_joints_at
@@ -142,13 +142,13 @@ def reconstruct(
         if ingested is None:
             raise DataError(folder, "was never ingested completely", "run `mocap ingest` again")
         detected = _detected(session, settings, workers, progress)
-        inputs = dict(ingested.outputs) | (detected.outputs if detected else {})
         measured = measured_for(detected.settings["detector"]) if detected else None
-        if measured is not None:
-            inputs["calibration of confidences"] = sha256_of(measured)
-        # A model of the user's is known by what it found, not by where it lies.
-        stated = asdict(settings) | {"detector": detected.settings["detector"] if detected else None}
-        run = session.begin(RECONSTRUCT, settings=stated, inputs=inputs, force=force)
+        run = session.begin(
+            RECONSTRUCT,
+            settings=_stated(settings, detected),
+            inputs=_inputs(ingested, detected, measured),
+            force=force,
+        )
         if run.finished:
             metrics = read_json(folder / "reconstruct" / "metrics.json")
             return Reconstructed(folder, run.record, metrics, skipped=True)
@@ -192,25 +192,12 @@ def reconstruct(
             metrics = metrics | {"trials": told_together(every, settings.disturb_poses, settings.seed)}
             warnings.append(_said_disturbance(settings))
         metrics = jsonable(metrics)
-        skeleton = skeleton_table(stored.observations, stored.result)
-        write_table(run.folder / "skeleton.parquet", skeleton, SKELETON)
-        if stored.poses is not None:
-            write_table(run.folder / "cameras.parquet", stored.poses, CAMERA_POSES)
-        write_json(run.folder / "metrics.json", metrics)
+        _write(run.folder, stored, metrics)
         record = run.publish(
-            counts={
-                **metrics["status_counts"],
-                "association": _association_counts(stored.association),
-                "left_right_swaps": {"undone_over_time": swaps, "between_views": stored.between_views},
-                "filled": metrics["filled"],
-                "smoothing": metrics["smoothing"],
-            },
+            counts=_counts(metrics, stored, swaps),
             warnings=[*warnings, *stored.warnings, *_unused(cameras, stored.result)],
         )
-        for name, (before, now) in run.replaces.items():
-            progress.note(f"replaced the reconstruction made with {name} = {before} (now {now})")
-        for name in run.outdated:
-            progress.note(f"removed {name}/: it showed the reconstruction before")
+        _tell_replaced(run, progress)
     return Reconstructed(folder, record, metrics, skipped=False)
 
 
@@ -238,6 +225,17 @@ def _detected(
     return detected
 
 
+def _stated(settings: Settings, detected: StageRecord | None) -> dict[str, object]:
+    """The settings; a model of the user's is known by what it found, not by where it lies."""
+    return asdict(settings) | {"detector": detected.settings["detector"] if detected else None}
+
+
+def _inputs(ingested: StageRecord, detected: StageRecord | None, measured: Path | None) -> dict[str, str]:
+    """The hashes of what is read: tables, and how confidences of the detector were measured."""
+    inputs = dict(ingested.outputs) | (detected.outputs if detected else {})
+    return inputs if measured is None else inputs | {"calibration of confidences": sha256_of(measured)}
+
+
 def _check_fill(fill_s: float | None) -> None:
     if fill_s is not None and not 0 < fill_s <= _LONGEST_FILL_S:
         raise DataError(
@@ -253,6 +251,34 @@ def _said_disturbance(settings: Settings) -> str:
         f"the poses were disturbed by {settings.disturb_poses}: the skeleton and the figures without `trials`"
         f" are those of {draws} (seed {settings.seed}), not the flight's"
     )
+
+
+def _write(folder: Path, attempt: _Attempt, metrics: Mapping[str, object]) -> None:
+    skeleton = skeleton_table(attempt.observations, attempt.result)
+    write_table(folder / "skeleton.parquet", skeleton, SKELETON)
+    if attempt.poses is not None:
+        write_table(folder / "cameras.parquet", attempt.poses, CAMERA_POSES)
+    write_json(folder / "metrics.json", metrics)
+
+
+def _counts(metrics: Mapping[str, Any], attempt: _Attempt, swaps: Mapping[str, object]) -> dict[str, object]:
+    """What was found, undone, filled and smoothed; how people were told apart, one number for each."""
+    told_apart = ("views", "ambiguous", "switches", "refused", "resumed")
+    return {
+        **metrics["status_counts"],
+        "association": {name: getattr(attempt.association, name).tolist() for name in told_apart},
+        "left_right_swaps": {"undone_over_time": swaps, "between_views": attempt.between_views},
+        "filled": metrics["filled"],
+        "smoothing": metrics["smoothing"],
+    }
+
+
+def _tell_replaced(run: Run, progress: Progress) -> None:
+    """Say what an earlier reconstruction was made with, and what showed it."""
+    for name, (before, now) in run.replaces.items():
+        progress.note(f"replaced the reconstruction made with {name} = {before} (now {now})")
+    for name in run.outdated:
+        progress.note(f"removed {name}/: it showed the reconstruction before")
 
 
 # --- the work ------------------------------------------------------------------------------------------
@@ -292,23 +318,18 @@ def _attempt(
         cameras, background["background"], warnings = _refine_cameras(
             cameras, flight.followed, description, settings
         )
-    found, observations, association, seen = _observe(flight, cameras, settings)
-    sigma = ray_sigma(cameras, observations.t_ns, observations.position, pixel_sigma=settings.pixel_sigma)
-    sides, between_views = _agreeing_sides(observations, sigma)
-    xy, confidence = on_sides(observations.xy, observations.confidence, sides)
-    observations = replace(observations, xy=xy, confidence=confidence)
+    seen = _observe(flight, cameras, settings)
     progress.advance()
+    observations = seen.observations
     views = views_with_noise(cameras, observations, pixel_sigma=settings.pixel_sigma, threads=workers)
     solve = solver_for(settings.method, cameras, observations, threads=workers)
-    result = refused_people(solve(views), observations, seen)
+    result = refused_people(solve(views), observations, seen.anybody)
     progress.advance()
     refined = None
     if settings.method == "refined":
-        refined = _refine(
-            cameras, found, association, observations, sides, views, result, description, settings, workers
-        )
+        refined = _refine(cameras, seen, views, result, description, settings, workers)
         observations, views = refined.observations, refined.views
-        result = refused_people(refined.result, observations, seen)
+        result = refused_people(refined.result, observations, seen.anybody)
     result, finished = finish(
         observations, views, result, fill_s=settings.fill_s, smoother=smoother(settings.smooth)
     )
@@ -326,19 +347,29 @@ def _attempt(
         observations,
         views,
         result,
-        association,
-        between_views,
+        seen.association,
+        seen.between_views,
         metrics | finished | background | (refined.metrics if refined else {}),
         _poses_stored(cameras, refined, background["background"]),
-        [*warnings, *(refined.warnings if refined else []), *association.reasons],
+        [*warnings, *(refined.warnings if refined else []), *seen.association.reasons],
     )
 
 
-def _observe(
-    flight: _Flight, cameras: list[Camera], settings: Settings
-) -> tuple[Candidates, Observations, Association, NDArray[np.bool_]]:
-    """All that was seen, what of each person, how people were told apart, when [T] anybody was seen."""
-    between = flight.description.pose_interpolation
+@dataclass(frozen=True)
+class _Seen:
+    """All that was seen, and what of it is each person's."""
+
+    found: Candidates
+    association: Association
+    observations: Observations  # at the skeleton's times, on these sides
+    sides: Int64  # [T, P, J, C], see `on_sides`
+    between_views: dict[str, int]  # left and right, see `swaps_across_views`
+    anybody: NDArray[np.bool_]  # [T] whether anybody was seen
+
+
+def _observe(flight: _Flight, cameras: list[Camera], settings: Settings) -> _Seen:
+    """Tell people apart, bring what was seen of each to common times, and left from right."""
+    between, pixel_sigma = flight.description.pose_interpolation, settings.pixel_sigma
     found = candidates(cameras, between)
     association = associate(
         (found.t_ns - found.t_ns[0]) / 1e9,
@@ -346,15 +377,19 @@ def _observe(
         found.confidence,
         found.position,
         found.rotation,
-        ray_sigma(cameras, found.t_ns, found.position, pixel_sigma=settings.pixel_sigma),
+        ray_sigma(cameras, found.t_ns, found.position, pixel_sigma=pixel_sigma),
         actor=None if flight.actor is None else flight.actor.hips_at(found.t_ns),
         people=settings.people,
     )
     base = time_base(cameras, settings.rate_hz)
     observations = observe(cameras, found, association.choice, base, between)
     nearest = np.clip(np.searchsorted(found.t_ns, observations.t_ns), 0, len(found.t_ns) - 1)
-    seen = np.asarray((found.confidence > 0).any(axis=(1, 2, 3)), dtype=np.bool_)[nearest]
-    return found, observations, association, seen
+    anybody = np.asarray((found.confidence > 0).any(axis=(1, 2, 3)), dtype=np.bool_)[nearest]
+    sigma = ray_sigma(cameras, observations.t_ns, observations.position, pixel_sigma=pixel_sigma)
+    sides, between_views = _agreeing_sides(observations, sigma)
+    xy, confidence = on_sides(observations.xy, observations.confidence, sides)
+    observations = replace(observations, xy=xy, confidence=confidence)
+    return _Seen(found, association, observations, sides, between_views, anybody)
 
 
 def _follow_backgrounds(
@@ -451,10 +486,7 @@ def _agreeing_sides(observations: Observations, sigma: Float) -> tuple[Int64, di
 
 def _refine(
     cameras: list[Camera],
-    found: Candidates,
-    association: Association,
-    observations: Observations,
-    sides: Int64,
+    seen: _Seen,
     views: Views,
     result: Triangulation,
     description: Description,
@@ -462,18 +494,20 @@ def _refine(
     workers: int,
 ) -> RefinedFlight:
     return refine_flight(
-        cameras,
-        found,
-        association.choice,
-        observations,
-        sides,
-        views,
-        result,
-        prior=load_pose_errors(description, cameras, settings.pose_noise),
-        clock_sigma_s=load_clock_sigma(description, cameras),
-        pixel_sigma=settings.pixel_sigma,
-        between=description.pose_interpolation,
-        threads=workers,
+        RobustFlight(
+            cameras,
+            seen.found,
+            seen.association.choice,
+            seen.observations,
+            seen.sides,
+            views,
+            result,
+            prior=load_pose_errors(description, cameras, settings.pose_noise),
+            clock_sigma_s=load_clock_sigma(description, cameras),
+            pixel_sigma=settings.pixel_sigma,
+            between=description.pose_interpolation,
+            threads=workers,
+        )
     )
 
 
@@ -501,9 +535,3 @@ def _unused(cameras: list[Camera], result: Triangulation) -> list[str]:
         for camera, any_used in zip(cameras, used, strict=True)
         if not any_used
     ]
-
-
-def _association_counts(association: Association) -> dict[str, list[int]]:
-    """How the people were told apart, one number for each person."""
-    names = ("views", "ambiguous", "switches", "refused", "resumed")
-    return {name: getattr(association, name).tolist() for name in names}

@@ -47,6 +47,30 @@ _HEAD = ("nose", "left_eye", "right_eye", "left_ear", "right_ear")  # as rigid a
 
 
 @dataclass(frozen=True)
+class RobustFlight:
+    """What `robust` made of a flight, and how far what went into it may be off."""
+
+    cameras: Sequence[Camera]  # all of them
+    found: Candidates  # every detection, at the times where people were told apart
+    choice: Int64  # [T', C, P] each person's detection, see `observe`
+    observations: Observations  # at the skeleton's times, on those sides
+    sides: Int64  # [T, P, J, C] which joint's view is the one of each joint, -1 for none, see `on_sides`
+    views: Views  # the same, one row for each joint-frame
+    result: Triangulation  # `robust` of the views
+    prior: Sequence[PoseErrors] | None  # of each camera's pose; None when nobody stated anything
+    clock_sigma_s: Float  # [C] how far each clock may be off, 0 for one that is known
+    pixel_sigma: float  # px, of a good keypoint
+    between: Interpolation  # how far logged poses are trusted
+    threads: int  # see `triangulate`
+
+    @property
+    def t_s(self) -> Float:
+        """[T] seconds since the skeleton's first time."""
+        seconds: Float = (self.observations.t_ns - self.observations.t_ns[0]) / 1e9
+        return seconds
+
+
+@dataclass(frozen=True)
 class RefinedFlight:
     """What the refinement made of a flight; what went in, where it must not be believed."""
 
@@ -58,126 +82,135 @@ class RefinedFlight:
     warnings: list[str]
 
 
-def refine_flight(
-    cameras: Sequence[Camera],
-    found: Candidates,
-    choice: Int64,
-    observations: Observations,
-    sides: Int64,
-    views: Views,
-    result: Triangulation,
-    *,
-    prior: Sequence[PoseErrors] | None,
-    clock_sigma_s: Float,
-    pixel_sigma: float,
-    between: Interpolation,
-    threads: int,
-) -> RefinedFlight:
-    """Refine what `robust` made of a flight.
-
-    Args:
-        cameras: all of them.
-        found: every detection, at the times where people were told apart.
-        choice: [T', C, P] each person's detection, see `observe`.
-        observations: at the skeleton's times, on those sides.
-        sides: [T, P, J, C] which joint's view is the one of each joint, -1 for none, see `on_sides`.
-        views: the same, one row for each joint-frame.
-        result: `robust` of the views.
-        prior: what is known of each camera's pose errors, None when nobody stated anything.
-        clock_sigma_s: [C] how far each clock may be off, 0 for one that is known.
-        pixel_sigma: px, of a good keypoint.
-        between: how far logged poses are trusted.
-        threads: see `triangulate`.
-    """
-    times, people, joints, _ = observations.confidence.shape
-    begin_ns = int(observations.t_ns[0])
-    t_s = (observations.t_ns - begin_ns) / 1e9
-    bones = rigid_pairs(observations.joints, people)
-
-    def seen_from(shifted: list[Camera], every: int = 1) -> tuple[Observations, Views]:
-        observed = observe(shifted, found, choice, observations.t_ns[::every], between)
-        xy, confidence = on_sides(observed.xy, observed.confidence, sides[::every])
-        observed = replace(observed, xy=xy, confidence=confidence)
-        rows = len(observed.t_ns) * people * joints
-        return observed, replace(
-            views,
-            xy=xy.reshape(rows, len(cameras), 2),
-            weight=confidence.reshape(rows, len(cameras)),
-            pose_index=views.pose_index[:rows],
-            position=observed.position,
-            rotation=observed.rotation,
-            pose_sigma=views.pose_sigma[::every],
-        )
-
-    def robustly(shifted: list[Camera]) -> Triangulation:
-        _, again = seen_from(shifted)
-        again = replace(again, pixel_sigma=estimate_noise(again, threads=threads))
-        return triangulate(again, method="robust", threads=threads)
-
-    every = -(-times // _SEARCHED)
-    offset_s = begun_offsets_s(
-        lambda shift_s: seen_from(_shifted(cameras, np.where(clock_sigma_s > 0, shift_s, 0.0)), every)[1],
-        len(observations.t_ns[::every]),
-        clock_sigma_s,
-    )
-
-    # A picture is joined to the three times nearest to its stamp, from which motion cannot be told far away,
-    # and levels of pose noise that are found beside a large offset hold part of it. So the stamps follow the
-    # clocks until little is left to correct.
-    shifted = _shifted(cameras, offset_s)
-    started = robustly(shifted) if offset_s.any() else result
-    for _ in range(1 + _MOST_SHIFTS):
-        sightings = [
-            replace(
-                _sighting(camera, found, c, choice, observations.t_ns, sides[..., c], pixel_sigma, between),
-                pose_covariance=None if prior is None else white_covariance(camera, prior[c]),
-            )
-            for c, camera in enumerate(shifted)
-        ]
-        start = started.points.reshape(times, people * joints, 3)
-        refined = refine(t_s, sightings, start, bones, prior, clock_sigma_s)
-        offset_s = offset_s + refined.clock_offset_s
-        shifted = _shifted(cameras, offset_s)
-        if np.abs(refined.clock_offset_s).max() <= SETTLED_S:
-            break
-        started = robustly(shifted)
-    warnings = [*refined.warnings, *_untold_clocks(refined, cameras, clock_sigma_s)]
-    metrics = _metrics(refined, cameras, offset_s)
+def refine_flight(flight: RobustFlight) -> RefinedFlight:
+    """Refine what `robust` made of a flight."""
+    refined, offset_s = _settle_clocks(flight, _begun_offsets_s(flight))
+    warnings = [*refined.warnings, *_untold_clocks(refined, flight.cameras, flight.clock_sigma_s)]
+    metrics = _metrics(refined, flight.cameras, offset_s)
     if refined.fallback is not None:
         warnings.append(f"refined: fell back to robust, because {refined.fallback}")
-        return RefinedFlight(observations, views, result, None, metrics, warnings)
+        return RefinedFlight(flight.observations, flight.views, flight.result, None, metrics, warnings)
 
-    observed, _ = seen_from(shifted) if offset_s.any() else (observations, views)
+    observed, views = _seen_with(refined, flight, offset_s)
+    result = _believed(refined, views, flight.threads)
+    poses = _camera_table(flight, refined, offset_s)
+    return RefinedFlight(observed, views, result, poses, metrics, warnings)
+
+
+# --- clocks --------------------------------------------------------------------------------------------
+
+
+def _begun_offsets_s(flight: RobustFlight) -> Float:
+    """The offset [C] of every clock to begin with, see `begun_offsets_s`, from some times of the flight."""
+    times = len(flight.observations.t_ns)
+    every = -(-times // _SEARCHED)
+
+    def views_at(shift_s: float) -> Views:
+        return _seen_from(flight, np.where(flight.clock_sigma_s > 0, shift_s, 0.0), every)[1]
+
+    return begun_offsets_s(views_at, len(range(0, times, every)), flight.clock_sigma_s)
+
+
+def _settle_clocks(flight: RobustFlight, offset_s: Float) -> tuple[Refined, Float]:
+    """The refinement, and by how much [C] in s the clocks were put forward in the end.
+
+    A picture is joined to the three times nearest to its stamp, from which motion cannot be told far away,
+    and levels of pose noise that are found beside a large offset hold part of it. So the stamps follow the
+    clocks until little is left to correct.
+    """
+    started = _robustly(flight, offset_s) if offset_s.any() else flight.result
+    for _ in range(1 + _MOST_SHIFTS):
+        refined = _refined_from(flight, offset_s, started)
+        offset_s = offset_s + refined.clock_offset_s
+        if np.abs(refined.clock_offset_s).max() <= SETTLED_S:
+            break
+        started = _robustly(flight, offset_s)
+    return refined, offset_s
+
+
+def _refined_from(flight: RobustFlight, offset_s: Float, started: Triangulation) -> Refined:
+    """The refinement with these clocks, from these points."""
+    _, people, joints, _ = flight.observations.confidence.shape
+    cameras = _shifted(flight.cameras, offset_s)
+    return refine(
+        flight.t_s,
+        [_sighting(flight, c, camera) for c, camera in enumerate(cameras)],
+        started.points.reshape(-1, people * joints, 3),
+        rigid_pairs(flight.observations.joints, people),
+        flight.prior,
+        flight.clock_sigma_s,
+        threads=flight.threads,
+    )
+
+
+def _robustly(flight: RobustFlight, offset_s: Float) -> Triangulation:
+    """What `robust` makes of the flight with these clocks."""
+    _, views = _seen_from(flight, offset_s)
+    views = replace(views, pixel_sigma=estimate_noise(views, threads=flight.threads))
+    return triangulate(views, method="robust", threads=flight.threads)
+
+
+def _untold_clocks(refined: Refined, cameras: Sequence[Camera], prior_s: Float) -> list[str]:
+    """Clocks that pictures hardly tell: nothing moved, or cameras that fly straight make up for it."""
+    return [
+        f"refined: the pictures do not tell the clock of {camera.name}: its offset is known to {sigma:.2g} s "
+        f"where {prior:.2g} s were stated"
+        for camera, sigma, prior in zip(cameras, refined.clock_sigma_s, prior_s, strict=True)
+        if refined.fallback is None and prior > 0 and sigma > _UNTOLD * prior
+    ]
+
+
+# --- what was seen, with other clocks and poses --------------------------------------------------------
+
+
+def _seen_from(flight: RobustFlight, offset_s: Float, every: int = 1) -> tuple[Observations, Views]:
+    """What was seen with these clocks, at every k-th of the skeleton's times."""
+    cameras = _shifted(flight.cameras, offset_s)
+    t_ns, sides = flight.observations.t_ns[::every], flight.sides[::every]
+    observed = observe(cameras, flight.found, flight.choice, t_ns, flight.between)
+    xy, confidence = on_sides(observed.xy, observed.confidence, sides)
+    observed = replace(observed, xy=xy, confidence=confidence)
+    rows = confidence[..., 0].size
+    return observed, replace(
+        flight.views,
+        xy=xy.reshape(rows, len(cameras), 2),
+        weight=confidence.reshape(rows, len(cameras)),
+        pose_index=flight.views.pose_index[:rows],
+        position=observed.position,
+        rotation=observed.rotation,
+        pose_sigma=flight.views.pose_sigma[::every],
+    )
+
+
+def _seen_with(refined: Refined, flight: RobustFlight, offset_s: Float) -> tuple[Observations, Views]:
+    """What was seen with these clocks and the corrected poses, which are taken for exact."""
+    observed, views = _seen_from(flight, offset_s) if offset_s.any() else (flight.observations, flight.views)
     position, rotation = observed.position.copy(), observed.rotation.copy()
-    for c in range(len(cameras)):
-        numbers = _numbers_at(refined.corrections[c], t_s - refined.clock_offset_s[c])
+    for c in range(len(flight.cameras)):
+        numbers = _numbers_at(refined.corrections[c], flight.t_s - refined.clock_offset_s[c])
         position[:, c], rotation[:, c] = corrected(position[:, c], rotation[:, c], numbers)
-    observed = replace(observed, position=position, rotation=rotation)
-    moved = replace(
+    views = replace(
         views,
-        xy=observed.xy.reshape(views.xy.shape),
-        weight=observed.confidence.reshape(views.weight.shape),
         position=position,
         rotation=rotation,
-        pixel_sigma=np.full(len(cameras), pixel_sigma),
+        pixel_sigma=np.full(len(flight.cameras), flight.pixel_sigma),
         pose_sigma=np.zeros_like(views.pose_sigma),
     )
-    moved = replace(moved, pixel_sigma=estimate_noise(moved, threads=threads))
-    gated = triangulate(moved, method="robust", threads=threads)
-    ok = (gated.status == STATUS.index("ok")) & ~np.isnan(refined.position.reshape(-1, 3)[:, 0])
-    final = replace(
+    views = replace(views, pixel_sigma=estimate_noise(views, threads=flight.threads))
+    return replace(observed, position=position, rotation=rotation), views
+
+
+def _believed(refined: Refined, views: Views, threads: int) -> Triangulation:
+    """The estimate's points and covariances, where `robust` reconstructs the joint from these views."""
+    gated = triangulate(views, method="robust", threads=threads)
+    position, covariance = refined.position.reshape(-1, 3), refined.covariance.reshape(-1, 3, 3)
+    ok = (gated.status == STATUS.index("ok")) & ~np.isnan(position[:, 0])
+    points = np.where(ok[:, None], position, gated.points)
+    return replace(
         gated,
-        points=np.where(ok[:, None], refined.position.reshape(-1, 3), gated.points),
-        covariance=np.where(ok[:, None, None], refined.covariance.reshape(-1, 3, 3), gated.covariance),
-    )
-    residual = reprojection_px(moved, final.points)
-    return RefinedFlight(
-        observed,
-        moved,
-        replace(final, residual_px=residual),
-        _camera_table(shifted, refined, begin_ns, between),
-        metrics,
-        warnings,
+        points=points,
+        covariance=np.where(ok[:, None, None], covariance, gated.covariance),
+        residual_px=reprojection_px(views, points),
     )
 
 
@@ -189,32 +222,25 @@ def _shifted(cameras: Sequence[Camera], offset_s: Float) -> list[Camera]:
     ]
 
 
-def _sighting(
-    camera: Camera,
-    found: Candidates,
-    c: int,
-    choice: Int64,
-    t_ns: Int64,
-    sides: Int64,
-    pixel_sigma: float,
-    between: Interpolation,
-) -> Sighting:
-    """What a camera saw in its own pictures, all people side by side.
+def _sighting(flight: RobustFlight, c: int, camera: Camera) -> Sighting:
+    """What camera `c`, its clock put forward, saw in its own pictures, all people side by side.
 
-    Left and right are on the sides [T, P, J] of the nearest of the skeleton's times.
+    Left and right are on the sides of the nearest of the skeleton's times.
     """
-    nearest = np.searchsorted((t_ns[:-1] + t_ns[1:]) // 2, camera.frame_t_ns)
-    xy, confidence = on_sides(*sightings_of(camera, found, c, choice[:, c]), sides[nearest])
-    frames = len(camera.frame_t_ns)
-    position, rotation = camera.poses_at(camera.frame_t_ns, between)
+    t_ns, frame_t_ns = flight.observations.t_ns, camera.frame_t_ns
+    nearest = np.searchsorted((t_ns[:-1] + t_ns[1:]) // 2, frame_t_ns)
+    seen = sightings_of(camera, flight.found, c, flight.choice[:, c])
+    xy, confidence = on_sides(*seen, flight.sides[nearest][..., c])
+    position, rotation = camera.poses_at(frame_t_ns, flight.between)
     return Sighting(
-        t_s=(camera.frame_t_ns - t_ns[0]) / 1e9,
-        xy=xy.reshape(frames, -1, 2),
-        confidence=np.nan_to_num(confidence.reshape(frames, -1)),
+        t_s=(frame_t_ns - t_ns[0]) / 1e9,
+        xy=xy.reshape(len(frame_t_ns), -1, 2),
+        confidence=np.nan_to_num(confidence.reshape(len(frame_t_ns), -1)),
         position=position,
         rotation=rotation,
         focal_px=camera.focal_px,
-        pixel_sigma=pixel_sigma,
+        pixel_sigma=flight.pixel_sigma,
+        pose_covariance=None if flight.prior is None else white_covariance(camera, flight.prior[c]),
     )
 
 
@@ -241,14 +267,7 @@ def _numbers_at(correction: tuple[Float, Float], t_s: Float) -> Float:
     return np.stack([np.interp(t_s, when, column) for column in numbers.T], axis=1)
 
 
-def _untold_clocks(refined: Refined, cameras: Sequence[Camera], prior_s: Float) -> list[str]:
-    """Clocks that pictures hardly tell: nothing moved, or cameras that fly straight make up for it."""
-    return [
-        f"refined: the pictures do not tell the clock of {camera.name}: its offset is known to {sigma:.2g} s "
-        f"where {prior:.2g} s were stated"
-        for camera, sigma, prior in zip(cameras, refined.clock_sigma_s, prior_s, strict=True)
-        if refined.fallback is None and prior > 0 and sigma > _UNTOLD * prior
-    ]
+# --- what is told of it ---------------------------------------------------------------------------------
 
 
 def _metrics(refined: Refined, cameras: Sequence[Camera], offset_s: Float) -> dict[str, Any]:
@@ -269,17 +288,15 @@ def _metrics(refined: Refined, cameras: Sequence[Camera], offset_s: Float) -> di
     }
 
 
-def _camera_table(
-    cameras: Sequence[Camera], refined: Refined, begin_ns: int, between: Interpolation
-) -> pd.DataFrame:
+def _camera_table(flight: RobustFlight, refined: Refined, offset_s: Float) -> pd.DataFrame:
     """The corrected pose of every picture that has one."""
     import pandas as pd
 
     parts = []
-    for c, camera in enumerate(cameras):
-        position, rotation = camera.poses_at(camera.frame_t_ns, between)
+    for c, camera in enumerate(_shifted(flight.cameras, offset_s)):
+        position, rotation = camera.poses_at(camera.frame_t_ns, flight.between)
         (posed,) = np.nonzero(~np.isnan(position[:, 0]))
-        stamped_s = (camera.frame_t_ns[posed] - begin_ns) / 1e9 - refined.clock_offset_s[c]
+        stamped_s = (camera.frame_t_ns[posed] - flight.observations.t_ns[0]) / 1e9 - refined.clock_offset_s[c]
         numbers = _numbers_at(refined.corrections[c], stamped_s)
         true_position, true_rotation = corrected(position[posed], rotation[posed], numbers)
         table = pd.DataFrame({"t_ns": camera.frame_t_ns[posed], "camera": camera.name})
