@@ -59,6 +59,49 @@ class Stretch:
         return np.broadcast_to(self.place, (len(t_s), 2)), heading
 
 
+@dataclass(frozen=True)
+class _Rhythm:
+    """When the steps of a stretch fall, at N moments from some seconds before it to some behind."""
+
+    start_s: float
+    knots: Float  # [K, 3] seconds since then, m/s, how far it is run
+    since_s: Float  # [N] since then
+    moments_s: Float  # [N]
+    steps: Float  # [N] since then, and parts of one
+    places: Float  # [N, 2] m, of the body
+
+    def when(self, step: float) -> float:
+        """When so many steps are taken."""
+        return self.start_s + float(np.interp(step, self.steps, self.since_s))
+
+    def gait_at(self, t_s: float) -> tuple[float, float]:
+        """Speed in m/s, and how much of the gait is a run."""
+        times, speeds, runs = self.knots.T
+        speed = float(np.interp(t_s - self.start_s, times, speeds))
+        return speed, float(np.interp(t_s - self.start_s, times, runs)) * gait.running(speed)
+
+    def outruns(self, step: Footstep, reach_m: float) -> float:
+        """When the body is as far from a foot as a leg reaches."""
+        soonest = int(np.searchsorted(self.moments_s, step.strike_s + 0.1, side="right"))
+        for begin in range(soonest, len(self.moments_s), _LOOKED_AHEAD):  # long ways have many steps
+            ahead = slice(begin, begin + _LOOKED_AHEAD)
+            far = np.hypot(*(self.places[ahead] - step.place).T) > reach_m
+            if far.any():
+                return float(self.moments_s[begin + int(far.argmax())])
+        return np.inf
+
+
+def _reached(stretch: Stretch, strike_s: float, above_s: float, speed: float) -> tuple[Float, float]:
+    """Where the body is, and its heading, when it stands above a foot that has come down."""
+    (now, place), (_, heading) = stretch.at(np.array([strike_s, above_s]))
+    # Who still gains speed does not yet reach as far ahead.
+    mean = float(np.hypot(*(place - now))) / (above_s - strike_s)
+    if mean > 1.1 * speed:
+        early_s = strike_s + (above_s - strike_s) * 1.1 * speed / mean
+        (place,), (heading,) = stretch.at(np.array([early_s]))
+    return place, heading
+
+
 @dataclass
 class Plan:
     """What has been planned up to `t_s`; the body stands there at `place`, looking along `heading`."""
@@ -175,65 +218,45 @@ class Plan:
         least: float = 0.0,
     ) -> None:
         """Plan the steps of a stretch: `count` of them up to the last knot, or until both feet stand."""
-        phase = self._phase(knots, least)
-        lasting = stretch.end_s - stretch.start_s
-        fine = np.linspace(-3.0, lasting + 5.0, int((lasting + 8.0) / 0.005))
-        moments_s = stretch.start_s + fine
-        places, _ = stretch.at(moments_s)
-        # Steps are shorter where it is steep.
-        climbed = np.abs(np.diff(self.ground(places))) / np.maximum(
-            np.hypot(*np.diff(places, axis=0).T), 1e-9
-        )
-        taken = np.diff(phase(fine)) * (1 + _SHORTER_UPHILL * np.minimum(climbed, 1.0))
-        phases = np.concatenate([[0.0], np.cumsum(taken)])
-        phases -= np.interp(0.0, fine, phases)
-        if count is not None:
-            phases *= count / np.interp(knots[-1][0], fine, phases)
-
-        def when(at_phase: float) -> float:
-            return stretch.start_s + float(np.interp(at_phase, phases, fine))
-
-        times, speeds, runs = np.array(knots).T
-
-        def gait_at(t_s: float) -> tuple[float, float]:
-            speed = float(np.interp(t_s - stretch.start_s, times, speeds))
-            return speed, float(np.interp(t_s - stretch.start_s, times, runs)) * gait.running(speed)
-
-        def outrun(step: Footstep) -> float:
-            """When the body is as far from a foot as a leg reaches."""
-            soonest = int(np.searchsorted(moments_s, step.strike_s + 0.1, side="right"))
-            for begin in range(soonest, len(fine), _LOOKED_AHEAD):  # long ways have many steps
-                ahead = slice(begin, begin + _LOOKED_AHEAD)
-                far = np.hypot(*(places[ahead] - step.place).T) > _REACH * self.leg_m
-                if far.any():
-                    return float(moments_s[begin + int(far.argmax())])
-            return np.inf
-
+        rhythm = self._rhythm(stretch, knots, count, least)
         landed, number = 0, 0
         while (landed < 2) if count is None else (number < count):
             number += 1
             foot = first if number % 2 else 1 - first
-            strike_s = when(number)
-            speed, run = gait_at(strike_s)
+            strike_s = rhythm.when(number)
+            speed, run = rhythm.gait_at(strike_s)
             in_air = gait.swing_steps(speed, run)
             # Who slows down lifts the foot behind as fast as it then still was.
-            lift_s = max(
-                when(number - max(in_air, gait.swing_steps(*gait_at(when(number - 1))))), stretch.start_s
-            )
-            lift_s = min(lift_s, outrun(self.feet[foot][-1]))
+            before = gait.swing_steps(*rhythm.gait_at(rhythm.when(number - 1)))
+            lift_s = max(rhythm.when(number - max(in_air, before)), stretch.start_s)
+            lift_s = min(lift_s, rhythm.outruns(self.feet[foot][-1], _REACH * self.leg_m))
             # The stance lasts 2 - in_air steps.
-            above_s = when(number + gait.above_foot(run) * (2 - in_air))
-            (now, place), (_, heading) = stretch.at(np.array([strike_s, above_s]))
-            # Who still gains speed does not yet reach as far ahead.
-            mean = float(np.hypot(*(place - now))) / (above_s - strike_s)
-            if mean > 1.1 * speed:
-                early_s = strike_s + (above_s - strike_s) * 1.1 * speed / mean
-                (place,), (heading,) = stretch.at(np.array([early_s]))
+            above_s = rhythm.when(number + gait.above_foot(run) * (2 - in_air))
+            place, heading = _reached(stretch, strike_s, above_s, speed)
             self._put(foot, lift_s, strike_s, self._beside(foot, place, heading, speed, run), run)
             self.t_s = strike_s
             landed = landed + 1 if above_s >= stretch.end_s else 0
         self.stretches.append(stretch)
         (self.place,), (self.heading,) = (values.copy() for values in stretch.at(np.array([stretch.end_s])))
+
+    def _rhythm(
+        self, stretch: Stretch, knots: Sequence[tuple[float, float, float]], count: int | None, least: float
+    ) -> _Rhythm:
+        """The cadence of the speed, steps shorter where it is steep; `count` of them up to the last knot."""
+        phase = self._phase(knots, least)
+        lasting = stretch.end_s - stretch.start_s
+        since_s = np.linspace(-3.0, lasting + 5.0, int((lasting + 8.0) / 0.005))
+        moments_s = stretch.start_s + since_s
+        places, _ = stretch.at(moments_s)
+        climbed = np.abs(np.diff(self.ground(places))) / np.maximum(
+            np.hypot(*np.diff(places, axis=0).T), 1e-9
+        )
+        taken = np.diff(phase(since_s)) * (1 + _SHORTER_UPHILL * np.minimum(climbed, 1.0))
+        steps = np.concatenate([[0.0], np.cumsum(taken)])
+        steps -= np.interp(0.0, since_s, steps)
+        if count is not None:
+            steps *= count / np.interp(knots[-1][0], since_s, steps)
+        return _Rhythm(stretch.start_s, np.array(knots), since_s, moments_s, steps, places)
 
     def _beside(
         self, foot: int, place: Float, heading: float, speed: float, run: float
