@@ -34,11 +34,13 @@ from pipelines.keypoints.grouping_rays import (
     add_logged_node,
     collect_nodes,
     compare_nodes,
+    empty_nodes,
     place_group,
     views_of_group,
 )
 from pipelines.keypoints.grouping_tracks import (
     Tracks,
+    empty_tracks,
     found_tracks,
     is_most_like,
     recognise_tracks,
@@ -182,30 +184,8 @@ def follow(
         overruled=np.zeros(confidence.shape[:3], np.bool_),
         nearest=np.full(times, np.nan),
     )
-    nodes = Nodes(
-        camera=np.zeros(room, np.int64),
-        detection=np.zeros(room, np.int64),
-        points=np.zeros((room, joints, 2)),
-        rays=np.zeros((room, joints, 3)),
-        size=np.zeros(room),
-        whole=np.zeros(room, np.bool_),
-        weight=np.zeros((room, room)),
-        known=np.zeros((room, slots)),
-        bond=np.zeros((room, slots + room)),
-        barred=np.zeros((room, slots), np.bool_),
-        label=np.zeros(room, np.int64),
-        member=np.zeros((slots + room, cameras + 1), np.int64),
-    )
-    tracks = Tracks(
-        identity=np.full(slots, -1, np.int64),
-        views=np.zeros(slots, np.int64),
-        seen_s=np.zeros(slots),
-        middle=np.zeros((slots, 3)),
-        spread=np.full(slots, np.nan),
-        held_s=np.full((slots, cameras + 1), -np.inf),
-        held=np.zeros((slots, cameras + 1, joints, 2)),
-        apart=np.zeros((slots, slots), np.bool_),
-    )
+    nodes = empty_nodes(room, slots, cameras, joints)
+    tracks = empty_tracks(slots, cameras, joints)
     _follow(
         np.ascontiguousarray(time_s, np.float64),
         np.ascontiguousarray(xy, np.float64),

@@ -39,6 +39,24 @@ class Nodes(NamedTuple):
     member: Int64  # [S + N, C] node of each label in each camera, -1 none
 
 
+def empty_nodes(room: int, slots: int, cameras: int, joints: int) -> Nodes:
+    """Room for the detections of any frame; each fills it anew. The logged actor is one more camera."""
+    return Nodes(
+        camera=np.zeros(room, np.int64),
+        detection=np.zeros(room, np.int64),
+        points=np.zeros((room, joints, 2)),
+        rays=np.zeros((room, joints, 3)),
+        size=np.zeros(room),
+        whole=np.zeros(room, np.bool_),
+        weight=np.zeros((room, room)),
+        known=np.zeros((room, slots)),
+        bond=np.zeros((room, slots + room)),
+        barred=np.zeros((room, slots), np.bool_),
+        label=np.zeros(room, np.int64),
+        member=np.zeros((slots + room, cameras + 1), np.int64),
+    )
+
+
 @helper
 def median_of(values: Float, count: int) -> float:
     """Median of the first `count` values, which are sorted in place."""

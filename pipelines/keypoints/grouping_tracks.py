@@ -40,6 +40,20 @@ class Tracks(NamedTuple):
     apart: Bool  # [S, S] seen side by side in one picture: two people
 
 
+def empty_tracks(slots: int, cameras: int, joints: int) -> Tracks:
+    """Nobody yet. The logged actor is one more camera."""
+    return Tracks(
+        identity=np.full(slots, -1, np.int64),
+        views=np.zeros(slots, np.int64),
+        seen_s=np.zeros(slots),
+        middle=np.zeros((slots, 3)),
+        spread=np.full(slots, np.nan),
+        held_s=np.full((slots, cameras + 1), -np.inf),
+        held=np.zeros((slots, cameras + 1, joints, 2)),
+        apart=np.zeros((slots, slots), np.bool_),
+    )
+
+
 @helper
 def recognise_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, scratch: Float) -> None:
     """How well each detection continues each track's last picture in the same camera."""
