@@ -143,7 +143,7 @@ def build_scene(
     rules: Rules,
 ) -> Scene:
     """Prepare a comparison: distance fields, times, where the first camera starts, and what is doubtful."""
-    notes, warnings = [], list(flight.warnings)
+    notes = []
     unknown: Unknown = "occupied" if description.map and description.map.unknown == "occupied" else "free"
     fields = tuple(
         sorted((distance_field(one, unknown=unknown) for one in maps), key=lambda field: field.from_ns)
@@ -180,21 +180,29 @@ def build_scene(
         notes=tuple(notes),
         warnings=(),
     )
+    return replace(scene, warnings=(*flight.warnings, *_doubts(scene)))
+
+
+def _doubts(scene: Scene) -> list[str]:
+    """What is amiss with the maps, the start and the skeleton, one line each."""
+    doubts = []
+    fields = scene.fields
     if fields and not scene.field.has_obstacles:
-        warnings.append("nothing in the map is occupied")
-    outside = float(1.0 - scene.field.covers(actor).mean()) if fields else 0.0
+        doubts.append("nothing in the map is occupied")
+    outside = float(1.0 - scene.field.covers(scene.actor).mean()) if fields else 0.0
     if outside > 0.0:
-        warnings.append(
+        doubts.append(
             f"the map does not cover {100 * outside:.0f} % of the actor's way: what lies outside is free"
         )
-    if fields and fields[0].from_ns > t_ns[0]:
-        late_s = min((fields[0].from_ns - int(t_ns[0])) / 1e9, float(scene.t_s[-1]))
-        warnings.append(f"the first map comes {late_s:.1f} s after the start: nothing is known until then")
+    if fields and fields[0].from_ns > scene.t_ns[0]:
+        late_s = min((fields[0].from_ns - int(scene.t_ns[0])) / 1e9, float(scene.t_s[-1]))
+        doubts.append(f"the first map comes {late_s:.1f} s after the start: nothing is known until then")
     inside = scene.start_slots_inside()
     if inside:
-        warnings.append(
-            f"{inside} of {drones} drones start inside an obstacle: choose another --yaw, --radius or --tilt"
+        doubts.append(
+            f"{inside} of {scene.drones} drones start inside an obstacle:"
+            " choose another --yaw, --radius or --tilt"
         )
-    if flight.skeleton is None:
-        warnings.append("no skeleton to look at, so no reconstruction error: run `mocap reconstruct` first")
-    return replace(scene, warnings=tuple(warnings))
+    if scene.flight.skeleton is None:
+        doubts.append("no skeleton to look at, so no reconstruction error: run `mocap reconstruct` first")
+    return doubts
