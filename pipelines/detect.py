@@ -136,27 +136,35 @@ def detect(
         lambda block: run.chunk(block.name, partial(produce, block)), blocks, workers=workers, halt=work.halt
     )
     counts = _assemble(run.folder, media, blocks, folders)
-    if not any(camera["detections"] for camera in counts.values()):
-        lost = sum(camera["undecoded"] for camera in counts.values())
-        raise DataError(
-            session.folder,
-            "nobody was found in any picture" + (f": {lost} of {pictures} cannot be decoded" if lost else ""),
-            "look at the pictures, or give keypoints",
-        )
+    _refuse_nobody(session.folder, counts, pictures)
     joints = list(read_json(folders[0] / "counts.json")["joints"])
     rows = {name: list(work.span(name)) for name in media}
-    progress.note(f"keypoints detected by {chosen.title}")
-    warnings = [
-        f"{name}: {gone} of {gone + camera.get('frames', 0)} pictures cannot be decoded"
-        for name, camera in counts.items()
-        if (gone := camera["undecoded"])
-    ]
-    for warning in warnings:
-        progress.note(warning)
+    warnings = _lost_pictures(counts)
+    for note in (f"keypoints detected by {chosen.title}", *warnings):
+        progress.note(note)
     return run.publish(
         counts={"detector": chosen.title, "joints": joints, "cameras": counts, "rows": rows},
         warnings=warnings,
     )
+
+
+def _refuse_nobody(folder: Path, counts: Mapping[str, Mapping[str, int]], pictures: int) -> None:
+    if any(camera["detections"] for camera in counts.values()):
+        return
+    lost = sum(camera["undecoded"] for camera in counts.values())
+    raise DataError(
+        folder,
+        "nobody was found in any picture" + (f": {lost} of {pictures} cannot be decoded" if lost else ""),
+        "look at the pictures, or give keypoints",
+    )
+
+
+def _lost_pictures(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
+    return [
+        f"{name}: {gone} of {gone + camera.get('frames', 0)} pictures cannot be decoded"
+        for name, camera in counts.items()
+        if (gone := camera["undecoded"])
+    ]
 
 
 def _inputs(

@@ -136,6 +136,7 @@ def film(
             seed=plan.seed,
         )
         reconstructed, metrics = {}, {}
+        desired_deg = float(compared.settings["planner.tilt_deg"])
         for name, arm in arms.items():
             parts = [
                 run.chunk(f"{name}-{camera}", partial(_shoot, arm, k, renderer, detector, progress))
@@ -145,13 +146,8 @@ def film(
             views = _views(arm, sightings, compared.settings["seed"])
             points = locate(views, method="robust").points.reshape(arm.of.joints.shape)
             reconstructed[name] = points
-            desired = float(compared.settings["planner.tilt_deg"])
-            metrics[name] = _measured(arm, sightings, views, points, desired_tilt_deg=desired)
-            (run.folder / name).mkdir()
-            motion = JointMotion(arm.of.t_ns, arm.of.person.joints, points[:, None])
-            write_table(run.folder / name / "skeleton.parquet", motion_table(motion), TRUTH)
-            for k, part in enumerate(parts):
-                _draw(arm, k, sightings, points, part / "pictures.mp4", run.folder / name)
+            metrics[name] = _measured(arm, sightings, views, points, desired_tilt_deg=desired_deg)
+            _write_arm(run.folder / name, arm, sightings, points, parts)
         true_joints = {name: arm.of.joints for name, arm in arms.items()}
         for name, error_mm in errors_in_common(reconstructed, true_joints).items():
             metrics[name]["common_mpjpe_mm"] = error_mm
@@ -334,6 +330,15 @@ def _measured(
 
 
 # --- drawing -------------------------------------------------------------------------------------------
+
+
+def _write_arm(folder: Path, arm: _Arm, sightings: Sightings, points: Float, parts: Sequence[Path]) -> None:
+    """Write what was reconstructed of an arm, and each camera's pictures with it drawn on them."""
+    folder.mkdir()
+    motion = JointMotion(arm.of.t_ns, arm.of.person.joints, points[:, None])
+    write_table(folder / "skeleton.parquet", motion_table(motion), TRUTH)
+    for k, part in enumerate(parts):
+        _draw(arm, k, sightings, points, part / "pictures.mp4", folder)
 
 
 def _draw(arm: _Arm, camera: int, sightings: Sightings, points: Float, pictures: Path, folder: Path) -> None:

@@ -23,7 +23,7 @@ from pipelines.session.errors import DataError, NotYetReadError
 from pipelines.session.manifest import Flight, read_flight
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.stage_records import Stage, StageRecord
-from pipelines.session.stages import locked
+from pipelines.session.stages import Run, locked
 from pipelines.session.storage import read_json, write_json
 
 INGEST = Stage("ingest", revision=2)
@@ -93,15 +93,7 @@ def ingest(
                 return Ingested(target, run.record, stored_description, skipped=True)
 
             progress.start("Reading cameras", len(flight.cameras))
-            entries: dict[str, CameraEntry] = {}
-            warnings: list[str] = []
-            for name in flight.cameras:
-                chunk = run.chunk(name, partial(reader.store_camera, name))
-                shutil.copytree(chunk / "tables", run.folder / "cameras" / name)
-                stored = read_json(chunk / "entry.json")
-                entries[name] = CameraEntry.model_validate(stored["entry"])
-                warnings += stored["warnings"]
-                progress.advance()
+            entries, warnings = _store_cameras(run, reader, list(flight.cameras), progress)
             _check_overlap(flight_path, entries)
             truth = reader.store_truth(run.folder, entries)
             actor = reader.store_actor(run.folder, entries)
@@ -132,6 +124,22 @@ def ingest(
             write_json(run.folder / "session.json", description.model_dump(mode="json", by_alias=True))
             record = run.publish(counts=_counts(entries), warnings=warnings)
     return Ingested(target, record, description, skipped=False)
+
+
+def _store_cameras(
+    run: Run, reader: FlightReader, names: Sequence[str], progress: Progress
+) -> tuple[dict[str, CameraEntry], list[str]]:
+    """Read the cameras that an interrupted ingest has not read; what the session says of each, and doubts."""
+    entries: dict[str, CameraEntry] = {}
+    warnings: list[str] = []
+    for name in names:
+        chunk = run.chunk(name, partial(reader.store_camera, name))
+        shutil.copytree(chunk / "tables", run.folder / "cameras" / name)
+        stored = read_json(chunk / "entry.json")
+        entries[name] = CameraEntry.model_validate(stored["entry"])
+        warnings += stored["warnings"]
+        progress.advance()
+    return entries, warnings
 
 
 def _refuse_losses(flight_path: Path, description: Description) -> None:
