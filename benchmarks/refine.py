@@ -58,7 +58,7 @@ def print_speed(times: int) -> None:
     for name, share in (("2 px", 0.0), ("outliers", 0.05)):
         flight = formation(times, 5, (), 0, bad_share=share)
         started, busy = time.perf_counter(), time.process_time()
-        result = refined_of(flight, (), told=True)
+        result = refined_of(flight, (), told=True, threads=2)
         elapsed, busy = time.perf_counter() - started, time.process_time() - busy
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(
@@ -122,11 +122,11 @@ def formation_and_refined(
     return flight, refined_of(flight, models, told=told)
 
 
-def refined_of(flight: Formation, models: Sequence[NoiseModel], *, told: bool) -> Refined:
+def refined_of(flight: Formation, models: Sequence[NoiseModel], *, told: bool, threads: int = 1) -> Refined:
     """What the refinement makes of a flight; not told, it has to find the levels itself."""
     count = len(flight.sightings)
     prior = [pose_errors(models)] * count if told else None
-    return refine(flight.t_s, flight.sightings, flight.start, BONES, prior, np.zeros(count))
+    return refine(flight.t_s, flight.sightings, flight.start, BONES, prior, np.zeros(count), threads=threads)
 
 
 def rooted(position: Float) -> Float:

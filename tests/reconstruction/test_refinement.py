@@ -14,7 +14,7 @@ from pipelines.geometry.metrics import aligned_distances
 from pipelines.geometry.noise import Bias, Drift, NoiseModel, White
 from pipelines.reconstruction.refinement import kernels
 from pipelines.reconstruction.refinement.building import build
-from pipelines.reconstruction.refinement.elimination import System, covariances, eliminate, misfit, prior_cost
+from pipelines.reconstruction.refinement.elimination import covariances, eliminate, moments
 from pipelines.reconstruction.refinement.estimate import initial_state, solve
 from pipelines.reconstruction.refinement.levels import shrunk
 from pipelines.reconstruction.refinement.problem import (
@@ -29,6 +29,7 @@ from pipelines.reconstruction.refinement.problem import (
     pose_errors,
 )
 from pipelines.reconstruction.refinement.refine import corrected, refine
+from pipelines.reconstruction.refinement.system import System, misfit, prior_cost
 from tests.reconstruction.formations import BONES, Formation, formation, mean_mm
 
 Float = NDArray[np.float64]
@@ -82,15 +83,17 @@ def test_derivatives_are_those_of_finite_differences(angle: float) -> None:
 # --- equations -----------------------------------------------------------------------------------------
 
 
-def small_system(*, exact: bool) -> tuple[System, State]:
-    """Five times, three joints, two cameras with every kind of unknown, one of them between the times."""
-    flight = formation(5, 2, [], 0, pixel_px=0.0 if exact else 4.0)
+def small_system(*, exact: bool, times: int = 5, knots: int = 3) -> tuple[System, State]:
+    """Few times, three joints, two cameras with every kind of unknown, one of them between the times."""
+    flight = formation(times, 2, [], 0, pixel_px=0.0 if exact else 4.0)
     shown = np.array([5, 11, 15])
     sightings = [replace(s, xy=s.xy[:, shown], confidence=s.confidence[:, shown]) for s in flight.sightings]
     if not exact:
         sightings[1] = replace(sightings[1], t_s=sightings[1].t_s + 0.008)
     problem = build(flight.t_s, sightings, np.array([[0, 1], [1, 2]]))
-    problem = replace(problem, knot_t_s=np.array([0.0, flight.t_s[2] - 1e-9, flight.t_s[-1]]))
+    knot_t_s = np.linspace(0.0, flight.t_s[-1], knots)
+    knot_t_s[1:-1] -= 1e-9  # so that times are clearly beyond them
+    problem = replace(problem, knot_t_s=knot_t_s)
     errors = PoseErrors(
         (0.05, 0.01),
         (Process(SHIFT_IN_WORLD, 0.3, 0.05), Process(ROTATION, 0.02), Process(SHIFT_IN_CAMERA, 0.1)),
@@ -142,10 +145,15 @@ def test_solution_is_where_the_cost_is_least() -> None:
 
 
 @pytest.mark.slow  # compiles much
-def test_covariances_are_those_of_the_whole_inverse() -> None:
-    system, state = small_system(exact=True)
+@pytest.mark.parametrize(
+    ("times", "knots"),
+    [(5, 3), (3, 2), (3, 6), (6, 9)],
+    ids=["both halves", "no second half", "a second half of knots", "several knots a time"],
+)
+def test_covariances_are_those_of_the_whole_inverse(times: int, knots: int) -> None:
+    system, state = small_system(exact=True, times=times, knots=knots)
     # Bones are as long as the lengths say and accelerations small: Gauss-Newton's matrix is the Hessian.
-    still = np.repeat(state.position[2:3], 5, axis=0)
+    still = np.repeat(state.position[2:3], times, axis=0)
     ends = still[0][system.problem.bones]
     shared = state.shared.copy()
     shared[-2:] = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)
@@ -154,7 +162,7 @@ def test_covariances_are_those_of_the_whole_inverse() -> None:
     hessian = picture_hessian(system, state) + prior_hessian(system, state)
     # Lengths of which the estimate holds 1e-6 in addition, and joints 1e-4: far below what is measured.
     inverse = np.linalg.inv(hessian)
-    times, joints = still.shape[:2]
+    joints = still.shape[1]
     own = inverse[: 3 * times * joints, : 3 * times * joints].reshape(times, joints, 3, times, joints, 3)
     expected = np.einsum("tjatjb->tjab", own)
     found = covariances(system, eliminate(system, state))
@@ -211,6 +219,19 @@ def test_long_flights_are_factorised_in_segments_with_the_same_result(
     monkeypatch.setattr("pipelines.reconstruction.refinement.elimination._KEPT_BYTES", 0)
     _, pieces, _ = solve(system.problem, system.knowledge, state, rounds=2)
     np.testing.assert_array_equal(packed(pieces), packed(whole))
+
+
+def test_two_threads_give_the_same_bytes() -> None:
+    system, state = small_system(exact=False, times=8)
+    found = []
+    for threads in (1, 2):
+        problem = replace(system.problem, threads=threads)
+        again, solved, at = solve(problem, system.knowledge, state, rounds=2)
+        found.append(
+            [packed(solved), covariances(again, at), *vars(moments(again, solved, at, every=1)).values()]
+        )
+    for alone, together in zip(*found, strict=True):
+        np.testing.assert_array_equal(alone, together)
 
 
 # --- results -------------------------------------------------------------------------------------------

@@ -43,13 +43,14 @@ class Sighting:
         return ~np.isnan(self.position[:, 0]) & ~np.isnan(self.xy[..., 0]).all(axis=1)
 
 
-def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64) -> Problem:
+def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64, *, threads: int = 1) -> Problem:
     """Sort all pictures by the skeleton's times around them; those near none of them are left out.
 
     Args:
         t_s: [T] strictly increasing times of the skeleton, at least three.
         sightings: what each camera saw.
         bones: [B, 2] joints whose distance hardly changes.
+        threads: see `Problem`.
     """
     parts, covariances, logged = [], [np.empty((0, 6, 6))], 0
     for camera, sighting in enumerate(sightings):
@@ -62,7 +63,7 @@ def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64) -> Problem:
     pictures = Pictures(*(np.ascontiguousarray(column[order]) for column in columns))
     knots = max(int(np.ceil((t_s[-1] - t_s[0]) / KNOT_S)) + 1, 2)
     knot_t_s = np.linspace(t_s[0], t_s[-1], knots)
-    return Problem(t_s, pictures, bones, knot_t_s, np.concatenate(covariances))
+    return Problem(t_s, pictures, bones, knot_t_s, np.concatenate(covariances), threads)
 
 
 def _pictures(t_s: Float, sighting: Sighting, camera: int, logged: int) -> tuple[NDArray[np.generic], ...]:

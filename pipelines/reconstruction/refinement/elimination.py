@@ -4,22 +4,24 @@ The normal equations are banded in time with a border: a second difference ties 
 picture three times and two knots, and the shared unknowns touch everything. So joints and knots are
 eliminated in the order of time by one small dense front (Duff & Reid 1983, multifrontal; the same as a
 forward filter in information form), and found again backwards, with the covariances of every front on the
-way (Takahashi's recursion; in time, the smoother of Rauch, Tung & Striebel 1965). Nothing is approximated by
-windows. Factors of a long flight do not fit into memory: the fronts at every `_SEGMENT` times are kept, and
-a segment is factorised again when the way back reaches it.
+way (Takahashi's recursion; in time, the smoother of Rauch, Tung & Striebel 1965). Two fronts start from both
+ends of the flight and meet in the middle. Nothing is approximated by windows. Factors of a long flight do not
+fit into memory: the fronts at every `_SEGMENT` times are kept, and a segment is factorised again when the way
+back reaches it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.reconstruction.refinement import kernels, sweeps
-from pipelines.reconstruction.refinement.problem import EXACT, Knowledge, Layout, PoseErrors, Problem, State
+from pipelines.reconstruction.refinement.halves import Half, halved, side_by_side
+from pipelines.reconstruction.refinement.problem import State
+from pipelines.reconstruction.refinement.system import System
 
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -28,155 +30,11 @@ Int64 = NDArray[np.int64]
 _forwards: Callable[..., tuple[int, float]] = sweeps.forwards
 _visit: Callable[..., tuple[Float, int]] = sweeps.visit
 _whiten: Callable[..., None] = kernels.whiten
-_misfit: Callable[..., float] = kernels.misfit
 
 _SEGMENT = 256  # times of the skeleton
-_KEPT_BYTES = 600e6  # of factors, before segments are factorised twice
+_KEPT_BYTES = 300e6  # of a half's factors, before segments are factorised twice
 _HELD = 1e10  # 1 / m^2, of a bone length
 _ANYWHERE_M = 100.0  # a joint that nobody saw lies within this of where the search began
-
-
-@dataclass(frozen=True)
-class System:
-    """A problem with its prior, linearised at will."""
-
-    problem: Problem
-    knowledge: Knowledge
-    layout: Layout
-    bound2: float  # of the robust loss
-    held: bool = False  # bone lengths stay as they are
-    sharpness: Float = field(init=False)
-    white_row: Int64 = field(init=False)  # [G] where the next has the picture's
-    white_precision: Float = field(init=False)  # [., 6, 6] of each camera, then of logged poses; inf without
-    inverse_acceleration: Float = field(init=False)  # [J, J]
-    of_time: Int64 = field(init=False)  # [T - 2]
-    fraction: Float = field(init=False)  # [G]
-    starts: Int64 = field(init=False)  # [T - 1] where the pictures of each time begin
-    usual_step_s: float = field(init=False)
-    curvature: Float = field(init=False)  # [T - 2, 3] weights that make an acceleration of three positions
-    spread: Float = field(init=False)  # [T - 2] its variance against the usual
-    tie_kept: Float = field(init=False)  # [K - 1, c] share of a slow error that is left at the next knot
-    tie_variance: Float = field(init=False)  # [K - 1, c] what comes in addition
-
-    def __post_init__(self) -> None:
-        """Derive what every linearisation needs."""
-        problem, known = self.problem, self.knowledge
-        of_time, fraction = problem.intervals()
-        white_row, white_precision = _white_errors(problem, known.poses)
-        before, after = np.diff(problem.t_s)[:-1], np.diff(problem.t_s)[1:]
-        usual = float(np.median(np.diff(problem.t_s)))
-        kept, variance = _ties(self.layout)
-        derived = {
-            "sharpness": problem.pictures.sharpness / (known.pixel_scale * np.sqrt(known.memory)),
-            "white_row": white_row,
-            "white_precision": white_precision,
-            "inverse_acceleration": np.linalg.inv(known.acceleration),
-            "of_time": of_time,
-            "fraction": fraction,
-            "starts": np.searchsorted(problem.pictures.first, np.arange(len(problem.t_s) - 1)),
-            "usual_step_s": usual,
-            "curvature": np.stack(
-                [2 / (before * (before + after)), -2 / (before * after), 2 / (after * (before + after))],
-                axis=1,
-            ),
-            "spread": usual / (0.5 * (before + after)),
-            "tie_kept": kept,
-            "tie_variance": variance,
-        }
-        for name, value in derived.items():
-            object.__setattr__(self, name, value)
-
-    @property
-    def size(self) -> int:
-        """Of a front."""
-        return 9 * self.problem.joints + 2 * self.layout.knot_count + self.layout.shared_count
-
-    def picture_arguments(self) -> tuple[Any, ...]:
-        """What the kernels take between a picture's place in time and the robust bound."""
-        pictures = self.problem.pictures
-        return (
-            pictures.xy,
-            self.sharpness,
-            pictures.position,
-            pictures.rotation,
-            pictures.speed,
-            pictures.turn,
-            pictures.trust,
-        )
-
-    def entries(self) -> tuple[Any, ...]:
-        """What the kernels need to know of the layout."""
-        layout = self.layout
-        return (
-            layout.entry_start,
-            layout.entry_number,
-            layout.entry_knot,
-            layout.entry_column,
-            layout.clock_column,
-        )
-
-    def grown(self, state: State) -> float:
-        """How much larger the body is than the one for which the prior of motion and bones holds."""
-        lengths = state.shared[self.layout.bone_column :]
-        return float(lengths.mean() / self.knowledge.size_m) if len(lengths) else 1.0
-
-    def arguments(self, state: State) -> tuple[Any, ...]:
-        """What the sweeps need to know of the problem and of where it is linearised."""
-        pictures = self.problem.pictures
-        return (
-            self.problem.t_s,
-            state.position,
-            state.knots,
-            state.shared,
-            state.white,
-            self.starts,
-            pictures.camera,
-            pictures.when_s,
-            self.fraction,
-            self.of_time,
-            *self.picture_arguments(),
-            self.bound2,
-            self.white_row,
-            self.white_precision,
-            *self.entries(),
-            self.layout.knot_count,
-            self.curvature,
-            self.spread,
-        )
-
-
-def _white_errors(problem: Problem, poses: Sequence[PoseErrors]) -> tuple[Int64, Float]:
-    """Where the inverse covariance of each picture's white error stands [G], and all of them [., 6, 6]."""
-    knot_s = float(problem.knot_t_s[1] - problem.knot_t_s[0])
-    pictures, logged = problem.pictures, problem.pose_covariance
-    level = np.array([np.repeat(errors.white_with_stray(knot_s), 3) for errors in poses])
-    usual = np.full((len(poses), 6, 6), np.inf)
-    has = level[:, 0] > 0
-    usual[has] = level[has, :, None] ** -2.0 * np.eye(6)
-    own = np.array([errors.logged for errors in poses])[pictures.camera] & (pictures.logged >= 0)
-    if not own.any():
-        return pictures.camera, usual
-    stray2 = level**2 - np.repeat(np.square([errors.white for errors in poses]), 3, axis=1)
-    of_camera = np.zeros(len(logged), dtype=np.int64)
-    of_camera[pictures.logged[own]] = pictures.camera[own]
-    added = np.maximum(stray2, EXACT**2)[of_camera]
-    precision = np.linalg.inv(logged + added[:, :, None] * np.eye(6))
-    return np.where(own, len(poses) + pictures.logged, pictures.camera), np.concatenate([usual, precision])
-
-
-def _ties(layout: Layout) -> tuple[Float, Float]:
-    """How every unknown of a knot [K - 1, c] goes on to the next."""
-    elapsed_s = np.diff(layout.knot_t_s)
-    kept, variance = (
-        np.ones((len(elapsed_s), layout.knot_count)),
-        np.ones((len(elapsed_s), layout.knot_count)),
-    )
-    for (_, process), (at_knots, column) in zip(layout.processes, layout.place, strict=True):
-        if at_knots:
-            steps = np.array([process.step(float(span)) for span in elapsed_s])
-            kept[:, column : column + 3] = steps[:, :1]
-            variance[:, column : column + 3] = steps[:, 1:]
-    return kept, variance
 
 
 @dataclass(frozen=True)
@@ -197,9 +55,9 @@ class Eliminated:
     """A state's equations after the elimination of all that does not live to the end."""
 
     state: State
-    kept: _Kept
-    rest: _Front
-    lower: Float  # Cholesky factor of what is left at the end
+    swept: tuple[_Swept, _Swept]
+    lower: Float  # Cholesky factor of what is left where the halves meet
+    gradient: Float  # of the same, in the order of the first half
     log_determinant: float  # half of it, of all equations, white errors too
 
 
@@ -209,25 +67,32 @@ def eliminate(system: System, state: State) -> Eliminated:
     Raises:
         LinAlgError: the equations are singular.
     """
-    kept, rest, half = _eliminate_all(system, state)
-    lower = _last_factor(system, rest)
-    return Eliminated(state, kept, rest, lower, half + float(np.log(np.diagonal(lower)).sum()))
+    swept = side_by_side(halved(system), lambda half: _sweep(half, half.state(state)), system.problem.threads)
+    lower, gradient = _meet(swept)
+    half_log = float(np.log(np.diagonal(lower)).sum()) + swept[0].log_determinant + swept[1].log_determinant
+    return Eliminated(state, swept, lower, gradient, half_log)
 
 
 def step(system: System, at: Eliminated) -> State:
     """The Gauss-Newton step."""
     from scipy.linalg.lapack import dpotrs
 
-    last = dpotrs(at.lower, -at.rest.gradient[_alive(system)], lower=1)[0]
+    last = dpotrs(at.lower, -at.gradient, lower=1)[0]
     return _solve_back(system, at, last)
 
 
 def covariances(system: System, at: Eliminated) -> Float:
     """Posterior covariance [T, J, 3, 3] of every joint at every time."""
-    joints = system.problem.joints
-    covariance = np.zeros((len(system.problem.t_s), joints, 3, 3))
-    _visit_back(system, at.state, at, covariance, 0)
-    return covariance
+    shape = (system.problem.joints, 3, 3)
+    whole = _last_covariance(at)
+
+    def of_half(swept: _Swept) -> Float:
+        covariance = np.zeros((len(swept.half.t_s), *shape))
+        _visit_back(swept, swept.state, whole, covariance, 0)
+        return covariance
+
+    first, second = side_by_side(at.swept, of_half, system.problem.threads)
+    return np.concatenate([first, second[-3::-1]])
 
 
 def moments(system: System, state: State, at: Eliminated, *, every: int) -> Moments:
@@ -235,7 +100,12 @@ def moments(system: System, state: State, at: Eliminated, *, every: int) -> Mome
 
     Covariances are those of the state that was eliminated, squares those of `state`, a step further.
     """
-    return _visit_back(system, state, at, np.zeros((0, 1, 3, 3)), every)
+    whole = _last_covariance(at)
+
+    def of_half(swept: _Swept) -> Moments:
+        return _visit_back(swept, swept.half.state(state), whole, np.zeros((0, 1, 3, 3)), every)
+
+    return _added(*side_by_side(at.swept, of_half, system.problem.threads))
 
 
 def shared_covariance(system: System, at: Eliminated) -> Float:
@@ -252,65 +122,6 @@ def samples(system: System, at: Eliminated, count: int, rng: np.random.Generator
     for _ in range(count):
         last = dtrtrs(at.lower, rng.standard_normal(len(at.lower)), lower=1, trans=1)[0]
         yield _solve_back(system, at, last, rng).position
-
-
-def misfit(system: System, state: State) -> tuple[float, Float, Float]:
-    """Loss of the pictures, whitened residuals [G, J, 2], NaN unseen, the ten numbers of each picture."""
-    pictures = system.problem.pictures
-    residual = np.empty(pictures.xy.shape)
-    numbers = np.empty((len(pictures.first), kernels.NUMBERS))
-    total: float = _misfit(
-        system.problem.t_s,
-        state.position,
-        state.knots,
-        state.shared,
-        state.white,
-        pictures.first,
-        pictures.camera,
-        pictures.when_s,
-        system.fraction,
-        system.of_time[pictures.first],
-        *system.picture_arguments(),
-        system.bound2,
-        *system.entries(),
-        residual,
-        numbers,
-    )
-    return total, residual, numbers
-
-
-def prior_cost(system: System, state: State) -> float:
-    """Minus twice the logarithm of the prior, up to a constant."""
-    problem, known, layout = system.problem, system.knowledge, system.layout
-    before, after = np.diff(problem.t_s)[:-1], np.diff(problem.t_s)[1:]
-    slopes = np.diff(state.position, axis=0) / np.diff(problem.t_s)[:, None, None]
-    acceleration = 2 * np.diff(slopes, axis=0) / (before + after)[:, None, None]
-    weight = 0.5 * (before + after) / system.usual_step_s
-    cost = np.einsum(
-        "t,tji,jk,tki->", weight, acceleration, system.inverse_acceleration, acceleration, optimize=True
-    )
-    lengths = state.shared[layout.bone_column :]
-    cost += np.sum(((_bone_lengths(problem, state.position) - lengths) / known.bone_sigma_m) ** 2)
-    cost /= system.grown(state) ** 2
-    precision = system.white_precision[system.white_row]
-    there = np.isfinite(precision[:, 0, 0])
-    white = state.white[there]
-    cost += np.sum((precision[there] @ white[..., None])[..., 0] * white)
-    for (_, process), (at_knots, column) in zip(layout.processes, layout.place, strict=True):
-        begins = state.knots[0] if at_knots else state.shared
-        cost += np.sum(begins[column : column + 3] ** 2) / process.sigma0**2
-    changes = state.knots[1:] - system.tie_kept * state.knots[:-1]
-    cost += np.sum(changes**2 / system.tie_variance)
-    clocks = layout.clock_column >= 0
-    cost += np.sum((state.shared[layout.clock_column[clocks]] / layout.clock_sigma_s[clocks]) ** 2)
-    return float(cost)
-
-
-def _bone_lengths(problem: Problem, position: Float) -> Float:
-    """[T, B] m."""
-    ends = position[:, problem.bones]
-    lengths: Float = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
-    return lengths
 
 
 # --- forwards ------------------------------------------------------------------------------------------
@@ -342,36 +153,60 @@ class _Factors:
 
 
 @dataclass
-class _Kept:
-    """Factors of segments, or the fronts from which they are made again."""
+class _Swept:
+    """A half after its elimination."""
 
-    fronts: list[_Front]
-    factors: dict[int, _Factors]
+    half: Half
+    state: State  # its part
+    fronts: list[_Front]  # at the beginning of every segment, from which its factors can be made again
+    factors: dict[int, _Factors]  # of segments, where they are kept
+    rest: _Front
+    log_determinant: float
 
 
-def _segments(system: System) -> list[tuple[int, int]]:
-    last = len(system.problem.t_s) - 2
-    return [(first, min(first + _SEGMENT, last)) for first in range(0, last, _SEGMENT)]
+def _segments(half: Half) -> list[tuple[int, int]]:
+    """A half without times of its own may still have knots."""
+    return [(first, min(first + _SEGMENT, half.count)) for first in range(0, max(half.count, 1), _SEGMENT)]
 
 
-def _eliminate_all(system: System, state: State) -> tuple[_Kept, _Front, float]:
-    front = _begin(system, state)
-    kept = _Kept([], {})
+def _sweep(half: Half, state: State) -> _Swept:
+    system = half.system
+    front = _begin(half, state)
+    fronts, kept = [], {}
     log_determinant = 0.0
     bytes_per_time = 8 * 3 * system.problem.joints * system.size
-    for index, (first, last) in enumerate(_segments(system)):
-        kept.fronts.append(front.copy())
-        factors, part = _eliminate(system, state, front, first, last)
+    for index, (first, last) in enumerate(_segments(half)):
+        fronts.append(front.copy())
+        factors, part = _eliminate(half, state, front, first, last)
         log_determinant += part
-        if bytes_per_time * last < _KEPT_BYTES or last == len(system.problem.t_s) - 2:
-            kept.factors[index] = factors
-    return kept, front, log_determinant
+        if bytes_per_time * last < _KEPT_BYTES or last == half.count:
+            kept[index] = factors
+    return _Swept(half, state, fronts, kept, front, log_determinant)
 
 
-def _begin(system: System, state: State) -> _Front:
-    """The priors of what is there from the start."""
-    layout, n3 = system.layout, 9 * system.problem.joints
+def _begin(half: Half, state: State) -> _Front:
+    """The first knots, tied; in the first half, the priors of what is there from the start."""
+    system = half.system
     front = _Front(np.zeros((system.size, system.size)), np.zeros(system.size), 0)
+    if not half.turned:
+        _add_priors(system, state, front)
+    if system.layout.knot_count:
+        sweeps.begin(
+            front.matrix,
+            front.gradient,
+            3 * system.problem.joints,
+            system.layout.knot_count,
+            state.knots,
+            half.tie_before,
+            half.tie_after,
+            half.tie_variance,
+        )
+    return front
+
+
+def _add_priors(system: System, state: State, front: _Front) -> None:
+    """Of slow errors at the first knot and of what all times share."""
+    layout, n3 = system.layout, 9 * system.problem.joints
     for (_, process), (at_knots, column) in zip(layout.processes, layout.place, strict=True):
         value = state.knots[0] if at_knots else state.shared
         offset = n3 if at_knots else n3 + 2 * layout.knot_count
@@ -386,24 +221,14 @@ def _begin(system: System, state: State) -> _Front:
     for place in range(n3 + 2 * layout.knot_count + layout.bone_column, system.size):
         # A length that nothing speaks of stays where it is.
         front.matrix[place, place] += _HELD if system.held else 1e-6
-    if layout.knot_count:
-        sweeps.begin(
-            front.matrix,
-            front.gradient,
-            3 * system.problem.joints,
-            layout.knot_count,
-            state.knots,
-            system.tie_kept,
-            system.tie_variance,
-        )
-    return front
 
 
-def _eliminate(system: System, state: State, front: _Front, first: int, last: int) -> tuple[_Factors, float]:
+def _eliminate(half: Half, state: State, front: _Front, first: int, last: int) -> tuple[_Factors, float]:
     """Eliminate the knots and joints of some times; the front is changed in place."""
+    system = half.system
     n, c = 3 * system.problem.joints, system.layout.knot_count
     times, size = last - first, system.size
-    knots = int(system.of_time[last - 1]) - front.interval if c else 0
+    knots = int(half.of_time[last]) - front.interval if c else 0
     factors = _Factors(
         front.interval,
         np.zeros((times, n, n)),
@@ -418,14 +243,16 @@ def _eliminate(system: System, state: State, front: _Front, first: int, last: in
         front.interval, log_determinant = _forwards(
             first,
             last,
-            *system.arguments(state),
+            *half.arguments(state),
             system.inverse_acceleration,
             1 / _ANYWHERE_M**2,
             system.problem.bones,
             system.knowledge.bone_sigma_m,
             grown,
-            system.tie_kept,
-            system.tie_variance,
+            half.own_times,
+            half.tie_before,
+            half.tie_after,
+            half.tie_variance,
             front.matrix,
             front.gradient,
             front.interval,
@@ -441,63 +268,88 @@ def _eliminate(system: System, state: State, front: _Front, first: int, last: in
     return factors, log_determinant
 
 
-# --- backwards -----------------------------------------------------------------------------------------
+# --- where the halves meet -------------------------------------------------------------------------------
 
 
-def _alive(system: System) -> Int64:
-    """What of a front is left at the end: two times, two knots, what all share."""
-    n = 3 * system.problem.joints
-    return np.concatenate([np.arange(2 * n), np.arange(3 * n, system.size)])
-
-
-def _last_factor(system: System, rest: _Front) -> Float:
+def _meet(swept: tuple[_Swept, _Swept]) -> tuple[Float, Float]:
+    """Cholesky factor of what is alive in both halves, and the gradient, in the order of the first."""
     from scipy.linalg.lapack import dpotrf
 
-    alive = _alive(system)
-    lower: Float
-    lower, failed = dpotrf(rest.matrix[np.ix_(alive, alive)], lower=1, clean=1)
+    system = swept[0].half.system
+    n = 3 * system.problem.joints
+    alive = np.concatenate([np.arange(2 * n), np.arange(3 * n, system.size)])
+    matrix, gradient = np.zeros((len(alive), len(alive))), np.zeros(len(alive))
+    for each in swept:
+        place = each.half.met()
+        lower = np.tril(each.rest.matrix[np.ix_(alive, alive)])
+        matrix[np.ix_(place, place)] += lower + np.tril(lower, -1).T
+        gradient[place] += each.rest.gradient[alive]
+    factor: Float
+    factor, failed = dpotrf(matrix, lower=1, clean=1)
     if failed:
         raise np.linalg.LinAlgError("the equations of what all times share are singular")
-    return lower
+    return factor, gradient
 
 
 def _last_covariance(at: Eliminated) -> Float:
+    """Of what is alive where the halves meet, in the order of the first."""
     from scipy.linalg.lapack import dpotri
 
     inverse, _ = dpotri(at.lower, lower=1)
     return np.ascontiguousarray(np.tril(inverse) + np.tril(inverse, -1).T)
 
 
-def _factors_backwards(system: System, at: Eliminated) -> Iterator[tuple[int, int, _Factors]]:
-    segments = _segments(system)
+# --- backwards -----------------------------------------------------------------------------------------
+
+
+def _factors_backwards(swept: _Swept) -> Iterator[tuple[int, int, _Factors]]:
+    segments = _segments(swept.half)
     for index in range(len(segments) - 1, -1, -1):
-        factors = at.kept.factors.get(index)
+        factors = swept.factors.get(index)
         if factors is None:
-            factors, _ = _eliminate(system, at.state, at.kept.fronts[index].copy(), *segments[index])
+            factors, _ = _eliminate(swept.half, swept.state, swept.fronts[index].copy(), *segments[index])
         yield *segments[index], factors
 
 
 def _solve_back(
     system: System, at: Eliminated, last_solution: Float, rng: np.random.Generator | None = None
 ) -> State:
-    """The unknowns of all times from those of the last; a draw about 0 where `rng` says so."""
-    problem, layout, state = system.problem, system.layout, at.state
-    n, count = 3 * problem.joints, layout.knot_count
-    times = len(problem.t_s)
-    position, knots = np.zeros((times, n)), np.zeros_like(state.knots)
-    position[-2:] = last_solution[: 2 * n].reshape(2, n)
-    shared = np.ascontiguousarray(last_solution[2 * n + 2 * count :])
-    interval = at.rest.interval
+    """The unknowns of all times from those of the meeting; a draw about 0 where `rng` says so."""
+    layout, state = system.layout, at.state
+    # Draws come from one source, so in order.
+    threads = 1 if rng is not None else system.problem.threads
+    (position, knots), (turned_position, turned_knots) = side_by_side(
+        at.swept, lambda swept: _follow_back(swept, last_solution, rng), threads
+    )
+    position = np.concatenate([position, turned_position[-3::-1]])
+    first_of_second = at.swept[0].rest.interval + 2
+    knots[first_of_second:] = turned_knots[::-1][first_of_second:]
+    shared = np.ascontiguousarray(last_solution[len(last_solution) - layout.shared_count :])
+    moved = State(position.reshape(state.position.shape), knots, shared, np.zeros_like(state.white))
+    if rng is None:
+        _add_white(system, state, moved)
+    return moved
+
+
+def _follow_back(swept: _Swept, last_solution: Float, rng: np.random.Generator | None) -> tuple[Float, Float]:
+    """Joints [T, n] of a half, and all knots [K, c], of which those of the other half are 0."""
+    half, state = swept.half, swept.state
+    n, count = 3 * half.system.problem.joints, half.system.layout.knot_count
+    alive = last_solution[half.met()]
+    position, knots = np.zeros((len(half.t_s), n)), np.zeros_like(state.knots)
+    position[-2:] = alive[: 2 * n].reshape(2, n)
+    shared = np.ascontiguousarray(alive[2 * n + 2 * count :])
+    interval = swept.rest.interval
     if count:
-        knots[interval : interval + 2] = last_solution[2 * n : 2 * n + 2 * count].reshape(2, count)
-    for first, last, factors in _factors_backwards(system, at):
+        knots[interval : interval + 2] = alive[2 * n : 2 * n + 2 * count].reshape(2, count)
+    for first, last, factors in _factors_backwards(swept):
         solved, knot_solved = factors.solved, factors.knot_solved
         if rng is not None:
             solved, knot_solved = rng.standard_normal(solved.shape), rng.standard_normal(knot_solved.shape)
         interval = sweeps.backwards(
             first,
             last,
-            system.of_time,
+            half.of_time,
             interval,
             factors.first_interval,
             factors.inverse,
@@ -510,10 +362,12 @@ def _solve_back(
             knots,
             shared,
         )
-    moved = State(position.reshape(state.position.shape), knots, shared, np.zeros_like(state.white))
-    if rng is not None:
-        return moved
-    pictures = problem.pictures
+    return position, knots
+
+
+def _add_white(system: System, state: State, moved: State) -> None:
+    """Every picture's white error that belongs to a step of all else, put into it."""
+    problem, pictures = system.problem, system.problem.pictures
     _whiten(
         problem.t_s,
         state.position,
@@ -535,34 +389,37 @@ def _solve_back(
         *system.entries(),
         moved.white,
     )
-    return moved
 
 
-def _visit_back(system: System, state: State, at: Eliminated, covariance: Float, every: int) -> Moments:
-    problem, layout = system.problem, system.layout
-    joints = problem.joints
-    others = _last_covariance(at)
+def _visit_back(
+    swept: _Swept, state: State, last_covariance: Float, covariance: Float, every: int
+) -> Moments:
+    """Sums of a half, linearised at `state`; `covariance` is filled where it has a length."""
+    half = swept.half
+    problem, layout = half.system.problem, half.system.layout
+    joints, place = problem.joints, half.met()
+    others = np.ascontiguousarray(last_covariance[np.ix_(place, place)])
     found = Moments(
         np.zeros((2, joints, joints)),
         np.zeros(len(problem.bones)),
         np.zeros((joints, 2)),
         np.zeros((2, 4)),
         np.zeros((layout.knot_count, 4)),
-        np.zeros((layout.knot_count + layout.shared_count, 2)),
-        len(problem.t_s) - 2,
+        np.zeros((0 if half.turned else layout.knot_count + layout.shared_count, 2)),
+        half.count,
     )
-    interval = at.rest.interval
-    if layout.knot_count and every:
-        sweeps.last_walk(
-            others, 3 * joints, layout.knot_count, state.knots, layout.knot_t_s, interval, found.walked
-        )
-    for first, last, factors in _factors_backwards(system, at):
+    knot_t_s = half.knot_t_s
+    interval = swept.rest.interval
+    if layout.knot_count and every and not half.turned:
+        sweeps.last_walk(others, 3 * joints, layout.knot_count, state.knots, knot_t_s, interval, found.walked)
+    for first, last, factors in _factors_backwards(swept):
         others, interval = _visit(
             first,
             last,
-            *system.arguments(state),
+            *half.arguments(state),
             problem.bones,
-            layout.knot_t_s,
+            half.own_times,
+            knot_t_s,
             others,
             interval,
             factors.first_interval,
@@ -580,3 +437,11 @@ def _visit_back(system: System, state: State, at: Eliminated, covariance: Float,
             found.starting,
         )
     return found
+
+
+def _added(first: Moments, second: Moments) -> Moments:
+    """Sums of the whole flight; what stands at its start is the first half's."""
+    sums = {each.name: getattr(first, each.name) for each in fields(Moments)}
+    for name in sums.keys() - {"starting"}:
+        sums[name] = sums[name] + getattr(second, name)
+    return Moments(**sums)

@@ -9,10 +9,7 @@ from numpy.typing import NDArray
 
 from pipelines.reconstruction.refinement.elimination import (
     Eliminated,
-    System,
     eliminate,
-    misfit,
-    prior_cost,
     step,
 )
 from pipelines.reconstruction.refinement.levels import reestimated
@@ -23,6 +20,7 @@ from pipelines.reconstruction.refinement.problem import (
     State,
     lay_out,
 )
+from pipelines.reconstruction.refinement.system import System, misfit, prior_cost
 
 Float = NDArray[np.float64]
 

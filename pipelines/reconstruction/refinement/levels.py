@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from pipelines.reconstruction.refinement.elimination import Eliminated, Moments, System, moments
+from pipelines.reconstruction.refinement.elimination import Eliminated, Moments, moments
 from pipelines.reconstruction.refinement.problem import (
     ROTATION,
     Knowledge,
@@ -25,6 +25,7 @@ from pipelines.reconstruction.refinement.problem import (
     Process,
     State,
 )
+from pipelines.reconstruction.refinement.system import System
 
 Float = NDArray[np.float64]
 

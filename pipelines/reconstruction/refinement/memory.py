@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.reconstruction.refinement.elimination import System, misfit
 from pipelines.reconstruction.refinement.problem import State
+from pipelines.reconstruction.refinement.system import System, misfit
 
 Float = NDArray[np.float64]
 

@@ -238,6 +238,8 @@ class Problem:
     knot_t_s: Float  # [K]
     pose_covariance: Float = field(default_factory=lambda: np.empty((0, 6, 6)))
     """[L, 6, 6] of logged white pose errors: shift in the world (m), rotation vector in the camera (rad)."""
+    threads: int = 1
+    """At most so many work on it; the results do not depend on them."""
 
     @property
     def joints(self) -> int:

@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from pipelines.reconstruction.refinement.building import Sighting, build
 from pipelines.reconstruction.refinement.elimination import (
     Eliminated,
-    System,
     covariances,
-    misfit,
     shared_covariance,
 )
 from pipelines.reconstruction.refinement.estimate import (
@@ -36,6 +34,7 @@ from pipelines.reconstruction.refinement.problem import (
     Process,
     State,
 )
+from pipelines.reconstruction.refinement.system import System, misfit
 
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -62,9 +61,9 @@ _SLOW_SHARE = 0.2  # of the disagreement of views: slow errors where the search 
 _MEDIAN_OF_TWO = 2 * np.log(2)  # of the chi-square distribution with two degrees of freedom
 _FARTHEST = 1.8
 """Times what the disagreement of the views lets expect; good estimates moved by up to 1.6 of it."""
-_FARTHEST_STATED = 2.65
-"""The same of stated levels, of which a constant error is one draw: sqrt(21.1 / 3), which the root of a
-chi-square variable with three degrees of freedom over three passes once in 10,000 times."""
+_FARTHEST_STATED = 3.2
+"""The same of stated levels, of which a constant error is one draw: sqrt(30.7 / 3), which the root of a
+chi-square variable with three degrees of freedom over three passes once in a million times."""
 _REFUSED = 0.5  # for every picture: by how much stated levels may be less likely than those that are refused
 _UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; it was estimated instead"
 
@@ -93,6 +92,8 @@ def refine(
     bones: Int64,
     prior: Sequence[PoseErrors] | None,
     clock_sigma_s: Float,
+    *,
+    threads: int = 1,
 ) -> Refined:
     """One maximum a posteriori estimate of a skeleton, its cameras' pose errors and clocks.
 
@@ -103,6 +104,7 @@ def refine(
         bones: [B, 2] pairs of joints whose distance hardly changes.
         prior: what is known of each camera's pose errors; None when nobody stated anything.
         clock_sigma_s: [C] how far each camera's clock may be off, 0 for one that is known.
+        threads: at most two work, on both halves of the flight; the result does not depend on it.
     """
     part = _participating(start)
     if part.sum() < 3 or len(t_s) < _FEWEST_TIMES:
@@ -110,10 +112,11 @@ def refine(
     sightings = [_take(sighting, part) for sighting in sightings]
     bones = _renumbered(bones, part)
     begun = _without_gaps(t_s, start[:, part])
+    problem = build(t_s, sightings, bones, threads=threads)
     refused = None
     try:
-        for found in _priors(t_s, sightings, begun, bones, prior, clock_sigma_s):
-            refined = _refined(t_s, sightings, start, part, begun, bones, found)
+        for found in _priors(problem, sightings, begun, prior, clock_sigma_s):
+            refined = _refined(problem, start, part, begun, found)
             if refined.fallback is None:
                 return refined
             refused = refused or refined
@@ -132,27 +135,18 @@ class _Prior:
     expected_m: float  # by how far the skeleton may move
 
 
-def _refined(
-    t_s: Float,
-    sightings: Sequence[Sighting],
-    start: Float,
-    part: NDArray[np.bool_],
-    begun: Float,
-    bones: Int64,
-    prior: _Prior,
-) -> Refined:
+def _refined(problem: Problem, start: Float, part: NDArray[np.bool_], begun: Float, prior: _Prior) -> Refined:
     """The estimate under a prior, and whether it may be believed.
 
     Raises:
         LinAlgError: its equations are singular.
     """
-    known = prior.known
-    problem = build(t_s, sightings, bones)
+    known, cameras = prior.known, len(prior.known.poses)
     state = initial_state(problem, known, begun)
     clock_s, clock_left_s = _clocks(problem, known, state)
     if np.abs(clock_s).max() <= SETTLED_S:
         known = replace(known, clock_sigma_s=clock_left_s)
-    freely = replace(known, acceleration=limber(known.acceleration, _spread_of(len(sightings))))
+    freely = replace(known, acceleration=limber(known.acceleration, _spread_of(cameras)))
     system, state, at = solve(problem, freely, state, rounds=_ROUNDS)
     covariance = covariances(system, at)
     if known.memory > REMEMBERED:
@@ -169,7 +163,7 @@ def _refined(
     return Refined(
         position=position,
         covariance=whole,
-        corrections=_corrections(system, state, len(sightings)),
+        corrections=_corrections(system, state, cameras),
         clock_offset_s=clock_s,
         clock_sigma_s=clock_left_s,
         levels=_levels(known),
@@ -294,10 +288,9 @@ def _without_gaps(t_s: Float, start: Float) -> Float:
 
 
 def _priors(
-    t_s: Float,
+    flight: Problem,
     sightings: Sequence[Sighting],
     start: Float,
-    bones: Int64,
     prior: Sequence[PoseErrors] | None,
     clock_sigma_s: Float,
 ) -> Iterator[_Prior]:
@@ -310,8 +303,8 @@ def _priors(
     Raises:
         LinAlgError: none of them explains the pictures.
     """
-    chosen = _stretches(len(t_s))
-    problem = build(t_s[chosen], sightings, bones)
+    chosen = _stretches(len(flight.t_s))
+    problem = build(flight.t_s[chosen], sightings, flight.bones, threads=flight.threads)
     guess, image, disagreement_m, range_m = _first_guess(problem, start[chosen])
     stated_m = 0.0 if prior is None else float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
     spread = _spread_of(len(sightings))

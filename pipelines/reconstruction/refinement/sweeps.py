@@ -115,7 +115,9 @@ def forwards(
     bones: Int64,
     bone_sigma: Float,
     grown: float,
-    tie_kept: Float,
+    own_times: int,
+    tie_before: Float,
+    tie_after: Float,
     tie_variance: Float,
     front: Float,
     gradient: Float,
@@ -129,9 +131,10 @@ def forwards(
 ) -> tuple[int, float]:
     """Eliminate joints and knots of the times from `first` to before `last`; the front changes in place.
 
-    Factors go to row `time - first` of `inverse` [., n, n], `across` [., m, n] and `solved` [., n], and
-    those of knots to row `k - interval` of the others. Returns the interval in which the front ends, and
-    half the logarithm of the determinant of all that was eliminated, white errors too.
+    Of the last three times, bones of the first `own_times` count here. Factors go to row `time - first` of
+    `inverse` [., n, n], `across` [., m, n] and `solved` [., n], and those of knots to row `k - interval` of
+    the others. Returns the interval in which the front ends, that of the time `last`, and half the logarithm
+    of the determinant of all that was eliminated, white errors too.
     """
     J = position.shape[1]
     n, c = 3 * J, knot_count
@@ -143,14 +146,16 @@ def forwards(
     first_interval = interval
     own, beside = np.empty((n, n)), np.empty((size - n, n))
     knot_own, knot_beside = np.empty((c, c)), np.empty((2 * n + c + s, c))
-    for time in range(first, last):
+    for time in range(first, last + 1):
         while c and interval < of_time[time]:
             k = interval - first_interval
             half += eliminate_knot(
                 front, gradient, n, c, knot_own, knot_beside, knot_inverse[k], knot_across[k], knot_solved[k]
             )
             interval += 1
-            tie_knots(front, gradient, n, c, knots, interval, tie_kept, tie_variance)
+            tie_knots(front, gradient, n, c, knots, interval, tie_before, tie_after, tie_variance)
+        if time == last:
+            break
         half += assemble(
             starts[time], starts[time + 1], time, t_s, position, knots, shared, white, camera, when, fraction,
             interval, xy, sharpness, pose_position, pose_rotation, speed, turn, trust, bound2,
@@ -161,8 +166,8 @@ def forwards(
             position[time : time + 3], curvature[time], precision, 1.0 / (spread[time] * grown**2), hold,
             lengths, length_offset, front, gradient,
         )  # fmt: skip
-        # All bones of a time at once with the first of its three; the last two times have their own.
-        for offset in range(1 if time < len(t_s) - 3 else 3):
+        # All bones of a time at once with the first of its three; the last two times may have their own.
+        for offset in range(1 if time < len(t_s) - 3 else own_times):
             add_bones(
                 position[time + offset], bones, lengths, bone_sigma, grown, n * offset, length_offset, front,
                 gradient,
@@ -263,25 +268,35 @@ def tie_knots(
     c: int,
     knots: Float,
     interval: int,
-    kept: Float,
+    by_before: Float,
+    by_after: Float,
     variance: Float,
 ) -> None:
-    """The random walk from the knot before to the knot after."""
+    """The random walk between the knot before and the knot after."""
     before, after = 3 * n, 3 * n + c
     for i in range(c):
-        p, q = kept[interval, i], variance[interval, i]
-        change = knots[interval + 1, i] - p * knots[interval, i]
-        front[before + i, before + i] += p * p / q
-        front[after + i, after + i] += 1 / q
-        front[after + i, before + i] -= p / q
-        gradient[before + i] -= p * change / q
-        gradient[after + i] += change / q
+        b, a, q = by_before[interval, i], by_after[interval, i], variance[interval, i]
+        change = a * knots[interval + 1, i] - b * knots[interval, i]
+        front[before + i, before + i] += b * b / q
+        front[after + i, after + i] += a * a / q
+        front[after + i, before + i] -= a * b / q
+        gradient[before + i] -= b * change / q
+        gradient[after + i] += a * change / q
 
 
 @cached
-def begin(front: Float, gradient: Float, n: int, c: int, knots: Float, kept: Float, variance: Float) -> None:
+def begin(
+    front: Float,
+    gradient: Float,
+    n: int,
+    c: int,
+    knots: Float,
+    by_before: Float,
+    by_after: Float,
+    variance: Float,
+) -> None:
     """Tie the first two knots."""
-    tie_knots(front, gradient, n, c, knots, 0, kept, variance)
+    tie_knots(front, gradient, n, c, knots, 0, by_before, by_after, variance)
 
 
 @cached
@@ -310,7 +325,7 @@ def backwards(
         zk[2 * n + c + i] = shared[i]
     rest_n, rest_c = np.empty(n), np.empty(c)
     for time in range(last - 1, first - 2, -1):
-        # Which knots were alive when this time was eliminated; at the end, those before the stretch.
+        # Which knots were alive when this time was eliminated; last, those before the stretch.
         while c and interval > (of_time[time] if time >= first else first_interval):
             interval -= 1
             follow_knot(
@@ -420,6 +435,7 @@ def visit(
     curvature: Float,
     spread: Float,
     bones: Int64,
+    own_times: int,
     knot_t_s: Float,
     others: Float,
     interval: int,
@@ -439,13 +455,13 @@ def visit(
 ) -> tuple[Float, int]:
     """Covariances of a stretch from its end, given those [m, m] of what was alive there; sums for the levels.
 
-    `covariance` [T, J, 3, 3] is filled where it has a length. Sums are made where `every` is not 0, over
-    the pictures of every so many times: `acceleration` [2, J, J] posterior mean squares and variances;
-    `bone_sums` [B]; `image` [J, 2] weighted squares, and how many of them the fit leaves;
-    `white_sums` [2, 4] of position and rotation:
-    mean squares, count, sums of what the pictures tell (1 - posterior / prior variance) and its square;
-    `walked` [c, 4] the same of every knot's change per s; `starting` [c + shared, 2] at time 0: mean square,
-    variance. Returns the covariance of what is alive at the beginning, and the interval there.
+    `covariance` [T, J, 3, 3] is filled where it has a length, of the last three times the first `own_times`.
+    Sums are made where `every` is not 0, over the pictures of every so many times: `acceleration` [2, J, J]
+    posterior mean squares and variances; `bone_sums` [B]; `image` [J, 2] weighted squares, and how many of
+    them the fit leaves; `white_sums` [2, 4] of position and rotation: mean squares, count, sums of what the
+    pictures tell (1 - posterior / prior variance) and its square; `walked` [c, 4] the same of every knot's
+    change per s; `starting` [c + shared, 2] at time 0, where it has a length: mean square, variance. Returns
+    the covariance of what is alive at the beginning, and the interval there.
     """
     J = position.shape[1]
     n, c = 3 * J, knot_count
@@ -457,9 +473,9 @@ def visit(
     by_joint, by_number = np.zeros((J, 2, 3)), np.zeros((J, 2, NUMBERS))
     of_joints, beside = np.empty((J, 3, 3)), np.empty((J, 3, NUMBERS))
     of_numbers, of_white = np.empty((NUMBERS, NUMBERS)), np.empty(WHITE)
-    joints_time = len(t_s) - 3
+    last_time = len(t_s) - 3
     for time in range(last - 1, first - 2, -1):
-        # As on the way forwards; at the end, the knots before the stretch.
+        # As on the way forwards; last, the knots before the stretch.
         while c and interval > (of_time[time] if time >= first else first_interval):
             interval -= 1
             row = interval - first_interval
@@ -480,7 +496,7 @@ def visit(
             for j in range(m):
                 whole[n + i, n + j] = alive[i, j]
         if len(covariance):
-            for k in range(3 if time == joints_time else 1):
+            for k in range(own_times if time == last_time else 1):
                 for joint in range(J):
                     p = k * n + 3 * joint
                     for a in range(3):
@@ -502,7 +518,7 @@ def visit(
                     )  # fmt: skip
                     noise_of(residual, believed, by_joint, by_number, of_joints, beside, of_numbers, image)
                     white_of(white[g], white_precision[white_row[g]], of_white, white_sums)
-            if time == 0:
+            if time == 0 and len(starting):
                 for i in range(c):
                     starting[i, 0] = knots[0, i] ** 2 + whole[3 * n + i, 3 * n + i]
                     starting[i, 1] = whole[3 * n + i, 3 * n + i]
@@ -554,7 +570,7 @@ def walk_of(
     alive: Float, n: int, c: int, knots: Float, knot_t_s: Float, interval: int, walked: Float
 ) -> None:
     """Add how much the slow errors changed between two knots, per second."""
-    elapsed = knot_t_s[interval + 1] - knot_t_s[interval]
+    elapsed = abs(knot_t_s[interval + 1] - knot_t_s[interval])
     for i in range(c):
         p, q = 2 * n + i, 2 * n + c + i
         variance = (alive[p, p] + alive[q, q] - 2 * alive[p, q]) / elapsed

@@ -1,0 +1,182 @@
+"""A flight seen from both its ends: two halves that are eliminated side by side and meet in the middle.
+
+The equations do not know which way time runs. Turned round, the second half is a flight like the first:
+times, pictures and knots in the opposite order, and the same kernels. What is alive when the first half is
+through, the joints at two times, the knots around them and what all times share, is alive when the second is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.reconstruction.refinement.problem import State
+from pipelines.reconstruction.refinement.system import System
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Value = TypeVar("Value", bound=np.generic)
+Part = TypeVar("Part")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Half:
+    """One half, in the order of its elimination; T times, of which the last two are the other's too."""
+
+    system: System
+    turned: bool
+    meeting: int  # the first of the flight's two times at which the halves meet
+    pictures: int  # of the flight, that belong to the first half
+    t_s: Float  # [T] falling where it is turned round
+    of_time: Int64  # [T - 1] the knot before each time that is eliminated, and before the meeting
+    starts: Int64  # [T - 1] where the pictures of each time begin
+    of_pictures: tuple[Any, ...]  # what the sweeps take of them, between the skeleton and the layout
+    curvature: Float  # [T - 2, 3] weights that make an acceleration of three positions
+    spread: Float  # [T - 2] its variance against the usual
+    tie_before: Float  # [K - 1, c] times a knot, less
+    tie_after: Float  # [K - 1, c] times the next, is 0
+    tie_variance: Float  # [K - 1, c] with this variance; inf where the other half says so
+
+    @property
+    def knot_t_s(self) -> Float:
+        """Times of the knots [K]."""
+        knot_t_s = self.system.layout.knot_t_s
+        return _turned(knot_t_s) if self.turned else knot_t_s
+
+    @property
+    def count(self) -> int:
+        """Times that are eliminated."""
+        return len(self.t_s) - 2
+
+    @property
+    def own_times(self) -> int:
+        """How many of the last three times are this half's: those of the meeting are the first one's."""
+        return 1 if self.turned else 3
+
+    def of_times(self, values: NDArray[Value]) -> NDArray[Value]:
+        """What belongs to this half of values [T', ...] of the flight's times."""
+        return _turned(values[self.meeting :]) if self.turned else values[: self.meeting + 2]
+
+    def state(self, state: State) -> State:
+        """A state's part; of the knots there are all."""
+        return State(
+            self.of_times(state.position),
+            _turned(state.knots) if self.turned else state.knots,
+            state.shared,
+            _turned(state.white[self.pictures :]) if self.turned else state.white[: self.pictures],
+        )
+
+    def met(self) -> Int64:
+        """Where each of the unknowns that are alive at the end stands in the order of the first half."""
+        n, c = 3 * self.system.problem.joints, self.system.layout.knot_count
+        place = np.arange(2 * n + 2 * c + self.system.layout.shared_count)
+        if self.turned:
+            joints, knots = place[: 2 * n].reshape(2, n), place[2 * n : 2 * n + 2 * c].reshape(2, c)
+            joints[:], knots[:] = joints[::-1].copy(), knots[::-1].copy()
+        return place
+
+    def arguments(self, part: State) -> tuple[Any, ...]:
+        """What the sweeps need to know of the half and of where it is linearised."""
+        system = self.system
+        camera, when_s, fraction, *seen, white_row = self.of_pictures
+        return (
+            self.t_s,
+            part.position,
+            part.knots,
+            part.shared,
+            part.white,
+            self.starts,
+            camera,
+            when_s,
+            fraction,
+            self.of_time,
+            *seen,
+            system.bound2,
+            white_row,
+            system.white_precision,
+            *system.entries(),
+            system.layout.knot_count,
+            self.curvature,
+            self.spread,
+        )
+
+
+def halved(system: System) -> tuple[Half, Half]:
+    """Both halves of a flight of at least three times."""
+    t_s = system.problem.t_s
+    meeting = (len(t_s) - 1) // 2
+    pictures = int(np.searchsorted(system.problem.pictures.first, meeting))
+    return _half(system, meeting, pictures, turned=False), _half(system, meeting, pictures, turned=True)
+
+
+def side_by_side(
+    both: tuple[Part, Part], work: Callable[[Part], Result], threads: int
+) -> tuple[Result, Result]:
+    """The same for both halves, at once where there may be two threads; each writes its own results."""
+    first, second = both
+    if threads < 2:
+        return work(first), work(second)
+    with ThreadPoolExecutor(1) as other:
+        later = other.submit(work, second)
+        return work(first), later.result()
+
+
+def _half(system: System, meeting: int, pictures: int, *, turned: bool) -> Half:
+    problem, seen = system.problem, system.problem.pictures
+    last_interval = max(len(problem.knot_t_s) - 2, 0)
+    met_at = int(system.of_time[min(meeting, len(system.of_time) - 1)])
+    variance = system.tie_variance
+    if turned:
+        mine, t_s = slice(pictures, None), _turned(problem.t_s[meeting:])
+        first = len(problem.t_s) - 3 - seen.first[mine]
+        of_time = last_interval - np.append(system.of_time[meeting:][::-1], met_at)
+        variance = variance.copy()
+        variance[met_at] = np.inf
+    else:
+        mine, t_s = slice(0, pictures), problem.t_s[: meeting + 2]
+        first = seen.first[mine]
+        of_time = np.append(system.of_time[:meeting], met_at)
+    order: Callable[[NDArray[Any]], NDArray[Any]] = _turned if turned else np.ascontiguousarray
+    tie = (system.tie_kept, np.ones_like(system.tie_kept))
+    before, after = np.diff(t_s)[:-1], np.diff(t_s)[1:]
+    return Half(
+        system,
+        turned,
+        meeting,
+        pictures,
+        t_s,
+        of_time,
+        np.searchsorted(order(first), np.arange(len(t_s) - 1)),
+        tuple(
+            order(values[mine])
+            for values in (
+                seen.camera,
+                seen.when_s,
+                1 - system.fraction if turned else system.fraction,
+                seen.xy,
+                system.sharpness,
+                seen.position,
+                seen.rotation,
+                seen.speed,
+                seen.turn,
+                seen.trust,
+                system.white_row,
+            )
+        ),
+        np.stack(
+            [2 / (before * (before + after)), -2 / (before * after), 2 / (after * (before + after))], axis=1
+        ),
+        system.usual_step_s / np.abs(0.5 * (before + after)),
+        *(order(values) for values in (*(tie[::-1] if turned else tie), variance)),
+    )
+
+
+def _turned(values: NDArray[Value]) -> NDArray[Value]:
+    """In the opposite order, of one piece: everything is compiled for that."""
+    return np.ascontiguousarray(values[::-1])

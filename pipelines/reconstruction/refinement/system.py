@@ -1,0 +1,189 @@
+"""A problem with its prior: what every linearisation needs, and how unlikely a state is.
+
+Its equations are eliminated in `elimination`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.reconstruction.refinement import kernels
+from pipelines.reconstruction.refinement.problem import EXACT, Knowledge, Layout, PoseErrors, Problem, State
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+# Its arguments are assembled from tuples, whose lengths types do not know.
+_misfit: Callable[..., float] = kernels.misfit
+
+
+@dataclass(frozen=True)
+class System:
+    """A problem with its prior, linearised at will."""
+
+    problem: Problem
+    knowledge: Knowledge
+    layout: Layout
+    bound2: float  # of the robust loss
+    held: bool = False  # bone lengths stay as they are
+    sharpness: Float = field(init=False)
+    white_row: Int64 = field(init=False)  # [G] where the next has the picture's
+    white_precision: Float = field(init=False)  # [., 6, 6] of each camera, then of logged poses; inf without
+    inverse_acceleration: Float = field(init=False)  # [J, J]
+    of_time: Int64 = field(init=False)  # [T - 2]
+    fraction: Float = field(init=False)  # [G]
+    usual_step_s: float = field(init=False)
+    tie_kept: Float = field(init=False)  # [K - 1, c] share of a slow error that is left at the next knot
+    tie_variance: Float = field(init=False)  # [K - 1, c] what comes in addition
+
+    def __post_init__(self) -> None:
+        """Derive what every linearisation needs."""
+        problem, known = self.problem, self.knowledge
+        of_time, fraction = problem.intervals()
+        white_row, white_precision = _white_errors(problem, known.poses)
+        kept, variance = _ties(self.layout)
+        derived = {
+            "sharpness": problem.pictures.sharpness / (known.pixel_scale * np.sqrt(known.memory)),
+            "white_row": white_row,
+            "white_precision": white_precision,
+            "inverse_acceleration": np.linalg.inv(known.acceleration),
+            "of_time": of_time,
+            "fraction": fraction,
+            "usual_step_s": float(np.median(np.diff(problem.t_s))),
+            "tie_kept": kept,
+            "tie_variance": variance,
+        }
+        for name, value in derived.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def size(self) -> int:
+        """Of a front."""
+        return 9 * self.problem.joints + 2 * self.layout.knot_count + self.layout.shared_count
+
+    def picture_arguments(self) -> tuple[Any, ...]:
+        """What the kernels take between a picture's place in time and the robust bound."""
+        pictures = self.problem.pictures
+        return (
+            pictures.xy,
+            self.sharpness,
+            pictures.position,
+            pictures.rotation,
+            pictures.speed,
+            pictures.turn,
+            pictures.trust,
+        )
+
+    def entries(self) -> tuple[Any, ...]:
+        """What the kernels need to know of the layout."""
+        layout = self.layout
+        return (
+            layout.entry_start,
+            layout.entry_number,
+            layout.entry_knot,
+            layout.entry_column,
+            layout.clock_column,
+        )
+
+    def grown(self, state: State) -> float:
+        """How much larger the body is than the one for which the prior of motion and bones holds."""
+        lengths = state.shared[self.layout.bone_column :]
+        return float(lengths.mean() / self.knowledge.size_m) if len(lengths) else 1.0
+
+
+def _white_errors(problem: Problem, poses: Sequence[PoseErrors]) -> tuple[Int64, Float]:
+    """Where the inverse covariance of each picture's white error stands [G], and all of them [., 6, 6]."""
+    knot_s = float(problem.knot_t_s[1] - problem.knot_t_s[0])
+    pictures, logged = problem.pictures, problem.pose_covariance
+    level = np.array([np.repeat(errors.white_with_stray(knot_s), 3) for errors in poses])
+    usual = np.full((len(poses), 6, 6), np.inf)
+    has = level[:, 0] > 0
+    usual[has] = level[has, :, None] ** -2.0 * np.eye(6)
+    own = np.array([errors.logged for errors in poses])[pictures.camera] & (pictures.logged >= 0)
+    if not own.any():
+        return pictures.camera, usual
+    stray2 = level**2 - np.repeat(np.square([errors.white for errors in poses]), 3, axis=1)
+    of_camera = np.zeros(len(logged), dtype=np.int64)
+    of_camera[pictures.logged[own]] = pictures.camera[own]
+    added = np.maximum(stray2, EXACT**2)[of_camera]
+    precision = np.linalg.inv(logged + added[:, :, None] * np.eye(6))
+    return np.where(own, len(poses) + pictures.logged, pictures.camera), np.concatenate([usual, precision])
+
+
+def _ties(layout: Layout) -> tuple[Float, Float]:
+    """How every unknown of a knot [K - 1, c] goes on to the next."""
+    elapsed_s = np.diff(layout.knot_t_s)
+    kept, variance = (
+        np.ones((len(elapsed_s), layout.knot_count)),
+        np.ones((len(elapsed_s), layout.knot_count)),
+    )
+    for (_, process), (at_knots, column) in zip(layout.processes, layout.place, strict=True):
+        if at_knots:
+            steps = np.array([process.step(float(span)) for span in elapsed_s])
+            kept[:, column : column + 3] = steps[:, :1]
+            variance[:, column : column + 3] = steps[:, 1:]
+    return kept, variance
+
+
+def misfit(system: System, state: State) -> tuple[float, Float, Float]:
+    """Loss of the pictures, whitened residuals [G, J, 2], NaN unseen, the ten numbers of each picture."""
+    pictures = system.problem.pictures
+    residual = np.empty(pictures.xy.shape)
+    numbers = np.empty((len(pictures.first), kernels.NUMBERS))
+    total: float = _misfit(
+        system.problem.t_s,
+        state.position,
+        state.knots,
+        state.shared,
+        state.white,
+        pictures.first,
+        pictures.camera,
+        pictures.when_s,
+        system.fraction,
+        system.of_time[pictures.first],
+        *system.picture_arguments(),
+        system.bound2,
+        *system.entries(),
+        residual,
+        numbers,
+    )
+    return total, residual, numbers
+
+
+def prior_cost(system: System, state: State) -> float:
+    """Minus twice the logarithm of the prior, up to a constant."""
+    problem, known, layout = system.problem, system.knowledge, system.layout
+    before, after = np.diff(problem.t_s)[:-1], np.diff(problem.t_s)[1:]
+    slopes = np.diff(state.position, axis=0) / np.diff(problem.t_s)[:, None, None]
+    acceleration = 2 * np.diff(slopes, axis=0) / (before + after)[:, None, None]
+    weight = 0.5 * (before + after) / system.usual_step_s
+    cost = np.einsum(
+        "t,tji,jk,tki->", weight, acceleration, system.inverse_acceleration, acceleration, optimize=True
+    )
+    lengths = state.shared[layout.bone_column :]
+    cost += np.sum(((_bone_lengths(problem, state.position) - lengths) / known.bone_sigma_m) ** 2)
+    cost /= system.grown(state) ** 2
+    precision = system.white_precision[system.white_row]
+    there = np.isfinite(precision[:, 0, 0])
+    white = state.white[there]
+    cost += np.sum((precision[there] @ white[..., None])[..., 0] * white)
+    for (_, process), (at_knots, column) in zip(layout.processes, layout.place, strict=True):
+        begins = state.knots[0] if at_knots else state.shared
+        cost += np.sum(begins[column : column + 3] ** 2) / process.sigma0**2
+    changes = state.knots[1:] - system.tie_kept * state.knots[:-1]
+    cost += np.sum(changes**2 / system.tie_variance)
+    clocks = layout.clock_column >= 0
+    cost += np.sum((state.shared[layout.clock_column[clocks]] / layout.clock_sigma_s[clocks]) ** 2)
+    return float(cost)
+
+
+def _bone_lengths(problem: Problem, position: Float) -> Float:
+    """[T, B] m."""
+    ends = position[:, problem.bones]
+    lengths: Float = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
+    return lengths
