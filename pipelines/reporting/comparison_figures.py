@@ -102,17 +102,21 @@ def _over_time(comparison: Comparison, measure: Measure) -> Plate:
             for one in there
         )
         told = f"Means over the flights: {told}."
+    caption = _caption_over_time(comparison, shown, bands=len(there) <= _MOST_BANDS)
+    return Plate("compare-time", title, caption, told, figure, {"": stacked(drawn)})
+
+
+def _caption_over_time(comparison: Comparison, shown: list[Measure], *, bands: bool) -> str:
     caption = f"From above: {listing(of.name for of in shown)}. "
     caption += "Errors are medians over joints"
-    if len(there) <= _MOST_BANDS:
+    if bands:
         caption += ", the range in the uppermost drawing from the 10th to the 90th percentile"
     caption += "; tilt and share are means. "
-    caption += (
+    return caption + (
         "Times count from the first frame of all."
         if all(pair.by_time for pair in comparison.pairs)
         else "Times of flights that do not hold the same motion count from the first frame of each."
     )
-    return Plate("compare-time", title, caption, told, figure, {"": stacked(drawn)})
 
 
 def _draw_over_time(

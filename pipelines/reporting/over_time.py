@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +27,7 @@ from pipelines.reporting.wording import (
 from pipelines.session.records import Float
 
 if TYPE_CHECKING:
-    pass
+    from matplotlib.axes import Axes
 
 MOST_BINS = 300
 
@@ -41,28 +42,15 @@ def draw_over_time(summary: Summary, motion: Motion) -> Plate:
     what = "reprojection error" if summary.errors_mm is None else "distance from truth"
     bins = time_bins(seconds)
     centres, shares = _status_shares(seconds, motion, bins)
+    shown = {word: 100 * shares[STATUS.index(word)] for word in summary.statuses}
     middle, low, high = percentiles(np.where(motion.measured, values, np.nan), seconds, bins)
     with page_style():
         figure = Figure((WIDTH_IN, 3.5), layout="constrained")
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
-        upper.grid(visible=True, axis="y")
-        upper.fill_between(centres, low, high, color=STATUS_COLOURS["ok"], alpha=0.22, linewidth=0)
-        upper.plot(centres, middle, color=STATUS_COLOURS["ok"])
-        upper.set_ylim(0, 1.08 * np.nanmax(high, initial=0.0) or 1.0)
+        _draw_errors(upper, centres, middle, low, high)
         upper.set_ylabel(f"{what} ({unit})")
-        quiet(upper, grid=False)
-        base = np.zeros(len(centres))
-        for word in summary.statuses:
-            top = base + 100 * shares[STATUS.index(word)]
-            lower.fill_between(
-                *_steps(bins, base, top), color=STATUS_COLOURS[word], linewidth=0, label=STATUS_LABELS[word]
-            )
-            base = top
-        lower.set_ylim(0, 100)
-        lower.set_xlim(bins[0], bins[-1])
-        lower.set_ylabel("joints (%)")
+        _draw_percentages(lower, bins, shown)
         lower.set_xlabel("time (s)")
-        quiet(lower)
         figure.legend(loc="outside upper left", ncols=len(STATUS))
         title = f"{what.capitalize()} over time, and what became of the joints"
         worst = int(np.nanargmax(middle)) if np.isfinite(middle).any() else None
@@ -78,13 +66,36 @@ def draw_over_time(summary: Summary, motion: Motion) -> Plate:
     )
     if len(centres) < len(motion.t_ns):
         caption += f" Each point stands for {bins[1] - bins[0]:.2g} s."
-    shown = {word: 100 * shares[STATUS.index(word)] for word in summary.statuses}
     numbers = table(
         t_s=centres,
         **{f"median_{unit}": middle, f"p10_{unit}": low, f"p90_{unit}": high},
         **{f"{word}_percent": share for word, share in shown.items()},
     )
     return Plate("time", title, caption, told, figure, {"": numbers})
+
+
+def _draw_errors(axes: Axes, centres: Float, middle: Float, low: Float, high: Float) -> None:
+    """A line on its range, from zero."""
+    axes.grid(visible=True, axis="y")
+    axes.fill_between(centres, low, high, color=STATUS_COLOURS["ok"], alpha=0.22, linewidth=0)
+    axes.plot(centres, middle, color=STATUS_COLOURS["ok"])
+    axes.set_ylim(0, 1.08 * np.nanmax(high, initial=0.0) or 1.0)
+    quiet(axes, grid=False)
+
+
+def _draw_percentages(axes: Axes, bins: Float, shown: Mapping[str, Float]) -> None:
+    """How many joints had which status, one on top of the other."""
+    base = np.zeros(len(bins) - 1)
+    for word, percent in shown.items():
+        top = base + percent
+        axes.fill_between(
+            *_steps(bins, base, top), color=STATUS_COLOURS[word], linewidth=0, label=STATUS_LABELS[word]
+        )
+        base = top
+    axes.set_ylim(0, 100)
+    axes.set_xlim(bins[0], bins[-1])
+    axes.set_ylabel("joints (%)")
+    quiet(axes)
 
 
 def time_bins(seconds: Float, most: int = MOST_BINS) -> Float:
