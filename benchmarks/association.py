@@ -18,6 +18,7 @@ from pipelines.geometry.cameras import Intrinsics, undistort
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.geometry.triangulation import Views, triangulate
 from pipelines.keypoints.association import associate
+from pipelines.session.records import Float, Int64
 from pipelines.simulation.drone_paths import orbit
 from pipelines.simulation.observe import KeypointNoise, detect, see
 from pipelines.simulation.walk import walk
@@ -32,27 +33,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=900)
     frames = parser.parse_args().frames
-    rng = np.random.default_rng(0)
     t_s = np.arange(frames) / RATE_HZ
-    people = [
-        walk(t_s, start=(2.5 * np.cos(k), 2.5 * np.sin(k)), heading_deg=70.0 * k, radius_m=2.0 + 0.4 * k)
-        for k in range(PEOPLE)
-    ]
-    position, quaternion = orbit(
-        t_s, np.tile([0.0, 0.0, 1.0], (frames, 1)), cameras=CAMERAS, range_m=14, variation=1
-    )
-    xy = np.full((frames, CAMERAS, PEOPLE, 17, 2), np.nan)
-    confidence = np.zeros(xy.shape[:-1])
-    for c in range(CAMERAS):
-        order = rng.permuted(np.tile(np.arange(PEOPLE), (frames, 1)), axis=1)
-        for k, person in enumerate(people):
-            pixels, sure = detect(
-                see(person, position[c], quaternion[c], LENS), KeypointNoise(pixel_px=PIXEL_PX), rng
-            )
-            rows, places = np.nonzero(order == k)
-            xy[rows, c, places], confidence[rows, c, places] = undistort(pixels, LENS), sure
-    position = position.swapaxes(0, 1).copy()
-    rotation = matrix_from_quaternion(quaternion).swapaxes(0, 1).copy()
+    truth = people_at(t_s)
+    xy, confidence, position, rotation = filmed(truth, t_s)
     sigma = np.full((frames, CAMERAS), PIXEL_PX / FOCAL)
 
     print("| run | association, ms a frame | triangulation, ms a frame | both |")
@@ -61,29 +44,63 @@ def main() -> None:
         started = time.perf_counter()
         found = associate(t_s, xy, confidence, position, rotation, sigma, people=PEOPLE)
         associated = time.perf_counter()
-        chosen = np.clip(found.choice, 0, None)[:, :, :, None]
-        absent = (found.choice < 0)[:, :, :, None]
-        taken = np.where(absent[..., None], np.nan, np.take_along_axis(xy, chosen[..., None], axis=2))
-        weight = np.where(absent, 0.0, np.take_along_axis(confidence, chosen, axis=2))
-        views = Views(
-            xy=np.moveaxis(taken, 1, 3).reshape(-1, CAMERAS, 2),
-            weight=np.moveaxis(weight, 1, 3).reshape(-1, CAMERAS),
-            pose_index=np.repeat(np.arange(frames), PEOPLE * 17),
-            position=position,
-            rotation=rotation,
-            focal=np.full(CAMERAS, FOCAL),
-            pixel_sigma=np.full(CAMERAS, PIXEL_PX),
-            pose_sigma=np.zeros((frames, CAMERAS, 2)),
-        )
+        views = views_of(found.choice, xy, confidence, position, rotation)
         result = triangulate(views, method="robust", threads=1)
         ended = time.perf_counter()
         first, second = 1e3 * (associated - started) / frames, 1e3 * (ended - associated) / frames
         print(f"| {run} | {first:.3f} | {second:.3f} | {first + second:.3f} |")
-    truth = np.stack(people, axis=1)
     points = result.points.reshape(frames, PEOPLE, 17, 3)
     apart = np.linalg.norm(points[:, :, None] - truth[:, None], axis=-1)
     nearest = np.nanmean(apart, axis=-1).min(axis=2)
     print(f"\nmean distance to the nearest true person {1e3 * np.nanmean(nearest):.1f} mm")
+
+
+def people_at(t_s: Float) -> Float:
+    """Joints [T, P, J, 3] in m of people who walk on circles."""
+    starts = [(2.5 * np.cos(k), 2.5 * np.sin(k)) for k in range(PEOPLE)]
+    people = [
+        walk(t_s, start=start, heading_deg=70.0 * k, radius_m=2.0 + 0.4 * k) for k, start in enumerate(starts)
+    ]
+    return np.stack(people, axis=1)
+
+
+def filmed(people: Float, t_s: Float) -> tuple[Float, Float, Float, Float]:
+    """Detections in a random order, and the poses of the cameras, as `associate` takes them."""
+    rng = np.random.default_rng(0)
+    frames = len(t_s)
+    middle = np.tile([0.0, 0.0, 1.0], (frames, 1))
+    position, quaternion = orbit(t_s, middle, cameras=CAMERAS, range_m=14, variation=1)
+    xy = np.full((frames, CAMERAS, PEOPLE, 17, 2), np.nan)
+    confidence = np.zeros(xy.shape[:-1])
+    for c in range(CAMERAS):
+        order = rng.permuted(np.tile(np.arange(PEOPLE), (frames, 1)), axis=1)
+        for k in range(PEOPLE):
+            pixels, sure = detect(
+                see(people[:, k], position[c], quaternion[c], LENS), KeypointNoise(pixel_px=PIXEL_PX), rng
+            )
+            rows, places = np.nonzero(order == k)
+            xy[rows, c, places], confidence[rows, c, places] = undistort(pixels, LENS), sure
+    rotation = matrix_from_quaternion(quaternion)
+    return xy, confidence, position.swapaxes(0, 1).copy(), rotation.swapaxes(0, 1).copy()
+
+
+def views_of(choice: Int64, xy: Float, confidence: Float, position: Float, rotation: Float) -> Views:
+    """What was chosen for each person, one row for each joint-frame."""
+    frames = len(choice)
+    chosen = np.clip(choice, 0, None)[:, :, :, None]
+    absent = (choice < 0)[:, :, :, None]
+    taken = np.where(absent[..., None], np.nan, np.take_along_axis(xy, chosen[..., None], axis=2))
+    weight = np.where(absent, 0.0, np.take_along_axis(confidence, chosen, axis=2))
+    return Views(
+        xy=np.moveaxis(taken, 1, 3).reshape(-1, CAMERAS, 2),
+        weight=np.moveaxis(weight, 1, 3).reshape(-1, CAMERAS),
+        pose_index=np.repeat(np.arange(frames), PEOPLE * 17),
+        position=position,
+        rotation=rotation,
+        focal=np.full(CAMERAS, FOCAL),
+        pixel_sigma=np.full(CAMERAS, PIXEL_PX),
+        pose_sigma=np.zeros((frames, CAMERAS, 2)),
+    )
 
 
 if __name__ == "__main__":

@@ -45,16 +45,6 @@ def print_speeds(frames: int, repeats: int) -> None:
     truth, exact = ring(frames, 5)
     noisy = with_pixel_noise(exact, rng)
     outliers, good = with_outliers(noisy, rng, uniform=False)
-    two_views = Views(
-        noisy.xy[:, :2],
-        noisy.weight[:, :2],
-        noisy.pose_index,
-        noisy.position[:, :2],
-        noisy.rotation[:, :2],
-        noisy.focal[:2],
-        noisy.pixel_sigma[:2],
-        noisy.pose_sigma[:, :2],
-    )
 
     started = time.perf_counter()
     triangulate(noisy, method="robust")
@@ -78,6 +68,21 @@ def print_speeds(frames: int, repeats: int) -> None:
                 ]
                 print(f"| {method} | {label} | {threads} | {' | '.join(figures)} |")
 
+    print_peers(truth, noisy, outliers, repeats)
+
+
+def print_peers(truth: Float, noisy: Views, outliers: Views, repeats: int) -> None:
+    """The same of what others have."""
+    two_views = Views(
+        noisy.xy[:, :2],
+        noisy.weight[:, :2],
+        noisy.pose_index,
+        noisy.position[:, :2],
+        noisy.rotation[:, :2],
+        noisy.focal[:2],
+        noisy.pixel_sigma[:2],
+        noisy.pose_sigma[:, :2],
+    )
     print("\n| peer, one thread | M/s | 2 px, mean mm | outliers, mean mm |")
     print("| --- | --- | --- | --- |")
     few = slice(0, 17 * 450)  # 7650 joint-frames are enough for the slow ones
