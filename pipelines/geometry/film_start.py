@@ -66,6 +66,28 @@ class _Path:
     known: Bool  # [G]
 
 
+@dataclass(frozen=True)
+class _Search:
+    """Starts on a grid, and how much better than a camera that stands still each explains the points."""
+
+    path: _Path
+    followed: Followed
+    moved: float  # how far points move in a stretch, median; rad
+    scatter: float  # rad: about what the best start of the grid leaves of it
+    starts_s: Float  # [K] after the first pose
+    gain: Float  # [K]; -inf where the log covers too little
+
+    def likeliest(self, among: Bool) -> tuple[float, float]:
+        """The likeliest start of some [K], with its standard deviation."""
+        best = np.argmax(np.where(among, self.gain, -np.inf))
+        return _refined(self.path, self.followed, float(self.starts_s[best]), self.scatter)
+
+    def explained(self, start_s: float) -> Float:
+        """[S] what a start explains; nothing of what the log does not cover."""
+        still = _still(self.followed, _SCATTER)
+        return np.nan_to_num(still - _misfits(self.path, self.followed, start_s, _SCATTER))
+
+
 def fit_start(
     t_ns: Int64,
     position: Float,
@@ -98,45 +120,31 @@ def fit_start(
     """
     if not len(followed.stretch):
         raise ValueError("nothing in them can be followed")
-    path = _path(t_ns, position, quaternion_xyzw, max_gap_ns)
-    last_s, length_s = float(followed.end_ns[-1]) / 1e9, _STEP_S * (len(path.known) - 1)
-    starts_s = np.arange(-last_s, length_s, _SEARCHED_S)
-    moved = float(np.median(np.linalg.norm(followed.end - followed.begin, axis=1)))
-    scatter = max(_SCATTER, _SEARCHED_SHARE * moved)
-    gain = _gains(path, _thinned(followed), starts_s, scatter)
-    if not np.isfinite(gain).any():
+    search = _search(_path(t_ns, position, quaternion_xyzw, max_gap_ns), followed)
+    if not np.isfinite(search.gain).any():
         raise ValueError("the poses cover less than half of them")
     near_s = None if near_ns is None else (near_ns - int(t_ns[0])) / 1e9
-    possible = np.isfinite(gain) & (near_s is None or np.abs(starts_s - near_s) <= within_s)
+    possible = np.isfinite(search.gain) & (near_s is None or np.abs(search.starts_s - near_s) <= within_s)
     if not possible.any():
         raise ValueError(f"the poses cover less than half of them within {within_s:g} s of the stated start")
 
-    def peak(among: Bool) -> tuple[float, float]:
-        """The likeliest start of some, with its standard deviation."""
-        return _refined(path, followed, float(starts_s[np.argmax(np.where(among, gain, -np.inf))]), scatter)
-
-    still = _still(followed, _SCATTER)
-
-    def explained(start_s: float) -> Float:
-        """[S] what a start explains; nothing of what the log does not cover."""
-        return np.nan_to_num(still - _misfits(path, followed, start_s, _SCATTER))
-
-    start_s, sigma_s = peak(possible)
+    start_s, sigma_s = search.likeliest(possible)
+    explained = search.explained(start_s)
     if near_s is not None:
-        likeliest_s, _ = peak(np.ones(len(starts_s), np.bool_))
+        likeliest_s, _ = search.likeliest(np.ones(len(possible), np.bool_))
         apart_s = likeliest_s - near_s
-        if abs(apart_s) > within_s and _is_clear(explained(likeliest_s) - explained(start_s)):
+        if abs(apart_s) > within_s and _is_clear(search.explained(likeliest_s) - explained):
             raise ValueError(
                 f"they move as the poses do {apart_s:+.2f} s from the stated start, which must be right to"
                 f" {within_s:g} s"
             )
-    if not _is_clear(explained(start_s)):
+    if not _is_clear(explained):
         raise ValueError("they do not move as the poses do")
-    elsewhere = possible & (np.abs(starts_s - start_s) > _ELSEWHERE_S)
+    elsewhere = possible & (np.abs(search.starts_s - start_s) > _ELSEWHERE_S)
     if elsewhere.any():
-        other_s, _ = peak(elsewhere)
+        other_s, _ = search.likeliest(elsewhere)
         apart_s = abs(other_s - start_s)
-        if apart_s > _ELSEWHERE_S / 2 and not _is_clear(explained(start_s) - explained(other_s)):
+        if apart_s > _ELSEWHERE_S / 2 and not _is_clear(explained - search.explained(other_s)):
             raise ValueError(
                 f"they move as the poses do at several times, {apart_s:.2f} s apart: too little, too evenly,"
                 " or again and again"
@@ -146,8 +154,8 @@ def fit_start(
     return StartFit(
         start_ns=int(t_ns[0]) + round(start_s * 1e9),
         sigma_s=sigma_s,
-        moved=moved,
-        beside=float(np.nanmedian(_distances(path, followed, start_s))),
+        moved=search.moved,
+        beside=float(np.nanmedian(_distances(search.path, followed, start_s))),
     )
 
 
@@ -174,6 +182,16 @@ def _path(t_ns: Int64, position: Float, quaternion_xyzw: Float, max_gap_ns: int)
         quaternion=quaternion / np.maximum(norm, 1e-9),
         known=there & np.asarray(weight > _LEAST_WEIGHT),
     )
+
+
+def _search(path: _Path, followed: Followed) -> _Search:
+    """Try all starts at which the video overlaps the log."""
+    last_s, length_s = float(followed.end_ns[-1]) / 1e9, _STEP_S * (len(path.known) - 1)
+    starts_s = np.arange(-last_s, length_s, _SEARCHED_S)
+    moved = float(np.median(np.linalg.norm(followed.end - followed.begin, axis=1)))
+    scatter = max(_SCATTER, _SEARCHED_SHARE * moved)
+    gain = _gains(path, _thinned(followed), starts_s, scatter)
+    return _Search(path, followed, moved, scatter, starts_s, gain)
 
 
 def _thinned(followed: Followed) -> Followed:
