@@ -73,7 +73,7 @@ from pipelines.session.true_joints import true_joints_at
 if TYPE_CHECKING:
     import pandas as pd
 
-RECONSTRUCT = Stage("reconstruct", revision=8)
+RECONSTRUCT = Stage("reconstruct", revision=9)
 
 _LONGEST_FILL_S = 10.0
 
