@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numba
 import numpy as np
@@ -12,16 +13,18 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.metrics import aligned_distances
 from pipelines.geometry.noise import Bias, Drift, NoiseModel, White
-from pipelines.reconstruction.refinement import kernels
+from pipelines.reconstruction.refinement import elimination, kernels
 from pipelines.reconstruction.refinement.building import build
-from pipelines.reconstruction.refinement.elimination import covariances, eliminate, moments
+from pipelines.reconstruction.refinement.elimination import covariances, eliminate, moments, step
 from pipelines.reconstruction.refinement.estimate import initial_state, solve
+from pipelines.reconstruction.refinement.halves import parted
 from pipelines.reconstruction.refinement.levels import shrunk
 from pipelines.reconstruction.refinement.problem import (
     ROTATION,
     SHIFT_IN_CAMERA,
     SHIFT_IN_WORLD,
     Knowledge,
+    Pictures,
     PoseErrors,
     Process,
     State,
@@ -165,7 +168,10 @@ def test_covariances_are_those_of_the_whole_inverse(times: int, knots: int) -> N
     joints = still.shape[1]
     own = inverse[: 3 * times * joints, : 3 * times * joints].reshape(times, joints, 3, times, joints, 3)
     expected = np.einsum("tjatjb->tjab", own)
-    found = covariances(system, eliminate(system, state))
+    at = eliminate(system, state)
+    # Held joints add half of 1e-4 times their variance, below 1.4 m^2, for each of 9 unknowns at 4 times.
+    assert at.log_determinant == pytest.approx(np.linalg.slogdet(hessian)[1] / 2, abs=2.5e-3)
+    found = covariances(system, at)
     # Second differences of costs of size 1 with steps of 1e-4 are good to 1e-8 of a curvature of 1e4.
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
 
@@ -219,6 +225,40 @@ def test_long_flights_are_factorised_in_segments_with_the_same_result(
     monkeypatch.setattr("pipelines.reconstruction.refinement.elimination._KEPT_BYTES", 0)
     _, pieces, _ = solve(system.problem, system.knowledge, state, rounds=2)
     np.testing.assert_array_equal(packed(pieces), packed(whole))
+
+
+@pytest.mark.parametrize("meeting", [1, 4, 5])
+def test_where_the_halves_meet_makes_no_difference(meeting: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    system, state = small_system(exact=False, times=8, knots=9)
+    # Slow errors that fade, so that time has a direction, and two stretches with knots between them.
+    fading = (
+        Process(SHIFT_IN_WORLD, 0.3, correlation_s=0.05),
+        Process(ROTATION, 0.02, 0.01),
+        Process(SHIFT_IN_CAMERA, 0.1),
+    )
+    pictures, later_s = system.problem.pictures, np.where(np.arange(8) < 4, 0.0, 0.4)
+    within = (pictures.first + 2 < 4) | (pictures.first >= 4)
+    pictures = Pictures(*(column[within] for column in vars(pictures).values()))
+    pictures = replace(pictures, when_s=pictures.when_s + later_s[pictures.first])
+    t_s = system.problem.t_s + later_s
+    problem = replace(system.problem, t_s=t_s, pictures=pictures, knot_t_s=np.linspace(t_s[0], t_s[-1], 9))
+    known = replace(system.knowledge, poses=(PoseErrors((0.05, 0.01), fading),) * 2)
+    state = initial_state(problem, known, state.position)
+    rng = np.random.default_rng(1)
+    state = unpacked(packed(state) + rng.normal(0.0, 0.01, packed(state).size), state)
+    system = System(problem, known, lay_out(known.poses, known.clock_sigma_s, 2, problem.knot_t_s), 9.0)
+    # The two times that lack this bound are those of the meeting.
+    monkeypatch.setattr(elimination, "_ANYWHERE_M", 1e6)
+    found = []
+    for at_time in (6, meeting):  # 6: the second half has no times of its own
+        monkeypatch.setattr(elimination, "halved", partial(parted, meeting=at_time))
+        at = eliminate(system, state)
+        sums = vars(moments(system, state, at, every=1))
+        del sums["bones"]  # those of the meeting are left out
+        found.append([at.log_determinant, packed(step(system, at)), covariances(system, at), *sums.values()])
+    for whole, parts in zip(*found, strict=True):
+        # Rounding, 1e-16, times how much better some unknowns are known than others, 1e9 in variance.
+        np.testing.assert_allclose(parts, whole, rtol=0, atol=1e-7 * np.abs(whole).max())
 
 
 def test_two_threads_give_the_same_bytes() -> None:

@@ -52,7 +52,7 @@ class Moments:
 
 @dataclass
 class Eliminated:
-    """A state's equations after the elimination of all that does not live to the end."""
+    """A state's equations after the elimination of all that is not alive where the halves meet."""
 
     state: State
     swept: tuple[_Swept, _Swept]

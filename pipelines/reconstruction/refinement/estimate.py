@@ -44,7 +44,9 @@ def solve(
     The equations returned are those of the last step, within a step of the state.
     """
     layout = lay_out(known.poses, known.clock_sigma_s, len(problem.bones), problem.knot_t_s)
-    for done in range(1, rounds + 1):
+    done = 0
+    while True:
+        done += 1
         bound = bounds[min(done, len(bounds)) - 1]
         if done < len(bounds):
             _, residual, _ = misfit(System(problem, known, layout, bound**2), state)
@@ -59,9 +61,9 @@ def solve(
             share /= 2
         state = state.moved(direction, share)
         moved = float(np.sqrt(np.mean((share * direction.position) ** 2)))
-        if moved < _CONVERGED_M and done >= len(bounds):
-            break
-    return system, state, at
+        if done >= rounds or (moved < _CONVERGED_M and done >= len(bounds)):
+            return system, state, at
+        del at  # or the factors of two rounds would be held at once
 
 
 def cost(system: System, state: State) -> float:

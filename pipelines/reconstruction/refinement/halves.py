@@ -36,7 +36,7 @@ class Half:
     t_s: Float  # [T] falling where it is turned round
     of_time: Int64  # [T - 1] the knot before each time that is eliminated, and before the meeting
     starts: Int64  # [T - 1] where the pictures of each time begin
-    of_pictures: tuple[Any, ...]  # what the sweeps take of them, between the skeleton and the layout
+    of_pictures: tuple[Any, ...]  # camera, time, fraction, `System.picture_arguments`, row of the white error
     curvature: Float  # [T - 2, 3] weights that make an acceleration of three positions
     spread: Float  # [T - 2] its variance against the usual
     tie_before: Float  # [K - 1, c] times a knot, less
@@ -73,7 +73,7 @@ class Half:
         )
 
     def met(self) -> Int64:
-        """Where each of the unknowns that are alive at the end stands in the order of the first half."""
+        """Where each of the unknowns alive at the meeting stands in the order of the first half."""
         n, c = 3 * self.system.problem.joints, self.system.layout.knot_count
         place = np.arange(2 * n + 2 * c + self.system.layout.shared_count)
         if self.turned:
@@ -109,8 +109,11 @@ class Half:
 
 def halved(system: System) -> tuple[Half, Half]:
     """Both halves of a flight of at least three times."""
-    t_s = system.problem.t_s
-    meeting = (len(t_s) - 1) // 2
+    return parted(system, (len(system.problem.t_s) - 1) // 2)
+
+
+def parted(system: System, meeting: int) -> tuple[Half, Half]:
+    """The same for a meeting at any time but the first and the last of T: 1 to T - 2."""
     pictures = int(np.searchsorted(system.problem.pictures.first, meeting))
     return _half(system, meeting, pictures, turned=False), _half(system, meeting, pictures, turned=True)
 
@@ -143,37 +146,34 @@ def _half(system: System, meeting: int, pictures: int, *, turned: bool) -> Half:
         first = seen.first[mine]
         of_time = np.append(system.of_time[:meeting], met_at)
     order: Callable[[NDArray[Any]], NDArray[Any]] = _turned if turned else np.ascontiguousarray
-    tie = (system.tie_kept, np.ones_like(system.tie_kept))
+    ties = system.tie_kept, np.ones_like(system.tie_kept)
+    tie_before, tie_after = ties[::-1] if turned else ties
     before, after = np.diff(t_s)[:-1], np.diff(t_s)[1:]
     return Half(
-        system,
-        turned,
-        meeting,
-        pictures,
-        t_s,
-        of_time,
-        np.searchsorted(order(first), np.arange(len(t_s) - 1)),
-        tuple(
+        system=system,
+        turned=turned,
+        meeting=meeting,
+        pictures=pictures,
+        t_s=t_s,
+        of_time=of_time,
+        starts=np.searchsorted(order(first), np.arange(len(t_s) - 1)),
+        of_pictures=tuple(
             order(values[mine])
             for values in (
                 seen.camera,
                 seen.when_s,
                 1 - system.fraction if turned else system.fraction,
-                seen.xy,
-                system.sharpness,
-                seen.position,
-                seen.rotation,
-                seen.speed,
-                seen.turn,
-                seen.trust,
+                *system.picture_arguments(),
                 system.white_row,
             )
         ),
-        np.stack(
+        curvature=np.stack(
             [2 / (before * (before + after)), -2 / (before * after), 2 / (after * (before + after))], axis=1
         ),
-        system.usual_step_s / np.abs(0.5 * (before + after)),
-        *(order(values) for values in (*(tie[::-1] if turned else tie), variance)),
+        spread=system.usual_step_s / np.abs(0.5 * (before + after)),
+        tie_before=order(tie_before),
+        tie_after=order(tie_after),
+        tie_variance=order(variance),
     )
 
 

@@ -149,13 +149,15 @@ def _refined(problem: Problem, start: Float, part: NDArray[np.bool_], begun: Flo
     freely = replace(known, acceleration=limber(known.acceleration, _spread_of(cameras)))
     system, state, at = solve(problem, freely, state, rounds=_ROUNDS)
     covariance = covariances(system, at)
+    doubts = _doubts(system, state, at, learned=prior.learned)
+    del at  # what follows has factors of its own
     if known.memory > REMEMBERED:
         quick = _quickly(system, state, freely)
     elif _all_lasts(problem, known, state):
         quick = _quickly(*_abruptly(problem, known, state)[:2], freely)
     else:
         quick = state.position
-    fallback = _doubts(system, state, at, learned=prior.learned) or _too_far(quick, begun, prior.expected_m)
+    fallback = doubts or _too_far(quick, begun, prior.expected_m)
     position = np.full_like(start, np.nan)
     position[:, part] = quick
     whole = np.full((*start.shape, 3), np.nan)
