@@ -322,6 +322,17 @@ def test_outliers_cost_at_most_a_fifth(models: list[NoiseModel]) -> None:
     assert mean_mm(without, clean.truth) < 0.6 * mean_mm(clean.start, clean.truth)
 
 
+@pytest.mark.parametrize("told", [True, False])
+def test_a_rigid_formation_says_that_body_errors_cannot_be_observed(told: bool) -> None:
+    models: list[NoiseModel] = [Bias(position_m=0.3, rotation_deg=1.0, frame="body")]
+    flight = formation(60, 3, models, 0, variation=0.0)
+    prior = [pose_errors(models)] * 3 if told else None
+    result = refine(flight.t_s, flight.sightings, flight.start, BONES, prior, np.zeros(3))
+    said = " ".join((*result.warnings, result.fallback or ""))
+    assert "the formation hardly changes, so pictures tell neither its scale" in said
+    assert (result.fallback is None) == told
+
+
 def test_a_wrong_prior_is_noticed() -> None:
     # Told a constant error of the medium level, given a walk: never worse than trusting the log.
     flight = formation(90, 3, [Drift(position_m_per_sqrt_s=0.03, rotation_deg_per_sqrt_s=0.15)], 4)

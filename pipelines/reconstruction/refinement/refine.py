@@ -29,6 +29,7 @@ from pipelines.reconstruction.refinement.problem import (
     SHIFT_IN_CAMERA,
     SHIFT_IN_WORLD,
     Knowledge,
+    Pictures,
     PoseErrors,
     Problem,
     Process,
@@ -66,6 +67,10 @@ _FARTHEST_STATED = 3.2
 chi-square variable with three degrees of freedom over three passes once in a million times."""
 _REFUSED = 0.5  # for every picture: by how much stated levels may be less likely than those that are refused
 _UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; it was estimated instead"
+_RESTS_ON_STATED = (
+    "refined: the formation hardly changes, so pictures tell neither its scale nor constant pose errors in "
+    "the cameras' own frames: these rest on the stated pose noise alone"
+)
 
 
 @dataclass(frozen=True)
@@ -150,6 +155,9 @@ def _refined(problem: Problem, start: Float, part: NDArray[np.bool_], begun: Flo
     system, state, at = solve(problem, freely, state, rounds=_ROUNDS)
     covariance = covariances(system, at)
     doubts = _doubts(system, state, at, learned=prior.learned)
+    warnings = prior.warnings
+    if not prior.learned and _scale_unseen(system, state, at):
+        warnings = (*warnings, _RESTS_ON_STATED)
     del at  # what follows has factors of its own
     if known.memory > REMEMBERED:
         quick = _quickly(system, state, freely)
@@ -172,7 +180,7 @@ def _refined(problem: Problem, start: Float, part: NDArray[np.bool_], begun: Flo
         bone_lengths_m=state.shared[system.layout.bone_column :],
         acceleration=freely.acceleration,
         learned=prior.learned,
-        warnings=prior.warnings,
+        warnings=warnings,
         fallback=fallback,
     )
 
@@ -467,26 +475,18 @@ def _doubts(system: System, state: State, at: Eliminated, *, learned: bool) -> s
     pictures = system.problem.pictures
     _, _, numbers = misfit(system, state)
     # The scale of the constellation: the one thing that pictures alone do not tell.
-    centre = np.stack(
-        [pictures.position[pictures.camera == c].mean(axis=0) for c in np.unique(pictures.camera)]
-    )
     moved, _ = corrected(pictures.position, pictures.rotation, numbers)
-    after = np.stack([moved[pictures.camera == c].mean(axis=0) for c in np.unique(pictures.camera)])
-    apart, apart_after = centre - centre.mean(axis=0), after - after.mean(axis=0)
+    apart, apart_after = _apart(pictures, pictures.position), _apart(pictures, moved)
     grown = float(np.sum(apart * apart_after) / np.sum(apart**2)) - 1
-    sigma = _slow_sigma(system) / float(np.sqrt(np.sum(apart**2)))
+    sigma = _scale_sigma(system)
     if abs(grown) > max(_SIGMAS * sigma, 0.05 if learned else 0.02):
         side = "wider" if grown > 0 else "closer"
         return f"the cameras would stand {100 * abs(grown):.0f} % {side} than logged"
-    if learned and sigma > _SMALL_SCALE:
-        lengths = state.shared[system.layout.bone_column :]
-        told = shared_covariance(system, at)[system.layout.bone_column :, system.layout.bone_column :]
-        scale_sigma = float(np.sqrt(told.sum())) / float(lengths.sum())
-        if scale_sigma > _UNSEEN_SCALE * sigma:
-            return (
-                "the formation hardly changes, so pictures tell neither its scale nor how far off poses are "
-                "all along, and nobody stated it: state the pose noise"
-            )
+    if learned and _scale_unseen(system, state, at):
+        return (
+            "the formation hardly changes, so pictures tell neither its scale nor how far off poses are "
+            "all along, and nobody stated it: state the pose noise"
+        )
     for (camera, process), (at_knots, column) in zip(
         system.layout.processes, system.layout.place, strict=True
     ):
@@ -495,6 +495,28 @@ def _doubts(system: System, state: State, at: Eliminated, *, learned: bool) -> s
         if surprise > _SIGMAS and not at_knots:
             return f"camera {camera + 1} would be {surprise:.0f} standard deviations from its logged poses"
     return None
+
+
+def _scale_unseen(system: System, state: State, at: Eliminated) -> bool:
+    """Whether the constellation's scale is hardly better known once the pictures were seen."""
+    sigma = _scale_sigma(system)
+    lengths = state.shared[system.layout.bone_column :]
+    told = shared_covariance(system, at)[system.layout.bone_column :, system.layout.bone_column :]
+    left = float(np.sqrt(told.sum())) / float(lengths.sum())
+    return sigma > _SMALL_SCALE and left > _UNSEEN_SCALE * sigma
+
+
+def _scale_sigma(system: System) -> float:
+    """Standard deviation of the constellation's scale before the pictures were seen."""
+    pictures = system.problem.pictures
+    return _slow_sigma(system) / float(np.sqrt(np.sum(_apart(pictures, pictures.position) ** 2)))
+
+
+def _apart(pictures: Pictures, position: Float) -> Float:
+    """Where the cameras [C, 3] are on average, from their common middle, given positions [G, 3]."""
+    centre = np.stack([position[pictures.camera == c].mean(axis=0) for c in np.unique(pictures.camera)])
+    away: Float = centre - centre.mean(axis=0)
+    return away
 
 
 def _too_far(position: Float, begun: Float, expected_m: float) -> str | None:
