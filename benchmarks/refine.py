@@ -63,7 +63,7 @@ def main() -> None:
 
 def print_speed(times: int) -> None:
     """Time, memory and error on the walk of the peers' table."""
-    print(f"{times} frames, 17 joints, 5 cameras, 2 px, true poses")
+    print(f"{times} frames, 17 joints, 5 cameras, 2 px, true poses\n")
     print("| data | robust mm | refined mm | seconds | CPU s | k joint-frames/s | peak MB |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name, share in (("2 px", 0.0), ("outliers", 0.05)):
@@ -79,7 +79,7 @@ def print_speed(times: int) -> None:
             flush=True,
         )
     print(
-        "\nPeers, as measured for this project in 2026: once, on another machine, at true poses; not run here"
+        "\nPeers, as measured for this project in 2026: once, on another machine, at true poses; not run here\n"
     )
     print("| peer | 2 px, mm | outliers, mm | k joint-frames/s |")
     print("| --- | --- | --- | --- |")

@@ -64,7 +64,7 @@ def print_speeds(frames: int, repeats: int) -> None:
                     f"{len(truth) / alone / 1e6:.1f}",
                     f"{len(truth) / whole / 1e6:.1f}",
                     f"{error_mm(points, truth):.2f}",
-                    f"{np.isfinite(points[:, 0]).mean():.4f}",
+                    f"{reconstructed(points):.4f}",
                 ]
                 print(f"| {method} | {label} | {threads} | {' | '.join(figures)} |")
 
@@ -104,32 +104,59 @@ def print_peers(truth: Float, noisy: Views, outliers: Views, repeats: int) -> No
 def print_pose_errors(draws: int) -> None:
     """Mean error under constant pose errors, as many independent draws as asked for."""
     print(f"\nMean mm over {draws} draws of a constant pose error, 2 px; told: pose_sigma states it")
-    print("| cameras | level | midpoint | robust, told | not told | outliers: midpoint | told | not told |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for cameras in (2, 3, 5):
+    print(
+        "only good: `robust`, told, of exactly the good views of the outliers; and what each reconstructed\n"
+    )
+    print(
+        "| cameras | level | midpoint | robust, told | not told | outliers: midpoint | told | not told"
+        " | only good | told, % there | only good, % there |"
+    )
+    print("|" + " --- |" * 11)
+    for cameras in (2, 3, 4, 5):
         truth, exact = ring(20, cameras)
         for level in LEVELS:
-            errors = []
-            for draw in range(draws):
-                rng = np.random.default_rng(draw)
-                told = with_pose_noise(with_pixel_noise(exact, rng), rng, level, constant=True, told=True)
-                bad, _ = with_outliers(told, rng, uniform=False)
-                errors.append([error for views in (told, bad) for error in three_errors(views, truth)])
+            rows = np.array([errors_of(exact, truth, level, draw) for draw in range(draws)])
+            *errors, share, share_of_good = rows.mean(axis=0)
             print(
                 f"| {cameras} | {level} | "
-                + " | ".join(f"{value:.0f}" for value in np.mean(errors, axis=0))
-                + " |"
+                + " | ".join(f"{value:.0f}" for value in errors)
+                + f" | {100 * share:.1f} | {100 * share_of_good:.1f} |"
             )
 
 
-def three_errors(told: Views, truth: Float) -> list[float]:
-    """Mean error of least squares, and of `robust` with the pose noise stated and not."""
-    silent = replace(told, pose_sigma=np.zeros_like(told.pose_sigma))
-    robust = [
-        locate(replace(views, pixel_sigma=estimate_noise(views)), method="robust").points
-        for views in (told, silent)
+def errors_of(exact: Views, truth: Float, level: str, draw: int) -> list[float]:
+    """One draw: errors without outliers, with them and of good views only; reconstructed shares."""
+    rng = np.random.default_rng(draw)
+    told = with_pose_noise(with_pixel_noise(exact, rng), rng, level, constant=True, told=True)
+    outliers, good = with_outliers(told, rng, uniform=False)
+    despite = robustly(outliers)
+    only_good = robustly(replace(outliers, weight=outliers.weight * good))
+    return [
+        error_mm(locate(told, method="midpoint").points, truth),
+        error_mm(robustly(told), truth),
+        error_mm(robustly(silent(told)), truth),
+        error_mm(locate(outliers, method="midpoint").points, truth),
+        error_mm(despite, truth),
+        error_mm(robustly(silent(outliers)), truth),
+        error_mm(only_good, truth),
+        reconstructed(despite),
+        reconstructed(only_good),
     ]
-    return [error_mm(points, truth) for points in (locate(told, method="midpoint").points, *robust)]
+
+
+def robustly(views: Views) -> Float:
+    """`robust` with the pixel noise that it estimates."""
+    return locate(replace(views, pixel_sigma=estimate_noise(views)), method="robust").points
+
+
+def silent(views: Views) -> Views:
+    """The same without a word of the poses' errors."""
+    return replace(views, pose_sigma=np.zeros_like(views.pose_sigma))
+
+
+def reconstructed(points: Float) -> float:
+    """Share of the points that are there."""
+    return float(np.isfinite(points[:, 0]).mean())
 
 
 def peer_row(name: str, run: Callable[[Views], Float], data: list[Views], truth: Float, repeats: int) -> str:
