@@ -79,7 +79,7 @@ def print_speed(times: int) -> None:
             flush=True,
         )
     print(
-        "\nPeers, as measured for this project in 2026: once, on another machine, at true poses; not run here\n"
+        "\nPeers, measured for this project in 2026, once, on another machine, at true poses; not run here\n"
     )
     print("| peer | 2 px, mm | outliers, mm | k joint-frames/s |")
     print("| --- | --- | --- | --- |")
