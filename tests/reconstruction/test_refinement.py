@@ -333,6 +333,17 @@ def test_a_rigid_formation_says_that_body_errors_cannot_be_observed(told: bool) 
     assert (result.fallback is None) == told
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("share", "most_mm"), [(0.0, 6.0), (0.05, 8.0)], ids=["2 px", "outliers"])
+def test_it_is_ahead_of_the_best_peer_at_true_poses(share: float, most_mm: float) -> None:
+    # Temporal optimisation with bone lengths has 6.5 and 14.2 mm of such a walk (docs/benchmarks.md).
+    flight = formation(300, 5, [], 0, bad_share=share)
+    position, _, fallback = refined(flight, [])
+    assert fallback is None
+    assert mean_mm(position, flight.truth) < most_mm
+    assert np.isfinite(position).all()
+
+
 def test_a_wrong_prior_is_noticed() -> None:
     # Told a constant error of the medium level, given a walk: never worse than trusting the log.
     flight = formation(90, 3, [Drift(position_m_per_sqrt_s=0.03, rotation_deg_per_sqrt_s=0.15)], 4)
