@@ -73,7 +73,7 @@ from pipelines.session.true_joints import true_joints_at
 if TYPE_CHECKING:
     import pandas as pd
 
-RECONSTRUCT = Stage("reconstruct", revision=9)
+RECONSTRUCT = Stage("reconstruct", revision=10)
 
 _LONGEST_FILL_S = 10.0
 
@@ -330,6 +330,9 @@ def _attempt(
         refined = _refine(cameras, seen, views, result, description, settings, workers)
         observations, views = refined.observations, refined.views
         result = refused_people(refined.result, observations, seen.anybody)
+        if refined.cameras is None:  # not believed: `robust` instead, with the loss that it has of its own
+            solve = solver_for("robust", cameras, observations, threads=workers)
+            result = refused_people(solve(views), observations, seen.anybody)
     result, finished = finish(
         observations, views, result, fill_s=settings.fill_s, smoother=smoother(settings.smooth)
     )

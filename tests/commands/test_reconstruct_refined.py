@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from pipelines.session.skeletons import mirrored
-from tests.commands.runner import succeeds
-from tests.synthetic.flights import write_flight
+from tests.commands.runner import mocap, succeeds
+from tests.synthetic.flights import SyntheticFlight, write_flight
 
 NOISE = {"white": {"position_m": 0.2, "rotation_deg": 0.7}}
 GOOD = {"white": {"position_m": 0.02, "rotation_deg": 0.1}}
@@ -83,6 +85,50 @@ def test_refined_finds_how_far_a_clock_is_off(tmp_path: Path) -> None:
     assert refined["clock_offset_sigmas_s"]["drone2"] < 0.005
     # At 1.2 m/s 200 ms are 240 mm beside one of two cameras; without them the keypoints' 26 mm are left.
     assert refined["mpjpe_mm"] < 0.3 * robust["mpjpe_mm"]
+
+
+def half_a_second_late(folder: Path) -> SyntheticFlight:
+    """A clock is called known and is not: no pose errors explain what its camera saw."""
+    flight = write_flight(folder, cameras=3, seconds=1.5, pose_noise={})
+    flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": 0.5, "sigma_s": 0}
+    return flight
+
+
+def half_a_second_long(folder: Path) -> SyntheticFlight:
+    """Too short to learn anything from; of still cameras, for which `robust` has a loss of its own."""
+    flight = write_flight(folder, cameras=3, seconds=0.5, static=True)
+    for camera in flight.settings["cameras"].values():
+        del camera["pose_noise"]
+    return flight
+
+
+@pytest.mark.parametrize(
+    ("written", "because"),
+    [(half_a_second_late, "the skeleton would move by"), (half_a_second_long, "too few joints or times")],
+)
+def test_refined_falls_back_to_what_robust_gives_and_says_why(
+    written: Callable[[Path], SyntheticFlight], because: str, tmp_path: Path
+) -> None:
+    flight = written(tmp_path)
+    flight.save()
+    session = tmp_path / "flight.session"
+    succeeds("ingest", flight.manifest, "-o", session)
+    robust = json.loads(succeeds("reconstruct", session, "--json"))
+    skeleton = (session / "reconstruct" / "skeleton.parquet").read_bytes()
+
+    done = mocap("reconstruct", session, "--method", "refined", "--json")
+    assert done.returncode == 0
+    refined = json.loads(done.stdout)
+    reason = refined["refinement"]["fallback"]
+    assert reason.startswith(because)
+    assert f"refined: fell back to robust, because {reason}" in done.stderr
+    assert (session / "reconstruct" / "skeleton.parquet").read_bytes() == skeleton
+    assert not (session / "reconstruct" / "cameras.parquet").exists()
+    of_refined_alone = {"method", "clock_offsets_s"}
+    assert {name: refined[name] for name in robust.keys() - of_refined_alone} == {
+        name: robust[name] for name in robust.keys() - of_refined_alone
+    }
+    assert set(refined["clock_offsets_s"].values()) == {0.0}
 
 
 def exchange_sides(keypoints: Path, joints: tuple[str, ...]) -> None:
