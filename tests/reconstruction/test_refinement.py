@@ -344,6 +344,24 @@ def test_it_is_ahead_of_the_best_peer_at_true_poses(share: float, most_mm: float
     assert np.isfinite(position).all()
 
 
+def test_a_place_that_nobody_saw_is_the_log_s() -> None:
+    # Two cameras whose logs drift, of which nobody told: levels come out that put the person a metre off.
+    models: list[NoiseModel] = [BIAS, Drift(position_m_per_sqrt_s=0.03, rotation_deg_per_sqrt_s=0.15)]
+    flight = formation(60, 2, models, 1, still=True)
+    result = refine(flight.t_s, flight.sightings, flight.start, BONES, None, np.zeros(2))
+    assert result.fallback is None
+    assert "on average the skeleton stays where the logged poses put it" in result.warnings[0]
+    off = np.nanmedian(result.position - flight.start, axis=(0, 1))
+    # Its median is over what was filled in between, too.
+    np.testing.assert_allclose(off, 0, atol=0.01)
+    # Pictures stay as they were explained: cameras moved with the skeleton.
+    _, numbers = result.corrections[0]
+    position, rotation = corrected(flight.sightings[0].position, flight.sightings[0].rotation, numbers)
+    seen = np.einsum("tij,tki->tkj", rotation, result.position - position[:, None])
+    miss_px = 1500 * np.abs(seen[..., :2] / seen[..., 2:] - flight.sightings[0].xy)
+    assert np.median(miss_px) < 2.0  # keypoints err by 2 px: 1.35 of it in the median
+
+
 def test_a_wrong_prior_is_noticed() -> None:
     # Told a constant error of the medium level, given a walk: never worse than trusting the log.
     flight = formation(90, 3, [Drift(position_m_per_sqrt_s=0.03, rotation_deg_per_sqrt_s=0.15)], 4)

@@ -65,8 +65,14 @@ _FARTHEST = 1.8
 _FARTHEST_STATED = 3.2
 """The same of stated levels, of which a constant error is one draw: sqrt(30.7 / 3), which the root of a
 chi-square variable with three degrees of freedom over three passes once in a million times."""
+_TOLD_PLACE = 0.7
+"""Of what slow pose errors do to a triangulated point: a place that is known no better was not seen."""
 _REFUSED = 0.5  # for every picture: by how much stated levels may be less likely than those that are refused
 _UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; it was estimated instead"
+_PLACED_AS_LOGGED = (
+    "refined: pictures hardly tell where the person was, and nobody stated pose noise that explains them: on "
+    "average the skeleton stays where the logged poses put it"
+)
 _RESTS_ON_STATED = (
     "refined: the formation hardly changes, so pictures tell neither its scale nor constant pose errors in "
     "the cameras' own frames: these rest on the stated pose noise alone"
@@ -155,32 +161,38 @@ def _refined(problem: Problem, start: Float, part: NDArray[np.bool_], begun: Flo
     system, state, at = solve(problem, freely, state, rounds=_ROUNDS)
     covariance = covariances(system, at)
     doubts = _doubts(system, state, at, learned=prior.learned)
-    warnings = prior.warnings
-    if not prior.learned and _scale_unseen(system, state, at):
-        warnings = (*warnings, _RESTS_ON_STATED)
+    as_stated = not prior.learned and _scale_unseen(system, state, at)
+    as_logged = prior.learned and _unplaced(system, state, at, covariance)
     del at  # what follows has factors of its own
+    slowly = system, state  # what tells the poses
     if known.memory > REMEMBERED:
-        quick = _quickly(system, state, freely)
+        quick = _quickly(*slowly, freely)
     elif _all_lasts(problem, known, state):
-        quick = _quickly(*_abruptly(problem, known, state)[:2], freely)
+        slowly = _abruptly(problem, known, state)[:2]
+        quick = _quickly(*slowly, freely)
     else:
         quick = state.position
     fallback = doubts or _too_far(quick, begun, prior.expected_m)
+    shift = np.median(begun - quick, axis=(0, 1)) if as_logged else np.zeros(3)
     position = np.full_like(start, np.nan)
-    position[:, part] = quick
+    position[:, part] = quick + shift
     whole = np.full((*start.shape, 3), np.nan)
     whole[:, part] = covariance
     return Refined(
         position=position,
         covariance=whole,
-        corrections=_corrections(system, state, cameras),
+        corrections=_corrections(*slowly, shift),
         clock_offset_s=clock_s,
         clock_sigma_s=clock_left_s,
         levels=_levels(known),
         bone_lengths_m=state.shared[system.layout.bone_column :],
         acceleration=freely.acceleration,
         learned=prior.learned,
-        warnings=warnings,
+        warnings=(
+            *prior.warnings,
+            *([_RESTS_ON_STATED] if as_stated else []),
+            *([_PLACED_AS_LOGGED] if as_logged else []),
+        ),
         fallback=fallback,
     )
 
@@ -497,13 +509,35 @@ def _doubts(system: System, state: State, at: Eliminated, *, learned: bool) -> s
     return None
 
 
+def _unplaced(system: System, state: State, at: Eliminated, covariance: Float) -> bool:
+    """Whether where the person is follows from estimated levels of slow errors rather than from pictures.
+
+    Constant errors are a handful of numbers, from which levels are had badly; where the estimate of a place
+    is hardly narrower than slow errors of these levels let it be, or the scale was not seen, it is a draw
+    from them, and no nearer to the truth than the log's.
+    """
+    _, distance = _residuals(system.problem, state.position)
+    range_m = float(np.nanmedian(distance))
+    poses = system.knowledge.poses
+    slow_m = float(np.mean([_ray_sigma_m(replace(errors, white=(0.0, 0.0)), range_m) for errors in poses]))
+    white_m = float(np.mean([_ray_sigma_m(replace(errors, processes=()), range_m) for errors in poses]))
+    if slow_m <= white_m:
+        return False
+    left_m = float(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1).mean()))
+    unseen = _scale_left(system, state, at) > _UNSEEN_SCALE
+    return unseen or left_m > _TOLD_PLACE * slow_m * _spread_of(len(poses))
+
+
 def _scale_unseen(system: System, state: State, at: Eliminated) -> bool:
     """Whether the constellation's scale is hardly better known once the pictures were seen."""
-    sigma = _scale_sigma(system)
+    return _scale_sigma(system) > _SMALL_SCALE and _scale_left(system, state, at) > _UNSEEN_SCALE
+
+
+def _scale_left(system: System, state: State, at: Eliminated) -> float:
+    """Share of the scale's standard deviation that is left once the pictures were seen."""
     lengths = state.shared[system.layout.bone_column :]
     told = shared_covariance(system, at)[system.layout.bone_column :, system.layout.bone_column :]
-    left = float(np.sqrt(told.sum())) / float(lengths.sum())
-    return sigma > _SMALL_SCALE and left > _UNSEEN_SCALE * sigma
+    return float(np.sqrt(told.sum())) / float(lengths.sum()) / _scale_sigma(system)
 
 
 def _scale_sigma(system: System) -> float:
@@ -539,11 +573,13 @@ def _slow_sigma(system: System) -> float:
     return float(np.sqrt(variance / len(system.knowledge.poses)))
 
 
-def _corrections(system: System, state: State, cameras: int) -> tuple[tuple[Float, Float], ...]:
+def _corrections(system: System, state: State, shift: Float) -> tuple[tuple[Float, Float], ...]:
+    """Of each camera, with everything moved by `shift` [3] m."""
     pictures = system.problem.pictures
     _, _, numbers = misfit(system, state)
+    numbers[:, SHIFT_IN_WORLD : SHIFT_IN_WORLD + 3] -= shift
     found = []
-    for c in range(cameras):
+    for c in range(len(system.knowledge.poses)):
         (mine,) = np.nonzero(pictures.camera == c)
         order = mine[np.argsort(pictures.when_s[mine], kind="stable")]
         found.append((pictures.when_s[order], numbers[order]))
