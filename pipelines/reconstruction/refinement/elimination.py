@@ -14,17 +14,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.reconstruction.refinement import kernels, sweeps
-from pipelines.reconstruction.refinement.halves import Half, halved, side_by_side
+from pipelines.reconstruction.refinement.halves import Half, halved
 from pipelines.reconstruction.refinement.problem import State
 from pipelines.reconstruction.refinement.system import System
+from pipelines.session.side_by_side import Halt, side_by_side
 
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+Part = TypeVar("Part")
+Result = TypeVar("Result")
 
 # Their arguments are assembled from tuples, whose lengths types do not know.
 _forwards: Callable[..., tuple[int, float]] = sweeps.forwards
@@ -67,7 +71,9 @@ def eliminate(system: System, state: State) -> Eliminated:
     Raises:
         LinAlgError: the equations are singular.
     """
-    swept = side_by_side(halved(system), lambda half: _sweep(half, half.state(state)), system.problem.threads)
+    swept = _on_both(
+        halved(system), lambda half, halt: _sweep(half, half.state(state), halt), system.problem.threads
+    )
     lower, gradient = _meet(swept)
     half_log = float(np.log(np.diagonal(lower)).sum()) + swept[0].log_determinant + swept[1].log_determinant
     return Eliminated(state, swept, lower, gradient, half_log)
@@ -86,12 +92,12 @@ def covariances(system: System, at: Eliminated) -> Float:
     shape = (system.problem.joints, 3, 3)
     whole = _last_covariance(at)
 
-    def of_half(swept: _Swept) -> Float:
+    def of_half(swept: _Swept, halt: Halt) -> Float:
         covariance = np.zeros((len(swept.half.t_s), *shape))
-        _visit_back(swept, swept.state, whole, covariance, 0)
+        _visit_back(swept, swept.state, whole, covariance, 0, halt)
         return covariance
 
-    first, second = side_by_side(at.swept, of_half, system.problem.threads)
+    first, second = _on_both(at.swept, of_half, system.problem.threads)
     return np.concatenate([first, second[-3::-1]])
 
 
@@ -102,10 +108,10 @@ def moments(system: System, state: State, at: Eliminated, *, every: int) -> Mome
     """
     whole = _last_covariance(at)
 
-    def of_half(swept: _Swept) -> Moments:
-        return _visit_back(swept, swept.half.state(state), whole, np.zeros((0, 1, 3, 3)), every)
+    def of_half(swept: _Swept, halt: Halt) -> Moments:
+        return _visit_back(swept, swept.half.state(state), whole, np.zeros((0, 1, 3, 3)), every, halt)
 
-    return _added(*side_by_side(at.swept, of_half, system.problem.threads))
+    return _added(*_on_both(at.swept, of_half, system.problem.threads))
 
 
 def shared_covariance(system: System, at: Eliminated) -> Float:
@@ -169,13 +175,23 @@ def _segments(half: Half) -> list[tuple[int, int]]:
     return [(first, min(first + _SEGMENT, half.count)) for first in range(0, max(half.count, 1), _SEGMENT)]
 
 
-def _sweep(half: Half, state: State) -> _Swept:
+def _on_both(
+    both: tuple[Part, Part], work: Callable[[Part, Halt], Result], threads: int
+) -> tuple[Result, Result]:
+    """The same for both halves, at once where there may be two threads; each writes its own results."""
+    halt = Halt()
+    first, second = side_by_side(lambda part: work(part, halt), both, workers=min(threads, 2), halt=halt)
+    return first, second
+
+
+def _sweep(half: Half, state: State, halt: Halt) -> _Swept:
     system = half.system
     front = _begin(half, state)
     fronts, kept = [], {}
     log_determinant = 0.0
     bytes_per_time = 8 * 3 * system.problem.joints * system.size
     for index, (first, last) in enumerate(_segments(half)):
+        halt.check()
         fronts.append(front.copy())
         factors, part = _eliminate(half, state, front, first, last)
         log_determinant += part
@@ -302,9 +318,10 @@ def _last_covariance(at: Eliminated) -> Float:
 # --- backwards -----------------------------------------------------------------------------------------
 
 
-def _factors_backwards(swept: _Swept) -> Iterator[tuple[int, int, _Factors]]:
+def _factors_backwards(swept: _Swept, halt: Halt) -> Iterator[tuple[int, int, _Factors]]:
     segments = _segments(swept.half)
     for index in range(len(segments) - 1, -1, -1):
+        halt.check()
         factors = swept.factors.get(index)
         if factors is None:
             factors, _ = _eliminate(swept.half, swept.state, swept.fronts[index].copy(), *segments[index])
@@ -318,8 +335,8 @@ def _solve_back(
     layout, state = system.layout, at.state
     # Draws come from one source, so in order.
     threads = 1 if rng is not None else system.problem.threads
-    (position, knots), (turned_position, turned_knots) = side_by_side(
-        at.swept, lambda swept: _follow_back(swept, last_solution, rng), threads
+    (position, knots), (turned_position, turned_knots) = _on_both(
+        at.swept, lambda swept, halt: _follow_back(swept, last_solution, rng, halt), threads
     )
     position = np.concatenate([position, turned_position[-3::-1]])
     first_of_second = at.swept[0].rest.interval + 2
@@ -331,7 +348,9 @@ def _solve_back(
     return moved
 
 
-def _follow_back(swept: _Swept, last_solution: Float, rng: np.random.Generator | None) -> tuple[Float, Float]:
+def _follow_back(
+    swept: _Swept, last_solution: Float, rng: np.random.Generator | None, halt: Halt
+) -> tuple[Float, Float]:
     """Joints [T, n] of a half, and all knots [K, c], of which those of the other half are 0."""
     half, state = swept.half, swept.state
     n, count = 3 * half.system.problem.joints, half.system.layout.knot_count
@@ -342,7 +361,7 @@ def _follow_back(swept: _Swept, last_solution: Float, rng: np.random.Generator |
     interval = swept.rest.interval
     if count:
         knots[interval : interval + 2] = alive[2 * n : 2 * n + 2 * count].reshape(2, count)
-    for first, last, factors in _factors_backwards(swept):
+    for first, last, factors in _factors_backwards(swept, halt):
         solved, knot_solved = factors.solved, factors.knot_solved
         if rng is not None:
             solved, knot_solved = rng.standard_normal(solved.shape), rng.standard_normal(knot_solved.shape)
@@ -392,7 +411,7 @@ def _add_white(system: System, state: State, moved: State) -> None:
 
 
 def _visit_back(
-    swept: _Swept, state: State, last_covariance: Float, covariance: Float, every: int
+    swept: _Swept, state: State, last_covariance: Float, covariance: Float, every: int, halt: Halt
 ) -> Moments:
     """Sums of a half, linearised at `state`; `covariance` is filled where it has a length."""
     half = swept.half
@@ -412,7 +431,7 @@ def _visit_back(
     interval = swept.rest.interval
     if layout.knot_count and every and not half.turned:
         sweeps.last_walk(others, 3 * joints, layout.knot_count, state.knots, knot_t_s, interval, found.walked)
-    for first, last, factors in _factors_backwards(swept):
+    for first, last, factors in _factors_backwards(swept, halt):
         others, interval = _visit(
             first,
             last,

@@ -8,7 +8,6 @@ through, the joints at two times, the knots around them and what all times share
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -21,8 +20,6 @@ from pipelines.reconstruction.refinement.system import System
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Value = TypeVar("Value", bound=np.generic)
-Part = TypeVar("Part")
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -116,18 +113,6 @@ def parted(system: System, meeting: int) -> tuple[Half, Half]:
     """The same for a meeting at any time but the first and the last of T: 1 to T - 2."""
     pictures = int(np.searchsorted(system.problem.pictures.first, meeting))
     return _half(system, meeting, pictures, turned=False), _half(system, meeting, pictures, turned=True)
-
-
-def side_by_side(
-    both: tuple[Part, Part], work: Callable[[Part], Result], threads: int
-) -> tuple[Result, Result]:
-    """The same for both halves, at once where there may be two threads; each writes its own results."""
-    first, second = both
-    if threads < 2:
-        return work(first), work(second)
-    with ThreadPoolExecutor(1) as other:
-        later = other.submit(work, second)
-        return work(first), later.result()
 
 
 def _half(system: System, meeting: int, pictures: int, *, turned: bool) -> Half:
