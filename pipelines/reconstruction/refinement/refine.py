@@ -366,9 +366,10 @@ def _priors(
         if name != "estimated":
             known, state = learn(problem, known, state, poses=False, rounds=_FEWER_ROUNDS)
         known = replace(known, acceleration=shrunk(known.acceleration, problem.t_s, state.position))
-        if known.memory < REMEMBERED and known.pixel_scale > _UNEXPLAINED * image:
+        # Given levels have to leave no more than estimated ones.
+        if known.memory < REMEMBERED and known.pixel_scale > _UNEXPLAINED * min(image, free.pixel_scale):
             raise np.linalg.LinAlgError("no level of pose noise explains the pictures")
-        of_stated = _FARTHEST_STATED * stated_m if name == "stated" else 0.0
+        of_stated = (_FARTHEST_STATED if name == best else _FARTHEST) * stated_m if name == "stated" else 0.0
         unlike = prior is not None and name != "stated"
         yield _Prior(
             known,
