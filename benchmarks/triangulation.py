@@ -19,6 +19,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from pipelines.geometry.picture_gate import triangulate_pictures
 from pipelines.geometry.triangulation import Method, Views, estimate_noise, locate, triangulate
 from tests.geometry.rings import FOCAL, LEVELS, ring, with_outliers, with_pixel_noise, with_pose_noise
 
@@ -67,8 +68,24 @@ def print_speeds(frames: int, repeats: int) -> None:
                     f"{reconstructed(points):.4f}",
                 ]
                 print(f"| {method} | {label} | {threads} | {' | '.join(figures)} |")
+        for threads in sorted({1, os.cpu_count() or 1}):
+            print(pictures_row(label, views, truth, threads, repeats))
 
     print_peers(truth, noisy, outliers, repeats)
+
+
+def pictures_row(label: str, views: Views, truth: Float, threads: int, repeats: int) -> str:
+    """The line of `robust` with the gate of pictures, as moving cameras have it."""
+    seen = replace(views, pixel_sigma=estimate_noise(views))
+    whole = best_s(
+        lambda: triangulate_pictures(seen, pixel_sigma=views.pixel_sigma, threads=threads), repeats
+    )
+    points = triangulate_pictures(seen, pixel_sigma=views.pixel_sigma).points
+    speed = f"{len(truth) / whole / 1e6:.1f}"
+    return (
+        f"| robust, pictures | {label} | {threads} | | {speed} | "
+        f"{error_mm(points, truth):.2f} | {reconstructed(points):.4f} |"
+    )
 
 
 def print_peers(truth: Float, noisy: Views, outliers: Views, repeats: int) -> None:
@@ -104,23 +121,26 @@ def print_peers(truth: Float, noisy: Views, outliers: Views, repeats: int) -> No
 def print_pose_errors(draws: int) -> None:
     """Mean error under constant pose errors, as many independent draws as asked for."""
     print(f"\nMean mm over {draws} draws of a constant pose error, 2 px; told: pose_sigma states it")
+    print("joints alone: told, without the gate of pictures")
     print(
         "only good: `robust`, told, of exactly the good views of the outliers; and what each reconstructed\n"
     )
     print(
-        "| cameras | level | midpoint | robust, told | not told | outliers: midpoint | told | not told"
-        " | only good | told, % there | only good, % there |"
+        "| cameras | level | midpoint | robust, told | not told | outliers: midpoint | joints alone | told"
+        " | not told | only good | joints alone, % there | told, % there | only good, % there |"
     )
-    print("|" + " --- |" * 11)
+    print("|" + " --- |" * 13)
     for cameras in (2, 3, 4, 5):
         truth, exact = ring(20, cameras)
         for level in LEVELS:
             rows = np.array([errors_of(exact, truth, level, draw) for draw in range(draws)])
-            *errors, share, share_of_good = rows.mean(axis=0)
+            errors, shares = np.split(rows.mean(axis=0), [8])
             print(
                 f"| {cameras} | {level} | "
                 + " | ".join(f"{value:.0f}" for value in errors)
-                + f" | {100 * share:.1f} | {100 * share_of_good:.1f} |"
+                + " | "
+                + " | ".join(f"{100 * share:.1f}" for share in shares)
+                + " |"
             )
 
 
@@ -129,6 +149,7 @@ def errors_of(exact: Views, truth: Float, level: str, draw: int) -> list[float]:
     rng = np.random.default_rng(draw)
     told = with_pose_noise(with_pixel_noise(exact, rng), rng, level, constant=True, told=True)
     outliers, good = with_outliers(told, rng, uniform=False)
+    alone = locate(replace(outliers, pixel_sigma=estimate_noise(outliers)), method="robust").points
     despite = robustly(outliers)
     only_good = robustly(replace(outliers, weight=outliers.weight * good))
     return [
@@ -136,17 +157,20 @@ def errors_of(exact: Views, truth: Float, level: str, draw: int) -> list[float]:
         error_mm(robustly(told), truth),
         error_mm(robustly(silent(told)), truth),
         error_mm(locate(outliers, method="midpoint").points, truth),
+        error_mm(alone, truth),
         error_mm(despite, truth),
         error_mm(robustly(silent(outliers)), truth),
         error_mm(only_good, truth),
+        reconstructed(alone),
         reconstructed(despite),
         reconstructed(only_good),
     ]
 
 
 def robustly(views: Views) -> Float:
-    """`robust` with the pixel noise that it estimates."""
-    return locate(replace(views, pixel_sigma=estimate_noise(views)), method="robust").points
+    """`robust` as moving cameras have it."""
+    told = replace(views, pixel_sigma=estimate_noise(views))
+    return triangulate_pictures(told, pixel_sigma=views.pixel_sigma).points
 
 
 def silent(views: Views) -> Views:

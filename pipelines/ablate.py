@@ -17,6 +17,7 @@ import numpy as np
 
 from pipelines.geometry.metrics import PCK_THRESHOLD_M, common, measure
 from pipelines.geometry.noise import NoiseModel
+from pipelines.geometry.picture_gate import triangulate_pictures
 from pipelines.geometry.triangulation import Views, estimate_noise, locate
 from pipelines.keypoints.alone import FollowedAlone
 from pipelines.keypoints.hints import project_actor
@@ -45,7 +46,7 @@ from pipelines.simulation.study.filming import (
 from pipelines.simulation.study.settings import Noise, Settings, StudyMethod
 from pipelines.simulation.world.scene import build_world
 
-_REVISION = 2
+_REVISION = 3
 _PER_JOINT = ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm")
 _HINT_SIGMA_M = 0.1  # of what the detector is told of the person's place: the camera looks straight there
 
@@ -230,7 +231,8 @@ def reconstructed(
         elapsed_s = (filmed.t_ns - filmed.t_ns[0]) / 1e9
         return refined_points(views, elapsed_s, tuple(filmed.person.joints), models)
     if method == "robust":
-        views = replace(views, pixel_sigma=estimate_noise(views))
+        told = replace(views, pixel_sigma=estimate_noise(views))
+        return triangulate_pictures(told, pixel_sigma=views.pixel_sigma).points, None
     return locate(views, method=method).points, None
 
 

@@ -21,7 +21,8 @@ from pipelines.formats.videos.video import VideoReader
 from pipelines.formats.videos.video_writing import Picture, write_h264
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel
-from pipelines.geometry.triangulation import Views, estimate_noise, locate
+from pipelines.geometry.picture_gate import triangulate_pictures
+from pipelines.geometry.triangulation import Views, estimate_noise
 from pipelines.keypoints.actor_hints import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD
 from pipelines.keypoints.alone import FollowedAlone
 from pipelines.keypoints.hints import project_actor
@@ -50,7 +51,7 @@ from pipelines.simulation.study.measuring import errors_in_common, measure_arm
 
 Bool = NDArray[np.bool_]
 
-FILM = Stage("film", revision=1)
+FILM = Stage("film", revision=2)
 
 _SAME_M = 0.05  # between the scenario's hips and the session's truth, which is interpolated
 _HIPS = ("left_hip", "right_hip")
@@ -143,8 +144,7 @@ def film(
                 for k, camera in enumerate(arm.names)
             ]
             sightings = _read_sightings(parts)
-            views = _views(arm, sightings, compared.settings["seed"])
-            points = locate(views, method="robust").points.reshape(arm.of.joints.shape)
+            views, points = _triangulated(arm, sightings, compared.settings["seed"])
             reconstructed[name] = points
             metrics[name] = _measured(arm, sightings, views, points, desired_tilt_deg=desired_deg)
             _write_arm(run.folder / name, arm, sightings, points, parts)
@@ -307,10 +307,12 @@ def _read_sightings(parts: Sequence[Path]) -> Sightings:
 # --- measuring -----------------------------------------------------------------------------------------
 
 
-def _views(arm: _Arm, sightings: Sightings, seed: int) -> Views:
-    """What triangulation is given: poses err as the comparison's do, once."""
+def _triangulated(arm: _Arm, sightings: Sightings, seed: int) -> tuple[Views, Float]:
+    """What triangulation is given, and its points [T, J, 3]; poses err as the comparison's do, once."""
     views = views_of(arm.of, arm.seen_by, sightings, arm.noise, seed=seed, trial=0)
-    return replace(views, pixel_sigma=estimate_noise(views))
+    told = replace(views, pixel_sigma=estimate_noise(views))
+    found = triangulate_pictures(told, pixel_sigma=views.pixel_sigma)
+    return told, found.points.reshape(arm.of.joints.shape)
 
 
 def _measured(

@@ -73,7 +73,7 @@ from pipelines.session.true_joints import true_joints_at
 if TYPE_CHECKING:
     import pandas as pd
 
-RECONSTRUCT = Stage("reconstruct", revision=10)
+RECONSTRUCT = Stage("reconstruct", revision=11)
 
 _LONGEST_FILL_S = 10.0
 
@@ -322,7 +322,9 @@ def _attempt(
     progress.advance()
     observations = seen.observations
     views = views_with_noise(cameras, observations, pixel_sigma=settings.pixel_sigma, threads=workers)
-    solve = solver_for(settings.method, cameras, observations, threads=workers)
+    solve = solver_for(
+        settings.method, cameras, observations, pixel_sigma=settings.pixel_sigma, threads=workers
+    )
     result = refused_people(solve(views), observations, seen.anybody)
     progress.advance()
     refined = None
@@ -331,7 +333,9 @@ def _attempt(
         observations, views = refined.observations, refined.views
         result = refused_people(refined.result, observations, seen.anybody)
         if refined.cameras is None:  # not believed: `robust` instead, with the loss that it has of its own
-            solve = solver_for("robust", cameras, observations, threads=workers)
+            solve = solver_for(
+                "robust", cameras, observations, pixel_sigma=settings.pixel_sigma, threads=workers
+            )
             result = refused_people(solve(views), observations, seen.anybody)
     result, finished = finish(
         observations, views, result, fill_s=settings.fill_s, smoother=smoother(settings.smooth)

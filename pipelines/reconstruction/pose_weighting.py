@@ -12,22 +12,26 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px, triangulate
+from pipelines.geometry.picture_gate import triangulate_pictures
+from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
 from pipelines.session.records import Float, Int64
 
 _ROUNDS = 4  # the last moves the median joint by less than a thousandth of its standard deviation
 _BLOCK = 8192  # joint-frames at once: memory
 
 
-def triangulate_weighted(views: Views, pose_covariance: Float, *, threads: int) -> Triangulation:
+def triangulate_weighted(
+    views: Views, pose_covariance: Float, *, pixel_sigma: Float, threads: int
+) -> Triangulation:
     """`robust`, its inliers weighed by their poses' full covariances.
 
     Args:
         views: what was seen; `pose_sigma` holds the level of the same covariances.
         pose_covariance: [F, C, 6, 6] position in the world (m^2), then rotation vector in the camera (rad^2).
+        pixel_sigma: [C] px, the detector's own, see `triangulate_pictures`.
         threads: see `triangulate`.
     """
-    first = triangulate(views, method="robust", threads=threads)
+    first = triangulate_pictures(views, pixel_sigma=pixel_sigma, threads=threads)
     points, covariance = first.points.copy(), first.covariance.copy()
     (ok,) = np.nonzero(first.status == STATUS.index("ok"))
     for start in range(0, len(ok), _BLOCK):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipelines.geometry.picture_gate import triangulate_pictures
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.geometry.triangulation import (
     STATUS,
@@ -147,7 +148,8 @@ def _robustly(flight: RobustFlight, offset_s: Float) -> Triangulation:
     """What `robust` makes of the flight with these clocks."""
     _, views = _seen_from(flight, offset_s)
     views = replace(views, pixel_sigma=estimate_noise(views, threads=flight.threads))
-    return triangulate(views, method="robust", threads=flight.threads)
+    pixel_sigma = np.full(len(flight.cameras), flight.pixel_sigma)
+    return triangulate_pictures(views, pixel_sigma=pixel_sigma, threads=flight.threads)
 
 
 def _untold_clocks(refined: Refined, cameras: Sequence[Camera], prior_s: Float) -> list[str]:

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipelines.geometry.noise import NoiseModel
+from pipelines.geometry.picture_gate import triangulate_pictures
 from pipelines.geometry.triangulation import STATUS, Views, estimate_noise, triangulate
 from pipelines.reconstruction.refinement.building import Sighting
 from pipelines.reconstruction.refinement.problem import pose_errors
@@ -37,7 +38,7 @@ def refined_points(
     """
     times, cameras = views.position.shape[:2]
     told = replace(views, pixel_sigma=estimate_noise(views))
-    start = triangulate(told, method="robust").points
+    start = triangulate_pictures(told, pixel_sigma=views.pixel_sigma).points
     sightings = [
         Sighting(
             t_s=t_s,

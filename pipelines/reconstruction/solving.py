@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.picture_gate import triangulate_pictures
 from pipelines.geometry.triangulation import (
     STATUS,
     Method,
@@ -87,19 +88,28 @@ def solver_for(
     cameras: Sequence[Camera],
     observations: Observations,
     *,
+    pixel_sigma: float,
     threads: int,
 ) -> Callable[[Views], Triangulation]:
     """How views become points, for `refined` at first.
 
-    `robust` has a loss of its own for calibrated cameras, and weights for logged covariances.
+    `robust` has a loss of its own for calibrated cameras; where poses err, a gate that knows what a picture's
+    joints share, and weights for logged covariances.
     """
     calibrated = observations.pose_sigma is None and all(camera.static for camera in cameras)
     if method == "robust" and calibrated:
         return partial(triangulate_heavy_tailed, threads=threads)
-    first: Method = "robust" if method == "refined" else method
-    if first == "robust" and observations.pose_covariance is not None:
-        return partial(triangulate_weighted, pose_covariance=observations.pose_covariance, threads=threads)
-    return partial(triangulate, method=first, threads=threads)
+    if method in ("dlt", "midpoint"):
+        return partial(triangulate, method=method, threads=threads)
+    sharpness = np.full(len(cameras), pixel_sigma)
+    if observations.pose_covariance is None:
+        return partial(triangulate_pictures, pixel_sigma=sharpness, threads=threads)
+    return partial(
+        triangulate_weighted,
+        pose_covariance=observations.pose_covariance,
+        pixel_sigma=sharpness,
+        threads=threads,
+    )
 
 
 def refused_people(
