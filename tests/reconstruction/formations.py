@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.noise import NoiseModel, disturb
+from pipelines.geometry.picture_gate import triangulate_pictures
 from pipelines.geometry.poses import matrix_from_quaternion
-from pipelines.geometry.triangulation import Views, estimate_noise, triangulate
+from pipelines.geometry.triangulation import Views, estimate_noise
 from pipelines.reconstruction.refinement.building import Sighting
 from pipelines.session.skeletons import bones_of
 from pipelines.simulation.drone_paths import orbit
@@ -146,8 +147,8 @@ def triangulated(sightings: Sequence[Sighting]) -> Float:
         pixel_sigma=np.array([s.pixel_sigma for s in sightings]),
         pose_sigma=np.zeros((times, count, 2)),
     )
-    told = Views(**{**views.__dict__, "pixel_sigma": estimate_noise(views)})
-    return triangulate(told, method="robust").points.reshape(times, joints, 3)
+    told = replace(views, pixel_sigma=estimate_noise(views))
+    return triangulate_pictures(told, pixel_sigma=views.pixel_sigma).points.reshape(times, joints, 3)
 
 
 def mean_mm(estimate: Float, truth: Float, where: Float | None = None) -> float:
