@@ -50,6 +50,7 @@ _ABRUPT = 3.0  # times the accelerations of the body, where clocks and slow pose
 SETTLED_S = 2e-3
 """Offset of a clock that may stay in the pictures' stamps."""
 _UNEXPLAINED = 1.15  # times the image noise that the pictures show between neighbours: the prior is wrong
+_LEFT_BY_GIVEN = 2**0.5  # times the image noise that estimated levels leave: twice the variance
 _SIGMAS = 4.0
 _SETTLING = 4  # rounds to see how well given levels explain the pictures
 _STATED = 10.0  # by how much its evidence, a logarithm, is raised
@@ -366,8 +367,8 @@ def _priors(
         if name != "estimated":
             known, state = learn(problem, known, state, poses=False, rounds=_FEWER_ROUNDS)
         known = replace(known, acceleration=shrunk(known.acceleration, problem.t_s, state.position))
-        # Given levels have to leave no more than estimated ones.
-        if known.memory < REMEMBERED and known.pixel_scale > _UNEXPLAINED * min(image, free.pixel_scale):
+        most = min(_UNEXPLAINED * image, _LEFT_BY_GIVEN * free.pixel_scale)
+        if known.memory < REMEMBERED and known.pixel_scale > most:
             raise np.linalg.LinAlgError("no level of pose noise explains the pictures")
         of_stated = (_FARTHEST_STATED if name == best else _FARTHEST) * stated_m if name == "stated" else 0.0
         unlike = prior is not None and name != "stated"
