@@ -48,7 +48,8 @@ def solve(
 ) -> tuple[System, State, Eliminated]:
     """Gauss-Newton with halved steps where the cost would rise; the robust bound tightens as it goes.
 
-    No step moves the joints by more than `most_m` (root mean square). The equations returned are those of the last step, within a step of the state.
+    No step moves the joints by more than `most_m` (root mean square). The equations returned are those of the
+    last step, within a step of the state.
     """
     layout = lay_out(known.poses, known.clock_sigma_s, len(problem.bones), problem.knot_t_s)
     done = 0
