@@ -32,7 +32,8 @@ REMEMBERED = 1.5
 
 _CONVERGED_M = 2e-4
 _BOUNDS = (20.0, 8.0, BOUND)
-_MOST_M = 0.3  # a longer step, 3 % of the range, is no linear one any more
+_MOST_M = 0.3  # a longer step is no linear one any more: cameras are some 10 m away
+_LEAST = 0.01  # of a step that raises the cost is made nevertheless
 _SETTLED = 3  # rounds after which an estimate is one of its prior
 _WIDE = 4.0  # times the usual residual of the start: poses are not corrected yet
 
@@ -65,8 +66,10 @@ def solve(
         direction = step(system, at)
         before = cost(system, state)
         length = float(np.sqrt(np.mean(direction.position**2)))
-        share = min(1.0, most_m / max(length, _CONVERGED_M))
-        while share > 0.01 and not cost(system, state.moved(direction, share)) <= before * (1 + 1e-9):
+        whole = share = min(1.0, most_m / max(length, _CONVERGED_M))
+        while share > _LEAST * whole and not cost(system, state.moved(direction, share)) <= before * (
+            1 + 1e-9
+        ):
             share /= 2
         state = state.moved(direction, share)
         if done >= rounds or (share * length < _CONVERGED_M and done >= len(bounds)):
