@@ -78,9 +78,12 @@ def pictures_row(label: str, views: Views, truth: Float, threads: int, repeats: 
     """The line of `robust` with the gate of pictures, as moving cameras have it."""
     seen = replace(views, pixel_sigma=estimate_noise(views))
     whole = best_s(
-        lambda: triangulate_pictures(seen, pixel_sigma=views.pixel_sigma, threads=threads), repeats
+        lambda: triangulate_pictures(
+            seen, picture=views.pose_index, pixel_sigma=views.pixel_sigma, threads=threads
+        ),
+        repeats,
     )
-    points = triangulate_pictures(seen, pixel_sigma=views.pixel_sigma).points
+    points = triangulate_pictures(seen, picture=views.pose_index, pixel_sigma=views.pixel_sigma).points
     speed = f"{len(truth) / whole / 1e6:.1f}"
     return (
         f"| robust, pictures | {label} | {threads} | | {speed} | "
@@ -170,7 +173,7 @@ def errors_of(exact: Views, truth: Float, level: str, draw: int) -> list[float]:
 def robustly(views: Views) -> Float:
     """`robust` as moving cameras have it."""
     told = replace(views, pixel_sigma=estimate_noise(views))
-    return triangulate_pictures(told, pixel_sigma=views.pixel_sigma).points
+    return triangulate_pictures(told, picture=views.pose_index, pixel_sigma=views.pixel_sigma).points
 
 
 def silent(views: Views) -> Views:

@@ -232,7 +232,9 @@ def reconstructed(
         return refined_points(views, elapsed_s, tuple(filmed.person.joints), models)
     if method == "robust":
         told = replace(views, pixel_sigma=estimate_noise(views))
-        return triangulate_pictures(told, pixel_sigma=views.pixel_sigma).points, None
+        return triangulate_pictures(
+            told, picture=views.pose_index, pixel_sigma=views.pixel_sigma
+        ).points, None
     return locate(views, method=method).points, None
 
 

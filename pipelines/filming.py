@@ -311,7 +311,7 @@ def _triangulated(arm: _Arm, sightings: Sightings, seed: int) -> tuple[Views, Fl
     """What triangulation is given, and its points [T, J, 3]; poses err as the comparison's do, once."""
     views = views_of(arm.of, arm.seen_by, sightings, arm.noise, seed=seed, trial=0)
     told = replace(views, pixel_sigma=estimate_noise(views))
-    found = triangulate_pictures(told, pixel_sigma=views.pixel_sigma)
+    found = triangulate_pictures(told, picture=views.pose_index, pixel_sigma=views.pixel_sigma)
     return told, found.points.reshape(arm.of.joints.shape)
 
 

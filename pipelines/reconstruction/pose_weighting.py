@@ -8,11 +8,11 @@ weighted once more: Gauss-Newton on the reprojection, a few steps from where `ro
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from pipelines.geometry.picture_gate import triangulate_pictures
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
 from pipelines.session.records import Float, Int64
 
@@ -21,17 +21,16 @@ _BLOCK = 8192  # joint-frames at once: memory
 
 
 def triangulate_weighted(
-    views: Views, pose_covariance: Float, *, pixel_sigma: Float, threads: int
+    views: Views, *, solve: Callable[[Views], Triangulation], pose_covariance: Float
 ) -> Triangulation:
     """`robust`, its inliers weighed by their poses' full covariances.
 
     Args:
         views: what was seen; `pose_sigma` holds the level of the same covariances.
+        solve: `robust`, as these views need it.
         pose_covariance: [F, C, 6, 6] position in the world (m^2), then rotation vector in the camera (rad^2).
-        pixel_sigma: [C] px, the detector's own, see `triangulate_pictures`.
-        threads: see `triangulate`.
     """
-    first = triangulate_pictures(views, pixel_sigma=pixel_sigma, threads=threads)
+    first = solve(views)
     points, covariance = first.points.copy(), first.covariance.copy()
     (ok,) = np.nonzero(first.status == STATUS.index("ok"))
     for start in range(0, len(ok), _BLOCK):

@@ -34,6 +34,7 @@ from pipelines.reconstruction.observations import (
 from pipelines.reconstruction.refinement.building import Sighting
 from pipelines.reconstruction.refinement.problem import NEW_SHARE, PoseErrors
 from pipelines.reconstruction.refinement.refine import SETTLED_S, Refined, corrected, refine
+from pipelines.reconstruction.solving import pictures_of
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Float, Int64
 from pipelines.session.skeletons import bones_of
@@ -148,8 +149,12 @@ def _robustly(flight: RobustFlight, offset_s: Float) -> Triangulation:
     """What `robust` makes of the flight with these clocks."""
     _, views = _seen_from(flight, offset_s)
     views = replace(views, pixel_sigma=estimate_noise(views, threads=flight.threads))
-    pixel_sigma = np.full(len(flight.cameras), flight.pixel_sigma)
-    return triangulate_pictures(views, pixel_sigma=pixel_sigma, threads=flight.threads)
+    return triangulate_pictures(
+        views,
+        picture=pictures_of(flight.observations),
+        pixel_sigma=np.full(len(flight.cameras), flight.pixel_sigma),
+        threads=flight.threads,
+    )
 
 
 def _untold_clocks(refined: Refined, cameras: Sequence[Camera], prior_s: Float) -> list[str]:

@@ -38,7 +38,7 @@ def refined_points(
     """
     times, cameras = views.position.shape[:2]
     told = replace(views, pixel_sigma=estimate_noise(views))
-    start = triangulate_pictures(told, pixel_sigma=views.pixel_sigma).points
+    start = triangulate_pictures(told, picture=views.pose_index, pixel_sigma=views.pixel_sigma).points
     sightings = [
         Sighting(
             t_s=t_s,

@@ -101,15 +101,21 @@ def solver_for(
         return partial(triangulate_heavy_tailed, threads=threads)
     if method in ("dlt", "midpoint"):
         return partial(triangulate, method=method, threads=threads)
-    sharpness = np.full(len(cameras), pixel_sigma)
-    if observations.pose_covariance is None:
-        return partial(triangulate_pictures, pixel_sigma=sharpness, threads=threads)
-    return partial(
-        triangulate_weighted,
-        pose_covariance=observations.pose_covariance,
-        pixel_sigma=sharpness,
+    in_pictures = partial(
+        triangulate_pictures,
+        picture=pictures_of(observations),
+        pixel_sigma=np.full(len(cameras), pixel_sigma),
         threads=threads,
     )
+    if observations.pose_covariance is None:
+        return in_pictures
+    return partial(triangulate_weighted, solve=in_pictures, pose_covariance=observations.pose_covariance)
+
+
+def pictures_of(observations: Observations) -> Int64:
+    """Which person in which picture [T * P * J] each joint-frame belongs to."""
+    times, people, joints, _ = observations.confidence.shape
+    return np.repeat(np.arange(times * people), joints)
 
 
 def refused_people(

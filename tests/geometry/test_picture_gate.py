@@ -11,6 +11,7 @@ from pipelines.geometry.picture_gate import triangulate_pictures
 from pipelines.geometry.triangulation import (
     STATUS,
     Float,
+    Int64,
     Triangulation,
     Views,
     estimate_noise,
@@ -24,8 +25,10 @@ def told(views: Views) -> Views:
     return replace(views, pixel_sigma=estimate_noise(views))
 
 
-def gated(views: Views) -> Triangulation:
-    return triangulate_pictures(told(views), pixel_sigma=views.pixel_sigma)
+def gated(views: Views, picture: Int64 | None = None) -> Triangulation:
+    """Of one person, unless rows of the same person and picture are named."""
+    of = views.pose_index if picture is None else picture
+    return triangulate_pictures(told(views), picture=of, pixel_sigma=views.pixel_sigma)
 
 
 def error_mm(points: Float, truth: Float) -> float:
@@ -36,8 +39,7 @@ def same(one: Triangulation, other: Triangulation) -> bool:
     return all(
         np.array_equal(getattr(one, field.name), getattr(other, field.name), equal_nan=True)
         for field in fields(Triangulation)
-        if field.name not in ("inlier", "status")
-    ) and bool((one.inlier == other.inlier).all() and (one.status == other.status).all())
+    )
 
 
 @pytest.mark.parametrize("constant", [True, False])
@@ -57,7 +59,9 @@ def test_where_nothing_errs_grossly_nothing_changes(cameras: int, level: str, co
     found, usual = gated(views), triangulate(told(views), method="robust")
 
     if level == "c" and not constant:
-        assert (found.inlier & usual.inlier).sum() >= usual.inlier.sum() - 2
+        changed = (found.inlier != usual.inlier).any(axis=1)
+        assert changed.sum() <= 2
+        np.testing.assert_array_equal(found.points[~changed], usual.points[~changed])
     else:
         assert same(found, usual)
 
@@ -72,7 +76,7 @@ def test_outliers_cost_no_more_than_their_views(
     """Twelve draws of pose errors that all see alike: methods are compared on the same draws.
 
     Beyond the good views alone 2 % are left for the joint-frames without two good views, 0.1 % of them, of
-    which each reconstructs others, at several times the mean error.
+    which each reconstructs others, at several times the mean error. A fifth is what outliers may cost at all.
     """
     truth, exact = ring(40, cameras)
     errors = []
@@ -99,7 +103,8 @@ def test_exactly_the_gross_errors_are_left_out_and_show_their_residuals() -> Non
 
     ok = found.status == STATUS.index("ok")
     assert not found.inlier[ok][outlier[ok]].any()
-    assert found.inlier[ok][good[ok]].mean() > 0.999
+    # Of the 8000 good views the gate of each joint, at four standard deviations, takes one in 3000.
+    assert found.inlier[ok][good[ok]].mean() > 1 - 3 / 3000
     residual = reprojection_px(bad, found.points)
     assert found.residual_px[outlier] == pytest.approx(residual[outlier], nan_ok=True)
     assert (found.views == found.inlier.sum(axis=1))[ok].all()
@@ -114,10 +119,11 @@ def test_two_cameras_lose_the_joint_and_say_that_views_disagreed() -> None:
     found = gated(bad)
 
     ok = found.status == STATUS.index("ok")
-    assert ok[good.all(axis=1)].mean() > 0.995
-    # What moves a keypoint along its epipolar line shows nowhere: a few of a hundred.
+    assert (~ok[good.all(axis=1)]).mean() < 3 / 3000
+    # 100 to 300 px in both axes are within eight standard deviations of some 4 px beside the epipolar line
+    # where that line runs within 10 deg of the outlier's direction, one of eighteen.
     disagreed = seen & ~good.all(axis=1)
-    assert (found.status[disagreed] == STATUS.index("rejected")).mean() > 0.95
+    assert (found.status[disagreed] == STATUS.index("rejected")).mean() > 17 / 18
     assert np.isnan(found.points[~ok]).all()
     assert not found.inlier[~ok].any()
 
@@ -148,6 +154,63 @@ def test_a_picture_of_few_joints_tells_nothing() -> None:
     assert same(gated(few), triangulate(told(few), method="robust"))
     whole = gated(replace(views, xy=xy))
     assert not whole.inlier[::17, 0].any()
+
+
+def beside(one: Views, other: Views) -> tuple[Views, Int64]:
+    """Two people whom the same cameras see, rows of an instant together; and who of them in which picture."""
+    frames = len(one.position)
+    joints = len(one.weight) // frames
+
+    def both(name: str) -> Float:
+        parts = [getattr(of, name).reshape(frames, joints, -1) for of in (one, other)]
+        return np.concatenate(parts, axis=1).reshape(2 * len(one.weight), *getattr(one, name).shape[1:])
+
+    rows = np.repeat(np.arange(2 * frames), joints)
+    return replace(one, xy=both("xy"), weight=both("weight"), pose_index=rows // 2), rows
+
+
+def test_people_far_apart_share_no_shift() -> None:
+    """One stands 4 m nearer to some cameras, whose errors of place move the pictures of both unlike."""
+    rng = np.random.default_rng(11)
+    truth, exact = ring(60, 5)
+    aside = replace(exact, position=exact.position - np.array([4.0, 0.0, 0.0]))
+    logged = with_pose_noise(exact, rng, "b", constant=True, told=True)
+    # Whoever stands 4 m to the east is seen as by cameras 4 m to the west.
+    seen = exact.xy.copy()
+    away = np.einsum(
+        "ncji,ncj->nci", aside.rotation[aside.pose_index], truth[:, None] - aside.position[aside.pose_index]
+    )
+    seen[...] = away[..., :2] / away[..., 2:]
+    one, other = (
+        with_pixel_noise(replace(logged, xy=xy), np.random.default_rng(seed))
+        for seed, xy in ((0, exact.xy), (1, seen))
+    )
+    views, picture = beside(one, other)
+
+    # Six joints of the second one are seen: of both together the first one's joints would be the median.
+    hidden = views.weight.copy()
+    hidden[(picture % 2 == 1) & (np.arange(len(picture)) % 17 > 5)] = 0
+    views = replace(views, weight=hidden)
+
+    assert same(gated(views, picture), triangulate(told(views), method="robust"))
+    assert not same(gated(views, views.pose_index), triangulate(told(views), method="robust"))
+
+
+def test_what_has_no_keypoint_or_no_pose_is_not_gross() -> None:
+    rng = np.random.default_rng(12)
+    views = with_pixel_noise(ring(30, 3)[1], rng)
+    xy, position = views.xy.copy(), views.position.copy()
+    xy[5::17, 0] = np.nan  # of confidence 1 nevertheless
+    position[10:20, 1] = np.nan
+    lacking = replace(views, xy=xy, position=position)
+
+    assert same(gated(lacking), triangulate(told(lacking), method="robust"))
+
+
+def test_one_camera_finds_nothing() -> None:
+    found = gated(ring(10, 1)[1])
+
+    assert (found.status == STATUS.index("few_views")).all()
 
 
 def test_nothing_seen_is_nothing_found() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -43,7 +44,9 @@ def test_alike_axes_give_what_triangulation_gives() -> None:
     covariance = np.tile(np.diag([0.01] * 3 + [1e-4] * 3), (60, 4, 1, 1))
     views = with_pixel_noise(disturbed(exact, covariance, np.random.default_rng(0)), np.random.default_rng(1))
     usual = triangulate(views, method="robust")
-    weighted = triangulate_weighted(views, covariance, pixel_sigma=views.pixel_sigma, threads=1)
+    weighted = triangulate_weighted(
+        views, solve=partial(triangulate, method="robust"), pose_covariance=covariance
+    )
     np.testing.assert_array_equal(weighted.status, usual.status)
     ok = usual.status == OK
     # Image covariances are taken at the point instead of where it was seen, and more steps are made:
@@ -71,7 +74,9 @@ def test_what_a_log_knows_of_its_axes_makes_points_better_and_covariances_true()
     covariance[..., :3, 3:], covariance[..., 3:, :3] = tie, tie.T
     views = with_pixel_noise(disturbed(exact, covariance, np.random.default_rng(2)), np.random.default_rng(3))
     usual = triangulate(views, method="robust")
-    weighted = triangulate_weighted(views, covariance, pixel_sigma=views.pixel_sigma, threads=1)
+    weighted = triangulate_weighted(
+        views, solve=partial(triangulate, method="robust"), pose_covariance=covariance
+    )
     first = np.arange(0, len(truth), 17)[usual.status[::17] == OK]  # a joint of every frame
     assert len(first) > 0.97 * frames
     error, error_before = weighted.points[first] - truth[first], usual.points[first] - truth[first]

@@ -64,12 +64,10 @@ def solve(
         system = System(problem, known, layout, bound**2, held=done < len(bounds))
         at = eliminate(system, state)
         direction = step(system, at)
-        before = cost(system, state)
+        most = cost(system, state) * (1 + 1e-9)
         length = float(np.sqrt(np.mean(direction.position**2)))
         whole = share = min(1.0, most_m / max(length, _CONVERGED_M))
-        while share > _LEAST * whole and not cost(system, state.moved(direction, share)) <= before * (
-            1 + 1e-9
-        ):
+        while share > _LEAST * whole and not cost(system, state.moved(direction, share)) <= most:
             share /= 2
         state = state.moved(direction, share)
         if done >= rounds or (share * length < _CONVERGED_M and done >= len(bounds)):
