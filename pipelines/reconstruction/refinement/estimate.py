@@ -32,7 +32,7 @@ REMEMBERED = 1.5
 
 _CONVERGED_M = 2e-4
 _BOUNDS = (20.0, 8.0, BOUND)
-_MOST_M = 0.3  # a longer step is no linear one any more: cameras are some 10 m away
+_MOST_GROWTH = 0.15  # of the body in a step: equations that are linear in its size hold no further
 _LEAST = 0.01  # of a step that raises the cost is made nevertheless
 _SETTLED = 3  # rounds after which an estimate is one of its prior
 _WIDE = 4.0  # times the usual residual of the start: poses are not corrected yet
@@ -45,12 +45,12 @@ def solve(
     *,
     rounds: int,
     bounds: tuple[float, ...] = _BOUNDS,
-    most_m: float = np.inf,
+    most_growth: float = np.inf,
 ) -> tuple[System, State, Eliminated]:
     """Gauss-Newton with halved steps where the cost would rise; the robust bound tightens as it goes.
 
-    No step moves the joints by more than `most_m` (root mean square). The equations returned are those of the
-    last step, within a step of the state.
+    No step makes the body larger or smaller by more than about exp(`most_growth`). The equations returned are
+    those of the last step, within a step of the state.
     """
     layout = lay_out(known.poses, known.clock_sigma_s, len(problem.bones), problem.knot_t_s)
     done = 0
@@ -65,14 +65,24 @@ def solve(
         at = eliminate(system, state)
         direction = step(system, at)
         most = cost(system, state) * (1 + 1e-9)
-        length = float(np.sqrt(np.mean(direction.position**2)))
-        whole = share = min(1.0, most_m / max(length, _CONVERGED_M))
+        growth = _growth(system, state, direction)
+        whole = share = most_growth / growth if growth > most_growth else 1.0
         while share > _LEAST * whole and not cost(system, state.moved(direction, share)) <= most:
             share /= 2
         state = state.moved(direction, share)
-        if done >= rounds or (share * length < _CONVERGED_M and done >= len(bounds)):
+        moved = float(np.sqrt(np.mean((share * direction.position) ** 2)))
+        if done >= rounds or (moved < _CONVERGED_M and done >= len(bounds)):
             return system, state, at
         del at  # or the factors of two rounds would be held at once
+
+
+def _growth(system: System, state: State, direction: State) -> float:
+    """By how much a step changes the logarithm of the mean bone's length."""
+    column = system.layout.bone_column
+    lengths, changes = state.shared[column:], direction.shared[column:]
+    if not len(lengths):
+        return 0.0
+    return abs(float(np.log(max(1.0 + changes.mean() / lengths.mean(), _LEAST))))
 
 
 def cost(system: System, state: State) -> float:
@@ -90,8 +100,8 @@ def learn(
     noise, which are quick, stay as they are if that is much less.
 
     New levels move an estimate little, but the size of a formation that hardly changes: two hovering cameras
-    went metres at a step, and the misfit was taken for image noise that lasts. Steps are kept short; more of
-    them instead run away with the size, which nothing tells there.
+    went metres at a step, and the misfit was taken for image noise that lasts. The size may therefore change
+    by little in a step; more steps instead run away with it, since nothing tells it there.
 
     Args:
         problem: stretches of the flight.
@@ -104,7 +114,9 @@ def learn(
         if index == 0:
             system, state, at = solve(problem, known, state, rounds=len(_BOUNDS))
         else:
-            system, state, at = solve(problem, known, state, rounds=1, bounds=(BOUND,), most_m=_MOST_M)
+            system, state, at = solve(
+                problem, known, state, rounds=1, bounds=(BOUND,), most_growth=_MOST_GROWTH
+            )
         known = reestimated(system, state, at, poses=poses, motion=known.memory < REMEMBERED)
         if poses and index == rounds // 2:
             memory = memory_of(system, state)
