@@ -33,7 +33,7 @@ from pipelines.reconstruction.refinement.problem import (
 )
 from pipelines.reconstruction.refinement.refine import corrected, refine
 from pipelines.reconstruction.refinement.system import System, misfit, prior_cost
-from tests.reconstruction.formations import BONES, Formation, formation, mean_mm
+from tests.reconstruction.formations import BONES, STATED_PX, Formation, formation, mean_mm
 
 Float = NDArray[np.float64]
 
@@ -361,6 +361,15 @@ def test_it_is_ahead_of_the_best_peer_at_true_poses(share: float, most_mm: float
     assert fallback is None
     assert mean_mm(position, flight.truth) < most_mm
     assert np.isfinite(position).all()
+
+
+def test_two_hovering_cameras_do_not_run_away_with_the_size() -> None:
+    """Nearly free, it halved in a step of learning, and the joints ended 1.8 times as far off as before."""
+    flight = formation(60, 2, [BIAS], 8, still=True, tilt_deg=45.0)
+    result = refine(flight.t_s, flight.sightings, flight.start, BONES, [pose_errors([BIAS])] * 2, np.zeros(2))
+    assert result.fallback is None
+    assert result.levels["pixel_scale"] < 1.15 * 2.0 / STATED_PX  # of 2 px keypoints
+    assert mean_mm(result.position, flight.truth) < mean_mm(flight.start, flight.truth)
 
 
 def test_a_place_that_nobody_saw_is_the_log_s() -> None:
