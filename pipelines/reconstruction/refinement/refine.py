@@ -51,8 +51,7 @@ SETTLED_S = 2e-3
 """Offset of a clock that may stay in the pictures' stamps."""
 _UNEXPLAINED = 1.15  # times the image noise that the pictures show between neighbours: the prior is wrong
 _LEFT_BY_GIVEN = 2**0.5
-"""Times the image noise that estimated levels leave: twice the variance. In flights of benchmarks.refine_grid
-right ones left up to 1.21, one that put the person three times as far off 1.63."""
+"""Times the image noise that estimated levels leave: twice the variance. Right levels leave less."""
 _SIGMAS = 4.0
 _SETTLING = 4  # rounds to see how well given levels explain the pictures
 _STATED = 10.0  # by how much its evidence, a logarithm, is raised
