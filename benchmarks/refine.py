@@ -1,6 +1,6 @@
-"""How far `refined` gets beside `robust`: the tables of docs/decisions/0004-refined.md.
+"""How far `refined` gets beside `robust`, and how fast: its speed in docs/decisions/0004-refined.md.
 
-python -m benchmarks.refine [--seeds N] [--times T] [--cameras N ...]
+python -m benchmarks.refine [--seeds N] [--times T] [--cameras N ...] [--long T]
 
 BLAS runs on one thread: set OPENBLAS_NUM_THREADS=1.
 """

@@ -1,6 +1,7 @@
 """How far `refined` is from the information bound, and are its covariances calibrated? Many short flights.
 
 python -m benchmarks.refine_calibration [--noise NAME ...] [--draws N] [--times T] [--cameras N ...]
+    [--told WHAT]
 
 Simulated: the walk and the formations of `benchmarks.refine`, moving cameras, every flight with keypoint and
 pose errors of its own. All joint-frames of a flight share its pose errors, so a flight is one draw: standard

@@ -1,6 +1,7 @@
 """Is `refined` ever worse than `robust`? Every noise model, told, told wrongly and not told.
 
 python -m benchmarks.refine_grid [--seeds N] [--times T] [--cameras N ...] [--tilts DEG ...]
+    [--noise NAME ...] [--told WHAT ...] [--formation KIND ...] [--keypoints KIND ...]
     [--bad-share SHARE] [--csv FILE]
 
 Simulated: the walk and the formations of `benchmarks.refine`, 0.3 m / 1 deg, 2 px. A cell is a noise model, a

@@ -49,8 +49,8 @@ def triangulate_pictures(
 
     Args:
         views: what was seen; `views.pixel_sigma` as `estimate_noise` found it.
-        picture: [N] rows of one number are the joints of one person in one picture of every camera. Where a
-            camera shows fewer than five of them its views are not judged.
+        picture: [N] rows of one number, not negative, are the joints of one person in one picture of every
+            camera. Where a camera shows fewer than five of them its views are not judged.
         pixel_sigma: [C] px, the detector's own, where `views` also holds what poses leave unexplained.
         threads: see `triangulate`.
 

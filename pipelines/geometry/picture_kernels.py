@@ -54,8 +54,13 @@ def move_pictures(
     """Move the views of each picture by the median residual of its joints, and mark those that were.
 
     Rows order[starts[p]] ... of `points` are those of picture p in every camera. A view without a point in
-    front of its camera has no residual and is moved with the others. `moved` starts as a copy of `xy`,
-    `judged` as False.
+    front of its camera has no residual and is moved with the others; pictures of less than `fewest` residuals
+    stay as they are.
+
+    `order` [N], `starts` [P + 1]; `points` [N, 3] m in the world, NaN where there is none; `xy` [N, C, 2]
+    normalised, NaN or of weight 0 where unseen; `weight` [N, C]; `pose_index` [N] into `position` [F, C, 3] m
+    and `rotation` [F, C, 3, 3] world_from_camera, NaN without a pose. Written: `moved` [N, C, 2], which
+    starts as a copy of `xy`, and `judged` [N, C], which starts as False.
     """
     most = 0
     for p in range(len(starts) - 1):

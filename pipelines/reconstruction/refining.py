@@ -87,7 +87,11 @@ class RefinedFlight:
 def refine_flight(flight: RobustFlight) -> RefinedFlight:
     """Refine what `robust` made of a flight."""
     refined, offset_s = _settle_clocks(flight, _begun_offsets_s(flight))
-    warnings = [*refined.warnings, *_untold_clocks(refined, flight.cameras, flight.clock_sigma_s)]
+    warnings = [
+        *refined.warnings,
+        *_untold_clocks(refined, flight.cameras, flight.clock_sigma_s),
+        *_unsettled_clocks(refined, flight.cameras),
+    ]
     metrics = _metrics(refined, flight.cameras, offset_s)
     if refined.fallback is not None:
         warnings.append(f"refined: fell back to robust, because {refined.fallback}")
@@ -164,6 +168,16 @@ def _untold_clocks(refined: Refined, cameras: Sequence[Camera], prior_s: Float) 
         f"where {prior:.2g} s were stated"
         for camera, sigma, prior in zip(cameras, refined.clock_sigma_s, prior_s, strict=True)
         if refined.fallback is None and prior > 0 and sigma > _UNTOLD * prior
+    ]
+
+
+def _unsettled_clocks(refined: Refined, cameras: Sequence[Camera]) -> list[str]:
+    """Clocks that each estimate from shifted stamps still moved."""
+    return [
+        f"refined: the clock of {camera.name} did not settle: the last of {1 + _MOST_SHIFTS} estimates still "
+        f"moved it by {1e3 * abs(left):.1f} ms"
+        for camera, left in zip(cameras, refined.clock_offset_s, strict=True)
+        if refined.fallback is None and abs(left) > SETTLED_S
     ]
 
 

@@ -26,7 +26,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Int64
 
 UNKNOWN_SIGMA = (0.3, np.radians(1.0))
-"""Camera pose noise (m, rad) taken for telling people apart where nobody states it: METHODS' medium level."""
+"""Camera pose noise (m, rad) taken for telling people apart where nobody states it: the studies' medium."""
 
 
 def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float, *, pixel_sigma: float) -> Float:
@@ -121,7 +121,7 @@ def pictures_of(observations: Observations) -> Int64:
 def refused_people(
     result: Triangulation, observations: Observations, seen: NDArray[np.bool_]
 ) -> Triangulation:
-    """Joints of a person for whom no view was taken, although somebody was seen, are rejected."""
+    """Joints of a person for whom no view was taken, although `seen` [T] says somebody was, are rejected."""
     shape = observations.confidence.shape[:3]
     status = result.status.reshape(shape)
     nobody = (status == STATUS.index("not_detected")).all(axis=2)

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipelines.reconstruction import refining
 from pipelines.session.skeletons import mirrored
 from tests.commands.runner import mocap, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
@@ -85,6 +86,19 @@ def test_refined_finds_how_far_a_clock_is_off(tmp_path: Path) -> None:
     assert refined["clock_offset_sigmas_s"]["drone2"] < 0.005
     # At 1.2 m/s 200 ms are 240 mm beside one of two cameras; without them the keypoints' 26 mm are left.
     assert refined["mpjpe_mm"] < 0.3 * robust["mpjpe_mm"]
+
+
+def test_a_clock_that_does_not_settle_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = write_flight(tmp_path, cameras=2, seconds=3.0, static=True, pose_noise={})
+    flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": -0.17, "sigma_s": 0.2}
+    flight.save()
+    session = tmp_path / "flight.session"
+    succeeds("ingest", flight.manifest, "-o", session)
+    # The search ahead of the estimate goes in steps of 67 ms and leaves some 30 of these.
+    monkeypatch.setattr(refining, "_MOST_SHIFTS", 0)
+    done = mocap("reconstruct", session, "--method", "refined")
+    assert "the clock of drone2 did not settle: the last of 1 estimates still moved it by" in done.stderr
+    assert "drone1 did not settle" not in done.stderr
 
 
 @pytest.mark.slow

@@ -48,8 +48,8 @@ class Moments:
     acceleration: Float  # [2, J, J] sums of mean squares and of variances over the times
     bones: Float  # [B] sums of mean squares
     image: Float  # [J, 2] weighted squares of residuals, and how many of them the fit leaves
-    white: Float  # [2, 4] of position, rotation: sum of mean squares, count, sum of told shares and squares
-    walked: Float  # [c, 4] of the changes between knots per s: mean squares, count, variances and squares
+    white: Float  # [2, 3] of position, rotation: sums of mean squares, count, sum of told shares
+    walked: Float  # [c, 3] of the changes between knots per s: sums of mean squares, count, variances
     starting: Float  # [c + shared, 2] mean squares and variances at the first time
     times: int
 
@@ -422,8 +422,8 @@ def _visit_back(
         np.zeros((2, joints, joints)),
         np.zeros(len(problem.bones)),
         np.zeros((joints, 2)),
-        np.zeros((2, 4)),
-        np.zeros((layout.knot_count, 4)),
+        np.zeros((2, 3)),
+        np.zeros((layout.knot_count, 3)),
         np.zeros((0 if half.turned else layout.knot_count + layout.shared_count, 2)),
         half.count,
     )

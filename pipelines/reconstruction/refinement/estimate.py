@@ -49,8 +49,8 @@ def solve(
 ) -> tuple[System, State, Eliminated]:
     """Gauss-Newton with halved steps where the cost would rise; the robust bound tightens as it goes.
 
-    No step makes the body larger or smaller by more than about exp(`most_growth`). The equations returned are
-    those of the last step, within a step of the state.
+    A step that would change the logarithm of the body's size by more than `most_growth` is shortened by the
+    ratio. The equations returned are those of the last step, within a step of the state.
     """
     layout = lay_out(known.poses, known.clock_sigma_s, len(problem.bones), problem.knot_t_s)
     done = 0
@@ -129,8 +129,8 @@ def learn(
 def evidence(problem: Problem, known: Knowledge, state: State) -> float:
     """Logarithm of how likely the pictures are under a prior, up to a constant of the pictures.
 
-    Laplace's approximation about the estimate that belongs to the prior, two Gauss-Newton steps from
-    `state`. The pictures count as if only one in `known.memory` were there.
+    Laplace's approximation about the estimate that belongs to the prior, at most three Gauss-Newton steps
+    from `state`. The pictures count as if only one in `known.memory` were there.
     """
     system, state, _ = solve(problem, known, state, rounds=_SETTLED, bounds=(BOUND,))
     at = eliminate(system, state)

@@ -174,7 +174,7 @@ def _poses(system: System, found: Moments) -> tuple[PoseErrors, ...]:
     stray2 = before**2 - np.square(known.poses[0].white)
     white = []
     for part in range(2):
-        squares, count, told, _ = found.white[part]
+        squares, count, told = found.white[part]
         if count == 0:
             white.append(0.0)
             continue
@@ -203,7 +203,7 @@ def _process(process: Process, places: list[tuple[bool, int]], found: Moments, k
     sigma0 = process.sigma0 * np.sqrt(min(_change(estimates, told, len(columns)), _MOST_OF_CONSTANT))
     rate = 0.0
     if process.rate > 0:
-        squares, count, spread, _ = found.walked[columns].sum(axis=0)
+        squares, count, spread = found.walked[columns].sum(axis=0)
         told = count - spread / process.rate**2
         estimates = (squares - spread) / process.rate**2
         rate = max(process.rate * float(np.sqrt(_change(estimates, told, count))), _LEAST_RATE[part])

@@ -4,7 +4,7 @@ A detector is wrong for the same reasons in neighbouring pictures, so many of th
 independent ones would: the mean of a stationary error falls as if only one in tau = 1 + 2 sum of its
 autocorrelations had been taken. An estimate that does not know this takes keypoint errors for slow pose
 errors. What tells them apart: a pose error moves all joints of a camera together, so it is looked for in
-what each joint does beside the others.
+what each joint does beside the others. Residuals show less of it, see `memory_of`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _MOST = 30.0
 
 
 def memory_of(system: System, state: State) -> float:
-    """How many neighbouring residuals at an estimate say as much as one: tau, at least 1."""
+    """How many neighbouring residuals at an estimate say as much as one: tau, from 1 to 30."""
     problem = system.problem
     pictures = problem.pictures
     _, residual, _ = misfit(system, state)

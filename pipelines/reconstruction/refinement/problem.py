@@ -104,6 +104,9 @@ def pose_errors(models: Sequence[NoiseModel]) -> PoseErrors:
 
     Latency is left to the clock: a log that lags and a clock that is off differ only where cameras
     accelerate.
+
+    Raises:
+        ValueError: a model that is none of flight.yaml's.
     """
     white = np.zeros(2)
     merged: dict[int, tuple[float, float]] = {}

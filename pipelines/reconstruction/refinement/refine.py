@@ -70,7 +70,8 @@ chi-square variable with three degrees of freedom over three passes once in a mi
 _TOLD_PLACE = 0.7
 """Of what slow pose errors do to a triangulated point: a place that is known no better was not seen."""
 _REFUSED = 0.5  # for every picture: by how much stated levels may be less likely than those that are refused
-_UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; it was estimated instead"
+_UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; "
+_INSTEAD = {"estimated": "it was estimated instead", "exact": "the poses were taken as they are"}
 _PLACED_AS_LOGGED = (
     "refined: pictures hardly tell where the person was, and nobody stated pose noise that explains them: on "
     "average the skeleton stays where the logged poses put it"
@@ -91,7 +92,7 @@ class Refined:
     clock_offset_s: Float  # [C] to be added to the pictures' times
     clock_sigma_s: Float  # [C] how well that is known, 0 for clocks that were
     levels: dict[str, float]
-    bone_lengths_m: Float  # [B]
+    bone_lengths_m: Float  # [B'] of the bones whose joints both took part
     acceleration: Float  # [P, P] (m/s^2)^2, covariance of the P joints' accelerations that was estimated
     learned: bool  # the levels of the pose errors were found from the pictures
     warnings: tuple[str, ...]
@@ -114,7 +115,7 @@ def refine(
         t_s: [T] the skeleton's times, strictly increasing.
         sightings: what each of C cameras saw, J joints.
         start: [T, J, 3] m, from a triangulation that trusts the poses; NaN where it found nothing.
-        bones: [B, 2] pairs of joints whose distance hardly changes.
+        bones: [B, 2] pairs of joints whose distance hardly changes; without any, the first two joints.
         prior: what is known of each camera's pose errors; None when nobody stated anything.
         clock_sigma_s: [C] how far each camera's clock may be off, 0 for one that is known.
         threads: at most two work, on both halves of the flight; the result does not depend on it.
@@ -293,7 +294,7 @@ def _renumbered(bones: Int64, part: NDArray[np.bool_]) -> Int64:
     there = part[bones].all(axis=1)
     renumbered: Int64 = number[bones[there]].astype(np.int64).reshape(-1, 2)
     if not len(renumbered):
-        # The size of the body has to be measured by something.
+        # The size of the body has to be measured by something: whatever two joints there are.
         renumbered = np.array([[0, 1]], dtype=np.int64)
     return renumbered
 
@@ -372,11 +373,10 @@ def _priors(
         if known.memory < REMEMBERED and known.pixel_scale > most:
             raise np.linalg.LinAlgError("no level of pose noise explains the pictures")
         of_stated = (_FARTHEST_STATED if name == best else _FARTHEST) * stated_m if name == "stated" else 0.0
-        unlike = prior is not None and name != "stated"
         yield _Prior(
             known,
             learned=name != "stated",
-            warnings=(_UNLIKE_STATED,) if unlike else (),
+            warnings=(_UNLIKE_STATED + _INSTEAD[name],) if "stated" in others and name != "stated" else (),
             expected_m=spread * max(_FARTHEST * disagreement_m, of_stated),
         )
 

@@ -458,10 +458,10 @@ def visit(
     `covariance` [T, J, 3, 3] is filled where it has a length, of the last three times the first `own_times`.
     Sums are made where `every` is not 0, over the pictures of every so many times: `acceleration` [2, J, J]
     posterior mean squares and variances; `bone_sums` [B]; `image` [J, 2] weighted squares, and how many of
-    them the fit leaves; `white_sums` [2, 4] of position and rotation: mean squares, count, sums of what the
-    pictures tell (1 - posterior / prior variance) and its square; `walked` [c, 4] the same of every knot's
-    change per s; `starting` [c + shared, 2] at time 0, where it has a length: mean square, variance. Returns
-    the covariance of what is alive at the beginning, and the interval there.
+    them the fit leaves; `white_sums` [2, 3] of position and rotation: mean squares, count, what the pictures
+    tell (1 - posterior / prior variance); `walked` [c, 3] of every knot's change per s: mean squares, count,
+    posterior variances; `starting` [c + shared, 2] at time 0, where it has a length: mean square, variance.
+    Returns the covariance of what is alive at the beginning, and the interval there.
     """
     J = position.shape[1]
     n, c = 3 * J, knot_count
@@ -578,7 +578,6 @@ def walk_of(
         walked[i, 0] += change**2 / elapsed + variance
         walked[i, 1] += 1
         walked[i, 2] += variance
-        walked[i, 3] += variance**2
 
 
 @cached
@@ -676,7 +675,7 @@ def noise_of(
 
 @helper
 def white_of(white: Float, precision: Float, variance: Float, sums: Float) -> None:
-    """Add what a picture's white error [6] says of its level [2, 4], given its posterior `variance` [6]."""
+    """Add what a picture's white error [6] says of its level [2, 3], given its posterior `variance` [6]."""
     for i in range(WHITE):
         if not np.isfinite(precision[i, i]):
             continue
@@ -685,4 +684,3 @@ def white_of(white: Float, precision: Float, variance: Float, sums: Float) -> No
         sums[part, 0] += white[i] ** 2 + variance[i]
         sums[part, 1] += 1
         sums[part, 2] += told
-        sums[part, 3] += told**2

@@ -131,7 +131,10 @@ def _ties(layout: Layout) -> tuple[Float, Float]:
 
 
 def misfit(system: System, state: State) -> tuple[float, Float, Float]:
-    """Loss of the pictures, whitened residuals [G, J, 2], NaN unseen, the ten numbers of each picture."""
+    """Loss of the pictures, whitened residuals [G, J, 2], the ten numbers [G, 10] of each picture.
+
+    Residuals are NaN for what was not seen, or lies behind its camera, and cost nothing.
+    """
     pictures = system.problem.pictures
     residual = np.empty(pictures.xy.shape)
     numbers = np.empty((len(pictures.first), kernels.NUMBERS))
