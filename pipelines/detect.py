@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.formats.flights.pictures import Picture, Pictures, open_pictures
+from pipelines.formats.flights.picture_encodings import Picture
+from pipelines.formats.flights.pictures import Pictures, open_pictures
 from pipelines.keypoints.actor_hints import actor_hints
 from pipelines.keypoints.hints import Hint
 from pipelines.keypoints.tracking import PeopleTracker

@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.flights.pictures import Picture, open_pictures
+from pipelines.formats.flights.picture_encodings import Picture
+from pipelines.formats.flights.pictures import open_pictures
 from pipelines.formats.videos.video_writing import TICK_S, join_videos, write_h264
 from pipelines.reporting.filmed import read_filmed
 from pipelines.reporting.frame_drawing import blank_frame, caption_of, draw_frame, padded_to_even

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.detect import detect
-from pipelines.formats.flights.pictures import Picture, open_pictures
+from pipelines.formats.flights.picture_encodings import Picture
+from pipelines.formats.flights.pictures import open_pictures
 from pipelines.geometry.triangulation import (
     STATUS,
     Method,

@@ -9,7 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.formats.flights.pictures import Picture, Pictures, open_pictures
+from pipelines.formats.flights.picture_encodings import Picture
+from pipelines.formats.flights.pictures import Pictures, open_pictures
 from pipelines.planning.hidden import hidden_shares
 from pipelines.planning.loading import load_flight
 from pipelines.reporting.comparison import compare, labels_of

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.formats.flights.picture_encodings import KNOWN, Picture, decode, is_known
 from pipelines.formats.logs.messages import all_samples
 from pipelines.formats.logs.picture_layouts import HEAD_LENGTH, picture_decoder, read_stamps
 from pipelines.formats.logs.recordings import OpenLog, messages_alike
@@ -20,11 +20,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, PictureSample, Sample
 from pipelines.session.registries import Log, LogFormat, recognise
 
-Picture = NDArray[np.uint8]
-
 _MAY_LEAP_NS = 1_000_000_000  # transport and decoding take less
-
-_CHANNELS = {"mono8": 1, "8uc1": 1, "rgb8": 3, "bgr8": 3, "8uc3": 3, "rgba8": 4, "bgra8": 4}
 
 
 class Pictures(Protocol):
@@ -81,6 +77,9 @@ class LoggedPictures:
         paths: the files of the recording.
         topic: the topic.
         stamps: which stamps order the pictures: header or receive.
+
+    Raises:
+        DataError: the log cannot be opened, or nobody knows how its pictures are encoded.
     """
 
     def __init__(self, paths: list[Path], topic: str, stamps: str) -> None:
@@ -92,6 +91,10 @@ class LoggedPictures:
         self._log: Log = self._stack.enter_context(log_format.open_log(paths))
         self._next = 0
         self._samples = self._begin()
+        with ExitStack() as unless_known:
+            unless_known.callback(self._stack.close)
+            self._refuse_unknown()
+            unless_known.pop_all()
 
     def __enter__(self) -> Self:
         """The pictures themselves."""
@@ -110,6 +113,16 @@ class LoggedPictures:
             if self._next > number:
                 return decode(sample)
         return None
+
+    def _refuse_unknown(self) -> None:
+        """All pictures of a camera are encoded alike: better said at once than found damaged one by one."""
+        first = next(self._begin(), None)
+        if first is not None and not is_known(first):
+            raise DataError(
+                self._source,
+                f"the pictures of {self._topic} are encoded as {first.encoding!r}, which is not known",
+                f"convert them to one of {', '.join(KNOWN)}, or give the camera a video",
+            )
 
     def _begin(self) -> Iterator[PictureSample]:
         samples = picture_samples(self._log, self._topic, self._source)
@@ -204,25 +217,3 @@ def _leap_ns(before: Stamped, after: Stamped) -> int:
 def stamp_of(picture: Stamped, stamps: str) -> int:
     """The stamp that counts: that of the header where it has one and it is wanted."""
     return picture.stamp_ns if stamps == "header" and picture.stamp_ns else picture.receive_ns
-
-
-def decode(sample: PictureSample) -> Picture | None:
-    """A picture of a log as BGR; None where its bytes are damaged or its encoding is not known."""
-    import cv2
-
-    if sample.width is None or sample.height is None:
-        decoded = (
-            cv2.imdecode(np.asarray(sample.data, np.uint8), cv2.IMREAD_COLOR) if len(sample.data) else None
-        )
-        return None if decoded is None else np.asarray(decoded, np.uint8)
-    encoding = sample.encoding.lower()
-    channels = _CHANNELS.get(encoding)
-    step = sample.step or sample.width * (channels or 0)
-    if channels is None or step < sample.width * channels or len(sample.data) < step * sample.height:
-        return None
-    rows = sample.data[: step * sample.height].reshape(sample.height, step)
-    pixels = rows[:, : sample.width * channels].reshape(sample.height, sample.width, channels)
-    if channels == 1:
-        return np.repeat(pixels, 3, axis=2)
-    colours = pixels[..., :3]
-    return np.ascontiguousarray(colours[..., ::-1] if encoding.startswith("rgb") else colours)
