@@ -29,7 +29,7 @@ from pipelines.session.records import Float
 from pipelines.session.registries import Detector, find_detector, hashes_of_models
 from pipelines.session.side_by_side import Halt, side_by_side
 from pipelines.session.storage import hash_of, jsonable, read_json, sha256_of, write_json
-from pipelines.session.whole_folders import STUDY_MARK, is_made, whole_folder
+from pipelines.session.whole_folders import STUDY_MARK, is_made, refuse_sessions, whole_folder
 from pipelines.simulation.detector_errors import MEASURED
 from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.scenario import World
@@ -102,7 +102,7 @@ def ablate(
         BusyError: another process makes the same folder.
     """
     progress = progress or Silent()
-    _refuse_sessions(folder)
+    refuse_sessions(folder, mark=STUDY_MARK, option="--output")
     detector = None if settings.detector is None else find_detector(settings.detector)
     key = _key(settings, detector)
     if not force and is_made(folder, key, mark=STUDY_MARK):
@@ -158,13 +158,6 @@ def _parts(
 ) -> list[Path]:
     """The folders of the finished parts, in the order of the work."""
     return side_by_side(lambda each: part(*each), work, workers=workers, halt=halt)
-
-
-def _refuse_sessions(folder: Path) -> None:
-    """What is of a session is not replaced, whatever was asked for."""
-    for mark, what in (("session.json", "a session"), ("stage.json", "a stage of a session")):
-        if (folder / mark).exists():
-            raise DataError(folder, f"is {what}", "choose another place with --output")
 
 
 def _refuse_nothing(folder: Path, summary: Mapping[str, Any]) -> None:

@@ -25,7 +25,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
 from pipelines.session.records import Occupancy
 from pipelines.session.run_notes import versions_of
-from pipelines.session.stage_records import Stage, StageRecord
+from pipelines.session.stage_records import Stage, StageRecord, outdated
 from pipelines.session.stages import Session, locked, open_session, session_name
 from pipelines.session.storage import as_data_error, hash_of, read_json, sha256_of
 from pipelines.session.tables import (
@@ -47,7 +47,7 @@ from pipelines.simulation.study.settings import command_of
 if TYPE_CHECKING:
     import pandas as pd
 
-REPORT = Stage("report", revision=7)
+REPORT = Stage("report", revision=8)
 _FIGURES_REVISION = 3
 
 
@@ -332,6 +332,7 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
         true_poses=_by_camera(folder / "truth_poses.parquet"),
         hidden=_load_hidden(folder, description, records, maps),
         made_by=versions_of(folder),
+        outdated=tuple(outdated(records)),
     )
 
 

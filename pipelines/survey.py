@@ -14,7 +14,7 @@ from pipelines.session.description import read_description
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight, read_flight
 from pipelines.session.registries import FORMATS, why_not
-from pipelines.session.stage_records import SCHEMA, STAGES
+from pipelines.session.stage_records import SCHEMA, STAGES, outdated
 from pipelines.session.stages import open_session
 from pipelines.session.storage import read_json
 from pipelines.session.whole_folders import SIMULATION_MARK, STUDY_MARK
@@ -82,15 +82,12 @@ def _of_session(path: Path) -> dict[str, Any]:
         "warnings": description.warnings,
     }
     records = {stage: record for stage in STAGES if (record := session.record(stage))}
-    made = {stage: record.key for stage, record in records.items()}
-    for record in records.values():
-        made |= record.outputs
     for stage, record in records.items():
         if stage == "ingest":
             continue
         facts[stage] = {"settings": record.settings, "counts": record.counts}
-        if any(made.get(name, digest) != digest for name, digest in record.inputs.items()):
-            facts[stage]["out of date"] = "what it was made of has changed since: run it again"
+    for stage in outdated(records):
+        facts[stage]["out of date"] = "what it was made of has changed since: run it again"
     return facts
 
 

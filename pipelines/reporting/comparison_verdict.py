@@ -182,6 +182,11 @@ def _doubts(comparison: Comparison) -> list[str]:
                 f"({percent(low / 100)}, not {percent(high / 100)}): {left}."
             )
     doubts += _unlike(comparison.sessions)
+    doubts += [
+        f"What {stage} of {named(session)} was made of has changed since: run it again."
+        for session in comparison.sessions
+        for stage in session.content.outdated
+    ]
     return doubts
 
 

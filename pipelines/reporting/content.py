@@ -52,6 +52,7 @@ class SessionContent:
     true_poses: dict[str, pd.DataFrame] = field(default_factory=dict)  # camera: tables.POSES, where known
     hidden: dict[str, float] = field(default_factory=dict)  # camera: share of moments, where a map is
     made_by: dict[str, dict[str, str]] = field(default_factory=dict)  # stage: program or library, and version
+    outdated: tuple[str, ...] = ()  # stages that were made of what has changed since
     studies: tuple[StudyContent, ...] = ()  # that stand beside the flight
 
 

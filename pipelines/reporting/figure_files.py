@@ -11,6 +11,7 @@ from pipelines.reporting.plates import Plate
 from pipelines.reporting.svg import WIDTH_IN, page_style, settled
 from pipelines.session.errors import DataError
 from pipelines.session.storage import read_json, write_json
+from pipelines.session.whole_folders import refuse_sessions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -79,13 +80,13 @@ def refuse_foreign(folder: Path, *, overwrite: bool) -> None:
 
     Args:
         folder: where figures shall go; what is there goes.
-        overwrite: replace other people's files; a session is never replaced.
+        overwrite: replace other people's files; sessions and their parts are never replaced.
 
     Raises:
-        DataError: a session, a file, or a folder with more in it than figures that were written before.
+        DataError: a session, its part, or what holds one; a file, or a folder with more in it than figures
+            that were written before.
     """
-    if (folder / "session.json").exists():
-        raise DataError(folder, "is a session", "name a folder of its own with --figures")
+    refuse_sessions(folder, mark=MARK, option="--figures")
     if overwrite or not folder.exists():
         return
     if not folder.is_dir():

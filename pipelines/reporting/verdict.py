@@ -179,6 +179,7 @@ def _doubts(content: SessionContent, summary: Summary) -> list[str]:
         >= NOTABLE_LOSS * (count := camera.entry.frames.count)
     ]
     doubts += _odd_cameras(summary)
+    doubts += [f"What {stage} was made of has changed since: run it again." for stage in content.outdated]
     doubts += summary.description.warnings
     for record in content.stages.values():
         doubts += [str(warning) for warning in items(record, "warnings")]

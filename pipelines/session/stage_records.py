@@ -63,6 +63,23 @@ def key_of(stage: Stage, settings: Mapping[str, object], inputs: Mapping[str, st
     return hash_of(ingredients)
 
 
+def outdated(records: Mapping[str, StageRecord]) -> list[str]:
+    """The stages, by name, of which something that they were made of has changed since.
+
+    Args:
+        records: the finished stages of a session, by name. Inputs that none of them made do not count.
+    """
+    made = {stage: record.key for stage, record in records.items()}
+    for record in records.values():
+        made |= record.outputs
+    return [
+        stage
+        for stage, record in records.items()
+        if stage != "ingest"
+        and any(made.get(name, digest) != digest for name, digest in record.inputs.items())
+    ]
+
+
 def read_record(path: Path) -> StageRecord:
     """What a `stage.json` says.
 

@@ -12,6 +12,7 @@ key: other settings do not find them.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -26,6 +27,8 @@ SIMULATION_MARK = "simulation.json"
 
 STUDY_MARK = "summary.json"
 """The file that every folder of `mocap ablate` has."""
+
+_OF_SESSIONS = {"session.json": "a session", "stage.json": "a stage of a session"}
 
 
 class Making:
@@ -104,6 +107,31 @@ def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Itera
         raise as_data_error(error, target) from error
     finally:
         _tidy(work)
+
+
+def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
+    """What is of a session is not replaced, whatever was asked for.
+
+    Args:
+        target: the folder that would be replaced.
+        mark: as for `whole_folder`.
+        option: by which the user named it.
+
+    Raises:
+        DataError: the target holds a session or a stage of one, at any depth, or lies in a session.
+    """
+    target = target.absolute()
+    if not target.is_dir():
+        return
+    for folder, _, files in os.walk(target):
+        for name in _OF_SESSIONS.keys() & set(files):
+            what, within = _OF_SESSIONS[name], Path(folder).relative_to(target).as_posix()
+            problem = f"is {what}" if within == "." else f"holds {what} in {within}"
+            raise DataError(target, problem, f"name another folder with {option}")
+    if not (target / mark).is_file():
+        for parent in target.parents:
+            if (parent / "session.json").is_file():
+                raise DataError(target, "is a part of a session", f"name another folder with {option}")
 
 
 def is_made(target: Path, key: str, *, mark: str) -> bool:

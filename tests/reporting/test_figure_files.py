@@ -166,6 +166,25 @@ def test_nothing_of_others_is_written_over(written: Path, tmp_path: Path) -> Non
         refuse_foreign(tmp_path, overwrite=True)
 
 
+@pytest.mark.parametrize(
+    ("named", "problem"),
+    [
+        (".", "holds a session in deep/a.session"),
+        ("deep/a.session/report", "is a stage of a session"),
+        ("deep/a.session/cameras", "is a part of a session"),
+    ],
+)
+def test_no_session_is_lost_with_what_is_around_it(named: str, problem: str, tmp_path: Path) -> None:
+    session = tmp_path / "deep" / "a.session"
+    (session / "cameras").mkdir(parents=True)
+    (session / "report").mkdir()
+    (session / "session.json").write_text("{}")
+    (session / "report" / "stage.json").write_text("{}")
+    with pytest.raises(DataError, match=problem):
+        refuse_foreign(tmp_path / named, overwrite=True)
+    refuse_foreign(session / "figures", overwrite=True)  # a folder of its own
+
+
 def test_a_file_beside_our_figures_is_not_ours(tmp_path: Path) -> None:
     (tmp_path / MARK).write_text('{"figures": [{"files": ["top.svg"]}]}')
     (tmp_path / "top.svg").write_text("<svg/>")
