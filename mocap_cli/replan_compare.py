@@ -35,10 +35,22 @@ if TYPE_CHECKING:
 @click.option(
     "--drones", type=click.IntRange(2, 8), help="How many [default: the session's cameras, at least 2]."
 )
-@click.option("--radius", type=FiniteRange(0.5, 500), metavar="M", help="From the actor to the slots.")
-@click.option("--tilt", type=FiniteRange(-10, 85), metavar="DEG", help="Of the slots above the actor.")
+@click.option(
+    "--radius",
+    type=FiniteRange(0.5, 500),
+    metavar="M",
+    help="From the actor to the slots (`covariance` and `greedy` only start there).",
+)
+@click.option(
+    "--tilt", type=FiniteRange(-10, 85), metavar="DEG", help="Of the slots above the actor (likewise)."
+)
 @click.option("--yaws", type=click.IntRange(1, 360), help="Cells of a full turn that are searched.")
-@click.option("--horizon", type=FiniteRange(0.1, 600), metavar="S", help="How far the search looks ahead.")
+@click.option(
+    "--horizon",
+    type=FiniteRange(0.1, 600),
+    metavar="S",
+    help="How far the search looks ahead, at most 60 knots.",
+)
 @click.option(
     "--yaw",
     type=FiniteRange(-360, 360),

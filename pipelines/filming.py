@@ -120,7 +120,9 @@ def film(
         if run.finished:
             return Filmed(folder, run.record, read_json(folder / "film" / "metrics.json"), skipped=True)
 
-        flight = load_flight(folder, description, None, pose_noise=compared.settings["pose_noise"])
+        flight = load_flight(
+            folder, description, session.record("reconstruct"), pose_noise=compared.settings["pose_noise"]
+        )
         setting = _set(plan, path, flight)
         actor = logged_actor(folder, description)
         arms = {

@@ -60,7 +60,7 @@ class PlannerConfig:
     w_obs: float = 1.0
     w_occ: float = 1.0
     w_turn: float = 0.05  # per 45 deg of yaw, or 2 s of tilting or approaching
-    w_error: float = 1.0  # per metre of predicted error, or per nat of information
+    w_error: float = 1.0  # per metre of predicted error, or unit of log det of the information
 
     # What the local planner weighs.
     l_obs: float = 50.0
@@ -142,12 +142,33 @@ class PlannerConfig:
         yaw, tilt = math.radians(self.yaw_rate_deg_per_s), math.radians(self.tilt_rate_deg_per_s)
         return yaw, tilt, self.range_rate_mps
 
+    def out_of_reach(self) -> list[str]:
+        """Which lattices have cells too wide to reach the next one between two knots: nothing turns there."""
+        lattices = (
+            ("yaws", self.yaws, self.knot_s, "formations of `adaptive` keep"),
+            (
+                "lattice_yaws",
+                self.lattice_yaws,
+                self.lattice_knots * self.knot_s,
+                "`covariance` and `greedy` keep",
+            ),
+        )
+        told = []
+        for name, yaws, seconds, keeps in lattices:
+            most_deg = self.yaw_rate_deg_per_s * seconds
+            if 1 < yaws < 360 / most_deg * (1 - 1e-9):
+                told.append(
+                    f"{name}: {yaws} cells of {360 / yaws:.3g} deg, but formations turn {most_deg:.3g} deg"
+                    f" between knots: {keeps} to their yaw, state at least {math.ceil(360 / most_deg - 1e-9)}"
+                )
+        return told
+
     def slot_weights(self) -> SlotWeights:
         """What the kernels of the formation search take."""
         return SlotWeights(self.w_obs, self.w_occ, self.eps_obs_m, self.sight_start_m)
 
     def local_weights(self, resolution_m: float) -> Weights:
-        """What the local planner's kernels take, sight lines sampled every half voxel of that side."""
+        """What the local planner's kernels take; sight lines from `radius_m` are sampled every half voxel."""
         reach_m = max(self.radius_m - self.sight_start_m, resolution_m)
         return Weights(
             l_obs=self.l_obs,

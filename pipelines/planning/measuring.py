@@ -26,7 +26,7 @@ Int64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 PIXEL_SIGMA = 3.0
-"""Standard deviation of a good keypoint that triangulation is told, as `mocap reconstruct` is by default."""
+"""Standard deviation of a good keypoint that triangulation is told: what `mocap reconstruct` begins with."""
 MIN_CONFIDENCE = 0.3
 """Keypoints below are not used, likewise."""
 

@@ -203,6 +203,7 @@ def _doubts(scene: Scene) -> list[str]:
             f"{inside} of {scene.drones} drones start inside an obstacle:"
             " choose another --yaw, --radius or --tilt"
         )
+    doubts += scene.config.out_of_reach()
     if scene.flight.skeleton is None:
         doubts.append("no skeleton to look at, so no reconstruction error: run `mocap reconstruct` first")
     return doubts

@@ -25,7 +25,7 @@ def visible(field: DistanceField, camera: Float, actor: Float, *, start_m: float
         start_m: the end of the line next to the actor is left out, this much of it: maps contain the actor.
 
     Returns:
-        [...]; True where camera and actor are nearer to each other than `start_m`.
+        [...]; True where camera and actor are nearer to each other than `start_m`, or not finite.
     """
     camera, actor = np.broadcast_arrays(camera, actor)
     seen = np.empty(camera.shape[:-1], dtype=np.bool_)

@@ -56,7 +56,7 @@ def draw_as_seen(replan: Replan) -> Plate | None:
         "The skeleton in the pictures of each arm's cameras, all enlarged alike"
         + (f" (the first {columns} cameras)" if skipped else "")
         + ", with its tilt over the actor and how many joints it sees. Of every quarter of the flight, the "
-        "moment at which the arms' cameras together see the fewest joints; of several, that of the highest "
+        "moment at which the cameras shown together see the fewest joints; of several, that of the highest "
         "tilt. Open and dotted: hidden by what stands in the map; joints outside the picture are left out. "
         "Exact, by map and field of view: no detector's errors."
     )

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import pytest
 
 from pipelines.planning.config import PlannerConfig, planner_config
+from pipelines.planning.formation import yaw_set
+from pipelines.planning.search import lattice
 from pipelines.session.errors import DataError
 
 
@@ -41,3 +46,30 @@ def test_what_cannot_be_meant_is_refused(values: dict[str, object], said: str) -
 def test_all_unknown_keys_are_in_one_message() -> None:
     with pytest.raises(DataError, match=r"^weights.yaml: unknown key 'a'; unknown key 'b'"):
         planner_config({"a": 1, "b": 2}, "weights.yaml")
+
+
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [
+        ({}, []),
+        ({"yaws": 1}, []),  # nobody expects that to turn
+        ({"yaws": 16}, []),  # 22.5 deg, as far as one second allows
+        ({"yaws": 15}, ["yaws: 15 cells of 24 deg"]),
+        ({"yaws": 8, "knot_s": 2.0}, []),
+        ({"lattice_knots": 1}, ["lattice_yaws: 8 cells of 45 deg"]),
+    ],
+)
+def test_cells_that_no_formation_reaches_are_told(values: dict[str, Any], named: list[str]) -> None:
+    config = PlannerConfig(**values)
+    told = config.out_of_reach()
+    assert [line.partition(",")[0] for line in told] == named
+    # As the search has it: a cell has a neighbour beside itself, or it has not.
+    for name, yaws, knot_s in (
+        ("yaws", config.yaws, config.knot_s),
+        ("lattice_yaws", config.lattice_yaws, config.lattice_knots * config.knot_s),
+    ):
+        states = np.zeros((yaws, 3))
+        states[:, 0] = yaw_set(yaws, 0.0)
+        neighbours = lattice(states, rates=np.array(config.slot_rates), knot_s=knot_s, w_turn=1.0).neighbours
+        alone = (neighbours >= 0).sum(axis=1).max() == 1
+        assert (alone and yaws > 1) == any(line.startswith(f"{name}:") for line in told)
