@@ -60,7 +60,7 @@ from pipelines.reconstruction.solving import (
 )
 from pipelines.reconstruction.tables import camera_poses_table, skeleton_table
 from pipelines.reconstruction.trials import disturbances, disturbed, told_together
-from pipelines.session.description import Description, read_description
+from pipelines.session.description import Description, Interpolation, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.logged_actor import LoggedActor, logged_actor
 from pipelines.session.progress import Progress, Silent
@@ -74,7 +74,7 @@ from pipelines.session.true_joints import true_joints_at
 if TYPE_CHECKING:
     import pandas as pd
 
-RECONSTRUCT = Stage("reconstruct", revision=11)
+RECONSTRUCT = Stage("reconstruct", revision=12)
 
 _LONGEST_FILL_S = 10.0
 
@@ -358,7 +358,7 @@ def _attempt(
         seen.association,
         seen.between_views,
         metrics | finished | background | (refined.metrics if refined else {}),
-        _poses_stored(cameras, refined, background["background"]),
+        _poses_stored(cameras, refined, background["background"], description.pose_interpolation),
         [*warnings, *(refined.warnings if refined else []), *seen.association.reasons],
     )
 
@@ -457,14 +457,16 @@ def _refine_cameras(
 
 
 def _poses_stored(
-    cameras: list[Camera], refined: RefinedFlight | None, background: Mapping[str, Any] | None
+    cameras: list[Camera],
+    refined: RefinedFlight | None,
+    background: Mapping[str, Any] | None,
+    between: Interpolation,
 ) -> pd.DataFrame | None:
-    """The pose of every picture that has one, where anything but the log decided."""
+    """The pose of every picture that has one, of the cameras where anything but the log decided."""
     if refined is not None and refined.cameras is not None:
         return refined.cameras
-    if background is None or not any(told["used"] for told in background.values()):
-        return None
-    return camera_poses_table(cameras)
+    corrected = [camera for camera in cameras if background is not None and background[camera.name]["used"]]
+    return camera_poses_table(corrected, between) if corrected else None
 
 
 def _without_swaps(cameras: list[Camera]) -> tuple[list[Camera], dict[str, dict[str, int]]]:

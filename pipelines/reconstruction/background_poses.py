@@ -11,6 +11,7 @@ Points are eliminated (Schur complement); Cauchy's loss for what is no backgroun
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,7 @@ from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rot
 from pipelines.session.records import Float, Int64
 
 STRETCH = 200
-"""Pictures that are adjusted together: beyond, points are new, and the matrices large."""
+"""Pictures that are adjusted together, about: beyond, points are new, and the matrices large."""
 
 _PIXEL_SIGMA = 0.5  # of a followed point; they drift by some tenths
 _LOSS = 2.0  # standard deviations at which a sighting counts half
@@ -61,7 +62,7 @@ class Adjusted:
     rotation: Float  # [T, 3, 3] world_from_camera
     covariance: Float  # [T, 6, 6] position in the world (m^2), then rotation vector in the camera (rad^2)
     points: int  # that were used
-    reprojection_px: float  # median
+    reprojection_px: float  # median; NaN where refused
     refused: str | None  # why the logged poses stay, in one plain line
 
 
@@ -86,14 +87,17 @@ def adjust(
         prior: how far the log may be off.
 
     Returns:
-        Adjusted poses; the logged ones where `refused`. Pictures without a pose stay without.
+        Adjusted poses, stretch by stretch of about 200 pictures; the logged ones where `refused`, which a
+        single stretch may cause. Pictures without a pose stay without.
     """
     new_position, new_rotation = position.copy(), rotation.copy()
     covariance = prior.covariance(len(position))
     used, residuals = 0, []
-    for first in range(0, len(position), STRETCH):
-        rows = np.arange(first, min(first + STRETCH, len(position)))
-        rows = rows[np.isfinite(position[rows, 0])]
+    posed = np.flatnonzero(np.isfinite(position[:, 0]))
+    if not len(posed):
+        return _refused(position, rotation, prior, 0, "none of its pictures has a pose")
+    # Alike long: the few pictures of a remainder would show too little.
+    for rows in np.array_split(posed, max(round(len(posed) / STRETCH), 1)):
         place = np.full(len(position), -1)
         place[rows] = np.arange(len(rows))
         mine = place[picture] >= 0
@@ -292,6 +296,6 @@ class _Stretch:
 
 def _sum_by(values: Float, number: Int64, count: int) -> Float:
     """Sums of the values [K, ...] of each number: [count, ...]."""
-    flat = values.reshape(len(values), -1)
+    flat = values.reshape(len(values), math.prod(values.shape[1:]))
     sums = np.stack([np.bincount(number, weights=column, minlength=count) for column in flat.T], axis=-1)
     return np.asarray(sums, dtype=np.float64).reshape(count, *values.shape[1:])

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipelines.geometry.triangulation import Triangulation, Views, reprojection_px, triangulate
 
-_ROUNDS = 12  # the median joint moves by less than 0.1 mm after that, on a real recording
+_ROUNDS = 12  # docs/decisions/0002-loss-of-still-cameras.md says what more would change
 
 
 def triangulate_heavy_tailed(views: Views, *, threads: int) -> Triangulation:

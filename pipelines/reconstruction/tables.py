@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.geometry.poses import interpolate_poses
+from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.geometry.triangulation import STATUS, Triangulation
 from pipelines.reconstruction.observations import Camera, Observations
+from pipelines.session.description import Interpolation
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Float
 
 if TYPE_CHECKING:
@@ -37,29 +38,20 @@ def skeleton_table(observations: Observations, result: Triangulation) -> pd.Data
     return table
 
 
-def camera_poses_table(cameras: Sequence[Camera]) -> pd.DataFrame:
+def camera_poses_table(cameras: Sequence[Camera], between: Interpolation) -> pd.DataFrame:
     """The poses of cameras at their pictures, as rows of `tables.CAMERA_POSES`.
 
-    Pictures before the first pose of a moving camera and after its last have no row.
+    Pictures that have none, as in a pause of the log, have no row.
     """
     import pandas as pd
 
     parts = []
     for camera in cameras:
-        log = camera.trajectory
-        position, quaternion = log.position, log.quaternion_xyzw
-        if camera.static:
-            t_ns = camera.frame_t_ns
-            position, quaternion = (np.repeat(part, len(t_ns), axis=0) for part in (position, quaternion))
-        else:
-            t_ns = camera.frame_t_ns[(camera.frame_t_ns >= log.t_ns[0]) & (camera.frame_t_ns <= log.t_ns[-1])]
-            longest = int(np.diff(log.t_ns).max(initial=0))
-            position, quaternion = interpolate_poses(
-                log.t_ns, position, quaternion, t_ns, max_gap_ns=longest, max_extrapolation_ns=0
-            )
-        table = pd.DataFrame({"t_ns": t_ns, "camera": camera.name})
-        table[["x", "y", "z"]] = position
-        table[["qx", "qy", "qz", "qw"]] = quaternion
+        position, rotation = camera.poses_at(camera.frame_t_ns, between)
+        (posed,) = np.nonzero(np.isfinite(position[:, 0]))
+        table = pd.DataFrame({"t_ns": camera.frame_t_ns[posed], "camera": camera.name})
+        table[["x", "y", "z"]] = position[posed]
+        table[["qx", "qy", "qz", "qw"]] = quaternion_from_matrix(rotation[posed])
         parts.append(table)
     return pd.concat(parts, ignore_index=True)
 

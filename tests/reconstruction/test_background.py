@@ -15,6 +15,7 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
     rotation_vector_from_quaternion,
 )
+from pipelines.reconstruction import background_poses
 from pipelines.reconstruction.background import prior_of
 from pipelines.reconstruction.background_poses import Adjusted, PosePrior, adjust
 from pipelines.reconstruction.background_tracks import follow
@@ -137,6 +138,32 @@ def test_a_log_that_the_pictures_contradict_is_kept_and_named() -> None:
     found = adjust(picture, point, xy, FOCAL, position, rotation @ askew, PRIOR)
     assert found.refused is not None
     assert "standard deviations from the log" in found.refused
+
+
+@pytest.mark.parametrize("pictures", [41, 60, 83])
+def test_a_few_pictures_more_than_a_stretch_cost_nothing(
+    pictures: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(background_poses, "STRETCH", 40)
+    rng = np.random.default_rng(6)
+    position, rotation = flown(pictures, 0.3 * pictures)
+    picture, point, xy = sighted(position, rotation, rng)
+    at, turned = logged(position, rotation, rng)
+    found = adjust(picture, point, xy, FOCAL, at, turned, PRIOR)
+    assert found.refused is None
+    assert np.median(turns_deg(found.rotation, rotation)) < np.median(turns_deg(turned, rotation))
+
+
+@pytest.mark.parametrize(("posed", "reason"), [(True, "0 points of the background"), (False, "a pose")])
+def test_a_camera_of_which_nothing_is_seen_keeps_its_logged_poses(posed: bool, reason: str) -> None:
+    """Fog or night, or a video that was taken before the log began."""
+    position, rotation = flown(40, 12.0)
+    position = position if posed else np.full_like(position, np.nan)
+    nothing = np.empty(0, np.int64)
+    found = adjust(nothing, nothing, np.empty((0, 2)), FOCAL, position, rotation, PRIOR)
+    assert found.refused is not None
+    assert reason in found.refused
+    np.testing.assert_array_equal(found.position, position)
 
 
 def test_pictures_without_a_pose_stay_without() -> None:

@@ -110,6 +110,10 @@ def test_a_method_that_measured_nothing_is_not_spoken_of() -> None:
             "mocap ablate noise --levels none,low,high --keypoints exact -o out",
         ),
         ({"study": "noise", "levels": ["high"]}, "mocap ablate noise --levels high -o out"),
+        (
+            {"study": "tilt", "tilts_deg": [12.3456789, 30], "seed": 20240101},
+            "mocap ablate tilt --tilts 12.3456789,30 --seed 20240101 -o out",
+        ),
     ],
 )
 def test_the_command_of_a_study_is_the_one_that_was_given(asked: dict[str, Any], said: str) -> None:

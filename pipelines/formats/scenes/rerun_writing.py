@@ -165,7 +165,10 @@ def _log_map(rr: Any, stream: Any, recording: Recording) -> None:
             )
         points = rr.Points3D(surface.middle, radii=surface.cube_m / 2, colors=[_STONE])
         if occupancy.from_ns:
-            stream.set_time("time", timestamp=np.datetime64(occupancy.from_ns, "ns"))
+            if occupancy.from_ns < _LAST_WITHOUT_DATE_NS:
+                stream.set_time("time", duration=np.timedelta64(occupancy.from_ns, "ns"))
+            else:
+                stream.set_time("time", timestamp=np.datetime64(occupancy.from_ns, "ns"))
             stream.log("world/map", points)
             stream.reset_time()
         else:

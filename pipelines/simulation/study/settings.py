@@ -158,7 +158,7 @@ def command_of(settings: Mapping[str, Any], output: str) -> str:
     plain = settings_for(study, methods=METHODS[:1], seconds=seconds)
     said: list[str] = []
     if tilts != list(plain.tilts_deg):
-        said += ["--tilts" if study == "tilt" else "--tilt", ",".join(f"{tilt:g}" for tilt in tilts)]
+        said += ["--tilts" if study == "tilt" else "--tilt", ",".join(map(_written, tilts))]
     if drones != list(plain.drones):
         said += ["--robots" if study == "robots" else "--drones", ",".join(map(str, drones))]
     if noise != {each.label: each.model for each in plain.noise}:
@@ -172,8 +172,13 @@ def command_of(settings: Mapping[str, Any], output: str) -> str:
     numbers = {"seconds": 75.0, "rate_hz": 30.0 if detector is None else 1.0, "trials": 10, "seed": 0}
     for name, default in numbers.items():
         if settings[name] != default:
-            said += [f"--{name.removesuffix('_hz')}", f"{settings[name]:g}"]
+            said += [f"--{name.removesuffix('_hz')}", _written(settings[name])]
     return shlex.join(["mocap", "ablate", study, *said, "-o", output])
+
+
+def _written(number: float) -> str:
+    """A number as the options take it: whole ones without a point, all of them with every digit."""
+    return str(int(number)) if float(number).is_integer() else repr(float(number))
 
 
 def _noise_words(study: Study, noise: Mapping[str, str], seconds: float) -> list[str]:
