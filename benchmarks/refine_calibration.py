@@ -52,7 +52,7 @@ class Draw:
     robust_mm: Float  # [3]
     refined_mm: Float  # [3]
     bound_mm: Float  # [3] with the temporal terms that were learned; NaN where `refined` fell back
-    squares: Float | None  # [T, J] e' S^-1 e; None where `refined` fell back
+    squares: Float | None  # [N] e' S^-1 e of what was estimated; None where `refined` fell back
     fallback: str | None
     cpu_s: float
 
@@ -97,7 +97,8 @@ def drawn(name: str, times: int, cameras: int, told: bool, seed: int) -> Draw:
     error = result.position - flight.truth
     squares: Float = np.einsum("tji,tjik,tjk->tj", error, np.linalg.inv(result.covariance), error)
     bound_mm = expected_mm(flight, MODELS[name], result.acceleration, _OF_ONE, seed=seed)
-    return Draw(robust_mm, errors_mm(error, flight.truth), bound_mm, squares, None, cpu_s)
+    found: Float = squares[np.isfinite(squares)]  # joints that were hardly triangulated take no part
+    return Draw(robust_mm, errors_mm(error, flight.truth), bound_mm, found, None, cpu_s)
 
 
 def row_of(draws: Sequence[Draw], known_mm: Float) -> str:

@@ -75,7 +75,7 @@ def test_stopped_in_the_middle_it_goes_on_with_what_is_finished(tmp_path: Path) 
     kept: dict[str, int] = {}
     for blocks, how, status in (
         (1, signal.SIGKILL, -signal.SIGKILL),
-        (3, signal.SIGINT, 130),
+        (2, signal.SIGINT, 130),
     ):
         assert stopped_with(how, blocks, session, detector) == status
         now = finished(session)

@@ -79,5 +79,5 @@ def test_a_study_in_a_session_disturbs_nothing_and_replaces_no_session(session: 
     before = content(session)
     for place in (session, session / "report"):
         line = refused("ablate", "robots", *STUDY, "-o", place, "--overwrite")
-        assert "choose another place with --output" in line
+        assert "name another folder with --output" in line
     assert content(session) == before

