@@ -145,12 +145,12 @@ class PlannerConfig:
     def out_of_reach(self) -> list[str]:
         """Which lattices have cells too wide to reach the next one between two knots: nothing turns there."""
         lattices = (
-            ("yaws", self.yaws, self.knot_s, "formations of `adaptive` keep"),
+            ("yaws", self.yaws, self.knot_s, "formations of adaptive keep"),
             (
                 "lattice_yaws",
                 self.lattice_yaws,
                 self.lattice_knots * self.knot_s,
-                "`covariance` and `greedy` keep",
+                "those of covariance and greedy keep",
             ),
         )
         told = []
