@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.poses import (
     compose,
+    conjugate,
     enu_from_ned,
     multiply,
     quaternion_from_rotation_vector,
@@ -121,6 +122,21 @@ def attitude_in_enu(
     if relative_to == "body":
         return multiply(_FLU_FROM_FRD, of_flu_gimbal)
     return enu_from_ned(np.zeros(3), of_flu_gimbal)[1]
+
+
+def meant_relative_to(
+    quaternion_xyzw: Float, *, taken: Literal["world", "body"], meant: Literal["world", "body"]
+) -> Float:
+    """Attitudes [..., 4] of `attitude_in_enu` from `ned`, had its angles been relative to the other.
+
+    A log may say angles without saying of what: north is then the nose, or the nose north.
+    """
+    if taken == meant:
+        return quaternion_xyzw
+    enu_from_world = enu_from_ned(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))[1]
+    if meant == "body":
+        return multiply(_FLU_FROM_FRD, multiply(conjugate(enu_from_world), quaternion_xyzw))
+    return multiply(enu_from_world, multiply(conjugate(_FLU_FROM_FRD), quaternion_xyzw))
 
 
 def compose_gimbal(

@@ -23,6 +23,7 @@ from pipelines.geometry.mounting import (
     compose_gimbal,
     compose_mount,
     flu_body_from_frd,
+    meant_relative_to,
 )
 from pipelines.geometry.pose_covariance import mounted_covariance, pose_covariance_in_body
 from pipelines.geometry.poses import (
@@ -296,3 +297,19 @@ def test_what_is_missing_stays_missing() -> None:
     )
     assert np.isnan(quaternion[0]).all()
     assert np.isfinite(quaternion[1]).all()
+
+
+@pytest.mark.parametrize(("taken", "meant"), [("world", "body"), ("body", "world"), ("body", "body")])
+def test_angles_are_taken_as_relative_to_what_the_user_says(
+    taken: Literal["world", "body"], meant: Literal["world", "body"]
+) -> None:
+    """As if the log had been read so from the beginning; level and straight ahead is north, or the nose."""
+    logged = np.random.default_rng(0).normal(size=(50, 4))
+    logged = np.concatenate([logged / np.linalg.norm(logged, axis=1, keepdims=True), [[0.0, 0.0, 0.0, 1.0]]])
+    found = meant_relative_to(
+        attitude_in_enu(logged, relative_to=taken, axes="ned"), taken=taken, meant=meant
+    )
+    expected = attitude_in_enu(logged, relative_to=meant, axes="ned")
+    np.testing.assert_allclose(np.abs(np.sum(found * expected, axis=1)), 1.0, atol=1e-12)
+    looks = rotate(found[-1], np.array([1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(looks, [1.0, 0, 0] if meant == "body" else [0, 1.0, 0], atol=1e-12)

@@ -19,7 +19,7 @@ from pipelines.formats.flights.log_times import world_times
 from pipelines.formats.flights.world_axes import in_world
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place, enu_from_enu, enu_from_geodetic
-from pipelines.geometry.mounting import compose_gimbal, compose_mount
+from pipelines.geometry.mounting import compose_gimbal, compose_mount, meant_relative_to
 from pipelines.geometry.poses import (
     compose,
     interpolate_points,
@@ -268,7 +268,9 @@ class TelemetryPoses:
                     "name the log and topic that do, or fixed angles",
                 )
             moved = self._at_world_times(camera.pose, telemetry, own)
-            return replace(moved, relative_to=gimbal.relative_to or "world")
+            meant = gimbal.relative_to or "world"
+            turned = meant_relative_to(moved.quaternion_xyzw, taken=moved.relative_to, meant=meant)
+            return replace(moved, quaternion_xyzw=turned, relative_to=meant)
         return stated_angles(gimbal, self._logs, self._flight.world.frame)
 
     def _at_world_times(self, pose: PoseSource, telemetry: Telemetry, track: AttitudeTrack) -> AttitudeTrack:
