@@ -56,9 +56,16 @@ def _nanoseconds(value: object) -> int:
     return nanoseconds
 
 
+def _seconds(value: float) -> float:
+    _nanoseconds(value)
+    return value
+
+
 Fps = Annotated[Fraction, BeforeValidator(_fps)]
 SecondsAsNs = Annotated[int, BeforeValidator(_nanoseconds)]
 """Seconds in the file (number or text), exact nanoseconds in the program."""
+Seconds = Annotated[float, AfterValidator(_seconds)]
+"""Seconds that can be added to any time."""
 
 
 class Origin(Part):
@@ -79,8 +86,8 @@ class World(Part):
 class LogClock(Part):
     """How a recorder's clock relates to the world's: the offset at the first message, and the drift since."""
 
-    offset_s: float = 0.0
-    drift_ppm: float = 0.0
+    offset_s: Seconds = 0.0
+    drift_ppm: float = Field(0.0, ge=-100_000, le=100_000)
 
 
 class WorldFromLog(Part):
@@ -360,7 +367,7 @@ class TruthJoints(Part):
     format: str | None = None
     unit: Literal["m", "cm", "mm"] | None = None
     axes: Literal["z-up", "y-up", "ned"] | None = None
-    offset_s: float = 0.0  # added to the times of the file: those of a C3D begin at 0
+    offset_s: Seconds = 0.0  # added to the times of the file: those of a C3D begin at 0
 
 
 class Truth(Part):

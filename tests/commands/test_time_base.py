@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from tests.commands.runner import mocap, succeeds
+from tests.commands.runner import mocap, refused, succeeds
 from tests.synthetic.flights import START_NS, SyntheticFlight, film_at, write_flight
 
 # Between two pictures a joint is taken to move in a straight line in the picture. A foot in mid swing is
@@ -139,3 +139,12 @@ def test_outliers_of_still_cameras_are_not_inliers(tmp_path: Path) -> None:
     assert set(nose["views"][::2]) == {3}
     assert set(nose["views"][1::2]) == {4}
     assert nose["reprojection_px"].max() < 1
+
+
+def test_offsets_in_milliseconds_are_refused_before_anything_is_read(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, seconds=0.4)
+    flight.settings["logs"] = {"d1": {"path": "d1.mcap", "clock": {"offset_s": 1.7e12}}}
+    flight.save()
+    line = refused("ingest", flight.manifest)
+    assert "logs.d1.clock.offset_s: is no time in seconds" in line
+    assert "are these ms or ns?" in line
