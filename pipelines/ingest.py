@@ -26,7 +26,7 @@ from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, locked
 from pipelines.session.storage import read_json, write_json
 
-INGEST = Stage("ingest", revision=2)
+INGEST = Stage("ingest", revision=3)
 
 
 @dataclass(frozen=True)

@@ -124,7 +124,7 @@ def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
     if not target.is_dir():
         return
     for folder, _, files in os.walk(target):
-        for name in _OF_SESSIONS.keys() & set(files):
+        for name in filter(files.__contains__, _OF_SESSIONS):
             what, within = _OF_SESSIONS[name], Path(folder).relative_to(target).as_posix()
             problem = f"is {what}" if within == "." else f"holds {what} in {within}"
             raise DataError(target, problem, f"name another folder with {option}")
