@@ -50,7 +50,7 @@ from pipelines.simulation.scenario import DetectorErrors
 if TYPE_CHECKING:
     import pandas as pd
 
-REPLAN_STAGE = Stage("replan", revision=2)
+REPLAN_STAGE = Stage("replan", revision=3)
 
 _HEIGHT_M = 1.75  # of the person, for how large a detector sees them
 _SKELETON = "reconstruct/skeleton.parquet"
@@ -157,6 +157,7 @@ def replan(
             "pictures": len(scene.t_ns[scene.pictures]),
             "joint_frames": {name: entrant.joint_frames for name, entrant in entrants.items()},
             "local_plans": {name: entrant.flown.separation for name, entrant in entrants.items()},
+            "safety": {name: entrant.flown.safety for name, entrant in entrants.items()},
         }
         record = run.publish(counts=counts, warnings=metrics["warnings"])
         _note_planning_times(folder, times)
@@ -254,7 +255,12 @@ def _fly(scene: Scene, arm: str, folder: Path) -> None:
     measured = film_arm(scene, flown, partial(_detect, joints=joints))
     write_table(folder / "trajectories.parquet", trajectories(scene, flown), REPLAN)
     np.save(folder / "known.npy", flown.known)
-    facts: dict[str, object] = {"separation": flown.separation, "seen_share": None, "joint_frames": 0}
+    facts: dict[str, object] = {
+        "separation": flown.separation,
+        "safety": flown.safety,
+        "seen_share": None,
+        "joint_frames": 0,
+    }
     if measured is not None:
         np.save(folder / "error_m.npy", measured.error_m)
         first = JointMotion(scene.t_ns[scene.pictures], joints, measured.first[:, None])
@@ -270,7 +276,7 @@ def _read_entrant(folder: Path) -> Entrant:
     table = read_table(folder / "trajectories.parquet", REPLAN)
     errors = folder / "error_m.npy"
     return Entrant(
-        flown=flight_from(table, np.load(folder / "known.npy"), facts["separation"]),
+        flown=flight_from(table, np.load(folder / "known.npy"), facts["separation"], facts["safety"]),
         error_m=np.load(errors) if errors.exists() else None,
         seen_share=facts["seen_share"],
         joint_frames=facts["joint_frames"],

@@ -50,6 +50,7 @@ class ArmFlight:
     slots: Float  # [N, T, 3] commanded yaw (rad, continuous), tilt (rad), range (m); NaN for what was flown
     known: Bool  # [N, T] False where a log has a gap and the position goes straight on
     separation: dict[str, int]  # local plans by what kept them apart; empty for what the log says
+    safety: dict[str, int]  # local plannings by what was flown (`guard.Flown`); likewise
     central_s: Sequence[float] = ()  # measured planning times, different from run to run
     local_s: Sequence[float] = ()
 
@@ -63,12 +64,12 @@ def logged_arm(scene: Scene, name: str) -> ArmFlight:
     if name == FLOWN:
         position, quaternion, known = scene.flown
         names = tuple(camera.name for camera in scene.flight.cameras)
-        return ArmFlight(names, position, quaternion, np.full_like(position, np.nan), known, {})
+        return ArmFlight(names, position, quaternion, np.full_like(position, np.nan), known, {}, {})
     position, known = planned_positions(scene.flight, scene.t_ns)
     believed = _estimates(scene)
     slots = slot_of(position - believed)
     slots[..., YAW] = np.unwrap(slots[..., YAW], axis=1)
-    return ArmFlight(tuple(scene.flight.planned), position, look_at(position, believed), slots, known, {})
+    return ArmFlight(tuple(scene.flight.planned), position, look_at(position, believed), slots, known, {}, {})
 
 
 def _estimates(scene: Scene) -> Float:
@@ -108,6 +109,7 @@ def fly_arm(scene: Scene, arm: Arm) -> ArmFlight:
         slots=done.slots,
         known=np.ones(done.position.shape[:2], dtype=np.bool_),
         separation=done.separation,
+        safety=done.safety,
         central_s=done.times.central_s,
         local_s=done.times.local_s,
     )
@@ -196,15 +198,17 @@ def seen_joints(scene: Scene, flown: ArmFlight, measured: Measured) -> pd.DataFr
     )
 
 
-def flight_from(table: pd.DataFrame, known: Bool, separation: dict[str, int]) -> ArmFlight:
-    """The flight that `trajectories` stored."""
+def flight_from(
+    table: pd.DataFrame, known: Bool, separation: dict[str, int], safety: dict[str, int]
+) -> ArmFlight:
+    """Rebuild the flight that `trajectories` stored."""
     names = tuple(dict.fromkeys(table["camera"]))
 
     def array(columns: list[str]) -> Float:
         rows = table[columns].to_numpy(np.float64).reshape(-1, len(names), len(columns))
         return np.ascontiguousarray(rows.swapaxes(0, 1))
 
-    return ArmFlight(names, array(_POSITION), array(_QUATERNION), array(_SLOT), known, separation)
+    return ArmFlight(names, array(_POSITION), array(_QUATERNION), array(_SLOT), known, separation, safety)
 
 
 def _rows(values: Float) -> Float:

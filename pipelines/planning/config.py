@@ -11,6 +11,7 @@ from typing import Literal, get_args
 
 from pipelines.planning.local_kernels import Weights
 from pipelines.planning.search_kernels import SlotWeights
+from pipelines.planning.tracking import Flying
 from pipelines.session.errors import DataError
 
 MOST_DRONES = 16
@@ -20,7 +21,7 @@ _SIGNED = ("tilt_deg",)
 _MAY_BE_ZERO = (
     *("w_obs", "w_occ", "w_turn", "w_error", "l_obs", "l_occ", "l_sep", "a_velocity", "a_acceleration"),
     *("speed_floor_mps", "sight_start_m", "k_integral", "actor_noise_m"),
-    *("position_sigma_m", "rotation_sigma_deg"),
+    *("position_sigma_m", "rotation_sigma_deg", "drone_radius_m", "actor_distance_m"),
 )
 _MOST = {
     "yaws": 360,
@@ -90,8 +91,12 @@ class PlannerConfig:
     k_velocity: float = 4.0
     k_integral: float = 0.5
     acceleration_mps2: float = 4.0
-    speed_mps: float = 8.0  # not enforced: what is faster is counted
-    jerk_mps3: float = 50.0  # likewise
+    speed_mps: float = 8.0
+    jerk_mps3: float = 50.0
+
+    # What no drone of an arm ever does.
+    drone_radius_m: float = 0.5  # nearer to an obstacle, or
+    actor_distance_m: float = 3.0  # to the actor
 
     # The actor's estimate.
     actor_sigma_m: float = 0.2  # of the logged position, per axis
@@ -162,6 +167,18 @@ class PlannerConfig:
                     f" between knots: {keeps} to their yaw, state at least {math.ceil(360 / most_deg - 1e-9)}"
                 )
         return told
+
+    def flying(self) -> Flying:
+        """Gains, limits and period of the drones."""
+        return Flying(
+            self.k_position,
+            self.k_velocity,
+            self.k_integral,
+            self.acceleration_mps2,
+            self.jerk_mps3,
+            self.speed_mps,
+            1.0 / self.tracking_hz,
+        )
 
     def slot_weights(self) -> SlotWeights:
         """What the kernels of the formation search take."""

@@ -24,7 +24,7 @@ from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.scene import Scene
 from pipelines.planning.scores import score
 from pipelines.planning.sight import visible
-from pipelines.planning.verdict import verdict
+from pipelines.planning.verdict import broken_limits, verdict
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -60,6 +60,7 @@ def compare(scene: Scene, entrants: Mapping[str, Entrant]) -> dict[str, Any]:
         if name != reference
     ]
     rules, flight = scene.rules, scene.flight
+    broken = [line for name, arm in arms.items() if (line := broken_limits(name, arm, scene.config))]
     return {
         "schema": 1,
         "simulated": True,  # replays are, and every reconstruction error
@@ -78,9 +79,9 @@ def compare(scene: Scene, entrants: Mapping[str, Entrant]) -> dict[str, Any]:
         "intervals": {"level": LEVEL, "errors_over": "trials", "flights_over_stretches_of_s": STRETCH_S},
         "arms": arms,
         "differences": differences,
-        "verdict": _verdict(arms, differences),
+        "verdict": _verdict(arms, differences, broken),
         "notes": list(scene.notes),
-        "warnings": [*scene.warnings, *_warnings(entrants)],
+        "warnings": [*broken, *scene.warnings, *_warnings(entrants)],
     }
 
 
@@ -94,6 +95,7 @@ def _scores(scene: Scene, name: str, entrant: Entrant, shared: Bool | None) -> d
         "simulated": name not in LOGGED,
         "drones": len(flown.position),
         "local_plans": flown.separation or None,
+        "safety": flown.safety or None,
         "reconstruction_error": {
             "simulated": True,
             "mpjpe_mm": _json(common),
@@ -154,11 +156,16 @@ def _hidden(scene: Scene, flown: ArmFlight) -> Float:
     return np.where(seen, 0.0, 1.0)
 
 
-def _verdict(arms: Mapping[str, Mapping[str, Any]], differences: Sequence[Mapping[str, Any]]) -> str:
-    if not differences:
-        return f"{next(iter(arms))} flew alone: there is nothing to compare it with"
-    wanted = next((each for each in differences if each["arm"] == "adaptive"), differences[0])
-    return verdict(wanted["arm"], wanted["against"], arms, wanted)
+def _verdict(
+    arms: Mapping[str, Mapping[str, Any]], differences: Sequence[Mapping[str, Any]], broken: Sequence[str]
+) -> str:
+    """Say what is violated, and then how the arms compare."""
+    if differences:
+        wanted = next((each for each in differences if each["arm"] == "adaptive"), differences[0])
+        said = verdict(wanted["arm"], wanted["against"], arms, wanted)
+    else:
+        said = f"{next(iter(arms))} flew alone: there is nothing to compare it with"
+    return ". ".join([*broken, said])
 
 
 def _warnings(entrants: Mapping[str, Entrant]) -> list[str]:

@@ -15,6 +15,7 @@ from pipelines.planning.config import MOST_DRONES, PlannerConfig
 from pipelines.planning.distance_field import DistanceField
 from pipelines.planning.forecast import ActorFilter, Forecast
 from pipelines.planning.formation import FormationPath, formation_slots, slot_offsets, turned
+from pipelines.planning.guard import Guard
 from pipelines.planning.heading import YawZero
 from pipelines.planning.local import LocalPlanner, Separation
 from pipelines.planning.tracking import Plan
@@ -85,6 +86,8 @@ class Pilot:
         self._formation = FormationPath(np.zeros(1), slots, np.array(config.slot_rates))
         self._plans: list[Plan | None] = [None] * drones
         self._next_central_s = self._next_local_s = -np.inf
+        self.guard: Guard | None = None
+        """Decides what is flown of the local plans, where somebody set it: a replay does."""
         self.times = PlanningTimes([], [])
         self.separation: Counter[Separation] = Counter()
 
@@ -156,5 +159,7 @@ class Pilot:
                 previous=self._plans[i],
             )
             self.times.local_s.append(self._clock() - started)
-            self._plans[i] = made.plan
+            self._plans[i] = (
+                made.plan if self.guard is None else self.guard.admit(i, t_s, made.plan, self._filter, field)
+            )
             self.separation[made.separation] += 1

@@ -15,10 +15,10 @@ from pipelines.planning.arms import Arm
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, open_space
 from pipelines.planning.formation import YAW, slot_of
+from pipelines.planning.guard import Flown, Guard
 from pipelines.planning.local import Separation
 from pipelines.planning.pilot import Pilot, PlanningTimes
 from pipelines.planning.sight import visible
-from pipelines.planning.tracking import Tracker
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -41,6 +41,7 @@ class ReplayResult:
     actor: Float  # [T, 3] the log, interpolated
     estimate: Float  # [T, 3] what the planner believed
     separation: dict[str, int]  # local plans by what kept them apart
+    safety: dict[str, int]  # local plannings by what was flown (`guard.Flown`)
     times: PlanningTimes  # measured, different from run to run
 
     @property
@@ -71,8 +72,8 @@ def replay(
 ) -> ReplayResult:
     """Fly an arm against a log; equal arguments give equal results, but for the measured times.
 
-    The drones start in their slots, at rest. The actor is measured as logged, with `actor_noise_m` added
-    from the seed; nothing sees a later measurement or map than its own time.
+    The drones start in their slots, at rest, and fly what `guard.Guard` admits. The actor is measured as
+    logged, with `actor_noise_m` added from the seed; nothing sees a measurement or map before its time.
 
     Args:
         arm: which slots the cameras take.
@@ -96,7 +97,7 @@ def replay(
     noise = np.random.default_rng(seed).normal(size=measured.shape)
     noisy = measured + config.actor_noise_m * noise
     maps = sorted(fields, key=lambda field: field.from_ns)
-    period_ns, replay_ns = round(1e9 / config.tracking_hz), replay_times(t_ns, config)
+    replay_ns = replay_times(t_ns, config)
     map_at = np.searchsorted([field.from_ns for field in maps], replay_ns, side="right")
     known = [open_space(), *maps]
     taken_in = np.searchsorted(t_ns, replay_ns, side="right")
@@ -104,7 +105,7 @@ def replay(
     pilot = Pilot(arm, config, drones=drones, yaw_rad=yaw_rad, heading_rad=heading_rad, clock=clock)
     pilot.measure(0.0, noisy[0])
     start = pilot.slots_now(0.0)[1]
-    tracker = Tracker(start, np.zeros_like(start), config)
+    guard = pilot.guard = Guard(start, config, exactly=mode == "plan-only")
     shape = (drones, len(replay_ns), 3)
     position, velocity, slots, estimate = (np.empty(s) for s in (shape, shape, shape, shape[1:]))
     done = 1
@@ -113,13 +114,10 @@ def replay(
         for row in range(done, taken_in[k]):
             pilot.measure(log_s[row], noisy[row])
         done = max(done, int(taken_in[k]))
-        command = pilot.step(t_s, tracker.position, tracker.velocity, known[map_at[k]])
-        position[:, k], velocity[:, k] = tracker.position, tracker.velocity
+        command = pilot.step(t_s, guard.position, guard.velocity, known[map_at[k]])
+        position[:, k], velocity[:, k] = guard.position, guard.velocity
         slots[:, k], estimate[k] = command.slots, command.actor
-        if mode == "closed-loop":
-            tracker.step(command.position, command.velocity, command.acceleration)
-        else:
-            tracker.position, tracker.velocity, _ = pilot.reference(t_s + period_ns / 1e9)
+        guard.advance()
 
     truth = np.stack([np.interp(replay_ns, t_ns, measured[:, axis]) for axis in range(3)], axis=-1)
     return ReplayResult(
@@ -134,6 +132,7 @@ def replay(
         actor=truth,
         estimate=estimate,
         separation={kind.value: pilot.separation[kind] for kind in Separation},
+        safety={kind.value: guard.counts[kind] for kind in Flown},
         times=pilot.times,
     )
 

@@ -116,8 +116,9 @@ class Scene:
         return self.actor + slot_offsets(slots)[:, None]
 
     def start_slots_inside(self) -> int:
-        """How many slots of the start stand in an obstacle."""
-        return int((self.field_at_start.sample(self._first_slots()[:, 0])[0] <= 0.0).sum())
+        """Count the slots of the start that are within the drones' radius of an obstacle, or in it."""
+        clearance_m = self.field_at_start.sample(self._first_slots()[:, 0])[0]
+        return int((clearance_m < self.config.drone_radius_m).sum())
 
     @property
     def field_at_start(self) -> DistanceField:
@@ -200,8 +201,8 @@ def _doubts(scene: Scene) -> list[str]:
     inside = scene.start_slots_inside()
     if inside:
         doubts.append(
-            f"{inside} of {scene.drones} drones start inside an obstacle:"
-            " choose another --yaw, --radius or --tilt"
+            f"{inside} of {scene.drones} drones start within {scene.config.drone_radius_m:g} m of an obstacle"
+            " and leave by the shortest way: choose another --yaw, --radius or --tilt"
         )
     doubts += scene.config.out_of_reach()
     if scene.flight.skeleton is None:

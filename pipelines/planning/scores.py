@@ -19,6 +19,7 @@ Scores = dict[str, object]
 
 NEAR_OBSTACLE_M = 15.0
 _MOTION_HZ = 10.0  # speed, acceleration and jerk are means over this period: plans change at 5 Hz
+_ROUNDING = 1.0 + 1e-6  # differences of positions; drones fly at their limits
 _LOOKS_PER_S = 5.0  # how often obstacles near the slots are looked for
 
 
@@ -44,7 +45,8 @@ def score(
     Returns:
         JSON-able: degrees and metres by name; None where there is nothing to count (no pair of drones,
         no obstacle at all, never near one). `limit_violations` counts episodes per drone (per pair for
-        separation).
+        separation): in an obstacle (`collision`), within `drone_radius_m` of one (`clearance`), within
+        `actor_distance_m` of the actor (`actor`), and beyond the other limits of the configuration.
         `predicted_error_m` is sqrt(tr S) of the ray model over the times at which two free views or more
         determine it, `undetermined_share` the share of the others.
     """
@@ -59,9 +61,13 @@ def score(
     determined = np.isfinite(error)
     motion = _motion(t_s, position)
     limits = {"speed": config.speed_mps, "acceleration": config.acceleration_mps2, "jerk": config.jerk_mps3}
-    violations = {name: _episodes(motion[name] > limit) for name, limit in limits.items()}
-    violations["separation"] = _episodes(apart < config.separation_m) if pairs else 0
-    violations["collision"] = _episodes(clearance <= 0.0)
+    violations = {
+        "collision": _episodes(clearance <= 0.0),
+        "clearance": _episodes(clearance < config.drone_radius_m),
+        "actor": _episodes(slots[..., RANGE] < config.actor_distance_m),
+        "separation": _episodes(apart < config.separation_m) if pairs else 0,
+        **{name: _episodes(motion[name] > limit * _ROUNDING) for name, limit in limits.items()},
+    }
     return {
         "tilt_deg": {
             "mean": float(tilt_deg.mean()),

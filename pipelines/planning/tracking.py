@@ -1,17 +1,34 @@
-"""Flying a plan: what it asks for at a time, and a point mass that a PID keeps on it."""
+"""Flying a plan: its reference at a time, and a point mass that a PID keeps on it within its limits.
+
+The acceleration is a = a_reference + k_p e + k_v e' + k_i integral of e. Each plan starts from where the
+drone is, so that errors restart small at 5 Hz: without the reference's acceleration a drone would fly less
+than half of every planned turn. Acceleration, jerk and speed keep to their limits by construction:
+
+    |a| <= A        by shortening
+    |a - a_before| <= J period      both ends lie in the ball |a| <= A, so every point between them does
+    |v + a LOOKAHEAD_S| <= V        by turning the acceleration before the speed is reached
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.compilation import cached
-from pipelines.planning.config import PlannerConfig
+from pipelines.geometry.compilation import cached, helper
 
 Float = NDArray[np.float64]
+
+POSITION, VELOCITY, ACCELERATION, INTEGRAL = range(4)
+"""Rows of a drone's state [4, 3]: m, m/s, m/s^2, and the integral of the position error in m s."""
+
+_LOOKAHEAD_S = 0.25  # longer than the change of acceleration from limit to limit takes (0.16 s by default)
+_BRAKING_PER_S = 3.0  # deceleration over speed in the end of a stop
+_STOPPED_MPS = 1e-3
+_LONGEST_MARGIN_S = 3.5  # of a stop: the exponential end from 1.3 m/s to 1 mm/s takes 2.4 s
 
 
 @dataclass(frozen=True)
@@ -33,90 +50,139 @@ class Plan:
         return position, velocity, acceleration
 
 
-class Tracker:
-    """Point masses that follow references: PID on the position and velocity, the acceleration limited.
+class Flying(NamedTuple):
+    """How a drone follows a plan: the gains of its PID, the limits that it keeps, and its period."""
 
-    a = a_reference + k_p e + k_v e' + k_i integral of e, at most `acceleration_mps2` long. Each plan starts
-    from where the drone is, so that errors restart small at 5 Hz: without the reference's acceleration a
-    drone would fly less than half of every planned turn.
+    k_position: float
+    k_velocity: float
+    k_integral: float
+    acceleration_mps2: float
+    jerk_mps3: float
+    speed_mps: float
+    period_s: float
 
-    Args:
-        position: [N, 3] metres at the start.
-        velocity: [N, 3] m/s at the start.
-        config: gains, limit and rate.
-    """
 
-    def __init__(self, position: Float, velocity: Float, config: PlannerConfig) -> None:
-        self.position, self.velocity = position.copy(), velocity.copy()
-        self._integral = np.zeros_like(position)
-        self._config = config
-
-    def step(self, position: Float, velocity: Float, acceleration: Float) -> None:
-        """Fly one period towards references [N, 3]."""
-        c = self._config
-        _advance(
-            self.position,
-            self.velocity,
-            self._integral,
-            position,
-            velocity,
-            acceleration,
-            (c.k_position, c.k_velocity, c.k_integral),
-            c.acceleration_mps2,
-            1.0 / c.tracking_hz,
-        )
+@helper
+def _reference(
+    path: Float, start_velocity: Float, h: float, after_s: float, x: Float, v: Float, a: Float
+) -> None:
+    """Position, velocity and acceleration [3] that a plan asks for at one time."""
+    last = path.shape[0] - 1
+    k = min(max(int(after_s / h), 0), last - 1)
+    u = after_s / h - k
+    for axis in range(3):
+        p0, p1 = path[k, axis], path[k + 1, axis]
+        m0 = start_velocity[axis] * h if k == 0 else (p1 - path[k - 1, axis]) / 2.0
+        m1 = p1 - p0 if k + 1 == last else (path[k + 2, axis] - p0) / 2.0
+        if u > 1.0:
+            x[axis], v[axis], a[axis] = p1 + (u - 1.0) * m1, m1 / h, 0.0
+            continue
+        c3, c2 = 2.0 * (p0 - p1) + m0 + m1, 3.0 * (p1 - p0) - 2.0 * m0 - m1
+        x[axis] = ((c3 * u + c2) * u + m0) * u + p0
+        v[axis] = ((3.0 * c3 * u + 2.0 * c2) * u + m0) / h
+        a[axis] = (6.0 * c3 * u + 2.0 * c2) / (h * h)
 
 
 @cached
 def _evaluate(
     path: Float, start_velocity: Float, h: float, after_s: Float, x: Float, v: Float, a: Float
 ) -> None:
-    last = path.shape[0] - 1
     for p in range(after_s.size):
-        k = min(max(int(after_s[p] / h), 0), last - 1)
-        u = after_s[p] / h - k
-        for axis in range(3):
-            p0, p1 = path[k, axis], path[k + 1, axis]
-            m0 = start_velocity[axis] * h if k == 0 else (p1 - path[k - 1, axis]) / 2.0
-            m1 = p1 - p0 if k + 1 == last else (path[k + 2, axis] - p0) / 2.0
-            if u > 1.0:
-                x[p, axis], v[p, axis], a[p, axis] = p1 + (u - 1.0) * m1, m1 / h, 0.0
-                continue
-            c3, c2 = 2.0 * (p0 - p1) + m0 + m1, 3.0 * (p1 - p0) - 2.0 * m0 - m1
-            x[p, axis] = ((c3 * u + c2) * u + m0) * u + p0
-            v[p, axis] = ((3.0 * c3 * u + 2.0 * c2) * u + m0) / h
-            a[p, axis] = (6.0 * c3 * u + 2.0 * c2) / (h * h)
+        _reference(path, start_velocity, h, after_s[p], x[p], v[p], a[p])
+
+
+@helper
+def _shorten(vector: Float, longest: float) -> bool:
+    """Keep the direction of [3], and the length within `longest`; True if it was longer."""
+    length = math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    if length <= longest:
+        return False
+    vector *= longest / length
+    return True
+
+
+@helper
+def _fly(wanted: Float, flying: Flying, state: Float, following: Float) -> bool:
+    """Fly one period, accelerated by `wanted` [3] or as near to it as limits allow; True if they did not."""
+    shortened = _shorten(wanted, flying.acceleration_mps2)
+    faster = state[VELOCITY] + wanted * _LOOKAHEAD_S
+    if _shorten(faster, flying.speed_mps):
+        shortened = True
+        wanted[:] = (faster - state[VELOCITY]) / _LOOKAHEAD_S
+        _shorten(wanted, flying.acceleration_mps2)
+    change = wanted - state[ACCELERATION]
+    _shorten(change, flying.jerk_mps3 * flying.period_s)
+    a, dt = state[ACCELERATION] + change, flying.period_s
+    following[POSITION] = state[POSITION] + state[VELOCITY] * dt + a * (dt * dt / 2.0)
+    following[VELOCITY] = state[VELOCITY] + a * dt
+    following[ACCELERATION] = a
+    return shortened
 
 
 @cached
-def _advance(
-    x: Float,
-    v: Float,
-    integral: Float,
-    wanted_x: Float,
-    wanted_v: Float,
-    wanted_a: Float,
-    gains: tuple[float, float, float],
-    limit: float,
-    dt: float,
-) -> None:
-    a = np.zeros(3)
-    for i in range(x.shape[0]):
-        length = 0.0
-        for axis in range(3):
-            error = wanted_x[i, axis] - x[i, axis]
-            integral[i, axis] += error * dt
-            a[axis] = (
-                wanted_a[i, axis]
-                + gains[0] * error
-                + gains[1] * (wanted_v[i, axis] - v[i, axis])
-                + gains[2] * integral[i, axis]
-            )
-            length += a[axis] ** 2
-        length = math.sqrt(length)
-        scale = 1.0 if length <= limit else limit / length
-        for axis in range(3):
-            if scale < 1.0:  # what cannot be flown must not pile up
-                integral[i, axis] -= (wanted_x[i, axis] - x[i, axis]) * dt
-            x[i, axis] += v[i, axis] * dt + scale * a[axis] * dt * dt / 2.0
-            v[i, axis] += scale * a[axis] * dt
+def roll_out(
+    path: Float,
+    start_velocity: Float,
+    step_s: float,
+    after_s: float,
+    ticks: int,
+    exactly: bool,
+    flying: Flying,
+    states: Float,
+) -> int:
+    """Follow a plan for some periods and then brake to a stop.
+
+    Args:
+        path: [N + 1, 3] m, of the plan, as the next two.
+        start_velocity: [3] m/s.
+        step_s: between its waypoints.
+        after_s: how long after the start of the plan the drone is in its first state.
+        ticks: for how many periods the plan is followed.
+        exactly: be where the plan is, whatever that takes, in place of tracking it.
+        flying: gains, limits and period.
+        states: [K + 1, 4, 3]; the first is where the drone is, the others are written.
+
+    Returns:
+        The row at which the drone stands still; all that follow are like it.
+    """
+    x, v, a, wanted = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    braking = min(_BRAKING_PER_S, 0.5 * flying.jerk_mps3 / flying.acceleration_mps2)
+    last = states.shape[0] - 1
+    for k in range(last):
+        state, following = states[k], states[k + 1]
+        following[:] = state
+        if k < ticks:
+            now_s = after_s + (k + 1 if exactly else k) * flying.period_s
+            _reference(path, start_velocity, step_s, now_s, x, v, a)
+            if exactly:
+                following[POSITION], following[VELOCITY], following[ACCELERATION] = x, v, a
+                _shorten(following[ACCELERATION], flying.acceleration_mps2)
+                continue
+            for axis in range(3):
+                error = x[axis] - state[POSITION, axis]
+                following[INTEGRAL, axis] += error * flying.period_s
+                wanted[axis] = (
+                    a[axis]
+                    + flying.k_position * error
+                    + flying.k_velocity * (v[axis] - state[VELOCITY, axis])
+                    + flying.k_integral * following[INTEGRAL, axis]
+                )
+            if _fly(wanted, flying, state, following):  # what cannot be flown must not pile up
+                following[INTEGRAL] = state[INTEGRAL]
+            continue
+        wanted[:] = -braking * state[VELOCITY]
+        _fly(wanted, flying, state, following)
+        following[INTEGRAL] = 0.0
+        if np.sum(following[VELOCITY] ** 2) < _STOPPED_MPS**2:
+            following[VELOCITY] = 0.0
+            following[ACCELERATION] = 0.0
+            for rest in range(k + 2, last + 1):
+                states[rest] = following
+            return k + 1
+    return int(last)
+
+
+def stopping_ticks(flying: Flying) -> int:
+    """Periods that any stop takes at most."""
+    slow_s = flying.speed_mps / flying.acceleration_mps2 + flying.acceleration_mps2 / flying.jerk_mps3
+    return math.ceil((slow_s + _LONGEST_MARGIN_S) / flying.period_s)

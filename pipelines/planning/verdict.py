@@ -1,9 +1,11 @@
-"""One plain sentence: whether the first arm is better than the second, as far as that can be told."""
+"""Plain sentences: which limits an arm violates, and whether the first arm is better than the second."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
+
+from pipelines.planning.config import PlannerConfig
 
 _ALIKE_DEG = 2.0  # tilts that differ by less are not worth a word
 _ALIKE_PERCENT = 1.0  # of the joints, likewise
@@ -23,6 +25,32 @@ def verdict(
     return (
         f"{_about_tilt(arm, against, arms)}; {_about_error(difference)}{_about_coverage(arm, against, arms)}"
     )
+
+
+def broken_limits(arm: str, scores: Mapping[str, Any], config: PlannerConfig) -> str | None:
+    """Name every limit that an arm violates, and how often; None if it keeps all of them.
+
+    Args:
+        arm: its name.
+        scores: of the arm, as they stand in metrics.json.
+        config: the limits.
+    """
+    kinds = {
+        "collision": "collides with an obstacle",
+        "clearance": f"comes within {config.drone_radius_m:g} m of an obstacle",
+        "actor": f"comes within {config.actor_distance_m:g} m of the actor",
+        "separation": f"has two drones within {config.separation_m:g} m of each other",
+        "speed": f"flies faster than {config.speed_mps:g} m/s",
+        "acceleration": f"accelerates by more than {config.acceleration_mps2:g} m/s^2",
+        "jerk": f"has a jerk of more than {config.jerk_mps3:g} m/s^3",
+    }
+    counts = scores["limit_violations"]
+    said = [f"{words} ({_times(counts[kind])})" for kind, words in kinds.items() if counts.get(kind)]
+    return f"{arm} {', '.join(said)}" if said else None
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
 
 
 def _about_tilt(arm: str, against: str, arms: Mapping[str, Mapping[str, Any]]) -> str:

@@ -1,0 +1,396 @@
+"""Replayed flights through random worlds: `python -m benchmarks.worlds [--count N] [--write FILE]`.
+
+Every world has a seed: walls down to one voxel thick, boxes, forests, hills, overhangs, and starts beside
+obstacles; 2, 3 or 5 drones; all arms. The map is made of voxels, and flights are checked against the analytic
+surfaces that the voxels were made from. All simulated. The command fails if a drone touches anything, comes
+below the ground or breaks a limit, or if flights that were safe before have become worse by more than 5 %:
+`worlds_before.json` holds the flights of commit 890a2c4, made by running this file there with `--write`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.distance_field import DistanceField, distance_field
+from pipelines.planning.formation import formation_slots, slot_offsets
+from pipelines.planning.replay import replay
+from pipelines.planning.scores import predicted_errors, score
+from pipelines.session.records import Occupancy
+from pipelines.session.registries import PLANNER_ARMS
+
+Float = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+ARMS = ("fixed", "adaptive", "covariance", "greedy")
+KINDS = ("wall", "boxes", "forest", "hills", "overhang", "beside")
+COUNT = 300
+BEFORE = Path(__file__).with_name("worlds_before.json")
+WORSE = 1.05  # at most, of what flights that were safe before had
+
+_SECONDS, _HIPS_M = 12.0, 1.0
+_SIZE_M, _HIGH_M = 52.0, 16.0
+_CLEAR_OF_ACTOR_M = 2.0  # obstacles keep as far from the actor's way
+_CLEAR_OF_START_M = 0.8  # and from the drones' first slots, but for `beside`
+_BESIDE_M = (0.1, 1.0)  # how near to a first slot an obstacle stands there
+_FINE = 4  # looks at the analytic surfaces between two tracking steps
+_MOST_ERROR_M = 2.0  # what an undetermined position counts as
+_CONFIG = PlannerConfig()
+
+
+class Solid(Protocol):
+    """Something that drones must not touch."""
+
+    def distance(self, points: Float) -> Float:
+        """Signed distances [...] in metres from points [..., 3] to its surface, negative inside."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box on edge or lying, turned about the vertical."""
+
+    centre: tuple[float, float, float]
+    half: tuple[float, float, float]
+    yaw_rad: float = 0.0
+
+    def distance(self, points: Float) -> Float:
+        """The exact distance."""
+        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        away = points - np.array(self.centre)
+        x, y = c * away[..., 0] + s * away[..., 1], c * away[..., 1] - s * away[..., 0]
+        over = np.abs(np.stack([x, y, away[..., 2]], axis=-1)) - np.array(self.half)
+        outside = np.linalg.norm(np.maximum(over, 0.0), axis=-1)
+        return np.asarray(outside + np.minimum(over.max(axis=-1), 0.0))
+
+
+@dataclass(frozen=True)
+class Tree:
+    """A trunk and a round crown."""
+
+    east_north: tuple[float, float]
+    height_m: float
+    crown_m: float
+
+    def distance(self, points: Float) -> Float:
+        """The exact distance outside of it."""
+        level = np.linalg.norm(points[..., :2] - np.array(self.east_north), axis=-1)
+        top = self.height_m - self.crown_m
+        trunk = np.hypot(np.maximum(level - 0.4, 0.0), np.maximum(points[..., 2] - top, 0.0))
+        crown = np.hypot(level, points[..., 2] - top) - self.crown_m
+        inside = (level < 0.4) & (points[..., 2] < top)
+        nearest: Float = np.minimum(np.where(inside, -0.1, trunk), crown)
+        return nearest
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The ground at height 0 with Gaussian hills."""
+
+    hills: tuple[tuple[float, float, float, float], ...] = ()  # east, north, sigma, height
+
+    def height(self, east: Float, north: Float) -> Float:
+        """Metres above the plain."""
+        total = np.zeros(np.broadcast(east, north).shape)
+        for x, y, sigma, high in self.hills:
+            total = total + high * np.exp(-((east - x) ** 2 + (north - y) ** 2) / (2 * sigma**2))
+        return total
+
+    def distance(self, points: Float) -> Float:
+        """A lower bound of the distance outside with the right sign: the gap over the steepest slope."""
+        slope = sum(high / sigma * np.exp(-0.5) for _, _, sigma, high in self.hills)
+        gap = points[..., 2] - self.height(points[..., 0], points[..., 1])
+        return np.asarray(gap / np.sqrt(1.0 + slope**2))
+
+
+@dataclass(frozen=True)
+class World:
+    """One world with a flight through it."""
+
+    seed: int
+    kind: str
+    drones: int
+    yaw_rad: float
+    resolution_m: float
+    actor_t_ns: Int64
+    actor: Float  # [A, 3]
+    ground: Ground
+    solids: tuple[Solid, ...]
+
+    def distance(self, points: Float) -> Float:
+        """Analytic signed distance [...] to whatever is nearest."""
+        solids = (self.ground, *self.solids)
+        nearest: Float = np.minimum.reduce([solid.distance(points) for solid in solids])
+        return nearest
+
+    def field(self) -> DistanceField:
+        """The planner's map: a voxel is occupied if its centre is inside of something."""
+        side = self.resolution_m
+        count = (round(_SIZE_M / side), round(_SIZE_M / side), round(_HIGH_M / side))
+        origin = np.append(self.actor[:, :2].mean(axis=0) - _SIZE_M / 2, -2 * side)
+        x, y, z = (origin[a] + side * (np.arange(count[a]) + 0.5) for a in range(3))
+        flat = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+        occupied = np.empty(count, dtype=np.float32)
+        for k, level in enumerate(z):  # a layer at a time: all at once takes 0.5 GB
+            points = np.concatenate([flat, np.full((*flat.shape[:2], 1), level)], axis=-1)
+            occupied[..., k] = self.distance(points) < 0
+        return distance_field(Occupancy(occupied, origin, side))
+
+    def first_slots(self) -> Float:
+        """[N, 3] where the drones start."""
+        slots = formation_slots(
+            np.array(self.yaw_rad), self.drones, tilt_rad=_CONFIG.tilt_rad, range_m=_CONFIG.radius_m
+        )
+        places: Float = self.actor[0] + slot_offsets(slots)
+        return places
+
+
+def world_of(seed: int) -> World:
+    """The world of a seed; equal seeds give equal worlds."""
+    rng = np.random.default_rng([2026, seed])
+    kind = KINDS[seed % len(KINDS)]
+    t_s, way = _walk(rng)
+    world = World(
+        seed=seed,
+        kind=kind,
+        drones=(2, 3, 5)[seed // len(KINDS) % 3],
+        yaw_rad=float(rng.uniform(-np.pi, np.pi)),
+        resolution_m=(0.5, 0.4, 0.5, 0.25)[seed // (3 * len(KINDS)) % 4],
+        actor_t_ns=(t_s * 1e9).astype(np.int64),
+        actor=np.column_stack([way, np.full(len(way), _HIPS_M)]),
+        ground=Ground(),
+        solids=(),
+    )
+    while kind == "hills":
+        ground = Ground(_hills(rng, way))
+        actor = np.column_stack([way, ground.height(way[:, 0], way[:, 1]) + _HIPS_M])
+        world = replace(world, ground=ground, actor=actor)
+        if ground.distance(world.first_slots()).min() >= _CLEAR_OF_START_M:
+            break
+    wanted = {"wall": 3, "boxes": 6, "forest": 14, "hills": 2, "overhang": 3, "beside": 2}[kind]
+    solids: list[Solid] = []
+    if kind == "beside":
+        solids.append(_beside(rng, world))
+    for _ in range(200):
+        if len(solids) == wanted:
+            break
+        solid = _solid(rng, world)
+        if solid.distance(world.actor).min() < _CLEAR_OF_ACTOR_M:
+            continue
+        if solid.distance(world.first_slots()).min() < _CLEAR_OF_START_M:
+            continue
+        solids.append(solid)
+    return replace(world, solids=tuple(solids))
+
+
+def _walk(rng: np.random.Generator) -> tuple[Float, Float]:
+    """Times [A] s and a way [A, 2] m that bends, walked or jogged, with a stop in some."""
+    t_s = np.arange(0.0, _SECONDS + 1e-9, 0.1)
+    speed = np.full(len(t_s), rng.uniform(0.8, 2.5))
+    if rng.random() < 0.2:
+        speed *= np.clip(np.abs(t_s - rng.uniform(4, 8)) - 1.0, 0.0, 1.0)
+    heading = rng.uniform(-np.pi, np.pi) + np.cumsum(rng.normal(0, 0.06, len(t_s)))
+    steps = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1) * 0.1
+    return t_s, np.cumsum(steps, axis=0)
+
+
+def _hills(rng: np.random.Generator, way: Float) -> tuple[tuple[float, float, float, float], ...]:
+    """Hills beside the way."""
+    found = []
+    for _ in range(rng.integers(1, 4)):
+        sigma = rng.uniform(2.5, 5.0)
+        place = way[rng.integers(len(way))] + rng.uniform(-12, 12, 2)
+        found.append((float(place[0]), float(place[1]), float(sigma), float(rng.uniform(2.0, 7.0))))
+    return tuple(found)
+
+
+def _solid(rng: np.random.Generator, world: World) -> Solid:
+    """Something of the world's kind, somewhere about the actor's way."""
+    place = world.actor[rng.integers(len(world.actor)), :2] + rng.uniform(-13, 13, 2)
+    east, north = float(place[0]), float(place[1])
+    yaw = float(rng.uniform(0, np.pi))
+    kind = world.kind
+    if kind in ("hills", "beside"):
+        kind = str(rng.choice(["wall", "boxes", "forest"]))
+    if kind == "wall":
+        thick = world.resolution_m * float(rng.choice([1.0, 1.0, 2.0, 4.0]))
+        high, long = float(rng.uniform(3, 12)), float(rng.uniform(4, 16))
+        return Box((east, north, high / 2), (long / 2, thick / 2, high / 2), yaw)
+    if kind == "boxes":
+        a, b, c = (float(side) for side in rng.uniform([1, 1, 2], [5, 5, 10]))
+        return Box((east, north, c / 2), (a / 2, b / 2, c / 2), yaw)
+    if kind == "forest":
+        crown = float(rng.uniform(0.8, 2.0))
+        return Tree((east, north), float(rng.uniform(3 + crown, 8)), crown)
+    low, thick = float(rng.uniform(3.0, 7.0)), float(rng.choice([1.0, 2.0, 4.0])) * world.resolution_m
+    a, b = (float(side) for side in rng.uniform(3, 9, 2))
+    return Box((east, north, low + thick / 2), (a / 2, b / 2, thick / 2), yaw)
+
+
+def _beside(rng: np.random.Generator, world: World) -> Solid:
+    """A wall so near to the first slot of one drone that it may lie within the drone's radius."""
+    slot = world.first_slots()[rng.integers(world.drones)]
+    thick = world.resolution_m * float(rng.choice([1.0, 2.0]))
+    high, long = float(rng.uniform(4, 10)), float(rng.uniform(2, 6))
+    away = slot[:2] - world.actor[0, :2]
+    yaw = float(np.arctan2(away[1], away[0]) + np.pi / 2)
+    gap = float(rng.uniform(*_BESIDE_M)) + thick / 2
+    place = slot[:2] + away / np.linalg.norm(away) * (gap if rng.random() < 0.7 else -gap)
+    return Box((float(place[0]), float(place[1]), high / 2), (long / 2, thick / 2, high / 2), yaw)
+
+
+def fly(seed: int, arms: Sequence[str] = ARMS) -> list[dict[str, Any]]:
+    """All arms through one world: what each flight did, measured on the analytic surfaces."""
+    world = world_of(seed)
+    field = world.field()
+    rows = []
+    for name in arms:
+        result = replay(
+            PLANNER_ARMS.get(name),
+            world.actor_t_ns,
+            world.actor,
+            [field],
+            config=_CONFIG,
+            drones=world.drones,
+            yaw_rad=world.yaw_rad,
+        )
+        place = _finely(result.position)
+        slots_now = world.actor[0] + (result.position[:, 0] - result.actor[0])
+        figures = score(result.t_s, result.position, result.actor, field, _CONFIG)
+        error = np.minimum(predicted_errors(result.position, result.actor, field, _CONFIG), _MOST_ERROR_M)
+        broken = figures["limit_violations"]
+        assert isinstance(broken, dict)
+        away = np.linalg.norm(result.position - result.actor, axis=-1)
+        rows.append(
+            {
+                "seed": seed,
+                "arm": name,
+                "kind": world.kind,
+                "drones": world.drones,
+                "clearance_m": float(world.distance(place).min()),
+                "first_m": float(world.distance(slots_now).min()),
+                "ground_m": float((place[..., 2] - world.ground.height(place[..., 0], place[..., 1])).min()),
+                "actor_m": float(away.min()),
+                "farthest_m": float(away[:, -1].max()),
+                "limits": {key: broken[key] for key in ("speed", "acceleration", "jerk", "separation")},
+                "tilt_deg": float(np.degrees(result.tilt_rad).mean()),
+                "hidden": float(1.0 - result.visible.mean()),
+                "error_m": float(error.mean()),
+                "safety": getattr(result, "safety", {}),
+            }
+        )
+    return rows
+
+
+def _finely(position: Float) -> Float:
+    """[N, S, 3] the path with further points between its steps."""
+    share = (np.arange(_FINE) / _FINE)[:, None]
+    start, end = position[:, :-1, None], position[:, 1:, None]
+    between = start + share * (end - start)
+    return np.concatenate([between.reshape(len(position), -1, 3), position[:, -1:]], axis=1)
+
+
+def is_safe(row: dict[str, Any]) -> bool:
+    """Nothing touched, all limits kept."""
+    return row["clearance_m"] > 0 and row["ground_m"] > 0 and not sum(row["limits"].values())
+
+
+def main() -> None:
+    """Fly, print the tables, and exit with 1 if anything is not as it must be."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first world (default 0)")
+    parser.add_argument("--count", type=int, default=COUNT, help=f"worlds (default {COUNT})")
+    parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
+    parser.add_argument("--write", type=Path, help="store the flights here, and check nothing")
+    arguments = parser.parse_args()
+    seeds = range(arguments.first, arguments.first + arguments.count)
+    rows = list(flown(seeds, arguments.workers))
+    if arguments.write:
+        keep = ("seed", "arm", "clearance_m", "ground_m", "limits", "tilt_deg", "hidden", "error_m")
+        short = [{key: _rounded(row[key]) for key in keep} for row in rows]
+        arguments.write.write_text("[\n" + ",\n".join(map(json.dumps, short)) + "\n]\n", encoding="utf-8")
+        return
+    trouble = report(rows, json.loads(BEFORE.read_text(encoding="utf-8")))
+    for line in trouble:
+        print(f"FAIL: {line}")
+    sys.exit(1 if trouble else 0)
+
+
+def flown(seeds: Iterable[int], workers: int) -> Iterable[dict[str, Any]]:
+    """The flights of some worlds, in the order of their seeds."""
+    if workers == 1:
+        for seed in seeds:
+            yield from fly(seed)
+        return
+    with ProcessPoolExecutor(workers) as pool:
+        for rows in pool.map(partial(fly), seeds):
+            yield from rows
+
+
+def report(rows: list[dict[str, Any]], before: list[dict[str, Any]]) -> list[str]:
+    """Print what the flights did, and say what is not as it must be."""
+    old = {(row["seed"], row["arm"]): row for row in before}
+    pairs = [(row, old[row["seed"], row["arm"]]) for row in rows if (row["seed"], row["arm"]) in old]
+    trouble = []
+    header = ("arm", "flights", "touched", "touched before", "nearest m", "limits broken", "nearest actor m")
+    print("| " + " | ".join([*header, "tilt", "hidden", "predicted error"]) + " |")
+    print("|" + " --- |" * 10)
+    for arm in (*ARMS, "all"):
+        of = [pair for pair in pairs if arm in (pair[0]["arm"], "all")]
+        if not of:
+            continue
+        now = [row for row, _ in of]
+        safe = [pair for pair in of if is_safe(pair[1])]
+        ratios = {key: _ratio(safe, key) for key in ("tilt_deg", "hidden", "error_m")}
+        cells = [
+            arm,
+            len(of),
+            sum(row["clearance_m"] <= 0 for row in now),
+            sum(was["clearance_m"] <= 0 for _, was in of),
+            f"{min(row['clearance_m'] for row in now):.2f}",
+            sum(sum(row["limits"].values()) > 0 for row in now),
+            f"{min(row['actor_m'] for row in now):.2f}",
+            *(f"{ratio:.3f}" for ratio in ratios.values()),
+        ]
+        print("| " + " | ".join(map(str, cells)) + " |")
+        trouble += [
+            f"{arm}: {key} is {ratio:.3f} of before in {len(safe)} flights that were safe"
+            for key, ratio in ratios.items()
+            if ratio > WORSE
+        ]
+    print("Ratios are of means over the flights that were safe before.")
+    for row in rows:
+        what = f"world {row['seed']} ({row['kind']}), {row['arm']}"
+        if row["clearance_m"] <= 0:
+            trouble.append(f"{what}: a drone touches something, {row['clearance_m']:.2f} m")
+        if row["ground_m"] <= 0:
+            trouble.append(f"{what}: a drone is below the ground")
+        broken = {key: count for key, count in row["limits"].items() if count}
+        if broken:
+            trouble.append(f"{what}: limits broken: {broken}")
+        if row["actor_m"] < _CONFIG.actor_distance_m:
+            trouble.append(f"{what}: {row['actor_m']:.2f} m from the actor")
+    return trouble
+
+
+def _ratio(pairs: list[tuple[dict[str, Any], dict[str, Any]]], key: str) -> float:
+    now, was = (float(np.mean([pair[k][key] for pair in pairs])) if pairs else 0.0 for k in (0, 1))
+    return now / was if was else float(now > 0) + 1.0
+
+
+def _rounded(value: object) -> object:
+    return round(value, 4) if isinstance(value, float) else value
+
+
+if __name__ == "__main__":
+    main()

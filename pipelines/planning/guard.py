@@ -1,0 +1,333 @@
+"""What keeps replayed drones out of obstacles, away from each other and from the actor.
+
+Invariant: every drone has a committed motion that ends at rest, keeps `drone_radius_m` from the map and
+`separation_m` from the committed motions of all others. A new plan is flown only if following it until the
+next one, and braking to a stop from there, keeps the invariant. Otherwise the drone follows the last plan
+that does, climbs, gives way, or goes on with its committed motion, which is braking. By induction no drone
+ever leaves free space, whatever the planner asks for. Three cases cannot be promised and are reported by
+`scores`: an actor who walks at a drone, a map that changes, a start inside the radius.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.compilation import cached
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.distance_field import DistanceField
+from pipelines.planning.field_kernels import Grid, interpolate
+from pipelines.planning.forecast import ActorFilter
+from pipelines.planning.tracking import (
+    POSITION,
+    VELOCITY,
+    Plan,
+    roll_out,
+    stopping_ticks,
+)
+
+Float = NDArray[np.float64]
+
+_CHECK_S = 0.05  # motions are checked as often, and every half voxel
+_ROUNDING_M = 1e-6
+_INSIDE_M = 1e-3  # who is nearer to an obstacle by more than this leaves first
+_DEEPER_M = 0.1  # ways out end this much beyond the radius
+_CLIMB_MPS = 2.0
+_ASIDE_MPS = 1.5
+_SETTLING_S = 0.5  # in which a drone takes up another velocity
+_WINDOW_M = 4.0  # in which a way out is looked for at first
+
+
+class Flown(StrEnum):
+    """What a drone flies after a local planning."""
+
+    PLANNED = "planned"
+    PREVIOUS = "previous"  # the plan before
+    CLIMBED = "climbed"
+    GAVE_WAY = "gave_way"  # sideways, or away from the actor
+    BRAKED = "braked"
+    LEFT = "left"  # an obstacle that was within its radius, by the shortest way
+    UNSAFE = "unsafe"  # nothing keeps all distances; what comes nearest to it
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """A motion that ends at rest, and how near it comes."""
+
+    kind: Flown
+    plan: Plan
+    states: Float  # [K + 1, 4, 3], see `tracking`
+    clearance_m: float
+    separation_m: float
+    actor_m: float
+
+
+class Guard:
+    """The drones of one replayed flight: flies what is safe of the planner's wishes.
+
+    Args:
+        position: [N, 3] m, where the drones are at rest.
+        config: distances, limits, gains and rates.
+        exactly: drones are exactly where plans are (`plan-only`). Limits of acceleration and jerk are those
+            of the plans then, and nothing keeps them.
+    """
+
+    def __init__(self, position: Float, config: PlannerConfig, *, exactly: bool = False) -> None:
+        self._config, self._flying, self._exactly = config, config.flying(), exactly
+        self._ticks = math.ceil(config.tracking_hz / config.local_hz - 1e-9)
+        rows = self._ticks + stopping_ticks(self._flying) + 1
+        self._states = np.zeros((len(position), rows, 4, 3))
+        self._states[:, :, POSITION] = position[:, None]
+        self._age = np.zeros(len(position), dtype=np.int64)  # periods since a drone's motion was committed
+        self._last: list[Plan | None] = [None] * len(position)
+        self.counts: Counter[Flown] = Counter()
+
+    @property
+    def position(self) -> Float:
+        """[N, 3] m, world."""
+        return self._now(POSITION)
+
+    @property
+    def velocity(self) -> Float:
+        """[N, 3] m/s."""
+        return self._now(VELOCITY)
+
+    def advance(self) -> None:
+        """Fly one period."""
+        self._age = np.minimum(self._age + 1, self._states.shape[1] - 1)
+
+    def admit(self, drone: int, t_s: float, plan: Plan, actor: ActorFilter, field: DistanceField) -> Plan:
+        """Commit a drone to the best safe motion.
+
+        Args:
+            drone: which.
+            t_s: now.
+            plan: what the local planner wants, from here and now.
+            actor: for where the actor will be.
+            field: what stands around.
+
+        Returns:
+            The plan that is flown.
+        """
+        others = self._others(drone)
+        after_s = self._flying.period_s * np.arange(self._states.shape[1], dtype=np.float64)
+        actor_path = actor.forecast(t_s + after_s)
+        here = self._states[drone, self._age[drone]]
+        least = self._least(here, others, actor_path[0], field)
+        tried = []
+        for motion in self._motions(drone, t_s, plan, actor_path, others, field):
+            tried.append(motion)
+            if _shortfall(motion, least) == (0.0, 0.0, 0.0):
+                chosen = motion
+                break
+        else:
+            chosen = min(tried, key=lambda motion: _shortfall(motion, least))
+        safe = _shortfall(chosen, least) == (0.0, 0.0, 0.0)
+        self.counts[chosen.kind if safe else Flown.UNSAFE] += 1
+        self._last[drone] = chosen.plan if chosen.kind in (Flown.PLANNED, Flown.PREVIOUS) else None
+        self._states[drone], self._age[drone] = chosen.states, 0
+        return chosen.plan
+
+    def _now(self, row: int) -> Float:
+        now: Float = self._states[np.arange(len(self._age)), self._age, row]
+        return now
+
+    def _others(self, drone: int) -> Float:
+        """[M, K + 1, 3] where the other drones are committed to be from now on."""
+        rows = np.arange(self._states.shape[1])
+        return np.stack(
+            [
+                self._states[j, np.minimum(self._age[j] + rows, rows[-1]), POSITION]
+                for j in range(len(self._age))
+                if j != drone
+            ]
+            or [np.empty((len(rows), 3))]
+        )[: len(self._age) - 1]
+
+    def _least(
+        self, here: Float, others: Float, actor: Float, field: DistanceField
+    ) -> tuple[float, float, float]:
+        """Distances to map, drones and actor that must be kept: the stated ones, or what there is now."""
+        config, place = self._config, here[POSITION]
+        now = (
+            float(field.sample(place)[0]),
+            float(np.linalg.norm(others[:, 0] - place, axis=-1).min(initial=np.inf)),
+            float(np.linalg.norm(actor - place)),
+        )
+        # The actor's estimate errs by about the log's noise.
+        stated = (
+            wanted_clearance_m(config, field.grid),
+            config.separation_m,
+            config.actor_distance_m + config.actor_sigma_m if config.actor_distance_m else 0.0,
+        )
+        map_m, drones_m, actor_m = (
+            min(one, other) - _ROUNDING_M for one, other in zip(stated, now, strict=True)
+        )
+        return map_m, drones_m, actor_m
+
+    def _motions(
+        self, drone: int, t_s: float, plan: Plan, actor: Float, others: Float, field: DistanceField
+    ) -> Iterator[_Motion]:
+        """Motions from the best to the last resort."""
+        here = self._states[drone, self._age[drone]]
+
+        def follow(kind: Flown, followed: Plan) -> _Motion:
+            states = np.empty_like(self._states[drone])
+            states[0] = here
+            exactly = self._exactly and followed is plan
+            stopped = roll_out(
+                followed.path,
+                followed.velocity,
+                followed.step_s,
+                t_s - followed.start_s,
+                self._ticks,
+                exactly,
+                self._flying,
+                states,
+            )
+            return self._measured(kind, followed, states, stopped, actor, others, field)
+
+        place = here[POSITION]
+        if float(field.sample(place)[0]) < wanted_clearance_m(self._config, field.grid) - _INSIDE_M:
+            wanted_m = wanted_clearance_m(self._config, field.grid) + _DEEPER_M
+            goal = nearest_free(field, place, wanted_m)
+            if goal is not None:
+                yield follow(Flown.LEFT, self._towards(t_s, here, goal))
+        yield follow(Flown.PLANNED, plan)
+        previous = self._last[drone]
+        if previous is not None:
+            yield follow(Flown.PREVIOUS, previous)
+        for kind, velocity in self._ways_out(here, actor[0], field):
+            yield follow(kind, self._steered(t_s, here, velocity))
+        rows = np.minimum(self._age[drone] + np.arange(self._states.shape[1]), self._states.shape[1] - 1)
+        committed = self._states[drone, rows]
+        stopped = self._states.shape[1] - 1
+        braked = self._plan_of(t_s, committed)
+        yield self._measured(Flown.BRAKED, braked, committed, stopped, actor, others, field)
+
+    def _ways_out(self, here: Float, actor: Float, field: DistanceField) -> list[tuple[Flown, Float]]:
+        """Velocities to take up: up, up and off what is near, aside, away from the actor."""
+        up = np.array([0.0, 0.0, _CLIMB_MPS])
+        level = field.sample(here[POSITION])[1] * [1.0, 1.0, 0.0]
+        off = level / max(float(np.linalg.norm(level)), 1e-9) * _ASIDE_MPS
+        away = (here[POSITION] - actor) * [1.0, 1.0, 0.0]
+        away = away / max(float(np.linalg.norm(away)), 1e-9) * _CLIMB_MPS
+        return [
+            (Flown.CLIMBED, up),
+            (Flown.CLIMBED, up + off),
+            (Flown.GAVE_WAY, away + up / 2.0),
+        ]
+
+    def _measured(
+        self,
+        kind: Flown,
+        plan: Plan,
+        states: Float,
+        stopped: int,
+        actor: Float,
+        others: Float,
+        field: DistanceField,
+    ) -> _Motion:
+        """How near a motion comes; the actor counts until the drone stands, after that they move on."""
+        place = states[:, POSITION]
+        apart = np.linalg.norm(others - place, axis=-1).min(initial=np.inf)
+        until = slice(0, stopped + 1)
+        return _Motion(
+            kind,
+            plan,
+            states,
+            least_clearance(field.grid, states, stopped, self._flying.period_s),
+            float(apart),
+            float(np.linalg.norm(actor[until] - place[until], axis=-1).min()),
+        )
+
+    def _steered(self, t_s: float, here: Float, velocity: Float) -> Plan:
+        """A plan that takes up a velocity [3] m/s."""
+        after = self._waypoint_times()
+        share = _SETTLING_S * (1.0 - np.exp(-after / _SETTLING_S))
+        path = here[POSITION] + velocity * (after - share) + here[VELOCITY] * share
+        return Plan(t_s, path, here[VELOCITY].copy(), self._config.waypoint_s)
+
+    def _towards(self, t_s: float, here: Float, goal: Float) -> Plan:
+        """A plan that goes straight to a point [3] and stays there."""
+        way = goal - here[POSITION]
+        length = max(float(np.linalg.norm(way)), 1e-9)
+        after = self._waypoint_times()
+        gone = np.minimum(_ASIDE_MPS * np.maximum(after - _SETTLING_S, 0.0), length)
+        path = here[POSITION] + way / length * gone
+        return Plan(t_s, path, here[VELOCITY].copy(), self._config.waypoint_s)
+
+    def _plan_of(self, t_s: float, states: Float) -> Plan:
+        """The plan that other drones see of a motion that is committed already."""
+        every = max(round(self._config.waypoint_s * self._config.tracking_hz), 1)
+        rows = np.minimum(every * np.arange(self._config.waypoints + 1), len(states) - 1)
+        return Plan(t_s, states[rows, POSITION], states[0, VELOCITY].copy(), self._config.waypoint_s)
+
+    def _waypoint_times(self) -> Float:
+        """[N + 1, 1] s, from the start of a plan."""
+        config = self._config
+        return config.waypoint_s * np.arange(config.waypoints + 1, dtype=np.float64)[:, None]
+
+
+def wanted_clearance_m(config: PlannerConfig, grid: Grid) -> float:
+    """The value of the distance field at which a drone keeps its radius from all that is occupied.
+
+    The field says how far the face of the nearest voxel is, as if seen along an axis. Corners are farther out
+    by 0.37 voxels, and trilinear interpolation errs by about a tenth: half a voxel covers both.
+    """
+    return config.drone_radius_m + grid.resolution_m / 2.0
+
+
+def nearest_free(field: DistanceField, point: Float, wanted_m: float) -> Float | None:
+    """The centre [3] of the nearest voxel that is `wanted_m` from obstacles or farther; None without one."""
+    grid = field.grid
+    size = np.array(grid.distance_m.shape)
+    middle = np.floor((point - grid.origin) / grid.resolution_m).astype(np.int64)
+    reach = math.ceil(_WINDOW_M / grid.resolution_m)
+    while True:
+        low, high = np.clip(middle - reach, 0, size - 1), np.clip(middle + reach + 1, 1, size)
+        part = grid.distance_m[tuple(slice(*ends) for ends in zip(low, high, strict=True))]
+        free = np.argwhere(part >= wanted_m)
+        if len(free):
+            centres = grid.origin + grid.resolution_m * (low + free + 0.5)
+            away = np.linalg.norm(centres - point, axis=1)
+            # Outside of the window voxels may be nearer than in its corners.
+            if away.min() <= reach * grid.resolution_m or ((low == 0).all() and (high == size).all()):
+                nearest: Float = centres[int(away.argmin())]
+                return nearest
+        elif (low == 0).all() and (high == size).all():
+            return None
+        reach *= 2
+
+
+@cached
+def least_clearance(grid: Grid, states: Float, last: int, period_s: float) -> float:
+    """The least distance to obstacles along a motion [K + 1, 4, 3] up to a row.
+
+    Looked at every 0.05 s or every half voxel, whichever is finer, straight between two rows.
+    """
+    least = math.inf
+    for k in range(last + 1):
+        x, y, z = states[k, 0, 0], states[k, 0, 1], states[k, 0, 2]
+        if k == last:
+            return float(min(least, interpolate(grid, x, y, z)[0]))
+        dx, dy, dz = states[k + 1, 0, 0] - x, states[k + 1, 0, 1] - y, states[k + 1, 0, 2] - z
+        moved = math.sqrt(dx * dx + dy * dy + dz * dz)
+        pieces = max(math.ceil(period_s / _CHECK_S), math.ceil(2.0 * moved / grid.resolution_m), 1)
+        for piece in range(pieces):
+            u = piece / pieces
+            least = min(least, interpolate(grid, x + u * dx, y + u * dy, z + u * dz)[0])
+    return float(least)
+
+
+def _shortfall(motion: _Motion, least: Sequence[float]) -> tuple[float, float, float]:
+    """By how much a motion comes too near to the map, to drones and to the actor; 0 where it does not."""
+    found = (motion.clearance_m, motion.separation_m, motion.actor_m)
+    map_m, drones_m, actor_m = (max(wanted - got, 0.0) for wanted, got in zip(least, found, strict=True))
+    return map_m, drones_m, actor_m
