@@ -40,7 +40,8 @@ _INSIDE_M = 1e-3  # who is nearer to an obstacle by more than this leaves first
 _DEEPER_M = 0.1  # ways out end this much beyond the radius
 _CLIMB_MPS = 2.0
 _ASIDE_MPS = 1.5
-_SETTLING_S = 0.5  # in which a drone takes up another velocity
+_CHANGE_SHARE = 0.75  # of the largest acceleration, with which a drone takes up another velocity
+_ACTOR_AHEAD_S = 2.0  # so far ahead plans keep away from where the actor will be
 _WINDOW_M = 4.0  # in which a way out is looked for at first
 
 
@@ -102,6 +103,10 @@ class Guard:
         """Fly one period."""
         self._age = np.minimum(self._age + 1, self._states.shape[1] - 1)
 
+    def committed(self) -> list[Float]:
+        """The motion of each drone from now on, [K, 4, 3], which ends at rest."""
+        return [states[age:] for states, age in zip(self._states, self._age, strict=True)]
+
     def admit(self, drone: int, t_s: float, plan: Plan, actor: ActorFilter, field: DistanceField) -> Plan:
         """Commit a drone to the best safe motion.
 
@@ -140,15 +145,9 @@ class Guard:
 
     def _others(self, drone: int) -> Float:
         """[M, K + 1, 3] where the other drones are committed to be from now on."""
-        rows = np.arange(self._states.shape[1])
-        return np.stack(
-            [
-                self._states[j, np.minimum(self._age[j] + rows, rows[-1]), POSITION]
-                for j in range(len(self._age))
-                if j != drone
-            ]
-            or [np.empty((len(rows), 3))]
-        )[: len(self._age) - 1]
+        drones, rows = np.arange(len(self._age)), np.arange(self._states.shape[1])
+        ahead = np.minimum(self._age[:, None] + rows, rows[-1])
+        return np.asarray(np.delete(self._states[drones[:, None], ahead, POSITION], drone, axis=0))
 
     def _least(
         self, here: Float, others: Float, actor: Float, field: DistanceField
@@ -191,42 +190,48 @@ class Guard:
                 self._flying,
                 states,
             )
-            return self._measured(kind, followed, states, stopped, actor, others, field)
+            return self._measured(kind, t_s, followed, states, stopped, actor, others, field)
 
         place = here[POSITION]
         if float(field.sample(place)[0]) < wanted_clearance_m(self._config, field.grid) - _INSIDE_M:
             wanted_m = wanted_clearance_m(self._config, field.grid) + _DEEPER_M
             goal = nearest_free(field, place, wanted_m)
             if goal is not None:
-                yield follow(Flown.LEFT, self._towards(t_s, here, goal))
+                way = goal - place
+                length = float(np.linalg.norm(way))
+                speed = min(_ASIDE_MPS, 2.0 * length)  # no farther than the goal within a second
+                yield follow(Flown.LEFT, self._steered(t_s, here, way * (speed / max(length, 1e-9))))
         yield follow(Flown.PLANNED, plan)
         previous = self._last[drone]
         if previous is not None:
             yield follow(Flown.PREVIOUS, previous)
-        for kind, velocity in self._ways_out(here, actor[0], field):
+        for kind, velocity in self._ways_out(here, actor, field):
             yield follow(kind, self._steered(t_s, here, velocity))
         rows = np.minimum(self._age[drone] + np.arange(self._states.shape[1]), self._states.shape[1] - 1)
         committed = self._states[drone, rows]
         stopped = self._states.shape[1] - 1
         braked = self._plan_of(t_s, committed)
-        yield self._measured(Flown.BRAKED, braked, committed, stopped, actor, others, field)
+        yield self._measured(Flown.BRAKED, t_s, braked, committed, stopped, actor, others, field)
 
     def _ways_out(self, here: Float, actor: Float, field: DistanceField) -> list[tuple[Flown, Float]]:
-        """Velocities to take up: up, up and off what is near, aside, away from the actor."""
+        """Velocities to take up: up, up and off what is near, and away from the actor, faster than they."""
         up = np.array([0.0, 0.0, _CLIMB_MPS])
         level = field.sample(here[POSITION])[1] * [1.0, 1.0, 0.0]
         off = level / max(float(np.linalg.norm(level)), 1e-9) * _ASIDE_MPS
-        away = (here[POSITION] - actor) * [1.0, 1.0, 0.0]
-        away = away / max(float(np.linalg.norm(away)), 1e-9) * _CLIMB_MPS
+        pace_mps = float(np.linalg.norm(actor[1] - actor[0])) / self._flying.period_s
+        away = (here[POSITION] - actor[0]) * [1.0, 1.0, 0.0]
+        away *= (pace_mps + _CLIMB_MPS) / max(float(np.linalg.norm(away)), 1e-9)
         return [
             (Flown.CLIMBED, up),
             (Flown.CLIMBED, up + off),
             (Flown.GAVE_WAY, away + up / 2.0),
+            (Flown.GAVE_WAY, away),
         ]
 
     def _measured(
         self,
         kind: Flown,
+        t_s: float,
         plan: Plan,
         states: Float,
         stopped: int,
@@ -234,33 +239,31 @@ class Guard:
         others: Float,
         field: DistanceField,
     ) -> _Motion:
-        """How near a motion comes; the actor counts until the drone stands, after that they move on."""
-        place = states[:, POSITION]
-        apart = np.linalg.norm(others - place, axis=-1).min(initial=np.inf)
-        until = slice(0, stopped + 1)
+        """Measure how near a motion comes to the map and to drones, and its plan to the actor.
+
+        Standing still is no way to keep away from somebody who walks: there the plan counts, not the stop.
+        """
+        apart = np.linalg.norm(others - states[:, POSITION], axis=-1).min(initial=np.inf)
+        after_s = self._flying.period_s * np.arange(0, len(actor), self._ticks, dtype=np.float64)
+        near = after_s <= _ACTOR_AHEAD_S
+        asked = plan.at(t_s + after_s[near])[0]
         return _Motion(
             kind,
             plan,
             states,
             least_clearance(field.grid, states, stopped, self._flying.period_s),
             float(apart),
-            float(np.linalg.norm(actor[until] - place[until], axis=-1).min()),
+            float(np.linalg.norm(actor[:: self._ticks][near] - asked, axis=-1).min()),
         )
 
     def _steered(self, t_s: float, here: Float, velocity: Float) -> Plan:
-        """A plan that takes up a velocity [3] m/s."""
+        """A plan that takes up a velocity [3] m/s with a constant acceleration."""
         after = self._waypoint_times()
-        share = _SETTLING_S * (1.0 - np.exp(-after / _SETTLING_S))
-        path = here[POSITION] + velocity * (after - share) + here[VELOCITY] * share
-        return Plan(t_s, path, here[VELOCITY].copy(), self._config.waypoint_s)
-
-    def _towards(self, t_s: float, here: Float, goal: Float) -> Plan:
-        """A plan that goes straight to a point [3] and stays there."""
-        way = goal - here[POSITION]
-        length = max(float(np.linalg.norm(way)), 1e-9)
-        after = self._waypoint_times()
-        gone = np.minimum(_ASIDE_MPS * np.maximum(after - _SETTLING_S, 0.0), length)
-        path = here[POSITION] + way / length * gone
+        change = velocity - here[VELOCITY]
+        until = float(np.linalg.norm(change)) / (_CHANGE_SHARE * self._config.acceleration_mps2)
+        share = np.minimum(after, until)
+        gained = change * (share**2 / (2.0 * max(until, 1e-9)) + after - share)
+        path = here[POSITION] + here[VELOCITY] * after + gained
         return Plan(t_s, path, here[VELOCITY].copy(), self._config.waypoint_s)
 
     def _plan_of(self, t_s: float, states: Float) -> Plan:

@@ -45,7 +45,7 @@ def occupied_share(field: DistanceField, camera: Float, actor: Float, *, start_m
 
 
 def _flat(points: Float) -> Float:
-    return np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+    return np.array(points, dtype=np.float64, order="C").reshape(-1, 3)  # broadcast arrays are no memory
 
 
 @cached

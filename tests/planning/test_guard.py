@@ -1,0 +1,254 @@
+"""The invariant that keeps replayed drones safe, whatever plans ask for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from benchmarks.worlds import fly, is_safe, world_of
+from pipelines.planning.arms import ADAPTIVE, FIXED
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.distance_field import DistanceField, distance_field, open_space
+from pipelines.planning.forecast import ActorFilter
+from pipelines.planning.guard import Flown, Guard, least_clearance, nearest_free, wanted_clearance_m
+from pipelines.planning.replay import replay
+from pipelines.planning.scores import score
+from pipelines.planning.tracking import Plan
+from pipelines.session.records import Occupancy
+from tests.planning.worlds import walker
+
+Float = NDArray[np.float64]
+CONFIG = PlannerConfig()
+TICKS = round(CONFIG.tracking_hz / CONFIG.local_hz)
+
+
+def boulders(seed: int, side_m: float = 0.5) -> DistanceField:
+    """A box of 20 x 20 x 10 m with random boulders of one voxel to three."""
+    rng = np.random.default_rng(seed)
+    occupied = np.zeros([round(length / side_m) for length in (20, 20, 10)], dtype=np.float32)
+    for corner in rng.integers(0, occupied.shape, (25, 3)):
+        size = rng.integers(1, 4, 3)
+        occupied[tuple(slice(c, c + s) for c, s in zip(corner, size, strict=True))] = 1
+    return distance_field(Occupancy(occupied, np.array([-10.0, -10.0, 0.0]), side_m))
+
+
+def slab(thick_m: float, side_m: float) -> DistanceField:
+    """A wall across y = 0, 40 m wide and 8 m high."""
+    across, along, high = (round(length / side_m) for length in (40.0, 20.0, 12.0))
+    y = side_m * (np.arange(along) + 0.5) - 10.0
+    z = side_m * (np.arange(high) + 0.5)
+    occupied = np.broadcast_to(((y >= 0) & (y < thick_m))[:, None] & (z < 8.0), (across, along, high))
+    return distance_field(Occupancy(occupied.astype(np.float32), np.array([-20.0, -10.0, 0.0]), side_m))
+
+
+def someone_at(*places: tuple[float, Float]) -> ActorFilter:
+    actor = ActorFilter(q=CONFIG.actor_q, sigma_m=CONFIG.actor_sigma_m)
+    for t_s, place in places:
+        actor.measure(t_s, place)
+    return actor
+
+
+FAR_AWAY = someone_at((0.0, np.array([500.0, 0.0, 0.0])))
+
+
+def free_places(field: DistanceField, count: int, rng: np.random.Generator) -> Float:
+    """[count, 3] random places that keep all distances."""
+    found: list[Float] = []
+    while len(found) < count:
+        place = rng.uniform([-10, -10, 1], [10, 10, 9])
+        clear = field.sample(place)[0] >= wanted_clearance_m(CONFIG, field.grid)
+        if clear and all(np.linalg.norm(place - other) >= CONFIG.separation_m for other in found):
+            found.append(place)
+    return np.array(found)
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 2**31), side_m=st.sampled_from([0.25, 0.5]), drones=st.integers(1, 4))
+def test_drones_can_always_stop_in_free_space_whatever_plans_ask_for(
+    seed: int, side_m: float, drones: int
+) -> None:
+    """Random plans through boulders: what is flown keeps the distances, and so does every committed stop."""
+    rng = np.random.default_rng(seed)
+    field = boulders(seed, side_m)
+    guard = Guard(free_places(field, drones, rng), CONFIG)
+    wanted_m = wanted_clearance_m(CONFIG, field.grid) - 1e-5
+    flown, motion = [guard.position], []
+    for turn in range(25):
+        for drone in range(drones):
+            steps = rng.normal(0, rng.uniform(0.2, 3.0), (21, 3))
+            path = guard.position[drone] + np.cumsum(steps, axis=0) - steps[0]
+            guard.admit(
+                drone, 0.2 * turn, Plan(0.2 * turn, path, guard.velocity[drone], 0.5), FAR_AWAY, field
+            )
+        for drone, states in enumerate(guard.committed()):
+            assert (states[-1, 1:3] == 0).all()
+            assert least_clearance(field.grid, states, len(states) - 1, 0.02) >= wanted_m
+            motion.append((drone, states[0, 0]))
+        ways = np.stack([states[:, 0] for states in guard.committed()])
+        apart = np.linalg.norm(ways[:, None] - ways[None], axis=-1)
+        assert apart[~np.eye(drones, dtype=bool)].min(initial=np.inf) >= CONFIG.separation_m - 1e-5
+        for _ in range(TICKS):
+            guard.advance()
+            flown.append(guard.position)
+    path = np.stack(flown, axis=1)  # [N, T, 3]
+    finely = np.concatenate(
+        [path[:, :-1] + u * np.diff(path, axis=1) for u in (0.0, 0.25, 0.5, 0.75)], axis=1
+    )
+    assert field.sample(finely)[0].min() >= wanted_m
+    assert guard.counts[Flown.UNSAFE] == 0
+    assert guard.counts.total() == 25 * drones
+
+
+@pytest.mark.parametrize(("thick_m", "side_m"), [(0.25, 0.25), (0.5, 0.5), (1.0, 0.25)])
+def test_a_slot_behind_a_wall_is_reached_over_it(thick_m: float, side_m: float) -> None:
+    """The plan leads straight through; its waypoints, 2.5 m apart, lie on both sides of the wall."""
+    field = slab(thick_m, side_m)
+    guard = Guard(np.array([[0.0, -6.0, 3.0]]), CONFIG)
+    path = []
+    for turn in range(60):
+        here = guard.position[0]
+        way = np.array([0.0, 6.0, here[2]]) - here
+        ahead = np.minimum(5.0 * 0.5 * np.arange(21), np.linalg.norm(way))
+        straight = here + way / np.linalg.norm(way) * ahead[:, None]
+        guard.admit(0, 0.2 * turn, Plan(0.2 * turn, straight, guard.velocity[0], 0.5), FAR_AWAY, field)
+        for _ in range(TICKS):
+            path.append(guard.position[0])
+            guard.advance()
+    assert field.sample(np.array(path))[0].min() >= CONFIG.drone_radius_m
+    assert guard.counts[Flown.CLIMBED] > 0
+    assert np.array(path)[:, 2].max() > 8.0 + CONFIG.drone_radius_m
+    assert np.array(path)[-1, 1] > thick_m
+
+
+def test_distances_of_the_field_hold_to_the_corners_of_voxels() -> None:
+    """Where the field has the value of `wanted_clearance_m`, voxels (cubes) are at least a radius away."""
+    for side_m in (0.1, 0.25, 0.5):
+        field = boulders(3, side_m)
+        points = np.random.default_rng(1).uniform([-10, -10, 0], [10, 10, 10], (300_000, 3))
+        near = points[np.abs(field.sample(points)[0] - wanted_clearance_m(CONFIG, field.grid)) < 0.02]
+        centres = field.grid.origin + side_m * (np.argwhere(field.grid.distance_m < 0) + 0.5)
+        assert len(near) > 100
+        for point in near[:400]:
+            over = np.maximum(np.abs(centres - point) - side_m / 2, 0.0)
+            assert np.linalg.norm(over, axis=1).min() >= CONFIG.drone_radius_m - 0.02
+
+
+@pytest.mark.parametrize("depth_m", [0.3, -0.2])  # in the wall, and within the radius of it
+def test_who_starts_too_near_leaves_by_the_shortest_way(depth_m: float) -> None:
+    """The wall is 4 m thick; its near face is at y = 0. The way out is straight back, never deeper."""
+    field = slab(4.0, 0.25)
+    start = np.array([[0.1, depth_m, 3.0]])
+    guard = Guard(start, CONFIG)
+    wanted_m = wanted_clearance_m(CONFIG, field.grid)
+    ahead = start[0] + np.array([0.0, 1.0, 0.0]) * np.linspace(0, 20, 21)[:, None]
+    path = [guard.position[0]]
+    for turn in range(15):
+        guard.admit(0, 0.2 * turn, Plan(0.2 * turn, ahead, guard.velocity[0], 0.5), FAR_AWAY, field)
+        for _ in range(TICKS):
+            guard.advance()
+            path.append(guard.position[0])
+    flown = np.array(path)
+    assert guard.counts[Flown.LEFT] > 0
+    clearance = field.sample(flown)[0]
+    out = int(np.flatnonzero(clearance >= wanted_m)[0])
+    assert (np.diff(clearance[: out + 1]) > -1e-3).all()
+    assert clearance[out:].min() >= wanted_m - 1e-3
+    assert np.linalg.norm(flown[: out + 1, [0, 2]] - start[0, [0, 2]], axis=1).max() < 0.25  # one voxel aside
+
+
+def test_the_nearest_free_voxel_is_the_nearest_of_all() -> None:
+    field = boulders(5)
+    rng = np.random.default_rng(2)
+    grid = field.grid
+    free = np.argwhere(grid.distance_m >= 1.0)
+    centres = grid.origin + grid.resolution_m * (free + 0.5)
+    for point in rng.uniform([-14, -14, -3], [14, 14, 13], (50, 3)):
+        found = nearest_free(field, point, 1.0)
+        assert found is not None
+        assert np.linalg.norm(found - point) == pytest.approx(np.linalg.norm(centres - point, axis=1).min())
+    full = distance_field(Occupancy(np.ones((4, 4, 4), np.float32), np.zeros(3), 0.5))
+    assert nearest_free(full, np.ones(3), 1.0) is None
+
+
+def test_a_drone_in_the_way_of_somebody_who_walks_gives_way() -> None:
+    """They walk at 1.5 m/s straight through where the drone wants to hover, at hip height."""
+    config = replace(CONFIG, actor_noise_m=0.0)
+    place = np.array([0.0, 0.0, 1.5])
+    guard = Guard(place[None], config)
+    actor = ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m)
+    nearest = np.inf
+    for turn in range(80):
+        t_s = 0.2 * turn
+        hips = np.array([-12.0 + 1.5 * t_s, 0.0, 1.0])
+        actor.measure(t_s, hips)
+        hover = Plan(t_s, np.tile(place, (21, 1)), guard.velocity[0], 0.5)
+        guard.admit(0, t_s, hover, actor, open_space())
+        for k in range(TICKS):
+            away = guard.position[0] - (hips + np.array([1.5 * 0.02 * k, 0.0, 0.0]))
+            nearest = min(nearest, float(np.linalg.norm(away)))
+            guard.advance()
+    assert nearest >= config.actor_distance_m
+    assert guard.counts[Flown.GAVE_WAY] + guard.counts[Flown.CLIMBED] > 0
+
+
+def test_a_map_that_comes_late_is_left_and_reported() -> None:
+    """From 4 s on the map says that both drones are in a block of concrete: the scores say so."""
+    stamps, hips = walker(8.0, 0.01)
+    start = replay(FIXED, stamps, hips, [], config=CONFIG, drones=1).position[0, 0]
+    side_m = 0.5
+    occupied = np.zeros((80, 80, 40), dtype=np.float32)
+    origin = np.array([-20.0, -20.0, -2.0])
+    low, high = ((start + way - origin) // side_m for way in (-1.5, 1.5))
+    occupied[tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))] = 1
+    late = distance_field(Occupancy(occupied, origin, side_m, from_ns=4_000_000_000))
+    result = replay(FIXED, stamps, hips, [late], config=CONFIG, drones=1)
+    assert result.safety[Flown.LEFT] > 0
+    figures = score(result.t_s, result.position, result.actor, late, CONFIG)
+    violations = figures["limit_violations"]
+    assert isinstance(violations, dict)
+    assert violations["collision"] == violations["clearance"] == 1
+    assert late.sample(result.position[0, -1])[0] >= CONFIG.drone_radius_m
+
+
+def test_plans_that_are_flown_exactly_do_not_pass_through_walls_either() -> None:
+    field = slab(0.5, 0.5)
+    stamps, hips = walker(20.0, 1.0)
+    hips = hips + np.array([-8.0, -7.0, 0.0])
+    result = replay(FIXED, stamps, hips, [field], config=CONFIG, drones=2, mode="plan-only")
+    assert field.sample(result.position)[0].min() >= CONFIG.drone_radius_m
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 5, 17, 23, 27, 32])
+def test_random_worlds_are_flown_without_touching_anything(seed: int) -> None:
+    """A slice of `benchmarks.worlds`: forest, hills, walls, and starts beside obstacles."""
+    for row in fly(seed, arms=("adaptive", "greedy")):
+        assert is_safe(row), row
+        voxel_m = world_of(seed).resolution_m  # surfaces lie within half a voxel of those of the map
+        assert row["clearance_m"] >= min(CONFIG.drone_radius_m, row["first_m"] - voxel_m / 2), row
+        assert row["actor_m"] >= CONFIG.actor_distance_m, row
+
+
+def test_worlds_are_those_of_their_seeds() -> None:
+    assert {world_of(seed).kind for seed in range(12)} == {
+        *("wall", "boxes", "forest", "hills", "overhang", "beside")
+    }
+    first, again = world_of(7), world_of(7)
+    points = np.random.default_rng(0).uniform(-20, 20, (500, 3))
+    assert np.array_equal(first.distance(points), again.distance(points))
+    assert first.field().grid.distance_m.tobytes() == again.field().grid.distance_m.tobytes()
+
+
+def test_the_adaptive_arm_that_fell_through_a_wall_before_does_not() -> None:
+    """A wall of one voxel, 12 m high, between the first slot and where the formation turns to."""
+    field = slab(0.25, 0.25)
+    stamps, hips = walker(25.0, 1.2)
+    hips = hips + np.array([-14.0, -8.0, 0.0])
+    for arm in (ADAPTIVE, FIXED):
+        result = replay(arm, stamps, hips, [field], config=CONFIG, drones=3, yaw_rad=np.radians(-90))
+        assert field.sample(result.position)[0].min() >= CONFIG.drone_radius_m
