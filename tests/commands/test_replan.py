@@ -117,11 +117,16 @@ def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_better(mound: 
     # The sentence and the table speak of the same joints.
     in_the_table = arms["adaptive"]["mpjpe_mm"] - arms["fixed"]["mpjpe_mm"]
     assert against_fixed["mpjpe_mm"]["mean"] == pytest.approx(in_the_table)
-    assert metrics["verdict"].startswith("adaptive keeps the tilt at ")
+    # What is violated stands first: the ring, that is flown, goes through the mound.
+    first, then = metrics["verdict"].split(". ", 1)
+    assert metrics["warnings"][0] == first
+    assert first.startswith("flown collides with an obstacle")
+    assert then.startswith("adaptive keeps the tilt at ")
     assert "smaller (simulated)" in metrics["verdict"]
     for name in ("adaptive", "fixed"):
         violations = arms[name]["limit_violations"]
-        assert violations["collision"] == violations["separation"] == 0
+        assert set(violations.values()) == {0}
+        assert sum(arms[name]["safety"].values()) == sum(arms[name]["local_plans"].values()) > 0
 
 
 def test_what_is_stored(mound: Path) -> None:
@@ -311,7 +316,11 @@ def test_what_the_map_and_the_log_leave_open_is_said(tmp_path: Path) -> None:
     said = " | ".join(metrics["warnings"])
     assert "the map does not cover" in said
     assert "not measured 1 times for more than 1 s" in said
-    assert "1 of 2 drones start inside an obstacle" in said
+    assert "1 of 2 drones start within 0.5 m of an obstacle" in said
+    for arm in (metrics["arms"][name] for name in ("adaptive", "fixed")):  # told, left, and said first
+        assert arm["limit_violations"]["collision"] == arm["limit_violations"]["clearance"] == 1
+        assert arm["safety"]["left"] > 0
+    assert metrics["warnings"][0].startswith("adaptive collides with an obstacle (once)")
 
 
 def test_a_real_map_is_loaded_and_flown_in(tmp_path: Path) -> None:

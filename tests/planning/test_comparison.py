@@ -13,7 +13,8 @@ from pipelines.planning.comparison import (
     mpjpe_mm,
     stretches,
 )
-from pipelines.planning.verdict import verdict
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.verdict import broken_limits, verdict
 
 
 def test_the_interval_of_a_mean_is_that_of_the_normal_distribution() -> None:
@@ -131,3 +132,27 @@ def test_the_verdict_in_words(
     own: dict[str, object], other: dict[str, object], error: object, said: str
 ) -> None:
     assert verdict("a", "b", {"a": own, "b": other}, {"mpjpe_mm": error}) == said
+
+
+def test_every_limit_that_is_violated_is_named_with_its_number() -> None:
+    config = PlannerConfig(drone_radius_m=0.4, speed_mps=7.5)
+    kept = dict.fromkeys(
+        ("collision", "clearance", "actor", "separation", "speed", "acceleration", "jerk"), 0
+    )
+    assert broken_limits("a", {"limit_violations": kept}, config) is None
+    for kind, number in {
+        "clearance": "0.4 m",
+        "actor": "3 m",
+        "separation": "3 m",
+        "speed": "7.5 m/s",
+        "acceleration": "4 m/s^2",
+        "jerk": "50 m/s^3",
+    }.items():
+        said = broken_limits("a", {"limit_violations": {**kept, kind: 2}}, config)
+        assert said is not None
+        assert number in said
+        assert said.startswith("a ")
+        assert said.endswith("(2 times)")
+    collided = broken_limits("a", {"limit_violations": {**kept, "jerk": 1, "collision": 1}}, config)
+    assert collided is not None
+    assert collided.index("collides") < collided.index("jerk")

@@ -35,7 +35,7 @@ def test_a_still_formation_in_the_open() -> None:
     assert figures["undetermined_share"] == 0
     assert figures["max_speed_mps"] == pytest.approx(0)
     assert figures["limit_violations"] == dict.fromkeys(
-        ("speed", "acceleration", "jerk", "separation", "collision"), 0
+        ("speed", "acceleration", "jerk", "separation", "collision", "clearance", "actor"), 0
     )
     assert figures["min_separation_m"] == pytest.approx(10 * np.cos(np.radians(30)) * np.sqrt(2))
     # cos gamma = cos^2 30 cos 90 + sin^2 30 = 1/4; 91 % of the joints are placed at 30 deg.
@@ -71,7 +71,7 @@ def test_what_the_wall_hides_and_who_flies_into_it() -> None:
     assert figures["undetermined_share"] == pytest.approx(behind.mean())
     assert figures["min_clearance_m"] == pytest.approx(-1.0, abs=0.5)  # the wall covers y = 6.5 to 9.5
     assert isinstance(figures["limit_violations"], dict)
-    assert figures["limit_violations"]["collision"] == 1
+    assert figures["limit_violations"]["collision"] == figures["limit_violations"]["clearance"] == 1
     assert figures["tilt_deg"] == pytest.approx({"mean": 0, "max": 0, "near_obstacle": 0}, abs=1e-9)
 
 
@@ -86,6 +86,17 @@ def test_one_drone_has_no_pairs_and_two_in_one_place_are_too_near() -> None:
     figures = score(T_S, together, actor, open_space(), CONFIG)
     assert isinstance(figures["limit_violations"], dict)
     assert figures["limit_violations"]["separation"] == 1
+
+
+def test_who_comes_near_without_touching_is_counted_apart() -> None:
+    """The wall's near face is y = 6.5. Two episodes within 0.5 m of it, and one within 3 m of the actor."""
+    position, actor = ring(1, 15.0)
+    position[0] = [12.0, -10.0, 1.0]
+    position[0, (T_S >= 3) & (T_S < 4)] = position[0, (T_S >= 6) & (T_S < 7)] = [12.0, 6.1, 1.0]
+    position[0, (T_S >= 9) & (T_S < 10)] = actor[0] + [2.9, 0.0, 0.0]
+    violations = score(T_S, position, actor, wall(), CONFIG)["limit_violations"]
+    assert isinstance(violations, dict)
+    assert (violations["collision"], violations["clearance"], violations["actor"]) == (0, 2, 1)
 
 
 def test_near_is_what_stands_above_the_actor_within_fifteen_metres() -> None:
