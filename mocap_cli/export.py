@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from mocap_cli.options import (
 )
 from mocap_cli.several import each
 from mocap_cli.terminal import watching
+
+_LONGEST_LIST = 4  # files
 
 
 class _ListsFormats(click.Command):
@@ -99,8 +102,15 @@ def export_command(
             "written": [str(path) for path in result.written],
             "unchanged": [str(path) for path in result.unchanged],
         }
-    for path in result.written:
-        click.echo(f"written: {path}")
-    for path in result.unchanged:
-        click.echo(f"unchanged: {path}")
+    _print("written", result.written)
+    _print("unchanged", result.unchanged)
     return None
+
+
+def _print(what: str, paths: Sequence[Path]) -> None:
+    """Print a line for each of a few files; of many the first, and how many more there are."""
+    shown = paths if len(paths) <= _LONGEST_LIST else paths[: _LONGEST_LIST - 1]
+    for path in shown:
+        click.echo(f"{what}: {path}")
+    if rest := len(paths) - len(shown):
+        click.echo(f"{what}: {rest} more in {paths[0].parent} (export.json lists them all)")

@@ -73,6 +73,22 @@ def test_pictures_lie_where_the_skeleton_does(filmed: Path) -> None:
     assert not dict(load_recording(filmed).overlays("drone2")), "none unless they are asked for"
 
 
+def test_many_files_are_told_in_a_few_lines(filmed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = ("export", filmed, "--to", "tum", "-o", out)
+    for what in ("written", "unchanged"):
+        lines = succeeds(*command).splitlines()
+        files = sorted(out.glob("*.tum"))
+        assert len(files) == 2 + 17  # cameras and joints
+        assert lines[:3] == [f"{what}: {path}" for path in files[:3]]
+        assert len(lines) == 4
+        assert str(len(files) - 3) in lines[3]
+    printed = json.loads(succeeds(*command, "--json"))
+    assert printed["unchanged"] == [str(path) for path in files]
+    few = succeeds("export", filmed, "--to", "csv,trc", "-o", out).splitlines()
+    assert [line.split(": ")[0] for line in few] == ["written"] * 4
+
+
 def test_files_of_an_earlier_export_are_replaced_others_are_not(filmed: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     first = export(filmed, ["trc", "csv"], out)
