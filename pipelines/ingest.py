@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,11 +17,17 @@ from pathlib import Path
 from pipelines.formats.common.stated_paths import leads_out
 from pipelines.formats.flights.flight_reader import FlightReader, span_words
 from pipelines.formats.flights.flight_sources import losses
-from pipelines.formats.flights.source_hashes import hash_sources, stated_paths
+from pipelines.formats.flights.source_hashes import (
+    hash_sources,
+    refuse_written,
+    source_stamps,
+    stated_paths,
+)
 from pipelines.session.description import CameraEntry, Description, Interpolation, read_description
 from pipelines.session.errors import DataError, NotYetReadError
 from pipelines.session.manifest import Flight, read_flight
 from pipelines.session.progress import Progress, Silent
+from pipelines.session.run_notes import note_sources
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, locked
 from pipelines.session.storage import read_json, write_json
@@ -63,7 +69,7 @@ def ingest(
         progress: who watches.
 
     Raises:
-        DataError: something cannot be used; the session stays as it was.
+        DataError: something cannot be used, or was written to meanwhile; the session stays as it was.
         BusyError: another process writes the session.
     """
     progress = progress or Silent()
@@ -81,25 +87,29 @@ def ingest(
     }
 
     with FlightReader(flight, flight_path, target, interpolation) as reader:
+        stamps = source_stamps(flight, flight_path.parent)
+        check_sources = partial(refuse_written, flight, flight_path.parent, stamps)
         # Where nothing can be skipped, what is hashed is read at the same time.
         meanwhile = reader.read_ahead() if force or _is_new(target) else iter(())
         sources, damage = hash_sources(flight, flight_path.parent, progress, meanwhile)
         with locked(target, create=True, overwrite=overwrite) as writable:
             run = writable.begin(INGEST, settings=settings, inputs=sources, force=force)
             if run.finished:
+                note_sources(target, sources, stamps)
                 stored_description = read_description(target)
                 if strict:
                     _refuse_losses(flight_path, stored_description)
                 return Ingested(target, run.record, stored_description, skipped=True)
 
             progress.start("Reading cameras", len(flight.cameras))
-            entries, warnings = _store_cameras(run, reader, list(flight.cameras), progress)
+            entries, warnings = _store_cameras(run, reader, list(flight.cameras), check_sources, progress)
             _check_overlap(flight_path, entries)
             truth = reader.store_truth(run.folder, entries)
             actor = reader.store_actor(run.folder, entries)
             map_ = reader.store_map(run.folder, entries)
             plan = reader.store_plan(run.folder, entries)
             origin = reader.origin()
+            check_sources()
             warnings += reader.take_notes()
             warnings += [f"{path}: {losses(causes)}: copy it again" for path, causes in damage.items()]
 
@@ -123,23 +133,34 @@ def ingest(
                 _refuse_losses(flight_path, description)
             write_json(run.folder / "session.json", description.model_dump(mode="json", by_alias=True))
             record = run.publish(counts=_counts(entries), warnings=warnings)
+            note_sources(target, sources, stamps)
     return Ingested(target, record, description, skipped=False)
 
 
 def _store_cameras(
-    run: Run, reader: FlightReader, names: Sequence[str], progress: Progress
+    run: Run,
+    reader: FlightReader,
+    names: Sequence[str],
+    check_sources: Callable[[], None],
+    progress: Progress,
 ) -> tuple[dict[str, CameraEntry], list[str]]:
     """Read the cameras that an interrupted ingest has not read; what the session says of each, and doubts."""
     entries: dict[str, CameraEntry] = {}
     warnings: list[str] = []
     for name in names:
-        chunk = run.chunk(name, partial(reader.store_camera, name))
+        chunk = run.chunk(name, partial(_store_camera, reader, name, check_sources))
         shutil.copytree(chunk / "tables", run.folder / "cameras" / name)
         stored = read_json(chunk / "entry.json")
         entries[name] = CameraEntry.model_validate(stored["entry"])
         warnings += stored["warnings"]
         progress.advance()
     return entries, warnings
+
+
+def _store_camera(reader: FlightReader, name: str, check_sources: Callable[[], None], folder: Path) -> None:
+    """Store one camera; nothing is kept of sources that were written to meanwhile."""
+    reader.store_camera(name, folder)
+    check_sources()
 
 
 def _refuse_losses(flight_path: Path, description: Description) -> None:

@@ -1,9 +1,13 @@
-"""When stages ran, for how long and with what: `run.json`, the one file that differs from run to run."""
+"""When stages ran, for how long, with what, and when sources were last changed.
+
+All of it stands in `run.json`, the one file that differs from run to run.
+"""
 
 from __future__ import annotations
 
 import platform
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -12,6 +16,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from pipelines.session.errors import DataError
 from pipelines.session.stage_records import SCHEMA
 from pipelines.session.storage import read_json, write_json
 
@@ -39,7 +44,7 @@ class Stopwatch:
             "libraries": _libraries(),
             "platform": platform.platform(),
         }
-        write_json(session / "run.json", {"schema": SCHEMA, "runs": [*_runs(session), entry]})
+        _write(session, {"runs": [*_runs(session), entry]})
 
 
 def versions_of(folder: Path) -> dict[str, dict[str, str]]:
@@ -50,11 +55,41 @@ def versions_of(folder: Path) -> dict[str, dict[str, str]]:
     return told
 
 
+def note_sources(session: Path, hashes: Mapping[str, str], stamps: Mapping[str, str]) -> None:
+    """Note the stamp that every source had when its content had this hash; both by the source's name."""
+    noted = {name: {"sha256": digest, "stamp": stamps[name]} for name, digest in hashes.items()}
+    if noted != _read(session).get("sources"):
+        _write(session, {"sources": noted})
+
+
+def noted_stamps(session: Path, hashes: Mapping[str, str]) -> dict[str, str]:
+    """The stamps of the sources that were noted with these hashes; none without a usable run.json."""
+    try:
+        noted = _read(session).get("sources")
+    except DataError:
+        return {}
+    if not isinstance(noted, dict):
+        return {}
+    return {
+        name: noted[name].get("stamp", "")
+        for name, digest in hashes.items()
+        if isinstance(noted.get(name), dict) and noted[name].get("sha256") == digest
+    }
+
+
 def _runs(session: Path) -> list[dict[str, Any]]:
-    path = session / "run.json"
-    told = read_json(path, "remove it: it holds only times of day") if path.exists() else {}
-    runs: list[dict[str, Any]] = told.get("runs", [])
+    runs: list[dict[str, Any]] = _read(session).get("runs", [])
     return runs
+
+
+def _read(session: Path) -> dict[str, Any]:
+    path = session / "run.json"
+    remedy = "remove it: it holds only times of day"
+    return read_json(path, remedy) if path.exists() else {}
+
+
+def _write(session: Path, changes: Mapping[str, object]) -> None:
+    write_json(session / "run.json", {**_read(session), "schema": SCHEMA, **changes})
 
 
 @cache

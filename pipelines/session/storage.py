@@ -56,6 +56,28 @@ def sha256_of(path: Path, hash_for: Callable[[Path], Any] = lambda _: hashlib.sh
         raise as_data_error(error, path) from error
 
 
+def file_stamp(path: Path) -> str:
+    """Hash a file's size and time of change, or those of all files of a folder with their names.
+
+    Equal stamps mean that nothing was written, so that the content need not be read again.
+
+    Raises:
+        DataError: the path is missing or cannot be read.
+    """
+    try:
+        if not path.is_dir():
+            return hash_of(_size_and_change(path))
+        files = ((file.relative_to(path).as_posix(), file) for file in _files(path))
+        return hash_of([[name, *_size_and_change(file)] for name, file in sorted(files)])
+    except OSError as error:
+        raise as_data_error(error, path) from error
+
+
+def _size_and_change(path: Path) -> list[int]:
+    status = path.stat()
+    return [status.st_size, status.st_mtime_ns]
+
+
 def _file_digest(path: Path, hash_for: Callable[[Path], Any]) -> bytes:
     with path.open("rb") as file:
         return hashlib.file_digest(file, lambda: hash_for(path)).digest()

@@ -19,6 +19,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.storage import (
     as_data_error,
     canonical_json,
+    file_stamp,
     jsonable,
     read_json,
     remove_tree,
@@ -188,3 +189,28 @@ def test_errors_of_the_system_name_the_file_and_the_remedy() -> None:
     assert str(as_data_error(OSError("cannot write"), Path("a.session"))).startswith(
         "a.session: cannot write; "
     )
+
+
+def test_the_stamp_of_a_file_tells_sizes_and_times_of_change(tmp_path: Path) -> None:
+    for place in (tmp_path / "one" / "a", tmp_path / "one" / "b"):
+        place.parent.mkdir(exist_ok=True)
+        place.write_bytes(b"12")
+        os.utime(place, ns=(0, 1_000_000_007))
+    file, folder = tmp_path / "one" / "a", tmp_path / "one"
+    before = file_stamp(file), file_stamp(folder)
+    assert file_stamp(tmp_path / "one" / "b") == before[0]
+    assert file_stamp(folder) == before[1]
+    os.utime(file, ns=(0, 1_000_000_008))
+    after = file_stamp(file), file_stamp(folder)
+    os.utime(file, ns=(0, 1_000_000_007))
+    assert (file_stamp(file), file_stamp(folder)) == before
+    file.write_bytes(b"123")
+    os.utime(file, ns=(0, 1_000_000_007))
+    grown = file_stamp(file), file_stamp(folder)
+    file.write_bytes(b"12")
+    os.utime(file, ns=(0, 1_000_000_007))
+    file.rename(tmp_path / "one" / "c")
+    assert len({before[0], after[0], grown[0]}) == 3
+    assert len({before[1], after[1], grown[1], file_stamp(folder)}) == 4
+    with pytest.raises(DataError, match="No such file"):
+        file_stamp(file)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from pathlib import Path
 
 from pipelines.formats.flights.flight_sources import source_files
 from pipelines.formats.logs.mcap_checksums import OTHER_CHECKSUM, CheckedHash, stated_checksum
+from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight
 from pipelines.session.progress import Progress
-from pipelines.session.storage import sha256_of
+from pipelines.session.storage import file_stamp, hash_of, sha256_of
 
 _HASHERS = 4
 
@@ -44,6 +45,35 @@ def hash_sources(
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return hashes, damage
+
+
+def source_stamps(flight: Flight, base: Path) -> dict[str, str]:
+    """The stamp of every file that is read, by the path that the manifest states.
+
+    Args:
+        flight: the manifest.
+        base: the folder that its paths are relative to.
+
+    Raises:
+        DataError: one of them is missing or cannot be read.
+    """
+    stamps = {path: [file_stamp(file) for file in source_files(base / path)] for path in stated_paths(flight)}
+    return {path: own[0] if len(own) == 1 else hash_of(own) for path, own in stamps.items()}
+
+
+def refuse_written(flight: Flight, base: Path, stamps: Mapping[str, str]) -> None:
+    """Refuse sources that were written to since they had these stamps: what was hashed is not what was read.
+
+    Raises:
+        DataError: one of them was, or is gone.
+    """
+    for path, stamp in source_stamps(flight, base).items():
+        if stamp != stamps[path]:
+            raise DataError(
+                base / path,
+                "was written to while it was being read",
+                "run `mocap ingest` again when it is complete",
+            )
 
 
 def stated_paths(flight: Flight) -> list[str]:
