@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.formats.flights.picture_encodings import Picture
-from pipelines.formats.flights.pictures import Pictures, open_pictures
+from pipelines.formats.flights.pictures import Pictures, open_pictures, refuse_changed_pictures
 from pipelines.keypoints.actor_hints import actor_hints
 from pipelines.keypoints.hints import Hint
 from pipelines.keypoints.tracking import PeopleTracker
@@ -101,13 +101,15 @@ def detect(
         The record of the stage; None where every camera has keypoints already.
 
     Raises:
-        DataError: the detector's files are missing, pictures are gone, or nobody was found in any.
+        DataError: the detector's files are missing, pictures are gone or not those that were ingested, a
+            table of the session was changed, or nobody was found in any picture.
     """
     progress = progress or Silent()
     description = read_description(session.folder)
     media = cameras_to_detect(description)
     if not media:
         return None
+    refuse_changed_pictures(session.folder, description, media)
     chosen = find_detector(detector)
     settings = {
         "detector": chosen.name,
@@ -175,7 +177,7 @@ def _inputs(
 
     A span of the flight counts from the first frame of all cameras, those with keypoints among them.
     """
-    ingested = session.record("ingest")
+    ingested = session.intact_record("ingest")
     if ingested is None:
         raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
     tables = {f"cameras/{name}/frames.parquet" for name in (description.cameras if in_span else media)}
@@ -183,9 +185,9 @@ def _inputs(
     if description.actor is not None:
         tables |= {"actor.parquet", *(f"cameras/{name}/poses.parquet" for name in media)}
         inputs["actor"] = hash_of([description.actor.point, description.pose_interpolation.model_dump()])
-    for name, of_pictures in media.items():
-        files = [description.sources[source] for source in of_pictures.sources]
-        inputs[f"pictures of {name}"] = hash_of([files, of_pictures.topic, of_pictures.stamps])
+    pictures = description.pictures
+    for name in media:
+        inputs[f"pictures of {name}"] = pictures[f"pictures of {name}"]
         if description.actor is not None:
             entry = description.cameras[name]
             inputs[f"camera {name}"] = hash_of(
@@ -276,9 +278,6 @@ def _span_words(start_s: float | None, end_s: float | None) -> str:
 def _produce(work: _Work, detector: Detector, progress: Progress, block: Block, folder: Path) -> None:
     """Write what the detector finds in the pictures of one block."""
     networks = work.networks(detector)
-    media = work.entry(block).media
-    if media is None:
-        raise ValueError(f"{block.camera} has no pictures")
     frame, t_ns = work.frames(block)
     tracker = PeopleTracker(networks)
     found: list[tuple[int, int, Float, Float]] = []
@@ -287,7 +286,7 @@ def _produce(work: _Work, detector: Detector, progress: Progress, block: Block, 
     hints = work.hints(block, t_ns)
     # Left early, the pictures must not be closed while the next one is being decoded.
     with (
-        open_pictures(media, work.folder) as pictures,
+        open_pictures(work.folder, work.description, block.camera) as pictures,
         closing(_decoded_ahead(pictures, numbers)) as decoded,
     ):
         for number, picture, hint in zip(numbers, decoded, hints, strict=True):

@@ -80,8 +80,8 @@ def export(
         progress: who watches.
 
     Raises:
-        DataError: no such format, none that has a choice of the unit or axes, nothing to export, or a file
-            would be overwritten.
+        DataError: no such format, none that has a choice of the unit or axes, nothing to export, tables or
+            pictures that were changed, or a file would be overwritten.
         BusyError: another process exports to the same folder.
     """
     progress = progress or Silent()
@@ -167,11 +167,13 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
     """The skeleton and the cameras of a session, its maps, and so many pictures per second.
 
     Raises:
-        DataError: not a session, or damaged.
+        DataError: not a session, or damaged; a table of it was changed.
     """
     session = open_session(folder)
     description = read_description(folder)
-    record = session.record("reconstruct")
+    for stage in ("ingest", "detect"):
+        session.intact_record(stage)
+    record = session.intact_record("reconstruct")
     skeleton, motion = None, None
     if record is not None:
         skeleton = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON)
@@ -184,9 +186,9 @@ def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
         description.flight,
         motion,
         cameras,
-        refined=refined_poses(folder) if record is not None else {},
+        refined={} if record is None else refined_poses(folder, record),
         lenses={name: camera.intrinsics.intrinsics() for name, camera in description.cameras.items()},
-        maps=lambda: each_map(folder),
+        maps=lambda: each_map(folder) if description.map else iter(()),
         pictures=_pictures(folder, description, record, pictures_hz),
         overlays=_overlays(folder, description, record, skeleton, pictures_hz),
     )
@@ -256,7 +258,7 @@ def _stills(
     media = description.cameras[camera].media
     if media is None or not len(rows) or any(not (folder / path).exists() for path in media.paths):
         return
-    with open_pictures(media, folder) as pictures:
+    with open_pictures(folder, description, camera) as pictures:
         for row in rows.tolist():
             picture = pictures.read(int(frame[row]))
             if picture is not None:

@@ -97,14 +97,16 @@ def film(
         progress: who watches.
 
     Raises:
-        DataError: nothing was compared yet, the flight was not simulated, its scenario is not there or
-            another flight's, the span holds no two pictures, or the detector's files are missing.
+        DataError: nothing was compared yet, a table of the session was changed, the flight was not simulated,
+            its scenario is not there or another flight's, the span holds no two pictures, or the detector's
+            files are missing.
         BusyError: another process writes the session.
     """
     shooting = shooting or Shooting()
     progress = progress or Silent()
     with locked(folder) as session:
-        compared = session.record("replan")
+        session.intact_record("ingest")
+        compared = session.intact_record("replan")
         if compared is None:
             raise DataError(folder, "holds no comparison to film", "run `mocap replan-compare` first")
         description = read_description(folder)
@@ -121,7 +123,10 @@ def film(
             return Filmed(folder, run.record, read_json(folder / "film" / "metrics.json"), skipped=True)
 
         flight = load_flight(
-            folder, description, session.record("reconstruct"), pose_noise=compared.settings["pose_noise"]
+            folder,
+            description,
+            session.intact_record("reconstruct"),
+            pose_noise=compared.settings["pose_noise"],
         )
         setting = _set(plan, path, flight)
         actor = logged_actor(folder, description)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.flights.picture_encodings import Picture
-from pipelines.formats.flights.pictures import open_pictures
+from pipelines.formats.flights.pictures import open_pictures, refuse_changed_pictures
 from pipelines.formats.videos.video_writing import TICK_S, join_videos, write_h264
 from pipelines.reporting.filmed import read_filmed
 from pipelines.reporting.frame_drawing import blank_frame, caption_of, draw_frame, padded_to_even
@@ -67,19 +67,23 @@ def write_overlays(
         The videos, in the order of the session's cameras.
 
     Raises:
-        DataError: the session holds no skeleton or no pictures, a camera that was named has none, or its
-            pictures are gone or damaged; or the place is taken.
+        DataError: the session holds no skeleton or no pictures, or tables that were changed; a camera that
+            was named has none, or its pictures are gone, damaged or not those that were ingested; or the
+            place is taken.
         BusyError: another process writes the session.
     """
     progress = progress or Silent()
     with locked(folder) as session:
-        record = session.record("reconstruct")
+        for stage in ("ingest", "detect"):
+            session.intact_record(stage)
+        record = session.intact_record("reconstruct")
         if record is None:
             raise DataError(folder, "holds no skeleton to draw", "run `mocap reconstruct` first")
         description = read_description(folder)
         wanted = _with_pictures(folder, description, cameras)
         _refuse_foreign(folder, force)
-        begin = partial(_begin, session, record, (start_s, end_s), force)
+        refuse_changed_pictures(folder, description, wanted)
+        begin = partial(_begin, session, description, record, (start_s, end_s), force)
         run = begin(wanted)
         if not run.finished:  # else pictures that are gone by now are not missed
             wanted = _still_there(folder, description, wanted, progress, all_of_them=cameras is not None)
@@ -101,21 +105,25 @@ def refuse_overlays(folder: Path, *, force: bool = False) -> None:
     description = read_description(folder)
     wanted = _with_pictures(folder, description, None)
     _refuse_foreign(folder, force)
+    refuse_changed_pictures(folder, description, wanted)
     if session.record("overlay") is None:
         _still_there(folder, description, wanted, Silent(), all_of_them=False)
 
 
 def _begin(
     session: WritableSession,
+    description: Description,
     record: StageRecord,
     span_s: tuple[float | None, float | None],
     force: bool,
     cameras: Sequence[str],
 ) -> Run:
-    """Begin the stage; the reconstruction's key stands for all that a session was made of."""
+    """Begin the stage; the reconstruction's key stands for all tables that it was made of."""
     start_s, end_s = span_s
     settings = {"cameras": list(cameras), "start_s": start_s, "end_s": end_s}
-    return session.begin(OVERLAY, settings=settings, inputs={"reconstruct": record.key}, force=force)
+    inputs = {"reconstruct": record.key}
+    inputs |= {f"pictures of {name}": description.pictures[f"pictures of {name}"] for name in cameras}
+    return session.begin(OVERLAY, settings=settings, inputs=inputs, force=force)
 
 
 def _videos(folder: Path, record: StageRecord) -> list[Path]:
@@ -186,7 +194,6 @@ class _Film:
     """The N pictures of a camera that are drawn on."""
 
     camera: FilmedCamera
-    media: MediaEntry
     rows: range  # N of the camera's frames
     pts_ns: Int64  # [N] since the first of them
     size: tuple[int, int]  # width, height
@@ -215,9 +222,8 @@ def _films(
             progress.note(f"{name}: no overlay, none of its pictures lies in the span")
             continue
         pts_ns = frames["pts_ns"].to_numpy(np.int64)[rows.start : rows.stop]
-        media = _media(description, name)
-        size = _picture_size(folder, media, camera, rows)
-        films.append(_Film(camera, media, rows, _apart(pts_ns - pts_ns[0]), size))
+        size = _picture_size(folder, description, camera, rows)
+        films.append(_Film(camera, rows, _apart(pts_ns - pts_ns[0]), size))
     if not films:
         raise DataError(folder, "has no picture in that span", "look at `mocap info`, or leave the span out")
     return films
@@ -230,9 +236,11 @@ def _apart(pts_ns: Int64) -> Int64:
     return spread
 
 
-def _picture_size(folder: Path, media: MediaEntry, camera: FilmedCamera, rows: range) -> tuple[int, int]:
+def _picture_size(
+    folder: Path, description: Description, camera: FilmedCamera, rows: range
+) -> tuple[int, int]:
     """Width and height of the first picture that can be decoded, else those of the calibration."""
-    with open_pictures(media, folder) as pictures:
+    with open_pictures(folder, description, camera.name) as pictures:
         for frame in camera.frame[rows.start : rows.stop].tolist():
             picture = pictures.read(frame)
             if picture is not None:
@@ -247,14 +255,14 @@ def _picture_size(folder: Path, media: MediaEntry, camera: FilmedCamera, rows: r
 class _Show:
     """What is the same in all videos."""
 
+    description: Description
     motion: Motion
     method: str
-    origin_ns: int
 
 
 def _show(folder: Path, description: Description, record: StageRecord) -> _Show:
     skeleton = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON)
-    return _Show(motion_from_skeleton(skeleton), record.settings["method"], description.start_ns)
+    return _Show(description, motion_from_skeleton(skeleton), record.settings["method"])
 
 
 def _draw(
@@ -298,7 +306,7 @@ def _draw_block(
 ) -> None:
     at = np.array(film.rows[block.start : block.stop])
     status = status_at(show.motion, film.camera.frame_t_ns[at])
-    views = views_of(film.camera, at, show.motion, status, show.origin_ns)
+    views = views_of(film.camera, at, show.motion, status, show.description.start_ns)
     width, height = film.size
     counts = {
         "frames": len(views),
@@ -307,7 +315,7 @@ def _draw_block(
     }
 
     def pictures() -> Iterator[Picture]:
-        with open_pictures(film.media, folder) as source:
+        with open_pictures(folder, show.description, film.camera.name) as source:
             for view, of_joints in zip(views, status, strict=True):
                 halt.check()
                 picture = source.read(view.frame)

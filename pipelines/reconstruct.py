@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pipelines.detect import detect
 from pipelines.formats.flights.picture_encodings import Picture
-from pipelines.formats.flights.pictures import open_pictures
+from pipelines.formats.flights.pictures import open_pictures, refuse_changed_pictures
 from pipelines.geometry.triangulation import (
     STATUS,
     Method,
@@ -129,8 +129,8 @@ def reconstruct(
         progress: who watches.
 
     Raises:
-        DataError: the session cannot be used, or nothing could be reconstructed; the message says
-            which gate stopped it.
+        DataError: the session cannot be used, one of its tables or the pictures were changed, or nothing
+            could be reconstructed; the message says which gate stopped it.
         BusyError: another process writes the session.
     """
     settings = settings or Settings()
@@ -139,9 +139,12 @@ def reconstruct(
     smoother(settings.smooth)
     _check_fill(settings.fill_s)
     with locked(folder) as session:
-        ingested = session.record("ingest")
+        ingested = session.intact_record("ingest")
         if ingested is None:
             raise DataError(folder, "was never ingested completely", "run `mocap ingest` again")
+        description = read_description(folder)
+        if settings.refine_cameras == "background":
+            refuse_changed_pictures(folder, description, _with_background(description))
         detected = _detected(session, settings, workers, progress)
         measured = measured_for(detected.settings["detector"]) if detected else None
         run = session.begin(
@@ -154,7 +157,6 @@ def reconstruct(
             metrics = read_json(folder / "reconstruct" / "metrics.json")
             return Reconstructed(folder, run.record, metrics, skipped=True)
 
-        description = read_description(folder)
         progress.start("Reconstructing", 1 + 3 * settings.trials)
         cameras, warnings = load_cameras(
             folder,
@@ -400,22 +402,30 @@ def _observe(flight: _Flight, cameras: list[Camera], settings: Settings) -> _See
     return _Seen(found, association, observations, sides, between_views, anybody)
 
 
+def _with_background(description: Description) -> list[str]:
+    """The moving cameras with pictures."""
+    return [
+        name
+        for name, entry in description.cameras.items()
+        if entry.media is not None and not entry.poses.static
+    ]
+
+
 def _follow_backgrounds(
     folder: Path, description: Description, cameras: list[Camera], progress: Progress
 ) -> dict[str, Followed | str]:
     """The background of every moving camera with pictures; of the others why it is not there."""
     followed: dict[str, Followed | str] = {}
     for camera in cameras:
-        media = description.cameras[camera.name].media
         if camera.static:
             followed[camera.name] = "it stands still"
-        elif media is None:
+        elif description.cameras[camera.name].media is None:
             followed[camera.name] = "it came without pictures"
         else:
             rows = rows_to_follow(camera)
             numbers = camera.frame_number[rows].tolist()
             progress.start(f"Following the background of {camera.name}", len(rows))
-            with open_pictures(media, folder) as pictures:
+            with open_pictures(folder, description, camera.name) as pictures:
                 grey = (_grey(pictures.read(number), progress) for number in numbers)
                 tracks = follow(grey, people_boxes(camera)[rows])
             followed[camera.name] = Followed(rows, tracks)

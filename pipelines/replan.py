@@ -120,7 +120,8 @@ def replan(
         progress: who watches.
 
     Raises:
-        DataError: the session cannot be used (nobody knows where the actor was), or a setting is wrong.
+        DataError: the session cannot be used (nobody knows where the actor was, or a table was changed), or a
+            setting is wrong.
         BusyError: another process writes the session.
     """
     settings = settings or Settings()
@@ -135,7 +136,9 @@ def replan(
 
         flight = load_flight(folder, description, reconstructed, pose_noise=settings.pose_noise)
         arms = _arms(folder, settings.arms, flight)
-        scene = build_scene(flight, load_maps(folder), description, _rules(settings))
+        scene = build_scene(
+            flight, load_maps(folder) if description.map else [], description, _rules(settings)
+        )
         for note in scene.notes:
             progress.note(note)
         progress.start("Replaying", len(arms))
@@ -171,13 +174,13 @@ def replan(
 
 def _inputs(session: WritableSession) -> tuple[Description, StageRecord | None, dict[str, str]]:
     """What is read: all that was ingested, and the reconstruction where truth or actor are not known."""
-    ingested = session.record("ingest")
+    ingested = session.intact_record("ingest")
     if ingested is None:
         raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
     description = read_description(session.folder)
     inputs = dict(ingested.outputs)
     needs_it = description.actor is None or not description.has_true_joints
-    reconstructed = session.record("reconstruct") if needs_it else None
+    reconstructed = session.intact_record("reconstruct") if needs_it else None
     if reconstructed is not None:
         inputs[_SKELETON] = reconstructed.outputs[_SKELETON]
     return description, reconstructed, inputs

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.formats.flights.picture_encodings import Picture
-from pipelines.formats.flights.pictures import Pictures, open_pictures
+from pipelines.formats.flights.pictures import Pictures, open_pictures, refuse_changed_pictures
 from pipelines.planning.hidden import hidden_shares
 from pipelines.planning.loading import load_flight
 from pipelines.reporting.comparison import compare, labels_of
@@ -69,7 +69,8 @@ def report(folder: Path, *, studies: Sequence[Path] = (), force: bool = False) -
         force: do it again although nothing changed.
 
     Raises:
-        DataError: not a session, or damaged; a folder that holds no study.
+        DataError: not a session, or damaged; a table of it, or pictures, were changed; a folder that holds no
+            study.
         BusyError: another process writes the session.
     """
     studied = [read_study(study) for study in studies]
@@ -80,6 +81,7 @@ def report(folder: Path, *, studies: Sequence[Path] = (), force: bool = False) -
             f"key of {name}": record.key for name, record in records.items()
         }  # their settings are shown
         description = read_description(folder)
+        _refuse_changed_pictures(folder, description)
         settings = {
             "name": session_name(folder),
             "pictures": _pictures_there(folder, description),
@@ -118,7 +120,8 @@ def compare_sessions(
         overwrite: write also where something else lies.
 
     Raises:
-        DataError: not a session, damaged, stated twice, or something else lies where the page goes.
+        DataError: not a session, damaged, changed by hand, stated twice, or something else lies where the
+            page goes.
     """
     resolved = [folder.resolve() for folder in folders]
     for folder, place in zip(folders, resolved, strict=True):
@@ -168,7 +171,8 @@ def write_figures_of(
         force: do it again although nothing changed.
 
     Raises:
-        DataError: not a session, or damaged; the folder holds something else, or cannot be written.
+        DataError: not a session, or damaged; a table of it, or pictures, were changed; the folder holds
+            something else, or cannot be written.
         BusyError: another process writes the same folder.
     """
     try:
@@ -180,6 +184,8 @@ def write_figures_of(
     labels = _labels([folder.resolve() for folder in folders])
     keys = [{name: record.key for name, record in own.items()} for own in records]
     descriptions = [read_description(folder) for folder in folders]
+    if len(folders) == 1:  # a comparison shows no pictures
+        _refuse_changed_pictures(folders[0], descriptions[0])
     pictures_there = [_pictures_there(*each) for each in zip(folders, descriptions, strict=True)]
     told = {
         "revision": _FIGURES_REVISION,
@@ -261,10 +267,16 @@ def _refuse_foreign(page: Path) -> None:
 
 
 def _finished_stages(session: Session) -> dict[str, StageRecord]:
-    records = {name: session.record(name) for name in ("ingest", "detect", "reconstruct", "replan")}
+    names = ("ingest", "detect", "reconstruct", "replan")
+    records = {name: session.intact_record(name) for name in names}
     if records["ingest"] is None:
         raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
     return {name: record for name, record in records.items() if record is not None}
+
+
+def _refuse_changed_pictures(folder: Path, description: Description) -> None:
+    filmed = [name for name, entry in description.cameras.items() if entry.media]
+    refuse_changed_pictures(folder, description, filmed)
 
 
 def _pictures_there(folder: Path, description: Description) -> list[str]:
@@ -282,7 +294,7 @@ def _open_pictures(
         if entry.media is None:
             continue
         try:
-            opened[name] = stack.enter_context(open_pictures(entry.media, folder))
+            opened[name] = stack.enter_context(open_pictures(folder, description, name))
         except DataError as error:
             warnings.append(f"{name}: no overlays on its pictures: {error}")
     return opened, warnings
@@ -310,7 +322,7 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
             for name in records["detect"].counts["cameras"]
             if name not in keypoints
         }
-    maps = load_maps(folder)
+    maps = load_maps(folder) if description.map else []
     return SessionContent(
         name=session_name(folder),
         session=description,
@@ -328,11 +340,11 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
         keypoints=keypoints,
         stages={name: asdict(record) for name, record in records.items()},
         replan=_load_replan(folder, records["replan"], maps) if "replan" in records else None,
-        refined=_by_camera(folder / "reconstruct" / "cameras.parquet") if reconstructed else {},
-        true_poses=_by_camera(folder / "truth_poses.parquet"),
+        refined=_by_camera(folder, "reconstruct/cameras.parquet", records.get("reconstruct")),
+        true_poses=_by_camera(folder, "truth_poses.parquet", records["ingest"]),
         hidden=_load_hidden(folder, description, records, maps),
         made_by=versions_of(folder),
-        outdated=tuple(outdated(records)),
+        outdated=tuple(outdated(records, description.pictures)),
     )
 
 
@@ -349,18 +361,17 @@ def _load_hidden(
     return hidden_shares(flight, description, maps)
 
 
-def _by_camera(path: Path) -> dict[str, pd.DataFrame]:
-    """The poses of a table of all cameras; empty where it is not there."""
-    if not path.exists():
+def _by_camera(folder: Path, name: str, record: StageRecord | None) -> dict[str, pd.DataFrame]:
+    """The poses of a table of all cameras; empty where the stage of this record wrote none."""
+    if record is None or name not in record.outputs:
         return {}
-    table = read_table(path, CAMERA_POSES).sort_values(["camera", "t_ns"])
+    table = read_table(folder / name, CAMERA_POSES).sort_values(["camera", "t_ns"])
     return {str(name): own[POSES.names].reset_index(drop=True) for name, own in table.groupby("camera")}
 
 
 def _load_replan(folder: Path, record: StageRecord, maps: list[Occupancy]) -> ReplanContent:
     place = folder / "replan"
     metrics = read_json(place / "metrics.json")
-    costs = place / "cost_map.parquet"
     return ReplanContent(
         metrics=metrics,
         arms={
@@ -369,7 +380,11 @@ def _load_replan(folder: Path, record: StageRecord, maps: list[Occupancy]) -> Re
             if f"replan/{arm}/trajectories.parquet" in record.outputs
         },
         actor=read_table(place / "actor.parquet", ACTOR),
-        cost_map=read_table(costs, COST_MAP) if costs.exists() else None,
+        cost_map=(
+            read_table(place / "cost_map.parquet", COST_MAP)
+            if "replan/cost_map.parquet" in record.outputs
+            else None
+        ),
         map=max(maps, key=lambda one: one.from_ns, default=None),
         seen={
             arm: read_table(place / arm / "seen.parquet", SEEN)

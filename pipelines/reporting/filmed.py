@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def refined_poses(folder: Path) -> dict[str, Trajectory]:
-    """The poses of the cameras that a session's reconstruction refined."""
-    path = folder / "reconstruct" / "cameras.parquet"
-    if not path.exists():
+def refined_poses(folder: Path, record: StageRecord) -> dict[str, Trajectory]:
+    """The poses of the cameras that a session's reconstruction, of this record, refined."""
+    name = "reconstruct/cameras.parquet"
+    if name not in record.outputs:
         return {}
-    table = read_table(path, CAMERA_POSES)
+    table = read_table(folder / name, CAMERA_POSES)
     return {str(name): trajectory_from(own.sort_values("t_ns")) for name, own in table.groupby("camera")}
 
 
@@ -42,7 +42,7 @@ def read_filmed(
         frames: the frame tables of the cameras that are wanted.
     """
     offset_ns = estimated_clocks(read_json(folder / "reconstruct" / "metrics.json"))
-    refined = refined_poses(folder)
+    refined = refined_poses(folder, record)
     filmed = {}
     for name, table in frames.items():
         entry = description.cameras[name]

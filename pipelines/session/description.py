@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pipelines.geometry.cameras import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import Occupancy
-from pipelines.session.storage import read_json
+from pipelines.session.storage import hash_of, read_json
 
 SCHEMA = 1
 
@@ -242,6 +242,21 @@ class Description(Entry):
     def has_true_joints(self) -> bool:
         """Whether it is known where the joints really were."""
         return self.truth is not None and bool(self.truth.joints)
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        """The hash of every camera's pictures as they were ingested, named as inputs of stages are."""
+        return {
+            f"pictures of {name}": hash_of(
+                [
+                    [self.sources.get(source) for source in entry.media.sources],
+                    entry.media.topic,
+                    entry.media.stamps,
+                ]
+            )
+            for name, entry in self.cameras.items()
+            if entry.media is not None
+        }
 
     @property
     def start_ns(self) -> int:

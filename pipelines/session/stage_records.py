@@ -16,6 +16,17 @@ SCHEMA = 1
 STAGES = ("ingest", "detect", "reconstruct", "overlay", "replan", "film", "report")
 """In the order in which they may run."""
 
+COMMANDS = {
+    "ingest": "mocap ingest",
+    "detect": "mocap reconstruct",
+    "reconstruct": "mocap reconstruct",
+    "overlay": "mocap reconstruct --overlay",
+    "replan": "mocap replan-compare",
+    "film": "mocap replan-compare --render",
+    "report": "mocap report",
+}
+"""The command that makes each stage."""
+
 
 class NewerSchemaError(DataError):
     """A file of a later version of this program."""
@@ -63,13 +74,14 @@ def key_of(stage: Stage, settings: Mapping[str, object], inputs: Mapping[str, st
     return hash_of(ingredients)
 
 
-def outdated(records: Mapping[str, StageRecord]) -> list[str]:
+def outdated(records: Mapping[str, StageRecord], pictures: Mapping[str, str]) -> list[str]:
     """The stages, by name, of which something that they were made of has changed since.
 
     Args:
         records: the finished stages of a session, by name. Inputs that none of them made do not count.
+        pictures: the hashes of the cameras' pictures that were ingested (`Description.pictures`).
     """
-    made = {stage: record.key for stage, record in records.items()}
+    made = {**pictures, **{stage: record.key for stage, record in records.items()}}
     for record in records.values():
         made |= record.outputs
     return [

@@ -34,6 +34,7 @@ from pipelines.session.publishing import (
 )
 from pipelines.session.run_notes import Stopwatch
 from pipelines.session.stage_records import (
+    COMMANDS,
     SCHEMA,
     NewerSchemaError,
     Stage,
@@ -71,6 +72,31 @@ class Session:
         """
         path = self.folder / stage / "stage.json"
         return read_record(path) if path.exists() else None
+
+    def intact_record(self, stage: str) -> StageRecord | None:
+        """Return what a stage says of itself once all of its files are found to be as it wrote them.
+
+        Stages that read another one's files ask here: what was edited, truncated or replaced since must not
+        be taken for what the record says. None if the stage was never finished.
+
+        Raises:
+            DataError: a file is gone or has another content; the record is damaged or of a later version.
+        """
+        record = self.record(stage)
+        if record is None:
+            return None
+        command = COMMANDS[stage]
+        for name, expected in record.outputs.items():
+            path = self.folder / name
+            if not path.is_file():
+                raise DataError(path, f"is gone although `{command}` wrote it", f"run `{command}` again")
+            if sha256_of(path) != expected:
+                raise DataError(
+                    path,
+                    f"is not what `{command}` wrote (other SHA-256): it was changed since",
+                    f"run `{command}` again, which makes it anew",
+                )
+        return record
 
 
 class WritableSession(Session):

@@ -25,7 +25,7 @@ from pipelines.reporting.frame_drawing import GREY as BLANK
 from pipelines.reporting.frame_drawing import SIDES
 from pipelines.session.errors import DataError
 from pipelines.session.storage import read_json, write_json
-from tests.commands.runner import refused, succeeds
+from tests.commands.runner import as_if_written, refused, succeeds
 from tests.synthetic.flights import LENS, START_NS, SyntheticFlight, film_at, write_flight
 from tests.synthetic.logged_flights import write_logged_flight
 
@@ -217,6 +217,7 @@ def test_refined_poses_take_the_place_of_the_logs(
     # A camera 0.4 m further right sees everything that many metres further left.
     poses[["x", "y", "z"]] += rotate(poses[["qx", "qy", "qz", "qw"]].to_numpy(), np.array([0.4, 0.0, 0.0]))
     poses.to_parquet(session / "reconstruct" / "cameras.parquet", index=False)
+    as_if_written(session, "reconstruct/cameras.parquet", "reconstruct")
     picture = decoded(write_overlays(session, cameras=["drone1"])[0])[3]
     body = flight.position[3] - flight.camera_position[0, 3]
     depth = rotate(conjugate(flight.camera_quaternion[0, 3]), body)[:, 2]
@@ -349,6 +350,7 @@ def test_estimated_clocks_move_the_skeleton_along(
     metrics = read_json(session / "reconstruct" / "metrics.json")
     # Picture k was taken when picture k + 6 says it was.
     write_json(session / "reconstruct" / "metrics.json", {**metrics, "clock_offsets_s": {"drone1": 0.2}})
+    as_if_written(session, "reconstruct/metrics.json", "reconstruct")
     picture = decoded(write_overlays(session, cameras=["drone1"])[0])[4]
     pixels = true_pixels(flight, "drone1")
     moved = np.linalg.norm(pixels[10] - pixels[4], axis=-1) > 8  # a dot and the search around it: 5

@@ -17,7 +17,7 @@ from pipelines.ingest import ingest
 from pipelines.planning.arm_flights import fly_arm
 from pipelines.reconstruct import reconstruct
 from pipelines.simulate import simulate
-from tests.commands.runner import content
+from tests.commands.runner import as_if_written, content
 from tests.real_data import real_data
 from tests.synthetic.flights import write_flight
 
@@ -312,6 +312,7 @@ def test_what_the_map_and_the_log_leave_open_is_said(tmp_path: Path) -> None:
     actor = pd.read_parquet(session / "actor.parquet")
     kept = (actor.index < 10) | (actor.index > 24)
     actor[kept].to_parquet(session / "actor.parquet", index=False)
+    as_if_written(session, "actor.parquet", "ingest")
     metrics = compared(session, "--trials", "1", "--yaw", "0", "--radius", "3", "--tilt", "0")
     said = " | ".join(metrics["warnings"])
     assert "the map does not cover" in said

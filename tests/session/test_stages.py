@@ -426,6 +426,31 @@ def test_a_damaged_stage_is_redone(tmp_path: Path, name: str, damage: Callable[[
     assert contents(folder) == expected
 
 
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [(flip, "is not what"), (Path.unlink, "is gone"), (lambda path: path.write_bytes(b""), "is not what")],
+)
+@pytest.mark.parametrize(
+    ("stage", "name", "command"),
+    [
+        ("reconstruct", "reconstruct/deep/metrics", "mocap reconstruct"),
+        ("ingest", "cameras/a/frames", "mocap ingest"),
+    ],
+)
+def test_a_stage_whose_files_changed_is_not_read(
+    tmp_path: Path, damage: Callable[[Path], object], said: str, stage: str, name: str, command: str
+) -> None:
+    folder = tmp_path / "a.session"
+    work(folder)
+    session = open_session(folder)
+    assert session.intact_record(stage) == session.record(stage)
+    assert session.intact_record("overlay") is None
+    damage(folder / name)
+    with pytest.raises(DataError, match=rf"{name}: {said} .*; run `{command}` again"):
+        session.intact_record(stage)
+    assert session.record(stage) is not None
+
+
 def test_a_record_that_lacks_something_is_one_line(tmp_path: Path) -> None:
     folder = tmp_path / "a.session"
     work(folder)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple, Protocol, Self, TypeVar
 
@@ -15,10 +16,12 @@ from pipelines.formats.logs.messages import all_samples
 from pipelines.formats.logs.picture_layouts import HEAD_LENGTH, picture_decoder, read_stamps
 from pipelines.formats.logs.recordings import OpenLog, messages_alike
 from pipelines.formats.videos.video import VideoReader
-from pipelines.session.description import MediaEntry
+from pipelines.session.description import Description, MediaEntry
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, PictureSample, Sample
 from pipelines.session.registries import Log, LogFormat, recognise
+from pipelines.session.run_notes import noted_stamps
+from pipelines.session.storage import file_stamp, sha256_of
 
 _MAY_LEAP_NS = 1_000_000_000  # transport and decoding take less
 
@@ -56,18 +59,70 @@ class _Stamps(NamedTuple):
 _Stamped = TypeVar("_Stamped", bound=Stamped)
 
 
-def open_pictures(media: MediaEntry, session: Path) -> Pictures:
-    """Open the pictures that a session was made from.
+@contextmanager
+def open_pictures(session: Path, description: Description, camera: str) -> Iterator[Pictures]:
+    """Open the pictures that a session was made from, and see that they stay those while they are read.
 
     Args:
-        media: where they lay, relative to the session.
         session: its folder.
+        description: its session.json.
+        camera: one that has pictures.
 
     Raises:
-        DataError: they are not there any more, or cannot be read.
+        DataError: they are not there any more, are not those that were ingested, or cannot be read.
     """
+    media = _media(description, camera)
+    refuse_changed_pictures(session, description, [camera])
     paths = [session / path for path in media.paths]
-    return VideoReader(paths[0]) if media.topic is None else LoggedPictures(paths, media.topic, media.stamps)
+    opened: Pictures = (
+        VideoReader(paths[0]) if media.topic is None else LoggedPictures(paths, media.topic, media.stamps)
+    )
+    with opened as pictures:
+        yield pictures
+    refuse_changed_pictures(session, description, [camera])
+
+
+def refuse_changed_pictures(session: Path, description: Description, cameras: Iterable[str]) -> None:
+    """Refuse pictures that are not those that were ingested; those that are gone are left to who opens them.
+
+    A file of the size and the time of change that ingest noted is taken to be the same. Of any other the
+    content is hashed: copies pass.
+
+    Args:
+        session: its folder.
+        description: its session.json.
+        cameras: the names of some that have pictures.
+
+    Raises:
+        DataError: another content lies in the place of what was ingested.
+    """
+    noted = noted_stamps(session, description.sources)
+    for camera in cameras:
+        media = _media(description, camera)
+        for stated, source in zip(media.paths, media.sources, strict=True):
+            path = (session / stated).resolve()
+            if not path.exists():
+                continue
+            stamp = file_stamp(path)
+            if stamp != noted.get(source) and _content(path, stamp) != description.sources.get(source):
+                raise DataError(
+                    path,
+                    f"does not hold the pictures of {camera} that were ingested (other SHA-256)",
+                    "run `mocap ingest` again, or put the file back that was ingested",
+                )
+
+
+@cache
+def _content(path: Path, stamp: str) -> str:  # noqa: ARG001  # another stamp asks for another reading
+    """The SHA-256 of a source, read once as long as its stamp stays."""
+    return sha256_of(path)
+
+
+def _media(description: Description, camera: str) -> MediaEntry:
+    media = description.cameras[camera].media
+    if media is None:
+        raise ValueError(f"{camera} has no pictures")
+    return media
 
 
 class LoggedPictures:

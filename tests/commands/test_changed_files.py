@@ -1,0 +1,324 @@
+"""Files that changed since they were ingested or written: no stage uses them unseen, one command mends it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import pipelines.formats.flights.pictures
+from pipelines.export import export, load_recording
+from pipelines.filming import film
+from pipelines.formats.videos.video import VideoReader
+from pipelines.ingest import ingest
+from pipelines.reconstruct import Settings, reconstruct
+from pipelines.report import compare_sessions
+from pipelines.session.errors import DataError
+from pipelines.session.progress import Silent
+from pipelines.session.storage import read_json, sha256_of
+from tests.commands.runner import content, refused, succeeds
+from tests.commands.test_overlay import filmed_flight
+from tests.keypoints.spotted_flights import spot_detector, write_pictures, write_spotted_flight
+from tests.synthetic.flights import write_flight
+
+FRAMES = 12
+
+
+def mirror(video: Path) -> None:
+    """Put another video in the place of one: left and right exchanged, frames and their times as before."""
+    with VideoReader(video) as reader:
+        pictures = [np.ascontiguousarray(picture[:, ::-1]) for _, picture in reader.frames()]
+    write_pictures(video, pictures)
+
+
+@pytest.fixture(scope="module")
+def detected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight of two cameras with videos alone, ingested and reconstructed: flight.session."""
+    folder = tmp_path_factory.mktemp("detected")
+    manifest = write_spotted_flight(folder, FRAMES)
+    detector = spot_detector(folder)
+    succeeds("ingest", manifest)
+    succeeds("reconstruct", folder / "flight.session", "--detector", detector)
+    return folder
+
+
+@pytest.fixture
+def flight(detected: Path, tmp_path: Path) -> Path:
+    """A copy of it, with the models it was detected with."""
+    return Path(shutil.copytree(detected, tmp_path / "copy", copy_function=shutil.copy2))
+
+
+def again(flight: Path, *options: str) -> list[str | Path]:
+    """The command that reconstructed the flight; models are known by their content, wherever they lie."""
+    return ["reconstruct", flight / "flight.session", "--detector", spot_detector(flight), *options]
+
+
+def stages_run(session: Path) -> list[str]:
+    return [run["stage"] for run in read_json(session / "run.json")["runs"]]
+
+
+# --- sources --------------------------------------------------------------------------------------------
+
+
+def test_an_exchanged_video_is_refused_until_it_is_ingested_and_its_keypoints_go(
+    flight: Path, tmp_path: Path
+) -> None:
+    session = flight / "flight.session"
+    before = content(session)
+    mirror(flight / "left.mp4")
+    for options in ((), ("--force",), ("--method", "dlt")):
+        line = refused(*again(flight, *options))
+        assert str(flight / "left.mp4") in line
+        assert "mocap ingest" in line
+    assert content(session) == before
+    # A flight that had the other video from the start says what is right now.
+    fresh = tmp_path / "fresh"
+    fresh.mkdir()
+    for source in flight.iterdir():
+        if source.is_file():
+            shutil.copy2(source, fresh)
+    for folder in (fresh, flight):
+        succeeds("ingest", folder / "flight.yaml")
+    told = json.loads(succeeds("info", session, "--json"))["readings"][0]
+    assert "out of date" in told["detect"], "its tables are those of before, its pictures are not"
+    for folder in (fresh, flight):
+        assert "written" in succeeds(*again(folder))
+    assert content(session) == content(fresh / "flight.session")
+    changed = "detect/left/keypoints.parquet"
+    assert content(session)[changed] != before[changed]
+    assert "unchanged" in succeeds(*again(flight))
+
+
+def test_the_same_video_goes_on_and_is_hashed_only_where_its_time_or_size_differ(
+    flight: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hashed: list[str] = []
+
+    def counted(path: Path) -> str:
+        hashed.append(path.name)
+        return sha256_of(path)
+
+    monkeypatch.setattr(pipelines.formats.flights.pictures, "sha256_of", counted)
+    assert "unchanged" in succeeds(*again(flight))
+    assert hashed == []
+    os.utime(flight / "left.mp4", ns=(1, 1))
+    assert "unchanged" in succeeds(*again(flight))
+    assert hashed == ["left.mp4"]
+    assert "unchanged" in succeeds("ingest", flight / "flight.yaml")  # which notes the new time
+    pipelines.formats.flights.pictures._content.cache_clear()
+    assert "unchanged" in succeeds(*again(flight))
+    assert hashed == ["left.mp4"]
+
+
+def test_without_the_noted_times_the_hash_decides(flight: Path) -> None:
+    (flight / "flight.session" / "run.json").unlink()
+    assert "unchanged" in succeeds(*again(flight))
+    status = (flight / "left.mp4").stat()
+    mirror(flight / "left.mp4")
+    os.utime(flight / "left.mp4", ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert "left.mp4" in refused(*again(flight))
+
+
+def test_videos_that_are_gone_do_not_stop_what_needs_them_no_more(flight: Path) -> None:
+    (flight / "left.mp4").unlink()
+    assert "unchanged" in succeeds(*again(flight))
+    assert "written" in succeeds(*again(flight, "--method", "dlt"))
+    assert "left.mp4" in refused(*again(flight, "--force"))
+
+
+class Meddler(Silent):
+    """Progress that does something at a step."""
+
+    def __init__(self, step: int, what: Callable[[], None]) -> None:
+        self._left, self._what = step, what
+
+    def advance(self, steps: int = 1) -> None:
+        self._left -= steps
+        if -steps < self._left <= 0:
+            self._what()
+
+
+def test_nothing_is_kept_of_a_video_that_is_exchanged_while_it_is_looked_at(flight: Path) -> None:
+    session, video = flight / "flight.session", flight / "right.mp4"
+    expected = content(session)
+    shutil.copy2(video, flight / "kept.mp4")
+    settings = Settings(detector=spot_detector(flight))
+    shutil.rmtree(session / "detect")
+    with pytest.raises(DataError, match=r"right\.mp4"):
+        reconstruct(session, settings, progress=Meddler(FRAMES + 3, lambda: mirror(video)))
+    shutil.copy2(flight / "kept.mp4", video)
+    reconstruct(session, settings)
+    assert content(session) == expected
+
+
+def exchange(session: Path) -> None:
+    mirror(session.parent / "drone1.mp4")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("reconstruct", "--overlay"),
+        ("reconstruct", "--refine-cameras", "background"),
+        ("report",),
+        ("report", "--force", "--figures", "figures"),
+        ("export", "--to", "mcap", "-o", "exported"),
+    ],
+)
+def test_every_command_that_reads_pictures_refuses_others(
+    filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    session = copied(filmed, tmp_path)
+    before = content(session)
+    exchange(session)
+    line = refused(command[0], session, *command[1:])
+    assert str(session.parent / "drone1.mp4") in line
+    assert "mocap ingest" in line
+    assert content(session) == before
+    assert not (tmp_path / "figures").exists()
+    assert not (tmp_path / "exported").exists()
+    # What reads no pictures goes on.
+    assert "unchanged" in succeeds("reconstruct", session)
+    assert "written" in succeeds("export", session, "--to", "csv", "-o", tmp_path / "csv")
+
+
+def test_a_source_that_is_written_while_it_is_ingested_is_refused(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, seconds=0.4)
+    log = tmp_path / "drone2.tum"
+    session = tmp_path / "flight.session"
+
+    def add_a_pose() -> None:
+        lines = log.read_text().splitlines()
+        stamp, rest = lines[-1].split(" ", 1)
+        log.write_text("\n".join([*lines, f"{float(stamp) + 1:.3f} {rest}", ""]))
+
+    hashed = 2 + 3 * len(flight.cameras)  # calibrations are inline: keypoints, poses and true ones, joints
+    with pytest.raises(DataError, match=r"drone2\.tum: was written to") as caught:
+        ingest(flight.manifest, session, progress=Meddler(hashed, add_a_pose))
+    assert "mocap ingest" in str(caught.value)
+    assert not session.exists()
+    assert not ingest(flight.manifest, session).skipped
+
+
+# --- tables ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A reconstructed session with imported keypoints, and videos beside it."""
+    folder = tmp_path_factory.mktemp("filmed")
+    flight = filmed_flight(folder)
+    succeeds("ingest", flight.manifest)
+    succeeds("reconstruct", folder / "flight.session")
+    return folder
+
+
+def copied(folder: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(folder, tmp_path / "copy", copy_function=shutil.copy2)) / "flight.session"
+
+
+def shift(table: Path) -> None:
+    """Move everything in a table by half a metre."""
+    frame = pd.read_parquet(table)
+    frame["x"] += 0.5
+    frame.to_parquet(table, index=False)
+
+
+def truncate(table: Path) -> None:
+    table.write_bytes(table.read_bytes()[:-8])
+
+
+@pytest.mark.parametrize("change", [shift, truncate, Path.unlink])
+def test_a_changed_table_of_ingest_is_refused_by_all_until_ingest_makes_it_anew(
+    filmed: Path, tmp_path: Path, change: Callable[[Path], None]
+) -> None:
+    session = copied(filmed, tmp_path)
+    manifest = session.parent / "flight.yaml"
+    before = content(session)
+    table = session / "cameras" / "drone2" / "poses.parquet"
+    change(table)
+    changed = content(session)
+    for command in (
+        ("reconstruct",),
+        ("reconstruct", "--force"),
+        ("reconstruct", "--method", "dlt", "--overlay"),
+        ("replan-compare",),
+        ("report",),
+        ("export", "--to", "tum", "-o", tmp_path / "exported"),
+    ):
+        line = refused(command[0], session, *command[1:])
+        assert str(table) in line
+        assert "mocap ingest" in line
+    with pytest.raises(DataError, match=r"poses\.parquet"):
+        compare_sessions([filmed / "flight.session", session], tmp_path / "compared.html")
+    assert content(session) == changed
+    assert "written" in succeeds("ingest", manifest)
+    assert content(session) == before
+    assert "unchanged" in succeeds("reconstruct", session)
+
+
+def test_a_changed_skeleton_is_refused_until_reconstruct_makes_it_anew(filmed: Path, tmp_path: Path) -> None:
+    session = copied(filmed, tmp_path)
+    before = content(session)
+    skeleton = session / "reconstruct" / "skeleton.parquet"
+    kept = skeleton.read_bytes()
+    shift(skeleton)
+    for command in (("report", session), ("export", session, "--to", "csv", "-o", tmp_path / "exported")):
+        line = refused(*command)
+        assert str(skeleton) in line
+        assert "mocap reconstruct" in line
+    skeleton.write_bytes(kept)
+    succeeds("export", session, "--to", "csv", "-o", tmp_path / "exported")
+    shift(skeleton)
+    assert "written" in succeeds("reconstruct", session)
+    assert content(session) == before
+
+
+def test_changed_keypoints_of_the_detector_are_found_anew(flight: Path) -> None:
+    session = flight / "flight.session"
+    before = content(session)
+    shift(session / "detect" / "left" / "keypoints.parquet")
+    line = refused("export", session, "--to", "csv", "-o", flight / "exported")
+    assert "left/keypoints.parquet" in line
+    assert "mocap reconstruct" in line
+    assert "unchanged" in succeeds(*again(flight))
+    assert stages_run(session) == ["ingest", "detect", "reconstruct", "detect"]
+    assert content(session) == before
+
+
+def test_a_changed_replay_is_neither_shown_nor_filmed(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, seconds=1.5, clean=True)
+    session = tmp_path / "flight.session"
+    succeeds("ingest", flight.manifest)
+    succeeds("reconstruct", session)
+    compare = ("replan-compare", session, "--arms", "fixed", "--trials", "1")
+    succeeds(*compare)
+    before = content(session)
+    shift(session / "replan" / "fixed" / "trajectories.parquet")
+    assert "mocap replan-compare" in refused("report", session)
+    with pytest.raises(DataError, match=r"trajectories\.parquet: is not what `mocap replan-compare` wrote"):
+        film(session)
+    assert "written" in succeeds(*compare)
+    assert content(session) == before
+    # Here the reconstruction is where the actor was.
+    shift(session / "reconstruct" / "skeleton.parquet")
+    assert "skeleton.parquet" in refused(*compare)
+
+
+def test_tables_that_no_stage_wrote_are_not_read(filmed: Path, tmp_path: Path) -> None:
+    session = copied(filmed, tmp_path)
+    poses = pd.read_parquet(session / "cameras" / "drone1" / "poses.parquet").assign(camera="drone1")
+    poses.to_parquet(session / "reconstruct" / "cameras.parquet", index=False)
+    (session / "map").mkdir()
+    (session / "map" / "index.json").write_text("[]")
+    recording = load_recording(session)
+    assert recording.refined == {}
+    assert list(recording.maps()) == []
+    export(session, ["mcap"], tmp_path / "exported", pictures_hz=0)
