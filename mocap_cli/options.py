@@ -18,7 +18,9 @@ overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Write where something else lies. Never done without this."
 )
 force_option = click.option(
-    "--force", is_flag=True, help="Do it again although inputs and settings did not change."
+    "--force",
+    is_flag=True,
+    help="Make everything that the command makes again although inputs and settings did not change.",
 )
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print the result as JSON; everything else goes to stderr."

@@ -125,7 +125,7 @@ def reconstruct(
         folder: the session.
         settings: what decides the result.
         workers: threads; the result does not depend on them.
-        force: do it again although nothing changed.
+        force: do it again although nothing changed, the detection as well.
         progress: who watches.
 
     Raises:
@@ -145,7 +145,7 @@ def reconstruct(
         description = read_description(folder)
         if settings.refine_cameras == "background":
             refuse_changed_pictures(folder, description, _with_background(description))
-        detected = _detected(session, settings, workers, progress)
+        detected = _detected(session, settings, workers, force, progress)
         measured = measured_for(detected.settings["detector"]) if detected else None
         run = session.begin(
             RECONSTRUCT,
@@ -205,7 +205,7 @@ def reconstruct(
 
 
 def _detected(
-    session: WritableSession, settings: Settings, workers: int, progress: Progress
+    session: WritableSession, settings: Settings, workers: int, force: bool, progress: Progress
 ) -> StageRecord | None:
     """The stage before this one; None where every camera came with keypoints."""
     detected = detect(
@@ -215,6 +215,7 @@ def _detected(
         start_s=settings.start_s,
         end_s=settings.end_s,
         workers=workers,
+        force=force,
         progress=progress,
     )
     if detected is None and (settings.start_s, settings.end_s) != (None, None):

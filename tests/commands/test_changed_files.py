@@ -322,3 +322,14 @@ def test_tables_that_no_stage_wrote_are_not_read(filmed: Path, tmp_path: Path) -
     assert recording.refined == {}
     assert list(recording.maps()) == []
     export(session, ["mcap"], tmp_path / "exported", pictures_hz=0)
+
+
+# --- force ----------------------------------------------------------------------------------------------
+
+
+def test_force_makes_all_that_the_command_makes(flight: Path) -> None:
+    session = flight / "flight.session"
+    before = content(session)
+    assert "written" in succeeds(*again(flight, "--force"))
+    assert stages_run(session) == ["ingest", *["detect", "reconstruct"] * 2]
+    assert content(session) == before
