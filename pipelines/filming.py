@@ -38,7 +38,7 @@ from pipelines.session.records import Float, Int64, JointMotion
 from pipelines.session.registries import Detector, find_detector, hashes_of_models
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import locked
-from pipelines.session.storage import hash_of, jsonable, read_json, write_json
+from pipelines.session.storage import hash_of, jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import REPLAN, TRUTH, read_table, write_table
 from pipelines.session.tabular import motion_table
 from pipelines.session.whole_folders import SIMULATION_MARK
@@ -117,6 +117,8 @@ def film(
         detector.load(threads=1)  # says at once what is missing
         plan = read_scenario(path)
         inputs = {"replan": compared.key, "scenario": hash_of(plan.model_dump(mode="json"))}
+        if plan.actor.motion.bvh is not None:
+            inputs["bvh"] = sha256_of(path.parent / plan.actor.motion.bvh)
         inputs |= {f"model {name}": digest for name, digest in hashes_of_models(detector).items()}
         run = session.begin(FILM, settings=asdict(shooting), inputs=inputs, force=force)
         if run.finished:

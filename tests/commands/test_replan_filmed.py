@@ -12,8 +12,10 @@ from pipelines.formats.videos.video import index_video
 from pipelines.ingest import ingest
 from pipelines.reconstruct import reconstruct
 from pipelines.session.errors import DataError
+from pipelines.session.stages import WritableSession
 from pipelines.session.storage import read_json
 from tests.commands.test_replan import compare, refused, session_of
+from tests.keypoints.spotted_flights import spot_detector
 from tests.synthetic.flights import write_flight
 
 SHORT = """
@@ -58,6 +60,30 @@ def test_arms_are_filmed_and_a_detector_looks_at_them(tmp_path: Path) -> None:
     other.write_text(SHORT.replace("distance_m: 5", "distance_m: 5, turn_deg: 90"), encoding="utf-8")
     assert "is not this flight's" in refused(session, *SMALL, "--scenario", other)
     assert "lie in the span" in refused(session, *SMALL, "--render-start", "0.9")
+
+
+class BegunError(Exception):
+    """Raised with the inputs of a stage, in the place of running it."""
+
+
+def test_another_motion_file_is_another_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = session_of(tmp_path, SHORT)
+    assert compare(session, "--arms", "fixed", "--trials", "1").exit_code == 0
+    scenario, motion = tmp_path / "danced.yaml", tmp_path / "dance.bvh"
+    scenario.write_text(SHORT.replace("[walk: {distance_m: 5}]", "{bvh: dance.bvh}"), encoding="utf-8")
+
+    def begun(*_: object, inputs: dict[str, str], **__: object) -> None:
+        raise BegunError(inputs)
+
+    monkeypatch.setattr(WritableSession, "begin", begun)
+    inputs = []
+    for text in ("one", "another", "one"):
+        motion.write_text(text, encoding="utf-8")
+        with pytest.raises(BegunError) as caught:
+            film(session, Shooting(detector=spot_detector(tmp_path)), scenario=scenario)
+        inputs.append(caught.value.args[0])
+    assert inputs[0] == inputs[2]
+    assert inputs[0] != inputs[1]
 
 
 def test_only_simulated_flights_are_filmed_again(tmp_path: Path) -> None:
