@@ -65,6 +65,8 @@ def survey(path: Path) -> list[Survey]:
 def _of_session(path: Path) -> dict[str, Any]:
     session = open_session(path)
     description = read_description(path)
+    records = {stage: record for stage in STAGES if (record := session.record(stage))}
+    detected = records["detect"].counts["cameras"] if "detect" in records else {}
     facts: dict[str, Any] = {
         "flight": description.flight,
         "cameras": {
@@ -74,14 +76,17 @@ def _of_session(path: Path) -> dict[str, Any]:
                 "rate_hz": camera.frames.rate_hz,
                 "poses": camera.poses.count,
                 "frames_without_pose": camera.poses.frames_without_pose,
-                "detections": camera.keypoints.detections if camera.keypoints else 0,
+                "detections": (
+                    camera.keypoints.detections
+                    if camera.keypoints
+                    else detected.get(name, {}).get("detections")
+                ),
             }
             for name, camera in description.cameras.items()
         },
         "truth": sorted(description.truth.joints) if description.truth else None,
         "warnings": description.warnings,
     }
-    records = {stage: record for stage in STAGES if (record := session.record(stage))}
     for stage, record in records.items():
         if stage == "ingest":
             continue

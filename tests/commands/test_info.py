@@ -11,6 +11,7 @@ import pytest
 
 from pipelines.session.storage import read_json, write_json
 from tests.commands.runner import refused, succeeds
+from tests.keypoints.spotted_flights import CAMERAS, spot_detector, write_spotted_flight
 from tests.synthetic.flights import write_flight
 from tests.synthetic.logged_flights import write_logged_flight
 
@@ -114,3 +115,20 @@ def test_a_stage_whose_data_changed_is_out_of_date(tmp_path: Path) -> None:
     assert "out of date" not in reading(session)["reconstruct"]
     succeeds("report", session)
     assert changed not in (session / "report" / "index.html").read_text(encoding="utf-8")
+
+
+def test_detections_of_a_session_are_the_imported_or_the_found_ones(tmp_path: Path) -> None:
+    manifest = write_spotted_flight(tmp_path, 6)
+    session = manifest.with_suffix(".session")
+
+    def detections() -> dict[str, int | None]:
+        return {name: camera["detections"] for name, camera in reading(session)["cameras"].items()}
+
+    succeeds("ingest", manifest)
+    assert detections() == dict.fromkeys(CAMERAS)  # nobody has looked yet: not 0
+    succeeds("reconstruct", session, "--detector", spot_detector(tmp_path))
+    assert detections() == dict.fromkeys(CAMERAS, 6)  # one person in each of the pictures
+    flight = write_flight(tmp_path / "imported", seconds=0.2, clean=True)
+    succeeds("ingest", flight.manifest)
+    session = flight.manifest.with_suffix(".session")
+    assert detections() == {"drone1": 6, "drone2": 6}
