@@ -83,10 +83,10 @@ def open_pictures(session: Path, description: Description, camera: str) -> Itera
 
 
 def refuse_changed_pictures(session: Path, description: Description, cameras: Iterable[str]) -> None:
-    """Refuse pictures that are not those that were ingested; those that are gone are left to who opens them.
+    """Refuse pictures that are not those that were ingested.
 
     A file of the size and the time of change that ingest noted is taken to be the same. Of any other the
-    content is hashed: copies pass.
+    content is hashed: copies pass. So do pictures that are gone, which whoever opens them refuses.
 
     Args:
         session: its folder.
@@ -108,7 +108,7 @@ def refuse_changed_pictures(session: Path, description: Description, cameras: It
                 raise DataError(
                     path,
                     f"does not hold the pictures of {camera} that were ingested (other SHA-256)",
-                    "run `mocap ingest` again, or put the file back that was ingested",
+                    "run `mocap ingest` again, or put back the file that was ingested",
                 )
 
 
