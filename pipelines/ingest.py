@@ -32,7 +32,7 @@ from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, locked
 from pipelines.session.storage import read_json, write_json
 
-INGEST = Stage("ingest", revision=3)
+INGEST = Stage("ingest", revision=4)
 
 
 @dataclass(frozen=True)
@@ -176,6 +176,9 @@ def _refuse_losses(flight_path: Path, description: Description) -> None:
     }
     parts |= description.damage
     parts["actor"] = description.actor.dropped if description.actor else {}
+    parts["truth"] = description.truth.dropped if description.truth else {}
+    poses_dropped = description.truth.poses_dropped if description.truth else {}
+    parts |= {f"{name}: true poses": dropped for name, dropped in poses_dropped.items()}
     parts["map"] = description.map.dropped if description.map else {}
     parts |= {f"{name}: plan": sent.dropped for name, sent in (description.plan or {}).items()}
     lost = [f"{part}: {losses(dropped)}" for part, dropped in parts.items() if dropped]

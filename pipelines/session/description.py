@@ -81,6 +81,7 @@ class KeypointsEntry(Entry):
     people_at_once: int
     frames_without_person: int
     dropped: dict[str, int]
+    adjusted: dict[str, int] = {}  # values that are in the tables, but not as the file has them
 
 
 class ClockEntry(Entry):
@@ -201,6 +202,9 @@ class TruthEntry(Entry):
     first_t_ns: int
     last_t_ns: int
     cameras: list[str]
+    missing: int = 0  # of all times, people and joints: how many have no position
+    dropped: dict[str, int] = {}  # of these, positions that the file has and that cannot be used
+    poses_dropped: dict[str, dict[str, int]] = {}  # of the true poses, by camera
 
 
 class Interpolation(Entry):

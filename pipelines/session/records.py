@@ -63,6 +63,9 @@ class Detections:
     frames_listed: Int64  # [F] sorted: every frame the files speak of, people in it or not
     image_size: tuple[int, int] | None = None  # width, height
     dropped: dict[str, int] = field(default_factory=dict)
+    adjusted: dict[str, int] = field(
+        default_factory=dict
+    )  # values that are kept, but not as the file has them
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,7 @@ class JointMotion:
     reprojection_px: Float | None = None  # [T, P, J]
     views: Int64 | None = None  # [T, P, J] cameras that measured the joint
     covariance: Float | None = None  # [T, P, J, 6] m^2: xx, xy, xz, yy, yz, zz
+    dropped: dict[str, int] = field(default_factory=dict)  # positions that were there, by cause
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -16,6 +17,15 @@ from tests.synthetic.flights import SyntheticFlight, write_flight
 @pytest.fixture
 def flight(tmp_path: Path) -> SyntheticFlight:
     return write_flight(tmp_path, cameras=3, seconds=0.5)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return document
+
+
+def session_json(folder: Path) -> dict[str, Any]:
+    return read_json(folder / "flight.session" / "session.json")
 
 
 def test_unknown_key_names_the_nearest(flight: SyntheticFlight) -> None:
@@ -68,6 +78,79 @@ def test_nan_poses_are_counted_and_the_rest_is_used(flight: SyntheticFlight, tmp
     assert "drone1: poses dropped: 3 not finite" in done.stderr
     stored = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
     assert stored["cameras"]["drone1"]["poses"]["dropped"] == {"not finite": 3}
+
+
+@pytest.mark.parametrize("absurd", [1e9, -1e308])
+def test_absurd_keypoints_are_counted_and_the_rest_is_used(
+    flight: SyntheticFlight, tmp_path: Path, absurd: float
+) -> None:
+    path = tmp_path / "drone2.json"
+    people = json.loads(path.read_text(encoding="utf-8"))
+    for person in people[3:5]:
+        person["keypoints"][0] = absurd
+    people[6]["keypoints"][2::3] = [1.5] * 17
+    people.append(people[8])
+    path.write_text(json.dumps(people), encoding="utf-8")
+    done = mocap("ingest", flight.manifest)
+    assert done.returncode == 0
+    keypoints = session_json(tmp_path)["cameras"]["drone2"]["keypoints"]
+    assert keypoints["dropped"]["joint more than 1000000 px away"] == 2
+    assert keypoints["dropped"]["detection listed twice"] == 1
+    assert keypoints["adjusted"] == {"confidence above 1, set to 1": 17}
+    lines = [line for line in done.stderr.splitlines() if line.startswith("warning: drone2: keypoints")]
+    assert len(lines) == 2
+    assert any("2 joint more than 1000000 px away" in line for line in lines)
+    assert any("17 confidence above 1" in line for line in lines)
+    succeeds("reconstruct", tmp_path / "flight.session")
+    metrics = read_json(tmp_path / "flight.session" / "reconstruct" / "metrics.json")
+    assert metrics["mpjpe_mm"] < 500  # one view at 1e9 px would put the joint kilometres away
+
+
+@pytest.mark.parametrize(("absurd", "missing", "dropped"), [("nan", 5, 0), ("1e9", 5, 5), ("-1e308", 5, 5)])
+def test_absurd_truth_is_counted_and_measures_nothing(
+    flight: SyntheticFlight, tmp_path: Path, absurd: str, missing: int, dropped: int
+) -> None:
+    path = tmp_path / "truth.csv"
+    header, *rows = path.read_text(encoding="utf-8").splitlines()
+    column = header.split(",").index("y")
+    for k in range(40, 45):
+        cells = rows[k].split(",")
+        cells[column] = absurd
+        rows[k] = ",".join(cells)
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    done = mocap("ingest", flight.manifest)
+    assert done.returncode == 0
+    truth = session_json(tmp_path)["truth"]
+    assert truth["missing"] == missing
+    assert sum(truth["dropped"].values()) == dropped
+    assert len([line for line in done.stderr.splitlines() if line.startswith("warning: truth: ")]) == 1
+    stored = pd.read_parquet(tmp_path / "flight.session" / "truth.parquet")
+    assert len(stored) == flight.position.shape[0] * 17 - 5
+    assert stored[["x", "y", "z"]].abs().to_numpy().max() < 100
+    succeeds("reconstruct", tmp_path / "flight.session")
+    assert read_json(tmp_path / "flight.session" / "reconstruct" / "metrics.json")["mpjpe_mm"] < 500
+    if dropped:
+        assert f"truth: {dropped} position" in refused("ingest", flight.manifest, "--strict")
+    else:
+        succeeds("ingest", flight.manifest, "--strict")
+
+
+def test_truth_of_nothing_but_absurd_positions_is_refused(flight: SyntheticFlight, tmp_path: Path) -> None:
+    path = tmp_path / "truth.csv"
+    header, *rows = path.read_text(encoding="utf-8").splitlines()
+    rows = [",".join([*row.split(",")[:-3], "1e9", "1e9", "1e9"]) for row in rows]
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    assert f"truth.csv: holds no position of a joint ({len(rows)} " in refused("ingest", flight.manifest)
+
+
+def test_true_poses_that_are_left_out_are_counted(flight: SyntheticFlight, tmp_path: Path) -> None:
+    path = tmp_path / "drone1_true.tum"
+    rows = path.read_text(encoding="utf-8").splitlines()
+    rows[20] = f"{rows[20].split()[0]} nan nan nan 0 0 0 1"
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    done = mocap("ingest", flight.manifest)
+    assert "warning: drone1: true poses dropped: 1 not finite" in done.stderr
+    assert session_json(tmp_path)["truth"]["poses_dropped"] == {"drone1": {"not finite": 1}}
 
 
 def test_log_of_nothing_but_nan(flight: SyntheticFlight, tmp_path: Path) -> None:

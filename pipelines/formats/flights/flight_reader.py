@@ -34,7 +34,7 @@ from pipelines.session.description import (
 from pipelines.session.errors import DataError, MocapError
 from pipelines.session.manifest import Camera, Flight, PoseSource
 from pipelines.session.maps import store_map
-from pipelines.session.records import Detections, Int64, Trajectory
+from pipelines.session.records import Detections, Int64, JointMotion, Trajectory
 from pipelines.session.registries import noise_models
 from pipelines.session.storage import write_json
 from pipelines.session.tables import (
@@ -167,6 +167,8 @@ class FlightReader:
             ("keypoints", entry.keypoints.dropped if entry.keypoints else {}),
         ):
             warnings += [f"{name}: {what} dropped: {losses(dropped)}"] if dropped else []
+        if entry.keypoints and entry.keypoints.adjusted:
+            warnings.append(f"{name}: keypoints adjusted: {losses(entry.keypoints.adjusted)}")
         write_json(folder / "entry.json", {"entry": entry.model_dump(mode="json"), "warnings": warnings})
 
     def _read_camera(self, name: str) -> _CameraData:
@@ -213,13 +215,18 @@ class FlightReader:
         if motion is not None and truth.joints is not None:
             self._refuse_no_overlap(truth.joints.path, motion.t_ns, entries)
             write_table(folder / "truth.parquet", motion_table(motion), TRUTH)
+        missing, dropped = self._note_truth_missing(motion) if motion else (0, {})
+        poses_dropped = {}
         if truth.poses:
             import pandas as pd
 
-            tables = [
-                pose_table(self._sources.true_poses(stated)).assign(camera=name)
-                for name, stated in truth.poses.items()
-            ]
+            tables = []
+            for name, stated in truth.poses.items():
+                poses = self._sources.true_poses(stated)
+                tables.append(pose_table(poses).assign(camera=name))
+                if poses.dropped:
+                    poses_dropped[name] = poses.dropped
+                    self._notes.append(f"{name}: true poses dropped: {losses(poses.dropped)}")
             write_table(folder / "truth_poses.parquet", pd.concat(tables, ignore_index=True), CAMERA_POSES)
         return TruthEntry(
             joints=list(motion.joints) if motion else [],
@@ -227,7 +234,20 @@ class FlightReader:
             first_t_ns=int(motion.t_ns[0]) if motion else 0,
             last_t_ns=int(motion.t_ns[-1]) if motion else 0,
             cameras=list(truth.poses),
+            missing=missing,
+            dropped=dropped,
+            poses_dropped=poses_dropped,
         )
+
+    def _note_truth_missing(self, motion: JointMotion) -> tuple[int, dict[str, int]]:
+        """Count true positions that are missing, and those of them that were dropped; note both."""
+        is_missing = np.isnan(motion.position[..., 0])
+        missing = int(is_missing.sum())
+        if motion.dropped:
+            self._notes.append(f"truth: positions dropped: {losses(motion.dropped)}")
+        if missing > sum(motion.dropped.values()):
+            self._notes.append(f"truth: {missing} of {is_missing.size} positions of joints are missing")
+        return missing, motion.dropped
 
     def store_actor(self, folder: Path, entries: Mapping[str, CameraEntry]) -> ActorEntry | None:
         """Write where the actor was, as logged."""
@@ -365,6 +385,7 @@ def _keypoints_entry(
         people_at_once=int(np.unique(detections.frame, return_counts=True)[1].max()),
         frames_without_person=frames - len(np.unique(detections.frame)),
         dropped=detections.dropped,
+        adjusted=detections.adjusted,
     )
 
 

@@ -60,6 +60,9 @@ from pipelines.session.registries import (
     recognise,
 )
 
+_FARTHEST_M = 10_000  # a person's joints stay nearer to their median than this in any flight
+_LARGEST_M = 1e8  # metric grids have coordinates up to 1e7
+
 
 class FlightSources:
     """Reads the parts of one flight; a context manager that closes the logs.
@@ -316,7 +319,11 @@ class FlightSources:
         return found
 
     def true_joints(self, source: TruthJoints) -> JointMotion:
-        """The true joints."""
+        """Read the true joints; positions too far from the others to be true are left out and counted.
+
+        Raises:
+            DataError: the file cannot be used, its axes are not known, or no position is left.
+        """
         path = self._base / source.path
         named = FORMATS.get(source.format) if source.format else None
         reader = named or recognise(path, JointFormat, "file of true joints")
@@ -332,6 +339,10 @@ class FlightSources:
         motion = reader.read_joints(path, unit=source.unit, axes="z-up" if is_ned else source.axes)
         if is_ned:
             motion = replace(motion, position=motion.position[..., [1, 0, 2]] * [1, 1, -1])
+        motion = _without_far_joints(motion)
+        if not np.isfinite(motion.position).any():
+            lost = f" ({losses(motion.dropped)})" if motion.dropped else ""
+            raise DataError(path, f"holds no position of a joint{lost}", "check what wrote it")
         return replace(motion, t_ns=motion.t_ns + round(source.offset_s * 1e9))
 
     def true_poses(self, stated: str) -> Trajectory:
@@ -339,6 +350,25 @@ class FlightSources:
         path = self._base / stated
         trajectory = recognise(path, TrajectoryFormat, "camera trajectory").read_trajectory(path)
         return in_enu(trajectory, self._flight.world.frame)
+
+
+def _without_far_joints(motion: JointMotion) -> JointMotion:
+    """Make positions missing that are incomplete, or too far from the median of all to be true."""
+    position = np.where(np.isfinite(motion.position).all(axis=-1, keepdims=True), motion.position, np.nan)
+    known = position[~np.isnan(position[..., 0])]
+    if not len(known):
+        return replace(motion, position=position)
+    with np.errstate(over="ignore", invalid="ignore"):  # 1e308 is infinitely far from its negative
+        far = (np.abs(position - np.median(known, axis=0)) > _FARTHEST_M).any(axis=-1)
+        far |= (np.abs(position) > _LARGEST_M).any(axis=-1)
+    if not far.any():
+        return replace(motion, position=position)
+    cause = f"position more than {_FARTHEST_M // 1000} km from the others"
+    return replace(
+        motion,
+        position=np.where(far[..., None], np.nan, position),
+        dropped=motion.dropped | {cause: int(far.sum())},
+    )
 
 
 def source_files(path: Path) -> list[Path]:

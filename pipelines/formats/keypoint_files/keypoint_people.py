@@ -16,6 +16,8 @@ from pipelines.session.skeletons import SKELETONS, Skeleton, get_skeleton, skele
 
 Float = NDArray[np.float64]
 
+_FARTHEST_PX = 1_000_000  # no picture is nearly as large: beyond is no detection but a fault of the file
+
 
 def choose_skeleton(
     path: Path, count: int, stated: str | None, names: tuple[str, ...] | None = None
@@ -160,30 +162,38 @@ class Gathering:
     ) -> Detections:
         """Everything gathered, cleaned and sorted.
 
-        Frames before `first_frame` are left out. A joint is missing (NaN, confidence 0) if its position is
-        not finite, or if position and confidence are all 0, which is how detectors write "not found".
-        A confidence that is not finite becomes 0. All of it but "not found" is counted in `dropped`.
+        Frames before `first_frame` are left out, and so is a detection that repeats another one of its frame
+        number by number. A joint is missing (NaN, confidence 0) if its position is not finite or further than
+        `_FARTHEST_PX` from the top left pixel, or if position and confidence are all 0, which is how
+        detectors write "not found". A confidence that is not finite or below 0 becomes 0. All of it but "not
+        found" is counted in `dropped`. A confidence above 1 becomes 1 and is counted in `adjusted`.
 
         Raises:
             DataError: no joint of any person is left.
         """
         frame = np.array(self._frame, dtype=np.int64) - first_frame
         listed = np.array(sorted(self._listed), dtype=np.int64) - first_frame
+        keypoints = self.keypoints()
         kept = frame >= 0
-        xy, confidence, dropped = _missing_marked(self.keypoints()[kept])
-        frame, person = frame[kept], self._person_numbers()[kept]
+        repeats = kept & self._repeats(keypoints)
+        kept &= ~repeats
+        xy, confidence, dropped, adjusted = _checked(keypoints[kept])
+        person = self._person_numbers(kept)
+        frame = frame[kept]
 
+        dropped += self.dropped
+        dropped["detection listed twice"] = int(repeats.sum())
         somebody = np.isfinite(xy).any(axis=(1, 2))
         if not somebody.any():
             last = int(listed[-1]) + first_frame
-            problem = f"holds no keypoints from frame {first_frame} on (its last frame is {last})"
+            causes = "".join(f", {number} x {cause}" for cause, number in sorted(dropped.items()) if number)
+            problem = f"holds no keypoints from frame {first_frame} on (its last frame is {last}{causes})"
             raise DataError(self.path, problem, "check first_frame, and that the detector saw the person")
         rows = np.flatnonzero(somebody)
         rows = rows[np.lexsort((person[rows], frame[rows]))]
         again = (np.diff(frame[rows], prepend=-1) == 0) & (np.diff(person[rows], prepend=-1) == 0)
         rows = rows[~again]
 
-        dropped += self.dropped
         dropped["frame before first_frame"] = int((listed < 0).sum())
         dropped["person without a joint"] = int((~somebody).sum())
         dropped["same person twice in a frame"] = int(again.sum())
@@ -196,27 +206,56 @@ class Gathering:
             frames_listed=listed[listed >= 0],
             image_size=image_size,
             dropped={cause: number for cause, number in sorted(dropped.items()) if number},
+            adjusted={cause: number for cause, number in sorted(adjusted.items()) if number},
         )
 
-    def _person_numbers(self) -> NDArray[np.int64]:
-        """The detector's own ids, unless somebody has none or several people share the only one there is."""
-        own = [own_id for own_id in self._own_id if own_id is not None]
-        crowded = max(self._people.values()) > 1
-        tracked = len(own) == len(self._own_id) and not (crowded and len(set(own)) == 1)
-        return np.array(own if tracked else self._rank, dtype=np.int64)
+    def _repeats(self, keypoints: Float) -> NDArray[np.bool_]:
+        """Mark the people [M] whose keypoints [M, K, 3] and id are those of an earlier one of their frame."""
+        repeats = np.zeros(len(keypoints), dtype=np.bool_)
+        found = (keypoints[..., :2] != 0).any(
+            axis=(1, 2)
+        )  # people who were not found are all 0, and all alike
+        seen: set[tuple[int, int | None, bytes]] = set()
+        for row in np.flatnonzero(found).tolist():
+            frame = self._frame[row]
+            if self._people[frame] > 1:
+                detection = (frame, self._own_id[row], keypoints[row].tobytes())
+                repeats[row] = detection in seen
+                seen.add(detection)
+        return repeats
+
+    def _person_numbers(self, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Number the kept people by the detector's own ids, or by their places within the frame.
+
+        The places count where somebody has no id, or where several people of a frame share the only id.
+        """
+        rows = np.flatnonzero(kept)
+        own = [own_id for row in rows if (own_id := self._own_id[row]) is not None]
+        crowded = len({self._frame[row] for row in rows}) < len(rows)
+        tracked = len(own) == len(rows) and not (crowded and len(set(own)) == 1)
+        return np.array(own if tracked else [self._rank[row] for row in rows], dtype=np.int64)
 
 
-def _missing_marked(keypoints: Float) -> tuple[Float, Float, Counter[str]]:
-    """Positions [M, K, 2] and confidences [M, K] of keypoints [M, K, 3], and how many were not finite."""
+def _checked(keypoints: Float) -> tuple[Float, Float, Counter[str], Counter[str]]:
+    """Positions [M, K, 2] and confidences [M, K] of keypoints [M, K, 3]; what was dropped, and adjusted."""
     xy, confidence = keypoints[..., :2].copy(), keypoints[..., 2].copy()
-    bad_confidence = ~np.isfinite(confidence)
-    confidence[bad_confidence] = 0.0
-    bad_position = ~np.isfinite(xy).all(axis=-1)
     not_found = (xy == 0).all(axis=-1) & (confidence == 0)
-    xy[bad_position | not_found] = np.nan
-    confidence[bad_position] = 0.0
-    causes = {"joint not finite": bad_position, "confidence not finite": bad_confidence & ~bad_position}
-    return xy, confidence, Counter({cause: int(rows.sum()) for cause, rows in causes.items()})
+    not_finite = ~np.isfinite(xy).all(axis=-1)
+    far = ~not_finite & (np.abs(xy) > _FARTHEST_PX).any(axis=-1)
+    bad = not_finite | far
+    confidence_not_finite = ~bad & ~np.isfinite(confidence)
+    below, above = ~bad & (confidence < 0), ~bad & (confidence > 1) & ~confidence_not_finite
+    xy[bad | not_found] = np.nan
+    confidence[bad | ~np.isfinite(confidence)] = 0.0
+    dropped = {
+        "joint not finite": not_finite,
+        f"joint more than {_FARTHEST_PX} px away": far,
+        "confidence not finite": confidence_not_finite,
+        "confidence below 0": below & ~confidence_not_finite,
+    }
+    adjusted = {"confidence above 1, set to 1": above}
+    counted = [Counter({cause: int(rows.sum()) for cause, rows in of.items()}) for of in (dropped, adjusted)]
+    return xy, np.clip(confidence, 0.0, 1.0), counted[0], counted[1]
 
 
 def describe_detections(detections: Detections) -> dict[str, object]:
@@ -240,4 +279,6 @@ def describe_detections(detections: Detections) -> dict[str, object]:
         facts["picture size"] = list(detections.image_size)
     if detections.dropped:
         facts["left out"] = detections.dropped
+    if detections.adjusted:
+        facts["adjusted"] = detections.adjusted
     return facts

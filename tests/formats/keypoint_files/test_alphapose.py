@@ -38,7 +38,11 @@ def test_the_real_file_holds_what_is_known_of_it() -> None:
     np.testing.assert_allclose([*found.xy[0, 0], found.confidence[0, 0]], facts["first_keypoint"], atol=5e-4)
     np.testing.assert_allclose(np.nanmin(found.xy, axis=(0, 1)), facts["xy_bbox"]["min"], atol=0.005)
     np.testing.assert_allclose(np.nanmax(found.xy, axis=(0, 1)), facts["xy_bbox"]["max"], atol=0.005)
-    assert found.confidence.max() == pytest.approx(facts["conf_range"][1], abs=5e-4)
+    confidence = np.concatenate([entry["keypoints"][2::3] for entry in json.loads(path.read_text())])
+    assert confidence.max() == pytest.approx(facts["conf_range"][1], abs=5e-4)
+    assert facts["conf_range"][1] > 1  # AlphaPose's heatmaps exceed 1 a little
+    assert found.confidence.max() == 1
+    assert found.adjusted == {"confidence above 1, set to 1": np.count_nonzero(confidence > 1)}
     # Everybody's idx is 0 (no tracker), so the second person of one frame must not be taken for the first.
     assert found.dropped == {}
     assert sorted(set(found.person.tolist())) == [0, 1]
@@ -78,6 +82,48 @@ def test_values_that_are_missing_or_not_finite(tmp_path: Path) -> None:
     assert found.confidence[0, :4].tolist() == [0, 0, 0, 0]
     assert found.xy[0, 3].tolist() == [4, 5]
     assert found.dropped == {"joint not finite": 2, "confidence not finite": 1}
+
+
+@pytest.mark.parametrize("absurd", [1e9, -1e9, 1e308, -1e308, 1_000_001])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_joints_far_beyond_any_picture_are_left_out_and_counted(
+    tmp_path: Path, absurd: float, axis: int
+) -> None:
+    one = entry("1.jpg")
+    keypoints = [5.0, 6.0, 0.5] * 17
+    keypoints[3 * 4 + axis] = absurd
+    one["keypoints"] = keypoints
+    found = FORMAT.read_keypoints(written(tmp_path, [one]), skeleton=None, first_frame=0)
+    assert np.isnan(found.xy[0, 4]).all()
+    assert found.confidence[0, 4] == 0
+    assert np.isfinite(np.delete(found.xy[0], 4, axis=0)).all()
+    assert found.dropped == {"joint more than 1000000 px away": 1}
+
+
+def test_a_file_of_nothing_but_absurd_joints_is_refused_with_their_number(tmp_path: Path) -> None:
+    one = entry("1.jpg") | {"keypoints": [1e9, -1e9, 0.5] * 17}
+    with pytest.raises(DataError, match="17 x joint more than 1000000 px away"):
+        FORMAT.read_keypoints(written(tmp_path, [one]), skeleton=None, first_frame=0)
+
+
+def test_confidences_outside_0_to_1_are_counted(tmp_path: Path) -> None:
+    one = entry("1.jpg")
+    given = [-0.1, -1e308, 1.07, 97.0, 1e308, 0.0, 1.0, *[0.5] * 10]
+    one["keypoints"] = [value for confidence in given for value in (5.0, 6.0, confidence)]
+    found = FORMAT.read_keypoints(written(tmp_path, [one]), skeleton=None, first_frame=0)
+    assert found.confidence[0].tolist() == [0, 0, 1, 1, 1, 0, 1, *[0.5] * 10]
+    assert np.isfinite(found.xy).all()
+    assert found.dropped == {"confidence below 0": 2}
+    assert found.adjusted == {"confidence above 1, set to 1": 3}
+
+
+@pytest.mark.parametrize("ids", [(0, 0), (None, None), (7, 7)])
+def test_a_detection_listed_twice_is_one_person(tmp_path: Path, ids: tuple[object, object]) -> None:
+    path = written(tmp_path, [entry("1.jpg", idx) for idx in ids] + [entry("2.jpg", ids[0])])
+    found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
+    assert found.frame.tolist() == [1, 2]
+    assert len(set(found.person.tolist())) == 1
+    assert found.dropped == {"detection listed twice": 1}
 
 
 def test_frames_before_the_first_are_left_out_and_counted(tmp_path: Path) -> None:

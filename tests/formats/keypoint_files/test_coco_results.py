@@ -41,6 +41,15 @@ def written(folder: Path, content: object) -> Path:
     return path
 
 
+def test_a_file_that_was_appended_to_itself_holds_nobody_twice(tmp_path: Path) -> None:
+    once = [result(0, 10.0), result(0, 300.0), result(1, 11.0)]
+    found = FORMAT.read_keypoints(written(tmp_path, once + once), skeleton=None, first_frame=0)
+    assert found.frame.tolist() == [0, 0, 1]
+    assert found.person.tolist() == [0, 1, 0]
+    assert found.xy[:, 0, 0].tolist() == [10, 300, 11]
+    assert found.dropped == {"detection listed twice": 3}
+
+
 def test_the_real_annotations_hold_what_is_known_of_them() -> None:
     path = real_data("keypoints/coco_gt_mmpose_test_coco.json")
     facts = json.loads(real_data("facts.json").read_text())["keypoints/coco_gt_mmpose_test_coco.json"]

@@ -68,7 +68,7 @@ def test_a_folder_of_pictures(tmp_path: Path) -> None:
     folder = tmp_path / "predictions"
     written(folder / "img_0003.json", [])
     written(folder / "img_0004.json", [instance()])
-    written(folder / "img_0005.json", {"meta_info": {}, "instance_info": [instance(), instance()]})
+    written(folder / "img_0005.json", {"meta_info": {}, "instance_info": [instance(), instance(30.0)]})
     (folder / "img_0006.json").write_text("[{")
     written(folder / "settings.json", {})
     assert recognise(folder, KeypointFormat, "keypoint file").name == "mmpose"

@@ -94,7 +94,7 @@ def test_tracks_are_used_where_openpose_gives_them(tmp_path: Path) -> None:
     frame_file(tmp_path / "a", "cam.0001.json", person(track=4), person(track=2))
     found = FORMAT.read_keypoints(tmp_path / "a", skeleton=None, first_frame=0)
     assert found.person.tolist() == [2, 4]
-    frame_file(tmp_path / "b", "cam.0001.json", person(track=0), person(track=0))
+    frame_file(tmp_path / "b", "cam.0001.json", person(track=0), person(50.0, track=0))
     assert FORMAT.read_keypoints(tmp_path / "b", skeleton=None, first_frame=0).person.tolist() == [0, 1]
 
 
