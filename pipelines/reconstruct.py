@@ -8,7 +8,7 @@ be measured is NaN with a status that says why.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -74,7 +74,7 @@ from pipelines.session.true_joints import true_joints_at
 if TYPE_CHECKING:
     import pandas as pd
 
-RECONSTRUCT = Stage("reconstruct", revision=12)
+RECONSTRUCT = Stage("reconstruct", revision=13)
 
 _LONGEST_FILL_S = 10.0
 
@@ -353,6 +353,7 @@ def _attempt(
         truth=None if flight.truth is None else true_joints_at(flight.truth, observations.t_ns),
         solve=solve,
     )
+    people = {"people": _people_seen(cameras, seen.association)}
     progress.advance()
     return _Attempt(
         observations,
@@ -360,9 +361,14 @@ def _attempt(
         result,
         seen.association,
         seen.between_views,
-        metrics | finished | background | (refined.metrics if refined else {}),
+        metrics | finished | background | people | (refined.metrics if refined else {}),
         _poses_stored(cameras, refined, background["background"], description.pose_interpolation),
-        [*warnings, *(refined.warnings if refined else []), *seen.association.reasons],
+        [
+            *warnings,
+            *(refined.warnings if refined else []),
+            *seen.association.reasons,
+            *_said_people(people["people"]),
+        ],
     )
 
 
@@ -410,6 +416,35 @@ def _with_background(description: Description) -> list[str]:
         for name, entry in description.cameras.items()
         if entry.media is not None and not entry.poses.static
     ]
+
+
+def _people_seen(cameras: Sequence[Camera], association: Association) -> dict[str, Any]:
+    """Count the people whom the cameras saw against those that were asked for, and what was not used."""
+    asked = association.choice.shape[2]
+    return {
+        "asked": asked,
+        "seen_at_once": int(association.people.max(initial=0)),
+        "times": len(association.people),
+        "times_with_more": int((association.people > asked).sum()),
+        "detections_not_used": dict(
+            zip([camera.name for camera in cameras], association.unused.tolist(), strict=True)
+        ),
+    }
+
+
+def _said_people(people: Mapping[str, Any]) -> list[str]:
+    """Say how many people were left out, and how many detections are nobody's who was reconstructed."""
+    unused = [f"{name} {count}" for name, count in people["detections_not_used"].items() if count]
+    if not unused:
+        return []
+    line = f"detections of people who were not reconstructed: {', '.join(unused)}"
+    if people["times_with_more"]:
+        line += (
+            f"; two cameras or more see up to {people['seen_at_once']} people at once, and more than"
+            f" {people['asked']} at {people['times_with_more']} of {people['times']} times:"
+            f" --persons {people['seen_at_once']} reconstructs them"
+        )
+    return [line]
 
 
 def _follow_backgrounds(

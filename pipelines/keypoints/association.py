@@ -33,6 +33,7 @@ class Association:
     refused: Int64  # [P] camera-frames with detections of which none is the person whom others see
     resumed: Int64  # [P] times the person was lost by all and taken up again
     people: Int64  # [T] people whom at least two cameras see
+    unused: Int64  # [C] detections, over all times, that could be somebody and are nobody's who was chosen
     reasons: tuple[str, ...]  # one line for each thing worth knowing
 
 
@@ -241,5 +242,6 @@ def _counted(chosen: Int64, seen: Followed, resumed: Int64, reasons: tuple[str, 
         refused=refused.sum((1, 2)),
         resumed=resumed,
         people=np.rint(standing.sum((1, 2))).astype(np.int64),
+        unused=(seen.track >= 0).sum((0, 2)) - present.sum((0, 1)),
         reasons=reasons,
     )

@@ -84,6 +84,32 @@ def test_disturbed_poses_err_as_their_model_says(clean: tuple[SyntheticFlight, P
     assert other["trials"]["each"] != trials["each"][:2]
 
 
+def test_people_beyond_those_asked_for_are_counted_and_said(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=3, bystander=True, clean=True)
+    session = tmp_path / "flight.session"
+    succeeds("ingest", flight.manifest, "-o", session)
+    times = len(flight.t_ns)
+    passing = {
+        name: len(json.loads((tmp_path / f"{name}.json").read_text(encoding="utf-8"))) - times
+        for name in flight.cameras
+    }
+    assert run(session)["people"] == {
+        "asked": 1,
+        "seen_at_once": 2,
+        "times": times,
+        "times_with_more": times,
+        "detections_not_used": passing,
+    }
+    (line,) = [line for line in stage(session)["warnings"] if "not reconstructed" in line]
+    assert f"drone1 {passing['drone1']}, drone2 {passing['drone2']}" in line
+    assert f"more than 1 at {times} of {times} times: --persons 2" in line
+    both = run(session, "--persons", "2")["people"]
+    assert both["seen_at_once"] == both["asked"] == 2
+    assert both["times_with_more"] == 0
+    assert set(both["detections_not_used"].values()) == {0}
+    assert not any("not reconstructed" in line for line in stage(session)["warnings"])
+
+
 def test_gaps_stay_open_until_somebody_asks(clean: tuple[SyntheticFlight, Path]) -> None:
     flight, session = clean
     open_gap = run(session)

@@ -175,6 +175,10 @@ def test_three_people_who_cross_keep_their_identities() -> None:
         assert np.array_equal(c == person, present)
         assert np.array_equal(c >= 0, present)
     assert np.median(result.people) == 3
+    assert result.unused.tolist() == [0] * 5
+    alone = scene.associate(people=1)
+    others = (scene.who >= 0).sum((0, 2)) - (alone.choice[..., 0] >= 0).sum(0)
+    assert alone.unused.tolist() == others.tolist()
     assert not result.resumed.any()
     assert result.reasons == ()
 
