@@ -2,7 +2,8 @@
 
 Layout (OpenSim documentation, "Marker (.trc) Files"): 1 file type and name, 2 keys, 3 values (rates, counts,
 unit), 4 `Frame#`, `Time` and marker names, 5 X1 Y1 Z1 ..., an optional blank line, then one row per frame.
-Coordinates are y up by OpenSim's convention; a marker that was not seen has blank cells.
+Coordinates are y up by OpenSim's convention. A marker that was not seen has blank cells or NaN. We write NaN:
+OpenSim 4.6 does not count blank cells at the end of a line, and refuses a file whose last marker is missing.
 """
 
 from __future__ import annotations
@@ -100,7 +101,7 @@ class TrcFormat:
         }
 
     def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
-        """Read every row; blank cells are NaN.
+        """Read every row; blank cells and NaN are missing.
 
         Raises:
             DataError: no TRC header, no unit that we know, a row with another number of cells or
@@ -201,7 +202,7 @@ class TrcExport:
 def write_joints(
     path: Path, motion: JointMotion, person: int, *, unit: str = "m", axes: str = "y-up"
 ) -> None:
-    """Write one person's joints; a joint that is missing at a time has three blank cells."""
+    """Write one person's joints; a joint that is missing at a time has NaN in its three cells."""
     step = median_step_ns(motion.t_ns)
     rate = f"{1e9 / step:.6g}" if step else "1"
     markers = [re.sub(r"\s+", " ", marker_name(joint)) for joint in motion.joints]
@@ -220,7 +221,7 @@ def write_joints(
     for frame, (stamp, row) in enumerate(
         zip(format_seconds(motion.t_ns), rows.tolist(), strict=True), start=1
     ):
-        cells = ["" if math.isnan(value) else f"{value:.{decimals}f}" for value in row]
+        cells = ["NaN" if math.isnan(value) else f"{value:.{decimals}f}" for value in row]
         lines.append("\t".join([str(frame), stamp, *cells]))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -161,8 +163,67 @@ def test_export_is_what_opensim_expects(tmp_path: Path) -> None:
     assert lines[3] == "Frame#\tTime\tRHip\t\t\tNose\t\t"
     assert lines[4] == "\t\tX1\tY1\tZ1\tX2\tY2\tZ2"
     # World x 1, y 2, z 3 (up) are OpenSim's z, x, y (up).
-    assert lines[6] == "1\t0.000000000\t2.0000000\t3.0000000\t1.0000000\t\t\t"
+    assert lines[6] == "1\t0.000000000\t2.0000000\t3.0000000\t1.0000000\tNaN\tNaN\tNaN"
     assert {len(line.split("\t")) for line in lines[6:10]} == {8}
+
+
+def opensim() -> Any:
+    """OpenSim itself, told not to write opensim.log into the working folder."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # SWIG's wrappers deprecate themselves
+        library = pytest.importorskip("opensim", reason="opensim, the reader of TRC files, is not installed")
+    library.Logger.removeFileSink()
+    return library
+
+
+_FIRST, _MIDDLE, _LAST, _FRAMES = (slice(None), 0), (slice(None), 1), (slice(None), 2), slice(1, 3)
+
+
+@pytest.mark.parametrize(
+    "gaps",
+    [
+        pytest.param([], id="none"),
+        pytest.param([(2, 0)], id="first"),
+        pytest.param([(2, 1)], id="middle"),
+        pytest.param([(2, 2)], id="last"),
+        pytest.param([(2, 1), (2, 2)], id="last two"),
+        pytest.param([_FRAMES], id="all, for two frames"),
+        pytest.param([0], id="all, in the first frame"),
+        pytest.param([4], id="all, in the last frame"),
+        pytest.param([_FIRST], id="first, always"),
+        pytest.param([_MIDDLE], id="middle, always"),
+        pytest.param([_LAST], id="last, always"),
+        pytest.param([slice(None)], id="all, always"),
+    ],
+)
+@pytest.mark.parametrize("unit", ["m", "mm"])
+def test_opensim_and_we_read_every_pattern_of_gaps(tmp_path: Path, gaps: list[Any], unit: str) -> None:
+    library = opensim()
+    position = np.random.default_rng(0).uniform(-5, 5, (5, 3, 3))
+    for where in gaps:
+        position[where] = np.nan
+    t_ns = 1_700_000_000_000_000_000 + np.arange(5) * 33_333_333
+    motion = JointMotion(t_ns, ("left_hip", "right_hip", "nose"), position[:, None])
+    path = tmp_path / "gaps.trc"
+    trc.write_joints(path, motion, 0, unit=unit)
+
+    table = library.TimeSeriesTableVec3(str(path))
+    assert list(table.getColumnLabels()) == ["LHip", "RHip", "Nose"]
+    assert table.getTableMetaDataString("Units") == unit
+    np.testing.assert_allclose(list(table.getIndependentColumn()), t_ns / 1e9, rtol=0, atol=1e-6)
+    rows = [table.getRowAtIndex(row) for row in range(table.getNumRows())]
+    cells = np.array([[[row[k][axis] for axis in range(3)] for k in range(3)] for row in rows])
+    # OpenSim's x, y (up), z are the world's y, z (up), x. Seven decimals of a metre are written.
+    turned = position[..., [1, 2, 0]]
+    np.testing.assert_allclose(cells / {"m": 1, "mm": 1000}[unit], turned, rtol=0, atol=0.5001e-7)
+    # The older reader, which scaling and inverse kinematics use for marker files.
+    frames = library.MarkerData(str(path))
+    assert (frames.getNumFrames(), frames.getNumMarkers()) == (5, 3)
+    older = [
+        [[frames.getFrame(row).getMarker(k)[axis] for axis in range(3)] for k in range(3)] for row in range(5)
+    ]
+    np.testing.assert_array_equal(np.isnan(older), np.isnan(turned))
+    np.testing.assert_array_equal(np.isnan(read(path).position[:, 0]), np.isnan(position))
 
 
 @pytest.mark.parametrize(
