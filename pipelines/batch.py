@@ -27,6 +27,7 @@ from pipelines.reconstruct import reconstruct
 from pipelines.replan import replan
 from pipelines.report import report
 from pipelines.reporting.flights import COLUMNS, FlightRow, render_flights
+from pipelines.reporting.wording import cell_text
 from pipelines.session.description import read_description
 from pipelines.session.errors import BusyError, DataError, MocapError
 from pipelines.session.progress import Progress, Silent
@@ -391,12 +392,11 @@ def _from(folder: Path, path: Path) -> str:
 def _store(folder: Path, rows: Sequence[FlightRow], outcomes: Sequence[Outcome]) -> None:
     arms = list(dict.fromkeys(name for row in rows for name in row.arms))
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*COLUMNS, *arms, "warnings", "report"])
+    csv.writer(text, lineterminator="\n").writerow(map(cell_text, [*COLUMNS, *arms, "warnings", "report"]))
+    writer = csv.writer(text, lineterminator="\n", quoting=csv.QUOTE_NONNUMERIC)
     for row in rows:
-        writer.writerow(
-            [*row.cells(), *(row.figures.get(arm) for arm in arms), len(row.warnings), row.report]
-        )
+        cells = [*row.cells(), *(row.figures.get(arm) for arm in arms), len(row.warnings), row.report]
+        writer.writerow(map(cell_text, cells))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _write_text(folder / _TABLE, text.getvalue())

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.plates import Plate
 from pipelines.reporting.svg import WIDTH_IN, page_style, settled
+from pipelines.reporting.wording import cell_text
 from pipelines.session.errors import DataError
 from pipelines.session.storage import read_json, write_json
 from pipelines.session.whole_folders import refuse_sessions
@@ -51,7 +52,10 @@ def write_figures(
         names = _write_drawing(folder, plate.key, plate.figure)
         for what, numbers in plate.numbers.items():
             name = f"{plate.key}-{what}.csv" if what else f"{plate.key}.csv"
-            numbers.to_csv(folder / name, index=False, float_format="%.9g", lineterminator="\n")
+            texts = numbers.select_dtypes(exclude="number").map(cell_text)
+            numbers.assign(**texts).to_csv(
+                folder / name, index=False, float_format="%.9g", lineterminator="\n"
+            )
             names.append(name)
         words = {"title": plate.title, "caption": plate.caption, "description": plate.description}
         told.append({"figure": plate.key, **words, "files": names})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 
@@ -10,6 +11,8 @@ ABSENT = "–"
 
 # A stamp after this one counts from the epoch: no log counts 30 years since its own start.
 _EPOCH_SINCE_NS = 946_684_800_000_000_000  # 2000-01-01
+
+_FORMULA = re.compile(r"(?:^|(?<=[;\t\r\n]))(?=[-=+@\t\r\n＝＋－＠])")
 
 STATUS_LABELS = {
     "ok": "measured",
@@ -92,6 +95,16 @@ def shortened(label: str, length: int = 24) -> str:
     clean = "".join(c if c.isprintable() else " " for c in label).strip()
     half = (length - 1) // 2
     return clean if len(clean) <= length else f"{clean[:half]}…{clean[-half:]}"
+
+
+def cell_text(value: object) -> object:
+    """Return a CSV's cell such that no spreadsheet takes its text for a formula; numbers stay as they are.
+
+    OWASP, "CSV Injection": a single quote before =, +, -, @, tab, carriage return, line feed and the
+    full-width forms of the first four. It stands also where a cell begins for spreadsheets that separate by
+    semicolons or tabs, and after line breaks.
+    """
+    return _FORMULA.sub("'", value) if isinstance(value, str) else value
 
 
 def joint_label(name: str) -> str:

@@ -97,6 +97,14 @@ def test_numbers_are_those_of_the_session(written: Path) -> None:
     np.testing.assert_allclose(radius, 6.0, atol=0.35)
 
 
+def test_labels_are_no_formulas_of_a_spreadsheet(tmp_path: Path, plates: Mapping[str, Plate]) -> None:
+    numbers = pd.DataFrame({"session": ["=1+1", "walk"], "value": [-1.5, 2.0]})
+    write_figures(tmp_path, {"time": replace(plates["time"], numbers={"": numbers})}, {}, "k")
+    read = _read(tmp_path, "time.csv")
+    assert read["session"].tolist() == ["'=1+1", "walk"]
+    assert read["value"].tolist() == [-1.5, 2.0]
+
+
 def test_numbers_of_arms_are_those_of_the_comparison(written: Path) -> None:
     arms = _read(written, "arms-time.csv")
     assert len(arms) == 3 * 2 * TIMES

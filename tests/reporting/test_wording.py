@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from pipelines.reporting.wording import (
     THIN,
+    cell_text,
     fixed,
     flattened,
     listing,
@@ -43,6 +44,15 @@ def test_shortened_fits_a_label(name: str) -> None:
     label = shortened(name)
     assert len(label) <= 24
     assert label.isprintable()
+
+
+@pytest.mark.parametrize("start", "=+-@\t\r\n＝＋－＠")
+def test_texts_of_cells_are_no_formulas(start: str) -> None:
+    assert cell_text(f"{start}1") == f"'{start}1"
+    assert cell_text(f"a{start}1") == f"a{start}1"
+    assert cell_text(f"a;{start}1") == f"a;'{start}1"
+    assert cell_text(-1.5) == -1.5
+    assert cell_text(None) is None
 
 
 def test_numbers() -> None:
