@@ -19,7 +19,7 @@ from mocap_cli.options import (
     verbosity_options,
     workers_option,
 )
-from mocap_cli.terminal import print_json, print_table, watching
+from mocap_cli.terminal import print_json, print_table, say, watching
 
 if TYPE_CHECKING:
     from pipelines.simulation.study.settings import Study
@@ -169,20 +169,21 @@ def _run(study: Study, varied: Mapping[str, Any], shared: Mapping[str, Any]) -> 
         return
     if not quiet:
         _print(result.summary)
-    click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder}")
+    say(f"{'unchanged' if result.skipped else 'written'}: {result.folder}")
 
 
 def _print(summary: Mapping[str, Any]) -> None:
     from pipelines.reporting.ablation import tables
 
     settings = summary["settings"]
-    click.echo(
+    say(
         f"Simulated: {settings['seconds']:g} s of walking at {settings['rate_hz']:g} Hz, keypoints:"
         f" {summary['keypoints']}; mean [95 % interval], trials: {settings['trials']};"
         " MPJPE, root-relative and PA on the joint-frames that every method has"
     )
     for table in tables(summary):
-        click.echo(f"\n{table.title}")
+        say()
+        say(table.title)
         print_table(table.header, table.rows)
 
 

@@ -17,7 +17,7 @@ from mocap_cli.options import (
     verbosity_options,
 )
 from mocap_cli.several import expanded
-from mocap_cli.terminal import one_line, print_json, watching
+from mocap_cli.terminal import one_line, print_json, say, watching
 
 if TYPE_CHECKING:
     from pipelines.geometry.triangulation import Method
@@ -110,7 +110,7 @@ def batch_command(
     failures = [row for row in result.rows if row.error is not None]
     if quiet:  # else they were told as they came
         for row in failures:
-            click.echo(f"failed: {one_line(str(row.error))}", err=True)
+            say(f"failed: {one_line(str(row.error))}", err=True)
     if as_json:
         print_json(
             {
@@ -124,9 +124,9 @@ def batch_command(
     else:
         done = len(result.rows) - len(failures)
         if not quiet:
-            click.echo(f"{done} of {len(result.rows)} flights done, {result.unchanged} of them unchanged")
-        click.echo(f"written: {result.table}")
-        click.echo(f"written: {result.page}")
+            say(f"{done} of {len(result.rows)} flights done, {result.unchanged} of them unchanged")
+        say(f"written: {result.table}")
+        say(f"written: {result.page}")
     if failures:
-        click.echo(f"mocap: {len(failures)} of {len(result.rows)} flights failed", err=True)
+        say(f"mocap: {len(failures)} of {len(result.rows)} flights failed", err=True)
         context.exit(1)

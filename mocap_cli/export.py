@@ -17,7 +17,7 @@ from mocap_cli.options import (
     verbosity_options,
 )
 from mocap_cli.several import each
-from mocap_cli.terminal import watching
+from mocap_cli.terminal import say, watching
 
 _LONGEST_LIST = 4  # files
 
@@ -111,6 +111,6 @@ def _print(what: str, paths: Sequence[Path]) -> None:
     """Print a line for each of a few files; of many the first, and how many more there are."""
     shown = paths if len(paths) <= _LONGEST_LIST else paths[: _LONGEST_LIST - 1]
     for path in shown:
-        click.echo(f"{what}: {path}")
+        say(f"{what}: {path}")
     if rest := len(paths) - len(shown):
-        click.echo(f"{what}: {rest} more in {paths[0].parent} (export.json lists them all)")
+        say(f"{what}: {rest} more in {paths[0].parent} (export.json lists them all)")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from mocap_cli.options import FiniteRange, any_path
-from mocap_cli.terminal import print_table
+from mocap_cli.terminal import print_table, say
 
 if TYPE_CHECKING:
     from pipelines.session.progress import Progress
@@ -78,7 +78,8 @@ def film_arms(session: Path, asked: Rendering, *, force: bool, progress: Progres
 
 def print_filmed(metrics: dict[str, Any]) -> None:
     """One row for each arm."""
-    click.echo(f"\nfilmed (simulated) at {metrics['rate_hz']:g} Hz, keypoints by {metrics['detector']}:")
+    say()
+    say(f"filmed (simulated) at {metrics['rate_hz']:g} Hz, keypoints by {metrics['detector']}:")
     header = [
         "arm",
         "pictures",

@@ -10,7 +10,7 @@ import click
 
 from mocap_cli.options import json_option
 from mocap_cli.several import each
-from mocap_cli.terminal import one_line
+from mocap_cli.terminal import one_line, say
 
 _LONGEST_LIST = 12
 
@@ -31,7 +31,7 @@ def info_command(path: Path, as_json: bool) -> dict[str, Any] | None:
     if as_json:
         return {"path": str(path), "readings": [{"kind": r.title, **jsonable(r.facts)} for r in readings]}
     for reading in readings:
-        click.echo(f"{reading.path}: {reading.title}")
+        say(f"{reading.path}: {reading.title}")
         _print_facts(reading.facts, indent=2)
     return None
 
@@ -41,10 +41,10 @@ def _print_facts(facts: Mapping[str, object], indent: int) -> None:
     for name, value in facts.items():
         label = " " * indent + one_line(name)
         if isinstance(value, Mapping) and value:
-            click.echo(label)
+            say(label)
             _print_facts(value, indent + 2)
         else:
-            click.echo(f"{label.ljust(indent + width)}  {_text(value)}")
+            say(f"{label.ljust(indent + width)}  {_text(value)}")
 
 
 def _text(value: object) -> str:

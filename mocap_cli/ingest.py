@@ -17,7 +17,7 @@ from mocap_cli.options import (
     verbosity_options,
 )
 from mocap_cli.several import each
-from mocap_cli.terminal import one_line, print_table, say_warnings, watching
+from mocap_cli.terminal import one_line, print_table, say, say_warnings, watching
 
 if TYPE_CHECKING:
     from pipelines.ingest import Ingested
@@ -86,7 +86,7 @@ def ingest_command(
         _print(result)
         _print_stamps(result)
         _print_origin(result)
-    click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder}")
+    say(f"{'unchanged' if result.skipped else 'written'}: {result.folder}")
     return None
 
 
@@ -95,13 +95,13 @@ def _print_stamps(result: Ingested) -> None:
     for stamps in ("header", "receive"):
         names = [name for name, c in result.description.cameras.items() if c.poses.stamps == stamps]
         if names:
-            click.echo(f"poses are timed by the {stamps} stamps of their logs: {', '.join(names)}")
+            say(f"poses are timed by the {stamps} stamps of their logs: {', '.join(names)}")
 
 
 def _print_origin(result: Ingested) -> None:
     """Where on Earth the world's origin was laid."""
     if origin := result.description.origin:
-        click.echo(
+        say(
             f"world origin: {origin.latitude_deg:.7f}, {origin.longitude_deg:.7f}, {origin.altitude_m:.2f} m"
             f" ({one_line(origin.source)})"
         )
@@ -113,7 +113,7 @@ def _print(result: Ingested) -> None:
         min(camera.frames.first_t_ns for camera in description.cameras.values()),
         max(camera.frames.last_t_ns for camera in description.cameras.values()),
     ]
-    click.echo(f"{one_line(description.flight)}: {(span[1] - span[0]) / 1e9:.2f} s")
+    say(f"{one_line(description.flight)}: {(span[1] - span[0]) / 1e9:.2f} s")
     print_table(
         ("camera", "picture", "frames", "Hz", "poses", "Hz", "no pose", "gaps", "keypoints", "people"),
         [

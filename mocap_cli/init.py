@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from mocap_cli.options import any_path, json_option, level, overwrite_option, verbosity_options
-from mocap_cli.terminal import one_line, print_json, watching
+from mocap_cli.terminal import one_line, print_json, say, watching
 
 _MANY = 5  # files of one kind in one folder that are told one by one
 
@@ -42,10 +42,10 @@ def init_command(
         result = draft(paths, output, overwrite=overwrite, progress=progress)
     if not quiet:
         for line in _left_out(result.left_out):
-            click.echo(line, err=True)
+            say(line, err=True)
         for word, remarks in (("missing", result.missing), ("assumed", result.assumed)):
             for remark in remarks:
-                click.echo(f"{word}: {one_line(remark)}", err=True)
+                say(f"{word}: {one_line(remark)}", err=True)
     if as_json:
         summary = {
             "flight": str(result.path),
@@ -56,8 +56,8 @@ def init_command(
         }
         print_json(jsonable(summary))
     else:
-        click.echo(f"cameras: {', '.join(result.cameras) or 'none'}")
-        click.echo(f"written: {_from_here(result.path)}")
+        say(f"cameras: {', '.join(result.cameras) or 'none'}")
+        say(f"written: {_from_here(result.path)}")
 
 
 def _from_here(path: Path) -> Path:

@@ -19,7 +19,7 @@ from mocap_cli.reconstruct import reconstruct_command
 from mocap_cli.replan_compare import replan_compare_command
 from mocap_cli.report import report_command
 from mocap_cli.simulate import simulate_command
-from mocap_cli.terminal import one_line
+from mocap_cli.terminal import one_line, say
 from pipelines.session.errors import MocapError
 
 _INTERRUPTED = 130  # what shells expect after Ctrl-C
@@ -37,10 +37,13 @@ class Mocap(click.Group):
         try:
             return super().invoke(ctx)
         except MocapError as error:
-            click.echo(f"mocap: {one_line(str(error))}", err=True)
+            say(f"mocap: {one_line(str(error))}", err=True)
             ctx.exit(1)
+        except click.UsageError as error:
+            error.message = one_line(error.message)  # a shell's pattern brings names of files
+            raise
         except KeyboardInterrupt:
-            click.echo("mocap: interrupted; nothing is lost, the same command continues", err=True)
+            say("mocap: interrupted; nothing is lost, the same command continues", err=True)
             ctx.exit(_INTERRUPTED)
 
 
@@ -79,7 +82,7 @@ def run() -> None:
         # The reader of our output (head, a pager) went away: no reason for a traceback at exit.
         _leave_stdout()
     except OSError as error:
-        click.echo(f"mocap: cannot write its output ({error.strerror}); nothing else is lost", err=True)
+        say(f"mocap: cannot write its output ({error.strerror}); nothing else is lost", err=True)
         _leave_stdout()
 
 

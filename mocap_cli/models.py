@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from mocap_cli.options import any_path, json_option
-from mocap_cli.terminal import print_json, print_table
+from mocap_cli.terminal import print_json, print_table, say
 
 
 @click.group("models", invoke_without_command=True, short_help="List and fetch keypoint detectors.")
@@ -15,8 +15,21 @@ from mocap_cli.terminal import print_json, print_table
 @click.pass_context
 def models_command(context: click.Context, as_json: bool) -> None:
     """List the keypoint detectors and whether their files are here; `fetch` gets those that are missing."""
-    if context.invoked_subcommand is not None:
-        return
+    if context.invoked_subcommand is None:
+        _list(as_json)
+
+
+@models_command.command("list")
+@json_option
+@click.pass_context
+def list_command(context: click.Context, as_json: bool) -> None:
+    """List the keypoint detectors and whether their files are here, as `mocap models` does."""
+    above = context.parent.params if context.parent else {}
+    _list(as_json or bool(above.get("as_json")))
+
+
+def _list(as_json: bool) -> None:
+    """Print the detectors that are registered, with their files, and the families of users' own models."""
     from pipelines.session.registries import DETECTORS, DetectorFamily
 
     registered = DETECTORS.all()
@@ -36,9 +49,13 @@ def models_command(context: click.Context, as_json: bool) -> None:
     )
     for detector in detectors:
         if None in detector.models().values():
-            click.echo(f"Get what is missing with `mocap models fetch {detector.name}`.")
+            say(f"Get what is missing with `mocap models fetch {detector.name}`.")
     for family in families:
-        click.echo(f"\n{family.title}: --detector {family.usage.replace(chr(10), chr(10) + '  ')}")
+        first, *more = family.usage.splitlines()
+        say()
+        say(f"{family.title}: --detector {first}")
+        for line in more:
+            say(f"  {line}")
 
 
 @models_command.command("fetch")
@@ -60,7 +77,7 @@ def fetch_command(name: str, source: Path | None, as_json: bool) -> None:
         print_json(_listed(detector.name, detector.title, detector.models()))
         return
     for path in detector.models().values():
-        click.echo(f"ready: {path}")
+        say(f"ready: {path}")
 
 
 def _listed(name: str, title: str, files: dict[str, Path | None]) -> dict[str, object]:

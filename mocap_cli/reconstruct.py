@@ -19,7 +19,7 @@ from mocap_cli.options import (
     verbosity_options,
 )
 from mocap_cli.several import each
-from mocap_cli.terminal import print_table, say_warnings, watching
+from mocap_cli.terminal import print_table, say, say_warnings, watching
 
 if TYPE_CHECKING:
     from pipelines.geometry.triangulation import Method
@@ -188,9 +188,9 @@ def reconstruct_command(
         return result.metrics
     if not quiet:
         _print(result, every_joint=verbose > 0)
-    click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'reconstruct'}")
+    say(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'reconstruct'}")
     for video in videos:
-        click.echo(f"written: {video}")
+        say(f"written: {video}")
     return None
 
 
@@ -198,14 +198,14 @@ def _print(result: Reconstructed, *, every_joint: bool) -> None:
     metrics: dict[str, Any] = result.metrics
     counts = metrics["status_counts"]
     filled = f", {counts['filled']} filled" if counts.get("filled") else ""
-    click.echo(f"{metrics['method']}: {counts['ok']} of {counts['all']} joint-frames reconstructed{filled}")
+    say(f"{metrics['method']}: {counts['ok']} of {counts['all']} joint-frames reconstructed{filled}")
     if metrics.get("smoothing"):
         done = metrics["smoothing"]
         cutoff = done["cutoff_hz"]
-        click.echo(f"smoothed: {done['filter']}" + (f", cutoff {cutoff:.2g} Hz" if cutoff else ""))
+        say(f"smoothed: {done['filter']}" + (f", cutoff {cutoff:.2g} Hz" if cutoff else ""))
     _print_summary(metrics)
     if every_joint:
-        click.echo()
+        say()
         _print_joints(metrics)
 
 

@@ -18,7 +18,7 @@ from mocap_cli.options import (
     verbosity_options,
 )
 from mocap_cli.several import each
-from mocap_cli.terminal import print_table, say_warnings, watching
+from mocap_cli.terminal import print_table, say, say_warnings, watching
 
 if TYPE_CHECKING:
     from pipelines.planning.replay import Mode
@@ -148,7 +148,7 @@ def replan_compare_command(
         _print(result.metrics)
         if filmed is not None:
             print_filmed(filmed)
-    click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'replan'}")
+    say(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'replan'}")
     return None
 
 
@@ -173,7 +173,7 @@ def _print(metrics: dict[str, Any]) -> None:
             ]
         )
     print_table(header, rows)
-    click.echo(metrics["verdict"])
+    say(metrics["verdict"])
 
 
 def _with_interval(estimate: dict[str, Any] | None) -> str | None:

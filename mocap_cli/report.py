@@ -15,7 +15,7 @@ from mocap_cli.options import (
     verbosity_options,
 )
 from mocap_cli.several import end, expanded, tell
-from mocap_cli.terminal import print_json, say_warnings, watching
+from mocap_cli.terminal import print_json, say, say_warnings, watching
 from pipelines.session.errors import MocapError
 
 
@@ -103,5 +103,5 @@ def report_command(
     pages += [] if compared is None else [(compared.skipped, compared.page)]
     pages += [] if drawn is None else [(drawn.skipped, drawn.folder)]
     for skipped, page in pages:
-        click.echo(f"{'unchanged' if skipped else 'written'}: {page}")
+        say(f"{'unchanged' if skipped else 'written'}: {page}")
     end(failed, ones)

@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from mocap_cli.options import any_path
-from mocap_cli.terminal import one_line, print_json
+from mocap_cli.terminal import one_line, print_json, say
 from pipelines.session.errors import DataError, MocapError
 from pipelines.session.several import names_of
 
@@ -92,7 +92,7 @@ def _run_all(
     failed: dict[str, str] = {}
     for path, call in zip(paths, calls, strict=True):
         if titled:
-            click.echo(f"{one_line(str(path))}:")
+            say(f"{one_line(str(path))}:")
         try:
             results[str(path)] = call()
         except MocapError as error:
@@ -105,12 +105,12 @@ def _run_all(
 def tell(error: MocapError) -> str:
     """The line of one that failed, which stops none of the others."""
     line = one_line(str(error))
-    click.echo(f"mocap: {line}", err=True)
+    say(f"mocap: {line}", err=True)
     return line
 
 
 def end(failed: Collection[str], paths: Collection[Path]) -> None:
     """Exit with 1, and the count, where any failed."""
     if failed:
-        click.echo(f"mocap: {len(failed)} of {len(paths)} failed", err=True)
+        say(f"mocap: {len(failed)} of {len(paths)} failed", err=True)
         click.get_current_context().exit(1)

@@ -15,7 +15,7 @@ from mocap_cli.options import (
     verbosity_options,
     workers_option,
 )
-from mocap_cli.terminal import print_json, print_table, watching
+from mocap_cli.terminal import print_json, print_table, say, watching
 
 
 @click.command("simulate", short_help="Make a flight with known truth.")
@@ -61,6 +61,6 @@ def simulate_command(
     if not quiet:
         summary = result.summary
         rows = [(name, count, summary["poses"][name]) for name, count in summary["frames"].items()]
-        click.echo(f"{summary['name']}: {summary['duration_s']:g} s, simulated, {summary['pictures']}")
+        say(f"{summary['name']}: {summary['duration_s']:g} s, simulated, {summary['pictures']}")
         print_table(("camera", "frames", "poses"), rows)
-    click.echo(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'flight.yaml'}")
+    say(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'flight.yaml'}")

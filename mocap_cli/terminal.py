@@ -1,9 +1,14 @@
-"""What the terminal shows: progress and notes on stderr, results on stdout."""
+"""What the terminal shows: progress and notes on stderr, results on stdout.
+
+All that commands print goes through here. Names of files, topics and cameras and texts of files come from
+others: whatever in them could steer a terminal or begin a line of its own is made visible instead.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -26,6 +31,16 @@ def one_line(text: str) -> str:
     return shown if len(shown) <= _LONGEST_LINE else shown[:_LONGEST_LINE] + " ..."
 
 
+def say(text: str = "", *, err: bool = False) -> None:
+    """Print one line. Control characters, line breaks and bytes that are no text become question marks."""
+    click.echo("".join(c if _is_shown(c) else "?" for c in text), err=err)
+
+
+def _is_shown(c: str) -> bool:
+    """Test if a character is text or a space of any width, and no control, direction mark or line break."""
+    return c.isprintable() or unicodedata.category(c) == "Zs"
+
+
 class _Notes:
     """Progress without bars: notes only, and none at all when quiet."""
 
@@ -34,14 +49,14 @@ class _Notes:
 
     def start(self, task: str, total: int) -> None:
         if self._verbosity > 0:
-            click.echo(f"{task} ({total})", err=True)
+            say(f"{one_line(task)} ({total})", err=True)
 
     def advance(self, steps: int = 1) -> None:
         """Nothing moves without a bar."""
 
     def note(self, message: str) -> None:
         if self._verbosity >= 0:
-            click.echo(one_line(message), err=True)
+            say(one_line(message), err=True)
 
 
 class _BarsOnStderr(_Notes):
@@ -53,7 +68,9 @@ class _BarsOnStderr(_Notes):
         self._task: TaskID | None = None
 
     def start(self, task: str, total: int) -> None:
-        self._task = self._bars.add_task(task, total=total)
+        from rich.markup import escape
+
+        self._task = self._bars.add_task(escape(one_line(task)), total=total)
 
     def advance(self, steps: int = 1) -> None:
         if self._task is not None:
@@ -81,12 +98,13 @@ def say_warnings(warnings: Sequence[str], quiet: bool) -> None:
     """What is doubtful, on stderr."""
     if not quiet:
         for warning in warnings:
-            click.echo(f"warning: {one_line(warning)}", err=True)
+            say(f"warning: {one_line(warning)}", err=True)
 
 
 def print_json(result: Mapping[str, object]) -> None:
-    """The machine-readable result."""
-    click.echo(json.dumps(result, indent=2, ensure_ascii=False, allow_nan=False))
+    """Print the machine-readable result; what is not printable is escaped, so that nothing of it is lost."""
+    text = json.dumps(result, indent=2, ensure_ascii=False, allow_nan=False)
+    click.echo("".join(c if _is_shown(c) or c == "\n" else json.dumps(c)[1:-1] for c in text))
 
 
 def print_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
@@ -102,7 +120,7 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> None
             cell.rjust(width) if right else cell.ljust(width)
             for cell, width, right in zip(line, widths, numeric, strict=True)
         ]
-        click.echo("  ".join(cells).rstrip())
+        say("  ".join(cells).rstrip())
 
 
 def _cell(value: object) -> str:

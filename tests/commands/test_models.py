@@ -32,6 +32,13 @@ def test_what_is_missing_is_listed_with_the_command_that_gets_it(empty_cache: Pa
     }
 
 
+def test_list_is_the_same_as_no_subcommand(empty_cache: Path) -> None:
+    assert succeeds("models", "list") == succeeds("models")
+    assert succeeds("models", "list", "--json") == succeeds("models", "--json")
+    assert succeeds("models", "--json", "list") == succeeds("models", "--json")
+    assert "list" in succeeds("models", "--help")
+
+
 def test_what_is_there_is_listed_with_its_place(empty_cache: Path) -> None:
     (empty_cache / "blazepose").mkdir(parents=True)
     for file in FILES:

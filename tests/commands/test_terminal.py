@@ -1,0 +1,95 @@
+"""What commands print: names and texts from outside must not steer a terminal or begin lines of their own."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import unicodedata
+from pathlib import Path
+
+import pytest
+
+import mocap_cli
+from mocap_cli.terminal import say
+from tests.commands.runner import mocap, succeeds
+from tests.synthetic.flights import write_flight
+
+# A colour, the same by one byte of C1, a title with BEL, reversed reading order, lines begun anew or forged.
+EVIL = ["\x1b[31m", "\x9b31m", "\x1b]0;t\x07", "\u202e", "\r", "\nmocap: all is well", "\x7f", "\u2028"]
+STEERING = {"Cc", "Cf", "Zl", "Zp", "Cs"}
+
+
+def steering(text: str) -> set[str]:
+    """What is in a text and could steer a terminal, but for the ends of lines."""
+    return {c for c in text.replace("\n", "") if unicodedata.category(c) in STEERING}
+
+
+def test_commands_print_in_one_place_only() -> None:
+    found = []
+    for path in sorted(Path(mocap_cli.__file__).parent.glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            name = ast.unparse(node.func) if isinstance(node, ast.Call) else ""
+            if name in {"click.echo", "click.secho", "print", "sys.stdout.write", "sys.stderr.write"}:
+                found.append(path.name)
+    assert found == ["terminal.py", "terminal.py"]  # `say` and `print_json`
+
+
+@pytest.mark.parametrize("evil", EVIL)
+def test_a_line_stays_one_line_that_steers_nothing(evil: str, capsys: pytest.CaptureFixture[str]) -> None:
+    say(f"  written: a{evil}b  c\u00a0d\u3000e \u00e9\u4e2d")
+    printed = capsys.readouterr().out
+    assert printed.count("\n") == 1
+    assert not steering(printed)
+    assert printed.startswith("  written: a?")
+    assert printed.endswith("b  c\u00a0d\u3000e \u00e9\u4e2d\n")
+
+
+@pytest.mark.parametrize("evil", EVIL)
+def test_info_of_an_evil_file(tmp_path: Path, evil: str) -> None:
+    path = tmp_path / f"true{evil}joints.csv"
+    joint = evil.strip("\r\n")
+    path.write_text(f"t_ns,joint,x,y,z\n0,no{joint}se,1,2,3\n", encoding="utf-8", newline="")
+    printed = succeeds("info", path)
+    assert not steering(printed)
+    assert not any(line.startswith("mocap: ") for line in printed.splitlines())
+    assert "joints.csv: 3D joints as CSV" in printed
+    told = succeeds("info", path, "--json")
+    assert not steering(told)
+    assert json.loads(told)["path"] == str(path)  # nothing of the name is lost there
+
+
+def test_a_name_that_is_no_text(tmp_path: Path) -> None:
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.csv"))
+    path.write_text("t_ns,joint,x,y,z\n0,nose,1,2,3\n", encoding="utf-8")
+    assert "/?.csv: 3D joints as CSV" in succeeds("info", path)
+    assert json.loads(succeeds("info", path, "--json"))["path"] == str(path)
+
+
+def test_every_command_that_names_files(tmp_path: Path) -> None:
+    folder = tmp_path / "a\x1b[31m\nmocap: all is well"
+    flight = write_flight(folder, seconds=0.3)
+    flight.settings["name"] = "Fly\x1b[2Jing\x9b"
+    flight.save()
+    session = folder / "flight.session"
+    commands: list[tuple[str | Path, ...]] = [
+        ("ingest", flight.manifest),
+        ("reconstruct", session),
+        ("export", session, "--to", "csv"),
+        ("export", session, "--to", "csv"),
+        ("report", session),
+        ("info", flight.manifest),
+        ("info", session, flight.manifest),
+        ("init", folder, "-o", folder / "draft.yaml"),
+        ("ingest", folder / "none.yaml"),
+        ("reconstruct", session, folder, "-q"),
+        ("reconstruct", session, f"--no\x1b[31m{folder}"),
+        (f"no\x1b[31m{folder}",),
+    ]
+    for command in commands:
+        done = mocap(*command)
+        printed = done.stdout + done.stderr
+        assert printed, command
+        assert not steering(printed), (command, printed)
+        assert not any(line == "mocap: all is well" for line in printed.splitlines()), command
+        assert "Traceback" not in printed
