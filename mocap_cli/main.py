@@ -40,8 +40,8 @@ class Mocap(click.Group):
             say(f"mocap: {one_line(str(error))}", err=True)
             ctx.exit(1)
         except click.UsageError as error:
-            error.message = one_line(error.message)  # a shell's pattern brings names of files
-            raise
+            # A shell's pattern brings names of files, which may be anything.
+            raise click.UsageError(one_line(error.format_message()), error.ctx) from None
         except KeyboardInterrupt:
             say("mocap: interrupted; nothing is lost, the same command continues", err=True)
             ctx.exit(_INTERRUPTED)

@@ -19,7 +19,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pipelines.formats.common.extras import need
 from pipelines.geometry.triangulation import Method
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings as ReconstructSettings
@@ -30,6 +29,7 @@ from pipelines.reporting.flights import COLUMNS, FlightRow, render_flights
 from pipelines.reporting.wording import cell_text
 from pipelines.session.description import read_description
 from pipelines.session.errors import BusyError, DataError, MocapError
+from pipelines.session.extras import need
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.several import names_of
 from pipelines.session.storage import as_data_error, read_json, write_json

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.session.errors import DataError
+from pipelines.session.extras import need
 
 Layout = Literal["nchw", "nhwc"]
 Provider = Literal["cpu", "cuda"]
@@ -125,14 +124,9 @@ class OnnxNetwork:
         return dict(zip(wanted, (np.asarray(value) for value in values), strict=True))
 
 
-def _runtime() -> ModuleType:
-    """ONNX Runtime, which brings no types."""
-    try:
-        return import_module("onnxruntime")
-    except ImportError:
-        raise DataError(
-            "onnxruntime", "is not installed", 'run `pip install "mocap-pipeline[onnx]"`'
-        ) from None
+def _runtime() -> Any:
+    """Import ONNX Runtime, which brings no types."""
+    return need("onnxruntime", "onnx")
 
 
 def _session(path: Path, provider: Provider, threads: int) -> Any:

@@ -262,7 +262,9 @@ def test_what_a_batch_cannot_start_with(tmp_path: Path, monkeypatch: pytest.Monk
         "batch", tmp_path / "a" / "*.yaml", "--scheduler", "tcp://127.0.0.1:9", "-o", tmp_path / "out"
     )
     monkeypatch.setitem(sys.modules, "distributed", None)
-    assert 'pip install "mocap-pipeline[batch]"' in refused("batch", tmp_path / "a" / "*.yaml")
+    assert 'run `pip install "dask>=2024.8" "distributed>=2024.8"`' in refused(
+        "batch", tmp_path / "a" / "*.yaml"
+    )
 
 
 def test_page_escapes_what_stands_in_files() -> None:

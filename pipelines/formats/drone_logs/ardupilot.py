@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.formats.common.extras import need
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
     on_gps_time,
@@ -31,6 +30,7 @@ from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.geodesy import Place
 from pipelines.geometry.mounting import attitude_from_angles
 from pipelines.session.errors import DataError
+from pipelines.session.extras import need
 from pipelines.session.records import Float, Int64
 from pipelines.session.telemetry import AttitudeTrack, PositionTrack, Telemetry, TelemetryChoice
 

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.formats.common.extras import need
 from pipelines.formats.common.stamps import Bool
 from pipelines.session.errors import DataError
+from pipelines.session.extras import need
 from pipelines.session.records import Float, Int64
 
 MAGIC = b"ULog\x01\x12\x35"

@@ -142,5 +142,5 @@ def test_without_pymavlink_it_is_said_what_to_install(
 ) -> None:
     path = write_dataflash(tmp_path / "a.bin", truth)
     monkeypatch.setitem(sys.modules, "pymavlink.DFReader", None)
-    with pytest.raises(DataError, match=r'pip install "mocap-pipeline\[drones\]"'):
+    with pytest.raises(DataError, match=r'pip install "pymavlink\S*" "pyulog\S*"`$'):
         read(path)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.formats.common import extras
 from pipelines.formats.scenes import rerun_writing
+from pipelines.session import extras
 from pipelines.session.errors import DataError
 from pipelines.session.registries import Export
 from tests.formats.exported import LENS, SIGMA_M, flown, recording, stamps
@@ -98,5 +98,5 @@ def test_without_rerun_one_line_says_what_to_install(tmp_path: Path, monkeypatch
     monkeypatch.setattr(extras, "import_module", absent)
     with pytest.raises(DataError) as caught:
         WRITER.write(recording(), tmp_path)
-    assert str(caught.value) == 'rerun: is not installed; run `pip install "mocap-pipeline[rerun]"`'
+    assert str(caught.value) == 'rerun: is not installed; run `pip install "rerun-sdk>=0.24"`'
     assert not list(tmp_path.iterdir())

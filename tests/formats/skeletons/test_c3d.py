@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.formats.common import extras
-from pipelines.formats.common.extras import need
 from pipelines.formats.skeletons import c3d
 from pipelines.formats.skeletons.even_frames import at_even_times
+from pipelines.session import extras
 from pipelines.session.errors import DataError
+from pipelines.session.extras import need
 from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion
 from pipelines.session.registries import ChoiceOfAxes, JointFormat
@@ -166,7 +166,7 @@ def test_without_ezc3d_one_line_says_what_to_install(tmp_path: Path, monkeypatch
     for attempt in (lambda: read(path), lambda: WRITER.write(recording(), tmp_path)):
         with pytest.raises(DataError) as caught:
             attempt()
-        assert str(caught.value) == 'ezc3d: is not installed; run `pip install "mocap-pipeline[c3d]"`'
+        assert str(caught.value) == 'ezc3d: is not installed; run `pip install "ezc3d>=1.5"`'
 
 
 def test_pauses_are_frames_without_points_and_counted(tmp_path: Path) -> None:

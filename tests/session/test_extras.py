@@ -1,0 +1,77 @@
+"""What is said of libraries that are missing: every hint names what there is, and brings what is imported."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+import tomllib
+from importlib.metadata import packages_distributions
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipelines.session.errors import DataError
+from pipelines.session.extras import install_command, need
+
+ROOT = Path(__file__).parents[2]
+PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
+
+
+def name_of(requirement: str) -> str:
+    found = re.match(r"[A-Za-z0-9._-]+", requirement)
+    assert found, requirement
+    return re.sub(r"[-_.]+", "-", found[0]).lower()
+
+
+def users_libraries() -> set[str]:
+    """What users install: not what tests and pages need."""
+    listed = [PROJECT["dependencies"], *(EXTRAS[extra] for extra in EXTRAS.keys() - {"dev", "docs"})]
+    return {name_of(requirement) for requirements in listed for requirement in requirements}
+
+
+def calls() -> list[tuple[str, str]]:
+    """Module and extra of every call of `need` in the program."""
+    found = []
+    for path in sorted((ROOT / "pipelines").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "need":
+                module, extra = (ast.literal_eval(argument) for argument in node.args)
+                found.append((module, extra))
+    return sorted(set(found))
+
+
+def test_the_program_asks_for_optional_libraries() -> None:
+    assert {extra for _, extra in calls()} == EXTRAS.keys() - {"dev", "docs"}
+
+
+@pytest.mark.parametrize(("module", "extra"), calls())
+def test_the_hint_installs_the_library_that_is_imported(module: str, extra: str) -> None:
+    command, *requirements = shlex.split(install_command(extra).removeprefix("pip "))
+    assert command == "install"
+    assert sorted(requirements) == sorted(EXTRAS[extra])
+    brought = {name_of(requirement) for requirement in requirements}
+    assert brought & {name_of(name) for name in packages_distributions()[module.partition(".")[0]]}
+
+
+def test_what_is_missing_is_one_line_with_the_command() -> None:
+    with pytest.raises(DataError) as caught:
+        need("pyulog.no_such_part", "drones")
+    assert str(caught.value).endswith(f"`{install_command('drones')}`")
+    with pytest.raises(ValueError, match="no extra 'dron'"):
+        install_command("dron")
+
+
+def test_every_command_on_a_page_names_what_there_is() -> None:
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    sources = sorted((ROOT / "pipelines").rglob("*.py")) + sorted((ROOT / "mocap_cli").rglob("*.py"))
+    named = []
+    for path in pages + sources:
+        for words in re.findall(r"pip install ([^`\n]+)`", path.read_text(encoding="utf-8")):
+            if "{" not in words:  # those are made from pyproject.toml, see above
+                named += [(path.name, name_of(word)) for word in shlex.split(words)]
+    assert len(named) > 5
+    unknown = [(page, name) for page, name in named if name not in users_libraries()]
+    assert not unknown  # and this package, which is on no index, is none of them
