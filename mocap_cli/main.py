@@ -40,6 +40,8 @@ class Mocap(click.Group):
             say(f"mocap: {one_line(str(error))}", err=True)
             ctx.exit(1)
         except click.UsageError as error:
+            if error.ctx is not None and error.message == error.ctx.get_help():
+                raise  # `mocap ablate` alone: click shows its help this way
             # A shell's pattern brings names of files, which may be anything.
             raise click.UsageError(one_line(error.format_message()), error.ctx) from None
         except KeyboardInterrupt:

@@ -433,11 +433,11 @@ def _people_seen(cameras: Sequence[Camera], association: Association) -> dict[st
 
 
 def _said_people(people: Mapping[str, Any]) -> list[str]:
-    """Say how many people were left out, and how many detections are nobody's who was reconstructed."""
+    """Say how many detections were not used, and how many people cameras saw beyond those asked for."""
     unused = [f"{name} {count}" for name, count in people["detections_not_used"].items() if count]
     if not unused:
         return []
-    line = f"detections of people who were not reconstructed: {', '.join(unused)}"
+    line = f"detections of nobody who was reconstructed: {', '.join(unused)}"
     if people["times_with_more"]:
         line += (
             f"; two cameras or more see up to {people['seen_at_once']} people at once, and more than"

@@ -45,6 +45,16 @@ def test_a_line_stays_one_line_that_steers_nothing(evil: str, capsys: pytest.Cap
     assert printed.endswith("b  c\u00a0d\u3000e \u00e9\u4e2d\n")
 
 
+def test_usage_errors_are_clicks_own_otherwise() -> None:
+    alone = mocap("ablate")
+    assert alone.returncode == 2
+    assert alone.stderr.strip() == succeeds("ablate", "--help").strip()
+    wrong = mocap("reconstruct", "a.session", "--persons", "0")
+    assert wrong.returncode == 2
+    assert " reconstruct [OPTIONS] SESSION" in wrong.stderr.splitlines()[0]
+    assert "Error: Invalid value for '--persons': 0 is not in the range" in wrong.stderr
+
+
 @pytest.mark.parametrize("evil", EVIL)
 def test_info_of_an_evil_file(tmp_path: Path, evil: str) -> None:
     path = tmp_path / f"true{evil}joints.csv"

@@ -212,9 +212,8 @@ class Gathering:
     def _repeats(self, keypoints: Float) -> NDArray[np.bool_]:
         """Mark the people [M] whose keypoints [M, K, 3] and id are those of an earlier one of their frame."""
         repeats = np.zeros(len(keypoints), dtype=np.bool_)
-        found = (keypoints[..., :2] != 0).any(
-            axis=(1, 2)
-        )  # people who were not found are all 0, and all alike
+        # People who were not found are all 0, and thus all alike.
+        found = (keypoints[..., :2] != 0).any(axis=(1, 2))
         seen: set[tuple[int, int | None, bytes]] = set()
         for row in np.flatnonzero(found).tolist():
             frame = self._frame[row]
