@@ -47,6 +47,7 @@ _BESIDE_M = (0.1, 1.0)  # how near to a first slot an obstacle stands there
 _FINE = 4  # looks at the analytic surfaces between two tracking steps
 _MOST_ERROR_M = 2.0  # what an undetermined position counts as
 _CONFIG = PlannerConfig()
+_KEPT = ("seed", "arm", "clearance_m", "ground_m", "limits", "tilt_deg", "hidden", "error_m")
 
 
 class Solid(Protocol):
@@ -282,7 +283,7 @@ def fly(seed: int, arms: Sequence[str] = ARMS) -> list[dict[str, Any]]:
                 "ground_m": float((place[..., 2] - world.ground.height(place[..., 0], place[..., 1])).min()),
                 "actor_m": float(away.min()),
                 "farthest_m": float(away[:, -1].max()),
-                "limits": {key: broken[key] for key in ("speed", "acceleration", "jerk", "separation")},
+                "limits": sum(broken[key] for key in ("speed", "acceleration", "jerk", "separation")),
                 "tilt_deg": float(np.degrees(result.tilt_rad).mean()),
                 "hidden": float(1.0 - result.visible.mean()),
                 "error_m": float(error.mean()),
@@ -302,7 +303,7 @@ def _finely(position: Float) -> Float:
 
 def is_safe(row: dict[str, Any]) -> bool:
     """Nothing touched, all limits kept."""
-    return row["clearance_m"] > 0 and row["ground_m"] > 0 and not sum(row["limits"].values())
+    return row["clearance_m"] > 0 and row["ground_m"] > 0 and not row["limits"]
 
 
 def main() -> None:
@@ -316,11 +317,11 @@ def main() -> None:
     seeds = range(arguments.first, arguments.first + arguments.count)
     rows = list(flown(seeds, arguments.workers))
     if arguments.write:
-        keep = ("seed", "arm", "clearance_m", "ground_m", "limits", "tilt_deg", "hidden", "error_m")
-        short = [{key: _rounded(row[key]) for key in keep} for row in rows]
+        short = [[_rounded(row[key]) for key in _KEPT] for row in rows]
         arguments.write.write_text("[\n" + ",\n".join(map(json.dumps, short)) + "\n]\n", encoding="utf-8")
         return
-    trouble = report(rows, json.loads(BEFORE.read_text(encoding="utf-8")))
+    before = [dict(zip(_KEPT, row, strict=True)) for row in json.loads(BEFORE.read_text(encoding="utf-8"))]
+    trouble = report(rows, before)
     for line in trouble:
         print(f"FAIL: {line}")
     sys.exit(1 if trouble else 0)
@@ -358,7 +359,7 @@ def report(rows: list[dict[str, Any]], before: list[dict[str, Any]]) -> list[str
             sum(row["clearance_m"] <= 0 for row in now),
             sum(was["clearance_m"] <= 0 for _, was in of),
             f"{min(row['clearance_m'] for row in now):.2f}",
-            sum(sum(row["limits"].values()) > 0 for row in now),
+            sum(row["limits"] > 0 for row in now),
             f"{min(row['actor_m'] for row in now):.2f}",
             *(f"{ratio:.3f}" for ratio in ratios.values()),
         ]
@@ -375,9 +376,8 @@ def report(rows: list[dict[str, Any]], before: list[dict[str, Any]]) -> list[str
             trouble.append(f"{what}: a drone touches something, {row['clearance_m']:.2f} m")
         if row["ground_m"] <= 0:
             trouble.append(f"{what}: a drone is below the ground")
-        broken = {key: count for key, count in row["limits"].items() if count}
-        if broken:
-            trouble.append(f"{what}: limits broken: {broken}")
+        if row["limits"]:
+            trouble.append(f"{what}: {row['limits']} limits broken")
         if row["actor_m"] < _CONFIG.actor_distance_m:
             trouble.append(f"{what}: {row['actor_m']:.2f} m from the actor")
     return trouble

@@ -101,7 +101,7 @@ class Pilot:
         return slots, self._filter.forecast(np.array([t_s]))[0] + slot_offsets(slots)
 
     def step(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> Command:
-        """Replan what is due, and say what to fly now.
+        """Replan what is due, and return what to fly now.
 
         Args:
             t_s: now; at or after the latest measurement, of which there must be one.
@@ -109,6 +109,11 @@ class Pilot:
             velocity: [N, 3] m/s.
             field: what is known of the surroundings now.
         """
+        self.replan(t_s, position, velocity, field)
+        return Command(*self.reference(t_s), *self.wanted(t_s))
+
+    def replan(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
+        """Replan what is due; arguments as in `step`."""
         config = self._config
         if t_s >= self._next_central_s - _NOW_S:
             self._next_central_s = max(self._next_central_s, t_s) + 1.0 / config.central_hz
@@ -116,8 +121,11 @@ class Pilot:
         if t_s >= self._next_local_s - _NOW_S:
             self._next_local_s = max(self._next_local_s, t_s) + 1.0 / config.local_hz
             self._plan_locally(t_s, position, velocity, field)
+
+    def wanted(self, t_s: float) -> tuple[Float, Float]:
+        """Commanded slots [N, 3], yaw from east, and the actor's estimate [3] that cameras aim at."""
         now = np.array([t_s])
-        return Command(*self.reference(t_s), self._slots_at(now)[0], self._filter.forecast(now)[0])
+        return self._slots_at(now)[0], self._filter.forecast(now)[0]
 
     def reference(self, t_s: float) -> tuple[Float, Float, Float]:
         """Position, velocity and acceleration [N, 3] of the latest local plans, after the first step."""

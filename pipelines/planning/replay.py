@@ -114,9 +114,9 @@ def replay(
         for row in range(done, taken_in[k]):
             pilot.measure(log_s[row], noisy[row])
         done = max(done, int(taken_in[k]))
-        command = pilot.step(t_s, guard.position, guard.velocity, known[map_at[k]])
         position[:, k], velocity[:, k] = guard.position, guard.velocity
-        slots[:, k], estimate[k] = command.slots, command.actor
+        pilot.replan(t_s, position[:, k], velocity[:, k], known[map_at[k]])
+        slots[:, k], estimate[k] = pilot.wanted(t_s)
         guard.advance()
 
     truth = np.stack([np.interp(replay_ns, t_ns, measured[:, axis]) for axis in range(3)], axis=-1)
