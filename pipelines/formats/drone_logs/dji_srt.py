@@ -27,6 +27,7 @@ from pipelines.formats.common.summaries import describe_times
 from pipelines.formats.common.text_tables import read_head
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
+    between_refreshed_angles,
     between_repeats,
     position_track,
     turned_as_stated,
@@ -305,7 +306,7 @@ def _attitude(
     if late := int(np.count_nonzero(stated)) - len(rows):
         dropped[f"{name} out of order"] = late
     continuous = np.degrees(np.unwrap(np.radians(yaw_pitch_roll_deg[rows]), axis=0))
-    between, _ = between_repeats(t_ns[rows], continuous)
+    between = between_refreshed_angles(t_ns[rows], continuous)
     return attitude_track(name, t_ns[rows], turned_as_stated(between), dropped)
 
 

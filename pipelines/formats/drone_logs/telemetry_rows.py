@@ -26,6 +26,7 @@ from pipelines.session.records import Float, Int64
 from pipelines.session.telemetry import AttitudeTrack, Height, PositionTrack, Telemetry
 
 _HELD_NS = 1_000_000_000  # receivers that drones carry report at least once a second
+_LEAST_REFRESHES = 4  # times between changes, before their regularity says anything
 
 
 def position_track(
@@ -217,7 +218,7 @@ def said_of_fit(fit: ClockFit) -> str:
 
 
 def between_repeats(t_ns: Int64, values: Float) -> tuple[Float, int]:
-    """Values of a log that repeats each measurement until the next one comes, as lines between the two.
+    """Draw lines between the positions of a log that repeats each measurement until the next one comes.
 
     A value that stays the same for longer than a second before it changes is taken to have stayed so until
     one second before.
@@ -229,23 +230,50 @@ def between_repeats(t_ns: Int64, values: Float) -> tuple[Float, int]:
     Returns:
         [N, D], and how many rows were moved.
     """
-    if len(t_ns) < 3:
-        return values, 0
-    smooth = values.copy()
-    for column in range(values.shape[1]):
-        of_column = values[:, column]
-        changes = np.flatnonzero(np.diff(of_column) != 0) + 1
-        if not len(changes):
-            continue
-        next_change = np.searchsorted(changes, np.arange(len(t_ns)), side="right")
-        last = np.append(changes, len(t_ns) - 1)[next_change]
-        measured = np.zeros(len(t_ns), dtype=np.bool_)
-        measured[[0, *changes.tolist()]] = True
-        measured |= (t_ns[last] - t_ns >= _HELD_NS) | (next_change == len(changes))
-        smooth[:, column] = interpolate_points(
-            t_ns[measured], of_column[measured], t_ns, max_gap_ns=int(np.ptp(t_ns)) + 1
-        )
+    smooth = np.stack([_between_changes(t_ns, column, len(t_ns)) for column in values.T], axis=1)
     return smooth, int(np.count_nonzero((smooth != values).any(axis=1)))
+
+
+def between_refreshed_angles(t_ns: Int64, angles: Float) -> Float:
+    """Draw lines between the angles of a log that repeats each measurement until the next one comes.
+
+    A gimbal that keeps an angle states the same number again and again, and each time it was measured. So an
+    angle counts as repeated only for as long as the log needs to refresh it: a hold that is longer ends in a
+    line over the last such time, and a step stays where it was logged but for that. The time is the shortest
+    between two changes, because a log that repeats cannot change sooner. It is believed where most changes
+    follow each other so soon; a log that changes now and then is left as it is.
+
+    Args:
+        t_ns: [N] increasing stamps.
+        angles: [N, D] without jumps by full turns; each column may be refreshed at its own rate.
+
+    Returns:
+        [N, D].
+    """
+    return np.stack([_between_changes(t_ns, column, _refreshed_rows(column)) for column in angles.T], axis=1)
+
+
+def _refreshed_rows(values: Float) -> int:
+    """Return for how many rows a log repeats each measurement of a column; 1 where nothing shows that it does."""
+    apart = np.diff(np.flatnonzero(np.diff(values) != 0))
+    if len(apart) < _LEAST_REFRESHES or apart.min() == 1:
+        return 1
+    longest = int(apart.min()) + 1  # pictures and measurements do not keep step: one row more or less
+    return longest if np.count_nonzero(apart <= longest) > len(apart) / 2 else 1
+
+
+def _between_changes(t_ns: Int64, values: Float, most_rows: int) -> Float:
+    """Draw a line to each change of a column, over at most so many rows and a second of what was held."""
+    changes = np.flatnonzero(np.diff(values) != 0) + 1
+    if not len(changes):
+        return values
+    rows = np.arange(len(t_ns))
+    next_change = np.searchsorted(changes, rows, side="right")
+    last = np.append(changes, len(t_ns) - 1)[next_change]
+    measured = np.zeros(len(t_ns), dtype=np.bool_)
+    measured[[0, *changes.tolist()]] = True
+    measured |= (t_ns[last] - t_ns >= _HELD_NS) | (last - rows >= most_rows) | (next_change == len(changes))
+    return interpolate_points(t_ns[measured], values[measured], t_ns, max_gap_ns=int(np.ptp(t_ns)) + 1)
 
 
 def _kept(t_ns: Int64, causes: dict[str, Bool], dropped: dict[str, int], prefix: str = "") -> Bool:

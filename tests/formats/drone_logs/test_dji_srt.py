@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipelines.formats.drone_logs.dji_srt import FORMAT, read_subtitles
-from pipelines.formats.drone_logs.telemetry_rows import between_repeats
+from pipelines.formats.drone_logs.telemetry_rows import between_refreshed_angles, between_repeats
 from pipelines.geometry.poses import rotate
 from pipelines.session.errors import DataError
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
@@ -212,3 +212,58 @@ def test_repeated_measurements_become_lines() -> None:
     assert smooth[t_ns <= 2_000_000_000].max() == 0
     np.testing.assert_allclose(smooth[t_ns == 2_500_000_000], 2.5)
     np.testing.assert_array_equal(between_repeats(t_ns, np.ones((40, 1)))[0], 1)
+
+
+def test_an_angle_that_is_held_and_steps_does_so_where_it_was_logged(tmp_path: Path) -> None:
+    """Held for three seconds, or twice for half a second: no number before the step knows of it."""
+    pitch = np.where(np.arange(150) < 90, -10.0, np.where(np.arange(150) < 105, -40.0, -80.0))
+    texts = [
+        f"[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5] [gb_yaw: 0.0 gb_pitch: {each} gb_roll: 0.0]"
+        for each in pitch
+    ]
+    path = tmp_path / "a.srt"
+    path.write_text(
+        "".join(
+            f"{n}\n00:00:0{n // 25},{n % 25 * 40:03d} --> 00:00:0{n // 25},{n % 25 * 40 + 39:03d}\n{text}\n\n"
+            for n, text in enumerate(texts)
+        )
+    )
+    gimbal = read(path).gimbal
+    assert gimbal is not None
+    ahead = rotate(gimbal.quaternion_xyzw, np.array([1.0, 0, 0]))
+    np.testing.assert_allclose(np.degrees(np.arcsin(ahead[:, 2])), pitch, atol=1e-5)
+
+
+def test_a_slew_that_every_picture_shows_stays_where_it_was_logged() -> None:
+    t_ns = np.arange(200, dtype=np.int64) * 33_000_000
+    pitch = np.interp(np.arange(200), [0, 100, 120, 200], [0.0, 0.0, -60.0, -60.0])[:, None]
+    np.testing.assert_array_equal(between_refreshed_angles(t_ns, pitch), pitch)
+
+
+@pytest.mark.parametrize("rows", [2, 3, 6])
+def test_angles_that_are_repeated_become_lines_and_their_holds_stay(rows: int) -> None:
+    """Yaw turns evenly, pitch is held, turns and is held again; both are refreshed at a lower rate."""
+    number = np.arange(60 * rows + 1)
+    t_ns = number * 33_000_000
+    true = np.stack(
+        [1.5 * number, np.interp(number, [0, 30 * rows, 40 * rows, 60 * rows], [0, 0, 40, 40])], 1
+    )
+    seen = true[number // rows * rows]
+    found = between_refreshed_angles(t_ns, seen)
+    np.testing.assert_allclose(found[:, 0], true[:, 0], atol=1e-9)
+    # The first change ends a hold: the line to it may begin one row early, as rates do not keep step.
+    np.testing.assert_allclose(found[:, 1], true[:, 1], atol=40 / 10 / (rows + 1) + 1e-9)
+    held = number < 31 * rows - (rows + 1)
+    np.testing.assert_array_equal(found[held, 1], 0)
+    np.testing.assert_allclose(found[31 * rows :, 1], true[31 * rows :, 1], atol=1e-9)
+
+
+def test_angles_whose_refresh_does_not_keep_step_with_the_pictures_become_lines() -> None:
+    """10 Hz in 29.97 pictures a second: three rows each, now and then two or four."""
+    number = np.arange(600)
+    t_ns = np.round(number * 1e9 / 29.97).astype(np.int64)
+    at_s = np.floor(t_ns / 1e8) / 10
+    found = between_refreshed_angles(t_ns, (20 * at_s)[:, None])[:, 0]
+    behind = 20 * (t_ns / 1e9) - found
+    # Each measurement is shown up to a picture late, and at the end none comes after the last.
+    assert np.ptp(behind[:-4]) < 20 / 29.97 + 1e-6
