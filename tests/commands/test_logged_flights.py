@@ -213,3 +213,19 @@ def test_moved_flight_is_the_same_flight(tmp_path: Path) -> None:
     shutil.copytree(tmp_path / "here", tmp_path / "there")
     assert "unchanged" in succeeds("ingest", tmp_path / "there" / "flight.yaml")
     assert content(tmp_path / "there" / "flight.session") == content(session)
+
+
+def test_logged_pictures_of_another_size_are_told_from_those_of_the_calibration(tmp_path: Path) -> None:
+    flight = write_logged_flight(tmp_path / "shape", "ros2-mcap", picture_size=(640, 400))
+    line = refused("ingest", flight.manifest)
+    assert "cameras.drone1.intrinsics" in line
+    assert "pictures are 640 x 400, the calibration is for 1280 x 720" in line
+
+    flight = write_logged_flight(tmp_path / "half", "ros2-mcap", picture_size=(640, 360))
+    for name in flight.cameras:
+        del flight.settings["cameras"][name]["keypoints"]  # they are of the whole size
+    flight.save()
+    _, description = ingested(tmp_path / "half")
+    lens = description["cameras"]["drone1"]["intrinsics"]
+    assert (lens["width"], lens["height"], lens["fx"], lens["cy"]) == (640, 360, 381.0, 179.0)
+    assert any("drone1: pictures are 640 x 360" in line for line in description["warnings"])

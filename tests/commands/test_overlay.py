@@ -245,11 +245,11 @@ def test_pictures_that_cannot_be_decoded_are_grey_and_counted(
 
 
 def test_odd_pictures_of_a_log(tmp_path: Path) -> None:
-    flight = write_logged_flight(tmp_path, "ros2-mcap")  # 16 x 9
+    flight = write_logged_flight(tmp_path, "ros2-mcap", picture_size=(1279, 719))
     videos = write_overlays(session_of(flight))
     for video in videos:
         drawn = index_video(video)
-        assert (drawn.width, drawn.height, drawn.count) == (16, 10, len(flight.t_ns))
+        assert (drawn.width, drawn.height, drawn.count) == (1280, 720, len(flight.t_ns))
         # The log's stamps, on the grid of the video.
         assert np.abs(drawn.pts_ns - (flight.t_ns - flight.t_ns[0])).max() <= 12_000
 

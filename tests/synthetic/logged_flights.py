@@ -19,14 +19,20 @@ LATE_NS = 4_000_000  # a message is received this long after its header stamp
 
 
 def write_logged_flight(
-    folder: Path, container: Container, *, cameras: int = 2, seconds: float = 0.5, jump_s: float = 0.0
+    folder: Path,
+    container: Container,
+    *,
+    cameras: int = 2,
+    seconds: float = 0.5,
+    jump_s: float = 0.0,
+    picture_size: tuple[int, int] = (LENS.width, LENS.height),
 ) -> SyntheticFlight:
     """A clean flight whose poses, intrinsics and frame times are in one log for each drone.
 
     The clock that stamps the odometry of drone1 jumps by `jump_s` after three quarters of the flight.
 
     The odometry is that of a body which carries its camera 30 degrees down on a lever arm. Pictures are
-    plain and 16 pixels wide: only their stamps matter.
+    plain, and of the size of the lens unless another is asked for.
     """
     flight = write_flight(folder, cameras=cameras, seconds=seconds, clean=True, keypoint_format="alphapose")
     for k, name in enumerate(flight.cameras):
@@ -34,7 +40,7 @@ def write_logged_flight(
             [
                 *_odometry(flight, k, name, jump_s if k == 0 else 0.0),
                 *_camera_info(flight, name),
-                *_pictures(flight, name),
+                *_pictures(flight, name, picture_size),
             ],
             key=lambda entry: (entry.stamp_ns, entry.topic),
         )
@@ -95,14 +101,14 @@ def _camera_info(flight: SyntheticFlight, name: str) -> list[Entry]:
     ]
 
 
-def _pictures(flight: SyntheticFlight, name: str) -> list[Entry]:
-    _, jpeg = cv2.imencode(".jpg", np.full((9, 16, 3), 90, np.uint8))
+def _pictures(flight: SyntheticFlight, name: str, size: tuple[int, int]) -> list[Entry]:
+    _, png = cv2.imencode(".png", np.full(size[::-1], 90, np.uint8))
     return [
         Entry(
             f"/{name}/image/compressed",
             "sensor_msgs/msg/CompressedImage",
             int(stamp_ns) + LATE_NS,
-            {"header": header(int(stamp_ns), name), "format": "jpeg", "data": jpeg.ravel()},
+            {"header": header(int(stamp_ns), name), "format": "png", "data": png.ravel()},
         )
         for stamp_ns in flight.t_ns
     ]

@@ -254,7 +254,7 @@ def between_refreshed_angles(t_ns: Int64, angles: Float) -> Float:
 
 
 def _refreshed_rows(values: Float) -> int:
-    """Return for how many rows a log repeats each measurement of a column; 1 where nothing shows that it does."""
+    """Return for how many rows a log repeats each measurement; 1 where nothing shows that it does."""
     apart = np.diff(np.flatnonzero(np.diff(values) != 0))
     if len(apart) < _LEAST_REFRESHES or apart.min() == 1:
         return 1

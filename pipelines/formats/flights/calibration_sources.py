@@ -57,8 +57,7 @@ class CalibrationSources:
             intrinsics = _inline_intrinsics(source, place)
         if source.readout_s:
             intrinsics = replace(intrinsics, readout_s=source.readout_s)
-        size = (video.width, video.height) if video else (detections.image_size if detections else None)
-        if size:
+        if size := self._picture_size(camera, video, detections):
             try:
                 intrinsics, note = fit_to_size(intrinsics, *size)
             except ValueError as error:
@@ -69,6 +68,17 @@ class CalibrationSources:
         if detections is not None:
             _refuse_keypoints_outside(place, intrinsics, detections)
         return intrinsics
+
+    def _picture_size(
+        self, camera: Camera, video: VideoIndex | None, detections: Detections | None
+    ) -> tuple[int, int] | None:
+        """The size of the pictures themselves, or that which the keypoints state."""
+        if video is not None:
+            return video.width, video.height
+        logged = camera.video.log if camera.video else None
+        if camera.video and logged and (size := self._logs.picture_size(logged, camera.video.topic)):
+            return size
+        return detections.image_size if detections else None
 
     def camera(self, name: str, path: str, camera: str | None) -> CalibratedCamera:
         """The camera of a calibration file that is asked for, bears this name, or is the only one."""

@@ -15,7 +15,8 @@ from typing import Literal, Self
 
 from pipelines.formats.flights.log_times import doubts_of_stamps, world_times
 from pipelines.formats.flights.open_logs import OpenLogs
-from pipelines.formats.flights.pictures import later_times, picture_stamps
+from pipelines.formats.flights.picture_encodings import decode
+from pipelines.formats.flights.pictures import later_times, picture_samples, picture_stamps
 from pipelines.formats.logs.commands import COMMAND_TYPES, read_commands
 from pipelines.formats.logs.fixed_layouts import poses_at_once
 from pipelines.formats.logs.frames import frames_of_poses, place_of_frame, transforms_in
@@ -48,6 +49,7 @@ from pipelines.session.records import (
     IntrinsicsSample,
     Message,
     Occupancy,
+    PictureSample,
     Topic,
     Trajectory,
 )
@@ -248,6 +250,23 @@ class FlightLogs:
         if len(taken_ns) > len(t_ns):
             lost["picture without a later stamp"] += len(taken_ns) - len(t_ns)
         return Frames(name, self._world_times(log, t_ns, started_ns), dict(lost))
+
+    def picture_size(self, log: str, topic: str | None) -> tuple[int, int] | None:
+        """Width and height of the pictures of a topic, by the first that is whole; None without any.
+
+        Raises:
+            DataError: no such topic.
+        """
+        with self._open(log) as (recording, source):
+            name = self._choose(recording, source, "pictures", topic)
+            for sample in picture_samples(recording, name, source):
+                if not isinstance(sample, PictureSample):
+                    continue  # `frames` refuses it
+                if sample.width and sample.height:
+                    return sample.width, sample.height
+                if (picture := decode(sample)) is not None:
+                    return picture.shape[1], picture.shape[0]
+        return None
 
     def maps(
         self, stated: MapSource, to_world: Callable[[Trajectory], Trajectory], *, max_gap_ns: int
