@@ -31,6 +31,7 @@ _MOST_SEARCHED = 500  # points, while all starts are tried
 _LEAST_COVERED = 0.5  # of the stretches, that the log must cover
 _ELSEWHERE_S = 0.5  # a start this far from the best is another one
 _CLEAR = 4.0  # standard deviations of a difference of log-likelihoods
+_MOST_STEPS = 30  # of Newton's method: halved every other time, they are shorter than 1e-5 s by then
 _REFINED_S = 0.01  # a step of the differences that refine a start
 _BLOCK_S = 1.0  # errors within a second resemble each other
 _LARGEST_SIGMA_S = 0.1
@@ -149,7 +150,9 @@ def fit_start(
                 f"they move as the poses do at several times, {apart_s:.2f} s apart: too little, too evenly,"
                 " or again and again"
             )
-    if not sigma_s < _LARGEST_SIGMA_S:
+    if not np.isfinite(sigma_s):
+        raise ValueError("no start explains their motion better than those shortly before and after it")
+    if sigma_s > _LARGEST_SIGMA_S:
         raise ValueError(f"their motion says when to {sigma_s:.2g} s only, not to {_LARGEST_SIGMA_S:g} s")
     return StartFit(
         start_ns=int(t_ns[0]) + round(start_s * 1e9),
@@ -275,21 +278,31 @@ def _is_clear(differences: Float) -> bool:
 
 
 def _refined(path: _Path, followed: Followed, start_s: float, scatter: float) -> tuple[float, float]:
-    """The start to a fraction of a step, and its standard deviation in s; with ever less scatter."""
+    """The start to a fraction of a step, and its standard deviation in s; with ever less scatter.
+
+    Newton's method, held to ever shorter steps once it steps over the likeliest: where points scatter little,
+    their likelihood is as sharp as a tip, and whole steps would leap from side to side of it. Beside the tip
+    it bends the other way; there a step goes downhill. The standard deviation is infinite where no start near
+    is likelier than those beside it.
+    """
     block = (followed.begin_ns / 1e9 / _BLOCK_S).astype(np.int64)
     sigma_s = np.inf
     while True:
-        for _ in range(10):
+        longest_s, before_s = _SEARCHED_S, 0.0
+        for _ in range(_MOST_STEPS):
             less, here, more = (
                 _misfits(path, followed, start_s + k * _REFINED_S, scatter) for k in (-1, 0, 1)
             )
             slope = np.nan_to_num((more - less) / (2 * _REFINED_S))
             bend = float(np.nansum(more - 2 * here + less)) / _REFINED_S**2
-            if bend <= 0:
-                return start_s, np.inf
-            sigma_s = float(np.sqrt((np.bincount(block, slope) ** 2).sum())) / bend
-            step_s = float(np.clip(-slope.sum() / bend, -_SEARCHED_S, _SEARCHED_S))
-            start_s += step_s
+            spread = float(np.sqrt((np.bincount(block, slope) ** 2).sum()))
+            sigma_s = spread / bend if bend > 0 else np.inf
+            downhill = -float(slope.sum())
+            step_s = downhill / bend if bend > 0 else float(np.copysign(longest_s, downhill))
+            if step_s * before_s < 0:
+                longest_s /= 2
+            step_s = float(np.clip(step_s, -longest_s, longest_s))
+            start_s, before_s = start_s + step_s, step_s
             if abs(step_s) < 1e-5:
                 break
         if scatter <= _SCATTER:

@@ -142,3 +142,18 @@ def test_pictures_of_another_flight_are_refused() -> None:
         fitted(turning, LOG_S, nothing)
     with pytest.raises(ValueError, match="cover less than half"):
         fitted(turning, LOG_S[:200], followed)
+
+
+def shaking(t_s: Float) -> tuple[Float, Rotation]:
+    """About both axes, by up to 8 deg, again and again but never twice alike."""
+    yaw = 0.113 * np.sin(2.116 * t_s) + 0.034 * np.sin(4.866 * t_s)
+    pitch = 0.049 * np.sin(2.521 * t_s + 1)
+    return np.zeros((len(t_s), 3)), Rotation.from_euler("YX", np.stack([yaw, pitch], axis=1))
+
+
+@pytest.mark.parametrize("start_s", [6.0, 8.7, 11.3, 16.1, 19.6, 21.7])
+def test_points_that_hardly_scatter_say_the_start_no_worse(start_s: float) -> None:
+    """Their likelihood is so sharp that whole steps of Newton's method leap over its tip, to and fro."""
+    found = fitted(shaking, LOG_S, seen(shaking, start_s, 8.0, 1.4e-4), near_s=start_s + 0.3)
+    assert (found.start_ns - EPOCH_NS) / 1e9 == pytest.approx(start_s, abs=4 * found.sigma_s + 1e-3)
+    assert found.sigma_s < 0.01
