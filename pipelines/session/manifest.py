@@ -120,6 +120,9 @@ class Video(Part):
     topic: str | None = None
 
 
+_COUNTED = (("start", "start_ns"), ("start_from", "start_from"), ("fps", "fps"))  # go with each other only
+
+
 class FrameTimes(Part):
     """When each frame was taken; container stamps from `start` on where nothing else is said."""
 
@@ -133,6 +136,23 @@ class FrameTimes(Part):
     srt: str | None = None
     ulog: str | None = None  # triggers that an autopilot logged, one for each frame
     ardupilot: str | None = None
+
+    @model_validator(mode="after")
+    def _from_one_place(self) -> FrameTimes:
+        every = ("csv", "srt", "log", "ulog", "ardupilot")
+        stated = [name for name in every if getattr(self, name) is not None]
+        counted = [key for key, name in _COUNTED if name in self.model_fields_set]
+        if len(stated) > 1 or (stated and counted):
+            problem = f"has {', '.join(stated + counted)}, which say different things of the same pictures"
+            raise ValueError(f"{problem}: leave all but one of them out")
+        if self.topic is not None and self.log is None:
+            raise ValueError("topic: needs the log that holds it")
+        return self
+
+    @property
+    def has_start(self) -> bool:
+        """Whether a start is stated, be it 0."""
+        return "start_ns" in self.model_fields_set
 
 
 class Clock(Part):
@@ -327,6 +347,13 @@ class Camera(Part):
             raise ValueError("gimbal: needs log and topic, or fixed: {yaw_deg: 90, pitch_deg: -30}")
         if self.pose.static and self.pose.of == "body":
             raise ValueError("a still camera's pose is its own: leave `of: body` and the mount out")
+        times = self.frame_times
+        found = times is not None and times.start_from == "motion" and not times.has_start
+        if found and self.clock is not None and self.clock.offset_ns:
+            raise ValueError(
+                "clock.offset_s: start_from: motion finds the start in world time: leave the offset out, or"
+                " state the start that it is added to"
+            )
         return self
 
 

@@ -124,14 +124,18 @@ def test_calibration_and_pictures_of_a_real_json_log(tmp_path: Path) -> None:
         f"    intrinsics: {{log: {log}, topic: /camera_calibration}}\n",
         encoding="utf-8",
     )
+    # Its calibration is an example that does not belong to its pictures.
+    assert "pictures are 520 x 360, the calibration is for 640 x 480" in refused("ingest", path)
+    text = path.read_text(encoding="utf-8")
+    logged = f"{{log: {log}, topic: /camera_calibration}}"
+    inline = "{width: 520, height: 360, fx: 800, fy: 800, cx: 260, cy: 180, distortion: [-0.2, 0.1, 0, 0]}"
+    path.write_text(text.replace(logged, inline), encoding="utf-8")
     succeeds("ingest", path)
     camera = session_of(path)["cameras"]["camera"]
     assert camera["frames"]["count"] == told["count"]
     assert camera["frames"]["first_t_ns"] == facts(name)["start_ns"]
-    assert camera["intrinsics"]["distortion"][:2] == [-0.2, 0.1]
-    text = path.read_text(encoding="utf-8")
     # Its header stamps stand still: one picture can be told from the others by them.
-    path.write_text(text.replace("stamps: receive", "stamps: header"), encoding="utf-8")
+    path.write_text(path.read_text(encoding="utf-8").replace("stamps: receive", "stamps: header"), "utf-8")
     done = mocap("ingest", path)
     assert "9 picture without a later stamp" in done.stderr
     path.write_text(text.replace("/camera_calibration", "/camera_calibration/custom"), encoding="utf-8")

@@ -7,9 +7,12 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
+from pipelines.geometry.cameras import project
+from pipelines.session.description import read_description
 from tests.commands.runner import content, mocap, mocap_process, refusal, refused, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 
@@ -165,6 +168,26 @@ def test_empty_keypoint_file(flight: SyntheticFlight, tmp_path: Path, text: str)
     assert not (tmp_path / "flight.session").exists()
 
 
+@pytest.mark.parametrize(
+    ("stated", "keys"),
+    [
+        ({"fps": 30, "csv": "a.csv"}, "csv, fps"),
+        ({"start": 0, "srt": "a.srt"}, "srt, start"),
+        ({"log": "d1", "ulog": "d1.ulg"}, "log, ulog"),
+        ({"start_from": "motion", "ardupilot": "d1.bin"}, "ardupilot, start_from"),
+        ({"csv": "a.csv", "srt": "a.srt", "fps": 30}, "csv, srt, fps"),
+    ],
+)
+def test_frame_times_from_several_places_are_refused(
+    flight: SyntheticFlight, stated: dict[str, object], keys: str
+) -> None:
+    flight.settings["cameras"]["drone1"]["frame_times"] = stated
+    flight.save()
+    assert f"cameras.drone1.frame_times: has {keys}, which say different" in refused(
+        "ingest", flight.manifest
+    )
+
+
 def test_camera_without_overlap_in_time(flight: SyntheticFlight) -> None:
     flight.settings["cameras"]["drone3"]["frame_times"]["start"] = 1_700_000_600
     flight.save()
@@ -201,6 +224,18 @@ def test_same_shape_at_another_size_is_rescaled_with_a_warning(flight: Synthetic
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0
     assert "warning: drone1: " in done.stderr
+
+
+def test_an_inline_fisheye_without_distortion_is_equidistant(flight: SyntheticFlight, tmp_path: Path) -> None:
+    inline = flight.settings["cameras"]["drone1"]["intrinsics"]
+    inline.update(model="fisheye", fx=300, cx=640, cy=360)
+    del inline["distortion"]
+    flight.save()
+    succeeds("ingest", flight.manifest)
+    lens = read_description(tmp_path / "flight.session").cameras["drone1"].intrinsics.intrinsics()
+    # 45 degrees to the side: r = f theta, where a pinhole has f tan(theta).
+    pixel = project(np.array([1.0, 0.0, 1.0]), lens)
+    np.testing.assert_allclose(pixel, [640 + 300 * np.pi / 4, 360])
 
 
 def test_keypoints_outside_the_calibrated_picture(flight: SyntheticFlight) -> None:

@@ -99,6 +99,8 @@ class CalibrationSources:
 
 
 def _inline_intrinsics(source: IntrinsicsSource, place: str) -> Intrinsics:
+    # Without coefficients a fisheye is the equidistant projection, as in calibration files; no pinhole.
+    coefficients = tuple(source.distortion) or ((0.0,) * 4 if source.model == "fisheye" else ())
     try:
         return Intrinsics(
             width=source.width or 0,
@@ -107,8 +109,8 @@ def _inline_intrinsics(source: IntrinsicsSource, place: str) -> Intrinsics:
             fy=source.fy or 0.0,
             cx=source.cx or 0.0,
             cy=source.cy or 0.0,
-            model=source.model if source.distortion else "none",
-            distortion=tuple(source.distortion),
+            model=source.model if coefficients else "none",
+            distortion=coefficients,
         )
     except ValueError as error:
         raise DataError(place, str(error), "mend the numbers") from None

@@ -154,7 +154,7 @@ class FlightReader:
             keypoints=_keypoints_entry(camera, detections, data.detector_format, len(frames.t_ns)),
             clock=ClockEntry(
                 offset_s=camera.clock.offset_ns / 1e9 if camera.clock else 0.0,
-                sigma_s=camera.clock.sigma_s if camera.clock else frames.start_sigma_s,
+                sigma_s=_clock_sigma_s(camera, frames),
             ),
             log_clock=_log_clock_entry(self._sources.log_clock(camera)),
             pose_noise=camera.pose_noise,
@@ -403,6 +403,14 @@ def _within(detections: Detections, frames: CameraFrames) -> Detections:
         confidence=detections.confidence[known],
         dropped=detections.dropped | lost,
     )
+
+
+def _clock_sigma_s(camera: Camera, frames: CameraFrames) -> float:
+    """Return what the manifest states; before the default of a clock comes what was found out."""
+    clock = camera.clock
+    if clock is None or (frames.start_sigma_s and "sigma_s" not in clock.model_fields_set):
+        return frames.start_sigma_s
+    return clock.sigma_s
 
 
 def _log_clock_entry(fit: ClockFit | None) -> LogClockEntry | None:

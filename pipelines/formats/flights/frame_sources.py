@@ -79,16 +79,19 @@ class FrameSources:
         """When each picture was taken.
 
         By what the manifest states: `fps` from `start` on, a file or topic of frame times, the stamps of
-        pictures in a log, or the container's own stamps from `start` on. Where the start is to be found by
-        motion, it is the time at which the pictures move as the poses do.
+        pictures in a log, or the container's own stamps from `start` on. The offset of the camera's clock is
+        added. Where the start is to be found by motion, it is the time at which the pictures move as the
+        poses do: world time, to which nothing is added. A stated start and offset say where to look for it.
 
         Raises:
             DataError: nothing says when the pictures were taken, or what does is unusable.
         """
         offset_ns = camera.clock.offset_ns if camera.clock else 0
         unclocked = self._unclocked_frames(name, camera, video, detections)
-        if camera.frame_times and camera.frame_times.start_from == "motion":
-            unclocked = self._begun_by_motion(name, camera, unclocked, intrinsics)
+        times = camera.frame_times
+        if times is not None and times.start_from == "motion":
+            near_ns = times.start_ns + offset_ns if times.has_start else None
+            return self._begun_by_motion(name, camera, unclocked, intrinsics, near_ns)
         return replace(unclocked, t_ns=unclocked.t_ns + offset_ns)
 
     def _unclocked_frames(
@@ -123,10 +126,11 @@ class FrameSources:
             )
         if logged is None:
             return replace(pictures, t_ns=self._start_ns(name, camera, times) + pictures.pts_ns)
-        if times.start_ns:
+        if times.has_start or times.start_from == "container":
+            key = "start" if times.has_start else "start_from"
             raise DataError(
                 self._manifest,
-                f"cameras.{name}.frame_times: start has no use, the log stamps its pictures",
+                f"cameras.{name}.frame_times: {key} has no use, the log stamps its pictures",
                 "leave it out, or correct the log's clock with logs: {...: {clock: ...}}",
             )
         return pictures
@@ -185,7 +189,7 @@ class FrameSources:
         return times.start_ns + made_ns
 
     def _begun_by_motion(
-        self, name: str, camera: Camera, frames: CameraFrames, intrinsics: Intrinsics
+        self, name: str, camera: Camera, frames: CameraFrames, intrinsics: Intrinsics, near_ns: int | None
     ) -> CameraFrames:
         """Frames of a video at the times at which its pictures turn as the poses do."""
         place = f"{self._manifest}: cameras.{name}.frame_times"
@@ -194,7 +198,6 @@ class FrameSources:
             raise DataError(place, "start_from: motion needs a video and poses that move", remedy)
         poses = self._trajectory(name, camera, 0)
         some = int(np.searchsorted(frames.pts_ns, frames.pts_ns[0] + _WATCHED_NS))
-        about_ns = camera.frame_times.start_ns if camera.frame_times else 0
         try:
             fit = fit_start(
                 poses.t_ns,
@@ -202,7 +205,7 @@ class FrameSources:
                 poses.quaternion_xyzw,
                 followed_points(self._base / camera.video.path, intrinsics, frames.pts_ns[:some]),
                 max_gap_ns=self._max_gap_ns,
-                near_ns=about_ns or None,
+                near_ns=near_ns,
             )
         except ValueError as error:
             problem = f"its pictures do not say when the video began: {error}"

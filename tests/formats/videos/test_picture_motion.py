@@ -135,6 +135,22 @@ def test_a_start_that_is_known_roughly_is_refined(filmed: Path, tmp_path: Path) 
         assert frames["first_t_ns"] / 1e9 == pytest.approx(START_S + BEGINS_S, abs=0.01)
 
 
+def test_the_offset_of_a_clock_counts_once(filmed: Path, tmp_path: Path) -> None:
+    """Start and offset together say where to look; what the motion says is world time."""
+    manifest = (filmed / "flight.yaml").read_text(encoding="utf-8").replace("drone1.", f"{filmed}/drone1.")
+    path = tmp_path / "flight.yaml"
+    stated = f"{{start: {START_S + BEGINS_S - 5.4}, start_from: motion}}\n    clock: {{offset_s: 5.5}}"
+    path.write_text(manifest.replace("{start_from: motion}", stated), encoding="utf-8")
+    succeeds("ingest", path)
+    described = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
+    camera = described["cameras"]["drone1"]
+    assert camera["frames"]["first_t_ns"] / 1e9 == pytest.approx(START_S + BEGINS_S, abs=0.01)
+    assert camera["clock"]["sigma_s"] < 2e-3  # what was found, not the default of a clock that states none
+    alone = "{start_from: motion}\n    clock: {offset_s: 5.5}"
+    path.write_text(manifest.replace("{start_from: motion}", alone), encoding="utf-8")
+    assert "cameras.drone1: clock.offset_s: start_from: motion finds the start" in refused("ingest", path)
+
+
 def test_a_camera_that_flies_beside_a_person_is_timed_by_what_it_passes(tmp_path: Path) -> None:
     """The sample flight (simulated): it flies a bow, over ground 10 m away, and the gimbal turns with it."""
     sample = Path(__file__).parents[3] / "sample_data" / "mound_walk"
