@@ -15,7 +15,10 @@ from pipelines.session.manifest import Camera, IntrinsicsSource
 from pipelines.session.records import CalibratedCamera, Detections, VideoIndex
 from pipelines.session.registries import CalibrationFormat, recognise
 
-_LARGEST_SHARE_OUTSIDE = 0.05  # of keypoints beyond the picture; detectors overshoot the border a little
+# Of keypoints. Detectors extrapolate people whom the border cuts, to all sides alike. Pictures of another
+# size show beyond the right and the lower border only: all pictures begin at 0.
+_LARGEST_SHARE_BEYOND = 0.2
+_LARGEST_SHARE_OUTSIDE = 0.5
 
 
 class CalibrationSources:
@@ -117,14 +120,24 @@ def _inline_intrinsics(source: IntrinsicsSource, place: str) -> Intrinsics:
 
 
 def _refuse_keypoints_outside(place: str, intrinsics: Intrinsics, detections: Detections) -> None:
-    """Refuse a calibration whose picture is too small for the keypoints: it is of another size."""
-    xy = detections.xy[~np.isnan(detections.xy[..., 0])]
-    outside = ((xy < -0.5) | (xy > [intrinsics.width - 0.5, intrinsics.height - 0.5])).any(axis=-1)
-    if len(xy) and outside.mean() > _LARGEST_SHARE_OUTSIDE:
-        reach = np.percentile(xy, 99, axis=0)
+    """Refuse a calibration that keypoints as a whole cannot belong to: it is for pictures of another size.
+
+    Keypoints count by their confidence: what a detector made up of a person whom the border cuts has little.
+    """
+    found = ~np.isnan(detections.xy[..., 0])
+    xy, weight = detections.xy[found], np.maximum(detections.confidence[found], 0.0)
+    if not len(xy):
+        return
+    weight = weight if weight.any() else np.ones(len(weight))
+    beyond = (xy > [intrinsics.width - 0.5, intrinsics.height - 0.5]).any(axis=-1)
+    outside = beyond | (xy < -0.5).any(axis=-1)
+    share_beyond, share_outside = (float(np.average(which, weights=weight)) for which in (beyond, outside))
+    if share_beyond > _LARGEST_SHARE_BEYOND or share_outside > _LARGEST_SHARE_OUTSIDE:
+        (left, top), (right, bottom) = np.percentile(xy[outside], [1, 99], axis=0)
         raise DataError(
             place,
-            f"is for {intrinsics.width}x{intrinsics.height} pictures, but {outside.mean():.0%} of the"
-            f" keypoints lie outside (they reach to x = {reach[0]:.0f}, y = {reach[1]:.0f})",
+            f"is for {intrinsics.width}x{intrinsics.height} pictures, but {share_outside:.0%} of the"
+            f" keypoints lie outside (those from x = {left:.0f}, y = {top:.0f} to x = {right:.0f},"
+            f" y = {bottom:.0f})",
             "give the calibration of these pictures, or their size with keypoints: {image_size: [W, H]}",
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -52,6 +53,9 @@ from pipelines.session.tabular import actor_table, frames_table, keypoints_table
 
 _MUCH_SHORTER = 0.9  # a video that covers less than this share of its pose log is worth a word
 _SHORTER_S = 1.0
+# Of a picture's sides. Detectors look at the box of a person, which most of them pad to 1.25 of its size: a
+# box as large as the picture reaches an eighth beyond it, and what lies further out nobody looked at.
+_EXTRAPOLATED = 1 / 8
 _AHEAD_ROWS = 200_000  # of cameras read while their sources are hashed: some 70 MB
 
 
@@ -179,6 +183,8 @@ class FlightReader:
         if camera.keypoints:
             detections, detector_format = sources.keypoints(camera.keypoints)
         intrinsics = sources.intrinsics(name, camera, video, detections)
+        if detections is not None:
+            detections = _near_picture(detections, intrinsics)
         frames = sources.frames(name, camera, video, detections, intrinsics)
         trajectory = sources.trajectory(name, camera, int(frames.t_ns[0]))
         if camera.pose_noise:
@@ -386,6 +392,31 @@ def _keypoints_entry(
         frames_without_person=frames - len(np.unique(detections.frame)),
         dropped=detections.dropped,
         adjusted=detections.adjusted,
+    )
+
+
+def _near_picture(detections: Detections, intrinsics: Intrinsics) -> Detections:
+    """Leave out and count keypoints further outside the picture than a detector may extrapolate."""
+    size = np.array([intrinsics.width, intrinsics.height])
+    margin = _EXTRAPOLATED * size
+    with np.errstate(invalid="ignore"):
+        beyond = (detections.xy < -0.5 - margin) | (detections.xy > size - 0.5 + margin)
+    far = np.asarray(beyond.any(axis=-1))
+    if not far.any():
+        return detections
+    lost = {"keypoints far outside the picture": int(far.sum())}
+    xy = np.where(far[..., None], np.nan, detections.xy)
+    confidence = np.where(far, 0.0, detections.confidence)
+    seen = np.isfinite(xy).any(axis=(1, 2))
+    if not seen.all():
+        lost["people far outside the picture"] = int((~seen).sum())
+    return replace(
+        detections,
+        frame=detections.frame[seen],
+        person=detections.person[seen],
+        xy=xy[seen],
+        confidence=confidence[seen],
+        dropped=dict(Counter(detections.dropped) + Counter(lost)),
     )
 
 

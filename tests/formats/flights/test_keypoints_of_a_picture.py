@@ -1,0 +1,123 @@
+"""Keypoints against the size of their picture: kept, left out, or of another picture altogether."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pipelines.formats.flights.calibration_sources import CalibrationSources
+from pipelines.formats.flights.flight_logs import FlightLogs
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import Camera, Flight
+from pipelines.session.records import Detections
+from tests.commands.runner import refused, succeeds
+from tests.synthetic.flights import LENS, SyntheticFlight, write_flight
+
+Float = NDArray[np.float64]
+
+WIDTH, HEIGHT = 1280, 720
+LENS_OF = {"width": WIDTH, "height": HEIGHT, "fx": 800, "fy": 800, "cx": 640, "cy": 360}
+CAMERA = Camera.model_validate({"pose": {"tum": "a.tum"}, "intrinsics": LENS_OF, "keypoints": "a.json"})
+
+
+def check(xy: Float, confidence: Float) -> None:
+    """Ask for the intrinsics of a camera with these keypoints [N, 2]."""
+    flight = Flight.model_validate({"schema": 1, "cameras": {"drone1": CAMERA}})
+    sources = CalibrationSources(Path("flight.yaml"), FlightLogs(flight, Path(), print), print)
+    number = np.arange(len(xy))
+    seen = Detections(("nose",), number, number * 0, xy[:, None], confidence[:, None], number)
+    sources.intrinsics("drone1", CAMERA, None, seen)
+
+
+@st.composite
+def entering(draw: st.DrawFn) -> tuple[Float, Float]:
+    """People inside, of whom a detector extrapolates up to a fifth of the keypoints beyond each border."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    inside = rng.uniform(0, [WIDTH - 1, HEIGHT - 1], (draw(st.integers(20, 100)), 2))
+    for axis, size in enumerate((WIDTH, HEIGHT)):
+        for edge, sign in ((0.0, -1), (size, 1)):
+            some = rng.choice(len(inside), draw(st.integers(0, len(inside) // 10)), replace=False)
+            inside[some, axis] = edge + sign * rng.uniform(1, draw(st.floats(1, 5000)), len(some))
+    return inside, np.ones(len(inside))
+
+
+@given(entering())
+def test_people_at_the_border_refuse_no_flight(found: tuple[Float, Float]) -> None:
+    check(*found)
+
+
+@given(st.integers(0, 2**32), st.floats(1.5, 8.0), st.booleans())
+def test_keypoints_of_larger_pictures_are_refused_with_numbers_outside(
+    seed: int, times: float, all_alike: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(0, [times * WIDTH, times * HEIGHT], (500, 2))  # 1 - 1 / times^2 of them lie outside
+    confidence = np.full(500, 0.9 if all_alike else 0.0)
+    with pytest.raises(DataError) as told:
+        check(xy, confidence)
+    right, bottom = (int(n) for n in re.findall(r"to x = (-?\d+), y = (-?\d+)\)", str(told.value))[0])
+    assert right > WIDTH or bottom > HEIGHT
+    assert right <= times * WIDTH
+    assert bottom <= times * HEIGHT
+
+
+@given(st.integers(0, 2**32))
+def test_keypoints_that_count_from_elsewhere_are_refused_with_numbers_outside(seed: int) -> None:
+    """From the middle of the picture: three quarters are negative, one is not."""
+    xy = np.random.default_rng(seed).uniform(-0.5, 0.5, (500, 2)) * [WIDTH, HEIGHT]
+    with pytest.raises(DataError) as told:
+        check(xy, np.ones(500))
+    left, top = (int(n) for n in re.findall(r"from x = (-?\d+), y = (-?\d+) to", str(told.value))[0])
+    assert -WIDTH / 2 - 1 <= left < 0
+    assert -HEIGHT / 2 - 1 <= top < 0
+
+
+def test_what_a_detector_makes_up_of_legs_below_the_picture_refuses_no_flight() -> None:
+    """Half of every person lies below the border, found with a tenth of the confidence of the rest."""
+    below = np.arange(1000) % 2 == 0
+    xy = np.stack([np.full(1000, 600.0), np.where(below, HEIGHT + 40.0, 500.0)], axis=1)
+    check(xy, np.where(below, 0.08, 0.8))
+    with pytest.raises(DataError, match="50% of the keypoints lie outside"):
+        check(xy, np.full(1000, 0.8))
+
+
+def moved(flight: SyntheticFlight, x_by_frame: dict[int, list[float]]) -> None:
+    """Set x of the first joints of drone1's people in some frames."""
+    path = flight.manifest.parent / "drone1.json"
+    people = json.loads(path.read_text(encoding="utf-8"))
+    for frame, values in x_by_frame.items():
+        for joint, x in enumerate(values):
+            people[frame]["keypoints"][3 * joint : 3 * joint + 3] = [x, 300.0, 0.9]
+    path.write_text(json.dumps(people), encoding="utf-8")
+
+
+@pytest.mark.parametrize("slightly", [-49.0, -LENS.width / 8, LENS.width + 49.0, LENS.width * 9 / 8 - 1])
+def test_keypoints_slightly_outside_are_kept_and_far_ones_left_out(tmp_path: Path, slightly: float) -> None:
+    flight = write_flight(tmp_path, cameras=2, seconds=0.5, clean=True)
+    succeeds("ingest", flight.manifest)
+    before = len(keypoints_of(flight))
+    # A detector extrapolates in frame 2, puts one joint where no box reached in 3, and a person in 4.
+    moved(flight, {2: [slightly] * 5, 3: [-300.0], 4: [3000.0] * 17})
+    succeeds("ingest", flight.manifest)
+    kept = keypoints_of(flight)
+    assert len(kept) == before - 18
+    assert np.count_nonzero(kept["x"] == slightly) == 5
+    entry = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
+    assert entry["cameras"]["drone1"]["keypoints"]["dropped"] == {
+        "keypoints far outside the picture": 18,
+        "people far outside the picture": 1,
+    }
+    assert "drone1: keypoints: 18 keypoints far outside" in refused("ingest", flight.manifest, "--strict")
+
+
+def keypoints_of(flight: SyntheticFlight) -> pd.DataFrame:
+    folder = flight.manifest.with_suffix(".session") / "cameras" / "drone1"
+    return pd.read_parquet(folder / "keypoints.parquet")
