@@ -42,6 +42,7 @@ class AttitudeTrack:
     t_ns: Int64  # [N]
     quaternion_xyzw: Float  # [N, 4] unit
     relative_to: Literal["world", "body"] = "world"
+    dropped: dict[str, int] = field(default_factory=dict)  # of a log that holds it alone
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import pandas as pd
 
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import conjugate, multiply, quaternion_from_rotation_vector, rotate
-from tests.commands.runner import mocap, succeeds
+from tests.commands.runner import mocap, refused, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log
@@ -115,3 +115,55 @@ def test_a_floor_plan_is_read_again_when_its_picture_changes(tmp_path: Path) -> 
     assert "written" in done.stdout
     described = json.loads(stored.read_text(encoding="utf-8"))["map"]
     assert described["occupied"] == described["shape"][2]
+
+
+def test_what_the_logs_of_a_gimbal_and_an_actor_lose_is_counted(tmp_path: Path) -> None:
+    """A gimbal's quaternion that is none and an actor's fixes without a fix, each in a log of its own."""
+    flight = write_flight(tmp_path, cameras=2, clean=True)
+    camera = flight.settings["cameras"]["drone1"]
+    angles = [(0.0, 0.0, 0.0, 1.0)] * len(flight.t_ns)
+    angles[3], angles[7] = (float("nan"), 0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 0.5)
+    entries = [
+        Entry(
+            "/gimbal",
+            "geometry_msgs/msg/QuaternionStamped",
+            int(stamp_ns),
+            {"header": header(int(stamp_ns), ""), "quaternion": dict(zip("xyzw", turned, strict=True))},
+        )
+        for stamp_ns, turned in zip(flight.t_ns, angles, strict=True)
+    ]
+    write_log(tmp_path, "gimbal", "mcap-cdr", entries)
+    camera["pose"] |= {"of": "body"}
+    camera["gimbal"] = {"log": "gimbal.mcap", "topic": "/gimbal", "relative_to": "world"}
+    fixes = [
+        Entry(
+            "/tag",
+            "sensor_msgs/msg/NavSatFix",
+            int(stamp_ns),
+            {
+                "header": header(int(stamp_ns), ""),
+                "status": {"status": -1 if row in {2, 5, 6} else 0},
+                "latitude": float("nan") if row == 9 else 47.5,
+                "longitude": 8.25,
+                "altitude": 400.0,
+            },
+        )
+        for row, stamp_ns in enumerate(flight.t_ns)
+    ]
+    write_log(tmp_path, "tag", "ros1", fixes)
+    flight.settings["actor"] = {"log": "tag.bag", "topic": "/tag"}
+    flight.settings["world"]["origin"] = {"latitude_deg": 47.5, "longitude_deg": 8.25, "altitude_m": 400}
+    flight.save()
+    done = mocap("ingest", flight.manifest)
+    assert done.returncode == 0, done.stderr
+    stored = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
+    assert stored["actor"]["dropped"] == {"no fix": 3, "not finite": 1}
+    assert stored["actor"]["count"] == len(flight.t_ns) - 4
+    lost = stored["cameras"]["drone1"]["poses"]["dropped"]
+    assert lost["gimbal angles: not finite"] == 1
+    assert lost["gimbal angles: quaternion not unit"] == 1
+    assert "actor: dropped: 3 no fix, 1 not finite" in done.stderr
+    assert "drone1: poses dropped: 1 gimbal angles: not finite" in done.stderr
+    line = refused("ingest", flight.manifest, "--strict")
+    assert "actor: 3 no fix" in line
+    assert "gimbal angles: not finite" in line

@@ -163,15 +163,17 @@ class FlightLogs:
             lost["trigger without a later stamp"] += repeated
         return Frames(topic, self._world_times(log, t_ns, started_ns), dict(lost))
 
-    def positions(self, log: str, topic: str | None) -> PositionTrack | None:
-        """Positions on Earth of a topic, at world times; None where it is no NavSatFix."""
+    def positions(self, log: str, topic: str | None) -> tuple[PositionTrack, dict[str, int]] | None:
+        """Positions on Earth of a topic, at world times, and what was lost; None where it is no NavSatFix."""
         with self._open(log) as (recording, source):
             types = {known.name: known.type for known in recording.topics}
             if topic is None or types.get(topic) != NAV_SAT_FIX:
                 return None
-            track = read_positions(recording, source, topic, self.settings(log).stamps)
+            dropped: dict[str, int] = {}
+            track = read_positions(recording, source, topic, self.settings(log).stamps, dropped)
+            lost = Counter(dropped) + Counter(recording.dropped)
             started_ns = _start_ns(recording)
-        return replace(track, t_ns=self._world_times(log, track.t_ns, started_ns))
+        return replace(track, t_ns=self._world_times(log, track.t_ns, started_ns)), dict(lost)
 
     def commands(self, log: str, topic: str) -> Trajectory | None:
         """Where setpoints or plans sent a drone, at world times; None where they are poses, or nothing."""

@@ -263,6 +263,8 @@ class FlightReader:
         trajectory = self._sources.actor(actor.log, actor.topic)
         self._refuse_no_overlap(actor.log, trajectory.t_ns, entries)
         write_table(folder / "actor.parquet", actor_table(trajectory), ACTOR)
+        if trajectory.dropped:
+            self._notes.append(f"actor: dropped: {losses(trajectory.dropped)}")
         return ActorEntry(
             source=actor.log, point=actor.point, count=len(trajectory.t_ns), dropped=trajectory.dropped
         )

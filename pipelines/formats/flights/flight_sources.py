@@ -240,9 +240,8 @@ class FlightSources:
         if camera.gimbal is None:
             position, quaternion = compose_mount(world_from_body, (lever_arm, rotation))
         else:
-            position, quaternion, without = self._on_gimbal(camera, body, lever_arm, rotation)
-            if without:
-                dropped["pose without gimbal angles"] = without
+            position, quaternion, lost = self._on_gimbal(camera, body, lever_arm, rotation)
+            dropped |= lost
         known = ~np.isnan(quaternion[:, 0])
         if not known.any():
             raise DataError(
@@ -264,7 +263,8 @@ class FlightSources:
 
     def _on_gimbal(
         self, camera: Camera, body: Trajectory, lever_arm: Float, rotation: Float
-    ) -> tuple[Float, Float, int]:
+    ) -> tuple[Float, Float, dict[str, int]]:
+        """Positions, rotations, and what was lost on the way."""
         gimbal = camera.gimbal
         if gimbal is None:
             raise ValueError("the camera has no gimbal")
@@ -277,14 +277,18 @@ class FlightSources:
             rotation,
             relative_to=track.relative_to,
         )
-        return position, quaternion, int(np.isnan(attitude[:, 0]).sum())
+        lost = dict(track.dropped)
+        if without := int(np.isnan(attitude[:, 0]).sum()):
+            lost["pose without gimbal angles"] = without
+        return position, quaternion, lost
 
     # --- actor, map, truth -----------------------------------------------------------------------------
 
     def actor(self, log: str, topic: str | None) -> Trajectory:
         """Where the actor was, as logged; its rotation means nothing."""
-        if (track := self._logs.positions(log, topic)) is not None:
-            return self._telemetry.points("actor", log, track)
+        if (found := self._logs.positions(log, topic)) is not None:
+            track, lost = found
+            return replace(self._telemetry.points("actor", log, track), dropped=lost)
         settings = self._logs.settings(log)
         trajectory = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
         return in_world(in_enu(trajectory, self._axes(settings.axes)), settings)

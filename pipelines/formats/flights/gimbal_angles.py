@@ -38,7 +38,8 @@ def stated_angles(gimbal: Gimbal, logs: FlightLogs, frame: Axes) -> AttitudeTrac
         relative_to=relative_to,
         axes=gimbal.axes or logs.settings(log).axes or frame,
     )
-    return AttitudeTrack(topic, logged.t_ns, turned, relative_to)
+    lost = {f"gimbal angles: {cause}": count for cause, count in logged.dropped.items()}
+    return AttitudeTrack(topic, logged.t_ns, turned, relative_to, lost)
 
 
 def attitudes_at(track: AttitudeTrack, t_ns: Int64, *, max_gap_ns: int) -> Float:

@@ -250,7 +250,8 @@ class TelemetryPoses:
             )
         else:
             raise AssertionError("refused above")
-        return self._complete(name, settings, telemetry, t_ns, position, multiply(turned, quaternion))
+        dropped = dict(telemetry.dropped) | (dict(gimbal.dropped) if gimbal is not None else {})
+        return self._complete(name, settings, dropped, t_ns, position, multiply(turned, quaternion))
 
     def _gimbal(self, name: str, camera: Camera, telemetry: Telemetry) -> AttitudeTrack | None:
         """The angles that the manifest names, or those of the drone's own log unless it asks for the body."""
@@ -302,7 +303,7 @@ class TelemetryPoses:
         self,
         name: str,
         settings: LogSource,
-        telemetry: Telemetry,
+        dropped: dict[str, int],
         t_ns: Int64,
         position: Float,
         quaternion: Float,
@@ -316,7 +317,6 @@ class TelemetryPoses:
                 f" {self._max_gap_ns / 1e9:g} s)",
                 "check the clocks of the two logs, or raise --max-pose-gap",
             )
-        dropped = dict(telemetry.dropped)
         for cause, count in (
             ("attitude without a position", np.count_nonzero(~placed)),
             ("position without an attitude", np.count_nonzero(placed & ~turned)),

@@ -242,13 +242,15 @@ def read_pair(
     )
 
 
-def read_positions(recording: Log, source: str, topic: str, stamps: Stamps) -> PositionTrack:
-    """A topic of positions alone.
+def read_positions(
+    recording: Log, source: str, topic: str, stamps: Stamps, dropped: dict[str, int]
+) -> PositionTrack:
+    """A topic of positions alone; what cannot be used is counted in `dropped`.
 
     Raises:
         DataError: nothing usable in it.
     """
-    return _position(recording, source, topic, "ellipsoid", stamps, {})
+    return _position(recording, source, topic, "ellipsoid", stamps, dropped)
 
 
 def _prefix(source: str, preset: Preset, namespace: str | None, counts: dict[str, int]) -> str:
