@@ -9,10 +9,11 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pipelines.geometry.cameras import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
+from pipelines.session.manifest import refuse_camera_names
 from pipelines.session.records import Occupancy
 from pipelines.session.storage import hash_of, read_json
 
@@ -242,6 +243,16 @@ class Description(Entry):
     damage: dict[str, dict[str, int]] = {}  # of sources as wholes: path -> how often, by cause
     warnings: list[str]
 
+    @model_validator(mode="after")
+    def _names_are_of_cameras(self) -> Description:
+        """Names lead to folders: those of a session from elsewhere must not lead out of it."""
+        refuse_camera_names(self.cameras)
+        named = [self.clock_reference, *(self.plan or {}), *(self.truth.cameras if self.truth else [])]
+        strange = [name for name in named if name not in self.cameras]
+        if strange:
+            raise ValueError(f"{strange[0]!r} is no camera of this flight")
+        return self
+
     @property
     def has_true_joints(self) -> bool:
         """Whether it is known where the joints really were."""
@@ -286,5 +297,7 @@ def read_description(session: Path) -> Description:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise DataError(
-            path, f"is damaged ({place}: {first['msg']})", "ingest the flight again with --force"
+            path,
+            f"is damaged ({place + ': ' if place else ''}{first['msg']})",
+            "ingest the flight again with --force",
         ) from None

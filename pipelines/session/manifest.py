@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
+from collections.abc import Collection
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
@@ -442,6 +443,19 @@ class Plan(Part):
         return self.topics[camera].log or self.log or ""
 
 
+def refuse_camera_names(names: Collection[str]) -> None:
+    """Refuse names of cameras that cannot each name a folder of its own.
+
+    Raises:
+        ValueError: which, and what names may be.
+    """
+    bad = [name for name in names if not CAMERA_NAME.fullmatch(name)]
+    if bad:
+        raise ValueError(f"camera name {bad[0]!r}: use 1 to 64 of A-Z a-z 0-9 _ -, it names a folder")
+    if len({name.lower() for name in names}) < len(names):
+        raise ValueError("two cameras differ in case only: their folders would be one on some systems")
+
+
 class Flight(Part):
     """One flight, as `flight.yaml` states it."""
 
@@ -460,12 +474,7 @@ class Flight(Part):
 
     @model_validator(mode="after")
     def _names_exist(self) -> Flight:
-        bad = [name for name in self.cameras if not CAMERA_NAME.fullmatch(name)]
-        if bad:
-            raise ValueError(f"camera name {bad[0]!r}: use 1 to 64 of A-Z a-z 0-9 _ -, it names a folder")
-        folded = [name.lower() for name in self.cameras]
-        if len(set(folded)) < len(folded):
-            raise ValueError("two cameras differ in case only: their folders would be one on some systems")
+        refuse_camera_names(self.cameras)
         named = [self.clock_reference] if self.clock_reference else []
         named += list(self.truth.poses) if self.truth else []
         named += self.plan.cameras if self.plan else []

@@ -46,13 +46,40 @@ def _flight(*positions: tuple[float, float, float]) -> LoggedFlight:
     )
 
 
+CAMERA = {
+    "intrinsics": {
+        "width": 640,
+        "height": 480,
+        "fx": 1,
+        "fy": 1,
+        "cx": 0,
+        "cy": 0,
+        "model": "none",
+        "distortion": [],
+        "readout_s": 0,
+    },
+    "frames": {"count": 1, "first_t_ns": START_NS, "last_t_ns": START_NS, "rate_hz": None},
+    "poses": {
+        "source": "",
+        "static": False,
+        "count": 1,
+        "rate_hz": None,
+        "gaps_ns": [],
+        "frames_without_pose": 0,
+        "dropped": {},
+    },
+    "keypoints": None,
+    "clock": {"offset_s": 0, "sigma_s": 0},
+    "pose_noise": None,
+    "media": None,
+}
 DESCRIPTION = Description.model_validate(
     {
         "schema": 1,
         "flight": "",
         "clock_reference": "c0",
         "pose_interpolation": {"max_gap_s": 0.5, "max_extrapolation_s": 0.1},
-        "cameras": {},
+        "cameras": {"c0": CAMERA},
         "truth": None,
         "sources": {},
         "warnings": [],
