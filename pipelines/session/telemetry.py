@@ -63,7 +63,7 @@ class TelemetryChoice:
     """What of a drone's log is wanted where it holds several; None leaves the choice to the reader."""
 
     position: Literal["local", "global", "gps"] | None = None
-    instance: int | None = None  # of an estimator, a receiver or a gimbal
+    instance: int | None = None  # of an estimator or a receiver
     time: Literal["gps", "boot"] | None = None
     altitude: Literal["relative", "absolute"] | float | None = None
 

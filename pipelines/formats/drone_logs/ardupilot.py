@@ -159,7 +159,7 @@ class ArduPilotFormat:
         fit = on_gps_time(path, _gps_time(log), choice.time, notes)
         body = _body(log, dropped)
         position = _position(log, choice, dropped, notes)
-        gimbal = _mount(log, choice.instance or 0, body, dropped)
+        gimbal = _mount(log, body, dropped, notes)
         return on_one_clock(path, position, body, gimbal, fit=fit, notes=notes, dropped=dropped)
 
     def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
@@ -186,11 +186,19 @@ def _position(
 ) -> PositionTrack:
     instance = choice.instance or 0
     there = {
-        "global": log.first(["POS"]),
+        "global": None if instance else log.first(["POS"]),  # the one that the autopilot flew by
         "local": log.first(["XKF1", "NKF1"], instance, "C", "I"),
         "gps": log.first(["GPS"], instance, "I"),
     }
     found = {kind: rows for kind, rows in there.items() if rows is not None}
+    if instance and (choice.position or "local") not in found:
+        wanted = f"{choice.position} position" if choice.position else "local position"
+        others = [kind for kind in found if kind != choice.position]
+        raise DataError(
+            log.path,
+            f"has no instance {instance} of a {wanted}",
+            f"write position: {others[0]}" if others else "leave `instance` out",
+        )
     if choice.position is not None and choice.position not in found:
         raise DataError(
             log.path, f"has no {choice.position} position", f"there is {', '.join(found) or 'none'}"
@@ -199,7 +207,8 @@ def _position(
         raise DataError(log.path, "has no POS, XKF1, NKF1 or GPS message", "log them (LOG_BITMASK)")
     kind: str = choice.position or next(iter(found))
     rows = found[kind]
-    notes.append(f"took the {kind} position from {rows.name}")
+    of_several = f" (instance {instance})" if instance else ""
+    notes.append(f"took the {kind} position from {rows.name}{of_several}")
     if rows.lost:
         dropped["cut off"] = dropped.get("cut off", 0) + rows.lost
     if kind == "local":
@@ -241,12 +250,19 @@ def _body(log: _Log, dropped: MutableMapping[str, int]) -> AttitudeTrack | None:
 
 
 def _mount(
-    log: _Log, instance: int, body: AttitudeTrack | None, dropped: MutableMapping[str, int]
+    log: _Log, body: AttitudeTrack | None, dropped: MutableMapping[str, int], notes: list[str]
 ) -> AttitudeTrack | None:
-    """MNT: roll and pitch against the horizon, yaw from north where it is stated, else from the nose."""
-    rows = log.first(["MNT"], instance, "I")
-    if rows is None or "Pitch" not in rows:
+    """MNT: roll and pitch against the horizon, yaw from north where it is stated, else from the nose.
+
+    Of several mounts the first: `instance` is that of an estimator or a receiver.
+    """
+    every = log.rows("MNT")
+    if every is None or "TimeUS" not in every or "Pitch" not in every:
         return None
+    mounts = np.unique(every.integers("I")).tolist() if "I" in every else [0]
+    rows = every.of(mounts[0], "I")
+    if len(mounts) > 1:
+        notes.append(f"has {len(mounts)} mounts (MNT): took the angles of the first, {mounts[0]}")
     roll, pitch, from_nose, from_north = (rows.numbers(f) for f in ("Roll", "Pitch", "YawB", "YawE"))
     turned = turned_as_stated(np.stack([from_north, pitch, roll], axis=1))
     unknown = np.isnan(from_north)

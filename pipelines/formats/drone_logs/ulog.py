@@ -99,7 +99,7 @@ class UlogFormat:
         dropped: dict[str, int] = {}
         notes: list[str] = []
         fit = on_gps_time(path, _gps_time(topics), choice.time, notes)
-        body = _body(topics, choice.instance, dropped)
+        body = _body(topics, choice.instance, dropped, notes)
         position = _position(path, topics, choice, dropped, notes)
         gimbal = _gimbal(topics, body, dropped, notes)
         return on_one_clock(path, position, body, gimbal, fit=fit, notes=notes, dropped=dropped)
@@ -133,6 +133,12 @@ _WANTED = {
     "mount_orientation",
 }
 
+_POSITIONS = {
+    "local": ("vehicle_local_position", "estimator_local_position"),
+    "global": ("vehicle_global_position", "estimator_global_position"),
+    "gps": _GPS,
+}
+
 # --- what a log says -----------------------------------------------------------------------------------
 
 
@@ -144,11 +150,17 @@ def _position(
     notes: list[str],
 ) -> PositionTrack:
     there = {
-        "local": _instance(path, topics, ("vehicle_local_position", "estimator_local_position"), choice),
-        "global": _instance(path, topics, ("vehicle_global_position", "estimator_global_position"), choice),
-        "gps": _instance(path, topics, _GPS, choice),
+        kind: _instance(path, topics, names, choice, wanted=choice.position == kind)
+        for kind, names in _POSITIONS.items()
     }
     found = {kind: topic for kind, topic in there.items() if topic is not None}
+    if (
+        not found
+        and choice.instance is not None
+        and any(_there(topics, names) for names in _POSITIONS.values())
+    ):
+        listed = [topic for names in _POSITIONS.values() for topic in _there(topics, names)]
+        raise _no_instance(path, choice.instance, "a position", listed)
     if choice.position is not None and choice.position not in found:
         raise DataError(path, f"has no {choice.position} position", f"there is {', '.join(found) or 'none'}")
     if not found:
@@ -253,11 +265,16 @@ def _accuracy(topic: Topic, usable: Bool) -> tuple[float, float] | None:
 
 
 def _body(
-    topics: Sequence[Topic], instance: int | None, dropped: MutableMapping[str, int]
+    topics: Sequence[Topic], instance: int | None, dropped: MutableMapping[str, int], notes: list[str]
 ) -> AttitudeTrack | None:
     found = [topic for topic in topics if topic.name == "vehicle_attitude"]
-    if instance:
-        found = [t for t in topics if t.name == "estimator_attitude" and t.instance == instance] or found
+    estimated = [topic for topic in topics if topic.name == "estimator_attitude" and len(topic)]
+    if instance and estimated:
+        found = [topic for topic in estimated if topic.instance == instance] or found
+        if found and found[0].name != "estimator_attitude":
+            notes.append(
+                f"has no estimator_attitude {instance}: took the attitude that the autopilot flew by"
+            )
     if not found:
         return None
     topic = found[0]
@@ -273,9 +290,11 @@ def _gimbal(
     notes: list[str],
 ) -> AttitudeTrack | None:
     """The gimbal's own attitude, or else what it was told relative to the body."""
-    for topic in topics:
-        if topic.name == "gimbal_device_attitude_status" and len(topic):
-            return _gimbal_device(topic, body, dropped)
+    devices = sorted(_there(topics, ["gimbal_device_attitude_status"]), key=lambda topic: topic.instance)
+    if devices:
+        if len(devices) > 1:
+            notes.append(f"has {len(devices)} gimbals: took the angles of the first, {devices[0].instance}")
+        return _gimbal_device(devices[0], body, dropped)
     for topic in topics:
         if topic.name == "mount_orientation" and len(topic):
             roll, pitch, yaw = (topic.numbers(f"attitude_euler_angle[{k}]") for k in range(3))
@@ -317,20 +336,32 @@ def _gps_time(topics: Sequence[Topic]) -> ClockFit | None:
 
 
 def _instance(
-    path: Path, topics: Sequence[Topic], names: Sequence[str], choice: TelemetryChoice
+    path: Path, topics: Sequence[Topic], names: Sequence[str], choice: TelemetryChoice, *, wanted: bool
 ) -> Topic | None:
-    """The topic of the instance asked for, the first by default; None where there is none of these names.
+    """The topic of the instance asked for, the first by default; None where there is none.
 
     vehicle_* is what the autopilot flew by, estimator_* what each of several estimators thought.
+
+    Raises:
+        DataError: this kind is wanted, and has no such instance.
     """
-    of_kind = [topic for name in names for topic in topics if topic.name == name and len(topic)]
+    of_kind = _there(topics, names)
     if not of_kind or choice.instance is None:
         return of_kind[0] if of_kind else None
     found = [topic for topic in of_kind if topic.instance == choice.instance]
-    if not found and choice.position is not None:
-        listed = ", ".join(f"{topic.name} {topic.instance}" for topic in of_kind)
-        raise DataError(path, f"has no instance {choice.instance} of {names[0]}", f"there are {listed}")
-    return found[-1] if found else of_kind[0]
+    if not found and wanted:
+        raise _no_instance(path, choice.instance, names[0], of_kind)
+    return found[-1] if found else None
+
+
+def _there(topics: Sequence[Topic], names: Sequence[str]) -> list[Topic]:
+    """Those of some names that hold messages."""
+    return [topic for name in names for topic in topics if topic.name == name and len(topic)]
+
+
+def _no_instance(path: Path, instance: int, what: str, there: Sequence[Topic]) -> DataError:
+    listed = ", ".join(f"{topic.name} {topic.instance}" for topic in there)
+    return DataError(path, f"has no instance {instance} of {what}", f"there are {listed}")
 
 
 def _far_off(t_ns: Int64, among: Bool) -> Bool:

@@ -14,7 +14,7 @@ from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.session.errors import DataError
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
-from tests.synthetic.drone_logs import BOOT_NS, HOME, DroneTruth, drone_of, write_dataflash
+from tests.synthetic.drone_logs import BOOT_NS, HOME, DroneTruth, dataflash, drone_of, write_dataflash
 from tests.synthetic.flights import write_flight
 
 
@@ -144,3 +144,29 @@ def test_without_pymavlink_it_is_said_what_to_install(
     monkeypatch.setitem(sys.modules, "pymavlink.DFReader", None)
     with pytest.raises(DataError, match=r'pip install "pymavlink\S*" "pyulog\S*"`$'):
         read(path)
+
+
+def test_an_instance_is_that_of_an_estimator_and_never_that_of_a_mount(
+    tmp_path: Path, truth: DroneTruth
+) -> None:
+    """Another estimator has the drone 50 m further north, and another mount looks straight down."""
+    path = write_dataflash(tmp_path / "a.bin", truth)
+    with path.open("ab") as log:
+        for us, (east, north, up) in zip(truth.boot_us.tolist(), truth.enu.tolist(), strict=True):
+            log.write(dataflash("MNT", us, 1, 0, 0.0, 0, -90.0, 0, 0.0, 0, 0.0))
+            log.write(dataflash("XKF1", us, 1, 0, 0, 0, 0, 0, 0, 0, north + 50, east, -up, 0, 0, 0, 0))
+    first, second = read(path, position="local"), read(path, instance=1)
+    assert first.gimbal is not None
+    assert second.gimbal is not None
+    np.testing.assert_allclose(
+        second.position.values - first.position.values, [[0, 50, 0]] * len(truth.t_ns), atol=1e-5
+    )
+    np.testing.assert_array_equal(second.gimbal.quaternion_xyzw, first.gimbal.quaternion_xyzw)
+    assert any("has 2 mounts (MNT): took the angles of the first, 0" in note for note in second.notes)
+    for position in ("global", "gps"):
+        with pytest.raises(
+            DataError, match=f"has no instance 1 of a {position} position; write position: local"
+        ):
+            read(path, position=position, instance=1)
+    with pytest.raises(DataError, match="has no instance 2 of a local position; leave `instance` out"):
+        read(path, instance=2)

@@ -160,6 +160,31 @@ def test_what_is_not_there(tmp_path: Path, truth: DroneTruth) -> None:
         read(no_gps, time="gps")
 
 
+def test_an_instance_is_taken_or_refused(tmp_path: Path, truth: DroneTruth) -> None:
+    """A second receiver with heights 7 m above the first one's, and a second gimbal that looks elsewhere."""
+    rows = ulog_rows(truth)
+    for name, _, fields in ulog_rows(truth):
+        if name == "vehicle_gps_position":
+            rows.append((name, 1, (*fields[:4], fields[4] + 7000, *fields[5:])))
+        elif name == "gimbal_device_attitude_status":
+            rows.append((name, 1, (fields[0], 1.0, 0.0, 0.0, 0.0, fields[-1])))
+    path = write_ulog(tmp_path / "a.ulg", rows)
+    first, second = read(path, position="gps"), read(path, instance=1)
+    np.testing.assert_allclose(
+        second.position.values - first.position.values, [[0, 0, 7]] * len(truth.t_ns), atol=1e-6
+    )
+    assert first.gimbal is not None
+    assert second.gimbal is not None
+    np.testing.assert_array_equal(second.gimbal.quaternion_xyzw, first.gimbal.quaternion_xyzw)
+    assert any("has 2 gimbals: took the angles of the first, 0" in note for note in second.notes)
+    with pytest.raises(
+        DataError, match="has no instance 2 of a position; there are vehicle_local_position 0, "
+    ):
+        read(path, instance=2)
+    with pytest.raises(DataError, match="has no instance 1 of vehicle_local_position"):
+        read(path, position="local", instance=1)
+
+
 def test_damage(tmp_path: Path, truth: DroneTruth) -> None:
     whole = write_ulog(tmp_path / "a.ulg", ulog_rows(truth)).read_bytes()
     cut = tmp_path / "cut.ulg"
