@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.poses import (
     compose,
-    conjugate,
     enu_from_ned,
     multiply,
     quaternion_from_rotation_vector,
@@ -97,9 +96,11 @@ def attitude_from_angles(
     return multiply(multiply(_turn("z", yaw), _turn("y", pitch)), _turn("x", roll))
 
 
-def attitude_in_enu(
-    quaternion_xyzw: Float, *, relative_to: Literal["world", "body"], axes: Literal["enu", "ned"]
-) -> Float:
+RelativeTo = Literal["world", "body", "heading"]
+"""What a gimbal's angles count from. Heading: yaw from the nose, pitch and roll from the horizon."""
+
+
+def attitude_in_enu(quaternion_xyzw: Float, *, relative_to: RelativeTo, axes: Literal["enu", "ned"]) -> Float:
     """A gimbal's attitude in our axes, from those of its log.
 
     With `enu` the world is ENU, body and gimbal FLU: yaw is counted from east to north, or from forward to
@@ -109,34 +110,25 @@ def attitude_in_enu(
     straight down.
 
     Args:
-        quaternion_xyzw: [..., 4] world_from_gimbal or body_from_gimbal.
-        relative_to: which of the two.
+        quaternion_xyzw: [..., 4] world_from_gimbal, body_from_gimbal or heading_from_gimbal.
+        relative_to: which of them.
         axes: the axes of the log.
 
     Returns:
-        [..., 4] the same, of an FLU gimbal in an ENU world or an FLU body.
+        [..., 4] the same, of an FLU gimbal in an ENU world, an FLU body or a level one that heads as it does.
     """
     if axes == "enu":
         return quaternion_xyzw
     of_flu_gimbal = multiply(quaternion_xyzw, _FLU_FROM_FRD)
-    if relative_to == "body":
-        return multiply(_FLU_FROM_FRD, of_flu_gimbal)
-    return enu_from_ned(np.zeros(3), of_flu_gimbal)[1]
+    if relative_to == "world":
+        return enu_from_ned(np.zeros(3), of_flu_gimbal)[1]
+    return multiply(_FLU_FROM_FRD, of_flu_gimbal)
 
 
-def meant_relative_to(
-    quaternion_xyzw: Float, *, taken: Literal["world", "body"], meant: Literal["world", "body"]
-) -> Float:
-    """Attitudes [..., 4] of `attitude_in_enu` from `ned`, had its angles been relative to the other.
-
-    A log may say angles without saying of what: north is then the nose, or the nose north.
-    """
-    if taken == meant:
-        return quaternion_xyzw
-    enu_from_world = enu_from_ned(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))[1]
-    if meant == "body":
-        return multiply(_FLU_FROM_FRD, multiply(conjugate(enu_from_world), quaternion_xyzw))
-    return multiply(enu_from_world, multiply(conjugate(_FLU_FROM_FRD), quaternion_xyzw))
+def level_heading(quaternion_xyzw: Float) -> Float:
+    """Attitudes [..., 4] in ENU of level things that head where x of others points: yaw alone."""
+    ahead = rotate(quaternion_xyzw, np.array([1.0, 0.0, 0.0]))
+    return _turn("z", np.arctan2(ahead[..., 1], ahead[..., 0]))
 
 
 def compose_gimbal(
@@ -145,13 +137,13 @@ def compose_gimbal(
     attitude_xyzw: Float,
     gimbal_from_camera_xyzw: Float,
     *,
-    relative_to: Literal["world", "body"],
+    relative_to: RelativeTo,
 ) -> Pose:
     """Poses of a camera on a gimbal.
 
-    An attitude in the world replaces the body's rotation, one relative to the body composes with it. The
-    lever arm, from the body's origin to the camera, turns with the body either way: the arm of the
-    gimbal's own joints is taken as part of it.
+    An attitude in the world replaces the body's rotation, one relative to the body composes with it, one
+    relative to the heading with its yaw alone. The lever arm, from the body's origin to the camera, turns
+    with the body in any case: the arm of the gimbal's own joints is taken as part of it.
 
     Args:
         world_from_body: position [N, 3] m and quaternion [N, 4], ENU from FLU.
@@ -164,7 +156,12 @@ def compose_gimbal(
         world_from_camera: position [N, 3] and quaternion [N, 4].
     """
     position, world_from_body_xyzw = world_from_body
-    attitude = attitude_xyzw if relative_to == "world" else multiply(world_from_body_xyzw, attitude_xyzw)
+    if relative_to == "world":
+        attitude = attitude_xyzw
+    elif relative_to == "body":
+        attitude = multiply(world_from_body_xyzw, attitude_xyzw)
+    else:
+        attitude = multiply(level_heading(world_from_body_xyzw), attitude_xyzw)
     return position + rotate(world_from_body_xyzw, lever_arm), multiply(attitude, gimbal_from_camera_xyzw)
 
 

@@ -18,6 +18,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from pipelines.geometry.mounting import RelativeTo
 from pipelines.session.yaml_models import Part, read_yaml_model
 
 SCHEMA = 1
@@ -261,7 +262,7 @@ class Gimbal(Part):
     log: str | None = None
     topic: str | None = None
     fixed: FixedAngles | None = None
-    relative_to: Literal["world", "body"] | None = None
+    relative_to: RelativeTo | None = None
     order: Literal["ypr", "rpy", "pry"] = "ypr"
     units: Literal["deg", "rad"] = "deg"
     axes: Axes | None = None

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
 
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place
+from pipelines.geometry.mounting import RelativeTo
 from pipelines.session.records import Float, Int64
 from pipelines.session.registries import Format
 
@@ -35,13 +37,16 @@ class PositionTrack:
 class AttitudeTrack:
     """How something was turned over time; stamps strictly increase.
 
-    Of a body (FLU) in an ENU world; of a gimbal (FLU, x where the camera looks) in that or in its body.
+    Of a body (FLU) in an ENU world; of a gimbal (FLU, x where the camera looks) in that, in its body, or in a
+    level one that heads as the body does.
     """
 
     name: str
     t_ns: Int64  # [N]
     quaternion_xyzw: Float  # [N, 4] unit
-    relative_to: Literal["world", "body"] = "world"
+    relative_to: RelativeTo = "world"
+    stated: Mapping[RelativeTo, Float] = field(default_factory=dict)
+    """[N, 4] of a gimbal: its angles as the log states them (FRD), by what the user says they count from."""
     dropped: dict[str, int] = field(default_factory=dict)  # of a log that holds it alone
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pandas as pd
+import pytest
 
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import conjugate, multiply, quaternion_from_rotation_vector, rotate
@@ -49,18 +50,23 @@ def test_the_logged_actor_decides_who_it_is(tmp_path: Path) -> None:
     assert result["mpjpe_mm"] < 0.5
 
 
-def test_gimbal_angles_in_the_world_replace_the_rotation_of_the_body(tmp_path: Path) -> None:
+@pytest.mark.parametrize("relative_to", ["world", "heading"])
+def test_gimbal_angles_of_a_topic_do_not_lean_with_the_body(tmp_path: Path, relative_to: str) -> None:
     flight = write_flight(tmp_path, cameras=2, clean=True)
     lever_arm = np.array([0.0, 0.0, -0.2])
     for k, name in enumerate(flight.cameras):
-        # A level body that heads anywhere; what looks at the actor is the gimbal alone.
+        # A body that heads anywhere and leans; what looks at the actor is the gimbal alone.
         heading = quaternion_from_rotation_vector(np.array([0.0, 0.0, 0.3 + k]))
-        world_from_gimbal = multiply(flight.camera_quaternion[k], conjugate(body_from_camera("forward")))
-        position = flight.camera_position[k] - rotate(heading, lever_arm)
+        body = multiply(heading, quaternion_from_rotation_vector(np.array([0.0, 0.2, 0.0])))
+        body = multiply(body, quaternion_from_rotation_vector(np.array([-0.1, 0.0, 0.0])))
+        logged_gimbal = multiply(flight.camera_quaternion[k], conjugate(body_from_camera("forward")))
+        if relative_to == "heading":
+            logged_gimbal = multiply(conjugate(heading), logged_gimbal)
+        position = flight.camera_position[k] - rotate(body, lever_arm)
         entries: list[Entry] = []
-        for stamp_ns, at, turned in zip(flight.t_ns, position, world_from_gimbal, strict=True):
+        for stamp_ns, at, turned in zip(flight.t_ns, position, logged_gimbal, strict=True):
             stamped = header(int(stamp_ns), "map")
-            pose = _pose(at, heading)
+            pose = _pose(at, body)
             attitude = dict(zip("xyzw", turned.tolist(), strict=True))
             entries += [
                 Entry(
@@ -77,7 +83,7 @@ def test_gimbal_angles_in_the_world_replace_the_rotation_of_the_body(tmp_path: P
         camera = flight.settings["cameras"][name]
         camera["pose"] = {"log": f"{name}_log.mcap", "topic": "/pose", "of": "body"}
         camera["mount"] = {"looks": "forward", "translation": lever_arm.tolist()}
-        camera["gimbal"] = {"log": f"{name}_log.mcap", "topic": "/gimbal", "relative_to": "world"}
+        camera["gimbal"] = {"log": f"{name}_log.mcap", "topic": "/gimbal", "relative_to": relative_to}
     flight.save()
     succeeds("ingest", flight.manifest)
     for k, name in enumerate(flight.cameras):

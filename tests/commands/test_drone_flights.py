@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 
 from pipelines.geometry.geodesy import place_at
+from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
@@ -157,6 +158,45 @@ def test_drones_that_log_body_and_gimbal(tmp_path: Path, write: Any, metres: flo
         off_m, off_deg = errors(flight, k)
         assert off_m < metres
         assert off_deg < degrees
+
+
+@pytest.mark.parametrize("says_north", [True, False])
+@pytest.mark.parametrize("meant", ["world", "body", "heading"])
+def test_what_angles_count_from_is_as_the_user_says(tmp_path: Path, meant: str, says_north: bool) -> None:
+    """Whatever the flags of the log say: angles of another reference than they claim are mended."""
+
+    def write(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
+        k = 0 if name == "drone1" else 1
+        ahead = rotate(truth.body, np.array([1.0, 0.0, 0.0]))
+        still = np.zeros(len(ahead))
+        yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
+        to_north = np.tile([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)], (len(ahead), 1))  # FLU, forward is north
+        world_from = {
+            "world": to_north,
+            "body": truth.body,
+            "heading": np.stack([still, still, np.sin(yaw / 2), np.cos(yaw / 2)], axis=1),
+        }
+        optical = conjugate(body_from_camera("forward"))
+        world_from_gimbal = multiply(cameras[k], optical)
+        x, y, z, w = multiply(conjugate(world_from[meant]), world_from_gimbal).T  # FLU
+        flags = 64 if says_north else 32
+        rows = [row for row in ulog_rows(truth) if row[0] != "gimbal_device_attitude_status"]
+        for us, turned in zip(truth.boot_us.tolist(), np.stack([w, x, -y, -z], axis=1).tolist(), strict=True):
+            rows.append(("gimbal_device_attitude_status", 0, (us, *turned, flags)))  # FRD
+        write_ulog(folder / f"{name}.ulg", rows)
+        return {"ulog": f"{name}.ulg"}
+
+    cameras = write_flight(tmp_path, cameras=2, seconds=1.0, clean=True).camera_quaternion
+    flight = with_poses(tmp_path, write, ON_GIMBAL)
+    for name in flight.cameras:
+        flight.settings["cameras"][name]["gimbal"] = {"relative_to": meant}
+    flight.save()
+    warnings = ingest(flight.manifest).description.warnings
+    assert sum(f"relative to the {meant} as stated" in line for line in warnings) == 2
+    for k in range(2):
+        off_m, off_deg = errors(flight, k)
+        assert off_m < 1e-4
+        assert off_deg < 1e-3  # quaternions of 32 bits, twice
 
 
 def test_one_origin_for_all_where_none_is_stated(tmp_path: Path) -> None:

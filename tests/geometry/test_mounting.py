@@ -23,7 +23,6 @@ from pipelines.geometry.mounting import (
     compose_gimbal,
     compose_mount,
     flu_body_from_frd,
-    meant_relative_to,
 )
 from pipelines.geometry.pose_covariance import mounted_covariance, pose_covariance_in_body
 from pipelines.geometry.poses import (
@@ -299,17 +298,19 @@ def test_what_is_missing_stays_missing() -> None:
     assert np.isfinite(quaternion[1]).all()
 
 
-@pytest.mark.parametrize(("taken", "meant"), [("world", "body"), ("body", "world"), ("body", "body")])
-def test_angles_are_taken_as_relative_to_what_the_user_says(
-    taken: Literal["world", "body"], meant: Literal["world", "body"]
-) -> None:
-    """As if the log had been read so from the beginning; level and straight ahead is north, or the nose."""
-    logged = np.random.default_rng(0).normal(size=(50, 4))
-    logged = np.concatenate([logged / np.linalg.norm(logged, axis=1, keepdims=True), [[0.0, 0.0, 0.0, 1.0]]])
-    found = meant_relative_to(
-        attitude_in_enu(logged, relative_to=taken, axes="ned"), taken=taken, meant=meant
+def test_yaw_from_the_nose_with_pitch_and_roll_from_the_horizon() -> None:
+    """A body that heads 30 deg left of east and leans; FRD angles of 20 deg right and 40 deg down."""
+    body = quaternion_from_rotation_vector(np.array([[0.0, 0.0, np.radians(30)]]))
+    leaning = multiply(body, quaternion_from_rotation_vector(np.array([[0.2, 0.15, 0.0]])))
+    stated = attitude_from_angles(np.array([[20.0, -40.0, 0.0]]), order="ypr", units="deg")
+    attitude = attitude_in_enu(stated, relative_to="heading", axes="ned")
+    nose = rotate(leaning, np.array([1.0, 0, 0]))[0]
+    east_to_nose = np.arctan2(nose[1], nose[0])
+    _, camera = compose_gimbal(
+        (np.zeros((1, 3)), leaning), np.zeros(3), attitude, body_from_camera("forward"), relative_to="heading"
     )
-    expected = attitude_in_enu(logged, relative_to=meant, axes="ned")
-    np.testing.assert_allclose(np.abs(np.sum(found * expected, axis=1)), 1.0, atol=1e-12)
-    looks = rotate(found[-1], np.array([1.0, 0.0, 0.0]))
-    np.testing.assert_allclose(looks, [1.0, 0, 0] if meant == "body" else [0, 1.0, 0], atol=1e-12)
+    yaw, pitch = east_to_nose - np.radians(20), np.radians(-40)
+    ahead = [np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)]
+    np.testing.assert_allclose(rotate(camera, np.array([0, 0, 1.0]))[0], ahead, atol=1e-12)
+    right = rotate(camera, np.array([1.0, 0, 0]))[0]
+    assert abs(right[2]) < 1e-12  # level, however the body leans

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
+    of_angles,
     on_gps_time,
     on_one_clock,
     position_track,
@@ -28,7 +29,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
 )
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.geodesy import Place
-from pipelines.geometry.mounting import attitude_from_angles
+from pipelines.geometry.mounting import RelativeTo, attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.extras import need
 from pipelines.session.records import Float, Int64
@@ -264,14 +265,18 @@ def _mount(
     if len(mounts) > 1:
         notes.append(f"has {len(mounts)} mounts (MNT): took the angles of the first, {mounts[0]}")
     roll, pitch, from_nose, from_north = (rows.numbers(f) for f in ("Roll", "Pitch", "YawB", "YawE"))
-    turned = turned_as_stated(np.stack([from_north, pitch, roll], axis=1))
+    world_from_mount = of_angles(np.stack([from_north, pitch, roll], axis=1))
+    heading_from_mount = of_angles(np.stack([from_nose, pitch, roll], axis=1))
+    turned = attitude_in_enu(world_from_mount, relative_to="world", axes="ned")
     unknown = np.isnan(from_north)
     if unknown.any() and body is not None:
-        angles = np.stack([from_nose, pitch, roll], axis=1)[unknown]
-        with np.errstate(invalid="ignore"):
-            heading_from_mount = attitude_from_angles(angles, order="ypr", units="deg")
-        turned[unknown] = world_from_heading(body, rows.t_ns()[unknown], heading_from_mount)
-    return attitude_track(rows.name, rows.t_ns(), turned, dropped)
+        turned[unknown] = world_from_heading(body, rows.t_ns()[unknown], heading_from_mount[unknown])
+    stated: dict[RelativeTo, Float] = {
+        "world": np.where(unknown[:, None], heading_from_mount, world_from_mount),
+        "body": heading_from_mount,
+        "heading": heading_from_mount,
+    }
+    return attitude_track(rows.name, rows.t_ns(), turned, dropped, stated=stated)
 
 
 def _gps_time(log: _Log) -> ClockFit | None:

@@ -29,8 +29,10 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
     between_refreshed_angles,
     between_repeats,
+    of_angles,
     position_track,
     turned_as_stated,
+    whatever_from,
 )
 from pipelines.formats.poses.pose_rows import longest_rising
 from pipelines.session.errors import DataError
@@ -307,7 +309,8 @@ def _attitude(
         dropped[f"{name} out of order"] = late
     continuous = np.degrees(np.unwrap(np.radians(yaw_pitch_roll_deg[rows]), axis=0))
     between = between_refreshed_angles(t_ns[rows], continuous)
-    return attitude_track(name, t_ns[rows], turned_as_stated(between), dropped)
+    as_logged = whatever_from(of_angles(between))
+    return attitude_track(name, t_ns[rows], turned_as_stated(between), dropped, stated=as_logged)
 
 
 def _clock_name(subtitles: Subtitles) -> str:

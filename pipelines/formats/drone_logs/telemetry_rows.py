@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, MutableMapping
+from collections.abc import Iterable, Mapping, MutableMapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -13,13 +13,11 @@ from pipelines.formats.common.stamps import Bool
 from pipelines.formats.poses.pose_rows import NORM_TOLERANCE, longest_rising
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place, enu_from_geodetic, place_at
-from pipelines.geometry.mounting import attitude_from_angles, attitude_in_enu
+from pipelines.geometry.mounting import RelativeTo, attitude_from_angles, attitude_in_enu, level_heading
 from pipelines.geometry.poses import (
     interpolate_points,
     interpolate_poses,
     multiply,
-    quaternion_from_rotation_vector,
-    rotate,
 )
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Int64
@@ -78,7 +76,8 @@ def attitude_track(
     quaternion_xyzw: Float,
     dropped: MutableMapping[str, int],
     *,
-    relative_to: Literal["world", "body"] = "world",
+    relative_to: RelativeTo = "world",
+    stated: Mapping[RelativeTo, Float] | None = None,
 ) -> AttitudeTrack | None:
     """Attitudes without the rows that cannot be used, counted as "attitude ...", or None without any.
 
@@ -88,6 +87,7 @@ def attitude_track(
         quaternion_xyzw: [N, 4] of an FLU thing in an ENU world or an FLU body.
         dropped: where losses are counted.
         relative_to: which of the two.
+        stated: of a gimbal, its angles as the log states them, as in `AttitudeTrack`.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         norm = np.linalg.norm(quaternion_xyzw, axis=1)
@@ -101,14 +101,24 @@ def attitude_track(
         return None
     for cause, count in found.items():
         dropped[cause] = dropped.get(cause, 0) + count
-    return AttitudeTrack(name, t_ns[keep], quaternion_xyzw[keep] / norm[keep, None], relative_to)
+    of_kept = {reference: angles[keep] / norm[keep, None] for reference, angles in (stated or {}).items()}
+    return AttitudeTrack(name, t_ns[keep], quaternion_xyzw[keep] / norm[keep, None], relative_to, of_kept)
 
 
-def turned_as_stated(yaw_pitch_roll_deg: Float, *, relative_to: Literal["world", "body"] = "world") -> Float:
+def turned_as_stated(yaw_pitch_roll_deg: Float, *, relative_to: RelativeTo = "world") -> Float:
     """Quaternions [N, 4] of angles [N, 3] as autopilots state them: FRD in NED, yaw from north to east."""
+    return attitude_in_enu(of_angles(yaw_pitch_roll_deg), relative_to=relative_to, axes="ned")
+
+
+def of_angles(yaw_pitch_roll_deg: Float) -> Float:
+    """Quaternions [N, 4] of angles [N, 3] in the axes that they are stated in."""
     with np.errstate(invalid="ignore"):
-        quaternion = attitude_from_angles(yaw_pitch_roll_deg, order="ypr", units="deg")
-    return attitude_in_enu(quaternion, relative_to=relative_to, axes="ned")
+        return attitude_from_angles(yaw_pitch_roll_deg, order="ypr", units="deg")
+
+
+def whatever_from(attitude: Float) -> Mapping[RelativeTo, Float]:
+    """Angles of which a log does not say what they count from: the same for whatever the user says."""
+    return {"world": attitude, "body": attitude, "heading": attitude}
 
 
 def placed_by(track: PositionTrack, fixes: PositionTrack) -> tuple[PositionTrack, str]:
@@ -155,11 +165,8 @@ def world_from_heading(body: AttitudeTrack, t_ns: Int64, heading_from_gimbal: Fl
         max_gap_ns=_HELD_NS,
         max_extrapolation_ns=_HELD_NS // 10,
     )
-    nose = rotate(turned, np.array([1.0, 0.0, 0.0]))
-    from_north = np.arctan2(nose[:, 0], nose[:, 1])
-    still = np.zeros_like(from_north)
-    heading = quaternion_from_rotation_vector(np.stack([still, still, from_north], axis=1))
-    return attitude_in_enu(multiply(heading, heading_from_gimbal), relative_to="world", axes="ned")
+    in_heading = attitude_in_enu(heading_from_gimbal, relative_to="heading", axes="ned")
+    return multiply(level_heading(turned), in_heading)
 
 
 def on_one_clock(

@@ -14,11 +14,13 @@ import numpy as np
 from pipelines.formats.common.stamps import Bool
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
+    of_angles,
     on_gps_time,
     on_one_clock,
     position_track,
     said_of_fit,
     turned_as_stated,
+    whatever_from,
     world_from_heading,
 )
 from pipelines.formats.drone_logs.ulog_file import MAGIC, Topic, open_ulog, topics_of
@@ -302,8 +304,10 @@ def _gimbal(
             notes.append(
                 "mount_orientation is taken as relative to the body (else gimbal: {relative_to: world})"
             )
-            turned = turned_as_stated(angles, relative_to="body")
-            return attitude_track(topic.name, topic.t_ns(), turned, dropped, relative_to="body")
+            turned, stated = turned_as_stated(angles, relative_to="body"), whatever_from(of_angles(angles))
+            return attitude_track(
+                topic.name, topic.t_ns(), turned, dropped, relative_to="body", stated=stated
+            )
     return None
 
 
@@ -321,7 +325,7 @@ def _gimbal_device(
             turned[~from_north] = np.nan
         else:
             turned[~from_north] = world_from_heading(body, topic.t_ns()[~from_north], stated[~from_north])
-    return attitude_track(topic.name, topic.t_ns(), turned, dropped)
+    return attitude_track(topic.name, topic.t_ns(), turned, dropped, stated=whatever_from(stated))
 
 
 def _gps_time(topics: Sequence[Topic]) -> ClockFit | None:

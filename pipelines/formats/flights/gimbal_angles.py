@@ -39,7 +39,7 @@ def stated_angles(gimbal: Gimbal, logs: FlightLogs, frame: Axes) -> AttitudeTrac
         axes=gimbal.axes or logs.settings(log).axes or frame,
     )
     lost = {f"gimbal angles: {cause}": count for cause, count in logged.dropped.items()}
-    return AttitudeTrack(topic, logged.t_ns, turned, relative_to, lost)
+    return AttitudeTrack(topic, logged.t_ns, turned, relative_to, dropped=lost)
 
 
 def attitudes_at(track: AttitudeTrack, t_ns: Int64, *, max_gap_ns: int) -> Float:

@@ -19,14 +19,12 @@ from pipelines.formats.flights.log_times import world_times
 from pipelines.formats.flights.world_axes import in_world
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place, enu_from_enu, enu_from_geodetic
-from pipelines.geometry.mounting import compose_gimbal, compose_mount, meant_relative_to
+from pipelines.geometry.mounting import attitude_in_enu, compose_gimbal, compose_mount, level_heading
 from pipelines.geometry.poses import (
     compose,
     interpolate_points,
     multiply,
     quaternion_from_matrix,
-    quaternion_from_rotation_vector,
-    rotate,
 )
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Camera, Flight, PoseSource
@@ -242,7 +240,7 @@ class TelemetryPoses:
             position, quaternion = compose_mount((position, world_from_body), (lever_arm, rotation))
         elif attitude is not None and gimbal is not None:
             if world_from_body is None:
-                world_from_body = _level_heading(attitude)
+                world_from_body = level_heading(attitude)  # all that is known of it
                 if lever_arm.any():
                     self._note(f"{name}: {stated} does not say how its body was turned: taken as level")
             position, quaternion = compose_gimbal(
@@ -270,7 +268,11 @@ class TelemetryPoses:
                 )
             moved = self._at_world_times(camera.pose, telemetry, own)
             meant = gimbal.relative_to or "world"
-            turned = meant_relative_to(moved.quaternion_xyzw, taken=moved.relative_to, meant=meant)
+            turned = attitude_in_enu(moved.stated[meant], relative_to=meant, axes="ned")
+            self._note(
+                f"{name}: its camera is turned as {own.name} of {_stated(camera.pose)} say, relative to the"
+                f" {meant} as stated"
+            )
             return replace(moved, quaternion_xyzw=turned, relative_to=meant)
         return stated_angles(gimbal, self._logs, self._flight.world.frame)
 
@@ -287,10 +289,11 @@ class TelemetryPoses:
             raise DataError(
                 place, f"{stated} says where the drone was but not how it was turned", _ADD_ANGLES
             )
-        if telemetry.body is None and gimbal is not None and gimbal.relative_to == "body":
+        if telemetry.body is None and gimbal is not None and gimbal.relative_to != "world":
             raise DataError(
                 place,
-                f"its gimbal's angles are relative to the body, but {stated} does not say how that turned",
+                f"its gimbal's angles are relative to the {gimbal.relative_to}, but {stated} does not say how"
+                " the body turned",
                 "give angles relative to the world",
             )
         if gimbal is None and camera.mount is None:
@@ -370,10 +373,3 @@ def _fastest(position_t_ns: Int64, others: Sequence[Int64]) -> Int64:
         return float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else np.inf
 
     return min([position_t_ns, *others], key=step)
-
-
-def _level_heading(attitude: Float) -> Float:
-    """A level body that heads where a gimbal [N, 4] looks: what is known where the body's attitude is not."""
-    ahead = rotate(attitude, np.array([1.0, 0.0, 0.0]))
-    yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
-    return quaternion_from_rotation_vector(np.stack([np.zeros_like(yaw), np.zeros_like(yaw), yaw], axis=1))

@@ -23,9 +23,11 @@ import numpy as np
 
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
+    of_angles,
     placed_by,
     position_track,
     turned_as_stated,
+    whatever_from,
     world_from_heading,
 )
 from pipelines.formats.logs.messages import nanoseconds
@@ -327,11 +329,13 @@ def _gimbal(
             return None
         rows = _read(recording, source, topic, _quaternion_of)
         t_ns = rows.times(stamps)
-        return attitude_track(topic, t_ns, world_from_heading(body, t_ns, rows.values()), dropped)
+        turned = world_from_heading(body, t_ns, rows.values())
+        return attitude_track(topic, t_ns, turned, dropped, stated=whatever_from(rows.values()))
     rows = _read(recording, source, topic, _vector_of)
     order = "rpy" if "ground_ENU" in rows.frames else "pry"
     angles = rows.values()[:, [order.index(letter) for letter in "ypr"]]
-    return attitude_track(topic, rows.times(stamps), turned_as_stated(angles), dropped)
+    stated = whatever_from(of_angles(angles))
+    return attitude_track(topic, rows.times(stamps), turned_as_stated(angles), dropped, stated=stated)
 
 
 def _gps_time(recording: Log, source: str, topic: str, counts: dict[str, int]) -> str:
