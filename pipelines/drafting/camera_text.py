@@ -246,7 +246,7 @@ class CameraText:
         self._miss("gimbal: relative_to, what its angles are relative to")
         lines = ["gimbal:", *(f"  {entry(key, value)}" for key, value in choice.taken.settings.items())]
         lines.append(
-            "  # relative_to: world  # missing: world (as DJI's: it replaces the body's turn) or body"
+            "  # relative_to: world  # missing: world (DJI: it replaces the body's turn), body or heading"
         )
         if choice.taken.topic and "Quaternion" not in choice.taken.topic.type:
             lines.append("  # order: ypr  # assumed: yaw, pitch, roll as they stand in the message; or rpy")

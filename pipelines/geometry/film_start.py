@@ -298,6 +298,8 @@ def _refined(path: _Path, followed: Followed, start_s: float, scatter: float) ->
             spread = float(np.sqrt((np.bincount(block, slope) ** 2).sum()))
             sigma_s = spread / bend if bend > 0 else np.inf
             downhill = -float(slope.sum())
+            if bend <= 0 and not downhill:
+                break  # the log says nothing here
             step_s = downhill / bend if bend > 0 else float(np.copysign(longest_s, downhill))
             if step_s * before_s < 0:
                 longest_s /= 2

@@ -268,7 +268,16 @@ class TelemetryPoses:
                 )
             moved = self._at_world_times(camera.pose, telemetry, own)
             meant = gimbal.relative_to or "world"
-            turned = attitude_in_enu(moved.stated[meant], relative_to=meant, axes="ned")
+            if meant in moved.stated:
+                turned = attitude_in_enu(moved.stated[meant], relative_to=meant, axes="ned")
+            elif meant == moved.relative_to:
+                turned = moved.quaternion_xyzw
+            else:
+                raise DataError(
+                    f"{self._manifest}: cameras.{name}.gimbal",
+                    f"{own.name} of {_stated(camera.pose)} cannot be taken relative to the {meant}",
+                    f"write relative_to: {moved.relative_to}",
+                )
             self._note(
                 f"{name}: its camera is turned as {own.name} of {_stated(camera.pose)} say, relative to the"
                 f" {meant} as stated"
