@@ -137,3 +137,38 @@ def packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[V
                 yield packet
     except FFmpegError:
         return
+
+
+def is_shown(packet: Packet[VideoStream], codec: str) -> bool:
+    """Test if a coded frame gives a picture.
+
+    VP8 and VP9 code frames that are never shown, only referred to (alternate reference frames). Some writers
+    store them as packets of their own, with the stamp of the next picture or one just before it.
+    VP8: RFC 6386, section 9.1. VP9: bitstream specification 0.6, section 6.2 and annex B (superframes).
+    """
+    if codec not in {"vp8", "vp9"}:
+        return True
+    content = bytes(packet)
+    if codec == "vp8":
+        return bool(content[0] >> 4 & 1)
+    return any(_is_shown_vp9(content[start]) for start in _vp9_frames(content))
+
+
+def _vp9_frames(content: bytes) -> list[int]:
+    """List where the frames of a VP9 packet begin; more than one with an index behind them."""
+    last = content[-1]
+    count, width = (last & 7) + 1, (last >> 3 & 3) + 1
+    length = 2 + count * width
+    if last >> 5 != 0b110 or length > len(content) or content[-length] != last:
+        return [0]
+    sizes = content[1 - length : -1]
+    starts = [0]
+    for place in range(0, len(sizes) - width, width):
+        starts.append(starts[-1] + int.from_bytes(sizes[place : place + width], "little"))
+    return [start for start in starts if start < len(content) - length] or [0]
+
+
+def _is_shown_vp9(first: int) -> bool:
+    """Read show_existing_frame and show_frame of a frame's first byte (profile 3: one bit later)."""
+    bits = first << 1 if first >> 4 & 3 == 3 else first
+    return first >> 6 != 2 or bool(bits & 0b1010)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.common.summaries import describe_times
-from pipelines.formats.videos.containers import container_format, open_container, packets
+from pipelines.formats.videos.containers import container_format, is_shown, open_container, packets
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, VideoIndex
 
@@ -79,7 +79,8 @@ class VideoContainer:
 def index_video(path: Path) -> VideoIndex:
     """When each frame is shown, from the container; only the first picture is decoded.
 
-    The largest video stream counts, cover pictures do not; frames that an edit list hides are none.
+    The largest video stream counts, cover pictures do not; frames that an edit list hides are none,
+    nor are those that VP8 and VP9 code for reference only.
     pts_ns[k] is the stamp of frame k less that of frame 0, rounded to a nanosecond once.
 
     Counted in `dropped`: "cut off" (the container's table lists them, the file ends before; with them the
@@ -283,7 +284,7 @@ def _scan(path: Path) -> _Scan:
         stored = [
             _Packet(packet.pos, packet.pts, packet.is_keyframe)
             for packet in packets(container, stream)
-            if not packet.is_discard
+            if not packet.is_discard and is_shown(packet, stream.codec_context.codec.canonical_name)
         ]
         # Only a whole table, as of MP4, lists frames beyond the file's end.
         lost = {e.pos: e.timestamp for e in stream.index_entries if e.size > 0 and e.pos + e.size > size}

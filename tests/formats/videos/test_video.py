@@ -5,6 +5,7 @@ from __future__ import annotations
 import weakref
 from fractions import Fraction
 from pathlib import Path
+from typing import cast
 
 import av
 import cv2
@@ -14,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.formats.videos import video
+from pipelines.formats.videos.containers import is_shown
 from pipelines.formats.videos.video import (
     Picture,
     VideoReader,
@@ -125,6 +127,59 @@ def test_frames_that_an_edit_list_hides_are_none(tmp_path: Path) -> None:
         assert reader.index.count == len(pictures) == 30
         assert [read_bar_code(picture) for _, picture in reader.frames()] == list(range(10, 40))
         assert reader.missing == set()
+
+
+def test_frames_that_vp9_never_shows_are_none() -> None:
+    path = real_data("second/roadtrip-vp92-10bit.webm")  # 80 packets, 8 of them alternate references
+    pictures, milliseconds = decoded_by_opencv(path)
+    with VideoReader(path) as reader:
+        assert reader.index.count == len(pictures) == 72
+        assert reader.index.dropped == {}
+        np.testing.assert_allclose(reader.index.pts_ns / 1e6, milliseconds, rtol=0, atol=1e-6)
+        assert not reader.index.variable
+        mine = dict(reader.frames())
+        assert (sorted(mine), reader.missing) == (list(range(72)), set())
+    # The two conversions of ten bits to eight differ by levels at edges; another frame differs by far more.
+    mean = [[np.abs(mine[k].astype(int) - pictures[j]).mean() for j in range(72)] for k in (0, 30, 50, 71)]
+    assert np.argmin(mean, axis=1).tolist() == [0, 30, 50, 71]
+
+
+def test_frames_that_vp8_never_shows_are_none(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.webm", even_ticks(40), codec="libvpx")
+    with av.open(str(path)) as container:
+        coded = [bytes(p) for p in container.demux(video=0) if p.size]
+    content = path.read_bytes()
+    for number in (7, 20, 33):  # the bit show_frame of RFC 6386, 9.1
+        first = coded[number][0] & ~0b10000
+        content = content.replace(coded[number], bytes([first]) + coded[number][1:])
+    path.write_bytes(content)
+    pictures, _ = decoded_by_opencv(path)
+    shown = [number for number in range(40) if number not in (7, 20, 33)]
+    with VideoReader(path) as reader:
+        assert reader.index.count == len(pictures) == len(shown)
+        assert [read_bar_code(picture) for _, picture in reader.frames()] == shown
+        assert reader.missing == set()
+        assert [round(t / 1e9 * 30) for t in reader.index.pts_ns.tolist()] == shown
+
+
+@pytest.mark.parametrize(
+    ("content", "shown"),
+    [
+        (b"\x86", True),  # profile 0: marker 10, 00, not an existing frame, no key frame, shown
+        (b"\x84", False),
+        (b"\x94", False),  # profile 2
+        (b"\x96", True),
+        (b"\x88", True),  # shows an existing frame
+        (b"\xb1", True),  # profile 3 has a reserved bit: marker 10, 11, 0, 0, 0, shown
+        (b"\xb2", False),
+        (b"\x84..\x86.\xc1\x03\x02\xc1", True),  # a superframe of a hidden and a shown frame
+        (b"\x84..\x84.\xc1\x03\x02\xc1", False),
+    ],
+)
+def test_the_heads_of_vp9_frames_say_if_they_are_shown(content: bytes, shown: bool) -> None:
+    packet = cast("av.Packet[av.VideoStream]", av.Packet(content))
+    assert is_shown(packet, "vp9") == shown
+    assert is_shown(packet, "h264")
 
 
 # --- pictures ------------------------------------------------------------------------------------------
