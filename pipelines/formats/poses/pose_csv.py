@@ -122,7 +122,7 @@ def _parse_header(line: int, cells: Sequence[str], delimiter: str) -> Header | N
     stamp = stamp_column(cells)
     poses: dict[str, int] = {}
     for index, cell in enumerate(cells):
-        column = _pose_column(cell_name(cell)[0])
+        column = pose_column(cell_name(cell)[0])
         if column is not None:
             poses.setdefault(column, index)
     if stamp is None or any(name not in poses for name in (*_POSITION, *_QUATERNION)):
@@ -130,7 +130,7 @@ def _parse_header(line: int, cells: Sequence[str], delimiter: str) -> Header | N
     return Header(line, delimiter, len(cells), stamp[0], stamp[1], poses)
 
 
-def _pose_column(name: str) -> str | None:
+def pose_column(name: str) -> str | None:
     """The table column that a heading means."""
     covariance = re.fullmatch(r"c([0-5])([0-5])", name)
     if name in _POSITION or (covariance and covariance[1] <= covariance[2]):

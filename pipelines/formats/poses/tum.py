@@ -1,4 +1,8 @@
-"""TUM trajectories: `t x y z qx qy qz qw`, one pose per line, t in seconds (TUM RGB-D benchmark)."""
+"""TUM trajectories: `t x y z qx qy qz qw`, one pose per line, t in seconds (TUM RGB-D benchmark).
+
+Some writers keep the layout and change the order; they say so in a line above the numbers, such as
+`# timestamp tx ty tz qw qx qy qz`. That line counts.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +12,16 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.export_names import safe_file_name, tracks_of
-from pipelines.formats.common.stamps import format_seconds, parse_stamps
+from pipelines.formats.common.stamps import SECONDS, cell_name, format_seconds, parse_stamps, stamp_column
 from pipelines.formats.common.summaries import describe_trajectory
 from pipelines.formats.common.text_tables import parse_table, read_head, read_text
-from pipelines.formats.poses.pose_csv import find_header
+from pipelines.formats.poses.pose_csv import find_header, pose_column
 from pipelines.formats.poses.pose_rows import clean_poses
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording, Trajectory
 
 _COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+_HEADING = re.compile(r"[^\s,;\[(]+(?:\s*(?:\[[^\]]*\]|\([^)]*\)))?")  # a name, perhaps with its unit
 
 
 class TumFormat:
@@ -30,10 +35,10 @@ class TumFormat:
     suffixes: tuple[str, ...] = (".tum", ".txt", ".csv", ".log")
 
     def recognises(self, path: Path) -> bool:
-        """Whether the first line that is no comment holds eight numbers and no header names the columns."""
+        """Whether the first line of numbers has eight, and no CSV's header stands above."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
-        head = _spaced(read_head(path))
+        head, _, _ = _take_header(_spaced(read_head(path)))
         first = next((line for line in head.split("\n") if line and not line.startswith("#")), "")
         return find_header(read_head(path)) is None and _is_eight_numbers(first)
 
@@ -42,21 +47,24 @@ class TumFormat:
         return describe_trajectory(self.read_trajectory(path))
 
     def read_trajectory(self, path: Path) -> Trajectory:
-        """Read every pose; `clean_poses` says which rows are dropped.
+        """Read every pose in the order of columns that the header states, else in TUM's.
+
+        `clean_poses` says which rows are dropped.
 
         Raises:
             DataError: not text, a line without eight numbers, stamps not in seconds, or no usable row.
         """
+        body, columns, unit = _take_header(_spaced(read_text(path)))
         table = parse_table(
             path,
-            _spaced(read_text(path)),
+            body,
             delimiter=" ",
             columns=len(_COLUMNS),
             text={"t": 0},
-            numbers={name: index for index, name in enumerate(_COLUMNS) if index},
+            numbers={name: index for index, name in enumerate(columns) if index},
             first_line=1,
         )
-        t_ns, readable = parse_stamps(path, table.text["t"])
+        t_ns, readable = parse_stamps(path, table.text["t"], unit)
         return clean_poses(
             path,
             t_ns,
@@ -134,6 +142,51 @@ def _spaced(text: str) -> str:
     if "  " in text:
         text = re.sub(" {2,}", " ", text)
     return text.replace("\n ", "\n").replace(" \n", "\n").strip(" ")
+
+
+def _take_header(text: str) -> tuple[str, tuple[str, ...], int]:
+    """Read the order of the columns from the lines above the first numbers.
+
+    Args:
+        text: spaced lines.
+
+    Returns:
+        The text with a header that is no comment made one, the names of the columns in their order (TUM's
+        where no line states another), and the unit of the stamps.
+    """
+    start, order = 0, _COLUMNS
+    for line in text.split("\n", 100)[:100]:
+        headings = _HEADING.findall(line.removeprefix("#"))
+        if found := _find_columns(headings):
+            marked = text if line.startswith("#") else f"{text[:start]}# {text[start:]}"
+            return marked, *found
+        order = _find_quaternion(headings) or order
+        if line and not line.startswith("#"):
+            break
+        start += len(line) + 1
+    return text, order, SECONDS
+
+
+def _find_columns(headings: list[str]) -> tuple[tuple[str, ...], int] | None:
+    """Find a time, three coordinates and a quaternion side by side; the quaternion may be w x y z alone."""
+    names = [cell_name(heading)[0] for heading in headings]
+    for k in range(len(headings) - len(_COLUMNS) + 1):
+        stamp = stamp_column(headings[k : k + 1])
+        position = tuple(pose_column(name) or "" for name in names[k + 1 : k + 4])
+        turned = names[k + 4 : k + 8]
+        quaternion = tuple(f"q{name}" if name in "xyzw" else pose_column(name) or "" for name in turned)
+        if stamp and sorted([*position, *quaternion]) == sorted(_COLUMNS[1:]) and "x" in position:
+            return ("t", *position, *quaternion), stamp[1]
+    return None
+
+
+def _find_quaternion(headings: list[str]) -> tuple[str, ...] | None:
+    """Find qx qy qz qw side by side, in any order, where the other columns have names of their own."""
+    names = [pose_column(cell_name(heading)[0]) or "" for heading in headings]
+    for k in range(len(names) - 3):
+        if sorted(names[k : k + 4]) == sorted(_COLUMNS[4:]):
+            return (*_COLUMNS[:4], *names[k : k + 4])
+    return None
 
 
 def _is_eight_numbers(line: str) -> bool:

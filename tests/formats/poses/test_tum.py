@@ -55,6 +55,60 @@ def test_separators_comments_blank_lines_and_line_ends(tmp_path: Path, separator
     assert poses.position.tolist() == [[1, 2, 3]]
 
 
+@pytest.mark.parametrize(
+    "header",
+    [
+        "# timestamp tx ty tz qw qx qy qz",
+        "#t x y z qw qx qy qz",
+        "# format: timestamp [s] tx [m] ty [m] tz [m] qw qx qy qz (body in world)",
+        "# t x y z w x y z",
+        "# timestamp, tx, ty, tz, qw, qx, qy, qz",
+        "timestamp tx ty tz qw qx qy qz",
+        "timestamp,tx,ty,tz,qw,qx,qy,qz",
+        "# time px py pz qw qx qy qz",
+        "# made by SLAM\n# timestamp(s) p_x p_y p_z q_w q_x q_y q_z\n# 2 poses",
+    ],
+)
+def test_a_header_states_the_order_of_the_quaternion(tmp_path: Path, header: str) -> None:
+    # 90 deg about x: w = x = sqrt(1/2). Read as x y z w it would be another axis and angle.
+    half = "0.7071067811865476"
+    text = rows(header, f"1 10 20 30 {half} {half} 0 0", f"2 10 20 30 {half} {half} 0 0")
+    poses = READER.read_trajectory(write(tmp_path, text))
+    assert poses.t_ns.tolist() == [10**9, 2 * 10**9]
+    assert poses.position.tolist() == [[10, 20, 30]] * 2
+    np.testing.assert_allclose(poses.quaternion_xyzw, [[0.5**0.5, 0, 0, 0.5**0.5]] * 2, atol=1e-16)
+    assert poses.dropped == {}
+    assert READER.recognises(tmp_path / "poses.tum") == ("," not in header)  # a CSV with a header is `csv`'s
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "# timestamp tx ty tz qx qy qz qw",
+        "# t x y z x y z w",
+        "timestamp x y z q_x q_y q_z q_w",
+        "# a quaternion (w x y z) was turned around",
+        "# ground truth",
+    ],
+)
+def test_other_headers_leave_the_order_as_it_is(tmp_path: Path, header: str) -> None:
+    poses = READER.read_trajectory(write(tmp_path, rows(header, "1 10 20 30 0 0 0.6 0.8")))
+    assert poses.position.tolist() == [[10, 20, 30]]
+    np.testing.assert_allclose(poses.quaternion_xyzw, [[0, 0, 0.6, 0.8]], atol=1e-16)
+
+
+def test_a_header_states_the_unit_of_the_stamps(tmp_path: Path) -> None:
+    header = "# timestamp[ns] tx ty tz qx qy qz qw"
+    poses = READER.read_trajectory(write(tmp_path, rows(header, f"1700000000123456789 0 0 0 {IDENTITY}")))
+    assert poses.t_ns.tolist() == [1700000000123456789]
+
+
+def test_a_line_behind_the_first_numbers_is_no_header(tmp_path: Path) -> None:
+    text = rows("1 0 0 0 0 0 0.6 0.8", "# timestamp tx ty tz qw qx qy qz", "2 0 0 0 0 0 0.6 0.8")
+    poses = READER.read_trajectory(write(tmp_path, text))
+    np.testing.assert_allclose(poses.quaternion_xyzw, [[0, 0, 0.6, 0.8]] * 2, atol=1e-16)
+
+
 def test_rows_are_dropped_by_cause(tmp_path: Path) -> None:
     path = write(
         tmp_path,
