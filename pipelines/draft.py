@@ -248,11 +248,9 @@ def _drone_log(head: Found, format_: TelemetryFormat) -> DroneLog | None:
     Raises:
         DataError: it cannot be read, or holds no position.
     """
-    has_height = True
     try:
         telemetry = format_.read_telemetry(head.path, TelemetryChoice())
     except DataError:  # where a height is all that is missing, one that is stated helps
-        has_height = False
         telemetry = format_.read_telemetry(head.path, TelemetryChoice(altitude=0.0))
     track = telemetry.position
     keys: tuple[Literal["dji"], Literal["ulog"], Literal["ardupilot"]] = ("dji", "ulog", "ardupilot")
@@ -275,7 +273,7 @@ def _drone_log(head: Found, format_: TelemetryFormat) -> DroneLog | None:
         by_gps=track.on_earth or track.origin is not None,
         body=telemetry.body is not None,
         gimbal=telemetry.gimbal is not None,
-        has_height=has_height,
+        height=track.height,
         video_start_ns=start_ns,
     )
 

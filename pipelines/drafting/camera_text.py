@@ -206,9 +206,12 @@ class CameraText:
     def _about_drone(self, found: DroneLog) -> list[str]:
         """What a drone's own log leaves open."""
         remarks = []
-        if not found.has_height:
+        if found.height == "stated":
             self._miss("pose: altitude, for its log states no height")
             remarks.append("missing: altitude: METRES above the take-off")
+        elif found.key == "dji" and found.height == "unknown":
+            self._assume("pose: absolute heights from a barometer, which differ between drones by metres")
+            remarks.append("assumed: absolute heights (altitude: relative takes the other)")
         elif found.key == "dji":
             self._assume("pose: heights above the take-off, which was level for all")
             remarks.append("assumed: heights above the take-off (altitude: absolute takes the other)")

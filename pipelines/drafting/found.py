@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from pipelines.session.telemetry import Height
+
 Place = tuple[str, ...]
 """Folders below the common one, then the name without its suffix: what a thing is called."""
 
@@ -119,7 +121,7 @@ class DroneLog(Found):
     by_gps: bool
     body: bool
     gimbal: bool
-    has_height: bool = True
+    height: Height = "unknown"  # what its heights count from; "stated" where it has none
     video_start_ns: int | None = None  # of the video beside it, where its own times are too coarse for frames
 
 

@@ -104,6 +104,36 @@ def test_subtitles_without_gimbal_angles(tmp_path: Path, name: str, start_s: flo
 
 
 @pytest.mark.parametrize(
+    ("stated", "from_take_off"),
+    [({}, True), ({"altitude": "relative"}, True), ({"altitude": "absolute"}, False)],
+)
+def test_an_altitude_without_a_reference_is_what_init_and_ingest_both_say(
+    tmp_path: Path, stated: dict[str, str], from_take_off: bool
+) -> None:
+    name = "second/mavic_air2.srt"
+    path = write_flight(tmp_path, name, 1651417318.6, {"dji": "", **stated}, **FIXED)
+    ingest(path)
+    z = poses_of(path)["z"]
+    first = 0.0 if from_take_off else 27.3  # absolute heights: the first one is the world's origin
+    assert (z.min(), z.max()) == pytest.approx((27.3 - first, 29.2 - first), abs=1e-6)
+    warnings = " ".join(session_of(path)["warnings"])
+    assert ("altitude: absolute" in warnings) == (not stated)
+    if not stated:
+        (tmp_path / "logs").mkdir()
+        shutil.copyfile(real_data(name), tmp_path / "logs" / "air2.srt")
+        assumed = draft([tmp_path / "logs"]).assumed
+        assert any("above the take-off" in line for line in assumed)
+
+
+def test_init_says_that_absolute_heights_are_absolute(tmp_path: Path) -> None:
+    text = real_data("second/mavic_air2.srt").read_text(encoding="utf-8").replace("[altitude", "[abs_alt")
+    (tmp_path / "air2.srt").write_text(text, encoding="utf-8")
+    result = draft([tmp_path])
+    assert any("absolute heights" in line for line in result.assumed)
+    assert not any("above the take-off" in line for line in result.assumed)
+
+
+@pytest.mark.parametrize(
     ("name", "position", "topic"),
     [
         ("sample.ulg", "local", "vehicle_local_position:0"),

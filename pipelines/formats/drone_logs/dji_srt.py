@@ -3,8 +3,9 @@
 Generations differ in everything but the subtitles' own form; all of these are read:
 
 - `[latitude: 41.4] [longitude: 2.2] [rel_alt: 3.6 abs_alt: 6.4] [gb_yaw: 30.0 gb_pitch: -45.0 gb_roll: 0.0]`
-  (since 2018), with blanks before the colons or without, `longitude` spelt `longtitude` by some, one
-  height called `altitude` by others, gimbal angles only from enterprise models;
+  (since 2018), with blanks before the colons or without, `longitude` spelt `longtitude` by some, gimbal
+  angles only from enterprise models; one height called `altitude` by others, which does not say what it
+  counts from (a Mavic Air 2 counts from the take-off);
 - `GPS(149.0251,-20.2533,16)`: longitude, latitude, satellites (until 2018), with `Hb:1.9`, `BAROMETER:20.1`
   or `H 85.80m` as height above take-off, and `F.PRY (...)`, `G.PRY (...)` as the angles of body and gimbal;
 - `GPS(36.6146,-6.1120,0.0M)`: latitude, longitude, height (Matrice 300): the M tells them apart.
@@ -63,10 +64,11 @@ _NAMES = {"longtitude": "longitude"} | {
     for angle in ("yaw", "pitch", "roll")
 }
 _COLUMNS = (
-    *("latitude", "longitude", "relative", "absolute"),
+    *("latitude", "longitude", "relative", "absolute", "altitude"),
     *("gb_yaw", "gb_pitch", "gb_roll", "drone_yaw", "drone_pitch", "drone_roll"),
 )
-_HEIGHTS = {"rel_alt": "relative", "abs_alt": "absolute", "altitude": "absolute"}
+_HEIGHTS = {"rel_alt": "relative", "abs_alt": "absolute"}
+_HIGHEST_M = 500  # above the take-off: DJI's drones climb no higher
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,11 @@ class DjiSrtFormat:
         }
         for name in ("latitude", "longitude"):
             facts[f"{name}_deg"] = _range(columns[name], 7)
-        heights = {"height_above_take_off_m": "relative", "height_absolute_m": "absolute"}
+        heights = {
+            "height_above_take_off_m": "relative",
+            "height_absolute_m": "absolute",
+            "height_m": "altitude",
+        }
         facts |= {said: _range(columns[name], 3) for said, name in heights.items() if _any(columns[name])}
         for said, part in (("gimbal", "gb"), ("body", "drone")):
             angles = _angles(columns, part)
@@ -156,7 +162,7 @@ class DjiSrtFormat:
         subtitles = read_subtitles(path)
         columns = _columns(subtitles.texts)
         t_ns, timed = subtitles.times()
-        height, which = _height(path, columns, choice)
+        height, which, said = _height(path, columns, choice)
         dropped: dict[str, int] = {}
         track = position_track(
             path,
@@ -174,7 +180,7 @@ class DjiSrtFormat:
             body=_attitude("F.PRY", t_ns[timed], _angles(columns, "drone")[timed], dropped),
             gimbal=_attitude("its gimbal angles", t_ns[timed], _angles(columns, "gb")[timed], dropped),
             clock=_clock_name(subtitles),
-            notes=tuple(f"{path}: {note}" for note in _notes(subtitles, which, moved, len(values))),
+            notes=tuple(f"{path}: {note}" for note in _notes(subtitles, said, moved, len(values))),
             dropped=dropped,
         )
 
@@ -259,12 +265,18 @@ def _said(text: str) -> dict[str, float]:
     return said
 
 
-def _height(path: Path, columns: Mapping[str, Float], choice: TelemetryChoice) -> tuple[Float, Height]:
-    """The height of each position, and what it counts from."""
-    stated = choice.altitude
+def _height(path: Path, columns: Mapping[str, Float], choice: TelemetryChoice) -> tuple[Float, Height, str]:
+    """Choose the height of each position; say what it counts from, and that in words.
+
+    An `altitude` that names no reference stands for whichever of the two heights has no name of its own.
+    """
+    stated, unnamed = choice.altitude, columns["altitude"]
     if isinstance(stated, int | float):
-        return np.full(len(columns["latitude"]), float(stated)), "stated"
-    there = [name for name in ("relative", "absolute") if _any(columns[name])]
+        throughout = np.full(len(columns["latitude"]), float(stated))
+        return throughout, "stated", "its height is the one stated, throughout"
+    both = ("relative", "absolute")
+    named = {name: columns[name] for name in both if _any(columns[name])}
+    there = (dict.fromkeys(both, unnamed) if _any(unnamed) else {}) | named
     if not there:
         raise DataError(
             path,
@@ -272,9 +284,20 @@ def _height(path: Path, columns: Mapping[str, Float], choice: TelemetryChoice) -
             "state it, in metres above the take-off: pose: {dji: ..., altitude: 30}",
         )
     if stated is not None and stated not in there:
-        raise DataError(path, f"holds no {stated} height", f"write altitude: {there[0]}, or the metres")
-    name = stated or there[0]
-    return columns[name], "take-off" if name == "relative" else "unknown"
+        raise DataError(
+            path, f"holds no {stated} height", f"write altitude: {next(iter(there))}, or the metres"
+        )
+    if stated is None and not named:
+        highest_m = float(np.nanmax(unnamed))
+        if highest_m > _HIGHEST_M:
+            problem = f"its altitude of up to {highest_m:.0f} m is no height above the take-off"
+            return unnamed, "unknown", f"{problem}: taken as absolute, from a barometer"
+        problem = "its altitude does not say what it counts from"
+        return unnamed, "take-off", f"{problem}: taken from the take-off (else write altitude: absolute)"
+    name = stated or ("relative" if "relative" in named else "absolute")
+    if name == "relative":
+        return there[name], "take-off", "heights count from the take-off"
+    return there[name], "unknown", "heights are absolute, from a barometer: drones differ by many metres"
 
 
 def _angles(columns: Mapping[str, Float], part: str) -> Float:
@@ -317,7 +340,7 @@ def _clock_name(subtitles: Subtitles) -> str:
     return "the drone's clock" if subtitles.has_clock.any() else "the video's start"
 
 
-def _notes(subtitles: Subtitles, height: Height, moved: int, rows: int) -> list[str]:
+def _notes(subtitles: Subtitles, height: str, moved: int, rows: int) -> list[str]:
     """What was chosen, and what is doubtful."""
     notes = []
     if not subtitles.has_clock.any():
@@ -326,12 +349,7 @@ def _notes(subtitles: Subtitles, height: Height, moved: int, rows: int) -> list[
         notes.append("shows whole seconds of local time, taken as UTC: let clock.sigma_s be 1")
     else:
         notes.append("its clock is the drone's local time, taken as UTC")
-    if height == "take-off":
-        notes.append("heights count from the take-off")
-    elif height == "stated":
-        notes.append("its height is the one stated, throughout")
-    else:
-        notes.append("heights are absolute, from a barometer: drones differ by many metres")
+    notes.append(height)
     if moved:
         notes.append(f"{moved} of {rows} positions repeat the one before: taken between measurements")
     return notes

@@ -164,9 +164,42 @@ def test_which_height(tmp_path: Path) -> None:
         read(bare)
     with pytest.raises(DataError, match="holds no relative height; write altitude: absolute"):
         read(
-            subtitles(tmp_path / "c.srt", "[latitude: 4.5] [longitude: 8.25] [altitude: 3]"),
+            subtitles(tmp_path / "c.srt", "[latitude: 4.5] [longitude: 8.25] [abs_alt: 3]"),
             altitude="relative",
         )
+
+
+@pytest.mark.parametrize(
+    ("text", "stated", "height", "metres"),
+    [
+        ("[altitude: 27.3]", None, "take-off", 27.3),
+        ("[altitude: 27.3]", "relative", "take-off", 27.3),
+        ("[altitude: 27.3]", "absolute", "unknown", 27.3),
+        ("[altitude: 501.0]", None, "unknown", 501),  # DJI's drones climb 500 m at most
+        ("[altitude: 501.0]", "relative", "take-off", 501),
+        ("[rel_alt: 3.5] [altitude: 480.0]", None, "take-off", 3.5),
+        ("[rel_alt: 3.5] [altitude: 480.0]", "absolute", "unknown", 480),
+        ("[altitude: 3.5] [abs_alt: 480.0]", "relative", "take-off", 3.5),
+        ("[altitude: 3.5] [abs_alt: 480.0]", None, "unknown", 480),
+    ],
+)
+def test_an_altitude_that_names_no_reference(
+    tmp_path: Path, text: str, stated: str | None, height: str, metres: float
+) -> None:
+    path = subtitles(tmp_path / "a.srt", *[f"[latitude: 47.5] [longitude: 8.25] {text}"] * 2)
+    track = read(path, altitude=stated).position
+    assert (track.height, track.values[0, 2]) == (height, metres)
+
+
+def test_a_mavic_air_2_counts_from_its_take_off() -> None:
+    # It hovers over ground that lies more than 50 m above the sea.
+    path = real_data("second/mavic_air2.srt")
+    assert FORMAT.describe(path)["height_m"] == [27.3, 29.2]
+    for stated in (None, "relative"):
+        telemetry = read(path, altitude=stated)
+        assert telemetry.position.height == "take-off"
+        assert (telemetry.position.values[:, 2].min(), telemetry.position.values[:, 2].max()) == (27.3, 29.2)
+    assert read(path, altitude="absolute").position.height == "unknown"
 
 
 def test_losses_are_counted(tmp_path: Path) -> None:
