@@ -10,12 +10,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipelines.formats.poses.tum import write_trajectory
 from pipelines.geometry.geodesy import place_at
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
+from pipelines.session.maps import write_grid
+from pipelines.session.records import Occupancy, Trajectory
 from tests.commands.runner import refused, succeeds
+from tests.real_data import real_data
 from tests.synthetic.drone_logs import (
     HOME,
     LEVER_ARM,
@@ -197,6 +201,73 @@ def test_what_angles_count_from_is_as_the_user_says(tmp_path: Path, meant: str, 
         off_m, off_deg = errors(flight, k)
         assert off_m < 1e-4
         assert off_deg < 1e-3  # quaternions of 32 bits, twice
+
+
+UTM = np.array([512_767.0, 5_403_710.0, 0.0])  # where the cloud below lies, zone 32N
+
+
+def _shifted_tum(flight: SyntheticFlight, path: Path, offset: Any) -> str:
+    trajectory = Trajectory(flight.t_ns, flight.camera_position[1] + offset, flight.camera_quaternion[1])
+    write_trajectory(path, trajectory)
+    return path.name
+
+
+def _utm_pose(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
+    flight.settings["cameras"]["drone2"]["pose"] = {"tum": _shifted_tum(flight, folder / "b.tum", offset)}
+
+
+def _utm_log(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
+    entries = []
+    for row, stamp_ns in enumerate(flight.t_ns.tolist()):
+        position = (flight.camera_position[1][row] + offset).tolist()
+        turned = flight.camera_quaternion[1][row].tolist()
+        pose = {
+            "position": dict(zip("xyz", position, strict=True)),
+            "orientation": dict(zip("xyzw", turned, strict=True)),
+        }
+        said = {"header": header(stamp_ns, "utm"), "pose": pose}
+        entries.append(Entry("/pose", "geometry_msgs/msg/PoseStamped", stamp_ns, said))
+    write_log(folder, "b", "mcap-cdr", entries)
+    flight.settings["cameras"]["drone2"]["pose"] = {"log": "b.mcap", "topic": "/pose", "of": "camera"}
+
+
+def _utm_truth(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
+    flight.settings["truth"] = {"poses": {"drone2": _shifted_tum(flight, folder / "b.tum", offset)}}
+
+
+def _utm_plan(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
+    flight.settings["plan"] = {"files": {"drone2": _shifted_tum(flight, folder / "b.tum", offset)}}
+
+
+def _utm_grid(flight: SyntheticFlight, folder: Path, offset: Any) -> None:
+    write_grid(folder / "b.npz", Occupancy(np.zeros((2, 2, 2), np.float32), np.asarray(offset), 1.0))
+    flight.settings["map"] = "b.npz"
+
+
+@pytest.mark.parametrize("state", [_utm_pose, _utm_log, _utm_truth, _utm_plan, _utm_grid])
+def test_coordinates_of_a_map_projection_are_refused_beside_gps(tmp_path: Path, state: Any) -> None:
+    flight = with_poses(tmp_path, _osdk, ON_GIMBAL)
+    if state in (_utm_pose, _utm_log):
+        del flight.settings["cameras"]["drone2"]["mount"]
+    flight.settings.pop("truth", None)
+    state(flight, tmp_path, UTM)
+    flight.save()
+    said = refused("ingest", flight.manifest)
+    assert "b." in said
+    assert "UTM" in said
+    assert f"latitude {HOME.latitude_deg:.6f}" in said
+    state(flight, tmp_path, np.array([0.0, 0.0, 5.0]))  # the same, in metres about the origin
+    flight.save()
+    ingest(flight.manifest)
+
+
+def test_a_cloud_in_utm_is_refused_beside_gps(tmp_path: Path) -> None:
+    flight = with_poses(tmp_path, _osdk, ON_GIMBAL)
+    flight.settings["map"] = {"path": str(real_data("second/isprs_samp11-utm.pcd")), "resolution_m": 2.0}
+    flight.save()
+    said = refused("ingest", flight.manifest)
+    assert "isprs_samp11-utm.pcd" in said
+    assert "UTM" in said
 
 
 def test_one_origin_for_all_where_none_is_stated(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from pipelines.formats.flights.flight_logs import FlightLogs
 from pipelines.formats.flights.frame_sources import CameraFrames, FrameSources
 from pipelines.formats.flights.gimbal_angles import attitudes_at, stated_angles
 from pipelines.formats.flights.telemetry_poses import Origin, TelemetryPoses
-from pipelines.formats.flights.world_axes import body_in_enu, in_enu, in_world
+from pipelines.formats.flights.world_axes import body_in_enu, in_enu, in_world, refuse_projected
 from pipelines.formats.logs.map_topics import LoggedMaps
 from pipelines.formats.maps.ros_map import FORMAT as ROS_MAP
 from pipelines.geometry.cameras import Intrinsics
@@ -184,15 +184,26 @@ class FlightSources:
                 position=calibrated.position[None],
                 quaternion_xyzw=calibrated.quaternion_xyzw[None],
             )
-            return in_enu(still, self._axes(pose.axes))
+            return self._local(self._base / pose.static.path, in_enu(still, self._axes(pose.axes)))
         if pose.is_telemetry:
             return self._telemetry.trajectory(name, camera, self._mounted(name, camera.mount))
         if pose.log:
-            return self._logged_trajectory(name, camera, pose.log)
-        trajectory = self._filed_trajectory(pose.tum or pose.csv or "", "tum" if pose.tum else "csv")
+            return self._local(self._logs.paths(pose.log)[0], self._logged_trajectory(name, camera, pose.log))
+        stated = pose.tum or pose.csv or ""
+        trajectory = self._filed_trajectory(stated, "tum" if pose.tum else "csv")
         if pose.of != "body":
-            return in_enu(trajectory, self._axes(pose.axes))
-        return self._on_body(name, camera, body_in_enu(trajectory, self._axes(pose.axes)))
+            return self._local(self._base / stated, in_enu(trajectory, self._axes(pose.axes)))
+        turned = self._local(self._base / stated, body_in_enu(trajectory, self._axes(pose.axes)))
+        return self._on_body(name, camera, turned)
+
+    def _local(self, source: Path | str, trajectory: Trajectory) -> Trajectory:
+        """The same trajectory; refused where it counts from another place than a world on Earth does."""
+        self._refuse_projected(source, trajectory.position)
+        return trajectory
+
+    def _refuse_projected(self, source: Path | str, position: Float) -> None:
+        if (origin := self._telemetry.origin()) is not None:
+            refuse_projected(source, position, origin.place)
 
     def _axes(self, *stated: Axes | None) -> Axes:
         return next((axes for axes in stated if axes), self._flight.world.frame)
@@ -291,25 +302,31 @@ class FlightSources:
             return replace(self._telemetry.points("actor", log, track), dropped=lost)
         settings = self._logs.settings(log)
         trajectory = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
-        return in_world(in_enu(trajectory, self._axes(settings.axes)), settings)
+        return self._local(
+            self._logs.paths(log)[0], in_world(in_enu(trajectory, self._axes(settings.axes)), settings)
+        )
 
     def planned(self, camera: str, plan: Plan) -> Trajectory:
         """Where a drone was sent; its rotation means nothing."""
         if camera in plan.files:
             path = self._base / plan.files[camera]
             filed = recognise(path, TrajectoryFormat, "file of commanded poses").read_trajectory(path)
-            return in_enu(filed, self._flight.world.frame)
+            return self._local(path, in_enu(filed, self._flight.world.frame))
         log, topic = plan.log_of(camera), plan.topics[camera].topic
         settings = self._logs.settings(log)
         sent = self._logs.commands(log, topic)
         if sent is None:
             sent = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
-        return in_world(in_enu(sent, self._axes(settings.axes)), settings)
+        return self._local(
+            self._logs.paths(log)[0], in_world(in_enu(sent, self._axes(settings.axes)), settings)
+        )
 
     def map(self, stated: str, resolution_m: float | None) -> Occupancy:
         """What stands around, from a file."""
         path = self._base / stated
-        return recognise(path, MapFormat, "map").read_map(path, resolution_m=resolution_m)
+        occupancy = recognise(path, MapFormat, "map").read_map(path, resolution_m=resolution_m)
+        self._refuse_projected(path, occupancy.origin[None])
+        return occupancy
 
     def logged_maps(self, stated: Map) -> LoggedMaps:
         """What stands around, from a log: maps that replace each other, in ENU axes at world times."""
@@ -320,7 +337,12 @@ class FlightSources:
         )
         for note in found.notes:
             self._note(note)
-        return found
+
+        def in_place(occupancy: Occupancy) -> Occupancy:
+            self._refuse_projected(self._logs.paths(stated.log or "")[0], occupancy.origin[None])
+            return occupancy
+
+        return replace(found, maps=map(in_place, found.maps))
 
     def true_joints(self, source: TruthJoints) -> JointMotion:
         """Read the true joints; positions too far from the others to be true are left out and counted.
@@ -347,13 +369,14 @@ class FlightSources:
         if not np.isfinite(motion.position).any():
             lost = f" ({losses(motion.dropped)})" if motion.dropped else ""
             raise DataError(path, f"holds no position of a joint{lost}", "check what wrote it")
+        self._refuse_projected(path, motion.position.reshape(-1, 3))
         return replace(motion, t_ns=motion.t_ns + round(source.offset_s * 1e9))
 
     def true_poses(self, stated: str) -> Trajectory:
         """The true poses of one camera."""
         path = self._base / stated
         trajectory = recognise(path, TrajectoryFormat, "camera trajectory").read_trajectory(path)
-        return in_enu(trajectory, self._flight.world.frame)
+        return self._local(path, in_enu(trajectory, self._flight.world.frame))
 
 
 def _without_far_joints(motion: JointMotion) -> JointMotion:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from pipelines.geometry.geodesy import Place
 from pipelines.geometry.mounting import flu_body_from_frd
 from pipelines.geometry.pose_covariance import carried_covariance
 from pipelines.geometry.poses import (
@@ -14,8 +16,11 @@ from pipelines.geometry.poses import (
     matrix_from_quaternion,
     quaternion_from_rotation_vector,
 )
+from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, Log
-from pipelines.session.records import Trajectory
+from pipelines.session.records import Float, Trajectory
+
+_FARTHEST_M = 100_000.0  # from the origin: no drone flies so far, and eastings of UTM begin at 166 km
 
 
 def in_enu(trajectory: Trajectory, axes: Axes) -> Trajectory:
@@ -53,3 +58,29 @@ def in_world(trajectory: Trajectory, log: Log) -> Trajectory:
         rotated[:3, :3] = matrix_from_quaternion(turn)  # the rotation part stays in the body
         covariance = carried_covariance(rotated, covariance)
     return replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)
+
+
+def refuse_projected(source: Path | str, position: Float, origin: Place) -> None:
+    """Refuse coordinates of a map projection, such as UTM, in a world whose origin on Earth is known.
+
+    Args:
+        source: the file or log, for the message.
+        position: [N, 3] m in the world; rows of NaN do not count.
+        origin: where on Earth the world's origin lies.
+
+    Raises:
+        DataError: the middle of the positions is further from the origin than anything flies.
+    """
+    across = position[np.isfinite(position[:, :2]).all(axis=1), :2]
+    if not len(across):
+        return
+    x_m, y_m = np.median(across, axis=0).tolist()
+    away_m = float(np.hypot(x_m, y_m))
+    if away_m > _FARTHEST_M:
+        raise DataError(
+            source,
+            f"lies about x {x_m:.0f} m, y {y_m:.0f} m (UTM or another map projection), {away_m / 1000:.0f} km"
+            f" from the world's origin (latitude {origin.latitude_deg:.6f}, longitude"
+            f" {origin.longitude_deg:.6f})",
+            "give metres east, north and up of that origin: subtract its projected coordinates",
+        )
