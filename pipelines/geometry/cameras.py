@@ -119,7 +119,11 @@ def undistort(pixels: Float, intrinsics: Intrinsics) -> Float:
 
 
 def rescaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
-    """The same camera with its pictures resized to `width` x `height`; no half-pixel shift."""
+    """The same camera with its pictures resized to `width` x `height`.
+
+    The corners of the picture stay corners. They lie half a pixel outside of the centres of pixels, so the
+    principal point moves by more than the factor, as in OpenCV's resize.
+    """
     sx, sy = width / intrinsics.width, height / intrinsics.height
     return replace(
         intrinsics,
@@ -127,8 +131,8 @@ def rescaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
         height=height,
         fx=intrinsics.fx * sx,
         fy=intrinsics.fy * sy,
-        cx=intrinsics.cx * sx,
-        cy=intrinsics.cy * sy,
+        cx=(intrinsics.cx + 0.5) * sx - 0.5,
+        cy=(intrinsics.cy + 0.5) * sy - 0.5,
     )
 
 

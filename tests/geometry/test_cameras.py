@@ -147,7 +147,20 @@ def test_undistort_keeps_shapes_and_missing_pixels() -> None:
 def test_resized_pictures_show_the_same_rays() -> None:
     half = rescaled(BARREL, 640, 360)
     points = points_in_view(BARREL)
-    np.testing.assert_allclose(project(points, half), project(points, BARREL) / 2, rtol=0, atol=1e-10)
+    # Corners stay corners: -0.5 is both pictures' left edge, 1279.5 and 639.5 are their right ones.
+    expected = (project(points, BARREL) + 0.5) / 2 - 0.5
+    np.testing.assert_allclose(project(points, half), expected, rtol=0, atol=1e-10)
+
+
+def test_resized_pictures_are_opencvs() -> None:
+    picture = np.zeros((60, 80), dtype=np.float32)
+    picture[21:27, 40:52] = 1.0  # its centre is (45.5, 23.5)
+    small = cv2.resize(picture, (40, 30), interpolation=cv2.INTER_AREA)
+    rows, columns = np.mgrid[:30, :40]
+    centre = np.array([(columns * small).sum(), (rows * small).sum()]) / small.sum()
+    lens = Intrinsics(80, 60, 100.0, 100.0, 45.5, 23.5, "none", ())
+    half = rescaled(lens, 40, 30)
+    np.testing.assert_allclose([half.cx, half.cy], centre, atol=1e-6)
 
 
 def test_a_calibration_fits_its_own_size_silently() -> None:
@@ -157,7 +170,7 @@ def test_a_calibration_fits_its_own_size_silently() -> None:
 def test_the_same_shape_at_another_size_is_rescaled() -> None:
     fitted, note = fit_to_size(PINHOLE, 1920, 1080)
     assert (fitted.width, fitted.height) == (1920, 1080)
-    assert (fitted.fx, fitted.cy) == (1350.0, 532.875)
+    assert (fitted.fx, fitted.cy) == (1350.0, 533.125)  # (355.25 + 0.5) * 1.5 - 0.5
     assert note is not None
     assert "1920 x 1080" in note
     assert "rescaled" in note

@@ -1,7 +1,7 @@
 """Camera matrices, Rodrigues vectors and camera_from_world poses to our records, checked.
 
-No pixel is shifted: what a file calls (cx, cy) is taken in our convention, the centre of the top left
-pixel at (0, 0), which is OpenCV's.
+A matrix counts pixels as we do, the centre of the top left one at (0, 0), which is OpenCV's convention.
+Readers of files that count otherwise (COLMAP) shift (cx, cy) before.
 """
 
 from __future__ import annotations

@@ -3,8 +3,7 @@
 Only cameras and images are read: points, rigs and frames are not needed, and the images of every
 version from 3.0 to 4 carry their own pose (camera_from_world).
 
-COLMAP puts (0, 0) at the corner of the top left pixel, we at its centre. As everywhere in this program the
-half pixel is NOT shifted: cx and cy are taken as they stand.
+COLMAP puts (0, 0) at the corner of the top left pixel, we at its centre: cx and cy lose half a pixel.
 """
 
 from __future__ import annotations
@@ -53,6 +52,8 @@ class _Model:
     def parameters(self) -> int:
         return self.focals + 2 + self.coefficients
 
+
+_CENTRE_PX = 0.5  # of the top left pixel, in COLMAP's pixels
 
 _MODELS = {
     "SIMPLE_PINHOLE": _Model(1, "none", 0, 0),
@@ -148,7 +149,8 @@ def _intrinsics(
 ) -> Intrinsics:
     layout = _MODELS[model]
     focals, rest = parameters[: layout.focals], parameters[layout.focals :]
-    matrix = np.array([[focals[0], 0, rest[0]], [0, focals[-1], rest[1]], [0, 0, 1]])
+    cx, cy = rest[0] - _CENTRE_PX, rest[1] - _CENTRE_PX
+    matrix = np.array([[focals[0], 0, cx], [0, focals[-1], cy], [0, 0, 1]])
     coefficients = rest[2:] + (0.0,) * (layout.padded - layout.coefficients)
     return build_intrinsics(source, str(camera), size, matrix, layout.distortion, coefficients)
 

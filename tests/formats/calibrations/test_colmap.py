@@ -66,8 +66,8 @@ def test_every_model_and_pose_as_pycolmap_has_it(folder: Path) -> None:
         camera = cameras[f"{name} a"]
         theirs = pycolmap.Camera(model=name, width=640, height=480, params=parameters)
         assert camera.intrinsics is not None
-        # Both compute in float64. COLMAP's half pixel is not shifted, in either.
-        expected = np.array([theirs.img_from_cam(point) for point in POINTS])
+        # Both compute in float64. COLMAP counts from the corner of the first pixel, we from its centre.
+        expected = np.array([theirs.img_from_cam(point) for point in POINTS]) - 0.5
         np.testing.assert_allclose(project(POINTS, camera.intrinsics), expected, rtol=0, atol=1e-9)
         world_from_camera = pose(index).inverse()
         assert camera.position is not None
@@ -94,7 +94,17 @@ def test_a_real_model() -> None:
         np.testing.assert_allclose(camera.position, image.projection_center(), atol=2e-5)
     lens = cameras["00"].intrinsics
     assert lens is not None
-    assert (lens.width, lens.height, lens.fx, lens.cx, lens.model) == (1919, 1079, 1847.53, 959.5, "none")
+    assert (lens.width, lens.height, lens.fx, lens.cx, lens.model) == (1919, 1079, 1847.53, 959.0, "none")
+
+
+def test_the_middle_of_a_picture_is_that_of_its_pixels(tmp_path: Path) -> None:
+    # COLMAP's own guess of the principal point is half the size; the middle of pixels 0 to 4 is 2.
+    guessed = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId.PINHOLE, 700.0, 5, 3)
+    assert guessed.params.tolist() == [700, 700, 2.5, 1.5]
+    cameras = f"1 PINHOLE 5 3 {' '.join(map(str, guessed.params))}\n"
+    lens = READER.read_calibration(write(tmp_path, cameras))["a"].intrinsics
+    assert lens is not None
+    assert (lens.cx, lens.cy) == (2, 1)
 
 
 def test_images_that_share_a_name_keep_their_folder(tmp_path: Path) -> None:

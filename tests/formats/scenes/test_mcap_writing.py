@@ -136,7 +136,7 @@ def test_pictures_come_with_the_lens_of_their_size(log: Path) -> None:
         assert np.abs(decoded.astype(int) - level).max() <= 2  # JPEG
         assert (info.width, info.height, info.distortion_model) == (960, 540, "plumb_bob")
         assert info.k[0] == pytest.approx(LENS.fx * 0.75)
-        assert info.k[2] == pytest.approx(LENS.cx * 0.75)
+        assert info.k[2] == pytest.approx((LENS.cx + 0.5) * 0.75 - 0.5)
         assert info.d.tolist() == [*LENS.distortion, 0.0]
 
 
