@@ -119,13 +119,13 @@ def _check_keypoints(people: Gathering, boxes: int) -> None:
 
 
 def _with_confidence(rows: Float, where: str) -> Float:
-    """Rows of x, y, visibility as x, y, confidence; all 0 where the visibility is 0."""
+    """Rows of x, y, visibility as x, y, confidence."""
     visibility = rows[:, 2:]
     if not np.isin(visibility, (0, 1, 2)).all():
         raise DataError(
             where, "its third values are not the visibilities 0, 1 and 2", "store it as COCO results"
         )
-    return np.where(visibility > 0, np.hstack([rows[:, :2], visibility / 2]), 0.0)
+    return np.hstack([rows[:, :2], visibility / 2])
 
 
 def _joint_names(content: dict[str, object]) -> tuple[str, ...] | None:

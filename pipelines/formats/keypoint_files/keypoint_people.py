@@ -164,9 +164,9 @@ class Gathering:
 
         Frames before `first_frame` are left out, and so is a detection that repeats another one of its frame
         number by number. A joint is missing (NaN, confidence 0) if its position is not finite or further than
-        `_FARTHEST_PX` from the top left pixel, or if position and confidence are all 0, which is how
-        detectors write "not found". A confidence that is not finite or below 0 becomes 0. All of it but "not
-        found" is counted in `dropped`. A confidence above 1 becomes 1 and is counted in `adjusted`.
+        `_FARTHEST_PX` from the top left pixel, or if its confidence is 0, which is how detectors write
+        "not found" wherever they put it. A confidence that is not finite or below 0 becomes 0. All of it but
+        "not found" is counted in `dropped`. A confidence above 1 becomes 1 and is counted in `adjusted`.
 
         Raises:
             DataError: no joint of any person is left.
@@ -238,7 +238,7 @@ class Gathering:
 def _checked(keypoints: Float) -> tuple[Float, Float, Counter[str], Counter[str]]:
     """Positions [M, K, 2] and confidences [M, K] of keypoints [M, K, 3]; what was dropped, and adjusted."""
     xy, confidence = keypoints[..., :2].copy(), keypoints[..., 2].copy()
-    not_found = (xy == 0).all(axis=-1) & (confidence == 0)
+    not_found = confidence == 0
     not_finite = ~np.isfinite(xy).all(axis=-1)
     far = ~not_finite & (np.abs(xy) > _FARTHEST_PX).any(axis=-1)
     bad = not_finite | far

@@ -112,7 +112,7 @@ def test_confidences_outside_0_to_1_are_counted(tmp_path: Path) -> None:
     one["keypoints"] = [value for confidence in given for value in (5.0, 6.0, confidence)]
     found = FORMAT.read_keypoints(written(tmp_path, [one]), skeleton=None, first_frame=0)
     assert found.confidence[0].tolist() == [0, 0, 1, 1, 1, 0, 1, *[0.5] * 10]
-    assert np.isfinite(found.xy).all()
+    assert np.isnan(found.xy[0]).any(axis=1).tolist() == [value == 0 for value in given]  # 0: not found
     assert found.dropped == {"confidence below 0": 2}
     assert found.adjusted == {"confidence above 1, set to 1": 3}
 

@@ -81,6 +81,22 @@ def test_results_by_number_or_name(tmp_path: Path) -> None:
     assert found.xy[:, 0, 0].tolist() == [2.0, 1.0, 3.0]
 
 
+def test_a_joint_of_confidence_zero_was_not_found(tmp_path: Path) -> None:
+    # pycocotools counts the joints with a third value above 0; where the others stand means nothing.
+    entry = result(1)
+    keypoints = entry["keypoints"]
+    assert isinstance(keypoints, list)
+    keypoints[2] = keypoints[3 * 5 + 2] = 0.0
+    found = FORMAT.read_keypoints(written(tmp_path, [entry]), skeleton="coco17", first_frame=0)
+    missing = np.isnan(found.xy[0]).all(axis=1)
+    assert np.flatnonzero(missing).tolist() == [0, 5]
+    assert np.flatnonzero(found.confidence[0] == 0).tolist() == [0, 5]
+    assert found.dropped == {}
+    assert FORMAT.describe(tmp_path / "results.json")["joints found, share"] == pytest.approx(
+        15 / 17, abs=1e-3
+    )
+
+
 def test_some_entries_without_keypoints_are_counted(tmp_path: Path) -> None:
     box = {"image_id": 3, "category_id": 1, "bbox": [1, 2, 3, 4]}
     found = FORMAT.read_keypoints(written(tmp_path, [result(1), box]), skeleton=None, first_frame=0)
