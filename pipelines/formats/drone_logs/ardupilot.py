@@ -98,9 +98,19 @@ class _Rows:
         ]
         return columns[0] if len(columns) == 1 else np.stack(columns, axis=1)
 
+    @property
+    def clock(self) -> tuple[str, int] | None:
+        """The field with the time since boot, and its unit in ns; None without one.
+
+        Until 2014 it was TimeMS, but in GPS messages T, where TimeMS is that of the GPS week.
+        """
+        units = (("TimeUS", 1000), ("T" if "Week" in self else "TimeMS", 1_000_000))
+        return next((unit for unit in units if unit[0] in self), None)
+
     def t_ns(self) -> Int64:
-        """[N] since boot."""
-        return self.integers("TimeUS") * 1000
+        """[N] since boot; 0 without a time."""
+        field, unit_ns = self.clock or ("", 0)
+        return self.integers(field) * unit_ns if field else np.zeros(len(self), np.int64)
 
     def of(self, instance: int, *columns: str) -> _Rows:
         """Those of one instance, by the first of some columns that there is; all of them without any."""
@@ -131,7 +141,7 @@ class ArduPilotFormat:
     def describe(self, path: Path) -> dict[str, object]:
         """Messages by name, times, GPS, and what was lost."""
         log = _Log(path)
-        timed = [rows for name in log.counts if (rows := log.rows(name)) is not None and "TimeUS" in rows]
+        timed = [rows for name in log.counts if (rows := log.rows(name)) is not None and rows.clock]
         every = np.concatenate([np.zeros(0, np.int64), *(rows.t_ns() for rows in timed)])
         facts: dict[str, object] = {"messages": sum(log.counts.values())}
         facts["span_s"] = round(int(np.ptp(every)) / 1e9, 6) if len(every) else 0.0
@@ -282,10 +292,13 @@ def _mount(
 def _gps_time(log: _Log) -> ClockFit | None:
     """From time since boot to UTC, by the first receiver; None without a time of it."""
     rows = log.first(["GPS"], 0, "I")
-    if rows is None or "GWk" not in rows or "GMS" not in rows:
+    names = (("GWk", "GMS"), ("Week", "TimeMS"))  # today's, and those until 2014
+    stated = next((pair for pair in names if rows is not None and all(name in rows for name in pair)), None)
+    if rows is None or stated is None:
         return None
-    known = (rows.numbers("Status") >= _3D_FIX) & (rows.integers("GWk") > 0)
-    gps_ns = rows.integers("GWk")[known] * _WEEK_NS + rows.integers("GMS")[known] * 1_000_000 + _GPS_EPOCH_NS
+    week, ms = (rows.integers(name) for name in stated)
+    known = (rows.numbers("Status") >= _3D_FIX) & (week > 0)
+    gps_ns = week[known] * _WEEK_NS + ms[known] * 1_000_000 + _GPS_EPOCH_NS
     return fit_clock(rows.t_ns()[known], gps_ns - _leap_ns(gps_ns))
 
 
@@ -323,7 +336,7 @@ class _Log:
         """The messages of the first of some names that has any of an instance."""
         for name in names:
             rows = self.rows(name)
-            if rows is not None and "TimeUS" in rows and len(found := rows.of(instance, *columns)):
+            if rows is not None and rows.clock and len(found := rows.of(instance, *columns)):
                 return found
         return None
 

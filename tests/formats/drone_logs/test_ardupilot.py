@@ -14,6 +14,7 @@ from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.session.errors import DataError
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from tests.real_data import real_data
 from tests.synthetic.drone_logs import BOOT_NS, HOME, DroneTruth, dataflash, drone_of, write_dataflash
 from tests.synthetic.flights import write_flight
 
@@ -109,6 +110,44 @@ def test_a_clock_that_drifts_is_found(tmp_path: Path) -> None:
     assert telemetry.fit.drift_ppm == pytest.approx(35.0, abs=1.0)
     # 35 ppm of 600 s are 21 ms; whole ms of GPS are left.
     assert np.abs(telemetry.position.t_ns - t_ns).max() < 1_500_000
+
+
+def test_a_log_from_2014_as_pymavlink_reads_it() -> None:
+    # Times are ms since boot, in GPS messages of the GPS week.
+    path = real_data("second/erle_25.bin")
+    mavutil = pytest.importorskip("pymavlink.mavutil")
+    theirs = mavutil.mavlink_connection(str(path))
+    stamps, fixes, turned = [], [], []
+    while (message := theirs.recv_msg()) is not None:
+        kind = message.get_type()
+        stamps += [
+            getattr(message, field)
+            for field in ("T" if kind == "GPS" else "TimeMS",)
+            if field in message.get_fieldnames()
+        ]
+        if kind == "ATT":
+            turned.append((message.TimeMS * 1_000_000, message.Yaw))
+        elif kind == "GPS" and message.Status >= 3:
+            fixes.append((message.T * 1_000_000, message.Lat, message.Lng, message.Alt, message.TimeMS))
+    theirs.close()
+    described = FORMAT.describe(path)
+    assert described["span_s"] == (max(stamps) - min(stamps)) / 1e3 == 212.894
+    assert described["gps_fixes"] == len(fixes)
+
+    telemetry = read(path, time="boot")
+    assert telemetry.dropped == {"no 3D fix": 658 - len(fixes)}
+    assert telemetry.position.t_ns.tolist() == [fix[0] for fix in fixes]
+    np.testing.assert_allclose(telemetry.position.values, [fix[1:4] for fix in fixes], atol=1e-9)
+    assert telemetry.body is not None
+    ahead = rotate(telemetry.body.quaternion_xyzw, np.array([1.0, 0, 0]))
+    yaw = np.degrees(np.arctan2(ahead[:, 0], ahead[:, 1])) % 360
+    known = np.isin([t for t, _ in turned], telemetry.body.t_ns)
+    np.testing.assert_allclose(yaw, np.array([y for _, y in turned])[known], atol=1e-4)
+    # Week 1813 and 16 leap seconds. Its own clock goes 9 % slow, which no fit of clocks takes for a drift:
+    # only the middle fits.
+    utc_s = 315_964_800 + 1813 * 604_800 - 16 + np.array([ms / 1e3 for _, _, _, _, ms in fixes])
+    late_s = read(path).position.t_ns / 1e9 - utc_s
+    assert abs(np.median(late_s)) < 0.2
 
 
 def test_damage(tmp_path: Path, truth: DroneTruth, capfd: pytest.CaptureFixture[str]) -> None:
