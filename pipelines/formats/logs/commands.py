@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipelines.formats.logs.messages import nanoseconds
+from pipelines.formats.logs.messages import FAULTS, nanoseconds, unreadable
 from pipelines.formats.poses.pose_rows import clean_poses
 from pipelines.session.errors import DataError
 from pipelines.session.records import Message, Trajectory
@@ -78,10 +78,8 @@ def read_commands(
     for message in recording.messages([topic]):
         try:
             points = list(_POINTS[message.topic.type](message, dropped))
-        except (AttributeError, TypeError, ValueError, OverflowError) as error:
-            raise DataError(
-                source, f"topic {topic}: a message cannot be read ({error})", "check what wrote the log"
-            ) from error
+        except FAULTS as error:
+            raise unreadable(message, source, error) from error
         if not points:
             continue
         if any(later[0] <= earlier[0] for earlier, later in pairwise(points)):

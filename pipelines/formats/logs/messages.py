@@ -79,10 +79,8 @@ def samples(message: Message, source: Source) -> Iterator[Sample]:
     try:
         _checked(message.receive_ns)
         yield from known[1](message, source)
-    except AttributeError as error:
-        raise _unreadable(message, source, f"lacks the field {error.name!r}") from error
-    except (TypeError, ValueError, OverflowError) as error:
-        raise _unreadable(message, source, f"cannot be read ({error})") from error
+    except FAULTS as error:
+        raise unreadable(message, source, error) from error
 
 
 def all_samples(messages: Iterable[Message], source: Source) -> Iterator[Sample]:
@@ -103,8 +101,15 @@ def all_samples(messages: Iterable[Message], source: Source) -> Iterator[Sample]
                 yield sample
 
 
-def _unreadable(message: Message, source: Source, problem: str) -> DataError:
+FAULTS = (AttributeError, TypeError, ValueError, OverflowError)
+"""What a message without a field, or with something else in it, raises when it is read."""
+
+
+def unreadable(message: Message, source: Source, error: Exception) -> DataError:
+    """Say what is wrong with a message that raised one of `FAULTS`."""
     topic = message.topic
+    lacks = isinstance(error, AttributeError)
+    problem = f"lacks the field {error.name!r}" if lacks else f"cannot be read ({error})"
     return DataError(
         source, f"topic {topic.name}: a message of type {topic.type} {problem}", "check what wrote the log"
     )

@@ -30,12 +30,12 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     whatever_from,
     world_from_heading,
 )
-from pipelines.formats.logs.messages import nanoseconds
+from pipelines.formats.logs.messages import FAULTS, nanoseconds, unreadable
 from pipelines.geometry.clocks import fit_clock
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Float, Int64, Message
 from pipelines.session.registries import Log
 from pipelines.session.telemetry import (
     AttitudeTrack,
@@ -51,6 +51,16 @@ Position = Literal["local", "global", "gps"]
 
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 _NO_FIX = -1  # NavSatFix.status.status
+_TIME_REFERENCE = "sensor_msgs/msg/TimeReference"
+
+_POSES = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "nav_msgs/msg/Odometry",
+)
+_POSITIONS = (NAV_SAT_FIX, "geometry_msgs/msg/PointStamped", *_POSES)
+_ATTITUDES = ("sensor_msgs/msg/Imu", "geometry_msgs/msg/QuaternionStamped", *_POSES)
+_VECTORS = ("geometry_msgs/msg/Vector3Stamped",)
 
 
 @dataclass(frozen=True)
@@ -292,8 +302,7 @@ def _position(
     stamps: Stamps,
     dropped: dict[str, int],
 ) -> PositionTrack:
-    type_ = next(known.type for known in recording.topics if known.name == topic)
-    if type_ != NAV_SAT_FIX:
+    if _type_of(recording, topic) != NAV_SAT_FIX:
         rows = _read(recording, source, topic, _point_of)
         return position_track(source, topic, rows.times(stamps), rows.values(), dropped, on_earth=False)
     rows = _read(recording, source, topic, _fix_of)
@@ -340,12 +349,14 @@ def _gimbal(
 
 def _gps_time(recording: Log, source: str, topic: str, counts: dict[str, int]) -> str:
     """How the recorder's clock goes against the time that the autopilot has from GPS; empty without it."""
-    if not counts.get(topic):
+    if not counts.get(topic) or _type_of(recording, topic) != _TIME_REFERENCE:
         return ""
-    pairs = [
-        (nanoseconds(message.value.header.stamp), nanoseconds(message.value.time_ref))
-        for message in recording.messages([topic])
-    ]
+    pairs = []
+    for message in recording.messages([topic]):
+        try:
+            pairs.append((nanoseconds(message.value.header.stamp), nanoseconds(message.value.time_ref)))
+        except FAULTS as error:
+            raise unreadable(message, source, error) from error
     stamped = np.array([pair for pair in pairs if min(pair) > 0], dtype=np.int64).reshape(-1, 2)
     fit = fit_clock(stamped[:, 0], stamped[:, 1])
     if fit is None:
@@ -356,11 +367,16 @@ def _gps_time(recording: Log, source: str, topic: str, counts: dict[str, int]) -
     )
 
 
+def _type_of(recording: Log, topic: str) -> str:
+    return next(known.type for known in recording.topics if known.name == topic)
+
+
 def _read(recording: Log, source: str, topic: str, numbers: Callable[[Any], Sequence[float]]) -> _Rows:
     """The numbers of every message of a topic.
 
     Raises:
-        DataError: a message lacks a field, or holds what is no number.
+        DataError: the topic is empty or holds something else, a message lacks a field, or holds what is no
+            number.
     """
     rows = _Rows()
     for message in recording.messages([topic]):
@@ -373,13 +389,27 @@ def _read(recording: Log, source: str, topic: str, numbers: Callable[[Any], Sequ
             rows.numbers.extend(said)
             if header is not None:
                 rows.frames.add(str(header.frame_id))
-        except (AttributeError, TypeError, ValueError, OverflowError) as error:
-            raise DataError(
-                source,
-                f"topic {topic}: a message of type {message.topic.type} cannot be read ({error})",
-                "check what wrote the log",
-            ) from error
+        except FAULTS as error:
+            raise _no_such(recording, source, message, error, *_READ[numbers]) from error
+    if not len(rows.header_ns):
+        raise DataError(source, f"topic {topic} holds no message", "name another")
     return rows
+
+
+def _no_such(
+    recording: Log, source: str, message: Message, error: Exception, noun: str, types: Sequence[str]
+) -> DataError:
+    """Say of a message that its type holds nothing of the kind, or else what is wrong with it."""
+    topic = message.topic
+    if isinstance(error, AttributeError) and topic.type not in types:
+        there = [known.name for known in recording.topics if known.type in types]
+        named = ", ".join(type_.rpartition("/")[2] for type_ in types)
+        return DataError(
+            source,
+            f"topic {topic.name} holds {topic.type}, no {noun} that can be read",
+            f"name a topic of {named}: {', '.join(sorted(there)) or 'this log has none'}",
+        )
+    return unreadable(message, source, error)
 
 
 def _point_of(value: Any) -> Sequence[float]:
@@ -414,3 +444,12 @@ def _quaternion_of(value: Any) -> Sequence[float]:
 
 def _vector_of(value: Any) -> Sequence[float]:
     return value.vector.x, value.vector.y, value.vector.z
+
+
+_READ: dict[Callable[[Any], Sequence[float]], tuple[str, tuple[str, ...]]] = {
+    _point_of: ("position", _POSITIONS),
+    _fix_of: ("position", _POSITIONS),
+    _quaternion_of: ("attitude", _ATTITUDES),
+    _vector_of: ("gimbal angles", _VECTORS),
+}
+"""What each of them reads, and the types that hold it."""

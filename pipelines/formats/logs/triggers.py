@@ -6,7 +6,7 @@ from array import array
 
 import numpy as np
 
-from pipelines.formats.logs.messages import nanoseconds
+from pipelines.formats.logs.messages import FAULTS, nanoseconds, unreadable
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64
 from pipelines.session.registries import Log
@@ -36,10 +36,8 @@ def read_triggers(recording: Log, source: str, topic: str) -> tuple[Int64, int]:
             holder = getattr(value, "header", value)
             stamp = getattr(value, "frame_stamp", None) or holder.stamp
             stated.append(nanoseconds(stamp))
-        except (AttributeError, TypeError, ValueError, OverflowError) as error:
-            raise DataError(
-                source, f"topic {topic}: a message cannot be read ({error})", "check what wrote the log"
-            ) from error
+        except FAULTS as error:
+            raise unreadable(message, source, error) from error
     t_ns = np.unique(np.frombuffer(stated, dtype=np.int64))
     t_ns = t_ns[t_ns > 0]
     if not len(t_ns):

@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.formats.logs.presets import Preset, namespaces, parts_of, read_preset
+from pipelines.formats.logs.presets import Preset, namespaces, parts_of, read_pair, read_preset
 from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.poses import rotate
 from pipelines.session.errors import DataError
 from pipelines.session.registries import LogFormat, recognise
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from tests.real_data import real_data
 from tests.synthetic.logged_flights import header
-from tests.synthetic.logs import Entry, write_log
+from tests.synthetic.logs import Entry, write_log, write_mcap
 
 START_NS = 1_700_000_000_000_000_000
 ROWS = 8
@@ -201,3 +202,60 @@ def test_several_drones(tmp_path: Path) -> None:
         read(tmp_path / "w", "dji_osdk", *both)
     with pytest.raises(DataError, match="has no gps position of /a/mavros; there is local"):
         read(tmp_path / "v", "mavros", both[0], position="gps")
+
+
+def _pair(path: Path, position: str, attitude: str) -> Telemetry:
+    with recognise(path, LogFormat, "log").open_log([path]) as log:
+        return read_pair(log, str(path), position, attitude, "enu", "header")
+
+
+@pytest.mark.parametrize(
+    ("position", "attitude", "fault", "type_"),
+    [
+        ("/gps/gps", "/novatel/oem7/odom", "/gps/gps", "gps_common/msg/GPSFix"),
+        (
+            "/novatel/oem7/inspva",
+            "/novatel/oem7/odom",
+            "/novatel/oem7/inspva",
+            "novatel_oem7_msgs/msg/INSPVA",
+        ),
+        ("/gps/fix", "/gps/gps", "/gps/gps", "gps_common/msg/GPSFix"),
+    ],
+)
+def test_topics_of_other_types_are_refused_by_name(
+    position: str, attitude: str, fault: str, type_: str
+) -> None:
+    path = real_data("second/novatel_bestpos.bag")
+    assert len(_pair(path, "/gps/fix", "/novatel/oem7/odom").position.t_ns)
+    with pytest.raises(DataError) as refused:
+        _pair(path, position, attitude)
+    assert fault in refused.value.problem
+    assert type_ in refused.value.problem
+    assert "attribute" not in str(refused.value)
+    # What can be read instead: the only topics of the bag with positions or attitudes.
+    assert "/novatel/oem7/odom" in refused.value.remedy
+    assert ("/gps/fix" in refused.value.remedy) == (fault == position)
+
+
+def test_vectors_and_fixes_of_foxglove_are_no_poses(tmp_path: Path) -> None:
+    place = {"latitude": 47.5, "longitude": 8.5, "altitude": 400.0, "frame_id": "gps"}
+    fixes = [Entry("/place", "foxglove.LocationFix", t, {"timestamp": t, **place}) for t in stamps()]
+    as_json = write_mcap(tmp_path / "a.mcap", fixes, "json")
+    ros = sorted([*vectors("/v", "", 1, 2, 3), *imu("/imu", (0, 0, 0, 1))], key=lambda entry: entry.stamp_ns)
+    as_ros = write_log(tmp_path, "b", "ros1", ros)
+    for path, topic, turned in ((as_json, "/place", "/place"), (as_ros, "/v", "/imu")):
+        with pytest.raises(DataError, match=f"topic {topic} holds .*no position") as refused:
+            _pair(path, topic, turned)
+        assert "attribute" not in str(refused.value)
+    with pytest.raises(DataError, match=r"topic /v holds .*no position"):
+        _pair(as_ros, "/v", "/v")
+
+
+def test_a_time_reference_of_another_type_is_left_aside(tmp_path: Path) -> None:
+    telemetry = read(
+        tmp_path,
+        "mavros",
+        poses("/mavros/local_position/pose", (1.0, 2.0, 3.0)),
+        vectors("/mavros/time_reference", "", 1, 2, 3),
+    )
+    assert telemetry.position.values[0].tolist() == [1, 2, 3]
