@@ -16,7 +16,7 @@ from pipelines.session.manifest import Flight, read_flight
 from pipelines.session.registries import FORMATS, why_not
 from pipelines.session.stage_records import SCHEMA, STAGES, outdated
 from pipelines.session.stages import open_session
-from pipelines.session.storage import read_json
+from pipelines.session.storage import read_json, refuse_special
 from pipelines.session.whole_folders import SIMULATION_MARK, STUDY_MARK
 from pipelines.session.yaml_models import keys_of
 from pipelines.simulation.scenario import Scenario, read_scenario
@@ -41,6 +41,7 @@ def survey(path: Path) -> list[Survey]:
     """
     if not path.exists():
         raise DataError(path, "does not exist", "check the path")
+    refuse_special(path)
     if (path / "session.json").is_file():
         return [Survey(path, "session", _of_session(path))]
     if made := _of_summary(path):

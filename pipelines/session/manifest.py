@@ -25,8 +25,11 @@ SCHEMA = 1
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 _LATEST_NS = 2**62  # differences of two such times fit int64
+_MOST_FRAMES = 10**9  # a year at 30 Hz
 
 Axes = Literal["enu", "ned"]
+Side = Annotated[int, Field(gt=0, le=100_000)]
+"""Pixels along one side of a picture."""
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Quaternion = Annotated[list[float], Field(min_length=4, max_length=4)]
 
@@ -40,7 +43,10 @@ def _unit_quaternion(value: list[float]) -> list[float]:
 
 def _fps(value: object) -> Fraction:
     try:
-        fps = Fraction(str(value).replace(" ", ""))
+        text = str(value).replace(" ", "")
+        if "e" in text.lower():  # an exponent of millions would make an integer of as many digits
+            raise ValueError(text)
+        fps = Fraction(text)
     except (ValueError, ZeroDivisionError):
         raise ValueError("is no frame rate; write 30, 29.97 or 30000/1001") from None
     if not Fraction(1, 1000) <= fps <= 100_000:
@@ -50,12 +56,13 @@ def _fps(value: object) -> Fraction:
 
 def _nanoseconds(value: object) -> int:
     try:
-        nanoseconds = int((Decimal(str(value)) * 1_000_000_000).to_integral_value())
+        nanoseconds = Decimal(str(value)) * 1_000_000_000
+        is_near = abs(nanoseconds) <= _LATEST_NS  # before it becomes an integer of as many digits
     except ArithmeticError:
         raise ValueError("is no time in seconds") from None
-    if abs(nanoseconds) > _LATEST_NS:
+    if not is_near:
         raise ValueError("is no time in seconds: it lies beyond the year 2116 (are these ms or ns?)")
-    return nanoseconds
+    return int(nanoseconds.to_integral_value())
 
 
 def _seconds(value: float) -> float:
@@ -291,8 +298,8 @@ class IntrinsicsSource(Part):
     camera: str | None = None
     log: str | None = None
     topic: str | None = None
-    width: int | None = Field(None, gt=0, le=100_000)
-    height: int | None = Field(None, gt=0, le=100_000)
+    width: Side | None = None
+    height: Side | None = None
     fx: float | None = Field(None, gt=0)
     fy: float | None = Field(None, gt=0)
     cx: float | None = None
@@ -317,8 +324,8 @@ class KeypointSource(Part):
     path: str
     format: str | None = None
     skeleton: str | None = None
-    first_frame: int = 0
-    image_size: Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
+    first_frame: int = Field(0, ge=-_MOST_FRAMES, le=_MOST_FRAMES)
+    image_size: Annotated[list[Side], Field(min_length=2, max_length=2)] | None = None
 
 
 class Camera(Part):

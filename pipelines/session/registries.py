@@ -31,7 +31,7 @@ from pipelines.session.records import (
     Trajectory,
     VideoIndex,
 )
-from pipelines.session.storage import sha256_of
+from pipelines.session.storage import is_special, refuse_special, sha256_of
 
 T = TypeVar("T")
 
@@ -339,6 +339,7 @@ def recognise(path: Path, protocol: type[F], noun: str, formats: Sequence[Format
         raise DataError(
             path, "does not exist", "check the path; paths are relative to the file that names them"
         )
+    refuse_special(path)
     candidates = [f for f in (FORMATS.all() if formats is None else formats) if isinstance(f, protocol)]
     matches = [f for f in candidates if f.recognises(path)]
     if len(matches) == 1:
@@ -356,7 +357,7 @@ def recognise(path: Path, protocol: type[F], noun: str, formats: Sequence[Format
 def why_not(path: Path) -> str:
     """What may have kept a file from being recognised, to be put behind that; empty where nothing is seen."""
     if not path.is_file():
-        return ""
+        return ": it is a pipe, a socket or a device" if is_special(path) else ""
     try:
         if path.stat().st_size == 0:
             return ": it is empty"

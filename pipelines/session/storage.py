@@ -32,6 +32,23 @@ def as_data_error(error: OSError, path: Path) -> DataError:
     return DataError(error.filename or path, error.strerror or str(error), remedy)
 
 
+def is_special(path: Path) -> bool:
+    """Whether it is a pipe, a socket or a device: reading one may never end."""
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
+def refuse_special(path: Path) -> None:
+    """Refuse what is neither a file nor a folder.
+
+    Raises:
+        DataError: it is a pipe, a socket or a device.
+    """
+    if is_special(path):
+        raise DataError(
+            path, "is a pipe, a socket or a device", "write what comes out of it to a file, and name that"
+        )
+
+
 def sha256_of(path: Path, hash_for: Callable[[Path], Any] = lambda _: hashlib.sha256()) -> str:
     """Hash of a file's content, or of a folder's: the relative names and contents of all its files, sorted.
 
@@ -42,8 +59,9 @@ def sha256_of(path: Path, hash_for: Callable[[Path], Any] = lambda _: hashlib.sh
         hash_for: makes what is given the bytes of a file and has their SHA-256 as its digest.
 
     Raises:
-        DataError: the path is missing or cannot be read.
+        DataError: the path is missing, cannot be read, or is no file or folder.
     """
+    refuse_special(path)
     try:
         if not path.is_dir():
             return _file_digest(path, hash_for).hex()

@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from pipelines.session.errors import DataError
+from pipelines.session.storage import refuse_special
 from pipelines.session.yaml_reading import plain_yaml
 
 _LARGEST_FILE = 1_000_000  # bytes; a real one has a few thousand
@@ -75,6 +76,7 @@ def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape
 
 
 def _read_yaml(path: Path, noun: str) -> object:
+    refuse_special(path)
     try:
         if path.stat().st_size > _LARGEST_FILE:
             raise DataError(path, f"is larger than {_LARGEST_FILE} bytes", f"this is no {noun}")
@@ -83,36 +85,7 @@ def _read_yaml(path: Path, noun: str) -> object:
         raise DataError(path, f"cannot be read ({error.strerror})", f"give the path of a {noun}") from None
     except UnicodeDecodeError:
         raise DataError(path, "is no UTF-8 text", f"give the path of a {noun}") from None
-    value = plain_yaml(path, text)
-    _refuse_impossible_text(path, value)
-    return value
-
-
-def _refuse_impossible_text(path: Path, value: object) -> None:
-    """Refuse escapes for what no name of a file can hold: zero bytes, halves of characters."""
-    seen: set[int] = set()  # aliases of aliases are one thing, however often they stand there
-    waiting = [(value, "")]
-    while waiting:
-        item, place = waiting.pop()
-        if id(item) in seen:
-            continue
-        seen.add(id(item))
-        if isinstance(item, Mapping):
-            waiting += [(part, f"{place}.{key}".strip(".")) for key, part in item.items()]
-            waiting += [(key, place) for key in item]  # last, so looked at before they name places
-        elif isinstance(item, list):
-            waiting += [(part, f"{place}.{index}".strip(".")) for index, part in enumerate(item)]
-        elif isinstance(item, str) and ("\0" in item or not _is_unicode(item)):
-            said = f"holds a text with impossible characters ({item[:60]!r})"
-            raise DataError(path, f"{place[:200]}: {said}" if place else said, "mend it")
-
-
-def _is_unicode(text: str) -> bool:
-    try:
-        text.encode("utf-8")
-    except UnicodeEncodeError:
-        return False
-    return True
+    return plain_yaml(path, text)
 
 
 def _describe(problem: Any, model: type[Part]) -> str:  # ErrorDetails, whose ctx has no fixed shape

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from pipelines.session.errors import DataError
+
+_MOST_BITS = 1024  # a float holds integers of fewer
 
 
 def plain_yaml(path: Path, text: str) -> object:
@@ -15,7 +18,8 @@ def plain_yaml(path: Path, text: str) -> object:
         text: of the whole file.
 
     Raises:
-        DataError: no valid YAML; the message names the line where there is one.
+        DataError: no valid YAML; the message names the line where there is one. Or a value that no program
+            can use: a text that cannot be written, an integer beyond any float.
     """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
@@ -30,4 +34,42 @@ def plain_yaml(path: Path, text: str) -> object:
     except (YAMLError, ValueError, RecursionError) as error:
         problem = " ".join(str(error).split())[:200]
         raise DataError(path, f"is no valid YAML ({problem})", remedy) from None
+    _refuse_impossible_values(path, value)
     return value
+
+
+def _refuse_impossible_values(path: Path, value: object) -> None:
+    """Refuse integers beyond any float, and escapes for what no name of a file can hold.
+
+    That is zero bytes and halves of characters. Python refuses to print integers of thousands of digits.
+    """
+    seen: set[int] = set()  # aliases of aliases are one thing, however often they stand there
+    waiting: list[tuple[object, tuple[object, ...]]] = [(value, ())]
+    while waiting:
+        item, place = waiting.pop()
+        if id(item) in seen:
+            continue
+        seen.add(id(item))
+        if isinstance(item, Mapping):
+            waiting += [(part, (*place, key)) for key, part in item.items()]
+            waiting += [(key, place) for key in item]  # last, so looked at before they name places
+        elif isinstance(item, list):
+            waiting += [(part, (*place, index)) for index, part in enumerate(item)]
+        elif isinstance(item, str) and ("\0" in item or not _is_unicode(item)):
+            raise _impossible(path, place, f"holds a text with impossible characters ({item[:60]!r})")
+        elif isinstance(item, int) and item.bit_length() >= _MOST_BITS:
+            digits = item.bit_length() * 3 // 10
+            raise _impossible(path, place, f"holds an integer of about {digits} digits")
+
+
+def _impossible(path: Path, place: tuple[object, ...], problem: str) -> DataError:
+    where = ".".join(map(str, place))[:200]
+    return DataError(path, f"{where}: {problem}" if where else problem, "mend it")
+
+
+def _is_unicode(text: str) -> bool:
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,7 @@ import pytest
 
 from pipelines.geometry.cameras import project
 from pipelines.session.description import read_description
+from pipelines.session.registries import FORMATS
 from tests.commands.runner import content, mocap, mocap_process, refusal, refused, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 
@@ -306,6 +310,74 @@ def test_text_that_no_name_of_a_file_can_hold(flight: SyntheticFlight, escape: s
     text = flight.manifest.read_text(encoding="utf-8")
     flight.manifest.write_text(text.replace("drone1.tum", f'"drone1{escape}.tum"', 1), encoding="utf-8")
     assert "holds a text with impossible characters" in refused("ingest", flight.manifest)
+
+
+HUGE = "0x" + "f" * 5000  # Python refuses to print it
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place"),
+    [
+        ("fps: 30", 'fps: "1e99999999"', "frame_times.fps"),
+        ("fps: 30", 'fps: "1e-99999999"', "frame_times.fps"),
+        ("start: 1700000000.0", 'start: "1e999980"', "frame_times.start"),
+        ("start: 1700000000.0", "start: .nan", "frame_times.start"),
+        ("schema: 1", f"schema: {HUGE}", "schema"),
+        ("fps: 30", f"fps: {HUGE}", "frame_times.fps"),
+        ("schema: 1", f"schema: 1\nname: {HUGE}", "name"),
+        ("schema: 1", f"schema: 1\n? {HUGE}\n: 1", "an integer of about 6000 digits"),
+        ("path: k.json", f"path: k.json, first_frame: {10**30}", "keypoints.first_frame"),
+        ("path: k.json", f"path: k.json, image_size: [{10**30}, 480]", "keypoints.image_size"),
+    ],
+)
+def test_numbers_beyond_all_bounds(tmp_path: Path, old: str, new: str, place: str) -> None:
+    text = (
+        "schema: 1\ncameras: {d: {frame_times: {start: 1700000000.0, fps: 30}, pose: {tum: a.tum},"
+        " intrinsics: i.yaml, keypoints: {path: k.json}}}\n"
+    )
+    assert old in text
+    path = tmp_path / "flight.yaml"
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    # In a process of its own: what computes for ever must not keep the other tests.
+    assert place in refusal(mocap_process("ingest", path, timeout=60))
+
+
+def test_pipes_and_sockets_are_refused_and_not_waited_for(flight: SyntheticFlight, tmp_path: Path) -> None:
+    folder = tmp_path / "pipes"
+    folder.mkdir()
+    for suffix, commands in {".yaml": ("info", "ingest"), ".csv": ("info",), ".mcap": ("init",)}.items():
+        pipe = folder / f"pipe{suffix}"
+        os.mkfifo(pipe)
+        for command in commands:
+            said = refusal(mocap_process(command, pipe, timeout=60))
+            assert f"{pipe.name}: " in said
+            assert "is a pipe, a socket or a device" in said
+    flight.settings["cameras"]["drone1"]["pose"]["tum"] = "pipes/pipe.csv"
+    flight.save()
+    said = refusal(mocap_process("ingest", flight.manifest, timeout=60))
+    assert "pipe.csv: is a pipe, a socket or a device" in said
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(os.path.relpath(folder / "s.srt"))  # names of sockets are short
+        assert "is a pipe, a socket or a device" in refused("info", folder / "s.srt")
+    assert "is a pipe, a socket or a device" in refused("info", "/dev/null")
+
+
+def test_no_format_opens_a_pipe(tmp_path: Path) -> None:
+    suffixes = sorted({suffix for format_ in FORMATS.all() for suffix in getattr(format_, "suffixes", ())})
+    pipes = [tmp_path / f"pipe{suffix}" for suffix in suffixes]
+    for pipe in pipes:
+        os.mkfifo(pipe)
+
+    def waited(*_: object) -> None:
+        pytest.fail("waited for a pipe")
+
+    before = signal.signal(signal.SIGALRM, waited)
+    signal.alarm(60)
+    try:
+        assert not [pipe for pipe in pipes if any(each.recognises(pipe) for each in FORMATS.all())]
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def test_unknown_export_lists_those_there_are(flight: SyntheticFlight, tmp_path: Path) -> None:

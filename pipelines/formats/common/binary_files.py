@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.session.errors import DataError
-from pipelines.session.storage import as_data_error
+from pipelines.session.storage import as_data_error, refuse_special
 
 LONGEST_HEADER = 64 * 1024
 
@@ -21,6 +21,7 @@ def read_bytes(path: Path) -> bytes:
     Raises:
         DataError: missing or unreadable.
     """
+    refuse_special(path)
     try:
         return path.read_bytes()
     except OSError as error:
@@ -29,6 +30,8 @@ def read_bytes(path: Path) -> bytes:
 
 def first_bytes(path: Path, count: int = LONGEST_HEADER) -> bytes:
     """The beginning of a file, for recognising it; empty when it cannot be read. Never raises."""
+    if not path.is_file():
+        return b""
     try:
         with path.open("rb") as file:
             return file.read(count)

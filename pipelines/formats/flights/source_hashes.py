@@ -12,7 +12,7 @@ from pipelines.formats.logs.mcap_checksums import OTHER_CHECKSUM, CheckedHash, s
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight
 from pipelines.session.progress import Progress
-from pipelines.session.storage import file_stamp, hash_of, sha256_of
+from pipelines.session.storage import file_stamp, hash_of, refuse_special, sha256_of
 
 _HASHERS = 4
 
@@ -29,6 +29,8 @@ def hash_sources(
         meanwhile: steps to take until all is hashed.
     """
     unique = stated_paths(flight)
+    for path in unique:  # before anything waits for one of them
+        refuse_special(base / path)
     progress.start("Hashing sources", len(unique))
     hashes, damage = {}, {}
     with ThreadPoolExecutor(_HASHERS) as pool:  # hashing releases the interpreter: long logs side by side

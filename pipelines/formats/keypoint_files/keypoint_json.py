@@ -55,7 +55,7 @@ def samples(path: Path) -> list[object]:
         files = json_files(path)
         files = files[:: max(1, len(files) // _SAMPLED_FILES)][:_SAMPLED_FILES]
     else:
-        files = [path] if path.suffix.lower() == ".json" else []
+        files = [path] if path.suffix.lower() == ".json" and path.is_file() else []
     found: list[object] = []
     for file in files:
         try:

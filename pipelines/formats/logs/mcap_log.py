@@ -49,6 +49,8 @@ class McapLog:
 
     def recognises(self, path: Path) -> bool:
         """Whether the file begins as MCAP does, or is an empty one."""
+        if not path.is_file():
+            return False
         try:
             with path.open("rb") as file:
                 head = file.read(len(_MAGIC))

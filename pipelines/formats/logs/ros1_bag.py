@@ -41,6 +41,8 @@ class Ros1Bag:
 
     def recognises(self, path: Path) -> bool:
         """Whether the file begins as a bag does, or is an empty one."""
+        if not path.is_file():
+            return False
         try:
             with path.open("rb") as file:
                 head = file.read(16)

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from pipelines.formats.logs.mcap_log import open_mcap
 from pipelines.formats.logs.recordings import (
@@ -25,6 +26,7 @@ from pipelines.formats.logs.recordings import (
 )
 from pipelines.formats.logs.ros2_sqlite3 import MAGIC, Sqlite3Part, has_bag_tables
 from pipelines.session.errors import DataError
+from pipelines.session.yaml_reading import plain_yaml
 
 _INFORMATION = "rosbag2_bagfile_information"
 _METADATA_LIMIT = 16 << 20  # bytes of a metadata.yaml
@@ -43,6 +45,8 @@ class Ros2Bag:
         try:
             if path.is_dir():
                 return _states_a_bag(path / "metadata.yaml") or _is_one_bag(_storage_files(path))
+            if not path.is_file():
+                return False
             with path.open("rb") as file:
                 head = file.read(len(MAGIC))
         except OSError:
@@ -147,12 +151,9 @@ def _contents(path: Path) -> _Contents:
 
 def _read_metadata(path: Path) -> _Metadata:
     """Read metadata.yaml; ValueError if it does not say what it must."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     try:
         with path.open(encoding="utf-8") as file:
-            content = YAML(typ="safe", pure=True).load(file.read(_METADATA_LIMIT))
+            content: Any = plain_yaml(path, file.read(_METADATA_LIMIT))
         information = content[_INFORMATION]
         return _Metadata(
             files=[str(name) for name in information["relative_file_paths"]],
@@ -162,7 +163,7 @@ def _read_metadata(path: Path) -> _Metadata:
                 "span_s": int(information["duration"]["nanoseconds"]) / 1e9,
             },
         )
-    except (YAMLError, OSError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+    except (DataError, OSError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise ValueError(str(error)) from error
 
 

@@ -90,7 +90,10 @@ def test_the_header_of_old_files_is_skipped(tmp_path: Path) -> None:
         ({"intrinsics": "[460, a, 366, 248]"}, "cam0.intrinsics is no list of numbers"),
         ({"intrinsics": "[460, true, 366, 248]"}, "cam0.intrinsics is no list of numbers"),
         ({"intrinsics": "[-460, 458, 366, 248]"}, "focal lengths"),
-        ({"intrinsics": f"[1{'0' * 400}, 458, 366, 248]"}, "a number too large"),
+        (
+            {"intrinsics": f"[1{'0' * 400}, 458, 366, 248]"},
+            "an integer of about 39[0-9] digits|an integer of about 40[0-9] digits",
+        ),
         ({"distortion_coeffs": "[.nan, 0, 0, 0]"}, "not all finite"),
         ({"resolution": None}, "cam0 lacks resolution"),
         ({"resolution": "752"}, "cam0.resolution is no list"),
