@@ -16,7 +16,11 @@ def median_step_ns(t_ns: Int64) -> float | None:
 
 
 def describe_times(t_ns: Int64) -> dict[str, object]:
-    """Where the stamps begin, how long they last, how often they come and where they pause."""
+    """Where the stamps begin, how long they last, how often they come and where they pause.
+
+    Args:
+        t_ns: [N] strictly increasing.
+    """
     if not len(t_ns):
         return {}
     step = median_step_ns(t_ns)

@@ -13,6 +13,7 @@ import numpy as np
 
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float
+from pipelines.session.storage import refuse_special
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -27,6 +28,7 @@ def read_text(path: Path) -> str:
     Raises:
         DataError: missing, unreadable, or not text.
     """
+    refuse_special(path)
     try:
         return path.read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -39,6 +41,8 @@ def read_text(path: Path) -> str:
 
 def read_head(path: Path) -> str:
     """The first lines of a file, for recognising it; empty when it cannot be read. Never raises."""
+    if not path.is_file():
+        return ""
     try:
         with path.open("rb") as file:
             head = file.read(HEAD_BYTES)
@@ -142,7 +146,10 @@ def _first_bad_line(
     for index, line in enumerate(lines):
         if not line.strip():
             continue
-        cells = next(csv.reader([line], delimiter=delimiter), [])
+        try:
+            cells = next(csv.reader([line], delimiter=delimiter), [])
+        except csv.Error as error:  # a cell of more than 131072 characters, most of all
+            return index, str(error)
         if len(cells) != columns:
             return index, f"{len(cells)} columns instead of {columns}"
         for name, column in numbers.items():

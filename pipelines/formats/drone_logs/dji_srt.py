@@ -126,12 +126,12 @@ class DjiSrtFormat:
         """Subtitles, times, box of the positions, heights, angles, and what was left out."""
         subtitles = read_subtitles(path)
         columns = _columns(subtitles.texts)
-        t_ns, _ = subtitles.times()
+        t_ns, timed = subtitles.times()
         placed = np.isfinite(columns["latitude"])
         facts: dict[str, object] = {
             "subtitles": len(subtitles.texts),
             "positions": int(np.count_nonzero(placed)),
-            **describe_times(t_ns),
+            **describe_times(np.unique(t_ns[timed])),
             "clock": _clock_name(subtitles),
         }
         for name in ("latitude", "longitude"):

@@ -108,8 +108,9 @@ FAULTS = (AttributeError, TypeError, ValueError, OverflowError)
 def unreadable(message: Message, source: Source, error: Exception) -> DataError:
     """Say what is wrong with a message that raised one of `FAULTS`."""
     topic = message.topic
-    lacks = isinstance(error, AttributeError)
-    problem = f"lacks the field {error.name!r}" if lacks else f"cannot be read ({error})"
+    problem = f"cannot be read ({error})"
+    if isinstance(error, AttributeError):
+        problem = f"lacks the field {error.name!r}"
     return DataError(
         source, f"topic {topic.name}: a message of type {topic.type} {problem}", "check what wrote the log"
     )

@@ -20,7 +20,7 @@ from pipelines.formats.poses.pose_rows import clean_poses
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording, Trajectory
 
-_COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+_COLUMNS: tuple[str, ...] = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 _HEADING = re.compile(r"[^\s,;\[(]+(?:\s*(?:\[[^\]]*\]|\([^)]*\)))?")  # a name, perhaps with its unit
 
 

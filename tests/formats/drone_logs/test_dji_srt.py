@@ -202,6 +202,20 @@ def test_a_mavic_air_2_counts_from_its_take_off() -> None:
     assert read(path, altitude="absolute").position.height == "unknown"
 
 
+def test_subtitles_of_one_moment(tmp_path: Path) -> None:
+    path = tmp_path / "a.srt"
+    text = "[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5]"
+    blocks = [f"{n}\n00:00:01,000 --> 00:00:01,040\n2024-05-01 10:00:01.000\n{text}\n\n" for n in (1, 2, 3)]
+    path.write_text("".join(blocks))
+    described = FORMAT.describe(path)
+    assert (described["subtitles"], described["span_s"]) == (3, 0.0)
+    assert "rate_hz" not in described
+    assert read(path).dropped == {"duplicate stamp": 2}
+    # Of subtitles without a clock beside others the time is not known: not the year 1970.
+    path.write_text("".join(blocks).replace("2024-05-01 10:00:01.000", "", 1))
+    assert FORMAT.describe(path)["first_ns"] == 1_714_557_601_000_000_000
+
+
 def test_losses_are_counted(tmp_path: Path) -> None:
     good = "[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5 abs_alt: 480.0]"
     path = subtitles(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from pipelines.formats.poses import tum
+from pipelines.formats.poses import pose_csv, tum
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording, Trajectory
 from pipelines.session.registries import Export, TrajectoryFormat
@@ -161,6 +161,16 @@ def test_a_malformed_line_in_the_middle_is_named(tmp_path: Path, line: str, prob
     path = write(tmp_path, rows("# c", f"1 0 0 0 {IDENTITY}", line, f"3 0 0 0 {IDENTITY}"))
     with pytest.raises(DataError, match=problem):
         READER.read_trajectory(path)
+
+
+@pytest.mark.parametrize("quoted", [False, True])
+def test_a_line_with_a_cell_of_megabytes_is_named(tmp_path: Path, quoted: bool) -> None:
+    cell = "9" * 1_500_000 + "x"
+    cell = f'"{cell}"' if quoted else cell
+    text = f"t,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n2,{cell},0,0,0,0,0,1\n3,0,0,0,0,0,0,1\n"
+    with pytest.raises(DataError, match="line 3: ") as refused:
+        pose_csv.FORMAT.read_trajectory(write(tmp_path, text, "poses.csv"))
+    assert len(str(refused.value)) < 1000
 
 
 @pytest.mark.parametrize("tail", ["3 0.1 0.", "3 0.1 0.2 0.3 0 0 0 -", "3"])
