@@ -8,6 +8,7 @@ import json
 import math
 import os
 import shutil
+import stat
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -33,8 +34,12 @@ def as_data_error(error: OSError, path: Path) -> DataError:
 
 
 def is_special(path: Path) -> bool:
-    """Whether it is a pipe, a socket or a device: reading one may never end."""
-    return path.exists() and not path.is_file() and not path.is_dir()
+    """Whether it is a pipe, a socket or a device: reading one may never end. Never raises."""
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):  # missing, or a name that no file can have: for whoever opens it to say
+        return False
+    return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
 
 
 def refuse_special(path: Path) -> None:

@@ -53,7 +53,7 @@ def _refuse_impossible_values(path: Path, value: object) -> None:
         if isinstance(item, Mapping):
             waiting += [(part, (*place, key)) for key, part in item.items()]
             waiting += [(key, place) for key in item]  # last, so looked at before they name places
-        elif isinstance(item, list):
+        elif isinstance(item, list | tuple):  # a tuple is a key
             waiting += [(part, (*place, index)) for index, part in enumerate(item)]
         elif isinstance(item, str) and ("\0" in item or not _is_unicode(item)):
             raise _impossible(path, place, f"holds a text with impossible characters ({item[:60]!r})")

@@ -324,6 +324,7 @@ HUGE = "0x" + "f" * 5000  # Python refuses to print it
         ("start: 1700000000.0", "start: .nan", "frame_times.start"),
         ("schema: 1", f"schema: {HUGE}", "schema"),
         ("fps: 30", f"fps: {HUGE}", "frame_times.fps"),
+        ("schema: 1", f"schema: 1\n? [{HUGE}]\n: 1", "an integer of about 6000 digits"),
         ("schema: 1", f"schema: 1\nname: {HUGE}", "name"),
         ("schema: 1", f"schema: 1\n? {HUGE}\n: 1", "an integer of about 6000 digits"),
         ("path: k.json", f"path: k.json, first_frame: {10**30}", "keypoints.first_frame"),

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.session.errors import DataError
-from pipelines.session.storage import as_data_error, refuse_special
+from pipelines.session.storage import as_data_error, is_special, refuse_special
 
 LONGEST_HEADER = 64 * 1024
 
@@ -30,7 +30,7 @@ def read_bytes(path: Path) -> bytes:
 
 def first_bytes(path: Path, count: int = LONGEST_HEADER) -> bytes:
     """The beginning of a file, for recognising it; empty when it cannot be read. Never raises."""
-    if not path.is_file():
+    if is_special(path):
         return b""
     try:
         with path.open("rb") as file:

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float
-from pipelines.session.storage import refuse_special
+from pipelines.session.storage import is_special, refuse_special
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -41,7 +41,7 @@ def read_text(path: Path) -> str:
 
 def read_head(path: Path) -> str:
     """The first lines of a file, for recognising it; empty when it cannot be read. Never raises."""
-    if not path.is_file():
+    if is_special(path):
         return ""
     try:
         with path.open("rb") as file:

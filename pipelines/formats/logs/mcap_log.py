@@ -23,6 +23,7 @@ from pipelines.formats.logs.message_decoders import Schema, ros2_name
 from pipelines.formats.logs.recordings import Channel, OpenLog, describe_log, open_file, open_parts
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64
+from pipelines.session.storage import is_special
 
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _STATISTICS = 2, 3, 4, 5, 6, 7, 11
@@ -49,7 +50,7 @@ class McapLog:
 
     def recognises(self, path: Path) -> bool:
         """Whether the file begins as MCAP does, or is an empty one."""
-        if not path.is_file():
+        if is_special(path):
             return False
         try:
             with path.open("rb") as file:

@@ -20,6 +20,7 @@ from pipelines.formats.logs.message_decoders import Schema, ros2_name
 from pipelines.formats.logs.recordings import Channel, OpenLog, describe_log, open_file, open_parts
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64
+from pipelines.session.storage import is_special
 
 _MAGIC = re.compile(rb"#ROSBAG V(\d+)\.(\d+)\n")
 _MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
@@ -41,7 +42,7 @@ class Ros1Bag:
 
     def recognises(self, path: Path) -> bool:
         """Whether the file begins as a bag does, or is an empty one."""
-        if not path.is_file():
+        if is_special(path):
             return False
         try:
             with path.open("rb") as file:

@@ -26,6 +26,7 @@ from pipelines.formats.logs.recordings import (
 )
 from pipelines.formats.logs.ros2_sqlite3 import MAGIC, Sqlite3Part, has_bag_tables
 from pipelines.session.errors import DataError
+from pipelines.session.storage import is_special
 from pipelines.session.yaml_reading import plain_yaml
 
 _INFORMATION = "rosbag2_bagfile_information"
@@ -45,7 +46,7 @@ class Ros2Bag:
         try:
             if path.is_dir():
                 return _states_a_bag(path / "metadata.yaml") or _is_one_bag(_storage_files(path))
-            if not path.is_file():
+            if is_special(path):
                 return False
             with path.open("rb") as file:
                 head = file.read(len(MAGIC))
