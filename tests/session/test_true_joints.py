@@ -85,3 +85,12 @@ def test_regular_samples_of_which_some_are_missing_are_never_bridged(seed: int, 
 def test_a_single_sample_is_known_at_its_own_time_alone() -> None:
     t_ns = np.array([10 * MS])
     np.testing.assert_array_equal(known_at(t_ns, np.array([9, 10, 11]) * MS), [False, True, False])
+
+
+@pytest.mark.parametrize(
+    "shutters_ms", [[0.0], [0.0, 9.8], [0.0, 0.3], [0.0, 4.0, 7.0], [0.0, 6.0, 13.0, 19.5]]
+)
+def test_the_moments_of_several_cameras_are_all_known(shutters_ms: list[float]) -> None:
+    frames = np.arange(50, dtype=np.int64) * 40 * MS
+    stamps = np.sort(np.concatenate([frames + round(ms * MS) for ms in shutters_ms]))
+    assert known_at(stamps, np.arange(stamps[0], stamps[-1], 1_000_003)).all()
