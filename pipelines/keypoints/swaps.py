@@ -3,14 +3,18 @@
 An exchange makes two joints jump by their distance, there and, when it ends, back. Two hypotheses at each
 picture, exchanged or not, are weighed by how well every joint goes on as it moved: Viterbi's shortest path
 over the errors of prediction at constant velocity. First for the arms and for the legs, then for the face,
-which goes with them where both were exchanged, then for each pair of joints. Which of
+which goes with them where both were exchanged, then for hands, feet and each other pair of joints. Which of
 the two sides is the right one is the majority's word: an exchange in most pictures cannot be seen here.
+
+Exchanges often begin or end where legs cross in the picture. Nothing jumps there, and detectors place
+joints that hide each other badly for some pictures. What happens at a crossing therefore decides nothing: a
+jump at one end is needed, and of the crossings before and behind it, the nearer one is the other end.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,12 +35,17 @@ _LIMBS = {
     "arms": ("shoulder", "elbow", "wrist", "pinky", "index", "thumb"),
     "legs": ("hip", "knee", "ankle", "heel", "toe"),
 }
+_PARTS = {"hand": ("wrist", "pinky", "index", "thumb"), "foot": ("ankle", "heel", "toe")}
 _CHANGE = 16.0  # what a change between the hypotheses costs: four standard deviations of one coordinate
+_HIDDEN_CHANGE = 4.0  # the same where joints cross, which is where detectors change most
 _EXCHANGED = 2.0  # what each picture costs in which left and right are exchanged: the majority is right
 _JUMP = 45.0  # what each end of an exchange must save against going on unchanged
-_CAP = 25.0  # an error of prediction counts up to five standard deviations
+_TAIL = 16.0  # variances from which on an error of prediction counts by its logarithm: limbs accelerate
 _LEAST_NOISE = 0.01  # of the body's size (median distance of joints from their middle), 4 mm
+_LONGEST_S = 0.3  # the longest exchange with one visible end: walkers' legs cross every half second
 _GAP_S = 0.5  # nothing is predicted over more
+_MOST = 0.6  # of the pairs usually seen: pictures with fewer are decided by the pictures beside them
+_APART = 0.3  # of the body's size: left and right nearer to each other than this are crossing
 
 
 def undo_swaps(
@@ -52,17 +61,18 @@ def undo_swaps(
 
     Returns:
         Positions and confidences with the exchanges undone, and the number of pictures in which there was
-        one: of the `arms`, the `legs`, the `face` apart from those, and of a single pair as `knee`.
+        one: of the `arms`, the `legs`, the `face` apart from those, of a `hand` or a `foot`, and of a single
+        pair as `knee`.
         What had none is the same to the last bit.
     """
     xy, confidence = xy.copy(), confidence.copy()
     pairs = {name.removeprefix("left_"): pair for name, pair in mirrored_pairs(joints).items()}
     limbs = limb_pairs(joints)
-    least_noise = _LEAST_NOISE * _body_size(xy)
+    size = _body_size(xy)
     counts: Counter[str] = Counter()
 
     def undo(name: str, group: Sequence[Pair]) -> Bools:
-        exchanged = exchanged_pictures(t_s, xy, group, least_noise=least_noise)
+        exchanged = exchanged_pictures(t_s, xy, group, size=size)
         exchange(xy, exchanged, group)
         exchange(confidence, exchanged, group)
         counts[name] += int(exchanged.sum())
@@ -73,8 +83,8 @@ def undo_swaps(
     exchange(xy, both, limbs["face"])
     exchange(confidence, both, limbs["face"])
     undo("face", limbs["face"])
-    for name, pair in pairs.items():
-        undo(name, [pair])
+    for name, group in _parts(pairs).items():
+        undo(name, group)
     return xy, confidence, dict(+counts)
 
 
@@ -117,50 +127,89 @@ def limb_pairs(joints: Sequence[str]) -> dict[str, list[Pair]]:
     }
 
 
+def _parts(pairs: Mapping[str, Pair]) -> dict[str, list[Pair]]:
+    """Group the pairs that detectors exchange together within a limb; every other pair stands alone."""
+    groups = {
+        part: [name for name in pairs if any(own in name for own in names)] for part, names in _PARTS.items()
+    }
+    grouped = {part: names for part, names in groups.items() if len(names) > 1}
+    alone = [name for name in pairs if not any(name in names for names in grouped.values())]
+    return {name: [pairs[name]] for name in alone} | {
+        part: [pairs[name] for name in names] for part, names in grouped.items()
+    }
+
+
 def exchange(values: Float, where: Bools, pairs: Sequence[Pair]) -> None:
     """Exchange, in place, the two columns of each pair in some rows of values [T, J, ...]."""
     for left, right in pairs:
         values[where, left], values[where, right] = values[where, right], values[where, left]
 
 
-def exchanged_pictures(t_s: Float, xy: Float, pairs: Sequence[Pair], *, least_noise: float) -> Bools:
-    """In which pictures [T] some pairs of joints, all together, are more likely exchanged than not."""
+def exchanged_pictures(t_s: Float, xy: Float, pairs: Sequence[Pair], *, size: float) -> Bools:
+    """Find the pictures [T] in which pairs of joints, all together, are more likely exchanged than not.
+
+    Args:
+        t_s: [T] seconds.
+        xy: [T, J, 2].
+        pairs: columns of left and right joints.
+        size: of the body, in the unit of `xy`.
+    """
     left, right = (xy[:, [pair[side] for pair in pairs]] for side in (0, 1))
-    (rows,) = np.nonzero(np.isfinite(left).all(-1).any(-1) | np.isfinite(right).all(-1).any(-1))
+    seen = (np.isfinite(left) & np.isfinite(right)).all(-1).sum(-1)
+    # In a picture with few of the joints the others would jump unseen: nothing predicts them in the next one.
+    usual = np.median(seen[seen > 0]) if seen.any() else 0.0
+    (rows,) = np.nonzero((seen > 0) & (seen >= _MOST * usual))
     exchanged = np.zeros(len(t_s), dtype=np.bool_)
     if len(rows) < 3:
         return exchanged
-    cost, linked, noise = _costs(t_s[rows], left[rows], right[rows], least_noise)
-    path = _shortest_path(cost, linked, _CHANGE, _EXCHANGED)
-    apart2 = np.nansum(((left - right)[rows] ** 2).sum(-1), axis=-1)
-    exchanged[rows] = _with_visible_ends(path, linked, apart2 > VISIBLE * noise**2, cost)
+    t_s, left, right = t_s[rows], left[rows], right[rows]
+    cost, linked, noise = _costs(t_s, left, right, _LEAST_NOISE * size)
+    distance2 = ((left - right) ** 2).sum(-1)
+    least2 = (_APART * size) ** 2
+    # Neither hypothesis may gain by a prediction from or of a pair that is crossing.
+    apart = distance2 > least2
+    predictable = apart & np.roll(apart, 1, axis=0) & np.roll(apart, 2, axis=0)
+    undecided = cost.min(axis=(1, 2, 3), keepdims=True)
+    total = np.where(predictable[:, None, None, None], cost, undecided).sum(-1)
+    together2 = np.nansum(distance2, axis=-1)
+    visible = together2 > np.maximum(least2 * np.isfinite(distance2).sum(-1), VISIBLE * noise**2)
+    crossing = ~(visible & np.roll(visible, 1))
+    change = np.where(linked, np.where(crossing, _HIDDEN_CHANGE, _CHANGE), 0.0)
+    path = _shortest_path(total, change, _EXCHANGED)
+    kept = _with_visible_ends(t_s, path, linked, crossing, total)
+    exchanged[rows] = kept
+    for first, stop, both in zip(rows[:-1], rows[1:], kept[:-1] & kept[1:] & linked[1:], strict=True):
+        exchanged[first:stop] |= both
     return exchanged
 
 
-def _with_visible_ends(path: Bools, linked: Bools, visible: Bools, cost: Float) -> Bools:
-    """The runs of a path [R] at whose ends something jumps.
+def _with_visible_ends(t_s: Float, path: Bools, linked: Bools, crossing: Bools, cost: Float) -> Bools:
+    """Keep the runs of a path [R] that begin and end with a jump, and short ones with a single visible end.
 
-    Where legs cross, either hypothesis may go on: a run is taken for an exchange only where both of its ends
-    were seen, the joints far enough apart, and each costs much less than not to change there.
+    The path has chosen the crossing, or the end of what was seen, that makes such a run shortest. A longer
+    one is left alone: the pictures on the other side of the jump might as well be the exchanged ones.
     """
     kept = path.copy()
     edges = np.flatnonzero(np.diff(path, prepend=False, append=False))
     for first, stop in edges.reshape(-1, 2):
-        if not all(_jumps(end, path, linked, visible, cost) for end in (first, stop)):
+        visible = [0 < end < len(path) and linked[end] and not crossing[end] for end in (first, stop)]
+        jumps = [_jumps(end, path, linked, crossing, cost) for end in (first, stop)]
+        short = t_s[stop - 1] - t_s[first] < _LONGEST_S
+        if not (all(jumps) or (any(jumps) and jumps == visible and short)):
             kept[first:stop] = False
     return kept
 
 
-def _jumps(end: int, path: Bools, linked: Bools, visible: Bools, cost: Float) -> bool:
-    """Whether the change before row `end` was seen as a jump; at the ends of what was seen none was."""
-    if not 0 < end < len(path) or not linked[end]:
+def _jumps(end: int, path: Bools, linked: Bools, crossing: Bools, cost: Float) -> bool:
+    """Test if the change before row `end` was seen as a jump; at the ends of what was seen none was."""
+    if not 0 < end < len(path) or not linked[end] or crossing[end]:
         return False
     before, now = int(path[end - 1]), int(path[end])
     changed, kept = cost[end, before, before, now], cost[end, before, before, before]
     if end + 1 < len(path) and linked[end + 1]:
         changed += cost[end + 1, before, now, int(path[end + 1])]
         kept += cost[end + 1, before, before, before]
-    return bool(visible[end - 1 : end + 1].all() and kept - changed > _JUMP)
+    return bool(kept - changed > _JUMP)
 
 
 def _body_size(xy: Float) -> float:
@@ -182,10 +231,10 @@ def _costs(t_s: Float, left: Float, right: Float, least_noise: float) -> tuple[F
         least_noise: that positions have at least, in their unit.
 
     Returns:
-        Costs [R, 2, 2, 2] for the hypotheses two rows before, one before, and now: the squared errors of
-        prediction in units of their variance, summed over the joints; 0 in the first two rows and behind
-        a gap. Then [R] whether a row follows the one before, so that a change of hypothesis has its price;
-        and the noise of a coordinate.
+        Costs [R, 2, 2, 2, K] for the hypotheses two rows before, one before, and now: the squared errors of
+        prediction in units of their variance, large ones by their logarithm, of both joints of a pair; 0 in
+        the first two rows and behind a gap. Then [R] whether a row follows the one before, so that a change
+        of hypothesis has its price; and the noise of a coordinate.
     """
     step = np.diff(t_s)
     ratio = step[1:] / step[:-1]
@@ -205,15 +254,16 @@ def _costs(t_s: Float, left: Float, right: Float, least_noise: float) -> tuple[F
     usual = usual[np.isfinite(usual)]
     # The median of a chi-squared of two degrees of freedom is 2 ln 2.
     noise2 = max(float(np.median(usual)) / (2 * np.log(2)) if usual.size else 0.0, least_noise**2)
-    squares = np.minimum(error / max(noise2, np.finfo(float).tiny), _CAP)
-    return np.nansum(squares, axis=(-2, -1)), linked, float(np.sqrt(noise2))
+    squares = _TAIL * np.log1p(error / (_TAIL * max(noise2, np.finfo(float).tiny)))
+    return np.nansum(squares, axis=-2), linked, float(np.sqrt(noise2))
 
 
 @cached
-def _shortest_path(cost: Float, linked: Bools, change: float, exchanged: float) -> Bools:
-    """The hypotheses [R] of the shortest path through costs [R, 2, 2, 2] (Viterbi over pairs of rows).
+def _shortest_path(cost: Float, change: Float, exchanged: float) -> Bools:
+    """Find the hypotheses [R] of the shortest path through costs [R, 2, 2, 2] (Viterbi over pairs of rows).
 
-    Of equally short ones that which is longer not exchanged.
+    A change before a row costs `change` [R], an exchanged row `exchanged`. Of equally short ones that which
+    is longer not exchanged.
     """
     rows = len(cost)
     length = np.empty((2, 2))  # by the hypotheses of the last row and of this one
@@ -221,15 +271,15 @@ def _shortest_path(cost: Float, linked: Bools, change: float, exchanged: float) 
     for last in range(2):
         for now in range(2):
             length[last, now] = exchanged * (last + now)
-            if linked[1] and last != now:
-                length[last, now] += change
+            if last != now:
+                length[last, now] += change[1]
     for row in range(2, rows):
         longer = np.empty((2, 2))
         for last in range(2):
             for now in range(2):
                 price = exchanged * now
-                if linked[row] and last != now:
-                    price += change
+                if last != now:
+                    price += change[row]
                 first = length[0, last] + cost[row, 0, last, now]
                 second = length[1, last] + cost[row, 1, last, now]
                 came[row, last, now] = 1 if second < first else 0

@@ -3,33 +3,58 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipelines.session.registries import find_detector
+from pipelines.session.storage import read_json
+from pipelines.session.tables import SKELETON, TRUTH, read_table
+from pipelines.session.tabular import motion_from
+from pipelines.session.true_joints import true_joints_at
 from tests.commands.runner import mocap_process, succeeds
 
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "mound_walk"
+LEGS = ("left_knee", "right_knee", "left_ankle", "right_ankle")
 
 
 @pytest.mark.slow
 def test_the_detector_and_true_poses_give_the_skeleton(tmp_path: Path) -> None:
     """At most 45 mm at 95 %: about half is what the detector means by hips and shoulders."""
+    session = reconstructed(tmp_path, "--every", "6")
+    metrics: dict[str, Any] = read_json(session / "reconstruct" / "metrics.json")
+    assert metrics["mpjpe_mm"] < 45
+    assert metrics["reconstructed_share"] > 0.95
+
+
+@pytest.mark.slow
+def test_no_leg_is_taken_for_the_other(tmp_path: Path) -> None:
+    """Seen from the side, BlazePose takes one for the other in 8 of the first 110 pictures of drone1.
+
+    A foot is then 0.3 to 0.6 m from truth; the detector's other errors stay below that.
+    """
+    session = reconstructed(tmp_path, "--end", "3.6")
+    skeleton = motion_from(read_table(session / "reconstruct" / "skeleton.parquet", SKELETON), LEGS)
+    truth = motion_from(read_table(session / "truth.parquet", TRUTH), LEGS)
+    assert skeleton.status is not None
+    error_m = np.linalg.norm(skeleton.position - true_joints_at(truth, skeleton.t_ns), axis=-1)
+    measured = skeleton.status == "ok"
+    assert measured.sum() > 400
+    assert (measured & (error_m > 0.3)).sum() <= 2
+
+
+def reconstructed(folder: Path, *options: str) -> Path:
+    """Ingest the sample with its true poses, and reconstruct it with the real detector."""
     if None in find_detector("blazepose").models().values():
         fetched = mocap_process("models", "fetch", "blazepose", timeout=300)
         if fetched.returncode:
             pytest.skip(f"the detector's networks cannot be fetched here: {fetched.stderr.strip()}")
-    shutil.copytree(SAMPLE, tmp_path / "flight")
-    session = tmp_path / "flight" / "true_poses.session"
-    succeeds("ingest", tmp_path / "flight" / "true_poses.yaml")
-    metrics: dict[str, Any] = json.loads(
-        succeeds("reconstruct", session, "--every", "6", "--workers", "2", "--json")
-    )
-    assert metrics["mpjpe_mm"] < 45
-    assert metrics["reconstructed_share"] > 0.95
+    session = folder / "true_poses.session"
+    succeeds("ingest", SAMPLE / "true_poses.yaml", "-o", session)
+    succeeds("reconstruct", session, *options, "--workers", "2")
+    return session
 
 
 @pytest.mark.slow

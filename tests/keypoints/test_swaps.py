@@ -70,18 +70,28 @@ def test_exchanges_are_undone(what: str, longest: int, turn_deg: float) -> None:
     # An end of a run makes the two joints of a pair jump by their distance, which adds g = 2 / 3 of the
     # pairs' squared distances, in variances of a coordinate, to the wrong path, with a deviation of
     # 2 sqrt(g). It is seen above the price of a change, 16.5: with four deviations on top from g = 94 on,
-    # 141 of those variances, in each limb and on both sides of both ends.
+    # 141 of those variances, in each limb and on both sides of both ends. Pairs nearer to each other than 0.3
+    # of the body's size, 36 px, may be crossing, and jumps count where two of three pairs do not: with the
+    # noise of a distance on top from 11 + 4 px on, in two pictures on either side, which predictions take.
     distance2 = np.min([squared_distance(truth, limb) for limb in limbs], axis=0)
+    without_noise = pixels(turn_deg, noise_px=0.0)
+    pairs_apart = np.min(
+        [
+            np.sum([squared_distance(without_noise, [pair]) > 15**2 for pair in limb], axis=0)
+            for limb in limbs
+        ],
+        axis=0,
+    )
     visible = swapped.copy()
     for first, stop in np.flatnonzero(np.diff(swapped, prepend=False, append=False)).reshape(-1, 2):
-        ends = [first - 1, first, stop - 1, stop]
-        visible[first:stop] = distance2[ends].min() > 141 * NOISE_PX**2
-    assert visible.sum() > 0.5 * swapped.sum()
+        ends = np.r_[first - 2 : first + 2, stop - 2 : stop + 2]
+        visible[first:stop] = distance2[ends].min() > 141 * NOISE_PX**2 and pairs_apart[ends].min() >= 2
+    assert visible.sum() > 0.15 * swapped.sum()
     columns = [side for pair in group for side in pair]
     restored = (found[:, columns] == truth[:, columns]).all(axis=(1, 2))
     assert restored[visible].mean() >= 0.95
-    # The others stay.
-    assert restored[~swapped].mean() >= 0.99
+    # The others stay, but for those up to a crossing that are fewer than the exchanged ones beyond it.
+    assert restored[~swapped].mean() >= 0.98
     assert sum(counts.values()) >= 0.9 * visible.sum()
 
 
@@ -123,3 +133,64 @@ def runs(count: int, longest: int, rng: np.random.Generator) -> np.ndarray[tuple
         first = int(rng.integers(3, count - longest - 3))
         where[first : first + int(rng.integers(1, longest + 1))] = True
     return where
+
+
+def step_sideways(crossing_s: float, step_s: float = 0.5, seconds: float = 4.0) -> tuple[Float, Float]:
+    """Knees and feet of a walker seen from the side at 30 Hz: [T] s and [T, 17, 2] px, without noise.
+
+    Left and right swing against each other by 25 px and cross every half second, one time at `crossing_s`.
+    Where they are nearer than 12 px, one hides the other, and detectors find both in the middle.
+    """
+    t_s = np.arange(round(seconds * FPS)) / FPS
+    swing = np.sin(np.pi * (t_s - crossing_s) / step_s)
+    xy = np.zeros((len(t_s), 17, 2))
+    xy[..., 0] = 640.0
+    xy[..., 1] = 250.0 + 10.0 * np.arange(17)
+    for part, share in (("hip", 0.0), ("knee", 0.6), ("ankle", 1.0)):
+        left, right = PAIRS[f"left_{part}"]
+        aside = np.where(np.abs(50.0 * share * swing) < 12.0, 0.0, 25.0 * share * swing)
+        xy[:, left, 0] += aside
+        xy[:, right, 0] -= aside
+    return t_s, xy
+
+
+@pytest.mark.parametrize("behind", [False, True])
+@pytest.mark.parametrize("pictures", [2, 3, 4, 5])
+def test_an_exchange_from_or_to_a_crossing_is_undone_and_no_other_picture_is_exchanged(
+    pictures: int, behind: bool
+) -> None:
+    """Detectors take legs for each other up to where they cross: only the other end jumps.
+
+    The exchange lasts less than half of the 15 pictures between two crossings. To exchange the rest of these
+    instead would make the same jump vanish.
+    """
+    t_s, truth = step_sideways(crossing_s=2.0 + 0.5 / FPS)
+    truth += np.random.default_rng(4).normal(0.0, 0.5, truth.shape)
+    rows = slice(61, 61 + pictures) if behind else slice(60 - pictures + 1, 61)
+    xy = truth.copy()
+    swapped = np.zeros(len(t_s), np.bool_)
+    swapped[rows] = True
+    exchange(xy, swapped, LEGS[1:])
+
+    found, _, _ = undo_swaps(t_s, xy, np.ones(xy.shape[:2]), COCO17)
+
+    feet = list(PAIRS["left_ankle"])
+    off_px = np.abs(found[:, feet] - truth[:, feet]).max(axis=(1, 2))
+    apart_px = np.abs(truth[:, feet[0], 0] - truth[:, feet[1], 0])
+    assert (off_px[~swapped] == 0).all()
+    assert (off_px[swapped & (apart_px > 15)] == 0).all()
+
+
+def test_a_picture_that_misses_most_joints_hides_no_jump() -> None:
+    t_s, truth = step_sideways(crossing_s=2.0)
+    truth += np.random.default_rng(5).normal(0.0, 0.5, truth.shape)
+    xy = truth.copy()
+    swapped = np.zeros(len(t_s), np.bool_)
+    swapped[66:69] = True
+    exchange(xy, swapped, LEGS[1:])
+    xy[[65, 69], PAIRS["left_ankle"][0]] = np.nan
+    xy[[65, 69], PAIRS["left_knee"][0]] = np.nan
+    found, _, _ = undo_swaps(t_s, xy, np.ones(xy.shape[:2]), COCO17)
+    legs = np.ravel(LEGS[1:])
+    known = np.isfinite(xy[:, legs]).all(axis=(1, 2))
+    np.testing.assert_array_equal(found[known][:, legs], truth[known][:, legs])
