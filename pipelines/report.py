@@ -47,7 +47,7 @@ from pipelines.simulation.study.settings import command_of
 if TYPE_CHECKING:
     import pandas as pd
 
-REPORT = Stage("report", revision=8)
+REPORT = Stage("report", revision=9)
 _FIGURES_REVISION = 3
 
 

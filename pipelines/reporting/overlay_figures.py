@@ -60,7 +60,12 @@ def _moment(k: int, moment: Moment) -> Plate:
         "Lines: the skeleton reprojected, left limbs in blue, right limbs in orange. Rings: what the "
         "detector found; crosses: found, but not reconstructed, in red where the views disagreed."
     )
-    caption += " The moment with the largest reprojection error." if moment.worst else ""
+    if moment.worst and moment.error_mm is not None:
+        caption += (
+            f" The moment of the largest error of a joint: {quantity(moment.error_mm, 'mm', 0)} from truth."
+        )
+    elif moment.worst:
+        caption += " The moment with the largest reprojection error."
     told = listing(f"{view.camera} {quantity(view.median_px, 'px')}" for view in moment.views)
     numbers = {"": stacked([_numbers(view) for view in moment.views])}
     return Plate(f"overlay-{k}", title, caption, f"Median reprojection error: {told}.", figure, numbers)

@@ -1,8 +1,9 @@
 """The skeleton put back into the pictures: what was found in them, and where its joints would be seen.
 
-A few moments, spread over the flight; the one where the views disagree most is always among them. Each
-camera shows its own frame nearest to the moment, with the skeleton and the logged pose interpolated to
-the time of that frame. `views_of` does the same for any stretch of a camera's frames.
+A few moments, spread over the flight; the worst is always among them: that of the largest error where
+truth is known, else the one where the views disagree most. Each camera shows its own frame nearest to the
+moment, with the skeleton and the logged pose interpolated to the time of that frame. `views_of` does the
+same for any stretch of a camera's frames.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ ReadFrame = Callable[[str, int], Picture | None]
 
 MOMENTS = 6
 _LONGEST_STEP = 1.5  # usual steps: the skeleton is not interpolated between times further apart
+_SAME_ERROR_MM = 1.0  # among times with as large an error the views decide which is the worst
 _STEP = 1e-4  # of a joint's depth: small against how lenses bend, large against rounding
 _SAME_PERSON = 0.5  # of a body's size in the picture: a detection further away is somebody else
 
@@ -79,6 +81,7 @@ class Moment:
 
     t_s: float
     worst: bool
+    error_mm: float | None  # the largest of a measured joint, where truth is known
     views: tuple[View, ...]
     without_frame: tuple[str, ...]
 
@@ -99,7 +102,7 @@ def collect_moments(
     cameras = [_camera(row, content, summary) for row in summary.cameras if row.name in content.keypoints]
     if not cameras:
         return ()
-    chosen, worst = choose_moments(motion)
+    chosen, worst = choose_moments(motion, summary.errors_mm)
     moments = []
     for row in chosen:
         t_ns = int(motion.t_ns[row])
@@ -108,6 +111,7 @@ def collect_moments(
             Moment(
                 t_s=(t_ns - summary.origin_ns) / 1e9,
                 worst=row == worst,
+                error_mm=_largest_mm(summary.errors_mm, row),
                 views=tuple(
                     _view(camera, at, motion, row, summary.origin_ns, read_frame)
                     for camera, at in frames
@@ -119,19 +123,34 @@ def collect_moments(
     return tuple(moments)
 
 
-def choose_moments(motion: Motion) -> tuple[list[int], int]:
-    """Rows of the motion to look at, in order, and which of them is the worst.
+def _largest_mm(error_mm: Float | None, row: int) -> float | None:
+    known = np.empty(0) if error_mm is None else error_mm[row][np.isfinite(error_mm[row])]
+    return float(known.max()) if known.size else None
 
-    Each of `MOMENTS` equal stretches gives one: the stretch with the largest median reprojection error
-    gives that time, every other the time with the most joints, nearest its middle. The worst is sought
-    where at least half of the most joints were measured, just before and after as well: one joint gone
-    astray does not make a moment.
+
+def choose_moments(motion: Motion, error_mm: Float | None = None) -> tuple[list[int], int]:
+    """Choose rows of the motion to look at, in order, and the worst of them.
+
+    Each of `MOMENTS` equal stretches gives one: the stretch with the worst time gives that, every other the
+    time with the most joints, nearest its middle. Where truth is known, the worst is the time of the largest
+    error of a measured joint: views may agree on legs that were taken for each other. Without truth it is the
+    time with the largest median reprojection error, where at least half of the most joints were measured,
+    just before and after as well: one joint gone astray does not make a moment.
+
+    Args:
+        motion: the skeleton.
+        error_mm: [T, P, J] its distance from truth; None where there is none.
     """
     count = motion.measured.sum(axis=(1, 2))
     around = np.concatenate([count[:1], count, count[-1:]])
     steady = np.minimum(np.minimum(around[:-2], around[2:]), count)
     error = _row_median(np.where(motion.measured, motion.reprojection_px, np.nan).reshape(len(count), -1))
     eligible = np.isfinite(error) & (steady >= steady.max() / 2)
+    if error_mm is not None and np.isfinite(error_mm).any():
+        largest = np.nan_to_num(error_mm, nan=-np.inf).max(axis=(1, 2))
+        as_large = largest > largest.max() - _SAME_ERROR_MM
+        eligible = eligible & as_large if (eligible & as_large).any() else as_large
+        error = np.nan_to_num(error)
     worst = int(np.argmax(np.where(eligible, error, -1.0) if eligible.any() else count))
     chosen = []
     for rows in np.array_split(np.arange(len(count)), min(MOMENTS, len(count))):

@@ -28,6 +28,8 @@ NOTABLE_LOSS = 0.01
 ODD_CAMERA = 2.0
 # A calibrated 95 % ellipsoid holds 95 % of the truths; outside these shares the page says so.
 BELIEVABLE_SHARES = (0.90, 0.99)
+# Measured joints further from truth than this are named among the doubts, however few.
+LARGE_ERROR_MM = 300.0
 # Root-relative error below this part of the absolute one: the cameras' poses carry most of the error.
 MOSTLY_SHARED = 0.6
 
@@ -157,6 +159,28 @@ def _odd_cameras(summary: Summary) -> list[str]:
     ]
 
 
+def _large_errors(summary: Summary) -> list[str]:
+    """State how many measured joint-frames are far from truth, which joints those are and when."""
+    if summary.motion is None or summary.errors_mm is None:
+        return []
+    large = np.nan_to_num(summary.errors_mm) > LARGE_ERROR_MM
+    if not large.any():
+        return []
+    count = large.sum(axis=(0, 1))
+    most = [joint_label(summary.motion.joints[j]) for j in np.argsort(-count, kind="stable")[:4] if count[j]]
+    t_s = (summary.motion.t_ns[large.any(axis=(1, 2))] - summary.origin_ns) / 1e9
+    when = (
+        f"at {quantity(t_s[0], 's', 2)}"
+        if len(t_s) == 1
+        else (f"at {plural(len(t_s), 'time')} from {quantity(t_s[0], 's', 2)} to {quantity(t_s[-1], 's', 2)}")
+    )
+    least, largest = quantity(LARGE_ERROR_MM, "mm", 0), quantity(float(np.nanmax(summary.errors_mm)), "mm", 0)
+    return [
+        f"Errors of more than {least} in {plural(int(large.sum()), 'joint-frame')} called measured (ok), "
+        f"up to {largest}, {when}; most often of the {listing(most)}."
+    ]
+
+
 def _doubts(content: SessionContent, summary: Summary) -> list[str]:
     doubts = []
     losses = sorted(((n, word) for word, n in summary.counts.items() if word != "ok"), reverse=True)
@@ -178,6 +202,7 @@ def _doubts(content: SessionContent, summary: Summary) -> list[str]:
         and (missed := camera.entry.keypoints.frames_without_person)
         >= NOTABLE_LOSS * (count := camera.entry.frames.count)
     ]
+    doubts += _large_errors(summary)
     doubts += _odd_cameras(summary)
     doubts += [f"What {stage} was made of has changed since: run it again." for stage in content.outdated]
     doubts += summary.description.warnings

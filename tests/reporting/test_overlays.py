@@ -153,6 +153,18 @@ def test_one_joint_gone_astray_makes_no_worst_moment() -> None:
     assert worst != 433
 
 
+def test_the_worst_moment_is_that_of_the_largest_error_where_truth_is_known() -> None:
+    """The views agree worst at 433 and well at 100, where a leg lies 600 mm from truth."""
+    motion = motion_from_skeleton(_with_error(433, list(JOINTS), 80.0))
+    error_mm = np.where(motion.measured, 20.0, np.nan)
+    row, person, joint = np.argwhere(motion.measured[100:101])[0] + (100, 0, 0)
+    error_mm[row, person, joint] = 600.0
+    chosen, worst = choose_moments(motion, error_mm)
+    assert worst == 100
+    assert 100 in chosen
+    assert choose_moments(motion, np.full_like(error_mm, np.nan))[1] == 433
+
+
 def test_no_moment_is_empty(content: SessionContent) -> None:
     assert content.skeleton is not None
     motion = motion_from_skeleton(content.skeleton)

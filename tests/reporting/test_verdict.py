@@ -65,6 +65,19 @@ def test_optimistic_covariance_is_called_so(content: SessionContent) -> None:
     assert "too small: do not rely on it" in said
 
 
+def test_joints_far_from_truth_are_doubtful_however_few(content: SessionContent) -> None:
+    assert content.skeleton is not None
+    assert "called measured (ok), up to" not in _said(content)
+    skeleton = content.skeleton.copy()
+    at = np.unique(skeleton["t_ns"])[[60, 90]]
+    rows = skeleton["t_ns"].isin(at) & (skeleton["joint"] == "left_knee") & (skeleton["status"] == "ok")
+    assert rows.sum() == 2
+    skeleton.loc[rows, "x"] += 0.5
+    said = _said(replace(content, skeleton=skeleton))
+    assert "Errors of more than 300 mm in 2 joint-frames called measured (ok), up to 5" in said
+    assert "at 2 times from 2.00 s to 3.00 s; most often of the left knee." in said
+
+
 @pytest.mark.parametrize(
     ("word", "reason", "remedy"),
     [
@@ -115,7 +128,7 @@ def test_no_warnings_no_doubts(content: SessionContent) -> None:
     session["cameras"] = {"drone1": cameras["drone1"]}
     skeleton = make_skeleton(20)
     complete = skeleton.assign(status="ok", x=1.0, y=2.0, z=0.5)
-    quiet = replace(content, session=described(session), skeleton=complete, stages={})
+    quiet = replace(content, session=described(session), skeleton=complete, truth=None, stages={})
     verdict = give_verdict(quiet, summarise(quiet))
     assert verdict.lead.startswith("All of the motion was reconstructed: 100")
     assert verdict.doubts == ()
