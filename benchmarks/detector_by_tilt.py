@@ -1,12 +1,12 @@
-"""How well the keypoint detector sees people from above: errors by tilt, on rendered flights.
+"""How well a keypoint detector sees people from above: errors by tilt, on rendered flights.
 
-python -m benchmarks.detector_by_tilt [--folder FOLDER] [--write]
+python -m benchmarks.detector_by_tilt [--detectors NAME ...] [--folder FOLDER] [--write]
 
 For every tilt four people walk on level ground while a drone circles each of them once at 10 m, filming
 1280x720 with a field of view of 80 degrees. The flights go through `mocap simulate`, `ingest` and the
 detection of `reconstruct`, as a user's would. The pictures are rendered; the detector is real. `--write`
-makes the data that simulation takes its detector's errors from, and those that turn its confidences into
-probabilities.
+makes the data that simulation takes a detector's errors from, and those that turn its confidences into
+probabilities, for each detector its own.
 """
 
 from __future__ import annotations
@@ -21,18 +21,26 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.stats import rankdata
 
 from pipelines.detect import detect
 from pipelines.ingest import ingest
 from pipelines.keypoints import calibration
-from pipelines.keypoints.calibration import Calibration, fit, read_calibration, write_calibration
+from pipelines.keypoints.calibration import (
+    Calibration,
+    fit,
+    measured_for,
+    read_calibration,
+    write_calibration,
+)
 from pipelines.keypoints.swaps import undo_swaps_of_tracks
 from pipelines.session.records import Int64
+from pipelines.session.registries import find_detector
 from pipelines.session.skeletons import get_skeleton
 from pipelines.session.stages import locked
 from pipelines.session.tabular import detections_from, keypoints_table
 from pipelines.simulate import simulate
-from pipelines.simulation.detector_errors import ANY_JOINT, COLUMNS, MEASURED, view_of
+from pipelines.simulation.detector_errors import ANY_JOINT, COLUMNS, MODELLED, errors_of, view_of
 from pipelines.simulation.flight import fly_scenario
 from pipelines.simulation.observe import see
 from pipelines.simulation.scenario import read_scenario
@@ -48,7 +56,6 @@ LOOKS = (
 )
 SECONDS, RATE_HZ = 12, 10
 COMMAND = "python -m benchmarks.detector_by_tilt --write"
-CALIBRATED = Path(calibration.__file__).parent / "data" / "blazepose_confidence.csv"
 JOINTS = get_skeleton("coco17").joints
 TORSO = (JOINTS.index("left_shoulder"), JOINTS.index("right_hip"))
 PCK = 0.2  # of the torso's length in the picture
@@ -74,18 +81,26 @@ class Sightings:
 def main() -> None:
     """Simulate, detect, compare, print; write the data when asked to."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--detectors", nargs="+", choices=MODELLED, default=MODELLED)
     parser.add_argument("--folder", type=Path, help="keep the flights there")
-    parser.add_argument("--write", action="store_true", help=f"write {MEASURED.name}, {CALIBRATED.name}")
+    parser.add_argument("--write", action="store_true", help="write the data of these detectors")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.folder or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        by_tilt = {tilt: [measure(folder, tilt, k) for k in range(len(LOOKS))] for tilt in TILTS_DEG}
-    print_table(by_tilt)
-    print_swaps([flight for flights in by_tilt.values() for flight in flights])
-    if options.write:
-        write_table(by_tilt)
-        write_calibration(CALIBRATED, calibrated(by_tilt))
+        for name in options.detectors:
+            detector = find_detector(name)
+            print(f"\n{name}: {detector.title}")
+            if None in detector.models().values():
+                print(f"not measured: run `mocap models fetch {name}`")
+                continue
+            by_tilt = {t: [measure(folder, name, t, k) for k in range(len(LOOKS))] for t in TILTS_DEG}
+            print_table(by_tilt)
+            print_telling(by_tilt)
+            print_swaps([flight for flights in by_tilt.values() for flight in flights])
+            if options.write:
+                write_table(name, by_tilt)
+                write_calibration(calibration.file_of(name), calibrated(by_tilt))
 
 
 def scenario_text(tilt_deg: int, look: int) -> str:
@@ -107,15 +122,15 @@ drones:
 """
 
 
-def measure(folder: Path, tilt_deg: int, look: int) -> Sightings:
-    """Simulate one flight, run the detector on its video, compare with the truth."""
+def measure(folder: Path, detector: str, tilt_deg: int, look: int) -> Sightings:
+    """Simulate one flight, run a detector on its video, compare with the truth."""
     path = folder / f"tilt{tilt_deg}-{look}.yaml"
     path.write_text(scenario_text(tilt_deg, look), encoding="utf-8")
     flight_folder = path.with_suffix("")
     simulate(path, flight_folder, workers=2)
     session = ingest(flight_folder / "flight.yaml").folder
     with locked(session) as writable:
-        detect(writable, workers=2)
+        detect(writable, detector=detector, workers=2)
     found = pd.read_parquet(session / "detect" / "drone1" / "keypoints.parquet")
 
     scenario = read_scenario(path)
@@ -130,17 +145,20 @@ def measure(folder: Path, tilt_deg: int, look: int) -> Sightings:
         focal_px=drone.intrinsics.fx,
     )
     error, confidence = compare(found, pixels, height_px)
-    used = found[probability(found) >= USED]
+    used = found[probability(found, detector) >= USED]
     with_swaps, _ = compare(used, pixels, height_px)
     without, _ = compare(without_swaps(used, truth.t_ns), pixels, height_px)
     torso = np.sqrt(((pixels[:, TORSO[0]] - pixels[:, TORSO[1]]) ** 2).sum(axis=-1))
     return Sightings(error, height_px, torso, confidence, tilt, with_swaps, without)
 
 
-def probability(found: pd.DataFrame) -> Float:
-    """What the confidences are worth by the measurement before this one."""
+def probability(found: pd.DataFrame, detector: str) -> Float:
+    """What the confidences are worth by the measurement before this one; at the first as they are."""
     confidence = found["confidence"].to_numpy(np.float64)
-    return read_calibration(CALIBRATED).probabilities(confidence, found["joint"].to_numpy(str))
+    measured = measured_for(detector)
+    if measured is None:
+        return confidence
+    return read_calibration(measured).probabilities(confidence, found["joint"].to_numpy(str))
 
 
 def without_swaps(found: pd.DataFrame, frame_t_ns: Int64) -> pd.DataFrame:
@@ -187,6 +205,21 @@ def print_table(by_tilt: dict[int, list[Sightings]]) -> None:
         )
 
 
+def print_telling(by_tilt: dict[int, list[Sightings]]) -> None:
+    """How well the confidence tells bad keypoints from good ones: the area under the ROC curve."""
+    flights = [flight for own in by_tilt.values() for flight in own]
+    share = np.concatenate([flight.error_px / flight.height_px[:, None] for flight in flights]).ravel()
+    confidence = np.concatenate([flight.confidence for flight in flights]).ravel()
+    found = np.isfinite(share) & (confidence > 0)
+    bad = share[found] > GOOD
+    rank = rankdata(-confidence[found])
+    pairs = float(bad.sum()) * float((~bad).sum())
+    area = (rank[bad].sum() - bad.sum() * (bad.sum() + 1) / 2) / pairs
+    print(
+        f"confidence tells errors above {100 * GOOD:g} % of the height: area under the ROC curve {area:.2f}"
+    )
+
+
 def print_swaps(flights: list[Sightings]) -> None:
     """What undoing swaps does, in joints that move by more than half a pixel, and to the mean error."""
     before = np.concatenate([flight.with_swaps_px for flight in flights])
@@ -198,11 +231,12 @@ def print_swaps(flights: list[Sightings]) -> None:
     )
 
 
-def write_table(by_tilt: dict[int, list[Sightings]]) -> None:
+def write_table(detector: str, by_tilt: dict[int, list[Sightings]]) -> None:
     """The data of the simulator: every joint by itself, and all joints together."""
     lines = [line for line in (__doc__ or "").splitlines() if line and not line.startswith("python")]
-    with MEASURED.open("w", encoding="utf-8", newline="") as file:
+    with errors_of(detector).open("w", encoding="utf-8", newline="") as file:
         file.writelines(f"# {line}\n" for line in lines)
+        file.write(f"# The detector: {find_detector(detector).title}\n")
         file.write(f"# Made by: {COMMAND}\n")
         file.write(
             "# median_error_share: of the person's height f H / d. missed_share: not found, or further\n"

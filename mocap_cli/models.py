@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from mocap_cli.options import any_path, json_option
 from mocap_cli.terminal import print_json, print_table, say
 
+if TYPE_CHECKING:
+    from pipelines.session.registries import Detector
+
 
 @click.group("models", invoke_without_command=True, short_help="List and fetch keypoint detectors.")
 @json_option
 @click.pass_context
 def models_command(context: click.Context, as_json: bool) -> None:
-    """List the keypoint detectors and whether their files are here; `fetch` gets those that are missing."""
+    """List the keypoint detectors and whether their files are here; `fetch` gets those that are missing.
+
+    MPJPE is that of the sample flight with true poses, ms the networks' time for one person in one picture
+    on one thread (docs/detector.md).
+    """
     if context.invoked_subcommand is None:
         _list(as_json)
 
@@ -38,14 +46,18 @@ def _list(as_json: bool) -> None:
     if as_json:
         print_json(
             {
-                "detectors": [_listed(d.name, d.title, d.models()) for d in detectors],
+                "detectors": [_listed(d) for d in detectors],
                 "families": [{"name": f.name, "title": f.title, "usage": f.usage} for f in families],
             }
         )
         return
     print_table(
-        ("detector", "file", "where"),
-        [(d.name, file, path or "missing") for d in detectors for file, path in d.models().items()],
+        ("detector", "MPJPE mm", "ms", "file", "where"),
+        [
+            (d.name, *_figures(d).values(), file, path or "missing")
+            for d in detectors
+            for file, path in d.models().items()
+        ],
     )
     for detector in detectors:
         if None in detector.models().values():
@@ -64,7 +76,7 @@ def _list(as_json: bool) -> None:
     "--from",
     "source",
     type=any_path,
-    help="Take the files from here instead of the network: the wheel that ships them, or a folder.",
+    help="Take the files from here instead of the network: the package that ships them, or a folder.",
 )
 @json_option
 def fetch_command(name: str, source: Path | None, as_json: bool) -> None:
@@ -74,15 +86,23 @@ def fetch_command(name: str, source: Path | None, as_json: bool) -> None:
     detector = find_detector(name)
     detector.fetch(source)
     if as_json:
-        print_json(_listed(detector.name, detector.title, detector.models()))
+        print_json(_listed(detector))
         return
     for path in detector.models().values():
         say(f"ready: {path}")
 
 
-def _listed(name: str, title: str, files: dict[str, Path | None]) -> dict[str, object]:
+def _listed(detector: Detector) -> dict[str, object]:
+    files = {file: None if path is None else str(path) for file, path in detector.models().items()}
+    return {"name": detector.name, "title": detector.title, **_figures(detector), "files": files}
+
+
+def _figures(detector: Detector) -> dict[str, float | None]:
+    """The accuracy and the time of a detector; None where they were not measured."""
+    from pipelines.session.registries import MeasuredDetector
+
+    measured = detector.measured if isinstance(detector, MeasuredDetector) else None
     return {
-        "name": name,
-        "title": title,
-        "files": {file: None if path is None else str(path) for file, path in files.items()},
+        "sample_mpjpe_mm": measured and measured.sample_mpjpe_mm,
+        "person_ms": measured and measured.person_ms,
     }

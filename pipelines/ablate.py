@@ -30,10 +30,11 @@ from pipelines.session.registries import Detector, find_detector, hashes_of_mode
 from pipelines.session.side_by_side import Halt, side_by_side
 from pipelines.session.storage import hash_of, jsonable, read_json, sha256_of, write_json
 from pipelines.session.whole_folders import STUDY_MARK, is_made, refuse_sessions, whole_folder
-from pipelines.simulation.detector_errors import MEASURED
+from pipelines.simulation.detector_errors import errors_of
 from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.scenario import World
 from pipelines.simulation.study.filming import (
+    IMITATED,
     Formation,
     Sightings,
     Walk,
@@ -136,7 +137,7 @@ def _key(settings: Settings, detector: Detector | None) -> str:
     """Equal for equal results."""
     ingredients: dict[str, object] = {"revision": _REVISION, "settings": asdict(settings)}
     if detector is None:
-        ingredients["errors"] = sha256_of(MEASURED)
+        ingredients["errors"] = sha256_of(errors_of(IMITATED))
     else:
         ingredients["detector"] = detector.name
         ingredients["models"] = hashes_of_models(detector)
@@ -343,4 +344,4 @@ def _summary(settings: Settings, key: str, rows: Sequence[Row]) -> dict[str, Any
 def _keypoints(settings: Settings) -> str:
     if settings.detector is not None:
         return f"{settings.detector} on rendered pictures"
-    return "exact" if settings.keypoints == "exact" else "modelled detector"
+    return "exact" if settings.keypoints == "exact" else f"modelled after {IMITATED}"

@@ -34,7 +34,13 @@ from pipelines.session.errors import DataError
 from pipelines.session.logged_actor import logged_actor
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Detections, Float, Int64
-from pipelines.session.registries import Detector, KeypointNetworks, find_detector, hashes_of_models
+from pipelines.session.registries import (
+    Detector,
+    KeypointNetworks,
+    advice_on,
+    find_detector,
+    hashes_of_models,
+)
 from pipelines.session.side_by_side import Halt, side_by_side
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import WritableSession
@@ -143,7 +149,7 @@ def detect(
     joints = list(read_json(folders[0] / "counts.json")["joints"])
     rows = {name: list(work.span(name)) for name in media}
     warnings = _lost_pictures(counts)
-    for note in (f"keypoints detected by {chosen.title}", *warnings):
+    for note in (f"keypoints detected by {chosen.title}", *advice_on(chosen), *warnings):
         progress.note(note)
     return run.publish(
         counts={"detector": chosen.title, "joints": joints, "cameras": counts, "rows": rows},

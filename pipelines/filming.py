@@ -35,7 +35,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.logged_actor import LoggedActor, logged_actor
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Float, Int64, JointMotion
-from pipelines.session.registries import Detector, find_detector, hashes_of_models
+from pipelines.session.registries import Detector, advice_on, find_detector, hashes_of_models
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import locked
 from pipelines.session.storage import hash_of, jsonable, read_json, sha256_of, write_json
@@ -124,6 +124,8 @@ def film(
         if run.finished:
             return Filmed(folder, run.record, read_json(folder / "film" / "metrics.json"), skipped=True)
 
+        for note in advice_on(detector):
+            progress.note(note)
         flight = load_flight(
             folder,
             description,

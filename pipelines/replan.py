@@ -41,10 +41,10 @@ from pipelines.session.records import Float, JointMotion
 from pipelines.session.registries import PLANNER_ARMS
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import WritableSession, locked
-from pipelines.session.storage import jsonable, read_json, write_json
+from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import ACTOR, COST_MAP, REPLAN, SEEN, TRUTH, read_table, write_table
 from pipelines.session.tabular import motion_table
-from pipelines.simulation.detector_errors import detect_keypoints, view_of
+from pipelines.simulation.detector_errors import MODELLED, detect_keypoints, errors_of, view_of
 from pipelines.simulation.scenario import DetectorErrors
 
 if TYPE_CHECKING:
@@ -136,6 +136,7 @@ def replan(
 
         flight = load_flight(folder, description, reconstructed, pose_noise=settings.pose_noise)
         arms = _arms(folder, settings.arms, flight)
+        errors = _detector_errors(session)
         scene = build_scene(
             flight, load_maps(folder) if description.map else [], description, _rules(settings)
         )
@@ -144,14 +145,14 @@ def replan(
         progress.start("Replaying", len(arms))
         entrants, times = {}, {}
         for arm in arms:
-            made = run.chunk(arm, partial(_fly, scene, arm))
+            made = run.chunk(arm, partial(_fly, scene, errors, arm))
             entrants[arm] = _read_entrant(made)
             times[arm] = read_json(made / "times.json")
             (run.folder / arm).mkdir()
             for table in made.glob("*.parquet"):
                 shutil.copyfile(table, run.folder / arm / table.name)
             progress.advance()
-        metrics = jsonable(compare(scene, entrants))
+        metrics = jsonable(compare(scene, entrants) | {"keypoints": f"modelled after {errors.detector}"})
         write_table(run.folder / "actor.parquet", _actor_table(scene), ACTOR)
         write_table(run.folder / "cost_map.parquet", _cost_table(scene), COST_MAP)
         write_json(run.folder / "metrics.json", metrics)
@@ -173,7 +174,10 @@ def replan(
 
 
 def _inputs(session: WritableSession) -> tuple[Description, StageRecord | None, dict[str, str]]:
-    """What is read: all that was ingested, and the reconstruction where truth or actor are not known."""
+    """What is read: all that was ingested, and the reconstruction where truth or actor are not known.
+
+    Where the errors of the session's own detector were measured, its arms see with those.
+    """
     ingested = session.intact_record("ingest")
     if ingested is None:
         raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
@@ -183,7 +187,17 @@ def _inputs(session: WritableSession) -> tuple[Description, StageRecord | None, 
     reconstructed = session.intact_record("reconstruct") if needs_it else None
     if reconstructed is not None:
         inputs[_SKELETON] = reconstructed.outputs[_SKELETON]
+    errors = _detector_errors(session)
+    if errors != DetectorErrors():
+        inputs["errors of the detector"] = sha256_of(errors_of(errors.detector))
     return description, reconstructed, inputs
+
+
+def _detector_errors(session: WritableSession) -> DetectorErrors:
+    """The errors of the detector that ran on the session's pictures, if measured; else the usual ones."""
+    detected = session.record("detect")
+    name = None if detected is None else detected.settings["detector"]
+    return DetectorErrors(detector=name) if name in MODELLED else DetectorErrors()
 
 
 def _flat(settings: Settings) -> dict[str, object]:
@@ -242,20 +256,21 @@ def _detect(
     rng: np.random.Generator,
     *,
     joints: tuple[str, ...],
+    errors: DetectorErrors,
 ) -> tuple[Float, Float]:
     """The modelled detector, by tilt and distance (`measuring.Detect`)."""
     tilt_deg, height_px = view_of(camera, target, height_m=_HEIGHT_M, focal_px=focal_px)
-    return detect_keypoints(pixels, free, tilt_deg, height_px, DetectorErrors(), rng, joints=joints)
+    return detect_keypoints(pixels, free, tilt_deg, height_px, errors, rng, joints=joints)
 
 
 # --- what is stored ------------------------------------------------------------------------------------
 
 
-def _fly(scene: Scene, arm: str, folder: Path) -> None:
+def _fly(scene: Scene, errors: DetectorErrors, arm: str, folder: Path) -> None:
     """Fly and film one arm; all that the comparison needs of it goes into the folder."""
     flown = logged_arm(scene, arm) if arm in LOGGED else fly_arm(scene, PLANNER_ARMS.get(arm))
     joints = scene.flight.skeleton.joints if scene.flight.skeleton else ()
-    measured = film_arm(scene, flown, partial(_detect, joints=joints))
+    measured = film_arm(scene, flown, partial(_detect, joints=joints, errors=errors))
     write_table(folder / "trajectories.parquet", trajectories(scene, flown), REPLAN)
     np.save(folder / "known.npy", flown.known)
     facts: dict[str, object] = {

@@ -31,6 +31,7 @@ from pipelines.session.registries import PLANNER_ARMS, noise_models
 from pipelines.session.side_by_side import Halt, side_by_side
 from pipelines.session.storage import hash_of, read_json, sha256_of, write_json
 from pipelines.session.whole_folders import SIMULATION_MARK, is_made, whole_folder
+from pipelines.simulation.detector_errors import errors_of
 from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, fly_scenario
 from pipelines.simulation.flying import Known, Planner
 from pipelines.simulation.log_messages import logged_messages
@@ -138,9 +139,11 @@ def _key(scenario: Scenario, path: Path, video: bool) -> str:
     """Equal for equal flights."""
     ingredients: dict[str, object] = {
         "revision": _REVISION,
-        "scenario": scenario.model_dump(mode="json"),
+        "scenario": scenario.model_dump(mode="json", exclude={"keypoints": {"detector"}}),
         "video": video,
     }
+    if not video:
+        ingredients["errors"] = sha256_of(errors_of(scenario.keypoints.detector))
     if scenario.actor.motion.bvh is not None:
         ingredients["bvh"] = sha256_of(path.parent / scenario.actor.motion.bvh)
     return hash_of(ingredients)
@@ -298,7 +301,7 @@ def _summary(flight: SimulatedFlight, key: str, video: bool) -> dict[str, Any]:
         "simulated": True,
         "seed": scenario.seed,
         "duration_s": scenario.duration_s,
-        "pictures": "rendered video" if video else "keypoints of a modelled detector",
+        "pictures": "rendered video" if video else f"keypoints modelled after {scenario.keypoints.detector}",
         "frames": {drone.name: len(drone.at_frames.t_ns) for drone in flight.drones},
         "poses": {drone.name: len(drone.log.body.t_ns) for drone in flight.drones},
     }

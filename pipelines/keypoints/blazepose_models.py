@@ -1,19 +1,25 @@
-"""The model files of `blazepose`: where they lie, and how they come out of the wheel that ships them.
+"""The model files of BlazePose: where they lie, and how they come out of the packages that ship them.
 
-The wheel is downloaded and opened, never installed: mediapipe 0.10.21 would force an old numpy on everything.
+The packages are downloaded and opened, never installed: mediapipe 0.10.21 would force an old numpy on
+everything, and of @mediapipe/pose only one file is wanted.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
+import shutil
 import subprocess
 import sys
+import tarfile
 import tempfile
 import zipfile
 import zlib
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 from pipelines.session.errors import DataError
 from pipelines.session.storage import as_data_error, sha256_of
@@ -21,9 +27,9 @@ from pipelines.session.storage import as_data_error, sha256_of
 
 @dataclass(frozen=True)
 class ModelFile:
-    """One file that a wheel ships."""
+    """One file that a package ships."""
 
-    member: str  # its path inside the wheel
+    member: str  # its path inside the package
     size: int  # bytes
     sha256: str
 
@@ -33,17 +39,140 @@ class ModelFile:
         return self.member.rpartition("/")[2]
 
 
+class Package(Protocol):
+    """A pinned version of somebody's package that ships model files."""
+
+    @property
+    def title(self) -> str:
+        """Its name, version and kind of file, for messages."""
+
+    @property
+    def noun(self) -> str:
+        """Its kind of file."""
+
+    def download(self, folder: Path, detector: str, remedy: str) -> Path:
+        """Download it into a folder and return its path; DataError about `detector` where that fails."""
+
+    def read(self, archive: Path, files: Sequence[ModelFile]) -> dict[ModelFile, bytes]:
+        """Read files out of it, of each at most one byte more than is expected; none that is absent.
+
+        Raises:
+            OSError: it cannot be read.
+            DataError: it is damaged, or of another kind.
+        """
+
+
 @dataclass(frozen=True)
-class WheelModels:
-    """Model files that are taken out of one pinned wheel into the user's cache.
+class Wheel:
+    """A wheel, which pip downloads."""
+
+    name: str
+    version: str
+    tags: tuple[str, str, str]  # Python, ABI and platform of the wheel to take; any machine can open it
+    noun: str = "wheel"
+
+    @property
+    def title(self) -> str:
+        """Its name, version and kind of file."""
+        return f"{self.name} {self.version} wheel"
+
+    def download(self, folder: Path, detector: str, remedy: str) -> Path:
+        """Let pip download it; errors as those of `Package.download`."""
+        python, abi, platform = self.tags
+        done = _ran(
+            [
+                *(sys.executable, "-m", "pip", "download", "--quiet", "--no-input", "--no-deps"),
+                # Two attempts: without a network the user should not wait for a minute to be told so.
+                *("--disable-pip-version-check", "--retries", "1", "--only-binary", ":all:"),
+                *("--implementation", "cp", "--python-version", python, "--abi", abi),
+                *("--platform", platform, "--dest", str(folder), f"{self.name}=={self.version}"),
+            ],
+            folder,
+        )
+        wheels = sorted(folder.glob("*.whl"))
+        if done.returncode == 0 and wheels:
+            return wheels[0]
+        reason = (done.stderr.strip().splitlines() or [f"pip exited with {done.returncode}"])[-1]
+        raise _not_downloaded(detector, reason.removeprefix("ERROR: "), remedy)
+
+    def read(self, archive: Path, files: Sequence[ModelFile]) -> dict[ModelFile, bytes]:
+        """Read files out of it; see `Package.read`."""
+        contents = {}
+        try:
+            with zipfile.ZipFile(archive) as wheel:
+                there = set(wheel.namelist())
+                for file in files:
+                    if file.member in there:
+                        with wheel.open(file.member) as member:
+                            contents[file] = member.read(file.size + 1)
+        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
+            raise _not_readable(archive, self, error) from None
+        return contents
+
+
+@dataclass(frozen=True)
+class NpmPackage:
+    """A tarball, which npm downloads."""
+
+    name: str
+    version: str
+    noun: str = "tarball"
+
+    @property
+    def title(self) -> str:
+        """Its name, version and kind of file."""
+        return f"{self.name} {self.version} tarball"
+
+    def download(self, folder: Path, detector: str, remedy: str) -> Path:
+        """Let npm download it; errors as those of `Package.download`."""
+        npm = shutil.which("npm")
+        if npm is None:
+            command = f"npm pack {self.name}@{self.version}"
+            raise DataError(
+                detector,
+                f"its model file comes by npm, which is not installed here ({self.title})",
+                f"install Node.js; or run `{command}` where npm is, and here {remedy}",
+            )
+        done = _ran(
+            [
+                *(npm, "pack", f"{self.name}@{self.version}", "--ignore-scripts", "--loglevel", "error"),
+                # Two attempts, as with pip.
+                *("--fetch-retries", "1", "--fetch-retry-mintimeout", "1000"),
+            ],
+            folder,  # npm writes where it is run, and heeds the settings of a project there
+        )
+        tarballs = sorted(folder.glob("*.tgz"))
+        if done.returncode == 0 and tarballs:
+            return tarballs[0]
+        raise _not_downloaded(detector, _reason_of_npm(done), remedy)
+
+    def read(self, archive: Path, files: Sequence[ModelFile]) -> dict[ModelFile, bytes]:
+        """Read files out of it; see `Package.read`."""
+        by_member = {file.member: file for file in files}
+        contents: dict[ModelFile, bytes] = {}
+        try:
+            with tarfile.open(archive, "r|gz") as tarball:
+                for member in tarball:
+                    file = by_member.get(member.name)
+                    stream = None if file is None else tarball.extractfile(member)
+                    if file is not None and stream is not None:
+                        contents[file] = stream.read(file.size + 1)
+                    if len(contents) == len(by_member):
+                        break
+        except (tarfile.TarError, zlib.error, EOFError) as error:
+            raise _not_readable(archive, self, error) from None
+        return contents
+
+
+@dataclass(frozen=True)
+class PackagedModels:
+    """Model files that are taken out of one pinned package into the user's cache.
 
     The cache is ~/.cache/mocap/models (XDG_CACHE_HOME is respected), or the folder that MOCAP_MODELS names.
     """
 
     detector: str
-    package: str
-    version: str
-    tags: tuple[str, str, str]  # Python, ABI and platform of the wheel to take; any machine can open it
+    package: Package
     files: tuple[ModelFile, ...]
 
     @property
@@ -81,11 +210,11 @@ class WheelModels:
         """Put the files that are missing or damaged into the cache; with all in place nothing is done.
 
         Args:
-            source: the wheel, or a folder with the files anywhere inside, where they are here already;
-                otherwise pip downloads the wheel.
+            source: the package, or a folder with the files anywhere inside, where they are here already;
+                otherwise it is downloaded.
 
         Raises:
-            DataError: no network, or what was found is not what was expected.
+            DataError: no network, or what was found is not what was expected. The cache stays as it was.
         """
         wanted = [file for file in self.files if not self._is_good(file)]
         if not wanted:
@@ -93,77 +222,86 @@ class WheelModels:
         if source is not None:
             self._take(wanted, source)
             return
+        remedy = (
+            f"run `mocap models fetch {self.detector} --from PATH` with the {self.package.title} or a folder "
+            f"that holds {' and '.join(file.name for file in self.files)}"
+        )
         with tempfile.TemporaryDirectory(prefix="mocap-") as folder:
-            self._take(wanted, self._download(Path(folder)))
+            self._take(wanted, self.package.download(Path(folder), self.detector, remedy))
 
     def _is_good(self, file: ModelFile) -> bool:
         path = self.folder / file.name
         return path.is_file() and sha256_of(path) == file.sha256
 
-    def _download(self, folder: Path) -> Path:
-        python, abi, platform = self.tags
-        done = subprocess.run(  # noqa: S603  # our own arguments, no shell
-            [
-                *(sys.executable, "-m", "pip", "download", "--quiet", "--no-input", "--no-deps"),
-                # Two attempts: without a network the user should not wait for a minute to be told so.
-                *("--disable-pip-version-check", "--retries", "1", "--only-binary", ":all:"),
-                *("--implementation", "cp", "--python-version", python, "--abi", abi),
-                *("--platform", platform, "--dest", str(folder), f"{self.package}=={self.version}"),
-            ],
-            capture_output=True,
-            text=True,
-            errors="replace",
-            check=False,
-        )
-        wheels = sorted(folder.glob("*.whl"))
-        if done.returncode == 0 and wheels:
-            return wheels[0]
-        reason = (done.stderr.strip().splitlines() or [f"pip exited with {done.returncode}"])[-1]
-        raise DataError(
-            self.detector,
-            f"its model files could not be downloaded ({reason.removeprefix('ERROR: ')})",
-            f"connect to the network, or run `mocap models fetch {self.detector} --from PATH` with the "
-            f"{self.package} {self.version} wheel or a folder that holds "
-            f"{' and '.join(file.name for file in self.files)}",
-        )
-
     def _take(self, wanted: list[ModelFile], source: Path) -> None:
         try:
-            contents = {file: _content(source, file) for file in wanted}
+            contents = self._contents(source, wanted)
             self.folder.mkdir(parents=True, exist_ok=True)
             for file, content in contents.items():
                 _write(self.folder / file.name, content)
         except OSError as error:
             raise as_data_error(error, source) from error
 
+    def _contents(self, source: Path, files: Sequence[ModelFile]) -> dict[ModelFile, bytes]:
+        """The contents of files, from a folder or out of the package, proven to be those expected."""
+        noun = self.package.noun
+        if source.is_dir():
+            paths = {file: path for file in files if (path := find_file(source, file.name)) is not None}
+            contents = {file: _beginning(path, file.size + 1) for file, path in paths.items()}
+            missing = [file.name for file in files if file not in contents]
+            remedy = f"give the folder that does, or the {noun}"
+        else:
+            paths = dict.fromkeys(files, source)
+            contents = self.package.read(source, files)
+            missing = [file.member for file in files if file not in contents]
+            remedy = f"give the {noun} that does"
+        if missing:
+            raise DataError(source, f"holds no {missing[0]}", remedy)
+        for file, content in contents.items():
+            if (found := hashlib.sha256(content).hexdigest()) != file.sha256:
+                size = (
+                    f"{len(content)} bytes" if len(content) <= file.size else f"more than {file.size} bytes"
+                )
+                raise DataError(
+                    paths[file],
+                    f"its {file.name} is not the one that was expected (SHA-256 {found[:8]}... of {size}, "
+                    f"not {file.sha256[:8]}... of {file.size})",
+                    "give the one of the version that was asked for",
+                )
+        return contents
 
-def _content(source: Path, file: ModelFile) -> bytes:
-    """The content of a file, from a folder or out of a wheel, proven to be the one expected."""
-    # One byte more than expected is enough to see that it is another file, however large that is.
-    limit = file.size + 1
-    if source.is_dir():
-        path = next(iter(sorted(source.rglob(file.name))), None)
-        if path is None:
-            raise DataError(source, f"holds no {file.name}", "give the folder that does, or the wheel")
-        with path.open("rb") as stream:
-            content = stream.read(limit)
-    else:
-        path = source
-        try:
-            with zipfile.ZipFile(source) as wheel, wheel.open(file.member) as member:
-                content = member.read(limit)
-        except KeyError:
-            raise DataError(source, f"holds no {file.member}", "give the wheel that does") from None
-        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as error:
-            raise DataError(source, f"is no readable wheel ({error})", "download it again") from None
-    if (found := hashlib.sha256(content).hexdigest()) != file.sha256:
-        raise DataError(
-            path,
-            f"its {file.name} is not the one that was expected "
-            f"(SHA-256 {found[:8]}..., not {file.sha256[:8]}...)",
-            "give the one of the version that was asked for",
-        )
-    return content
+
+def find_file(folder: Path, name: str) -> Path | None:
+    """The first file of that name anywhere in a folder; None where there is none."""
+    return next(iter(sorted(folder.rglob(name))), None)
+
+
+def _beginning(path: Path, count: int) -> bytes:
+    with path.open("rb") as stream:
+        return stream.read(count)
+
+
+def _ran(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(  # noqa: S603  # our own arguments, no shell
+        command, cwd=folder, capture_output=True, text=True, errors="replace", check=False
+    )
+
+
+def _reason_of_npm(done: subprocess.CompletedProcess[str]) -> str:
+    """The code of npm's error and its first sentence; advice about proxies and the trace follow them."""
+    lines = re.findall(r"^npm (?:error|ERR!) +(.+)$", done.stderr, re.MULTILINE)
+    code = [line for line in lines if line.startswith("code ")][:1]
+    sentence = [line for line in lines if line.split()[0] not in ("code", "syscall", "errno")][:1]
+    return ": ".join(code + sentence) or f"npm exited with {done.returncode}"
+
+
+def _not_downloaded(detector: str, reason: str, remedy: str) -> DataError:
+    what = f"its model files could not be downloaded ({reason})"
+    return DataError(detector, what, f"connect to the network, or {remedy}")
+
+
+def _not_readable(archive: Path, package: Package, error: Exception) -> DataError:
+    return DataError(archive, f"is no readable {package.noun} ({error})", "download it again")
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -179,11 +317,13 @@ def _write(path: Path, content: bytes) -> None:
         partial.unlink(missing_ok=True)
 
 
-BLAZEPOSE_MODELS = WheelModels(
+BLAZEPOSE_MODELS = PackagedModels(
     detector="blazepose",
-    package="mediapipe",
-    version="0.10.21",  # the last one that ships models
-    tags=("3.11", "cp311", "manylinux_2_28_x86_64"),
+    package=Wheel(
+        "mediapipe",
+        "0.10.21",  # the last one that ships models
+        tags=("3.11", "cp311", "manylinux_2_28_x86_64"),
+    ),
     files=(
         ModelFile(
             "mediapipe/modules/pose_detection/pose_detection.tflite",
@@ -194,6 +334,21 @@ BLAZEPOSE_MODELS = WheelModels(
             "mediapipe/modules/pose_landmark/pose_landmark_full.tflite",
             6_440_512,
             "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
+        ),
+    ),
+)
+PERSON_MODELS = replace(BLAZEPOSE_MODELS, files=BLAZEPOSE_MODELS.files[:1])
+"""The person detector alone, which every BlazePose shares."""
+
+HEAVY_MODELS = PackagedModels(
+    detector="blazepose-heavy",
+    # The wheel has no heavy network; this package's person detector is another one, and is left alone.
+    package=NpmPackage("@mediapipe/pose", "0.5.1675469404"),
+    files=(
+        ModelFile(
+            "package/pose_landmark_heavy.tflite",
+            27_709_200,
+            "59e42d71bcd44cbdbabc419f0ff76686595fd265419566bd4009ef703ea8e1fe",
         ),
     ),
 )

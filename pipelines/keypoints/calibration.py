@@ -64,8 +64,13 @@ class Calibration:
 
 def measured_for(detector: str) -> Path | None:
     """Where the calibration of a detector lies, if its confidences were measured."""
-    path = _MEASURED / f"{detector}_confidence.csv"
+    path = file_of(detector)
     return path if path.is_file() else None
+
+
+def file_of(detector: str) -> Path:
+    """Where the calibration of a detector belongs."""
+    return _MEASURED / f"{detector}_confidence.csv"
 
 
 def fit(

@@ -191,6 +191,27 @@ class Detector(Protocol):
         """Load the networks. DataError where a file is missing or is not the one that was expected."""
 
 
+@dataclass(frozen=True)
+class Measured:
+    """Accuracy and time of a detector, as docs/detector.md says they are measured."""
+
+    sample_mpjpe_mm: float  # of the sample flight with true poses
+    person_ms: float  # its networks' time for each person in each picture, on one thread
+
+
+@runtime_checkable
+class MeasuredDetector(Detector, Protocol):
+    """A detector that `mocap models` lists with its accuracy and its time."""
+
+    @property
+    def measured(self) -> Measured:
+        """Its accuracy and its time."""
+
+    @property
+    def advice(self) -> str | None:
+        """One line on a detector that is more accurate, said where this one runs."""
+
+
 @runtime_checkable
 class DetectorFamily(Protocol):
     """Detectors that are told what to run, behind a colon: `--detector NAME:ARGUMENT`."""
@@ -316,6 +337,12 @@ def find_detector(text: str) -> Detector:
     if colon:
         raise DataError(text, f"{name} takes nothing behind its name", f"write {name}")
     return found
+
+
+def advice_on(detector: Detector) -> list[str]:
+    """What is said where a detector runs: a line on a more accurate one, where it knows one."""
+    known = isinstance(detector, MeasuredDetector) and detector.advice
+    return [known] if known else []
 
 
 def hashes_of_models(detector: Detector) -> dict[str, str]:

@@ -1,7 +1,7 @@
 """What a keypoint detector would make of true pixels, where no video is rendered.
 
-How large its errors are was measured by tilt (`data/detector_errors.csv` says how); how they hang together
-in time, behind obstacles and between left and right is modelled here, by the constants below.
+How large a detector's errors are was measured by tilt (`data/<detector>_errors.csv` says how); how they hang
+together in time, behind obstacles and between left and right is modelled here, by the constants below.
 """
 
 from __future__ import annotations
@@ -11,18 +11,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.session.errors import DataError
 from pipelines.session.skeletons import mirrored
-from pipelines.simulation.scenario import DetectorErrors
+from pipelines.simulation.scenario import DetectorErrors, ModelledDetector
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-MEASURED = Path(__file__).parent / "data" / "detector_errors.csv"
+MODELLED: tuple[str, ...] = get_args(ModelledDetector)
+"""The detectors whose errors were measured, by the names that `--detector` takes; the usual one first."""
 COLUMNS = ("tilt_deg", "joint", "median_error_share", "missed_share", "confidence")
 ANY_JOINT = "*"
 
@@ -84,8 +86,13 @@ class ErrorTable:
         return values[0], values[1], values[2]
 
 
+def errors_of(detector: str) -> Path:
+    """Where the measured errors of one of the `MODELLED` detectors are."""
+    return Path(__file__).parent / "data" / f"{detector}_errors.csv"
+
+
 @lru_cache(maxsize=4)
-def read_errors(path: Path = MEASURED) -> ErrorTable:
+def read_errors(path: Path) -> ErrorTable:
     """The measured errors: a CSV with `COLUMNS`; lines that begin with # say where they are from.
 
     Raises:
@@ -171,7 +178,7 @@ def detect_keypoints(
         errors: the scenario's; its shares hold for visible joints.
         rng: draws as many numbers for what is seen as for what is not.
         joints: the joints' names.
-        table: measured errors; by default those that come with the program.
+        table: measured errors; by default those of `errors.detector`.
 
     Returns:
         [T, J, 2] px, NaN for what was missed, and confidences [T, J] above 0 and at most 1; 0 for those.
@@ -179,7 +186,7 @@ def detect_keypoints(
     Raises:
         ValueError: a joint without measured errors.
     """
-    table = read_errors() if table is None else table
+    table = read_errors(errors_of(errors.detector)) if table is None else table
     median_share, measured_missed, mean_confidence = table.at(tilt_deg, joints)
     _, usual, _ = table.at(np.array([REFERENCE_TILT_DEG]), joints)
     growth = measured_missed / max(float(usual.mean()) if usual.size else 0.0, _LEAST_MISSED)

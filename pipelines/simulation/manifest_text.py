@@ -20,6 +20,7 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
     scenario = flight.scenario
     lines = [
         "# Simulated by `mocap simulate` from scenario.yaml; simulation.json says how.",
+        *([] if video else [f"# The keypoints have the measured errors of {scenario.keypoints.detector}."]),
         "schema: 1",
         f"name: {_quoted(scenario.name)}",
         "simulated: true",

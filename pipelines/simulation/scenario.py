@@ -262,9 +262,14 @@ class Drones(Part):
     clock_offsets_s: list[float] = []  # of each drone's pictures against its log, by drone; 0 where absent
 
 
+ModelledDetector = Literal["blazepose", "blazepose-heavy"]
+"""A detector whose errors were measured (`detector_errors`)."""
+
+
 class DetectorErrors(Part):
     """What `--no-video` makes of true keypoints, beside what grows with tilt and hides behind things."""
 
+    detector: ModelledDetector = "blazepose"  # whose measured errors
     scale: float = Field(1.0, ge=0, le=100)  # of the measured pixel error; 0 gives exact keypoints
     # At 15 degrees of tilt; together what was measured there as missed or grossly wrong.
     missed_share: float = Field(0.008, ge=0, lt=1)

