@@ -48,6 +48,7 @@ bench: setup
 	$(BIN)/python -m benchmarks.arms
 	$(BIN)/python -m benchmarks.rendering
 	$(BIN)/python -m benchmarks.detection
+	$(BIN)/python -m benchmarks.detectors
 	$(BIN)/python -m benchmarks.detector_by_tilt
 	$(BIN)/python -m benchmarks.legs
 	$(BIN)/python -m benchmarks.refine --seeds 1 --times 150

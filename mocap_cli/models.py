@@ -103,6 +103,6 @@ def _figures(detector: Detector) -> dict[str, float | None]:
 
     measured = detector.measured if isinstance(detector, MeasuredDetector) else None
     return {
-        "sample_mpjpe_mm": measured and measured.sample_mpjpe_mm,
-        "person_ms": measured and measured.person_ms,
+        "sample_mpjpe_mm": None if measured is None else measured.sample_mpjpe_mm,
+        "person_ms": None if measured is None else measured.person_ms,
     }

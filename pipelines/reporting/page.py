@@ -86,6 +86,7 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
             title=summary.description.flight or content.name,
             summary=summary,
             detected=set(content.keypoints),
+            detector=text(section(content.stages.get("detect", {}), "settings"), "detector"),
             description=summary.description,
             started=wording.moment(summary.origin_ns),
             method=text(summary.metrics, "method"),

@@ -49,6 +49,11 @@ def study(*arguments: str | Path) -> dict[tuple[float, int, str, str], dict[str,
     return {(cell["tilt_deg"], cell["drones"], cell["noise"], cell["method"]): cell for cell in cells}
 
 
+def keypoints_of(folder: Path) -> object:
+    """What a study says of its keypoints."""
+    return json.loads((folder / "summary.json").read_text(encoding="utf-8"))["keypoints"]
+
+
 def covariance_trace(cameras: int, tilt_deg: float) -> float:
     """Trace of the covariance of a point in units of one ray's variance: rays err across themselves."""
     yaw = (np.pi / 2 if cameras == 2 else 2 * np.pi / cameras) * np.arange(cameras)
@@ -65,6 +70,7 @@ def rms_m(cell: dict[str, Any]) -> float:
 def test_exact_keypoints_and_poses_give_nothing(tmp_path: Path) -> None:
     """Only rounding is left: 1e-16 of 30 m, a thousandfold for the conditioning of two rays."""
     cells = study("tilt", *SMALL, "--keypoints", "exact", "--levels", "none", "-o", tmp_path / "out")
+    assert keypoints_of(tmp_path / "out") == "exact"
     assert {cell[0] for cell in cells} == {0, 15, 30, 45, 60}
     for cell in cells.values():
         assert cell["metrics"]["mpjpe_mm"]["mean"] < 1e-6
@@ -120,6 +126,7 @@ def test_modelled_keypoints_and_exact_poses_stay_below_60_mm(tmp_path: Path) -> 
         "tilt", *TRUSTING, "--seconds", "20", "--rate", "10", "--trials", "2", "--tilts", "0,15,30,60",
         "--levels", "none", "-o", tmp_path / "out",
     )  # fmt: skip
+    assert keypoints_of(tmp_path / "out") == "modelled after blazepose"
     for (tilt, *_), cell in cells.items():
         error_mm = cell["metrics"]["mpjpe_mm"]["mean"]
         assert error_mm <= 60 if tilt <= 30 else error_mm > 60

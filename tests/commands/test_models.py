@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import tarfile
 from pathlib import Path
 
 import pytest
 
+from pipelines.session.errors import DataError
+from pipelines.session.registries import advice_on, find_detector
 from tests.commands.runner import refused, succeeds
 
 FILES = ("pose_detection.tflite", "pose_landmark_full.tflite")
+HEAVY = "pose_landmark_heavy.tflite"
 
 
 @pytest.fixture
@@ -23,12 +27,27 @@ def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_what_is_missing_is_listed_with_the_command_that_gets_it(empty_cache: Path) -> None:
     listed = succeeds("models")
-    for file in FILES:
+    for file in (*FILES, HEAVY):
         assert file in listed
-    assert "mocap models fetch blazepose" in listed
+    for name in ("blazepose", "blazepose-heavy"):
+        assert f"`mocap models fetch {name}`" in listed
     detectors = json.loads(succeeds("models", "--json"))["detectors"]
-    assert {"blazepose": dict.fromkeys(FILES)} == {
-        d["name"]: d["files"] for d in detectors if d["name"] == "blazepose"
+    assert {d["name"]: d["files"] for d in detectors} == {
+        "blazepose": dict.fromkeys(FILES),
+        "blazepose-heavy": dict.fromkeys((FILES[0], HEAVY)),
+    }
+
+
+def test_accuracy_and_time_are_those_of_the_documentation(empty_cache: Path) -> None:
+    """The table of docs/detector.md is what `python -m benchmarks.detectors` printed."""
+    page = (Path(__file__).parents[2] / "docs" / "detector.md").read_text(encoding="utf-8")
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if "|" in line]
+    documented = {row[0]: (float(row[1]), float(row[-1])) for row in rows if row[0].startswith("blazepose")}
+    detectors = json.loads(succeeds("models", "--json"))["detectors"]
+    assert {d["name"]: (d["sample_mpjpe_mm"], d["person_ms"]) for d in detectors} == documented
+    listed = [line.split() for line in succeeds("models").splitlines() if line.startswith("blazepose")]
+    assert {(name, float(mm), float(ms)) for name, mm, ms, *_ in listed} == {
+        (name, *figures) for name, figures in documented.items()
     }
 
 
@@ -45,13 +64,46 @@ def test_what_is_there_is_listed_with_its_place(empty_cache: Path) -> None:
         (empty_cache / "blazepose" / file).touch()
     listed = succeeds("models")
     assert str(empty_cache / "blazepose" / FILES[0]) in listed
-    assert "missing" not in listed
+    assert [line.split()[3] for line in listed.splitlines() if line.endswith("missing")] == [HEAVY]
 
 
 def test_fetching_without_a_network_says_what_to_do(empty_cache: Path) -> None:
     line = refused("models", "fetch", "blazepose")
     assert "could not be downloaded" in line
     assert "--from" in line
+
+
+def test_heavy_without_npm_says_what_to_do(empty_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(empty_cache))
+    line = refused("models", "fetch", "blazepose-heavy")
+    for part in ("npm", "--from", HEAVY):
+        assert part in line
+    assert not empty_cache.exists()
+
+
+def test_heavy_from_a_tarball_of_something_else_is_refused(empty_cache: Path, tmp_path: Path) -> None:
+    tarball = tmp_path / "mediapipe-pose.tgz"
+    tarball.write_text("not a tarball")
+    assert "is no readable tarball" in refused("models", "fetch", "blazepose-heavy", "--from", tarball)
+    (tmp_path / "package").mkdir()
+    (tmp_path / "package" / HEAVY).write_bytes(b"another network")
+    with tarfile.open(tarball, "w:gz") as made:
+        made.add(tmp_path / "package", "package")
+    line = refused("models", "fetch", "blazepose-heavy", "--from", tarball)
+    assert "of 15 bytes" in line
+    assert "of 27709200" in line
+    assert not empty_cache.exists()
+
+
+def test_heavy_that_is_missing_is_refused_before_anything_runs(empty_cache: Path) -> None:
+    with pytest.raises(DataError, match="is missing; run `mocap models fetch blazepose-heavy`"):
+        find_detector("blazepose-heavy").load(threads=1)
+
+
+def test_only_the_default_says_that_there_is_a_more_accurate_one() -> None:
+    (line,) = advice_on(find_detector("blazepose"))
+    assert "--detector blazepose-heavy" in line
+    assert advice_on(find_detector("blazepose-heavy")) == []
 
 
 def test_fetching_from_a_file_that_is_no_wheel_is_refused(empty_cache: Path, tmp_path: Path) -> None:

@@ -13,9 +13,11 @@ from click.testing import CliRunner, Result
 
 from mocap_cli.main import Mocap
 from mocap_cli.replan_compare import replan_compare_command
+from pipelines.detect import DETECT
 from pipelines.ingest import ingest
 from pipelines.planning.arm_flights import fly_arm
 from pipelines.reconstruct import reconstruct
+from pipelines.session.stages import locked
 from pipelines.simulate import simulate
 from tests.commands.runner import as_if_written, content
 from tests.real_data import real_data
@@ -97,6 +99,20 @@ def mound(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def calm(tmp_path: Path) -> Path:
     return session_of(tmp_path, CALM)
+
+
+def test_arms_see_with_the_errors_of_the_detector_that_the_session_used(calm: Path) -> None:
+    options = ("--arms", "fixed", "--trials", "4")
+    before = compared(calm, *options)
+    assert before["keypoints"] == "modelled after blazepose"
+    with locked(calm) as session:
+        run = session.begin(DETECT, settings={"detector": "blazepose-heavy"}, inputs={}, force=False)
+        run.publish(counts={}, warnings=[])
+    after = compared(calm, *options)
+    assert after["keypoints"] == "modelled after blazepose-heavy"
+    # The same draws, smaller errors.
+    errors = [told["arms"]["fixed"]["mpjpe_mm"]["mean"] for told in (after, before)]
+    assert errors[0] < errors[1]
 
 
 def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_better(mound: Path) -> None:

@@ -72,6 +72,19 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulated(tmp_path_factory.mktemp("small"), SMALL, "--no-video")
 
 
+def test_keypoints_say_which_detector_they_imitate(small: Path, tmp_path: Path) -> None:
+    other = simulated(tmp_path, SMALL + "keypoints: {detector: blazepose-heavy}\n", "--no-video")
+    found = []
+    for flight, name in ((small, "blazepose"), (other, "blazepose-heavy")):
+        told = json.loads((flight.parent / "simulation.json").read_text(encoding="utf-8"))
+        assert told["pictures"] == f"keypoints modelled after {name}"
+        assert f"measured errors of {name}.\n" in flight.read_text(encoding="utf-8")
+        found.append((flight.parent / "drone1_keypoints.json").read_bytes())
+    assert found[0] != found[1]
+    wrong = scenario(tmp_path, SMALL + "keypoints: {detector: oracle}\n")
+    assert "blazepose-heavy" in refused("simulate", wrong, "-o", tmp_path / "wrong", "--no-video")
+
+
 def reconstructed(flight: Path, *options: str) -> dict[str, Any]:
     succeeds("ingest", flight)
     metrics: dict[str, Any] = json.loads(

@@ -99,8 +99,9 @@ def test_what_is_no_calibration_is_refused(tmp_path: Path, text: str) -> None:
         read_calibration(path)
 
 
-def test_keypoints_in_any_order_are_worth_the_same() -> None:
-    path = measured_for("blazepose")
+@pytest.mark.parametrize("detector", ["blazepose", "blazepose-heavy"])
+def test_keypoints_in_any_order_are_worth_the_same(detector: str) -> None:
+    path = measured_for(detector)
     assert path is not None
     assert measured_for("onnx:somebody's") is None
     calibration = read_calibration(path)

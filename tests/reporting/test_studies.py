@@ -30,7 +30,7 @@ def summary_of(study: str, cells: list[dict[str, Any]]) -> dict[str, Any]:
         "trials": 4,
         "seed": 0,
     }
-    return {"study": study, "keypoints": "modelled detector", "settings": settings, "cells": cells}
+    return {"study": study, "keypoints": "modelled after blazepose", "settings": settings, "cells": cells}
 
 
 def cell(mean_mm: float | None, **of: Any) -> dict[str, Any]:

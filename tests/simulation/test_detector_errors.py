@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.session.errors import DataError
+from pipelines.session.registries import find_detector
 from pipelines.session.skeletons import mirrored
 from pipelines.simulation.detector_errors import (
     COLUMNS,
@@ -18,11 +19,12 @@ from pipelines.simulation.detector_errors import (
     HIDDEN_ERROR,
     HIDDEN_MISSED_SHARE,
     KEPT_PER_FRAME,
-    MEASURED,
+    MODELLED,
     OUTLIER_SHARES,
     SWAP_FRAMES,
     ErrorTable,
     detect_keypoints,
+    errors_of,
     read_errors,
     view_of,
 )
@@ -50,7 +52,7 @@ def detect(
     tilt_deg: float = 15.0,
     hidden: bool = False,
     seed: int = 0,
-    table: ErrorTable = EXAMPLE,
+    table: ErrorTable | None = EXAMPLE,
 ) -> tuple[Float, Float]:
     """Keypoints of a person who stands still, 200 px tall."""
     return detect_keypoints(
@@ -79,15 +81,20 @@ def write(path: Path, *rows: str) -> Path:
     return path
 
 
-def test_the_table_that_comes_along_says_where_it_is_from() -> None:
-    lines = MEASURED.read_text(encoding="utf-8").splitlines()
+@pytest.mark.parametrize("detector", MODELLED)
+def test_the_tables_that_come_along_say_where_they_are_from(detector: str) -> None:
+    lines = errors_of(detector).read_text(encoding="utf-8").splitlines()
     assert "# Made by: python -m benchmarks.detector_by_tilt --write" in lines
-    assert {"*", *COCO17} == set(read_errors().rows)
+    assert f"# The detector: {find_detector(detector).title}" in lines
+    assert {"*", *COCO17} == set(read_errors(errors_of(detector)).rows)
 
 
-def test_a_joint_is_found_worse_the_steeper_the_camera_looks() -> None:
+@pytest.mark.parametrize("detector", MODELLED)
+def test_a_joint_is_found_worse_the_steeper_the_camera_looks(detector: str) -> None:
     """As in the seed: alike up to 30 degrees, worse above; of all joints together."""
-    error, missed, confidence = read_errors().at(np.array([0.0, 15.0, 30.0, 45.0, 60.0]), ("*",))
+    error, missed, confidence = read_errors(errors_of(detector)).at(
+        np.array([0.0, 15.0, 30.0, 45.0, 60.0]), ("*",)
+    )
     assert (np.diff(error[1:, 0]) > 0).all()
     assert (np.diff(missed[1:, 0]) > 0).all()
     assert (np.diff(confidence[1:, 0]) < 0).all()
@@ -159,6 +166,16 @@ def test_tilt_and_apparent_height() -> None:
 
 
 # --- errors --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("detector", MODELLED)
+def test_errors_are_those_of_the_detector_that_is_named(detector: str) -> None:
+    """A table of its own for each, with the tolerance of the test below."""
+    xy, _ = detect(CLEAN.model_copy(update={"detector": detector}), tilt_deg=45.0, table=None)
+    share, _, _ = read_errors(errors_of(detector)).at(np.array([45.0]), COCO17)
+    for joint in ("nose", "left_knee", "right_wrist"):
+        column = COCO17.index(joint)
+        assert np.median(lengths(xy)[:, column]) == pytest.approx(share[0, column] * HEIGHT_PX, rel=0.08)
 
 
 @pytest.mark.parametrize(("tilt_deg", "median_share"), [(15.0, 0.0192), (60.0, 0.0407), (52.5, 0.03545)])
