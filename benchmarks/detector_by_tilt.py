@@ -199,7 +199,7 @@ def print_table(by_tilt: dict[int, list[Sightings]]) -> None:
         seen = np.isfinite(error).any(axis=1)
         right = np.nan_to_num(error, nan=np.inf) <= PCK * torso
         print(
-            f"| {tilt.mean():.0f} | {len(error)} | {100 * seen.mean():.1f} % | {np.nanmean(error):.1f} | "
+            f"| {round(tilt.mean())} | {len(error)} | {100 * seen.mean():.1f} % | {np.nanmean(error):.1f} | "
             f"{np.nanmedian(error):.1f} | {100 * np.nanmedian(error / height):.2f} | "
             f"{100 * right.mean():.1f} % | {np.nanmean(confidence):.2f} |"
         )
