@@ -86,8 +86,7 @@ class Wheel:
                 *("--disable-pip-version-check", "--retries", "1", "--only-binary", ":all:"),
                 *("--implementation", "cp", "--python-version", python, "--abi", abi),
                 *("--platform", platform, "--dest", str(folder), f"{self.name}=={self.version}"),
-            ],
-            folder,
+            ]
         )
         wheels = sorted(folder.glob("*.whl"))
         if done.returncode == 0 and wheels:
@@ -139,7 +138,7 @@ class NpmPackage:
                 # Two attempts, as with pip.
                 *("--fetch-retries", "1", "--fetch-retry-mintimeout", "1000"),
             ],
-            folder,  # npm writes where it is run, and heeds the settings of a project there
+            within=folder,  # npm writes where it is run, and heeds the settings of a project there
         )
         tarballs = sorted(folder.glob("*.tgz"))
         if done.returncode == 0 and tarballs:
@@ -281,9 +280,9 @@ def _beginning(path: Path, count: int) -> bytes:
         return stream.read(count)
 
 
-def _ran(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+def _ran(command: list[str], *, within: Path | None = None) -> subprocess.CompletedProcess[str]:
     return subprocess.run(  # noqa: S603  # our own arguments, no shell
-        command, cwd=folder, capture_output=True, text=True, errors="replace", check=False
+        command, cwd=within, capture_output=True, text=True, errors="replace", check=False
     )
 
 

