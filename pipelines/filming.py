@@ -124,8 +124,6 @@ def film(
         if run.finished:
             return Filmed(folder, run.record, read_json(folder / "film" / "metrics.json"), skipped=True)
 
-        for note in advice_on(detector):
-            progress.note(note)
         flight = load_flight(
             folder,
             description,
@@ -174,6 +172,8 @@ def film(
         write_json(run.folder / "metrics.json", told)
         counts = {name: len(arm.of.t_ns) for name, arm in arms.items()}
         record = run.publish(counts={"moments": counts, "detector": detector.title})
+        for note in advice_on(detector):
+            progress.note(note)
     return Filmed(folder, record, told, skipped=False)
 
 
