@@ -89,6 +89,21 @@ def test_frames_that_the_detector_left_out_do_not_count(content: SessionContent)
     assert _rows(found)["drone1"].detected == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize("detector", ["blazepose", "blazepose-heavy"])
+def test_the_page_names_the_detector_that_looked_at_the_pictures(
+    content: SessionContent, detector: str
+) -> None:
+    session = make_session()
+    cameras = session["cameras"]
+    assert isinstance(cameras, dict)
+    cameras["drone1"]["keypoints"] = None
+    record = {"settings": {"detector": detector}, "counts": {"cameras": {"drone1": {"frames": 200}}}}
+    page = render_page(
+        replace(content, session=described(session), stages=content.stages | {"detect": record})
+    )
+    assert page.count(f"<td>{detector}, run here</td>") == 1
+
+
 def test_the_page_says_what_made_it_and_where_cameras_stand(content: SessionContent) -> None:
     made = {"mocap": "1.2.3", "numpy": "2.0"}
     told = replace(
