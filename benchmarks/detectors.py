@@ -52,6 +52,9 @@ def main() -> None:
         sample = ingest(SAMPLE / "true_poses.yaml", folder / "sample.session").folder
         real = None if not REAL.is_dir() else ingest(real_flight(folder), folder / "real.session").folder
         for detector in arguments.detectors:
+            if None in find_detector(detector).models().values():
+                print(f"{detector} was not measured: run `mocap models fetch {detector}`")
+                continue
             cells = [*of_sample(sample, detector, arguments.every)]
             cells += ["", "", ""] if real is None else of_real(real, detector, arguments.every)
             print(f"| {detector} | {' | '.join([*cells, f'{person_ms(detector):.0f}'])} |", flush=True)
