@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,14 @@ class Flown(StrEnum):
     UNSAFE = "unsafe"  # nothing keeps all distances; what comes nearest to it
 
 
+class _Around(NamedTuple):
+    """What a drone must keep away from; K + 1 times, one per period from now on."""
+
+    field: DistanceField
+    others: Float  # [M, K + 1, 3] m, where the other drones are committed to be
+    actor: Float  # [K + 1, 3] m, where the actor will be
+
+
 @dataclass(frozen=True)
 class _Motion:
     """A motion that ends at rest, and how near it comes."""
@@ -83,6 +92,7 @@ class Guard:
         self._config, self._flying, self._exactly = config, config.flying(), exactly
         self._ticks = math.ceil(config.tracking_hz / config.local_hz - 1e-9)
         rows = self._ticks + stopping_ticks(self._flying) + 1
+        self._ticks_ahead = min(round(_ACTOR_AHEAD_S * config.tracking_hz), rows - 1)
         self._states = np.zeros((len(position), rows, 4, 3))
         self._states[:, :, POSITION] = position[:, None]
         self._age = np.zeros(len(position), dtype=np.int64)  # periods since a drone's motion was committed
@@ -120,21 +130,16 @@ class Guard:
         Returns:
             The plan that is flown.
         """
-        others = self._others(drone)
         after_s = self._flying.period_s * np.arange(self._states.shape[1], dtype=np.float64)
-        actor_path = actor.forecast(t_s + after_s)
-        here = self._states[drone, self._age[drone]]
-        least = self._least(here, others, actor_path[0], field)
+        around = _Around(field, self._others(drone), actor.forecast(t_s + after_s))
+        least = self._least(self._states[drone, self._age[drone], POSITION], around)
         tried = []
-        for motion in self._motions(drone, t_s, plan, actor_path, others, field):
+        for motion in self._motions(drone, t_s, plan, around):
             tried.append(motion)
-            if _shortfall(motion, least) == (0.0, 0.0, 0.0):
-                chosen = motion
+            if _shortfall(motion, least) == _NONE:
                 break
-        else:
-            chosen = min(tried, key=lambda motion: _shortfall(motion, least))
-        safe = _shortfall(chosen, least) == (0.0, 0.0, 0.0)
-        self.counts[chosen.kind if safe else Flown.UNSAFE] += 1
+        chosen = min(tried, key=lambda motion: _shortfall(motion, least))
+        self.counts[chosen.kind if _shortfall(chosen, least) == _NONE else Flown.UNSAFE] += 1
         self._last[drone] = chosen.plan if chosen.kind in (Flown.PLANNED, Flown.PREVIOUS) else None
         self._states[drone], self._age[drone] = chosen.states, 0
         return chosen.plan
@@ -149,19 +154,17 @@ class Guard:
         ahead = np.minimum(self._age[:, None] + rows, rows[-1])
         return np.asarray(np.delete(self._states[drones[:, None], ahead, POSITION], drone, axis=0))
 
-    def _least(
-        self, here: Float, others: Float, actor: Float, field: DistanceField
-    ) -> tuple[float, float, float]:
+    def _least(self, place: Float, around: _Around) -> tuple[float, float, float]:
         """Distances to map, drones and actor that must be kept: the stated ones, or what there is now."""
-        config, place = self._config, here[POSITION]
+        config = self._config
         now = (
-            float(field.sample(place)[0]),
-            float(np.linalg.norm(others[:, 0] - place, axis=-1).min(initial=np.inf)),
-            float(np.linalg.norm(actor - place)),
+            float(around.field.sample(place)[0]),
+            float(np.linalg.norm(around.others[:, 0] - place, axis=-1).min(initial=np.inf)),
+            float(np.linalg.norm(around.actor[0] - place)),
         )
         # The actor's estimate errs by about the log's noise.
         stated = (
-            wanted_clearance_m(config, field.grid),
+            wanted_clearance_m(config, around.field.grid),
             config.separation_m,
             config.actor_distance_m + config.actor_sigma_m if config.actor_distance_m else 0.0,
         )
@@ -170,32 +173,19 @@ class Guard:
         )
         return map_m, drones_m, actor_m
 
-    def _motions(
-        self, drone: int, t_s: float, plan: Plan, actor: Float, others: Float, field: DistanceField
-    ) -> Iterator[_Motion]:
+    def _motions(self, drone: int, t_s: float, plan: Plan, around: _Around) -> Iterator[_Motion]:
         """Motions from the best to the last resort."""
-        here = self._states[drone, self._age[drone]]
+        here, field = self._states[drone, self._age[drone]], around.field
 
         def follow(kind: Flown, followed: Plan) -> _Motion:
-            states = np.empty_like(self._states[drone])
-            states[0] = here
             exactly = self._exactly and followed is plan
-            stopped = roll_out(
-                followed.path,
-                followed.velocity,
-                followed.step_s,
-                t_s - followed.start_s,
-                self._ticks,
-                exactly,
-                self._flying,
-                states,
-            )
-            return self._measured(kind, t_s, followed, states, stopped, actor, others, field)
+            states, stopped = self._rolled_out(t_s, here, followed, self._ticks, exactly)
+            ahead, _ = self._rolled_out(t_s, here, followed, self._ticks_ahead, exactly)
+            return self._measured(kind, followed, states, stopped, ahead, around)
 
-        place = here[POSITION]
-        if float(field.sample(place)[0]) < wanted_clearance_m(self._config, field.grid) - _INSIDE_M:
-            wanted_m = wanted_clearance_m(self._config, field.grid) + _DEEPER_M
-            goal = nearest_free(field, place, wanted_m)
+        place, wanted_m = here[POSITION], wanted_clearance_m(self._config, field.grid)
+        if float(field.sample(place)[0]) < wanted_m - _INSIDE_M:
+            goal = nearest_free(field, place, wanted_m + _DEEPER_M)
             if goal is not None:
                 way = goal - place
                 length = float(np.linalg.norm(way))
@@ -205,21 +195,33 @@ class Guard:
         previous = self._last[drone]
         if previous is not None:
             yield follow(Flown.PREVIOUS, previous)
-        for kind, velocity in self._ways_out(here, actor, field):
+        for kind, velocity in self._ways_out(here, around):
             yield follow(kind, self._steered(t_s, here, velocity))
         rows = np.minimum(self._age[drone] + np.arange(self._states.shape[1]), self._states.shape[1] - 1)
         committed = self._states[drone, rows]
-        stopped = self._states.shape[1] - 1
         braked = self._plan_of(t_s, committed)
-        yield self._measured(Flown.BRAKED, t_s, braked, committed, stopped, actor, others, field)
+        yield self._measured(Flown.BRAKED, braked, committed, len(committed) - 1, committed, around)
 
-    def _ways_out(self, here: Float, actor: Float, field: DistanceField) -> list[tuple[Flown, Float]]:
+    def _rolled_out(
+        self, t_s: float, here: Float, plan: Plan, ticks: int, exactly: bool
+    ) -> tuple[Float, int]:
+        """States [K + 1, 4, 3] of who follows a plan for some periods and stops; and the row of the stop."""
+        states = np.empty((ticks + self._states.shape[1] - self._ticks, 4, 3))
+        states[0] = here
+        after_s = t_s - plan.start_s
+        stopped = roll_out(
+            plan.path, plan.velocity, plan.step_s, after_s, ticks, exactly, self._flying, states
+        )
+        return states, stopped
+
+    def _ways_out(self, here: Float, around: _Around) -> list[tuple[Flown, Float]]:
         """Velocities to take up: up, up and off what is near, and away from the actor, faster than they."""
+        actor, place = around.actor, here[POSITION]
         up = np.array([0.0, 0.0, _CLIMB_MPS])
-        level = field.sample(here[POSITION])[1] * [1.0, 1.0, 0.0]
+        level = around.field.sample(place)[1] * [1.0, 1.0, 0.0]
         off = level / max(float(np.linalg.norm(level)), 1e-9) * _ASIDE_MPS
         pace_mps = float(np.linalg.norm(actor[1] - actor[0])) / self._flying.period_s
-        away = (here[POSITION] - actor[0]) * [1.0, 1.0, 0.0]
+        away = (place - actor[0]) * [1.0, 1.0, 0.0]
         away *= (pace_mps + _CLIMB_MPS) / max(float(np.linalg.norm(away)), 1e-9)
         return [
             (Flown.CLIMBED, up),
@@ -229,31 +231,23 @@ class Guard:
         ]
 
     def _measured(
-        self,
-        kind: Flown,
-        t_s: float,
-        plan: Plan,
-        states: Float,
-        stopped: int,
-        actor: Float,
-        others: Float,
-        field: DistanceField,
+        self, kind: Flown, plan: Plan, states: Float, stopped: int, ahead: Float, around: _Around
     ) -> _Motion:
         """Measure how near a motion comes to the map and to drones, and its plan to the actor.
 
         Standing still is no way to keep away from somebody who walks: there the plan counts, not the stop.
+        The actor may walk on as forecast, or stop where they are.
         """
-        apart = np.linalg.norm(others - states[:, POSITION], axis=-1).min(initial=np.inf)
-        after_s = self._flying.period_s * np.arange(0, len(actor), self._ticks, dtype=np.float64)
-        near = after_s <= _ACTOR_AHEAD_S
-        asked = plan.at(t_s + after_s[near])[0]
+        apart = np.linalg.norm(around.others - states[:, POSITION], axis=-1).min(initial=np.inf)
+        rows = slice(0, self._ticks_ahead + 1)
+        place, actor = ahead[rows, POSITION], around.actor[rows]
         return _Motion(
             kind,
             plan,
             states,
-            least_clearance(field.grid, states, stopped, self._flying.period_s),
+            least_clearance(around.field.grid, states, stopped, self._flying.period_s),
             float(apart),
-            float(np.linalg.norm(actor[:: self._ticks][near] - asked, axis=-1).min()),
+            float(np.linalg.norm([actor - place, actor[0] - place], axis=-1).min()),
         )
 
     def _steered(self, t_s: float, here: Float, velocity: Float) -> Plan:
@@ -327,6 +321,9 @@ def least_clearance(grid: Grid, states: Float, last: int, period_s: float) -> fl
             u = piece / pieces
             least = min(least, interpolate(grid, x + u * dx, y + u * dy, z + u * dz)[0])
     return float(least)
+
+
+_NONE = (0.0, 0.0, 0.0)
 
 
 def _shortfall(motion: _Motion, least: Sequence[float]) -> tuple[float, float, float]:
