@@ -133,15 +133,14 @@ def measure(folder: Path, detector: str, tilt_deg: int, look: int) -> Sightings:
         detect(writable, detector=detector, workers=2)
     found = pd.read_parquet(session / "detect" / "drone1" / "keypoints.parquet")
 
-    scenario = read_scenario(path)
-    flight = fly_scenario(scenario, [])
-    drone = flight.drones[0]
+    flight = fly_scenario(read_scenario(path), [])
+    drone, person = flight.drones[0], flight.people[0]
     truth, rows = drone.at_frames, flight.moments_of(drone)
-    pixels = see(flight.joints[rows], truth.camera_position, truth.camera_quaternion_xyzw, drone.intrinsics)
+    pixels = see(person.joints[rows], truth.camera_position, truth.camera_quaternion_xyzw, drone.intrinsics)
     tilt, height_px = view_of(
         truth.camera_position,
-        flight.motion.root[rows],
-        height_m=scenario.actor.body.height_m,
+        person.motion.root[rows],
+        height_m=person.look.body.height_m,
         focal_px=drone.intrinsics.fx,
     )
     error, confidence = compare(found, pixels, height_px)

@@ -42,9 +42,11 @@ from pipelines.session.storage import hash_of, jsonable, read_json, sha256_of, w
 from pipelines.session.tables import REPLAN, TRUTH, read_table, write_table
 from pipelines.session.tabular import motion_table
 from pipelines.session.whole_folders import SIMULATION_MARK
+from pipelines.simulation.body import Person
 from pipelines.simulation.flight import Set, build_set
 from pipelines.simulation.observe import see
 from pipelines.simulation.rendering.renderer import Renderer
+from pipelines.simulation.rig import BodyMotion
 from pipelines.simulation.scenario import Scenario, read_scenario
 from pipelines.simulation.study.filming import Formation, Sightings, Walk, views_of
 from pipelines.simulation.study.measuring import errors_in_common, measure_arm
@@ -116,9 +118,9 @@ def film(
         detector = find_detector(shooting.detector)
         detector.load(threads=1)  # says at once what is missing
         plan = read_scenario(path)
-        inputs = {"replan": compared.key, "scenario": hash_of(plan.model_dump(mode="json"))}
-        if plan.actor.motion.bvh is not None:
-            inputs["bvh"] = sha256_of(path.parent / plan.actor.motion.bvh)
+        inputs = {"replan": compared.key, "scenario": hash_of(plan.identity())}
+        if hashes := {name: sha256_of(file) for name, (file, _) in plan.motion_files(path.parent).items()}:
+            inputs["bvh"] = hash_of(hashes) if plan.actors else hashes["actor"]
         inputs |= {f"model {name}": digest for name, digest in hashes_of_models(detector).items()}
         run = session.begin(FILM, settings=asdict(shooting), inputs=inputs, force=force)
         if run.finished:
@@ -186,6 +188,7 @@ class _Arm:
 
     names: tuple[str, ...]
     of: Walk
+    others: list[tuple[Person, BodyMotion]]  # who is in the pictures, too
     seen_by: Formation
     actor: Float | None  # [T, 3] m, where the log has the actor
     noise: tuple[NoiseModel, ...]
@@ -209,18 +212,16 @@ def _scenario_of(folder: Path, description: Description) -> Path:
 
 def _set(plan: Scenario, path: Path, flight: LoggedFlight) -> Set:
     """World and actor of a scenario, if it is this flight's."""
-    motion = plan.actor.motion
-    bvh = (
-        None
-        if motion.bvh is None
-        else read_motion(path.parent / motion.bvh, unit=motion.unit, axes=motion.axes)
-    )
+    bvh = {
+        name: read_motion(file, unit=motion.unit, axes=motion.axes)
+        for name, (file, motion) in plan.motion_files(path.parent).items()
+    }
     setting = build_set(plan, bvh=bvh)
     if flight.hips is None:
         raise DataError(path, "cannot be told to be this flight's", "ingest the flight with its truth")
-    moved = setting.moving((flight.hips.t_ns - plan.start_ns) / 1e9)
-    joints = setting.person.keypoints(moved)
-    hips = joints[:, [setting.person.joints.index(name) for name in _HIPS]].mean(axis=1)
+    followed = setting.people[0]
+    joints = followed.person.keypoints(followed.moving((flight.hips.t_ns - plan.start_ns) / 1e9))
+    hips = joints[:, [followed.person.joints.index(name) for name in _HIPS]].mean(axis=1)
     off_m = float(np.nanmax(np.linalg.norm(hips - flight.hips.position[:, 0, 0], axis=-1)))
     if not off_m <= _SAME_M:
         raise DataError(
@@ -252,13 +253,15 @@ def _arm(
         return np.ascontiguousarray(values[rows].swapaxes(0, 1))
 
     moments = t_ns[rows]
-    motion = setting.moving((moments - plan.start_ns) / 1e9)
-    person = setting.person
+    followed, *others = setting.people
+    t_s = (moments - plan.start_ns) / 1e9
+    motion, person = followed.moving(t_s), followed.person
     joints = person.keypoints(motion)
-    walked = Walk(moments, person, plan.actor.body.height_m, motion, joints, motion.root)
+    walked = Walk(moments, person, followed.look.body.height_m, motion, joints, motion.root)
     seen_by = Formation(dense("x", "y", "z"), dense("qx", "qy", "qz", "qw"), flight.cameras[0].intrinsics)
     hips = None if actor is None else actor.hips_at(moments)
-    return _Arm(cameras, walked, seen_by, hips, flight.cameras[0].noise)
+    beside = [(each.person, each.moving(t_s)) for each in others]
+    return _Arm(cameras, walked, beside, seen_by, hips, flight.cameras[0].noise)
 
 
 def _rows(t_ns: Int64, shooting: Shooting) -> Int64:
@@ -286,8 +289,11 @@ def _shoot(
     def pictures() -> Iterator[Picture]:
         for k in range(len(of.t_ns)):
             pose = arm.seen_by.position[camera, k], arm.seen_by.quaternion_xyzw[camera, k]
-            surface = of.person.surface(of.motion.root[k], of.motion.rotation[k])
-            picture = renderer.picture(*pose, [surface], k)
+            people = [
+                person.surface(motion.root[k], motion.rotation[k])
+                for person, motion in ((of.person, of.motion), *arm.others)
+            ]
+            picture = renderer.picture(*pose, people, k)
             hint = None
             if arm.actor is not None and np.isfinite(arm.actor[k]).all():
                 hint = project_actor(

@@ -90,12 +90,12 @@ def simulate(
     if not overwrite:
         _refuse_to_lose_others(folder)
     noise = noise_models(f"{scenario_path}: drones.pose_noise", scenario.drones.pose_noise)
-    bvh = _bvh(scenario, scenario_path)
+    motions = _motions(scenario, scenario_path)
     planner = _planner(scenario, scenario_path)
 
     with whole_folder(folder, key, mark=SIMULATION_MARK, overwrite=overwrite) as making:
         progress.start("Flying", 3 + scenario.drones.count)
-        flight = fly_scenario(scenario, noise, bvh=bvh, planner=planner)
+        flight = fly_scenario(scenario, noise, bvh=motions, planner=planner)
         progress.advance()
         write_truth(making.folder, flight)
         progress.advance()
@@ -139,21 +139,22 @@ def _key(scenario: Scenario, path: Path, video: bool) -> str:
     """Equal for equal flights."""
     ingredients: dict[str, object] = {
         "revision": _REVISION,
-        "scenario": scenario.model_dump(mode="json", exclude={"keypoints": {"detector"}}),
+        "scenario": scenario.identity(),
         "video": video,
     }
     if not video:
         ingredients["errors"] = sha256_of(errors_of(scenario.keypoints.detector))
-    if scenario.actor.motion.bvh is not None:
-        ingredients["bvh"] = sha256_of(path.parent / scenario.actor.motion.bvh)
+    if hashes := {name: sha256_of(file) for name, (file, _) in scenario.motion_files(path.parent).items()}:
+        ingredients["bvh"] = hashes if scenario.actors else hashes["actor"]
     return hash_of(ingredients)
 
 
-def _bvh(scenario: Scenario, path: Path) -> SkeletalMotion | None:
-    motion = scenario.actor.motion
-    if motion.bvh is None:
-        return None
-    return read_motion(path.parent / motion.bvh, unit=motion.unit, axes=motion.axes)
+def _motions(scenario: Scenario, path: Path) -> dict[str, SkeletalMotion]:
+    """The recorded motions by actor."""
+    return {
+        name: read_motion(file, unit=motion.unit, axes=motion.axes)
+        for name, (file, motion) in scenario.motion_files(path.parent).items()
+    }
 
 
 def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | None:
@@ -172,11 +173,12 @@ def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | Non
             "leave them out, or take planner: ring",
         )
     arm = PLANNER_ARMS.get(formation.planner)
+    followed = next(iter(scenario.people.values()))
     try:
         config = PlannerConfig(
             radius_m=formation.radius_m,
             tilt_deg=formation.tilt_deg,
-            actor_sigma_m=max(scenario.actor.estimate_sigma_m, _LEAST_SIGMA_M),
+            actor_sigma_m=max(followed.estimate_sigma_m, _LEAST_SIGMA_M),
             speed_mps=scenario.drones.limits.speed_mps,
             acceleration_mps2=scenario.drones.limits.acceleration_mps2,
         )
@@ -268,16 +270,16 @@ def _film_block(
     progress: Progress,
     folder: Path,
 ) -> None:
-    truth, motion = drone.at_frames, flight.motion
+    truth = drone.at_frames
     frames = range(first, min(first + _BLOCK, len(truth.t_ns)))
     rows = flight.moments_of(drone)
 
     def pictures() -> Iterator[Picture]:
         for frame in frames:
             halt.check()
-            person = flight.person.surface(motion.root[rows[frame]], motion.rotation[rows[frame]])
+            people = [person.surface(rows[frame]) for person in flight.people]
             yield renderer.picture(
-                truth.camera_position[frame], truth.camera_quaternion_xyzw[frame], [person], frame
+                truth.camera_position[frame], truth.camera_quaternion_xyzw[frame], people, frame
             )
             progress.advance()
 

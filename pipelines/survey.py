@@ -180,7 +180,7 @@ def _of_scenario(path: Path) -> dict[str, Any]:
     scenario = read_scenario(path)
     stated = scenario.model_dump(mode="json", exclude_defaults=True)
     facts = {"name": scenario.name, "seed": scenario.seed, "duration_s": scenario.duration_s}
-    facts |= {part: stated[part] for part in ("actor", "world", "keypoints") if part in stated}
+    facts |= {part: stated[part] for part in ("actor", "actors", "world", "keypoints") if part in stated}
     return facts | {"drones": {"count": scenario.drones.count} | stated.get("drones", {})}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,7 @@ from pipelines.simulation.recording import (
 )
 from pipelines.simulation.rig import BodyMotion
 from pipelines.simulation.scenario import Actor, Lens, Scenario
+from pipelines.simulation.surfaces import Surface, hidden_by
 from pipelines.simulation.world.scene import World, build_world
 from pipelines.simulation.world.terrain import raise_mounds
 
@@ -43,7 +44,8 @@ LEAD_S = 0.2
 _PLANNER_HZ = 50.0  # how often a planner is asked; it replans as often as it likes
 _WAY_S = 0.25  # between the points of the actor's way that the wood keeps clear of
 # What chance decides, each with numbers of its own: changing one thing leaves the others as they were.
-_FRAMES, _LOG, _NOISE, _ACTOR, _KEYPOINTS = range(5)
+_FRAMES, _LOG, _NOISE, _ACTOR, _KEYPOINTS, _MOTION = range(6)
+_REACH_M = 0.4  # of a body beyond its keypoints: hands, feet, crown and girth, of a person of 2.2 m
 
 
 @dataclass(frozen=True)
@@ -59,23 +61,47 @@ class SimulatedDrone:
 
 
 @dataclass(frozen=True)
+class SimulatedPerson:
+    """One person's part of a flight: the truth at the flight's moments T, and what was logged."""
+
+    name: str
+    look: Actor
+    person: Person
+    motion: BodyMotion  # at the moments T
+    joints: Float  # [T, J, 3] m, of `person.joints`
+    topic: str  # of the logged estimates
+    estimate_ns: Int64  # [A] since the flight's start
+    estimate: Float  # [A, 3] m, where the hip was thought to be
+
+    def surface(self, row: int) -> Surface:
+        """Return the person's surface at one of the moments T."""
+        return self.person.surface(self.motion.root[row], self.motion.rotation[row])
+
+
+@dataclass(frozen=True)
 class SimulatedFlight:
     """A flight. Truth stands at every moment at which any drone took a picture."""
 
     scenario: Scenario
     world: World
-    person: Person
+    people: list[SimulatedPerson]  # the drones follow the first
     drones: list[SimulatedDrone]
     t_ns: Int64  # [T] since the flight's start
-    motion: BodyMotion  # at those moments
-    joints: Float  # [T, J, 3] m, of `person.joints`
-    actor_ns: Int64  # [A] since the flight's start
-    actor: Float  # [A, 3] m, where the hip was thought to be
 
     def moments_of(self, drone: SimulatedDrone) -> Int64:
-        """The rows [F] of `motion` and `joints` at which a drone took its pictures."""
+        """The rows [F] of `t_ns` at which a drone took its pictures."""
         rows: Int64 = np.searchsorted(self.t_ns, drone.at_frames.t_ns)
         return rows
+
+
+@dataclass(frozen=True)
+class Performer:
+    """A person who moves."""
+
+    name: str
+    look: Actor
+    person: Person
+    moving: Moving  # the person's motion at seconds since the flight's start
 
 
 @dataclass(frozen=True)
@@ -83,66 +109,66 @@ class Set:
     """Who is filmed, and where: all of a scenario but its drones."""
 
     world: World
-    person: Person
-    moving: Moving  # the person's motion at seconds since the flight's start
+    people: list[Performer]  # the drones follow the first
 
 
-def build_set(scenario: Scenario, *, bvh: SkeletalMotion | None = None) -> Set:
-    """Build a scenario's world and let its actor move there.
+def build_set(scenario: Scenario, *, bvh: Mapping[str, SkeletalMotion] | None = None) -> Set:
+    """Build a scenario's world and let its actors move there.
+
+    Args:
+        scenario: who and where.
+        bvh: recorded motions by the name of the actor whose scenario names one.
 
     Raises:
-        DataError: the world cannot be built, or the motion is not that of a person.
+        DataError: the world cannot be built, or a motion is not that of a person.
     """
-    person = make_body(scenario.actor.body)
-    moving = _moving(scenario.actor, person, scenario, bvh)
-    way = moving(np.arange(*_span_s(scenario), _WAY_S)).root[:, :2]
-    return Set(build_world(scenario.world, scenario.seed, keep_clear=way), person, moving)
+    people = []
+    for index, (name, look) in enumerate(scenario.people.items()):
+        person = make_body(look.body)
+        moving = _moving(look, person, scenario, (bvh or {}).get(name), _motion_seed(scenario.seed, index))
+        people.append(Performer(name, look, person, moving))
+    way_s = np.arange(*_span_s(scenario), _WAY_S)
+    ways = np.concatenate([each.moving(way_s).root[:, :2] for each in people])
+    return Set(build_world(scenario.world, scenario.seed, keep_clear=ways), people)
 
 
 def fly_scenario(
     scenario: Scenario,
     noise: Sequence[NoiseModel],
     *,
-    bvh: SkeletalMotion | None = None,
+    bvh: Mapping[str, SkeletalMotion] | None = None,
     planner: Callable[[World], Planner] | None = None,
 ) -> SimulatedFlight:
-    """Let the actor move, the drones fly, and the recorders run.
+    """Let the actors move, the drones fly, and the recorders run.
 
     Args:
         scenario: who, where and how.
         noise: the errors of the logged poses.
-        bvh: the motion that the scenario names, if it names one.
-        planner: makes a planner for a world; without one drones fly on a ring about where the actor
+        bvh: recorded motions by the name of the actor whose scenario names one.
+        planner: makes a planner for a world; without one drones fly on a ring about where the first actor
             truly is, whatever stands in the way.
 
     Raises:
-        DataError: the world cannot be built, the motion is not that of a person, or the flight is over
+        DataError: the world cannot be built, a motion is not that of a person, or the flight is over
             before a drone takes its first picture.
     """
-    seed = scenario.seed
     set_up = build_set(scenario, bvh=bvh)
-    world, person, moving = set_up.world, set_up.person, set_up.moving
+    world, followed = set_up.world, set_up.people[0]
     span_s = _span_s(scenario)
 
     t_s = moments(*span_s)
-    hip = moving(t_s).root
-    actor_ns, actor = estimate_actor(
-        t_s,
-        hip,
-        sigma_m=scenario.actor.estimate_sigma_m,
-        rate_hz=scenario.actor.estimate_rate_hz,
-        span_s=span_s,
-        rng=np.random.default_rng([seed, _ACTOR]),
-    )
-    paths = _paths(scenario, t_s, hip, actor_ns / 1e9, actor, world, planner)
+    estimates = [_estimated(each, k, scenario, t_s) for k, each in enumerate(set_up.people)]
+    actor_ns, actor = estimates[0]
+    paths = _paths(scenario, t_s, followed.moving(t_s).root, actor_ns / 1e9, actor, world, planner)
     lens = intrinsics_of(scenario.drones.camera)
     drones = [_drone(scenario, lens, paths, index, noise, span_s) for index in range(scenario.drones.count)]
 
     t_ns = np.unique(np.concatenate([drone.at_frames.t_ns for drone in drones]))
-    motion = moving(t_ns / 1e9)
-    return SimulatedFlight(
-        scenario, world, person, drones, t_ns, motion, person.keypoints(motion), actor_ns, actor
-    )
+    people = [
+        _person(each, estimated, scenario, t_ns)
+        for each, estimated in zip(set_up.people, estimates, strict=True)
+    ]
+    return SimulatedFlight(scenario, world, people, drones, t_ns)
 
 
 def picture_stamps(flight: SimulatedFlight, drone: SimulatedDrone) -> Int64:
@@ -152,32 +178,40 @@ def picture_stamps(flight: SimulatedFlight, drone: SimulatedDrone) -> Int64:
     return stamps
 
 
-def visible_joints(flight: SimulatedFlight, drone: SimulatedDrone) -> tuple[Float, Bool]:
-    """Where a drone's pictures show the joints, and whether they do.
+def visible_joints(
+    flight: SimulatedFlight, drone: SimulatedDrone, person: SimulatedPerson
+) -> tuple[Float, Bool]:
+    """Where a drone's pictures show a person's joints, and whether they do.
 
     Returns:
-        [F, J, 2] exact px, NaN outside the picture; [F, J] whether a joint is in the picture and nothing of
-        the world stands before it. The person's own body hides nothing here.
+        [F, J, 2] exact px, NaN outside the picture; [F, J] whether a joint is in the picture and neither the
+        world nor anybody else stands before it. The person's own body hides nothing here.
     """
-    truth, joints = drone.at_frames, flight.joints[flight.moments_of(drone)]
+    rows = flight.moments_of(drone)
+    truth, joints = drone.at_frames, person.joints[rows]
     pixels = see(joints, truth.camera_position, truth.camera_quaternion_xyzw, drone.intrinsics)
     hidden = flight.world.hidden(truth.camera_position[:, None], joints)
+    for other in flight.people:
+        if other is not person:
+            hidden |= _hidden_by_person(other, rows, truth.camera_position, joints)
     return pixels, np.isfinite(pixels).all(axis=-1) & ~hidden
 
 
-def keypoints_of(flight: SimulatedFlight, drone: SimulatedDrone) -> tuple[Float, Float]:
-    """What a detector would find in a drone's pictures, by the measured errors of one.
+def keypoints_of(
+    flight: SimulatedFlight, drone: SimulatedDrone, person: SimulatedPerson
+) -> tuple[Float, Float]:
+    """What a detector would find of a person in a drone's pictures, by the measured errors of one.
 
     Returns:
         [F, J, 2] px, NaN for what was missed, and [F, J] confidences.
     """
     scenario, truth = flight.scenario, drone.at_frames
     rows = flight.moments_of(drone)
-    pixels, visible = visible_joints(flight, drone)
+    pixels, visible = visible_joints(flight, drone, person)
     tilt_deg, height_px = view_of(
         truth.camera_position,
-        flight.motion.root[rows],
-        height_m=scenario.actor.body.height_m,
+        person.motion.root[rows],
+        height_m=person.look.body.height_m,
         focal_px=drone.intrinsics.fx,
     )
     return detect_keypoints(
@@ -186,8 +220,10 @@ def keypoints_of(flight: SimulatedFlight, drone: SimulatedDrone) -> tuple[Float,
         tilt_deg,
         height_px,
         scenario.keypoints,
-        np.random.default_rng([scenario.seed, _KEYPOINTS, flight.drones.index(drone)]),
-        joints=flight.person.joints,
+        np.random.default_rng(
+            [scenario.seed, _KEYPOINTS, flight.drones.index(drone), *_of_others(flight.people.index(person))]
+        ),
+        joints=person.person.joints,
     )
 
 
@@ -202,7 +238,70 @@ def _span_s(scenario: Scenario) -> tuple[float, float]:
     return -LEAD_S, scenario.duration_s + LEAD_S
 
 
-def _moving(actor: Actor, person: Person, scenario: Scenario, bvh: SkeletalMotion | None) -> Moving:
+def _of_others(person: int) -> list[int]:
+    """The first person has the random numbers of an only one; every other has some of their own."""
+    return [person] if person else []
+
+
+def _motion_seed(seed: int, person: int) -> int:
+    """Seed of a person's way of moving."""
+    if not person:
+        return seed
+    return int(np.random.default_rng([seed, _MOTION, person]).integers(2**32))
+
+
+def _estimated(each: Performer, index: int, scenario: Scenario, t_s: Float) -> tuple[Int64, Float]:
+    """Where a person was thought to be in flight (`estimate_actor`)."""
+    return estimate_actor(
+        t_s,
+        each.moving(t_s).root,
+        sigma_m=each.look.estimate_sigma_m,
+        rate_hz=each.look.estimate_rate_hz,
+        span_s=_span_s(scenario),
+        rng=np.random.default_rng([scenario.seed, _ACTOR, *_of_others(index)]),
+    )
+
+
+def _person(
+    each: Performer, estimated: tuple[Int64, Float], scenario: Scenario, t_ns: Int64
+) -> SimulatedPerson:
+    motion = each.moving(t_ns / 1e9)
+    topic = "/actor" if scenario.actors is None else f"/actor/{each.name}"
+    joints = each.person.keypoints(motion)
+    return SimulatedPerson(each.name, each.look, each.person, motion, joints, topic, *estimated)
+
+
+def _hidden_by_person(other: SimulatedPerson, rows: Int64, eye: Float, joints: Float) -> Bool:
+    """Which joints [F, J] of somebody a person's body hides.
+
+    Args:
+        other: who may stand in the way.
+        rows: [F] of the moments.
+        eye: [F, 3] m, of the camera.
+        joints: [F, J, 3] m.
+    """
+    hidden = np.zeros(joints.shape[:2], dtype=np.bool_)
+    low, high = other.joints[rows].min(axis=1) - _REACH_M, other.joints[rows].max(axis=1) + _REACH_M
+    near = _meets_box(eye[:, None], joints, low[:, None], high[:, None])
+    for frame in np.flatnonzero(near.any(axis=1)).tolist():
+        asked = near[frame]
+        hidden[frame, asked] = hidden_by(other.surface(rows[frame]), eye[frame], joints[frame, asked])
+    return hidden
+
+
+def _meets_box(start: Float, end: Float, low: Float, high: Float) -> Bool:
+    """Test if straight lines between two points meet boxes along the axes, [..., 3] each, broadcast."""
+    way = end - start
+    with np.errstate(divide="ignore", invalid="ignore"):  # a line along an axis: infinite, or NaN on a face
+        sides = np.stack([(low - start) / way, (high - start) / way])
+    enter, leave = np.fmin(*sides).max(axis=-1), np.fmax(*sides).min(axis=-1)
+    meets: Bool = np.fmax(enter, 0.0) <= np.fmin(leave, 1.0)
+    return meets
+
+
+def _moving(
+    actor: Actor, person: Person, scenario: Scenario, bvh: SkeletalMotion | None, seed: int
+) -> Moving:
     """The actor's motion as a function of time since the flight's start."""
     terrain = raise_mounds(scenario.world.mounds)
     start = np.array(actor.start)
@@ -228,7 +327,7 @@ def _moving(actor: Actor, person: Person, scenario: Scenario, bvh: SkeletalMotio
                 start=start,
                 heading_deg=actor.heading_deg,
                 repeat=actor.motion.repeat,
-                seed=scenario.seed,
+                seed=seed,
             )
         return BodyMotion(t_s, motion.root, motion.rotation)
 

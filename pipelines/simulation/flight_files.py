@@ -6,7 +6,7 @@ Numbers are written with enough digits that reading them back costs less than 0.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,6 +42,18 @@ def write_joints(path: Path, t_ns: Int64, names: tuple[str, ...], joints: Float)
     lines = ["t_ns,joint,x,y,z"]
     for stamp, points in zip(t_ns.tolist(), joints.tolist(), strict=True):
         lines += [f"{stamp},{n},{x:.6f},{y:.6f},{z:.6f}" for n, (x, y, z) in zip(names, points, strict=True)]
+    write_lines(path, lines)
+
+
+def write_people(path: Path, t_ns: Int64, names: tuple[str, ...], people: Sequence[Float]) -> None:
+    """Joints [T, J, 3] of several people as a long CSV like that of one, with `person` 0, 1, ...."""
+    lines = ["t_ns,person,joint,x,y,z"]
+    for row, stamp in enumerate(t_ns.tolist()):
+        for person, joints in enumerate(people):
+            lines += [
+                f"{stamp},{person},{n},{x:.6f},{y:.6f},{z:.6f}"
+                for n, (x, y, z) in zip(names, joints[row].tolist(), strict=True)
+            ]
     write_lines(path, lines)
 
 

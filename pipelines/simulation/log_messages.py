@@ -13,7 +13,7 @@ import numpy as np
 
 from pipelines.geometry.pose_covariance import pose_covariance_in_body
 from pipelines.geometry.poses import conjugate
-from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight
+from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, SimulatedPerson
 
 _RECEIVED_NS = 2_000_000  # after a message's own stamp, by the recorder on board
 _CAMERA_INFO_NS = 1_000_000_000
@@ -29,10 +29,11 @@ class LoggedMessage(NamedTuple):
 
 
 def logged_messages(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[LoggedMessage]:
-    """The messages of one drone in the order of receipt; the first drone hears of the actor, too."""
+    """The messages of one drone in the order of receipt; the first drone hears of the actors, too."""
     messages = [*_odometry(flight, drone), *_gimbal(flight, drone), *_camera_infos(flight, drone)]
     if drone is flight.drones[0]:
-        messages += _actor(flight)
+        for person in flight.people:
+            messages += _actor(flight, person)
     for stamp_ns, topic, type_, fields in sorted(messages, key=lambda message: message[:2]):
         yield LoggedMessage(stamp_ns + _RECEIVED_NS, topic, type_, fields)
 
@@ -85,18 +86,18 @@ def _camera_infos(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_S
         )
 
 
-def _actor(flight: SimulatedFlight) -> Iterator[_Stamped]:
-    sigma = flight.scenario.actor.estimate_sigma_m
+def _actor(flight: SimulatedFlight, person: SimulatedPerson) -> Iterator[_Stamped]:
+    sigma = person.look.estimate_sigma_m
     covariance = np.diag([sigma**2] * 3 + [0.0] * 3)
     for stamp_ns, place in zip(
-        (flight.actor_ns + flight.scenario.start_ns).tolist(), flight.actor, strict=True
+        (person.estimate_ns + flight.scenario.start_ns).tolist(), person.estimate, strict=True
     ):
         pose = {"position": _xyz(place), "orientation": {"w": 1.0}}
         fields = {
             "header": {"stamp": stamp_ns, "frame_id": "world"},
             "pose": {"pose": pose, "covariance": covariance},
         }
-        yield stamp_ns, "/actor", "geometry_msgs/msg/PoseWithCovarianceStamped", fields
+        yield stamp_ns, person.topic, "geometry_msgs/msg/PoseWithCovarianceStamped", fields
 
 
 def _xyz(vector: np.ndarray[Any, Any]) -> dict[str, float]:

@@ -33,7 +33,7 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
         lines += [*_pictures(flight, drone, video), *_poses(flight, drone, true_poses)]
     poses = ", ".join(f"{drone.name}: truth/{drone.name}.tum" for drone in flight.drones)
     lines += [
-        "actor: {log: drone1, topic: /actor, point: hip}",
+        f"actor: {{log: drone1, topic: {flight.people[0].topic}, point: hip}}",
         "map: site.bt",
         "truth:",
         "  joints: truth/joints.csv",

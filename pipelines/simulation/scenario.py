@@ -7,6 +7,7 @@ is at z = 0 where nothing rises.
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,6 +18,7 @@ from pipelines.session.yaml_models import Part, read_yaml_model
 
 SCHEMA = 1
 _MOST_VOXELS = 20_000_000
+_MOST_ACTORS, _LONGEST_NAME = 16, 50
 _FARTHEST_VOXEL = 32_768  # from the origin along an axis, in an OctoMap
 # Logs begin before the flight and clocks run off; stamps in ROS are neither negative nor after January 2038.
 _EARLIEST_NS, _LATEST_NS = 60 * 10**9, (2**31 - 60) * 10**9
@@ -123,7 +125,7 @@ class Motion(Part):
 
 
 class Actor(Part):
-    """Who is filmed."""
+    """One person: how they look and move, and how well their position was known in flight."""
 
     body: Body = Body()
     start: Place = [0.0, 0.0]
@@ -131,6 +133,19 @@ class Actor(Part):
     motion: Motion
     estimate_sigma_m: float = Field(0.2, ge=0, le=10)  # of the actor's logged position, per axis
     estimate_rate_hz: float = Field(10.0, gt=0, le=100)
+
+
+def _is_topic(text: str) -> str:
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*", text) or len(text) > _LONGEST_NAME:
+        raise ValueError(
+            f"{text[:_LONGEST_NAME]!r} cannot name an actor, whose topic is /actor/NAME: take a letter, then"
+            f" letters, digits and single underscores between them, at most {_LONGEST_NAME} in all"
+        )
+    return text
+
+
+ActorName = Annotated[str, AfterValidator(_is_topic)]
+"""Part of a ROS 2 topic."""
 
 
 # --- the world -----------------------------------------------------------------------------------------
@@ -280,12 +295,14 @@ class DetectorErrors(Part):
 class Scenario(Part):
     """A flight to be simulated."""
 
+    one_of = ("actor", "actors")
     schema_version: Literal[1] = Field(alias="schema")
     name: str = Field("", max_length=1000)
     seed: int = Field(1, ge=0, lt=2**32)
     duration_s: Seconds
     start_ns: SecondsAsNs = Field(1_700_000_000_000_000_000, alias="start")
-    actor: Actor
+    actor: Actor | None = None
+    actors: dict[ActorName, Actor] | None = Field(None, min_length=1, max_length=_MOST_ACTORS)
     world: World = World()
     drones: Drones = Drones()
     keypoints: DetectorErrors = DetectorErrors()
@@ -304,6 +321,32 @@ class Scenario(Part):
             raise ValueError("drones.clock_offsets_s: an offset is beyond 10 s")
         return self
 
+    @property
+    def people(self) -> dict[str, Actor]:
+        """Everybody by name, in the scenario's order; the drones follow the first."""
+        if self.actor is not None:
+            return {"actor": self.actor}
+        return dict(self.actors or {})
+
+    def motion_files(self, folder: Path) -> dict[str, tuple[Path, Motion]]:
+        """Return the BVH files that are named, by actor; relative ones lie in a folder."""
+        motions = {name: actor.motion for name, actor in self.people.items()}
+        return {
+            name: (folder / motion.bvh, motion) for name, motion in motions.items() if motion.bvh is not None
+        }
+
+    def identity(self) -> dict[str, object]:
+        """Return what decides the flight, to be hashed: equal for equal flights.
+
+        A hash does not see the order of a mapping, but the first actor is followed. So actors become a list.
+        The detector that keypoints imitate is left out: the hash of its errors takes part instead.
+        """
+        unused: dict[str, bool | set[str]] = {"actor" if self.actors else "actors": True}
+        stated = self.model_dump(mode="json", exclude={**unused, "keypoints": {"detector"}})
+        if self.actors:
+            stated["actors"] = list(stated["actors"].items())
+        return stated
+
 
 def read_scenario(path: Path) -> Scenario:
     """Read and validate a scenario.
@@ -313,6 +356,10 @@ def read_scenario(path: Path) -> Scenario:
             every problem that was found.
     """
     scenario = read_yaml_model(
-        path, Scenario, "scenario", newest=SCHEMA, shape="a mapping with `schema: 1` and `actor:`"
+        path,
+        Scenario,
+        "scenario",
+        newest=SCHEMA,
+        shape="a mapping with `schema: 1` and `actor:` or `actors:`",
     )
     return scenario if scenario.name else scenario.model_copy(update={"name": path.stem})

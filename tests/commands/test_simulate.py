@@ -53,6 +53,22 @@ drones:
 """
 
 
+TWO = """
+schema: 1
+name: Two
+duration_s: 3
+actors:
+  anna: {motion: [walk: {distance_m: 5}]}
+  ben: {motion: [walk: {distance_m: 5}], start: [0, 4], body: {sex: female, height_m: 1.6}}
+world: {ground: {size_m: 40}, map: {resolution_m: 0.5, height_m: 4}}
+drones:
+  count: 3
+  camera: {shutters: synchronised}
+  formation: {tilt_deg: 35}
+keypoints: {scale: 0, missed_share: 0, outlier_share: 0, swap_share: 0}
+"""
+
+
 def scenario(folder: Path, text: str) -> Path:
     path = folder / "scenario.yaml"
     path.write_text(text, encoding="utf-8")
@@ -210,6 +226,101 @@ def test_what_stands_in_the_way_is_told(tmp_path: Path) -> None:
     assert grid["readings"][0]["occupied_voxels"] == tree["readings"][0]["occupied_voxels"] > 0
 
 
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The flight.yaml of two people's flight without videos, to look at and not to change."""
+    return simulated(tmp_path_factory.mktemp("two"), TWO, "--no-video")
+
+
+def test_every_person_is_in_the_truth_the_keypoints_and_the_log(two: Path) -> None:
+    folder = two.parent
+    assert json.loads((folder / "truth" / "people.json").read_text()) == {"people": ["anna", "ben"]}
+    truth = pd.read_csv(folder / "truth" / "joints.csv")
+    assert truth.groupby("t_ns").size().eq(2 * 17).all()
+    hip = truth[truth["joint"] == "left_hip"]
+    north = hip.groupby("person")["y"].mean()
+    assert north.to_dict() == {0: pytest.approx(0, abs=0.3), 1: pytest.approx(4, abs=0.3)}
+    shown = pd.read_csv(folder / "truth" / "drone1_visible.csv")
+    assert shown.groupby("frame")["person"].apply(list).tolist() == [[0, 1]] * 90
+    found = json.loads((folder / "drone1_keypoints.json").read_text())
+    assert {entry["idx"] for entry in found} == {1, 2}
+
+    with AnyReader([folder / "drone1.mcap"]) as reader:
+        logged = {
+            connection.topic: reader.deserialize(data, connection.msgtype).pose.pose.position.y  # type: ignore[attr-defined]
+            for connection, _, data in reader.messages()
+            if connection.topic.startswith("/actor")
+        }
+    # Estimates err by 0.2 m; the second walks 4 m north of the first.
+    assert logged == {"/actor/anna": pytest.approx(0, abs=1), "/actor/ben": pytest.approx(4, abs=1)}
+    assert "actor: {log: drone1, topic: /actor/anna, point: hip}" in two.read_text()
+    assert list(
+        json.loads(succeeds("info", folder / "scenario.yaml", "--json"))["readings"][0]["actors"]
+    ) == [
+        "anna",
+        "ben",
+    ]
+
+
+@pytest.mark.parametrize("first", ["anna", "ben"])
+def test_everybody_reconstructed_is_compared_with_their_own_truth(
+    two: Path, tmp_path: Path, first: str
+) -> None:
+    """As exact as one person alone, whoever is named first: that one is the logged actor, and person 0."""
+    flight = two
+    if first == "ben":
+        anna, ben = (line for line in TWO.splitlines(keepends=True) if line.startswith(("  anna", "  ben")))
+        flight = simulated(tmp_path, TWO.replace(anna + ben, ben + anna), "--no-video")
+    session = tmp_path / "two.session"
+    succeeds("ingest", flight, "-o", session)
+    truth = pd.read_parquet(session / "truth.parquet")
+    actor = truth[(truth["person"] == 0) & (truth["joint"] == "left_hip")]
+    for people in (1, 2):
+        metrics = json.loads(succeeds("reconstruct", session, "--persons", str(people), "--json"))
+        assert metrics["joint_frames"] == people * 90 * 17
+        assert metrics["mpjpe_mm"] < 0.5
+        assert metrics["reconstructed_share"] > 0.97
+        found = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
+        hip = found[(found["person"] == 0) & (found["joint"] == "left_hip") & (found["status"] == "ok")]
+        # People walk 4 m from each other, and the logged actor errs by 0.2 m.
+        assert np.abs(np.interp(hip["t_ns"], actor["t_ns"], actor["y"]) - hip["y"]).max() < 0.1
+
+
+@pytest.mark.slow
+def test_the_film_shows_everybody_and_the_nearer_hides_the_farther(tmp_path: Path) -> None:
+    """Ben stands between the first drone and Anna, the same body in the same pose, in black; she wears a red shirt.
+
+    Level with the hip and 10 m away, he covers her but for a rim; from the second drone both are seen.
+    """
+    begin = TWO.index("actors:")
+    people = """
+actors:
+  anna: {motion: [stand: {seconds: 1}], body: {outfit: casual}}
+  ben: {motion: [stand: {seconds: 1}], body: {outfit: dark}, start: [1, 0]}
+drones:
+  count: 2
+  camera: {width: 640, height: 360, rate_hz: 4, hfov_deg: 30, shutters: synchronised}
+  formation: {tilt_deg: 0}
+"""
+    text = TWO[:begin].replace("duration_s: 3", "duration_s: 0.5") + people
+
+    def red_pixels(flight: Path, name: str) -> int:
+        """Count the pixels of the red shirt in the first picture."""
+        with av.open(str(flight.parent / f"{name}.mp4")) as container:
+            picture = next(container.decode(video=0)).to_ndarray(format="rgb24").astype(int)
+        red, green, blue = np.moveaxis(picture, -1, 0)
+        return int(((red > 60) & (red > 1.8 * blue) & (red > 1.8 * green)).sum())
+
+    shirts = {}
+    for name, stated in {"both": text, "one": text.replace("start: [1, 0]", "start: [0, 40]")}.items():
+        (tmp_path / name).mkdir()
+        flight = simulated(tmp_path / name, stated)
+        shirts[name] = [red_pixels(flight, drone) for drone in ("drone1", "drone2")]
+    assert shirts["one"][0] > 300
+    assert shirts["both"][0] < 0.25 * shirts["one"][0]
+    assert shirts["both"][1] == pytest.approx(shirts["one"][1], rel=0.1)
+
+
 def test_a_flight_that_is_there_is_not_made_again(tmp_path: Path) -> None:
     flight = simulated(tmp_path, SMALL, "--no-video")
     written = flight.stat().st_mtime_ns
@@ -354,6 +465,28 @@ HOSTILE = {
     "a sun below the horizon": ("walls:", "sun: [1, 0, -1]\n  walls:", "sun"),
     "an odd picture": ("width: 320", "width: 321", "width"),
     "more offsets than drones": ("[0, 0.12]", "[0, 0.12, 0.3]", "clock_offsets_s"),
+    "one actor and several": (
+        "drones:",
+        "actors: {b: {motion: [stand: {seconds: 1}]}}\ndrones:",
+        "exactly one",
+    ),
+    "nobody": ("actor: {motion: [walk: {distance_m: 5}]}\n", "", "exactly one of actor, actors"),
+    "no actors": ("actor: {motion: [walk: {distance_m: 5}]}", "actors: {}", "actors: needs at least one"),
+    "an actor who cannot be a topic": (
+        "actor: {",
+        "actors: {the actor: {motion: [stand: {seconds: 1}]}}\nold: {",
+        "'the actor'",
+    ),
+    "an actor without a motion": (
+        "actor: {motion: [walk: {distance_m: 5}]}",
+        "actors: {b: {}}",
+        "actors.b.motion",
+    ),
+    "an actor's BVH that is not there": (
+        "actor: {motion: [walk: {distance_m: 5}]}",
+        "actors: {a: {motion: [stand: {seconds: 1}]}, b: {motion: {bvh: jig.bvh}}}",
+        "jig.bvh",
+    ),
     "newer schema": ("schema: 1", "schema: 2", "schema"),
     "a flight shorter than a picture": ("duration_s: 2", "duration_s: 0.001", "no picture"),
     "before the epoch": ("duration_s: 2", "duration_s: 2\nstart: 0", "start"),

@@ -12,11 +12,14 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.cameras import Intrinsics, project, undistort
 from pipelines.geometry.poses import invert, quaternion_from_matrix, rotate, transform
+from pipelines.simulation.body import make_body
 from pipelines.simulation.rendering import Renderer
 from pipelines.simulation.rendering.ground import FULL_SCALE, TILE_TEXELS, ground_texture
 from pipelines.simulation.rendering.sensor import EXPOSURE, NOISE
 from pipelines.simulation.rendering.shading import HAZE_M, HORIZON_RGB
-from pipelines.simulation.surfaces import Surface
+from pipelines.simulation.rig import BONES
+from pipelines.simulation.scenario import Body
+from pipelines.simulation.surfaces import Surface, hidden_by
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -190,6 +193,34 @@ def test_the_nearer_one_hides_the_farther() -> None:
     assert np.array_equal(renderer(half).silhouette(*pose, person), alone & left)
     rest = renderer().silhouette(*pose, half, [person])
     assert not (rest & renderer(half).silhouette(*pose, person)).any()
+
+
+@pytest.mark.parametrize(("aside", "hidden"), [(0.0, True), (0.96, True), (1.01, False)])
+def test_a_sphere_hides_what_is_behind_it(aside: float, hidden: bool) -> None:
+    """A line passes the centre at `aside` radii; the facets' planes are no nearer to it than cos(7.5 deg)."""
+    ball = sphere(np.zeros(3), 2.0)
+    ends = np.array([[30.0, 2 * aside, 0.0], [1e3, 2 * aside, 0.0], [-3.0, 2 * aside, 0.0], [np.nan, 0, 0]])
+    eye = np.array([-30.0, 2 * aside, 0.0])
+    assert hidden_by(ball, eye, ends).tolist() == [hidden, hidden, False, False]
+    assert hidden_by(ball, ends[0], eye[None]).tolist() == [hidden]  # its inside hides as well
+
+
+def test_a_person_hides_what_lies_behind_the_nearest_surface() -> None:
+    """The rasteriser's depth buffer and the intersection of lines with triangles say the same."""
+    person = make_body(Body())
+    body = person.surface(person.rig.offset[0], np.tile([0.0, 0.0, 0.0, 1.0], (len(BONES), 1)))
+    pose = looking((2.5, 1.0, 2.4), (0.0, 0.0, 0.9))
+    depth = renderer().depth(*pose, [body])
+    seen = np.argwhere(np.isfinite(depth))[::25]
+    empty = np.argwhere(np.isinf(depth))[::400]
+    assert min(len(seen), len(empty)) > 40
+    row, column = seen.T
+    through = rays(pose)[row, column]
+    before, behind = (pose[0] + through * (depth[row, column] + by)[:, None] for by in (-0.003, 0.003))
+    assert hidden_by(body, pose[0], behind).all()
+    assert not hidden_by(body, pose[0], before).any()
+    beside = pose[0] + rays(pose)[empty[:, 0], empty[:, 1]] * 10.0
+    assert not hidden_by(body, pose[0], beside).any()
 
 
 def linear(picture: NDArray[np.uint8]) -> Float:
