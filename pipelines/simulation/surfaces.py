@@ -47,7 +47,9 @@ def joined(*surfaces: Surface) -> Surface:
 
 
 def hidden_by(surface: Surface, eye: Float, targets: Float) -> Bool:
-    """Test if a surface stands between an eye and targets, exactly.
+    """Test if a surface stands between an eye and targets.
+
+    Exact up to rounding, which counts where a line runs through the edge of a triangle.
 
     Args:
         surface: the triangles; both of their sides hide.

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 
 from pipelines.filming import Shooting, film
@@ -14,6 +16,8 @@ from pipelines.reconstruct import reconstruct
 from pipelines.session.errors import DataError
 from pipelines.session.stages import WritableSession
 from pipelines.session.storage import read_json
+from pipelines.simulation.rendering.renderer import Renderer
+from pipelines.simulation.surfaces import Surface
 from tests.commands.test_replan import compare, refused, session_of
 from tests.keypoints.spotted_flights import spot_detector
 from tests.synthetic.flights import write_flight
@@ -94,3 +98,30 @@ def test_only_simulated_flights_are_filmed_again(tmp_path: Path) -> None:
         film(session)
     reconstruct(session)
     assert "only simulated flights can be filmed again" in refused(session, *SMALL, "-q")
+
+
+def test_everybody_of_the_scenario_is_filmed_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two people the first is measured; the second is in the pictures where the truth has them."""
+    people = (
+        "actors: {anna: {motion: [walk: {distance_m: 5}], estimate_sigma_m: 0.02},"
+        " ben: {motion: [stand: {seconds: 1}], start: [1, 3]}}"
+    )
+    text = SHORT.replace("actor: {motion: [walk: {distance_m: 5}], estimate_sigma_m: 0.02}", people)
+    session = session_of(tmp_path, text)
+    assert compare(session, "--arms", "fixed", "--trials", "1").exit_code == 0
+    rendered = []
+
+    def picture(
+        _: Renderer, position: object, quaternion: object, people: list[Surface], frame: int
+    ) -> object:
+        rendered.append([person.vertices.mean(axis=0) for person in people])
+        return np.zeros((360, 640, 3), np.uint8)
+
+    monkeypatch.setattr(Renderer, "picture", picture)
+    film(session, Shooting(rate_hz=4.0, end_s=0.6, detector=spot_detector(tmp_path)))
+    truth = pd.read_parquet(session / "truth.parquet").groupby("person")[["x", "y", "z"]].mean()
+    assert len(rendered) == 6
+    # A walk begins with a stand: within half a second nobody gets further than a step from their mean.
+    for people_seen in rendered:
+        np.testing.assert_allclose(people_seen, truth.to_numpy(), atol=1.2)
+    assert np.ptp(np.array(rendered)[:, 1], axis=0).max() < 0.05  # Ben stands

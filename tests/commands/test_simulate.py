@@ -288,7 +288,7 @@ def test_everybody_reconstructed_is_compared_with_their_own_truth(
 
 @pytest.mark.slow
 def test_the_film_shows_everybody_and_the_nearer_hides_the_farther(tmp_path: Path) -> None:
-    """Ben stands between the first drone and Anna, the same body in the same pose, in black; she wears a red shirt.
+    """Ben, in black, stands between the first drone and Anna, whose shirt is red; bodies and poses are alike.
 
     Level with the hip and 10 m away, he covers her but for a rim; from the second drone both are seen.
     """
