@@ -3,16 +3,21 @@
 Pictures are taken in blocks of fixed length, each followed from its own start, so that blocks can be worked
 on side by side and an interrupted run continues with those that are missing; the result does not depend on
 either.
+
+Keypoints are kept as long as the pictures, the detector and the actor's log are the same. Other clocks change
+their times only. Other poses, clocks and calibrations also change where the actor is looked for, a little;
+`hints_from` in `stage.json` says with which of them the keypoints were found.
 """
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from threading import local
 from typing import TYPE_CHECKING
@@ -25,7 +30,6 @@ from pipelines.keypoints.actor_hints import actor_hints
 from pipelines.keypoints.hints import Hint
 from pipelines.keypoints.tracking import PeopleTracker
 from pipelines.session.description import (
-    CameraEntry,
     Description,
     MediaEntry,
     read_description,
@@ -124,13 +128,26 @@ def detect(
         "start_s": start_s,
         "end_s": end_s,
     }
-    inputs = {f"model {name}": digest for name, digest in hashes_of_models(chosen).items()}
-    inputs |= _inputs(session, description, media, in_span=(start_s, end_s) != (None, None))
-    run = session.begin(DETECT, settings=settings, inputs=inputs, force=force)
+    ingested = session.intact_record("ingest")
+    if ingested is None:
+        raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
+    work = _Work(session.folder, description, every, (start_s, end_s))
+    looked_at = _looked_at(work, chosen, media)
+    kept = None if force else _kept(session, settings, looked_at)
+    hints = hints_of(description, ingested, media) if kept is None else hints_from(kept)
+    run = session.begin(
+        DETECT, settings=settings, inputs=looked_at | _times(ingested, media) | hints, force=force
+    )
     if run.finished:
         return run.record
+    if kept is not None:
+        progress.note(
+            "keypoints kept: the pictures and the detector are the same; their times were written anew"
+        )
+        _store_with_new_times(work, media, run.folder)
+        rows = {name: list(work.span(name)) for name in media}
+        return run.publish(counts=kept.counts | {"rows": rows}, warnings=kept.warnings)
 
-    work = _Work(session.folder, description, every, (start_s, end_s))
     blocks = [block for name in media for block in work.blocks(name)]
     pictures = sum(work.pictures(block) for block in blocks)
     if not pictures:
@@ -140,7 +157,7 @@ def detect(
             "look at `mocap info`, or leave it out",
         )
     progress.start("Detecting keypoints", pictures)
-    produce = partial(_produce, work, chosen, progress)
+    produce = partial(_produce, work, _Hints(session.folder, description, media), chosen, progress)
     folders = side_by_side(
         lambda block: run.chunk(block.name, partial(produce, block)), blocks, workers=workers, halt=work.halt
     )
@@ -176,30 +193,96 @@ def _lost_pictures(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
     ]
 
 
-def _inputs(
-    session: WritableSession, description: Description, media: Mapping[str, MediaEntry], *, in_span: bool
-) -> dict[str, str]:
-    """The hashes of what decides the keypoints: pictures, frame times, and what the hints are made of.
+# --- what keypoints depend on --------------------------------------------------------------------------
 
-    A span of the flight counts from the first frame of all cameras, those with keypoints among them.
-    """
-    ingested = session.intact_record("ingest")
-    if ingested is None:
-        raise DataError(session.folder, "was never ingested completely", "run `mocap ingest` again")
-    tables = {f"cameras/{name}/frames.parquet" for name in (description.cameras if in_span else media)}
-    inputs = {}
-    if description.actor is not None:
-        tables |= {"actor.parquet", *(f"cameras/{name}/poses.parquet" for name in media)}
-        inputs["actor"] = hash_of([description.actor.point, description.pose_interpolation.model_dump()])
-    pictures = description.pictures
+_HINTS_FROM = "hints_from"
+
+
+def hints_of(description: Description, ingested: StageRecord, cameras: Iterable[str]) -> dict[str, str]:
+    """Return the hash of all that says where the actor should be in the pictures; empty without an actor."""
+    if description.actor is None:
+        return {}
+    entries = {name: description.cameras[name] for name in sorted(cameras)}
+    made_of = [
+        [
+            description.actor.point,
+            description.pose_interpolation.model_dump(),
+            ingested.outputs["actor.parquet"],
+        ],
+        *(
+            [
+                name,
+                [entry.intrinsics.model_dump(), entry.poses.static, entry.pose_noise],
+                [ingested.outputs[f"cameras/{name}/{table}.parquet"] for table in ("frames", "poses")],
+            ]
+            for name, entry in entries.items()
+        ),
+    ]
+    return {_HINTS_FROM: hash_of(made_of)}
+
+
+def hints_from(detected: StageRecord) -> dict[str, str]:
+    """Return the hash, as `hints_of` has it, of the hints that keypoints were found with."""
+    return {name: digest for name, digest in detected.inputs.items() if name == _HINTS_FROM}
+
+
+def _looked_at(work: _Work, detector: Detector, media: Mapping[str, MediaEntry]) -> dict[str, str]:
+    """The hashes of what must be the same for keypoints to be kept: models, pictures and the actor's log."""
+    models = {f"model {name}": digest for name, digest in hashes_of_models(detector).items()}
+    frames = {f"frames of {name}": work.digest_of_frames(name) for name in media}
+    others = {f"pictures of {name}" for name in work.description.cameras if name not in media}
+    recorded = {name: it for name, it in work.description.recorded.items() if name not in others}
+    return models | frames | recorded
+
+
+def _times(ingested: StageRecord, media: Mapping[str, MediaEntry]) -> dict[str, str]:
+    """The hashes of the tables of the frames' times."""
+    tables = [f"cameras/{name}/frames.parquet" for name in media]
+    return {name: ingested.outputs[name] for name in tables}
+
+
+def _kept(
+    session: WritableSession, settings: Mapping[str, object], looked_at: Mapping[str, str]
+) -> StageRecord | None:
+    """Return the record of the detection that holds the keypoints of these pictures already, if one does."""
+    before = session.reusable(DETECT)
+    if before is None or before.settings != settings:
+        return None
+    may_change = {name for name in before.inputs if name.startswith("cameras/")} | {_HINTS_FROM}
+    same = {name: digest for name, digest in before.inputs.items() if name not in may_change} == looked_at
+    return before if same else None
+
+
+def _store_with_new_times(work: _Work, media: Mapping[str, MediaEntry], folder: Path) -> None:
+    """Write the keypoints that the session holds, at the times that its frames have now."""
     for name in media:
-        inputs[f"pictures of {name}"] = pictures[f"pictures of {name}"]
-        if description.actor is not None:
-            entry = description.cameras[name]
-            inputs[f"camera {name}"] = hash_of(
-                [entry.intrinsics.model_dump(), entry.poses.static, entry.pose_noise]
-            )
-    return inputs | {name: digest for name, digest in ingested.outputs.items() if name in tables}
+        keypoints = read_table(work.folder / DETECT.name / name / "keypoints.parquet", KEYPOINTS)
+        frame, t_ns = work.times(name)
+        row = np.searchsorted(frame, keypoints["frame"].to_numpy(np.int64))
+        (folder / name).mkdir()
+        write_table(folder / name / "keypoints.parquet", keypoints.assign(t_ns=t_ns[row]), KEYPOINTS)
+
+
+# --- the work ------------------------------------------------------------------------------------------
+
+
+class _Hints:
+    """Where the logged actor should be in the pictures of the cameras."""
+
+    def __init__(self, folder: Path, description: Description, cameras: Iterable[str]) -> None:
+        self._description = description
+        self._actor = logged_actor(folder, description)
+        self._tracks = {
+            name: trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
+            for name in (cameras if self._actor is not None else ())
+        }
+
+    def at(self, camera: str, t_ns: Int64) -> list[Hint | None]:
+        """The hints for a camera's pictures of these times [T]."""
+        if self._actor is None:
+            return [None] * len(t_ns)
+        entry, between = self._description.cameras[camera], self._description.pose_interpolation
+        return actor_hints(self._actor, camera, entry, self._tracks[camera], between, t_ns)
 
 
 class _Work:
@@ -225,11 +308,6 @@ class _Work:
             name: rows_between(frames["t_ns"].to_numpy(np.int64) - description.start_ns, *span_s)
             for name, frames in self._frames.items()
         }
-        self._actor = logged_actor(folder, description)
-        self._tracks = {
-            name: trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
-            for name in (self._frames if self._actor is not None else ())
-        }
 
     def blocks(self, camera: str) -> list[Block]:
         """The blocks of a camera; a single one of nothing where no picture is in the span."""
@@ -253,15 +331,18 @@ class _Work:
 
     def frames(self, block: Block) -> tuple[Int64, Int64]:
         """Numbers and times of the frames that are looked at."""
-        rows = self._frames[block.camera].iloc[list(self.rows(block))]
-        return rows["frame"].to_numpy(np.int64), rows["t_ns"].to_numpy(np.int64)
+        frame, t_ns = self.times(block.camera)
+        rows = list(self.rows(block))
+        return frame[rows], t_ns[rows]
 
-    def hints(self, block: Block, t_ns: Int64) -> list[Hint | None]:
-        """Where the logged actor should be in the pictures of these times [T]."""
-        if self._actor is None:
-            return [None] * len(t_ns)
-        name, between = block.camera, self.description.pose_interpolation
-        return actor_hints(self._actor, name, self.entry(block), self._tracks[name], between, t_ns)
+    def times(self, camera: str) -> tuple[Int64, Int64]:
+        """Numbers and times of all frames of a camera."""
+        frames = self._frames[camera]
+        return frames["frame"].to_numpy(np.int64), frames["t_ns"].to_numpy(np.int64)
+
+    def digest_of_frames(self, camera: str) -> str:
+        """The hash of the numbers of the frames that are looked at, block by block."""
+        return hash_of([sha256(self.frames(block)[0].tobytes()).hexdigest() for block in self.blocks(camera)])
 
     def networks(self, detector: Detector) -> KeypointNetworks:
         """The detector, loaded once by each thread: its networks may be used by one at a time."""
@@ -270,10 +351,6 @@ class _Work:
         networks: KeypointNetworks = self._of_thread.networks
         return networks
 
-    def entry(self, block: Block) -> CameraEntry:
-        """The camera as it was ingested."""
-        return self.description.cameras[block.camera]
-
 
 def _span_words(start_s: float | None, end_s: float | None) -> str:
     start = "" if start_s is None else f" from {start_s:g} s on"
@@ -281,7 +358,9 @@ def _span_words(start_s: float | None, end_s: float | None) -> str:
     return f"in the flight{start}{end}"
 
 
-def _produce(work: _Work, detector: Detector, progress: Progress, block: Block, folder: Path) -> None:
+def _produce(
+    work: _Work, hints: _Hints, detector: Detector, progress: Progress, block: Block, folder: Path
+) -> None:
     """Write what the detector finds in the pictures of one block."""
     networks = work.networks(detector)
     frame, t_ns = work.frames(block)
@@ -289,13 +368,12 @@ def _produce(work: _Work, detector: Detector, progress: Progress, block: Block, 
     found: list[tuple[int, int, Float, Float]] = []
     undecoded = 0
     numbers = frame.tolist()
-    hints = work.hints(block, t_ns)
     # Left early, the pictures must not be closed while the next one is being decoded.
     with (
         open_pictures(work.folder, work.description, block.camera) as pictures,
         closing(_decoded_ahead(pictures, numbers)) as decoded,
     ):
-        for number, picture, hint in zip(numbers, decoded, hints, strict=True):
+        for number, picture, hint in zip(numbers, decoded, hints.at(block.camera, t_ns), strict=True):
             work.halt.check()
             progress.advance()
             if picture is None:

@@ -32,7 +32,7 @@ from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, locked
 from pipelines.session.storage import read_json, write_json
 
-INGEST = Stage("ingest", revision=4)
+INGEST = Stage("ingest", revision=5)
 
 
 @dataclass(frozen=True)

@@ -122,7 +122,7 @@ def _begin(
     start_s, end_s = span_s
     settings = {"cameras": list(cameras), "start_s": start_s, "end_s": end_s}
     inputs = {"reconstruct": record.key}
-    inputs |= {f"pictures of {name}": description.pictures[f"pictures of {name}"] for name in cameras}
+    inputs |= {f"pictures of {name}": description.recorded[f"pictures of {name}"] for name in cameras}
     return session.begin(OVERLAY, settings=settings, inputs=inputs, force=force)
 
 

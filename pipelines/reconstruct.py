@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.detect import detect
+from pipelines.detect import detect, hints_from, hints_of
 from pipelines.formats.flights.picture_encodings import Picture
 from pipelines.formats.flights.pictures import open_pictures, refuse_changed_pictures
 from pipelines.geometry.triangulation import (
@@ -198,7 +198,12 @@ def reconstruct(
         _write(run.folder, stored, metrics)
         record = run.publish(
             counts=_counts(metrics, stored, swaps),
-            warnings=[*warnings, *stored.warnings, *_unused(cameras, stored.result)],
+            warnings=[
+                *_said_hints(description, ingested, detected),
+                *warnings,
+                *stored.warnings,
+                *_unused(cameras, stored.result),
+            ],
         )
         _tell_replaced(run, progress)
     return Reconstructed(folder, record, metrics, skipped=False)
@@ -235,9 +240,21 @@ def _stated(settings: Settings, detected: StageRecord | None) -> dict[str, objec
 
 
 def _inputs(ingested: StageRecord, detected: StageRecord | None, measured: Path | None) -> dict[str, str]:
-    """The hashes of what is read: tables, and how confidences of the detector were measured."""
-    inputs = dict(ingested.outputs) | (detected.outputs if detected else {})
+    """The hashes of what is read: tables, hints of the detector, and how its confidences were measured."""
+    inputs = dict(ingested.outputs) | (detected.outputs | hints_from(detected) if detected else {})
     return inputs if measured is None else inputs | {"calibration of confidences": sha256_of(measured)}
+
+
+def _said_hints(description: Description, ingested: StageRecord, detected: StageRecord | None) -> list[str]:
+    """Say where keypoints were found with other clocks, poses or calibrations than were ingested last."""
+    if detected is None or hints_from(detected) == hints_of(
+        description, ingested, detected.counts["cameras"]
+    ):
+        return []
+    return [
+        "keypoints are those of an earlier ingest: the clocks, poses or calibrations that said where to look"
+        " for the actor have changed since; --force detects them anew"
+    ]
 
 
 def _check_fill(fill_s: float | None) -> None:

@@ -344,7 +344,7 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
         true_poses=_by_camera(folder, "truth_poses.parquet", records["ingest"]),
         hidden=_load_hidden(folder, description, records, maps),
         made_by=versions_of(folder),
-        outdated=tuple(outdated(records, description.pictures)),
+        outdated=tuple(outdated(records, description.recorded)),
     )
 
 

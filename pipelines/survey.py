@@ -92,7 +92,7 @@ def _of_session(path: Path) -> dict[str, Any]:
         if stage == "ingest":
             continue
         facts[stage] = {"settings": record.settings, "counts": record.counts}
-    for stage in outdated(records, description.pictures):
+    for stage in outdated(records, description.recorded):
         facts[stage]["out of date"] = "what it was made of has changed since: run it again"
     return facts
 

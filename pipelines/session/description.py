@@ -142,6 +142,8 @@ class ActorEntry(Entry):
     """Where the actor was, as logged."""
 
     source: str
+    sources: list[str] = []  # the files of that log as `Description.sources` names them
+    topic: str | None = None  # as the manifest states it
     point: str  # of the body: hip, head, feet, centre
     count: int
     dropped: dict[str, int]
@@ -259,9 +261,12 @@ class Description(Entry):
         return self.truth is not None and bool(self.truth.joints)
 
     @property
-    def pictures(self) -> dict[str, str]:
-        """The hash of every camera's pictures as they were ingested, named as inputs of stages are."""
-        return {
+    def recorded(self) -> dict[str, str]:
+        """The hashes of recordings that were ingested: every camera's pictures, and the actor's log.
+
+        They are named as inputs of stages are. Clocks, poses and calibrations do not change them.
+        """
+        recorded = {
             f"pictures of {name}": hash_of(
                 [
                     [self.sources.get(source) for source in entry.media.sources],
@@ -272,6 +277,10 @@ class Description(Entry):
             for name, entry in self.cameras.items()
             if entry.media is not None
         }
+        if self.actor is not None:
+            log = [self.sources.get(source) for source in self.actor.sources]
+            recorded["log of the actor"] = hash_of([log, self.actor.topic, self.actor.point])
+        return recorded
 
     @property
     def start_ns(self) -> int:

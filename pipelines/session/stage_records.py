@@ -74,14 +74,14 @@ def key_of(stage: Stage, settings: Mapping[str, object], inputs: Mapping[str, st
     return hash_of(ingredients)
 
 
-def outdated(records: Mapping[str, StageRecord], pictures: Mapping[str, str]) -> list[str]:
+def outdated(records: Mapping[str, StageRecord], recorded: Mapping[str, str]) -> list[str]:
     """The stages, by name, of which something that they were made of has changed since.
 
     Args:
         records: the finished stages of a session, by name. Inputs that none of them made do not count.
-        pictures: the hashes of the cameras' pictures that were ingested (`Description.pictures`).
+        recorded: the hashes of the recordings that were ingested (`Description.recorded`).
     """
-    made = {**pictures, **{stage: record.key for stage, record in records.items()}}
+    made = {**recorded, **{stage: record.key for stage, record in records.items()}}
     for record in records.values():
         made |= record.outputs
     return [

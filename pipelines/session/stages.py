@@ -133,6 +133,19 @@ class WritableSession(Session):
         new.mkdir()
         return Run(self.folder, stage, key, settings, inputs, before=before, finished=False)
 
+    def reusable(self, stage: Stage) -> StageRecord | None:
+        """Return the record of a finished stage whose files a new run may take over.
+
+        None if the stage was never finished, is of another revision, or one of its files was changed since.
+
+        Raises:
+            DataError: the stage was written by a later version.
+        """
+        before = usable_record(self.folder / stage.name / "stage.json")
+        if before is None or before.revision != stage.revision or not self._intact(before):
+            return None
+        return before
+
     def _intact(self, record: StageRecord) -> bool:
         files = {self.folder / name: expected for name, expected in record.outputs.items()}
         return all(path.is_file() and sha256_of(path) == expected for path, expected in files.items())

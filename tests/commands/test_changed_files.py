@@ -95,6 +95,37 @@ def test_an_exchanged_video_is_refused_until_it_is_ingested_and_its_keypoints_go
     assert "unchanged" in succeeds(*again(flight))
 
 
+def test_another_clock_keeps_the_keypoints_at_new_times(flight: Path, tmp_path: Path) -> None:
+    session, manifest = flight / "flight.session", flight / "flight.yaml"
+    before = content(session)
+    keypoints = session / "detect" / "left" / "keypoints.parquet"
+    found, counts = pd.read_parquet(keypoints), read_json(session / "detect" / "stage.json")["counts"]
+    fresh = Path(shutil.copytree(flight, tmp_path / "fresh", copy_function=shutil.copy2))
+    shutil.rmtree(fresh / "flight.session")
+    stated = manifest.read_text()
+    corrected = stated.replace("offset_s: 0", "offset_s: 0.004", 1)
+    for folder in (flight, fresh):
+        (folder / "flight.yaml").write_text(corrected)
+        succeeds("ingest", folder / "flight.yaml")
+    videos = [flight / "left.mp4", flight / "right.mp4"]
+    for video in videos:
+        video.rename(video.with_suffix(".away"))
+    assert "written" in succeeds(*again(flight))  # nobody looks at a picture
+    assert "unchanged" in succeeds(*again(flight))
+    now = pd.read_parquet(keypoints)
+    pd.testing.assert_frame_equal(now, found.assign(t_ns=found["t_ns"] + 4_000_000))
+    assert read_json(session / "detect" / "stage.json")["counts"] == counts
+    # Nobody was logged: no hint can have changed, and the keypoints are those of the corrected flight.
+    succeeds(*again(fresh))
+    assert content(session) == content(fresh / "flight.session")
+    for video in videos:
+        video.with_suffix(".away").rename(video)
+    manifest.write_text(stated)
+    succeeds("ingest", manifest)
+    succeeds(*again(flight))
+    assert content(session) == before
+
+
 def test_the_same_video_goes_on_and_is_hashed_only_where_its_time_or_size_differ(
     flight: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

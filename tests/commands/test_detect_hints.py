@@ -20,7 +20,10 @@ from pipelines.session.logged_actor import logged_actor
 from pipelines.session.records import Trajectory
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.stages import locked
+from pipelines.session.storage import read_json
 from pipelines.session.tabular import trajectory_from
+from tests.commands.runner import mocap
+from tests.keypoints.onnx_graphs import constant_model
 from tests.keypoints.spotted_flights import CAMERAS, FPS, LENS, START_S, spot_detector, write_spotted_flight
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import Entry, write_log
@@ -64,14 +67,17 @@ class Flight:
         entry, between = description.cameras["left"], description.pose_interpolation
         return actor_hints(actor, "left", entry, track, between, stamps)
 
-    def key(self, detector: str, start_s: float | None = None) -> str:
-        """The key of the stage, which is run where that is not there yet."""
+    def detected(self, detector: str, start_s: float | None = None) -> StageRecord:
+        """The record of the stage, which is run where it has to be."""
         self.ingest()
-        record: StageRecord | None
         with locked(self.session) as writable:
             record = detect(writable, detector=detector, start_s=start_s)
         assert record is not None
-        return record.key
+        return record
+
+    def key(self, detector: str, start_s: float | None = None) -> str:
+        """The key of the stage, which is run where that is not there yet."""
+        return self.detected(detector, start_s).key
 
 
 @pytest.mark.parametrize(
@@ -136,23 +142,65 @@ def test_logged_covariances_count_where_nothing_is_stated(tmp_path: Path) -> Non
     )
 
 
-def test_what_decides_the_hints_decides_the_key(tmp_path: Path) -> None:
+def test_only_another_log_of_the_actor_has_the_keypoints_detected_anew(tmp_path: Path) -> None:
     flight, detector = Flight(tmp_path), spot_detector(tmp_path)
     camera = flight.settings["cameras"]["left"]
-    keys = [flight.key(detector)]
-    # Without an actor nothing is made of the poses' noise.
+    first = flight.detected(detector)
+    assert "hints_from" not in first.inputs, "nobody was logged"
     camera["pose_noise"] = NOISE
-    assert flight.key(detector) == keys[0]
+    assert flight.detected(detector) == first
     flight.log_actor("hip", 1.0)
-    keys.append(flight.key(detector))
-    assert flight.key(detector) == keys[-1]
+    hinted = flight.detected(detector)
+    assert hinted.inputs["log of the actor"] not in first.inputs.values()
+    # Poses, calibrations and clocks move the hints; the keypoints stay those that were found with the first.
     camera["pose_noise"] = {"white": {"position_m": 0.4}}
-    keys.append(flight.key(detector))
-    flight.settings["actor"]["point"] = "feet"
-    keys.append(flight.key(detector))
+    assert flight.detected(detector) == hinted
     camera["intrinsics"]["fx"] = 290.0
-    keys.append(flight.key(detector))
-    assert len(set(keys)) == len(keys)
+    assert flight.detected(detector) == hinted
+    camera["clock"]["offset_s"] = 0.01
+    later = flight.detected(detector)
+    assert later.key != hinted.key
+    assert later.inputs["hints_from"] == hinted.inputs["hints_from"]
+    # Another log, or another point of the body that it follows, is another actor.
+    flight.log_actor("hip", 1.2)
+    higher = flight.detected(detector)
+    flight.settings["actor"]["point"] = "feet"
+    feet = flight.detected(detector)
+    found_with = [record.inputs["hints_from"] for record in (hinted, higher, feet)]
+    assert len(set(found_with)) == 3
+
+
+def test_earlier_hints_are_said_until_the_keypoints_are_detected_anew(tmp_path: Path) -> None:
+    flight, detector = Flight(tmp_path), spot_detector(tmp_path)
+    # The actor stands in the middle of the square about the hint: row 120 of 240, 142 of the network's 320.
+    box = np.array([(100.0, 82.0, 220.0, 202.0, 0.9)], np.float32)
+    constant_model(tmp_path / "people.onnx", (320, 320), {"dets": box})
+    flight.log_actor("hip", 1.0)
+    flight.ingest()
+    reconstruct = ("reconstruct", flight.session, "--detector", detector)
+    assert "--force" not in told(reconstruct)
+    before = read_json(flight.session / "detect" / "stage.json")
+    flight.settings["cameras"]["left"]["pose_noise"] = NOISE
+    flight.ingest()
+    assert "--force" in told(reconstruct)
+    assert read_json(flight.session / "detect" / "stage.json") == before
+    assert any("earlier ingest" in line for line in warnings(flight.session))
+    assert "--force" in told(reconstruct), "unchanged, and still so"
+    assert "--force" not in told((*reconstruct, "--force"))
+    assert not any("earlier ingest" in line for line in warnings(flight.session))
+    after = read_json(flight.session / "detect" / "stage.json")
+    assert after["inputs"]["hints_from"] != before["inputs"]["hints_from"]
+
+
+def told(arguments: tuple[str | Path, ...]) -> str:
+    """What a command that succeeds says on stderr."""
+    done = mocap(*arguments)
+    assert done.returncode == 0, done.stderr
+    return done.stderr
+
+
+def warnings(session: Path) -> list[str]:
+    return list(read_json(session / "reconstruct" / "stage.json")["warnings"])
 
 
 def test_a_camera_that_gets_anothers_pictures_is_looked_at_again(tmp_path: Path) -> None:

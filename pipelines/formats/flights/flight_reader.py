@@ -266,7 +266,12 @@ class FlightReader:
         if trajectory.dropped:
             self._notes.append(f"actor: dropped: {losses(trajectory.dropped)}")
         return ActorEntry(
-            source=actor.log, point=actor.point, count=len(trajectory.t_ns), dropped=trajectory.dropped
+            source=actor.log,
+            sources=self._sources.files(actor.log),
+            topic=actor.topic,
+            point=actor.point,
+            count=len(trajectory.t_ns),
+            dropped=trajectory.dropped,
         )
 
     def store_map(self, folder: Path, entries: Mapping[str, CameraEntry]) -> MapEntry | None:

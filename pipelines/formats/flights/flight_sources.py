@@ -110,6 +110,10 @@ class FlightSources:
         """Which stamps of a log's messages count: header or receive."""
         return self._logs.settings(log).stamps
 
+    def files(self, log: str) -> list[str]:
+        """The files of a log, as the manifest states them."""
+        return self._logs.settings(log).path
+
     # --- keypoints and pictures ------------------------------------------------------------------------
 
     def keypoints(self, source: KeypointSource) -> tuple[Detections, str]:
@@ -157,7 +161,7 @@ class FlightSources:
         video = camera.video
         if video is None:
             return None
-        stated = self._logs.settings(video.log).path if video.log else [video.path or ""]
+        stated = self.files(video.log) if video.log else [video.path or ""]
         return MediaEntry(
             paths=[Path(os.path.relpath(self._base / path, session)).as_posix() for path in stated],
             sources=stated,
