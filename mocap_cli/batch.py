@@ -14,7 +14,9 @@ from mocap_cli.options import (
     json_option,
     level,
     overwrite_option,
+    provider_option,
     verbosity_options,
+    with_provider,
 )
 from mocap_cli.several import expanded
 from mocap_cli.terminal import one_line, print_json, say, watching
@@ -56,9 +58,10 @@ if TYPE_CHECKING:
     type=click.Choice(["dlt", "midpoint", "robust", "refined"]),
     default="robust",
     show_default=True,
-    help="Of `mocap reconstruct`, as the next two are.",
+    help="Of `mocap reconstruct`, as the next three are.",
 )
 @click.option("--detector", default="blazepose", show_default=True, help="For flights without keypoints.")
+@provider_option
 @every_option
 @force_option
 @overwrite_option
@@ -74,6 +77,7 @@ def batch_command(
     stages: str,
     method: Method | Literal["refined"],
     detector: str,
+    provider: str | None,
     every: int,
     force: bool,
     overwrite: bool,
@@ -93,7 +97,7 @@ def batch_command(
     settings = Settings(
         stages=tuple(name.strip() for name in stages.split(",") if name.strip()),
         method=method,
-        detector=detector,
+        detector=with_provider(detector, provider),
         every=every,
     )
     with watching(level(quiet, verbose)) as progress:

@@ -37,6 +37,26 @@ every_option = click.option(
 )
 
 
+provider_option = click.option(
+    "--provider",
+    metavar="NAME",
+    help="ONNX Runtime's execution provider that runs the models of --detector onnx:..., such as cuda"
+    " [default: cpu].",
+)
+
+
+def with_provider(detector: str, provider: str | None) -> str:
+    """What is asked of `--detector` and `--provider`, in one text."""
+    if provider is None:
+        return detector
+    if ":" not in detector:
+        raise click.BadParameter(
+            f"{detector} is not run by ONNX Runtime: leave it out, or write --detector onnx:MODEL.onnx",
+            param_hint="--provider",
+        )
+    return f"{detector},provider={provider}"
+
+
 def workers_option(help_text: str) -> Callable[[Command], Command]:
     """Threads of a simulation: two, unless the user says otherwise."""
     return click.option(

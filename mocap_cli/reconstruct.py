@@ -15,8 +15,10 @@ from mocap_cli.options import (
     force_option,
     json_option,
     level,
+    provider_option,
     seed_option,
     verbosity_options,
+    with_provider,
 )
 from mocap_cli.several import each
 from mocap_cli.terminal import print_table, say, say_warnings, watching
@@ -106,6 +108,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Runs on the pictures of cameras that came without keypoints (see `mocap models`).",
 )
+@provider_option
 @every_option
 @click.option(
     "--start",
@@ -144,6 +147,7 @@ def reconstruct_command(
     fill: float | None,
     smooth: str | None,
     detector: str,
+    provider: str | None,
     every: int,
     start: float | None,
     end: float | None,
@@ -167,7 +171,7 @@ def reconstruct_command(
         min_confidence=min_confidence,
         pixel_sigma=pixel_noise,
         pose_noise=pose_noise,
-        detector=detector,
+        detector=with_provider(detector, provider),
         every=every,
         start_s=start,
         end_s=end,

@@ -14,9 +14,9 @@ from pipelines.session.errors import DataError
 from pipelines.session.extras import need
 
 Layout = Literal["nchw", "nhwc"]
-Provider = Literal["cpu", "cuda"]
 
-_PROVIDERS: dict[Provider, str] = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
+_PROVIDER_OPTIONS = {"cuda": {"cudnn_conv_algo_search": "HEURISTIC"}}
+"""Their settings. Unasked, CUDA times its algorithms and takes the fastest, so that two runs may differ."""
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 _FATAL = 4  # ONNX Runtime's least talkative level: what fails is said by us
 
@@ -33,13 +33,15 @@ class Colours:
 IMAGENET_MEAN, IMAGENET_STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 
 
-def available_provider() -> Provider:
-    """CUDA where this ONNX Runtime was built with it, otherwise the CPU.
+def provider_name(text: str) -> str:
+    """Return the short name of an execution provider: `cuda` for `CUDAExecutionProvider` and `CUDA`."""
+    return text.lower().removesuffix("executionprovider")
 
-    Raises:
-        DataError: ONNX Runtime is not installed.
-    """
-    return "cuda" if _PROVIDERS["cuda"] in _runtime().get_available_providers() else "cpu"
+
+def provider_with_options(name: str) -> str:
+    """Return a provider's short name with the options that it is given: what decides the last digits."""
+    options = _PROVIDER_OPTIONS.get(name, {})
+    return ":".join([name, *(f"{option}={value}" for option, value in sorted(options.items()))])
 
 
 class OnnxNetwork:
@@ -48,7 +50,7 @@ class OnnxNetwork:
     Args:
         path: the model.
         colours: how it wants its pixels.
-        provider: what runs it.
+        provider: the short name of the execution provider that runs it.
         size: width and height of its input, where the graph leaves them open.
         layout: of its input, where the graph leaves it open.
         threads: on the CPU.
@@ -58,7 +60,8 @@ class OnnxNetwork:
         shapes: of the outputs, by name, for one picture.
 
     Raises:
-        DataError: not a model that ONNX Runtime can run, or not one of a single picture as input.
+        DataError: not a model that ONNX Runtime can run, or not one of a single picture as input; no such
+            provider.
     """
 
     def __init__(
@@ -66,7 +69,7 @@ class OnnxNetwork:
         path: Path,
         colours: Colours,
         *,
-        provider: Provider,
+        provider: str,
         size: tuple[int, int] | None = None,
         layout: Layout | None = None,
         threads: int,
@@ -129,7 +132,7 @@ def _runtime() -> Any:
     return need("onnxruntime", "onnx")
 
 
-def _session(path: Path, provider: Provider, threads: int) -> Any:
+def _session(path: Path, provider: str, threads: int) -> Any:
     runtime = _runtime()
     if not path.is_file():
         raise DataError(path, "does not exist", "give the path of an ONNX model")
@@ -137,15 +140,21 @@ def _session(path: Path, provider: Provider, threads: int) -> Any:
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = _FATAL
-    wanted = _PROVIDERS[provider]
-    if wanted not in runtime.get_available_providers():
-        raise DataError(f"provider={provider}", "is not in this ONNX Runtime", "install onnxruntime-gpu")
+    there = {provider_name(full): full for full in runtime.get_available_providers()}
+    if provider not in there:
+        raise DataError(
+            f"--provider {provider}",
+            "is not in this ONNX Runtime",
+            f"there are {', '.join(sorted(there))}; other builds of it, such as onnxruntime-gpu, have others",
+        )
+    wanted = there[provider]
+    given = [(wanted, _PROVIDER_OPTIONS.get(provider, {}))]
     try:
-        session = runtime.InferenceSession(str(path), options, providers=[wanted])
+        session = runtime.InferenceSession(str(path), options, providers=given)
     except Exception as error:  # ONNX Runtime's exceptions share no other base
         raise DataError(path, f"is no model that ONNX Runtime can run ({_line(error)})") from None
     if session.get_providers()[0] != wanted:
-        raise DataError(f"provider={provider}", "could not be started", "write provider=cpu")
+        raise DataError(f"--provider {provider}", "could not be started", "leave it out: the CPU runs it")
     return session
 
 

@@ -12,7 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from pipelines.keypoints.onnx_network import IMAGENET_MEAN, IMAGENET_STD, Colours, Layout, Provider
+from pipelines.keypoints.onnx_network import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    Colours,
+    Layout,
+    provider_name,
+)
 from pipelines.keypoints.pose_outputs import HeatmapCells
 from pipelines.session.errors import DataError
 from pipelines.session.skeletons import SKELETONS
@@ -26,11 +32,12 @@ skeleton=NAME: which joints [by their number]; of more joints the first are take
 heatmap=udp|msra: how a heatmap model was trained: ViTPose udp, plain HRNet and FastPose msra [udp]
 mean=R/G/B, std=R/G/B, colours=rgb|bgr: what it wants, of values 0..255 [ImageNet's, rgb]
 size=WxH, layout=nchw|nhwc: of its input, where the graph leaves them open
-provider=cpu|cuda: what runs it [cuda where ONNX Runtime has it]"""
+provider=NAME: ONNX Runtime's execution provider that runs it, such as cuda; --provider says the same [cpu]"""
 
 Three = tuple[float, float, float]
 
 _OPTION = re.compile(r"[a-z_]+=")
+_UNSTATED = {"people", "provider"}
 _PEOPLE_NORMS: dict[str, tuple[Three, Three]] = {
     "none": ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
     "imagenet": (IMAGENET_MEAN, IMAGENET_STD),
@@ -49,9 +56,9 @@ class OnnxOptions:
     heatmap: HeatmapCells
     size: tuple[int, int] | None
     layout: Layout | None
-    provider: Provider | None
+    provider: str
     stated: tuple[tuple[str, str], ...]
-    """The options as written, sorted, without paths."""
+    """The options as written, sorted, without paths and provider."""
 
 
 def parse_options(argument: str) -> OnnxOptions:
@@ -81,8 +88,8 @@ def parse_options(argument: str) -> OnnxOptions:
         heatmap=read.get("heatmap", "udp"),
         size=read.get("size"),
         layout=read.get("layout"),
-        provider=read.get("provider"),
-        stated=tuple(sorted((name, value) for name, value in given.items() if name != "people")),
+        provider=read.get("provider", "cpu"),
+        stated=tuple(sorted((name, value) for name, value in given.items() if name not in _UNSTATED)),
     )
 
 
@@ -98,6 +105,12 @@ def _one_of(*choices: str) -> Callable[[str, str], str]:
         return value
 
     return read
+
+
+def _provider(place: str, value: str) -> str:
+    if not re.fullmatch(r"\w+", value, re.ASCII):
+        raise DataError(place, "names no execution provider", "write its name, such as cpu or cuda")
+    return provider_name(value)
 
 
 def _three(place: str, value: str) -> Three:
@@ -135,5 +148,5 @@ _READERS: dict[str, Callable[[str, str], object]] = {
     "colours": _one_of("rgb", "bgr"),
     "size": _wide_and_high,
     "layout": _one_of(*get_args(Layout)),
-    "provider": _one_of(*get_args(Provider)),
+    "provider": _provider,
 }

@@ -15,7 +15,7 @@ import numpy as np
 
 from pipelines.keypoints.blazepose import DETECTOR as BLAZEPOSE
 from pipelines.keypoints.crops import Picture, in_picture, sampled, side_of_box, upright_crop
-from pipelines.keypoints.onnx_network import OnnxNetwork, Provider, available_provider
+from pipelines.keypoints.onnx_network import OnnxNetwork, provider_with_options
 from pipelines.keypoints.onnx_options import USAGE, OnnxOptions, parse_options
 from pipelines.keypoints.onnx_people import OnnxPeople
 from pipelines.keypoints.pose_outputs import PoseDecoder, decoder_for
@@ -125,7 +125,7 @@ class OnnxDetector:
     @property
     def name(self) -> str:
         """The options without paths, and what runs the model, since another gives other last digits."""
-        stated = {**dict(self.options.stated), "provider": self._provider}
+        stated = {**dict(self.options.stated), "provider": provider_with_options(self.options.provider)}
         return "onnx:" + ",".join(f"{name}={value}" for name, value in sorted(stated.items()))
 
     @property
@@ -138,10 +138,6 @@ class OnnxDetector:
         else:
             finder = "no person detector: people are seen only where the log says that the actor is"
         return f"{self.options.model.name} ({finder})"
-
-    @property
-    def _provider(self) -> Provider:
-        return self.options.provider or available_provider()
 
     @property
     def _has_blazepose(self) -> bool:
@@ -174,7 +170,7 @@ class OnnxDetector:
         network = OnnxNetwork(
             options.model,
             options.colours,
-            provider=self._provider,
+            provider=options.provider,
             size=options.size,
             layout=options.layout,
             threads=threads,
@@ -187,7 +183,7 @@ class OnnxDetector:
         options = self.options
         if options.people is not None:
             people = OnnxNetwork(
-                options.people, options.people_colours, provider=self._provider, threads=threads
+                options.people, options.people_colours, provider=options.provider, threads=threads
             )
             return _BoxedPeople(OnnxPeople(people), size)
         return BLAZEPOSE.load_person_finder(threads=threads) if self._has_blazepose else None

@@ -13,7 +13,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.commands.runner import MOCAP, content, refused, succeeds
+from pipelines.session.extras import need
+from tests.commands.runner import MOCAP, content, mocap, refused, succeeds
 from tests.keypoints.spotted_flights import CAMERAS, FPS, person_at, spot_detector, write_spotted_flight
 
 
@@ -53,6 +54,40 @@ def test_what_cannot_be_run_is_refused_in_one_line(tmp_path: Path) -> None:
     text = tmp_path / "text.onnx"
     text.write_text("no model")
     assert "is no model" in refused("reconstruct", session, "--detector", f"onnx:{text}")
+
+
+def test_another_provider_detects_anew_and_one_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    session = write_spotted_flight(tmp_path, 5).with_suffix(".session")
+    succeeds("ingest", tmp_path / "flight.yaml")
+    reconstruct = (
+        "reconstruct",
+        session,
+        "--detector",
+        spot_detector(tmp_path).removesuffix(",provider=cpu"),
+    )
+    line = refused(*reconstruct, "--provider", "QuantumExecutionProvider")
+    assert "--provider quantum" in line
+    assert "cpu" in line
+    assert not (session / "detect").exists()
+    succeeds(*reconstruct)
+    assert "unchanged" in succeeds(*reconstruct, "--provider", "CPUExecutionProvider")
+    assert provider(session) == "cpu"
+    assert "states provider twice" in refused(*reconstruct[:-1], spot_detector(tmp_path), "--provider", "cpu")
+    refusal = mocap("reconstruct", session, "--provider", "cpu")
+    assert refusal.returncode == 2, "BlazePose is not run by ONNX Runtime"
+    onnxruntime = need("onnxruntime", "onnx")
+    others = [name for name in onnxruntime.get_available_providers() if name != "CPUExecutionProvider"]
+    if not others:
+        pytest.skip("this ONNX Runtime has no other provider")
+    succeeds(*reconstruct, "--provider", others[0])
+    assert provider(session) == others[0].removesuffix("ExecutionProvider").lower()
+
+
+def provider(session: Path) -> str:
+    """What ran the models, as the stage says."""
+    stage = json.loads((session / "detect" / "stage.json").read_text(encoding="utf-8"))
+    stated = dict(option.split("=", 1) for option in stage["settings"]["detector"][len("onnx:") :].split(","))
+    return str(stated["provider"])
 
 
 def test_models_tells_how_to_use_your_own() -> None:

@@ -159,6 +159,21 @@ def test_what_decides_the_result_is_in_the_name_and_paths_are_not(tmp_path: Path
     assert a.models()["pose"] == path
 
 
+def test_the_processor_runs_models_unless_another_provider_is_asked_for(tmp_path: Path) -> None:
+    path = simcc_model(tmp_path / "m.onnx")
+    assert DETECTOR.configured(str(path)).name == "onnx:provider=cpu"
+    assert DETECTOR.configured(f"{path},provider=CPUExecutionProvider").name == "onnx:provider=cpu"
+    cuda = {DETECTOR.configured(f"{path},provider={it}").name for it in ("cuda", "CUDAExecutionProvider")}
+    # What it is told to do otherwise than by itself is part of what decides the result.
+    assert cuda == {"onnx:provider=cuda:cudnn_conv_algo_search=HEURISTIC"}
+
+
+def test_a_provider_that_is_not_there_is_refused_with_those_that_are(tmp_path: Path) -> None:
+    detector = DETECTOR.configured(f"{simcc_model(tmp_path / 'm.onnx')},provider=QuantumExecutionProvider")
+    with pytest.raises(DataError, match=r"^--provider quantum: .*there are .*\bcpu\b"):
+        detector.load(threads=1)
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -171,6 +186,8 @@ def test_what_decides_the_result_is_in_the_name_and_paths_are_not(tmp_path: Path
         ("magic=1", "no option 'magic'"),
         ("layout=nchw,layout=nhwc", "states layout twice"),
         ("skeleton=ape", "there are coco17"),
+        ("provider=", "names no execution provider"),
+        ("provider=cpu,provider=cuda", "states provider twice"),
     ],
 )
 def test_bad_options_are_refused_with_what_there_is(tmp_path: Path, options: str, said: str) -> None:
