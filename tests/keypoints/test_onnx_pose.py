@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from pipelines.keypoints.crops import Picture
+from pipelines.keypoints.onnx_network import OnnxNetwork
 from pipelines.keypoints.onnx_pose import DETECTOR, OnnxPose
 from pipelines.session.errors import DataError
 from pipelines.session.registries import Region
@@ -71,6 +76,24 @@ def test_any_batch_and_layout_gives_the_same(tmp_path: Path, batch: int | str, l
         np.testing.assert_allclose(person.xy, alone.xy, atol=1e-4)  # float32 sums in another order
         np.testing.assert_allclose(person.xy[:2], [UPPER, LOWER], atol=1.05 * HEATMAP_PX)
     assert networks.locate(picture, []) == []
+
+
+@pytest.mark.parametrize(("batch", "runs"), [("n", 1), (1, 3), (2, 2), (8, 1)])
+def test_the_people_of_a_picture_are_one_batch_where_the_graph_takes_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch: int | str, runs: int
+) -> None:
+    networks = load(heatmap_model(tmp_path / "m.onnx", batch=batch))
+    lengths: list[int] = []
+    outputs = OnnxNetwork._outputs
+
+    def counted(network: OnnxNetwork, rgb: Picture, names: Sequence[str] | None) -> dict[str, NDArray[Any]]:
+        lengths.append(len(rgb))
+        return outputs(network, rgb, names)
+
+    monkeypatch.setattr(OnnxNetwork, "_outputs", counted)
+    regions = [Region((300.0 + i, 200.0), 160.0 + i) for i in range(3)]
+    assert len(networks.locate(spots(640, 400, [UPPER, LOWER], SPOT_PX), regions)) == 3
+    assert lengths == [3 if batch == "n" else batch] * runs
 
 
 def test_an_open_size_is_stated(tmp_path: Path) -> None:
