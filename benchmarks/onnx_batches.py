@@ -58,7 +58,7 @@ def main() -> None:
 
 
 def taken(network: OnnxNetwork, crops: NDArray[np.uint8], clock: Callable[[], float]) -> float:
-    """Seconds of one run."""
+    """Return the seconds of one run."""
     begun = clock()
     network.batch(crops, ["heatmap"])
     return clock() - begun
@@ -108,12 +108,13 @@ class _Graph:
         self._rng = np.random.default_rng(0)
 
     def add(self, kind: str, inputs: list[str], **attributes: Any) -> str:
+        """Add a node; return the name of its output."""
         name = f"value{len(self.nodes)}"
         self.nodes.append(helper.make_node(kind, inputs, [name], **attributes))
         return name
 
     def weight(self, shape: tuple[int, ...]) -> str:
-        """Random numbers that keep the size of what goes through."""
+        """Add random numbers that keep the size of what goes through; return their name."""
         name = f"weight{len(self.weights)}"
         spread = np.sqrt(2 / np.prod(shape[1:]))
         values = (spread * self._rng.standard_normal(shape)).astype(np.float32)
@@ -123,7 +124,7 @@ class _Graph:
     def conv(
         self, value: str, channels: int, made: int, *, kernel: int = 1, stride: int = 1, relu: bool = True
     ) -> str:
-        """A convolution of the size of its input, or of half of it."""
+        """Add a convolution whose output has its input's size divided by the stride; return its name."""
         around = [kernel // 2] * 4
         weight = self.weight((made, channels, kernel, kernel))
         value = self.add(

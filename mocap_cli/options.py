@@ -46,7 +46,7 @@ provider_option = click.option(
 
 
 def with_provider(detector: str, provider: str | None) -> str:
-    """What is asked of `--detector` and `--provider`, in one text."""
+    """Add the provider to the detector's options, where one was asked for."""
     if provider is None:
         return detector
     if ":" not in detector:

@@ -227,7 +227,7 @@ def hints_from(detected: StageRecord) -> dict[str, str]:
 
 
 def _looked_at(work: _Work, detector: Detector, media: Mapping[str, MediaEntry]) -> dict[str, str]:
-    """The hashes of what must be the same for keypoints to be kept: models, pictures and the actor's log."""
+    """Hash what must be the same for keypoints to be kept: models, pictures and the actor's log."""
     models = {f"model {name}": digest for name, digest in hashes_of_models(detector).items()}
     frames = {f"frames of {name}": work.digest_of_frames(name) for name in media}
     others = {f"pictures of {name}" for name in work.description.cameras if name not in media}
@@ -236,7 +236,7 @@ def _looked_at(work: _Work, detector: Detector, media: Mapping[str, MediaEntry])
 
 
 def _times(ingested: StageRecord, media: Mapping[str, MediaEntry]) -> dict[str, str]:
-    """The hashes of the tables of the frames' times."""
+    """Return the hashes of the tables that hold the frames' times."""
     tables = [f"cameras/{name}/frames.parquet" for name in media]
     return {name: ingested.outputs[name] for name in tables}
 
@@ -278,7 +278,7 @@ class _Hints:
         }
 
     def at(self, camera: str, t_ns: Int64) -> list[Hint | None]:
-        """The hints for a camera's pictures of these times [T]."""
+        """Return the hints for a camera's pictures of these times [T]."""
         if self._actor is None:
             return [None] * len(t_ns)
         entry, between = self._description.cameras[camera], self._description.pose_interpolation
@@ -336,12 +336,12 @@ class _Work:
         return frame[rows], t_ns[rows]
 
     def times(self, camera: str) -> tuple[Int64, Int64]:
-        """Numbers and times of all frames of a camera."""
+        """Return numbers and times of all frames of a camera."""
         frames = self._frames[camera]
         return frames["frame"].to_numpy(np.int64), frames["t_ns"].to_numpy(np.int64)
 
     def digest_of_frames(self, camera: str) -> str:
-        """The hash of the numbers of the frames that are looked at, block by block."""
+        """Hash the numbers of the frames that are looked at, block by block."""
         return hash_of([sha256(self.frames(block)[0].tobytes()).hexdigest() for block in self.blocks(camera)])
 
     def networks(self, detector: Detector) -> KeypointNetworks:

@@ -193,7 +193,7 @@ def test_earlier_hints_are_said_until_the_keypoints_are_detected_anew(tmp_path: 
 
 
 def told(arguments: tuple[str | Path, ...]) -> str:
-    """What a command that succeeds says on stderr."""
+    """Run a command that must succeed; return its stderr."""
     done = mocap(*arguments)
     assert done.returncode == 0, done.stderr
     return done.stderr

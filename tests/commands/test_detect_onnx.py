@@ -84,7 +84,7 @@ def test_another_provider_detects_anew_and_one_that_is_not_there_is_refused(tmp_
 
 
 def provider(session: Path) -> str:
-    """What ran the models, as the stage says."""
+    """Return the provider that the stage says ran the models."""
     stage = json.loads((session / "detect" / "stage.json").read_text(encoding="utf-8"))
     stated = dict(option.split("=", 1) for option in stage["settings"]["detector"][len("onnx:") :].split(","))
     return str(stated["provider"])

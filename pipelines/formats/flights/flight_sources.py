@@ -111,7 +111,7 @@ class FlightSources:
         return self._logs.settings(log).stamps
 
     def files(self, log: str) -> list[str]:
-        """The files of a log, as the manifest states them."""
+        """Return the files of a log, as the manifest states them."""
         return self._logs.settings(log).path
 
     # --- keypoints and pictures ------------------------------------------------------------------------
