@@ -54,7 +54,7 @@ class Person:
     keypoint_moment: Float  # [17, M, 3] m, at rest
 
     def surface(self, root: Float, rotation: Float) -> Surface:
-        """The person in one pose.
+        """Return the person's surface in one pose.
 
         Args:
             root: [3] m, the pelvis's joint in the world.
@@ -63,7 +63,7 @@ class Person:
         return Surface(self.skin.moved(*self.skinning.transforms(root, rotation)), self.faces, self.colour)
 
     def keypoints(self, motion: BodyMotion) -> Float:
-        """Where the keypoints are: [T, 17, 3] m, world, in the order of `joints`.
+        """Compute the keypoints [T, 17, 3] m, world, in the order of `joints`.
 
         A blend of transforms is linear in the points, so the mean of the skinned vertices of a keypoint
         is the blend of their mass and moment by bone.
@@ -77,7 +77,7 @@ class Person:
 
 
 def make_body(look: Body) -> Person:
-    """The person of a scenario, `look.height_m` tall from bare soles to the crown in the neutral pose.
+    """Make the person of a scenario: `look.height_m` from bare soles to the crown in the neutral pose.
 
     Shoes and hair come on top: 1 % and 1 % of the height. The ground, z = 0 of the neutral pose, is
     under the shoes.
@@ -116,7 +116,10 @@ def _undressed(look: Body) -> Undressed:
 
 
 def _height_standing(vertices: Float, joint: Float) -> float:
-    """Bare, legs straight down: they are spread at rest, which lowers the body by some millimetres."""
+    """Return the bare body's height with straight legs, m.
+
+    At rest the legs are spread. This lowers the body by some millimetres.
+    """
     thigh, shank, foot = (joint[BONE[f"left_{name}"]] for name in ("thigh", "shank", "foot"))
     leg = np.linalg.norm(shank - thigh) + np.linalg.norm(foot - shank)
     return float(vertices[:, 2].max() - thigh[2] + leg + foot[2])
@@ -126,7 +129,7 @@ def _height_standing(vertices: Float, joint: Float) -> float:
 
 
 def _cleared(body: Undressed) -> Skinning:
-    """The neutral pose, with the least lean of the arms that keeps them off the body in any clothes."""
+    """Return the neutral pose with the least lean of the arms that keeps them off the body in any clothes."""
     skin = make_skin(body.vertices, body.weights)
     arm = body.weights[:, [BONE["left_forearm"], BONE["left_hand"]]].sum(axis=1) > 0.5
     inner = [BONE[name] for name in ("pelvis", "spine", "back", "left_thigh")]
@@ -141,7 +144,7 @@ def _cleared(body: Undressed) -> Skinning:
 
 
 def _apart(outer: Float, inner: Float) -> bool:
-    """Whether the first lie left of the second in every level slice, with room for clothes between."""
+    """Test if the first points lie left of the second in every level slice, with room for clothes between."""
     bottom = min(outer[:, 2].min(), inner[:, 2].min())
     at_outer, at_inner = (((points[:, 2] - bottom) / _SLICE).astype(np.intp) for points in (outer, inner))
     slices = max(at_outer.max(), at_inner.max()) + 1
@@ -152,13 +155,16 @@ def _apart(outer: Float, inner: Float) -> bool:
 
 
 def _standing(skinning: Skinning, skin: Skin) -> Float:
-    """[V, 3] m from the pelvis's joint in the neutral pose."""
+    """Return the points [V, 3] in the neutral pose, in m from the pelvis's joint."""
     still = np.tile([0.0, 0.0, 0.0, 1.0], (len(BONES), 1))
     return skin.moved(*skinning.transforms(np.zeros(3), still))
 
 
 def _measured(skinning: Skinning, skin: Skin, dressed: Dressed, strip_m: float) -> Rig:
-    """The rig of a mesh, with the point of the ground between the ankles below the neutral pelvis."""
+    """Measure the rig of a mesh.
+
+    The pelvis's offset starts at the ground, at the point between the ankles below the neutral pelvis.
+    """
     points = _standing(skinning, skin)
     offset = skinning.offset.copy()
     ankle = sum(offset[BONE[f"left_{name}"]] for name in ("thigh", "shank", "foot"))
@@ -174,7 +180,7 @@ def _measured(skinning: Skinning, skin: Skin, dressed: Dressed, strip_m: float) 
 
 
 def _sole_at(under: Float, x: float, strip_m: float) -> Float:
-    """The middle of a sole [N, 3] m across the foot, `x` ahead of its joint."""
+    """Find the middle of a sole [N, 3] m across the foot, `x` ahead of its joint."""
     near = under[np.abs(under[:, 0] - x) < strip_m]
     return np.array([x, (near[:, 1].min() + near[:, 1].max()) / 2, under[:, 2].min()])
 
@@ -183,7 +189,10 @@ def _sole_at(under: Float, x: float, strip_m: float) -> Float:
 
 
 def _keypoint_parts(body: Undressed) -> tuple[Float, Float]:
-    """What each moving bone holds of each keypoint: share [17, M] and share times place [17, M, 3]."""
+    """Compute the part of each moving bone in each keypoint: mass [17, M] and moment [17, M, 3].
+
+    The mass is the bone's share of the keypoint; rows sum to 1. The moment is the share times the place.
+    """
     asset = _asset()
     vertex, row = asset["keypoint_vertex"].astype(np.intp), asset["keypoint"].astype(np.intp)
     by_bone = moving_weights(body.weights[vertex]) * asset["keypoint_weight"].astype(np.float64)[:, None]

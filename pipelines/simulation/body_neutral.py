@@ -1,4 +1,4 @@
-"""From the pose a body was modelled in, limbs spread, to the neutral pose of `rig`."""
+"""Turns and offsets from the pose a body was modelled in, limbs spread, to the neutral pose of `rig`."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ Float = NDArray[np.float64]
 
 
 def neutral_turns(rest_joint: Float, lean_rad: float) -> Float:
-    """How each bone turns from rest to neutral: [22, 4] quaternions xyzw.
+    """Compute the turn of each bone from rest to neutral: [22, 4] quaternions xyzw.
 
     Trunk and head stay. Legs come down straight, arms straight with the hands forward of the elbows'
     bend, so that a knee or elbow bends about the axis from side to side; feet point ahead, soles level.
 
     Args:
         rest_joint: [22, 3] m, x forward, y left, z up.
-        lean_rad: how far the arms hang from the vertical, outward, to clear the hips.
+        lean_rad: angle of the arms from the vertical, outward, to clear the hips.
     """
     turns = np.tile(np.eye(3), (len(BONES), 1, 1))
     for sign, side in zip((1.0, -1.0), SIDES, strict=True):
@@ -48,7 +48,7 @@ def neutral_turns(rest_joint: Float, lean_rad: float) -> Float:
 
 
 def neutral_offsets(rest_joint: Float, turns: Float) -> Float:
-    """Where each joint lies from its parent's in the neutral pose: [22, 3] m, the root's row zero.
+    """Compute each joint's place relative to its parent's, neutral pose: [22, 3] m, the root's row zero.
 
     Parts that must be zero, sideways in the trunk and in a hanging leg, are exactly zero.
     """
@@ -63,13 +63,16 @@ def neutral_offsets(rest_joint: Float, turns: Float) -> Float:
 
 
 def _turn(source: tuple[Float, Float], target: tuple[Float, Float]) -> Float:
-    """The rotation that takes the first direction to the first, and the plane of both to that of both."""
+    """Return the rotation that takes the first source direction to the first target direction.
+
+    It takes the plane of both source directions to the plane of both target directions.
+    """
     turn: Float = np.einsum("ik,jk->ij", _frame(*target), _frame(*source))
     return turn
 
 
 def _frame(first: Float, second: Float) -> Float:
-    """Axes in columns: along the first, across both, and the third."""
+    """Return axes in columns: along the first, across both, and the third."""
     x = first / np.linalg.norm(first)
     z = np.cross(x, second)
     z /= np.linalg.norm(z)

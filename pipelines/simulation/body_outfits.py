@@ -1,4 +1,4 @@
-"""Dressing a body: which skin shows, and clothes, shoes and hair as layers that lie over each other.
+"""Clothes, shoes and hair of a body, as layers that lie over each other, and the skin that shows.
 
 Garments are cut from a suit of tights that lies on the skin (MakeHuman's), each with vertices of its own
 and its own distance from the skin, so that a shirt hangs over trousers and trousers over shoes.
@@ -32,7 +32,10 @@ _WRINKLE_PER_M = 28.0  # standard deviation of the wave numbers, rad: folds of a
 
 @dataclass(frozen=True)
 class Outfit:
-    """Colours are linear RGB reflectances; `sleeve` and `leg` say where they end, in places along a limb."""
+    """Colours and lengths of clothes.
+
+    Colours are linear RGB reflectances. `sleeve` and `leg` say where they end, in places along a limb.
+    """
 
     sleeve: float
     leg: float
@@ -92,7 +95,7 @@ _SOCKS = (0.65, 0.65, 0.65)
 
 @dataclass(frozen=True)
 class Undressed:
-    """A body at rest as the asset has it, in metres."""
+    """A body at rest, as stored in the asset, in metres."""
 
     vertices: Float  # [V, 3]
     quads: NDArray[np.intp]  # [Q, 4]
@@ -104,7 +107,7 @@ class Undressed:
 
 @dataclass(frozen=True)
 class Dressed:
-    """What is seen of a person, at rest."""
+    """The visible surface of a person, at rest."""
 
     vertices: Float  # [N, 3] m
     weights: Float  # [N, 22]
@@ -144,13 +147,13 @@ def dress(body: Undressed, outfit: Outfit, *, hair_m: float) -> Dressed:
 
 
 def _bare(body: Undressed) -> Patch:
-    """Skin and eyes."""
+    """Return skin and eyes."""
     quads = body.quads[body.part[body.quads].min(axis=1) != PARTS.index("cloth")]
     return _with_values(body, triangles(quads))
 
 
 def _suit(body: Undressed) -> Patch:
-    """The tights that clothes are cut from."""
+    """Return the tights that clothes are cut from."""
     quads = body.quads[body.part[body.quads].min(axis=1) == PARTS.index("cloth")]
     return _with_values(body, triangles(quads))
 
@@ -177,7 +180,7 @@ def _with_values(body: Undressed, faces: NDArray[np.intp]) -> Patch:
 
 
 def _along_limb(body: Undressed, bones: tuple[str, str, str]) -> Float:
-    """[V] the place along an arm or leg, by the side a vertex is on; negative or zero off the limb."""
+    """Return each vertex's place [V] along an arm or leg, on its own side; negative or zero off the limb."""
     place = np.zeros(len(body.vertices))
     for sign, side in zip((1.0, -1.0), SIDES, strict=True):
         root, bend, end = (body.joint[BONE[f"{side}_{name}"]] for name in bones)
@@ -197,7 +200,9 @@ def _share(points: Float, start: Float, end: Float) -> Float:
 
 
 def _on_scalp(ahead: Float, above: Float) -> Float:
-    """[V] how far hair grows beyond its line, m; places relative to the middle of the eyes.
+    """Compute the distance [V] of places inside the hairline, m; negative outside of it.
+
+    Places are relative to the middle of the eyes.
 
     The line goes over the forehead, down before the ears, round behind them and along the nape.
     """
@@ -208,7 +213,7 @@ def _on_scalp(ahead: Float, above: Float) -> Float:
 
 
 def _wrinkles(vertices: Float) -> Float:
-    """[V] folds of cloth, -1.5..1.5: a sum of plane waves, the same for everyone."""
+    """Compute folds of cloth [V], -1.5..1.5: a sum of plane waves, the same for everyone."""
     draw = np.random.default_rng(0)
     wave, phase = draw.normal(0.0, _WRINKLE_PER_M, (12, 3)), draw.uniform(0.0, 2 * np.pi, 12)
     folds = np.sin(np.einsum("vi,ki->vk", vertices, wave) + phase).sum(axis=1) / np.sqrt(12)
@@ -220,14 +225,14 @@ def _wrinkles(vertices: Float) -> Float:
 
 
 def _put_on(patch: Patch, colour: Colour, off_m: Float) -> Patch:
-    """A layer of one colour, [V] m outward from the body."""
+    """Return a layer of one colour, `off_m` [V] outward from the body."""
     place = patch.values["place"] + off_m[:, None] * patch.values["normal"]
     shade = 1 + 0.1 * patch.values["wrinkle"] + 0.04 * patch.values["rough"]
     return patch.replaced(place=place, colour=np.array(colour) * shade[:, None])
 
 
 def _skin_and_hair(skin: Patch, outfit: Outfit, hair_m: float) -> tuple[Patch, Patch]:
-    """Skin where an outfit bares it, and a little under every hem; hair on the scalp."""
+    """Return the skin that an outfit bares, with a little under every hem, and the hair on the scalp."""
     arm, leg = skin.values["arm"], skin.values["leg"]
     bare = (arm > outfit.sleeve - _TUCKED) | ((leg > outfit.leg - _TUCKED) & (leg < _SOCK_TOP + _TUCKED))
     bare |= (skin.values["below_collar"] < 0.04) & (arm <= 0)
@@ -246,7 +251,7 @@ def _skin_and_hair(skin: Patch, outfit: Outfit, hair_m: float) -> tuple[Patch, P
 
 
 def _skin_colours(outfit: Outfit) -> Float:
-    """[P, 3] by `PARTS`; lips are as much darker as the skin."""
+    """Return colours [P, 3] by `PARTS`; lips are darker in the same ratio as the skin."""
     darker = np.array(outfit.skin) / np.array(OUTFITS["casual"].skin)
     by_part = dict.fromkeys(PARTS, np.array(outfit.skin))
     by_part |= {"lips": darker * _LIPS, "brow": np.array(_BROW)}
@@ -255,7 +260,7 @@ def _skin_colours(outfit: Outfit) -> Float:
 
 
 def _shoes(patch: Patch, outfit: Outfit, unit: float) -> list[Patch]:
-    """Shoes with level soles below the bare feet, and the socks above them."""
+    """Return shoes with level soles below the bare feet, and the socks above them."""
     place, normal, leg = (patch.values[name] for name in ("place", "normal", "leg"))
     off_m = np.where(leg > _SHOE_TOP, 0.007, 0.006) * unit
     sole = (place[:, 2] < 0.014 * unit) | ((normal[:, 2] < -0.45) & (place[:, 2] < 0.03 * unit))

@@ -1,4 +1,4 @@
-"""Pieces of a surface whose vertices carry values, and cutting them along lines across their triangles."""
+"""Pieces of a surface whose vertices carry values, and cuts along lines across their triangles."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ class Patch:
     faces: Faces
 
     def replaced(self, **values: Float) -> Patch:
-        """The same patch with other values, or more."""
+        """Return the same patch with other or additional values."""
         return Patch(self.values | values, self.faces)
 
 
 def triangles(quads: Faces) -> Faces:
-    """[2 Q, 3] of quads [Q, 4]."""
+    """Split quads [Q, 4] into triangles [2 Q, 3]."""
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
 def normals(vertices: Float, faces: Faces) -> Float:
-    """[V, 3] unit, outward, means over the triangles around by area; zero where there are none."""
+    """Compute outward unit normals [V, 3], means over the triangles around by area; zero where none are."""
     across = np.cross(
         vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
     )
@@ -41,7 +41,7 @@ def normals(vertices: Float, faces: Faces) -> Float:
 
 
 def cut(patch: Patch, keep: Float) -> Patch:
-    """What of a patch lies where `keep` [V], linear in each triangle, is not negative.
+    """Return the part of a patch where `keep` [V], linear in each triangle, is not negative.
 
     Along the cut, vertices are added whose values are linear between the ends of the edge that was cut.
     """
@@ -73,12 +73,12 @@ def cut(patch: Patch, keep: Float) -> Patch:
 
 
 def pick(patch: Patch, wanted: NDArray[np.bool_]) -> Patch:
-    """Some triangles [F] of a patch, whole."""
+    """Return some triangles [F] of a patch, whole."""
     return _compact(patch.values, patch.faces[wanted])
 
 
 def together(patches: list[Patch], names: tuple[str, ...]) -> Patch:
-    """Several patches side by side, with the values named."""
+    """Join several patches side by side, with the values named."""
     counts = [len(patch.values[names[0]]) for patch in patches]
     first = np.cumsum([0, *counts[:-1]])
     faces = np.concatenate([patch.faces + k for patch, k in zip(patches, first, strict=True)])
@@ -86,7 +86,7 @@ def together(patches: list[Patch], names: tuple[str, ...]) -> Patch:
 
 
 def _odd_first(faces: Faces, odd: NDArray[np.bool_]) -> Faces:
-    """Corners turned, in their order, until the one that differs from the others comes first."""
+    """Rotate each triangle's corners, in their order, until the one that differs comes first."""
     turn = (np.argmax(odd, axis=1)[:, None] + np.arange(3)) % 3
     return np.take_along_axis(faces, turn, axis=1)
 

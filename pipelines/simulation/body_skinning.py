@@ -1,12 +1,13 @@
-"""Moving a mesh with bones: linear blend skinning that does not collapse where joints bend far.
+"""Linear blend skinning that does not collapse where joints bend far.
 
-Blending the transforms of two bones that differ by an angle a pulls points halfway between them to
-cos(a/2) of their distance from the joint: a knee bent by 120 degrees loses half its girth. So at every
-joint a bone is added that turns half as far as the joint bends; it takes over what the two bones share, and
+Blending the transforms of two bones that differ by an angle a pulls points halfway between them to cos(a/2)
+of their distance from the joint: a knee bent by 120 degrees loses half its girth. At every joint a bone is
+added that turns half as far as the joint bends. It takes over the weights that the two bones share, so that
 no two neighbours differ by more than a/2 (after Mohr and Gleicher, "Building efficient, accurate character
-skins from examples", SIGGRAPH 2003, which adds such joints). What is left at 120 degrees is 0.87.
+skins from examples", SIGGRAPH 2003, which adds such joints). At 120 degrees a point keeps 0.87 of its
+distance from the joint.
 
-Each added bone lies after the rig's, in the order of the bones below its joint, the root's left out.
+Each added bone lies after the rig's, in the order of the bones below its joint. The root has none.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ HINGE = np.concatenate([np.arange(len(BONES)), _BELOW])
 
 
 def moving_weights(weights: Float) -> Float:
-    """What each of the M moving bones has of weights [..., 22] on the rig's bones: [..., M], the same sum.
+    """Distribute weights [..., 22] on the rig's bones to the M moving bones: [..., M], the same sum.
 
-    Two neighbours with equal weights give all to the bone between them, and one alone keeps its own. A
-    bone that shares with several gives to none more than its part.
+    Two neighbours with equal weights give all to the bone between them, and one alone keeps its own. A bone
+    that shares with several is scaled down, so that it gives no more than it has.
     """
     shared = np.minimum(weights[..., _ABOVE], weights[..., _BELOW])
     asked = np.zeros_like(weights)
@@ -50,7 +51,7 @@ def moving_weights(weights: Float) -> Float:
 
 @dataclass(frozen=True)
 class Skinning:
-    """How bones move: where they rest, how the neutral pose turned them, and the rig's offsets.
+    """Bones at rest, their turns to the neutral pose, and the rig's offsets.
 
     Motions are relative to the neutral pose; the mesh rests in the pose it was modelled in, limbs spread.
     """
@@ -60,7 +61,7 @@ class Skinning:
     offset: Float  # [22, 3] m, of the rig
 
     def transforms(self, root: Float, rotation: Float) -> tuple[Float, Float]:
-        """World from rest for all moving bones: rotations [..., M, 3, 3], translations [..., M, 3] m.
+        """Compute world from rest of all moving bones: rotations [..., M, 3, 3], translations [..., M, 3] m.
 
         Args:
             root: [..., 3] m, the pelvis's joint in the world.
@@ -86,19 +87,19 @@ class Skinning:
 
 @dataclass(frozen=True)
 class Skin:
-    """Points that bones move, each by the few that hold it."""
+    """Points that bones move, each by a few weighted bones."""
 
     rest: Float  # [V, 3] m
     bone: NDArray[np.int64]  # [V, K] moving bones, the strongest first
     weight: Float  # [V, K], rows sum to 1; where it is 0 the bone does not matter
 
     def moved(self, matrix: Float, translation: Float) -> Float:
-        """The points [V, 3] under transforms [M, 3, 3], [M, 3] of the moving bones."""
+        """Return the points [V, 3] under transforms [M, 3, 3], [M, 3] of the moving bones."""
         return blend(self.rest, self.bone, self.weight, matrix, translation)
 
 
 def make_skin(rest: Float, weights: Float) -> Skin:
-    """A skin of points [V, 3] and their weights [V, 22] on the rig's bones, rows of which sum to 1."""
+    """Make a skin of points [V, 3] and weights [V, 22] on the rig's bones, whose rows sum to 1."""
     moving = moving_weights(weights)
     most = int(np.max(np.sum(moving > 0, axis=1)))
     bone = np.argsort(-moving, axis=1, kind="stable")[:, :most]
@@ -107,7 +108,7 @@ def make_skin(rest: Float, weights: Float) -> Skin:
 
 @cached
 def blend(rest: Float, bone: NDArray[np.int64], weight: Float, matrix: Float, translation: Float) -> Float:
-    """Points [V, 3] moved by the weighted mean of their bones' transforms; see `Skin`."""
+    """Move points [V, 3] by the weighted mean of their bones' transforms; see `Skin`."""
     moved = np.empty_like(rest)
     for v in range(rest.shape[0]):
         x, y, z = rest[v, 0], rest[v, 1], rest[v, 2]

@@ -1,7 +1,7 @@
-"""What a keypoint detector would make of true pixels, where no video is rendered.
+"""Model of a keypoint detector's errors, applied to true pixels where no video is rendered.
 
-How large a detector's errors are was measured by tilt (`data/<detector>_errors.csv` says how); how they hang
-together in time, behind obstacles and between left and right is modelled here, by the constants below.
+The size of a detector's errors was measured by tilt (`data/<detector>_errors.csv` says how). Their
+correlation in time, behind obstacles and between left and right is modelled here, by the constants below.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ COLUMNS = ("tilt_deg", "joint", "median_error_share", "missed_share", "confidenc
 ANY_JOINT = "*"
 
 REFERENCE_TILT_DEG = 15.0
-"""Where a scenario's shares of missed joints and outliers hold; elsewhere they grow as the measured one."""
-_LEAST_MISSED = 0.01  # fewer than this a few hundred pictures do not tell apart
+"""Tilt at which a scenario's shares of missed joints and outliers hold; they grow with the measured ones."""
+_LEAST_MISSED = 0.01  # a few hundred pictures do not resolve smaller shares
 
 KEPT_PER_FRAME = 0.7
 """Autocorrelation of a joint's error from one frame to the next: 0.1 s at 30 frames a second."""
 
 HIDDEN_MISSED_SHARE, HIDDEN_ERROR, HIDDEN_CONFIDENCE = 0.7, 4.0, 0.4
-"""Of hidden joints: how many are missed; the others' errors and confidences, times those of visible ones."""
+"""Share of hidden joints that are missed; factors of the others' errors and confidences to visible ones'."""
 
 OUTLIER_SHARES = (0.2, 1.0)
-"""How far an outlier lies from the truth, in heights of the person."""
+"""Distance of an outlier from the truth, in heights of the person: least and most."""
 
 SWAP_FRAMES = (2, 6)
-"""For how many frames left and right stay swapped."""
+"""Number of frames for which left and right stay swapped: least and most."""
 
 # Ordinary errors raise or lower the confidence by up to half the range, outliers lower it by half of it
 # and some more. Chosen so that it tells errors above 5 % of the height as well as the measured detector's
@@ -68,9 +68,9 @@ class ErrorTable:
     rows: Mapping[str, Float]  # [K, 4]: tilt in degrees, rising; median error share; missed share; confidence
 
     def at(self, tilt_deg: Float, joints: tuple[str, ...]) -> tuple[Float, Float, Float]:
-        """Median error share, missed share and confidence, each [T, J].
+        """Return median error share, missed share and confidence, each [T, J].
 
-        Straight between the measured tilts; beyond them as at the nearest.
+        Linear between the measured tilts; beyond them as at the nearest.
 
         Raises:
             ValueError: a joint has no rows, and there are none for all others.
@@ -87,13 +87,13 @@ class ErrorTable:
 
 
 def errors_of(detector: str) -> Path:
-    """Where the measured errors of one of the `MODELLED` detectors are."""
+    """Return the path of the measured errors of one of the `MODELLED` detectors."""
     return Path(__file__).parent / "data" / f"{detector}_errors.csv"
 
 
 @lru_cache(maxsize=4)
 def read_errors(path: Path) -> ErrorTable:
-    """The measured errors: a CSV with `COLUMNS`; lines that begin with # say where they are from.
+    """Read the measured errors: a CSV with `COLUMNS`; lines that begin with # give their source.
 
     Raises:
         DataError: no such file, other columns, something that is no number or out of range, a tilt twice.
@@ -115,7 +115,7 @@ def read_errors(path: Path) -> ErrorTable:
 
 
 def _numbers(path: Path, row: list[str]) -> list[float]:
-    """Tilt, error, missed share and confidence of one row."""
+    """Parse tilt, error, missed share and confidence of one row."""
     try:
         tilt, _, error, missed, confidence = row
         values = [float(text) for text in (tilt, error, missed, confidence)]
@@ -131,7 +131,7 @@ def _numbers(path: Path, row: list[str]) -> list[float]:
 
 
 def view_of(camera: Float, target: Float, *, height_m: float, focal_px: float) -> tuple[Float, Float]:
-    """How steeply a camera looks down at a person [T] in degrees, and the person's apparent height [T] px.
+    """Compute a camera's tilt down at a person [T] in degrees, and the person's apparent height [T] px.
 
     Args:
         camera: [T, 3] m.
@@ -140,8 +140,8 @@ def view_of(camera: Float, target: Float, *, height_m: float, focal_px: float) -
         focal_px: the camera's focal length.
 
     Returns:
-        The elevation of the camera above the target, and f H/d: the height as seen from the side,
-        whatever the tilt, which measured errors are shares of.
+        The elevation of the camera above the target, and f H/d: the height as seen from the side, for any
+        tilt. Measured errors are shares of this height.
     """
     away = camera - target
     distance = np.linalg.norm(away, axis=-1)
@@ -159,7 +159,7 @@ def detect_keypoints(
     joints: tuple[str, ...],
     table: ErrorTable | None = None,
 ) -> tuple[Float, Float]:
-    """Keypoints of one person in one camera, frame by frame.
+    """Simulate the detected keypoints of one person in one camera, frame by frame.
 
     Errors have the measured median length and no preferred direction; from frame to frame they follow a
     first-order autoregression (`KEPT_PER_FRAME`). Misses and outliers come one by one, more of them the
@@ -172,7 +172,7 @@ def detect_keypoints(
 
     Args:
         pixels: [T, J, 2] exact pixels; NaN for what is not in the picture, which is never found.
-        visible: [T, J] whether nothing hides the joint.
+        visible: [T, J] True where nothing hides the joint.
         tilt_deg: [T] elevation of the camera above the person.
         apparent_height_px: [T] (`view_of`).
         errors: the scenario's; its shares hold for visible joints.
@@ -218,7 +218,7 @@ def detect_keypoints(
 
 
 def _correlated(shape: tuple[int, ...], rng: np.random.Generator) -> Float:
-    """Unit normal errors [T, J, 2]; each joint's go on as those of the frame before."""
+    """Draw unit normal errors [T, J, 2], each joint's correlated with those of the frame before."""
     error = rng.standard_normal((*shape, 2))
     fresh = np.sqrt(1 - KEPT_PER_FRAME**2)
     for k in range(1, len(error)):
@@ -227,7 +227,7 @@ def _correlated(shape: tuple[int, ...], rng: np.random.Generator) -> Float:
 
 
 def _swapped(frames: int, joints: tuple[str, ...], share: float, rng: np.random.Generator) -> Bool:
-    """Which joints [T, J] have their mirror's place: one limb of a pair at a time, for a few frames.
+    """Draw which joints [T, J] have their mirror's place: one limb of a pair at a time, for a few frames.
 
     Runs of mean length L begin with the probability p per frame outside of them; the mean gap is then
     (1 - p) / p, and the share of swapped frames s = L / (L + (1 - p) / p).
@@ -247,13 +247,13 @@ def _swapped(frames: int, joints: tuple[str, ...], share: float, rng: np.random.
 
 
 def _limb(joints: tuple[str, ...], parts: tuple[str, ...]) -> Bool:
-    """Which joints [J] belong to a pair of limbs, both sides of each there."""
+    """Return a mask [J] of the joints of a pair of limbs whose mirror is there, too."""
     names = {f"{side}_{part}" for side in ("left", "right") for part in parts}
     return np.array([name in names and mirrored(name) in joints for name in joints], dtype=np.bool_)
 
 
 def _exchanged(values: Float, swapped: Bool, joints: tuple[str, ...]) -> Float:
-    """[T, J, ...] with every swapped joint's value taken from its mirror."""
+    """Return values [T, J, ...] with every swapped joint's taken from its mirror."""
     mirror = [
         joints.index(mirrored(name)) if mirrored(name) in joints else j for j, name in enumerate(joints)
     ]

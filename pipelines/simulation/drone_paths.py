@@ -1,4 +1,4 @@
-"""Where the cameras of a formation fly, and where they look: poses as formulas of time."""
+"""Camera poses of a formation as formulas of time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def orbit(
     yaw_rate_deg_per_s: float = 4.0,
     variation: float = 0.0,
 ) -> tuple[Float, Float]:
-    """A formation on a ring around a moving target, every camera looking at it.
+    """Compute the poses of a formation on a ring around a moving target; every camera looks at it.
 
     The slots of Ho et al., "3D Human Reconstruction in the Wild with Collaborative Aerial Cameras":
     yaw_i = yaw + i 2 pi/n (pi/2 for two cameras, which must not face each other), position =
@@ -34,12 +34,12 @@ def orbit(
     Args:
         t_s: [T] seconds.
         target: [T, 3] metres, world: a smooth point of the actor at those times.
-        cameras: how many, at least 1.
+        cameras: number of cameras, at least 1.
         range_m: distance from the target.
         tilt_deg: elevation of the cameras above the target, below 90.
         yaw_deg: yaw of the first camera at time 0, counterclockwise from east.
-        yaw_rate_deg_per_s: how fast the ring turns.
-        variation: how far each camera strays from its slot, by sines of its own periods: 10 degrees of
+        yaw_rate_deg_per_s: angular speed of the ring.
+        variation: deviation of each camera from its slot, by sines of its own periods: 10 degrees of
             yaw, 1 m of range and 3 degrees of tilt at 1.
 
     Returns:
@@ -57,6 +57,6 @@ def orbit(
 
 
 def _sway(t_s: Float, period_s: float, camera: NDArray[np.int64]) -> Float:
-    """A sine for each camera, with a period and phase of its own: [N, T]."""
+    """Compute a sine [N, T] for each camera, with a period and phase of its own."""
     sway: Float = np.sin(2 * np.pi * t_s / (period_s + 1.3 * camera) + 2.0 * camera)
     return sway

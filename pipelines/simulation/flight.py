@@ -1,4 +1,4 @@
-"""One simulated flight: everything that is true of it, and everything its logs would say."""
+"""One simulated flight: the truth and the contents of its logs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Bool = NDArray[np.bool_]
 Moving = Callable[[Float], BodyMotion]
 
 LEAD_S = 0.2
-"""How long logs run, and the actor moves, before the first picture and after the last."""
+"""Time that logs run, and the actor moves, before the first picture and after the last, s."""
 
 _PLANNER_HZ = 50.0  # how often a planner is asked; it replans as often as it likes
 _WAY_S = 0.25  # between the points of the actor's way that the wood keeps clear of
@@ -54,10 +54,10 @@ class SimulatedDrone:
 
     name: str
     intrinsics: Intrinsics
-    clock_offset_s: float  # true time minus what its pictures are stamped with
+    clock_offset_s: float  # true time minus the stamps of its pictures
     at_frames: DronePoses  # [F] the truth when its pictures were taken
     at_log: DronePoses  # [M] the truth at the stamps of its log
-    log: PoseLog  # [M] what it logged
+    log: PoseLog  # [M] its log
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class SimulatedPerson:
 
 @dataclass(frozen=True)
 class SimulatedFlight:
-    """A flight. Truth stands at every moment at which any drone took a picture."""
+    """A flight. Truth is known at every moment at which any drone took a picture."""
 
     scenario: Scenario
     world: World
@@ -106,7 +106,7 @@ class Performer:
 
 @dataclass(frozen=True)
 class Set:
-    """Who is filmed, and where: all of a scenario but its drones."""
+    """The actor and the world: all of a scenario but its drones."""
 
     world: World
     people: list[Performer]  # the drones follow the first
@@ -172,7 +172,7 @@ def fly_scenario(
 
 
 def picture_stamps(flight: SimulatedFlight, drone: SimulatedDrone) -> Int64:
-    """Stamps [F] of a drone's pictures by its own camera's clock, ns since the epoch."""
+    """Return the stamps [F] of a drone's pictures by its own camera's clock, ns since the epoch."""
     offset_ns = round(drone.clock_offset_s * 1e9)
     stamps: Int64 = drone.at_frames.t_ns + flight.scenario.start_ns - offset_ns
     return stamps
@@ -228,13 +228,17 @@ def keypoints_of(
 
 
 def intrinsics_of(lens: Lens) -> Intrinsics:
-    """A pinhole that looks straight ahead: the picture's middle is half a pixel inside of its pixels."""
+    """Return a pinhole that looks straight ahead.
+
+    The principal point is the middle of the picture. It is (width - 1) / 2, because pixel centres are whole
+    numbers.
+    """
     focal = lens.width / 2 / float(np.tan(np.radians(lens.hfov_deg / 2)))
     return Intrinsics(lens.width, lens.height, focal, focal, (lens.width - 1) / 2, (lens.height - 1) / 2)
 
 
 def _span_s(scenario: Scenario) -> tuple[float, float]:
-    """When the logs begin and end."""
+    """Return the first and last second of the logs."""
     return -LEAD_S, scenario.duration_s + LEAD_S
 
 

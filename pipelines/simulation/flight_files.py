@@ -1,4 +1,4 @@
-"""The files that a simulated flight leaves behind, in the formats a real one has.
+"""Files of a simulated flight, in the formats that a real one has.
 
 Numbers are written with enough digits that reading them back costs less than 0.01 mm at 10 m.
 """
@@ -28,7 +28,7 @@ class Sighting(NamedTuple):
 
 
 def write_tum(path: Path, t_ns: Int64, position: Float, quaternion_xyzw: Float) -> None:
-    """Poses [N] as `t x y z qx qy qz qw`, t in seconds to the nanosecond."""
+    """Write poses [N] as `t x y z qx qy qz qw`, t in seconds to the nanosecond."""
     lines = ["# t x y z qx qy qz qw"]
     for stamp, xyz, xyzw in zip(t_ns.tolist(), position.tolist(), quaternion_xyzw.tolist(), strict=True):
         numbers = [*(f"{v:.6f}" for v in xyz), *(f"{v:.9f}" for v in xyzw)]
@@ -38,7 +38,7 @@ def write_tum(path: Path, t_ns: Int64, position: Float, quaternion_xyzw: Float) 
 
 
 def write_joints(path: Path, t_ns: Int64, names: tuple[str, ...], joints: Float) -> None:
-    """Joints [T, J, 3] of one person as a long CSV: t_ns, joint, x, y, z in metres, z up."""
+    """Write joints [T, J, 3] of one person as a long CSV: t_ns, joint, x, y, z in metres, z up."""
     lines = ["t_ns,joint,x,y,z"]
     for stamp, points in zip(t_ns.tolist(), joints.tolist(), strict=True):
         lines += [f"{stamp},{n},{x:.6f},{y:.6f},{z:.6f}" for n, (x, y, z) in zip(names, points, strict=True)]
@@ -58,7 +58,7 @@ def write_people(path: Path, t_ns: Int64, names: tuple[str, ...], people: Sequen
 
 
 def write_alphapose(path: Path, people: Iterable[Sighting]) -> None:
-    """Keypoints as AlphaPose writes them with its tracker: a list of people, picture by picture.
+    """Write keypoints as AlphaPose does with its tracker: a list of people, picture by picture.
 
     Frame k is picture `00000k.jpg`. Joints that were missed are 0, 0, 0; frames in which all of a person's
     joints were missed have no entry. Within a picture people stand in the order given.
@@ -92,5 +92,5 @@ def _alphapose_entry(frame: int, person: Sighting) -> dict[str, object]:
 
 
 def write_lines(path: Path, lines: list[str]) -> None:
-    """Lines of text that end as on Linux, everywhere."""
+    """Write lines of text that end as on Linux, on every system."""
     path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")

@@ -1,11 +1,11 @@
-"""How drones fly: point masses that track moving slots, bodies that lean, gimbals that aim.
+"""Flight model of drones: point masses that track moving slots, bodies that lean, gimbals that aim.
 
 A drone is a mass that a cascade of two loops steers, as autopilots do: the distance to its slot asks for a
-velocity, the error in velocity for an acceleration, and the attitude needs time to give it. Nothing blows
-and nothing saturates but speed and acceleration. The attitude follows from the motion: a multirotor leans
-so that its thrust makes the acceleration; its nose turns to the actor. The camera hangs in a gimbal.
+velocity, the error in velocity for an acceleration, and the attitude needs time to give it. There is no wind.
+Only speed and acceleration saturate. The attitude follows from the motion: a multirotor leans so that its
+thrust makes the acceleration; its nose turns to the actor. The camera hangs in a gimbal.
 
-Everything is integrated in equal steps of at most `STEP_S` between the moments that are asked for.
+Everything is integrated in equal steps of at most `STEP_S` between the requested moments.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ STEP_S = 0.005
 """The integration's longest step."""
 
 LEVER_ARM = (0.10, 0.0, -0.05)
-"""Where the camera sits in the body (forward, left, up), m."""
+"""Position of the camera in the body (forward, left, up), m."""
 
 POSITION_GAIN_PER_S, VELOCITY_GAIN_PER_S = 1.5, 4.0
-ATTITUDE_LAG_S = 0.15  # until an acceleration that is asked for is there: the body must lean first
+ATTITUDE_LAG_S = 0.15  # delay of a commanded acceleration: the body must lean first
 _BRAKING_SHARE = 0.5  # of the acceleration limit, for coming to a stop; the rest is for corrections
 
 HEADING_LAG_S, HEADING_RATE_RADPS = 0.3, math.radians(90.0)
@@ -47,7 +47,7 @@ _LEAST_LIFT = 0.2  # of gravity: rotors do not push down
 
 @dataclass(frozen=True)
 class DronePaths:
-    """Where every drone is, and how it and its camera are turned."""
+    """Positions of all drones, and attitudes of bodies and cameras."""
 
     t_s: Float  # [T] seconds since the flight's start, strictly increasing
     position: Float  # [N, T, 3] m, the body's origin in the world
@@ -57,22 +57,22 @@ class DronePaths:
 
     @property
     def camera_position(self) -> Float:
-        """[N, T, 3] m: the lever arm turns with the body."""
+        """Position of the cameras [N, T, 3] m; the lever arm turns with the body."""
         return self.position + rotate(self.body_xyzw, np.array(LEVER_ARM))
 
 
 class Known(NamedTuple):
-    """What a planner knows when it is asked: nothing later than `t_s`, and of the actor only estimates."""
+    """Input of a planner: nothing later than `t_s`, and only estimates of the actor."""
 
     t_s: float
     actor_t_s: Float  # [M] stamps of the estimates so far
-    actor: Float  # [M, 3] m, where the actor's hip was estimated to be
+    actor: Float  # [M, 3] m, estimated positions of the actor's hip
     position: Float  # [N, 3] m, the drones
     velocity: Float  # [N, 3] m/s
 
 
 Planner = Callable[[Known], tuple[Float, Float]]
-"""Asked at a stated rate: where every drone's slot is now [N, 3] m, and how it moves [N, 3] m/s.
+"""Function that returns every drone's slot [N, 3] m and the slot's velocity [N, 3] m/s, at a fixed rate.
 
 Until it is asked again the slots move on in straight lines. A planner that plans trajectories samples its
 latest one here and replans as often as it likes; it keeps its own state.
@@ -80,16 +80,16 @@ latest one here and replans as often as it likes; it keeps its own state.
 
 
 def moments(first_s: float, last_s: float) -> Float:
-    """Moments [T] to fly at: 100 a second, from `first_s` to `last_s` or just beyond."""
+    """Return moments [T] to fly at: 100 a second, from `first_s` to `last_s` or just beyond."""
     return first_s + np.arange(math.ceil((last_s - first_s) * 100 - 1e-6) + 1) / 100
 
 
 def ring_slots(formation: Formation, count: int, actor: Float, t_s: Float) -> Float:
-    """Slots [N, T, 3] m on a ring about the actor, whatever stands in the way.
+    """Compute slots [N, T, 3] m on a ring about the actor; obstacles are ignored.
 
     Args:
         formation: the ring; its `planner` does not matter here.
-        count: how many drones.
+        count: number of drones.
         actor: [T, 3] m, a smooth point of the actor.
         t_s: [T] seconds.
     """
@@ -107,16 +107,15 @@ def ring_slots(formation: Formation, count: int, actor: Float, t_s: Float) -> Fl
 
 
 def fly(slots: Float, aim: Float, t_s: Float, limits: Limits) -> DronePaths:
-    """Fly after slots that are known beforehand.
+    """Fly after slots that are known in advance.
 
-    The drones start in their slots and move with them as fast as they may. Behind a slot that
-    accelerates by `a` a drone lags by about a / (POSITION_GAIN_PER_S VELOCITY_GAIN_PER_S): the slot's
-    velocity is fed forward, its acceleration is not. The camera lags by the rate at which its aim turns
-    times GIMBAL_LAG_S.
+    The drones start in their slots and move with them as fast as the limits allow. A drone lags behind a slot
+    that accelerates by `a` by about a / (POSITION_GAIN_PER_S VELOCITY_GAIN_PER_S): the slot's velocity is fed
+    forward, its acceleration is not. The camera lags by the rate at which its aim turns times GIMBAL_LAG_S.
 
     Args:
         slots: [N, T, 3] m, of the bodies' origins.
-        aim: [T, 3] m, what the cameras look at.
+        aim: [T, 3] m, the point that the cameras look at.
         t_s: [T] seconds, strictly increasing (`moments`).
         limits: of speed and acceleration; neither is ever exceeded.
 
@@ -141,18 +140,18 @@ def fly_with(
     actor: Float,
     rate_hz: float,
 ) -> DronePaths:
-    """Fly after slots that a planner gives on the way.
+    """Fly after slots that a planner gives during the flight.
 
     Args:
-        planner: asked at the first of the moments `t_s` and then at the first one at or after every
+        planner: called at the first of the moments `t_s` and then at the first one at or after every
             further 1 / `rate_hz`.
-        start: [N, 3] m, where the drones hover at first.
-        aim: [T, 3] m, what the cameras look at.
+        start: [N, 3] m, the positions where the drones hover at first.
+        aim: [T, 3] m, the point that the cameras look at.
         t_s: [T] seconds, strictly increasing (`moments`).
         limits: of speed and acceleration; neither is ever exceeded.
-        actor_t_s: [M] seconds, increasing: when the actor's position was estimated.
+        actor_t_s: [M] seconds, increasing: times of the actor's position estimates.
         actor: [M, 3] m, the estimates.
-        rate_hz: how often the planner is asked.
+        rate_hz: rate of the planner's calls.
 
     Raises:
         ValueError: times that do not increase strictly, numbers that are not finite, or slots of
@@ -178,7 +177,7 @@ def fly_with(
 
 
 class _Flight(NamedTuple):
-    """A flight in the making; rows are filled as it advances."""
+    """A flight in progress; rows are filled as it advances."""
 
     t_s: Float  # [T]
     limits: Limits
@@ -188,7 +187,10 @@ class _Flight(NamedTuple):
 
     @classmethod
     def starting(cls, position: Float, velocity: Float, t_s: Float, limits: Limits) -> _Flight:
-        """All drones at [N, 1, 3] with velocities [N, 1, 3], as far as the limits go; nothing flown yet."""
+        """Return a flight with all drones at [N, 1, 3], not yet flown.
+
+        Velocities [N, 1, 3] are cut to the limits.
+        """
         speed = np.linalg.norm(velocity, axis=-1, keepdims=True)
         allowed = velocity * (limits.speed_mps / np.maximum(speed, limits.speed_mps))
         rows = (1, len(t_s), 1)
@@ -196,7 +198,7 @@ class _Flight(NamedTuple):
         return cls(t_s, limits, positions, np.tile(allowed, rows), np.zeros_like(positions))
 
     def advance(self, first: int, slot: Float, slot_velocity: Float) -> None:
-        """Track slots [N, S, 3] from the moment `first` for as long as they reach."""
+        """Track slots [N, S, 3] from the moment `first` to the end of the slots."""
         rows = slice(first, first + slot.shape[1])
         _track(
             self.t_s[rows],
@@ -210,7 +212,7 @@ class _Flight(NamedTuple):
         )
 
     def paths(self, aim: Float) -> DronePaths:
-        """The bodies' attitudes, which follow from the motion, and the cameras'."""
+        """Compute the bodies' attitudes, which follow from the motion, and the cameras'."""
         away = aim - self.position
         heading = _followed(
             np.arctan2(away[..., 1], away[..., 0]), self.t_s, HEADING_LAG_S, HEADING_RATE_RADPS
@@ -235,7 +237,7 @@ def _check(t_s: Float, *places: Float) -> None:
 
 
 def _leaning(acceleration: Float, velocity: Float, heading: Float) -> Float:
-    """world_from_body [..., 4] of multirotors: up along the thrust, the nose above the heading.
+    """Compute world_from_body [..., 4] of multirotors: up along the thrust, the nose above the heading.
 
     Mellinger & Kumar 2011, "Minimum snap trajectory generation and control for quadrotors", Sec. III,
     with drag against the velocity.
@@ -249,7 +251,7 @@ def _leaning(acceleration: Float, velocity: Float, heading: Float) -> Float:
 
 
 def _followed(angle: Float, t_s: Float, lag_s: float, fastest_radps: float) -> Float:
-    """Angles [N, T] of something that turns after `angle`, and points there at first."""
+    """Compute angles [N, T] of something that turns after `angle` and starts there."""
     target = np.unwrap(angle, axis=1) if angle.size else angle
     followed = target.copy()
     _follow(t_s, target, lag_s, fastest_radps, followed)
@@ -266,13 +268,13 @@ def _unit(vectors: Float) -> Float:
 
 @helper
 def _steps(span_s: float) -> int:
-    """Into how many equal steps an interval is divided; the margin is for rounding alone."""
+    """Return the number of equal steps of an interval; the margin is for rounding alone."""
     return max(1, math.ceil(span_s / STEP_S - 1e-6))
 
 
 @helper
 def _shorten(vector: Float, longest: float) -> None:
-    """Keep the direction of [3], and the length within `longest`."""
+    """Limit the length of [3] to `longest`, in place; keep the direction."""
     length = math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
     if length > longest:
         vector *= longest / length
@@ -280,7 +282,7 @@ def _shorten(vector: Float, longest: float) -> None:
 
 @helper
 def _approach(distance_m: float, braking_mps2: float) -> float:
-    """How fast to fly towards a slot: in proportion while near, and so as to be able to stop from afar.
+    """Compute the speed towards a slot: in proportion while near, such that it can stop while far.
 
     The "square root controller" of ArduPilot: both parts and their slopes agree where they meet.
     """
@@ -301,11 +303,11 @@ def _track(
     speed_limit: float,
     acceleration_limit: float,
 ) -> None:
-    """Fly from the first row of the last three arrays [N, T, 3], and write the others.
+    """Fly from the first row of the last three arrays [N, T, 3], and write their other rows.
 
     The acceleration is a mean of accelerations within the limit, so it keeps to the limit. A velocity
     that would leave the ball of allowed ones is put back on it; as a ball is convex, that never lengthens
-    the step from a velocity inside, so what the drone really accelerated keeps to the limit as well.
+    the step from a velocity inside, so the drone's true acceleration keeps to the limit as well.
     """
     kept = _BRAKING_SHARE * acceleration_limit
     for n in range(position.shape[0]):
@@ -335,7 +337,7 @@ def _track(
 
 @cached
 def _follow(t_s: Float, target: Float, lag_s: float, fastest_radps: float, angle: Float) -> None:
-    """Turn after angles [N, T], from the first row of `angle`, whose other rows are written."""
+    """Turn after angles [N, T] from the first row of `angle`, and write its other rows."""
     for n in range(target.shape[0]):
         now = angle[n, 0] if len(t_s) else 0.0
         for k in range(len(t_s) - 1):

@@ -1,4 +1,4 @@
-"""What the recorder on board of a simulated drone is sent: poses, gimbal, lens, and where the actor is.
+"""Messages that the recorder on board of a simulated drone receives: poses, gimbal, lens, the actor's place.
 
 Messages are those of ROS 2, their fields plain numbers by name; a stamp is nanoseconds since the epoch, and
 fields that are zero may be left out. Axes are the world's, east-north-up.
@@ -20,7 +20,7 @@ _CAMERA_INFO_NS = 1_000_000_000
 
 
 class LoggedMessage(NamedTuple):
-    """One message as it was received."""
+    """One message, as received."""
 
     received_ns: int
     topic: str

@@ -9,13 +9,13 @@ _UNKNOWN_CLOCK_SIGMA_S = 0.3
 
 
 def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = False) -> str:
-    """What ties the files together.
+    """Write the manifest, which ties the files together.
 
     Args:
         flight: the flight.
-        video: whether there are videos, or keypoints in their place.
-        true_poses: take the true poses for logged ones. Else it states what a user would know, and the
-            truth only under `truth`.
+        video: True for videos; False for keypoints in their place.
+        true_poses: take the true poses for logged ones. Otherwise the manifest states only what a user would
+            know; the truth is only under `truth`.
     """
     scenario = flight.scenario
     lines = [
@@ -44,7 +44,7 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
 
 
 def _quoted(text: str) -> str:
-    """Any text as a scalar of YAML on one line."""
+    """Return any text as a scalar of YAML on one line."""
     plain = text.replace("\\", "\\\\").replace('"', '\\"')
     return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in plain) + '"'
 

@@ -1,4 +1,4 @@
-"""What a keypoint detector makes of the truth; what a log makes of poses is `geometry.noise`."""
+"""Detector noise on true keypoints; noise on logged poses is in `geometry.noise`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pipelines.geometry.poses import invert, transform
 
 Float = NDArray[np.float64]
 
-_OUTLIER_PX = (30.0, 150.0)  # how far a gross outlier lies from the truth
+_OUTLIER_PX = (30.0, 150.0)  # distance of a gross outlier from the truth
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class KeypointNoise:
 
 
 def see(joints: Float, position: Float, quaternion_xyzw: Float, intrinsics: Intrinsics) -> Float:
-    """Exact pixels of joints; nothing hides anything.
+    """Compute the exact pixels of joints; nothing hides anything.
 
     Args:
         joints: [T, J, 3] metres, world.
@@ -44,7 +44,7 @@ def see(joints: Float, position: Float, quaternion_xyzw: Float, intrinsics: Intr
 
 
 def detect(pixels: Float, noise: KeypointNoise, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Keypoints as a detector reports them.
+    """Simulate the keypoints that a detector reports.
 
     Args:
         pixels: [..., 2] exact pixels, NaN for what cannot be seen.

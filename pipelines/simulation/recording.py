@@ -1,4 +1,4 @@
-"""What the recorders make of a flight: stamps of their own, and poses as an estimator believes them."""
+"""Recorders of a flight: their own stamps, and poses with the errors of an estimator."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ JITTER_SHARE = 0.02  # sigma of a log's stamps, of the time between them; at mos
 _LARGEST_JITTER = 0.2
 
 ACTOR_CORRELATION_S = 0.5
-"""How long an actor's estimate errs to the same side: it comes out of somebody's filter."""
+"""Correlation time of the errors of an actor's estimate: they come out of a filter."""
 
 
 @dataclass(frozen=True)
 class DronePoses:
-    """One drone at some moments: its body and its camera in the world, exactly."""
+    """The exact poses of one drone at some moments: its body and its camera in the world."""
 
     t_ns: Int64  # [M] since the flight's start
     position: Float  # [M, 3] m, world_from_body
@@ -48,7 +48,7 @@ class DronePoses:
 
 @dataclass(frozen=True)
 class PoseLog:
-    """What the estimator on board says of one drone, row by row at the same stamps.
+    """The log of the estimator on board of one drone, row by row at the same stamps.
 
     `gimbal_xyzw` is world_from_gimbal: with it, `body` and the lever arm `compose_gimbal` gives `camera`.
     """
@@ -62,9 +62,10 @@ class PoseLog:
 
 
 def log_times(rate_hz: float, span_s: tuple[float, float], rng: np.random.Generator) -> Int64:
-    """Stamps [M] of a log within a span, ns since the flight's start, strictly increasing.
+    """Draw the stamps [M] of a log within a span, ns since the flight's start, strictly increasing.
 
-    The recorder's ticks lie anywhere against the flight's start, and every stamp a little beside its tick.
+    The recorder's ticks have a random phase against the flight's start. Every stamp has a small jitter about
+    its tick.
     """
     first, last = span_s
     ticks = first + (np.arange(max(0, np.ceil((last - first) * rate_hz))) + rng.random()) / rate_hz
@@ -74,11 +75,11 @@ def log_times(rate_hz: float, span_s: tuple[float, float], rng: np.random.Genera
 
 
 def frame_times(lens: Lens, duration_s: float, rng: np.random.Generator) -> Int64:
-    """Stamps [F] of the frames that one camera kept, ns since the flight's start.
+    """Draw the stamps [F] of the frames that one camera kept, ns since the flight's start.
 
-    The shutter is even and starts anywhere within the first frame's time, or at the flight's start where
-    shutters are synchronised. Frames are lost one by one with the lens's share; the first and the last
-    are kept.
+    The shutter is periodic. It starts at a random time within the first frame's period, or at the flight's
+    start where shutters are synchronised. Frames are lost one by one with the lens's share; the first and the
+    last are kept.
     """
     phase = rng.random() * (lens.shutters == "free")
     count = max(0, int(np.ceil(duration_s * lens.rate_hz - phase)))
@@ -93,14 +94,14 @@ def frame_times(lens: Lens, duration_s: float, rng: np.random.Generator) -> Int6
 
 
 def poses_at(paths: DronePaths, drone: int, t_ns: Int64) -> DronePoses:
-    """Where one drone truly is at any moments of its path.
+    """Interpolate the true poses of one drone at any moments of its path.
 
     Positions follow the cubic through the path's positions and velocities, attitudes turn evenly. The
     camera always sits at the lever arm's end.
 
     Args:
         paths: the flight.
-        drone: which one.
+        drone: its index.
         t_ns: [M] since the flight's start.
 
     Raises:
@@ -129,7 +130,7 @@ def poses_at(paths: DronePaths, drone: int, t_ns: Int64) -> DronePoses:
 def sample_log(
     paths: DronePaths, drone: int, rate_hz: float, span_s: tuple[float, float], rng: np.random.Generator
 ) -> DronePoses:
-    """One drone's true poses at the stamps of its log (`log_times`).
+    """Interpolate one drone's true poses at the stamps of its log (`log_times`).
 
     Raises:
         ValueError: the span reaches beyond the path.
@@ -138,12 +139,15 @@ def sample_log(
 
 
 def gimbal_attitude(camera_xyzw: Float) -> Float:
-    """world_from_gimbal [..., 4] of world_from_camera [..., 4]: x where it looks, z up in the picture."""
+    """Convert world_from_camera [..., 4] to world_from_gimbal [..., 4].
+
+    The gimbal's x points where the camera looks, z up in the picture.
+    """
     return multiply(camera_xyzw, conjugate(body_from_camera("forward")))
 
 
 def estimate(truth: DronePoses, models: Sequence[NoiseModel], rng: np.random.Generator) -> PoseLog:
-    """One drone's log with the errors of some models, and the covariances that belong to them.
+    """Simulate one drone's log with the errors of some models, and the covariances that belong to them.
 
     The models' errors are the camera's. The body is logged where a camera with those errors has it: body
     and gimbal share the error in rotation, as both come from the same estimate of north and down, and
@@ -152,11 +156,11 @@ def estimate(truth: DronePoses, models: Sequence[NoiseModel], rng: np.random.Gen
     Args:
         truth: the true poses, stamps strictly increasing.
         models: the errors, drawn in this order.
-        rng: where chance comes from.
+        rng: source of random numbers.
 
     Returns:
         Poses whose covariances [M, 6, 6] (position in world, rotation vector in the body or the camera)
-        hold the models' marginal sigmas at each stamp; none where no model says anything. ROS states
+        hold the models' marginal sigmas at each stamp; None if no model has any. ROS states
         rotations about fixed axes: `pose_covariance_in_body(covariance, conjugate(quaternion))`.
     """
     true_camera = truth.camera_position, truth.camera_quaternion_xyzw
@@ -185,18 +189,18 @@ def estimate_actor(
     span_s: tuple[float, float],
     rng: np.random.Generator,
 ) -> tuple[Int64, Float]:
-    """Where the actor's hip was thought to be.
+    """Simulate the estimated positions of the actor's hip.
 
     The error is a Gauss-Markov process: `sigma_m` per axis at any moment, and correlated over
     ACTOR_CORRELATION_S.
 
     Args:
         t_s: [T] seconds, strictly increasing.
-        hip: [T, 3] m, the truth; straight between the moments.
+        hip: [T, 3] m, the truth; linear between the moments.
         sigma_m: of the error, per axis.
-        rate_hz: how often an estimate is logged.
+        rate_hz: rate of the logged estimates.
         span_s: first and last second of the log, within `t_s`.
-        rng: where chance comes from.
+        rng: source of random numbers.
 
     Returns:
         Stamps [M], ns since the flight's start, and positions [M, 3]; never NaN.
@@ -220,7 +224,7 @@ def _nanoseconds(t_s: Float) -> Int64:
 
 
 def _hermite(grid_ns: Int64, position: Float, velocity: Float, t_ns: Int64) -> Float:
-    """The cubic [M, 3] through positions and velocities [T, 3], within the grid."""
+    """Evaluate the cubic [M, 3] through positions and velocities [T, 3], within the grid."""
     if len(grid_ns) < 2 or not len(t_ns):
         return np.tile(position[:1], (len(t_ns), 1))
     before = np.clip(np.searchsorted(grid_ns, t_ns, side="right") - 1, 0, len(grid_ns) - 2)

@@ -1,4 +1,4 @@
-"""The bones of a simulated person: what motions are made of and what a body's mesh hangs on.
+"""The bones of a simulated person, used by motions and by the body's mesh.
 
 Every bone is turned from a neutral pose: standing upright, arms hanging, legs straight, feet pointing
 ahead, soles flat on the ground. Body axes are x forward, y left, z up, so that a person whose bones are
@@ -51,9 +51,10 @@ BONE = {name: index for index, name in enumerate(BONES)}
 class Rig:
     """The lengths of one person's bones, in the neutral pose.
 
-    `offset` is where each bone's joint (its upper end) lies from its parent's joint; the pelvis's lies
-    from the point of the ground between the feet. `sole` is where heel, ball and tip of each sole lie
-    from the joint of that foot, left then right; the tip belongs to the toes, the others to the foot.
+    `offset` is the place of each bone's joint (its upper end) relative to its parent's joint. The pelvis's is
+    relative to the point of the ground between the feet. `sole` is the place of heel, ball and tip of each
+    sole relative to the joint of that foot, left then right; the tip belongs to the toes, the others to the
+    foot.
     """
 
     offset: Float  # [B, 3] m
@@ -61,18 +62,18 @@ class Rig:
 
     @property
     def height_of_pelvis(self) -> float:
-        """How high the pelvis's joint is above the ground in the neutral pose, m."""
+        """Height of the pelvis's joint above the ground in the neutral pose, m."""
         return float(self.offset[0, 2])
 
     @property
     def length_of_leg(self) -> float:
-        """How high the joints of the hips are above the ground in the neutral pose, m."""
+        """Height of the hips' joints above the ground in the neutral pose, m."""
         return self.height_of_pelvis + float(self.offset[BONE["left_thigh"], 2])
 
 
 @dataclass(frozen=True)
 class BodyMotion:
-    """How one person moves.
+    """The motion of one person.
 
     `rotation` is world_from_bone relative to the neutral pose: a bone's point that lies `v` from the
     bone's joint in the neutral pose lies `rotate(rotation, v)` from it now. Knees, elbows and other joints
@@ -85,7 +86,7 @@ class BodyMotion:
 
 
 def joint_centres(rig: Rig, motion: BodyMotion) -> Float:
-    """Where the joint of every bone is: [T, B, 3] m, world, in the order of `BONES`."""
+    """Compute the joint of every bone: [T, B, 3] m, world, in the order of `BONES`."""
     centres = np.empty((len(motion.t_s), len(BONES), 3))
     for bone, (name, parent) in enumerate(PARENT.items()):
         if parent is None:
@@ -97,7 +98,7 @@ def joint_centres(rig: Rig, motion: BodyMotion) -> Float:
 
 
 def sole_points(rig: Rig, motion: BodyMotion) -> Float:
-    """Where heel, ball and tip of the soles are: [T, 2, 3, 3] m, world, left foot first."""
+    """Compute heel, ball and tip of the soles: [T, 2, 3, 3] m, world, left foot first."""
     centres = joint_centres(rig, motion)
     points = np.empty((len(motion.t_s), 2, 3, 3))
     for index, side in enumerate(SIDES):
@@ -110,7 +111,7 @@ def sole_points(rig: Rig, motion: BodyMotion) -> Float:
 
 
 def average_rig(height_m: float = 1.75) -> Rig:
-    """A person of average proportions.
+    """Return the rig of a person of average proportions.
 
     Segment lengths are fractions of the height after Drillis & Contini (in Winter, "Biomechanics and
     Motor Control of Human Movement", 4th ed. 2009, chapter 4), the trunk in three equal parts.

@@ -1,4 +1,4 @@
-"""`SCENARIO.yaml`: who moves how, in which world, and which drones film it.
+"""`SCENARIO.yaml`: the actor, the motion, the world, and the drones that film.
 
 Everything is stated in metres, seconds and degrees, in a world with x east, y north, z up whose ground
 is at z = 0 where nothing rises.
@@ -33,7 +33,7 @@ Metres = Annotated[float, Field(gt=0, le=1000)]
 
 
 class Body(Part):
-    """What the actor looks like."""
+    """Appearance of the actor."""
 
     sex: Literal["female", "male"] = "male"
     height_m: float = Field(1.75, ge=1.2, le=2.2)
@@ -42,7 +42,7 @@ class Body(Part):
 
 
 class Travel(Part):
-    """On foot from here to there: a straight line, an arc of `turn_deg` (left is positive), or to a place."""
+    """A way on foot: a straight line, an arc of `turn_deg` (left is positive), or to a place."""
 
     one_of = ("distance_m", "to")
     distance_m: Metres | None = None
@@ -60,26 +60,26 @@ class Travel(Part):
 
 
 class Stand(Part):
-    """Stay, breathing and swaying a little."""
+    """A stand, breathing and swaying a little."""
 
     seconds: float = Field(ge=0.05, le=3600)
 
 
 class Turn(Part):
-    """On the spot, in small steps; left is positive."""
+    """A turn on the spot, in small steps; left is positive."""
 
     deg: float = Field(ge=-720, le=720)
 
 
 class Crouch(Part):
-    """Down, stay, up again."""
+    """A crouch: down, stay, up again."""
 
     seconds: Seconds = 2.0
     depth: float = Field(0.8, gt=0, le=1)  # 1 is as deep as people sit on their heels
 
 
 class Reach(Part):
-    """Up and ahead with a hand, and back."""
+    """A reach up and ahead with a hand, and back."""
 
     side: Literal["left", "right", "both"] = "right"
     height_m: float = Field(1.9, ge=0.3, le=2.6)
@@ -94,7 +94,7 @@ class Kick(Part):
 
 
 class Step(Part):
-    """One thing the actor does."""
+    """One action of the actor."""
 
     one_of = ("walk", "jog", "stand", "turn", "crouch", "reach", "kick")
     walk: Travel | None = None
@@ -113,7 +113,7 @@ def _is_path(text: str) -> str:
 
 
 class Motion(Part):
-    """What the actor does one after another, or a BVH file. Whoever is done stands still, or begins again."""
+    """The actor's actions one after another, or a BVH file. At the end the actor stands, or begins again."""
 
     shorthand = "steps"
     one_of = ("steps", "bvh")
@@ -152,7 +152,7 @@ ActorName = Annotated[str, AfterValidator(_is_topic)]
 
 
 class Ground(Part):
-    """The ground that is there to see and to map: a square about the middle."""
+    """The visible and mapped ground: a square about its centre."""
 
     centre: Place = [0.0, 0.0]
     size_m: float = Field(60.0, gt=1, le=1000)
@@ -195,14 +195,14 @@ class Wall(Part):
 
 
 class Mapping(Part):
-    """The occupancy map that the drones had: voxels over the ground, up to a height."""
+    """The occupancy map of the drones: voxels over the ground, up to a height."""
 
     resolution_m: float = Field(0.25, gt=0.01, le=10)
     height_m: Metres = 12.0
 
 
 class World(Part):
-    """What stands around."""
+    """The surroundings: ground, mounds, trees, walls, the map and the sun."""
 
     ground: Ground = Ground()
     mounds: Annotated[list[Mound], Field(max_length=100)] = []
@@ -236,7 +236,7 @@ class World(Part):
 
 
 class Formation(Part):
-    """Where the drones fly about the actor: slots at yaw + i 360/n (90 for two)."""
+    """Slots of the drones about the actor, at yaw + i 360/n (90 for two)."""
 
     planner: str = "ring"  # or a planner arm: adaptive, fixed, ...
     radius_m: float = Field(10.0, ge=2, le=200)
@@ -247,7 +247,7 @@ class Formation(Part):
 
 
 class Limits(Part):
-    """What a drone can do."""
+    """Limits of a drone's motion."""
 
     speed_mps: float = Field(8.0, gt=0, le=50)
     acceleration_mps2: float = Field(4.0, gt=0, le=50)
@@ -282,7 +282,7 @@ ModelledDetector = Literal["blazepose", "blazepose-heavy"]
 
 
 class DetectorErrors(Part):
-    """What `--no-video` makes of true keypoints, beside what grows with tilt and hides behind things."""
+    """Errors of `--no-video` on true keypoints; more come with tilt and behind obstacles."""
 
     detector: ModelledDetector = "blazepose"  # whose measured errors
     scale: float = Field(1.0, ge=0, le=100)  # of the measured pixel error; 0 gives exact keypoints

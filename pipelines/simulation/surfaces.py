@@ -1,4 +1,4 @@
-"""Surfaces of triangles: what bodies and worlds are made of and what is rendered."""
+"""Surfaces of triangles, for bodies, worlds and rendering."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Surface:
 
 
 def joined(*surfaces: Surface) -> Surface:
-    """Several surfaces of one kind as one.
+    """Join several surfaces of one kind to one.
 
     Raises:
         ValueError: they differ in `smooth` or `ground`, or there are none.

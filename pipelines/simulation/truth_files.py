@@ -1,4 +1,4 @@
-"""What was really the case in a simulated flight, and what a detector would have seen, as files."""
+"""Files of a simulated flight's truth, and of a simulated detector's keypoints."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from pipelines.simulation.flight_files import (
 
 
 def write_truth(folder: Path, flight: SimulatedFlight) -> None:
-    """What was really the case, at the times of pictures and logs."""
+    """Write the truth at the times of pictures and logs."""
     start_ns = flight.scenario.start_ns
     truth = folder / "truth"
     truth.mkdir()

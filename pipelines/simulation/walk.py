@@ -56,7 +56,7 @@ def walk(
     radius_m: float | None = None,
     height_m: float = 1.75,
 ) -> Float:
-    """Joints of a person who walks straight on, or round a circle.
+    """Compute the joints of a person who walks straight on, or round a circle.
 
     Limb, hip, shoulder and head lengths are constant to rounding (the trunk twists), left and right are
     mirror images half a stride apart, and the mean speed is exactly `speed_mps`. The stride (1.32 m at
@@ -91,7 +91,7 @@ def walk(
 
 
 def stride_m(height_m: float = 1.75) -> float:
-    """How far a person of that height walks until the same foot lands again."""
+    """Return the length of a stride, until the same foot lands again, of a person of that height."""
     radians_per_height, _ = _pelvis_travel()
     return 2 * np.pi / radians_per_height * height_m
 
@@ -103,7 +103,7 @@ def route(
     heading_deg: float = 0.0,
     radius_m: float | None = None,
 ) -> tuple[Float, Float]:
-    """Where a straight line or a left-turning circle is after some way; arguments as those of `walk`.
+    """Compute the place on a straight line or a left-turning circle after some way; arguments as in `walk`.
 
     Returns:
         [T, 2] east and north in metres, and [T] the heading in radians, counterclockwise from east.
@@ -118,7 +118,7 @@ def route(
 
 
 def _standing_joints(phase: Float) -> Float:
-    """[T, 17, 3] joints in body heights: forward, left, up from the ground below the pelvis."""
+    """Compute joints [T, 17, 3] in body heights: forward, left, up from the ground below the pelvis."""
     joints = _legs(phase)
     left, right = (-_sole_centre(joints, side)[:, 2] for side in SIDES)
     pelvis_up = _ROLL_RADIUS + _HANDOVER * np.logaddexp(left / _HANDOVER, right / _HANDOVER)
@@ -129,7 +129,7 @@ def _standing_joints(phase: Float) -> Float:
 
 
 def _legs(phase: Float) -> dict[str, Float]:
-    """Hips, knees and ankles from the middle of the hips."""
+    """Compute hips, knees and ankles from the middle of the hips."""
     pelvis_yaw = _series(_PELVIS_YAW_DEG, phase)
     adduction = np.radians(_HIP_ADDUCTION_DEG)
     joints: dict[str, Float] = {}
@@ -144,7 +144,7 @@ def _legs(phase: Float) -> dict[str, Float]:
 
 
 def _upper_body(phase: Float) -> dict[str, Float]:
-    """Shoulders, arms and face from the middle of the hips; the head looks ahead."""
+    """Compute shoulders, arms and face from the middle of the hips; the head looks ahead."""
     lean = np.radians(_CHEST_LEAN_DEG)
     chest = _TRUNK * np.array([np.sin(lean), 0.0, np.cos(lean)])
     chest_yaw = _series(_CHEST_YAW_DEG, phase)
@@ -164,14 +164,16 @@ def _upper_body(phase: Float) -> dict[str, Float]:
 
 
 def _sole_centre(joints: dict[str, Float], side: str) -> Float:
-    """Where the centre of the sole's arc is: up the shank from the ankle."""
+    """Compute the centre of the sole's arc: up the shank from the ankle."""
     knee, ankle = joints[f"{side}_knee"], joints[f"{side}_ankle"]
     return ankle + (knee - ankle) * ((_ROLL_RADIUS - _ANKLE_HEIGHT) / _SHANK)
 
 
 @cache
 def _pelvis_travel() -> tuple[float, NDArray[np.complex128]]:
-    """Phase per body height that the pelvis travels, and its sway about the mean speed (Fourier series).
+    """Compute the phase per body height that the pelvis travels, and its sway (Fourier series).
+
+    The sway is about the mean speed.
 
     The pelvis goes forward as fast as the soles roll, each weighed by how much it carries (the
     derivative of the pelvis height by its drop). Integrated as a Fourier series: exact for a period.
@@ -191,14 +193,14 @@ def _pelvis_travel() -> tuple[float, NDArray[np.complex128]]:
 
 
 def _derivative(samples: Float) -> Float:
-    """Derivative by phase of one evenly sampled period."""
+    """Compute the derivative by phase of one evenly sampled period."""
     spectrum = np.fft.rfft(samples)
     derivative: Float = np.fft.irfft(1j * np.arange(spectrum.size) * spectrum, samples.size)
     return derivative
 
 
 def _periodic(coefficients: NDArray[np.complex128], phase: Float) -> Float:
-    """A real Fourier series from its coefficients of non-negative order, without its mean."""
+    """Evaluate a real Fourier series from its coefficients of non-negative order, without its mean."""
     orders = np.arange(1, coefficients.size)
     waves = np.exp(1j * phase[:, None] * orders)
     # Not `@`: the sums of BLAS depend on its version, and the sample flight is compared byte by byte.
@@ -207,7 +209,7 @@ def _periodic(coefficients: NDArray[np.complex128], phase: Float) -> Float:
 
 
 def _series(coefficients_deg: tuple[float, ...], phase: Float) -> Float:
-    """Radians of a series that is given as degrees: mean, then cosine and sine of each harmonic."""
+    """Evaluate a series in radians that is given in degrees: mean, then cosine and sine of each harmonic."""
     angle = np.full_like(phase, coefficients_deg[0])
     pairs = zip(coefficients_deg[1::2], coefficients_deg[2::2], strict=True)
     for order, (cosine, sine) in enumerate(pairs, start=1):
@@ -216,18 +218,18 @@ def _series(coefficients_deg: tuple[float, ...], phase: Float) -> Float:
 
 
 def _hanging(angle: Float) -> Float:
-    """[T, 3] unit vectors that hang down, swung forward by `angle`."""
+    """Return unit vectors [T, 3] that hang down, swung forward by `angle`."""
     return np.stack([np.sin(angle), np.zeros_like(angle), -np.cos(angle)], axis=1)
 
 
 def _inward(vectors: Float, angle: float) -> Float:
-    """Vectors in the sagittal plane, tilted about the forward axis: down goes right for positive angles."""
+    """Tilt vectors in the sagittal plane about the forward axis: down goes right for positive angles."""
     forward, _, up = vectors.T
     return np.stack([forward, np.sin(angle) * up, np.cos(angle) * up], axis=1)
 
 
 def _about_up(vectors: Float, angle: Float) -> Float:
-    """[T, ..., 3] vectors turned counterclockwise about the upward axis by [T] angles."""
+    """Turn vectors [T, ..., 3] counterclockwise about the upward axis by [T] angles."""
     shaped = angle.reshape(angle.shape + (1,) * (vectors.ndim - 2))
     x, y, z = np.moveaxis(vectors, -1, 0)
     cosine, sine = np.cos(shaped), np.sin(shaped)

@@ -1,1 +1,1 @@
-"""How the simulated actor moves: scripted actions, or somebody's recorded motion put on the actor's bones."""
+"""Motion of the simulated actor: scripted actions, or recorded motion put on the actor's bones."""

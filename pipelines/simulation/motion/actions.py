@@ -1,4 +1,4 @@
-"""What a person does on one spot, and the kick: the keys of trunk, arms and legs over time."""
+"""Actions of a person on one spot, and the kick: the keys of trunk, arms and legs over time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ _GO_DOWN_S, _REACH_S = 0.9, 0.7
 
 
 def crouch(plan: Plan, seconds: float, depth: float) -> None:
-    """Down, stay, up again: thighs level at two thirds, heels off the ground below that."""
+    """Go down, stay, come up again.
+
+    The thighs are level at two thirds of the depth. Deeper, the heels are off the ground.
+    """
     down = plan.t_s + _GO_DOWN_S * (0.6 + 0.4 * depth)
     up = down + seconds
     end = up + down - plan.t_s
@@ -30,15 +33,15 @@ def crouch(plan: Plan, seconds: float, depth: float) -> None:
 
 
 def reach(plan: Plan, side: str, height_m: float, seconds: float, shoulder_m: float, arm_m: float) -> None:
-    """A hand (or both) up and ahead to a height above the ground, held there, and back.
+    """Move a hand (or both) up and ahead to a height above the ground, hold it there, and move it back.
 
-    What lies below the waist is reached for by bending trunk and knees.
+    Trunk and knees bend to reach heights below the waist.
 
     Args:
-        plan: is added to.
+        plan: the plan that the action is added to.
         side: left, right or both.
         height_m: of the hand's joint.
-        seconds: that it is held.
+        seconds: time that it is held.
         shoulder_m: height of the shoulders of the person standing.
         arm_m: from shoulder to wrist.
     """
@@ -102,7 +105,7 @@ _LIFT_S, _LAND_S, _CLOSE_S, _STAND_S = -0.15, 0.68, 0.78, 1.22
 
 
 def kick(plan: Plan, side: str, run_up_m: float) -> None:
-    """An instep kick at a ball: run up, plant the other foot, swing back, kick, follow through, stand.
+    """Plan an instep kick at a ball: run up, plant the other foot, swing back, kick, follow through, stand.
 
     The angles are read off Lees, Asai, Andersen, Nunome & Sterzing, "The biomechanics of kicking in
     soccer" (J. Sports Sci. 2010) and Nunome, Asai, Ikegami & Sakurai, "Three-dimensional kinetic analysis

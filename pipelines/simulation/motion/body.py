@@ -1,4 +1,4 @@
-"""From a plan to the bones: pelvis, trunk, legs and arms at every moment."""
+"""Bones at every moment of a plan: pelvis, trunk, legs and arms."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ Heights = Callable[[Float], Float]
 
 _WALKING_SOFTNESS_M, _RUNNING_SOFTNESS_M = 0.006, 0.026
 _SCRAPES_M = 0.02  # a kicking foot that comes as near to the ground is lifted
-# What is wanted of the pelvis of somebody upright is more than the legs allow.
+# The wanted height of an upright pelvis is more than the legs allow, by this much.
 _STANDING_HEADROOM_M, _WALKING_HEADROOM_M = 0.015, 0.004
 
 
 @dataclass(frozen=True)
 class Style:
-    """What is different from one person to the next."""
+    """Movement habits that differ from one person to the next."""
 
     sway_m: float
     sway_phase: tuple[float, float, float]  # rad
@@ -42,12 +42,12 @@ def bodies(
     """Pose all bones.
 
     Args:
-        rig: whose bones.
-        plan: what is done.
-        style: how.
+        rig: the person's bones.
+        plan: the actions.
+        style: the person's habits.
         t_s: [T]
-        start: [2] m, where the plan began.
-        heading: rad, and looking where.
+        start: [2] m, the place where the plan began.
+        heading: rad, at the start of the plan.
         ground: heights of places [N, 2].
     """
     keys = plan.keys
@@ -91,7 +91,7 @@ def bodies(
 def _kicking(
     rig: Rig, plan: Plan, side: str, foot: Foot, t_s: Float, root: Float, pelvis: Float, ground: Heights
 ) -> Foot:
-    """A foot, or, as far as it kicks, where the angles of hip, knee and ankle bring it."""
+    """Move a foot, as far as it kicks, to the place given by the angles of hip, knee and ankle."""
     share = foot.kicks
     if not share.any():
         return foot
@@ -108,7 +108,7 @@ def _kicking(
         rotation=partly(foot.rotation, kicked, share),
         toes=partly(foot.toes, kicked, share),
     )
-    # What would scrape the ground is lifted by a bent knee.
+    # A bent knee lifts a foot that would scrape the ground.
     heel, tip = (point[:, 2] - ground(point[:, :2]) for point in sole_of(rig, SIDES.index(side), moved))
     lowest = -_SCRAPES_M / 4 * np.logaddexp(-4 * heel / _SCRAPES_M, -4 * tip / _SCRAPES_M)
     spare = (lowest - _SCRAPES_M) / _SCRAPES_M
@@ -121,7 +121,7 @@ def _deg(keys: Keys, name: str, t_s: Float) -> Float:
 
 
 def _idle(style: Style, t_s: Float, rate_hz: float, which: int) -> Float:
-    """Slow, never quite repeating, at most 1."""
+    """Compute a slow, never quite repeating movement, at most 1."""
     phase = style.sway_phase[which]
     return 0.6 * np.sin(2 * np.pi * rate_hz * t_s + phase) + 0.4 * np.sin(
         2 * np.pi * rate_hz * 0.43 * t_s + 2 * phase
@@ -129,7 +129,10 @@ def _idle(style: Style, t_s: Float, rate_hz: float, which: int) -> Float:
 
 
 def _wanted_height(rig: Rig, plan: Plan, speed: Float, run: Float, stride: Float) -> Float:
-    """Of the pelvis above the ground: out of reach for walkers, a bounce for runners."""
+    """Compute the wanted height of the pelvis above the ground.
+
+    For walkers it is slightly out of reach of the legs. For runners it bounces.
+    """
     moving = np.tanh(speed / 0.5)
     headroom = _STANDING_HEADROOM_M + moving * (_WALKING_HEADROOM_M - _STANDING_HEADROOM_M)
     upright = rig.height_of_pelvis + headroom
@@ -169,7 +172,7 @@ def _arms(
     bones: dict[str, Float],
     floor: Float,
 ) -> None:
-    """Clavicles, arms and hands: hanging, swinging, or reaching for a height."""
+    """Add clavicles, arms and hands to `bones`: hanging, swinging, or reaching for a height."""
     keys = plan.keys
     chest = bones["chest"]
     shoulders = root
@@ -197,7 +200,7 @@ def _arms(
         if reaching.any():
             up = height + floor - shoulder[:, 2]
             far = 0.96 * (np.sqrt(np.sum(upper_arm**2)) + np.sqrt(np.sum(forearm**2)))
-            # Up to the arm's length, and ahead by what that leaves, no farther than is comfortable.
+            # Up to the arm's length, and ahead by the rest, no farther than is comfortable.
             up = far * up / (far**12 + up**12) ** (1 / 12)
             ahead = np.sqrt(far**2 - up**2 + 0.01 * far**2)
             ahead = ahead * 0.75 * far / (ahead**4 + (0.75 * far) ** 4) ** 0.25
@@ -214,6 +217,6 @@ def _arms(
 
 
 def _yaw(rotation: Float) -> Float:
-    """[T] rad, where x points over the ground."""
+    """Compute the direction of x over the ground, [T] rad."""
     ahead = rotate(rotation, np.array([1.0, 0.0, 0.0]))
     return np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))

@@ -1,4 +1,4 @@
-"""Which bone of a foreign skeleton is which of ours: by its name, then by where it hangs."""
+"""Matching of a foreign skeleton's bones to ours: by name, then by place in the hierarchy."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import SkeletalMotion
 from pipelines.simulation.rig import SIDES
 
-# What a bone is called once its side, prefix and separators are gone; the first that is there is taken.
+# Names of a bone without side, prefix and separators; the first one that is there is taken.
 _SIDED = {
     "thigh": ("upleg", "upperleg01", "upperleg", "thigh", "thigh1", "femur", "hip"),
     "shank": ("leg", "lowerleg01", "lowerleg", "lowleg", "shin", "shin1", "calf", "tibia", "knee"),
@@ -29,12 +29,12 @@ _LIMB_ABOVE = {"shank": "thigh", "foot": "shank", "forearm": "upper_arm"}
 
 
 def match_bones(source: SkeletalMotion) -> dict[str, int]:
-    """The bone of the source that moves as each of ours does.
+    """Find the bone of the source that moves as each of ours does.
 
     Names are compared without prefix (`mixamorig:`, `Bip01_`), case and separators; a side is `left`,
-    `right`, or a lone `l` or `r` before or after. The trunk is the chain from the pelvis to where the
-    arms hang, thirds of it are spine, back and chest. A part that the source lacks moves with what it
-    hangs on: toes with the foot, hands with the forearm, clavicles with the chest.
+    `right`, or a lone `l` or `r` before or after. The trunk is the chain from the pelvis to the bone that
+    both arms hang on; spine, back and chest are its first, middle and last bone. A part that the source lacks
+    moves with what it hangs on: toes with the foot, hands with the forearm, clavicles with the chest.
 
     Raises:
         DataError: essential bones were not found; lists them and what there is.
@@ -73,7 +73,7 @@ def match_bones(source: SkeletalMotion) -> dict[str, int]:
 
 
 def _parts_of(name: str) -> tuple[str, str]:
-    """Side (left, right or nothing) and what is left of a name without it."""
+    """Split a name into its side (left, right or empty) and the rest."""
     bare = re.sub(r"^(bip\d*|character\d*|def)(?=[\W_])", "", name.rsplit(":", 1)[-1], flags=re.IGNORECASE)
     lower = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", bare)]
     for position in (0, -1):
@@ -100,7 +100,7 @@ def _take(found: dict[str, int], ours: str, candidates: list[int | None]) -> Non
 
 
 def _above(source: SkeletalMotion, bone: int) -> list[int]:
-    """What a bone hangs on, nearest first."""
+    """Return the bones that a bone hangs on, nearest first."""
     chain = []
     while (bone := source.parent[bone]) >= 0:
         chain.append(bone)
@@ -112,7 +112,7 @@ def _hangs_on(source: SkeletalMotion, bone: int, other: int) -> bool:
 
 
 def _trunk(source: SkeletalMotion, found: dict[str, int]) -> None:
-    """Spine, back and chest from the chain that both arms hang on; neck and head where they lack."""
+    """Add spine, back and chest from the chain that both arms hang on; add neck and head if missing."""
     pelvis = found["pelvis"]
     both = [
         bone

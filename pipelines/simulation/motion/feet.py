@@ -1,4 +1,4 @@
-"""Feet over time: planted and rolled over heel, ball and tip while they carry, swung to the next place after.
+"""Feet over time: planted, rolled over heel, ball and tip while they carry, then swung to the next place.
 
 A planted foot turns about the point of it that touches the ground: the heel from the strike until the
 sole is flat, then, once the heel rises, the joint of the toes, which stay flat behind until they have bent
@@ -26,9 +26,9 @@ Heights = Callable[[Float], Float]
 
 _FULL_SWING_M = 1.3  # of a leg of 0.93 m
 _TOES_BEND = np.radians(42.0)
-_SOFTNESS_M = (0.0003, 0.02)  # over which the point changes about which a foot turns: planted, swung
-_LONGEST_ROLL_S = 0.8  # of a stance that lasts longer, the foot is flat for the rest
-_STILL_SHARE = 0.05  # of the swing at either end, in which the foot goes up or down only
+_SOFTNESS_M = (0.0003, 0.02)  # range over which the point changes that a foot turns about: planted, swung
+_LONGEST_ROLL_S = 0.8  # in a longer stance the foot is flat for the rest
+_STILL_SHARE = 0.05  # of the swing at either end; there the foot goes only up or down
 _SET_DOWN = 0.65  # share of the stance that belongs to the strike, the rest to the lift
 _HALF_WIDTH_M = 0.04
 
@@ -42,20 +42,21 @@ class Foot:
     toes: Float  # [T, 4]
     carries: Float  # [T] 1 while it is planted, 0 in the middle of a swing
     kicks: Float  # [T] 1 while it swings as a kick, not as a step
-    least_knee: Float  # [T] rad that its knee is flexed at least
+    least_knee: Float  # [T] rad, least flexion of its knee
 
 
 def foot_over_time(
     rig: Rig, side: int, t_s: Float, steps: Sequence[Footstep], extra: Keys, ground: Heights
 ) -> Foot:
-    """Where a foot is.
+    """Compute the place and the attitude of a foot over time.
 
     Args:
-        rig: whose foot.
+        rig: the person's bones.
         side: 0 is left.
         t_s: [T]
-        steps: in the order of time; the first only says where the foot stands at the beginning.
-        extra: curves beside the steps: `heel_deg` that both heels are raised by, `left_kick`, `right_kick`.
+        steps: in the order of time; the first only gives the foot's place at the beginning.
+        extra: curves beside the steps: `heel_deg`, the angle by which both heels are raised, `left_kick`,
+            `right_kick`.
         ground: heights of places [N, 2].
     """
     keys = _keys_of_steps(steps, leg_m=rig.length_of_leg)
@@ -86,7 +87,7 @@ def foot_over_time(
 
 
 def sole_of(rig: Rig, side: int, foot: Foot) -> tuple[Float, Float]:
-    """Heel and tip of a foot, [T, 3] m, world."""
+    """Compute heel and tip of a foot, [T, 3] m, world."""
     joint = rig.offset[BONE[f"{SIDES[side]}_toes"]]
     heel, _, tip = rig.sole[side]
     at_tip = rotate(foot.rotation, joint) + rotate(foot.toes, tip - joint)
@@ -94,14 +95,14 @@ def sole_of(rig: Rig, side: int, foot: Foot) -> tuple[Float, Float]:
 
 
 def _sole(rig: Rig, side: int) -> tuple[Float, Float, Float]:
-    """Joint of the toes, heel and tip from the ankle, forward and up, [2] m each."""
+    """Return the joint of the toes, heel and tip from the ankle, forward and up, [2] m each."""
     joint = rig.offset[BONE[f"{SIDES[side]}_toes"]]
     heel, _, tip = rig.sole[side]
     return joint[[0, 2]], heel[[0, 2]], np.array([tip[0], heel[2]])
 
 
 def _keys_of_steps(steps: Sequence[Footstep], leg_m: float) -> Keys:
-    """The curves of one foot: where its flat sole is, how it is pitched, how high it is swung."""
+    """Write the curves of one foot: the place of its flat sole, its pitch, its height in swing."""
     keys = Keys()
     extents = [_extent(a, b, leg_m) for a, b in pairwise(steps)]
     runs = [(a.run + b.run) / 2 for a, b in pairwise(steps)]
@@ -124,13 +125,13 @@ def _keys_of_steps(steps: Sequence[Footstep], leg_m: float) -> Keys:
 
 
 def _extent(before: Footstep, after: Footstep, leg_m: float) -> float:
-    """How long a swing is, by that of a full stride of walking."""
+    """Compute the length of a swing, as a share of a full stride of walking."""
     moved = float(np.hypot(*(after.place - before.place))) + 0.15 * abs(after.yaw - before.yaw)
     return moved * 0.93 / (leg_m * _FULL_SWING_M)
 
 
 def _stance(keys: Keys, strike_s: float, lift_s: float | None, rolled: Roll) -> None:
-    """From the strike until the foot is flat, and, if it lifts, from when the heel rises until it does."""
+    """Write the keys from the strike until the foot is flat, and, if it lifts, from heel rise to lift."""
     lasting = _LONGEST_ROLL_S if lift_s is None else min(lift_s - strike_s, _LONGEST_ROLL_S)
     for name, value in (("pitch_deg", rolled.strike_deg), ("clear", 0.0), ("soft", _SOFTNESS_M[0])):
         keys.add(name, (strike_s, value))
@@ -151,7 +152,7 @@ def _stance(keys: Keys, strike_s: float, lift_s: float | None, rolled: Roll) -> 
 
 
 def _onward(keys: Keys, lift_s: float, before: Footstep, after: Footstep, rolled: Roll) -> None:
-    """From one place on the ground to the next, without these two."""
+    """Write the keys from one place on the ground to the next, without these two."""
     for name, start, end in (
         ("x", before.place[0], after.place[0]),
         ("y", before.place[1], after.place[1]),
@@ -162,7 +163,7 @@ def _onward(keys: Keys, lift_s: float, before: Footstep, after: Footstep, rolled
 
 
 def _swing(keys: Keys, lift_s: float, strike_s: float, rolled: Roll) -> None:
-    """From the lift to the strike, without these two."""
+    """Write the keys from the lift to the strike, without these two."""
     for name, curve in (
         ("pitch_deg", rolled.swing_deg),
         ("clear", rolled.clearance_m),
@@ -175,7 +176,7 @@ def _swing(keys: Keys, lift_s: float, strike_s: float, rolled: Roll) -> None:
 
 
 def _bent_toes(pitch: Float) -> Float:
-    """How far the toes are bent up when they lie on the ground, [T] rad: all of the pitch, up to a limit."""
+    """Compute the bend of toes that lie on the ground, [T] rad: all of the pitch, up to a limit."""
     raised = np.maximum(-pitch, 0.0)
     # x / (1 + x^8)^(1/8): as good as x below three quarters of the limit.
     part = raised / _TOES_BEND
@@ -183,13 +184,13 @@ def _bent_toes(pitch: Float) -> Float:
 
 
 def _turned(point: Float, pitch: Float) -> Float:
-    """[T, 2] forward and up of a point of the foot, pitched toes up by [T] rad."""
+    """Turn a point of the foot, pitched toes up by [T] rad: [T, 2] forward and up."""
     cosine, sine = np.cos(pitch), np.sin(pitch)
     return np.stack([cosine * point[0] - sine * point[1], sine * point[0] + cosine * point[1]], axis=1)
 
 
 def _rolled(joint: Float, heel: Float, tip: Float, pitch: Float, bend: Float, softness_m: Float) -> Float:
-    """How far the ankle is from where it is while the sole is flat, [T, 2] m, if one point stays put.
+    """Compute the ankle's shift from its place with a flat sole, [T, 2] m, if one point stays put.
 
     The point is the lower one of heel and tip; where both are as low, the change from one to the other is
     spread over `softness_m` of the difference of their heights.
@@ -204,7 +205,7 @@ def _rolled(joint: Float, heel: Float, tip: Float, pitch: Float, bend: Float, so
 def _on_ground(
     place: Float, yaw: Float, heel_m: float, tip_m: float, ground: Heights
 ) -> tuple[Float, Float, Float]:
-    """Where a flat sole lies: [T, 3] m below the ankle, the ground's tilt, [T, 4], and its slope, [T]."""
+    """Find the place of a flat sole: [T, 3] m below the ankle, the ground's tilt [T, 4], its slope [T]."""
     ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
     left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
     at_heel, at_tip = ground(place + heel_m * ahead), ground(place + tip_m * ahead)

@@ -1,11 +1,11 @@
-"""How people step at which speed: cadence, shares of stance, the roll of the foot, the swing of the arms.
+"""Gait by speed: cadence, shares of stance, the roll of the foot, the swing of the arms.
 
-Sources: step length and cadence of walking by the constant walk ratio of Sekiya & Nagasaki,
-"Reproducibility of the walking patterns of normal young adults" (Gait & Posture 1998); shares of stance
-and foot, pelvis and arm angles of walking from Perry & Burnfield, "Gait Analysis" (2nd ed. 2010) and
-Winter, "Biomechanics and Motor Control of Human Movement" (4th ed. 2009); jogging from Novacheck,
-"The biomechanics of running" (Gait & Posture 1998). The keys of walking feet and knees are those with which
-hip, knee and ankle come nearest to the mean curves of the former two at 1.3 m/s (least squares).
+Sources: step length and cadence of walking by the constant walk ratio of Sekiya & Nagasaki, "Reproducibility
+of the walking patterns of normal young adults" (Gait & Posture 1998); shares of stance and foot, pelvis and
+arm angles of walking from Perry & Burnfield, "Gait Analysis" (2nd ed. 2010) and Winter, "Biomechanics and
+Motor Control of Human Movement" (4th ed. 2009); jogging from Novacheck, "The biomechanics of running" (Gait &
+Posture 1998). The keys of walking feet and knees were fitted: with them hip, knee and ankle come nearest to
+the mean curves of Perry & Burnfield and of Winter at 1.3 m/s (least squares).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Float = NDArray[np.float64]
 
 WALK_SPEED_MPS = 1.3
 JOG_SPEED_MPS = 2.7
-FASTEST_WALK_MPS = 2.1  # people who want to be faster run (Novacheck 1998)
+FASTEST_WALK_MPS = 2.1  # faster people run (Novacheck 1998)
 _RUNNING_FROM_MPS, _RUNNING_FULLY_MPS = 1.0, 1.9
 
 _WALK_RATIO_M_S = 0.0064 * 60  # step length by cadence
@@ -29,33 +29,33 @@ _SLOWEST_CADENCE = 1.1  # steps per s, of a first or last step
 # Foot against the ground in stance: share of stance and degrees, toes up; the strike and the lift are added.
 _STANCE_WALK = ((0.13, 0.0), (0.34, 0.0), (0.66, -11.5), (0.78, -16.5))
 _STANCE_RUN = ((0.20, 0.0), (0.47, 0.0), (0.60, -8.0), (0.82, -33.0))
-# In walking strides longer than that at 1.3 m/s the heel rises farther, by a share of what they are longer.
+# In walking strides longer than that at 1.3 m/s the heel rises farther, by a share of the extra length.
 _USUAL_STRIDE, _LONG_STRIDE_LIFTS = 1.09, 0.8
 # And in swing.
 _SWING_WALK = ((0.08, -71.5), (0.19, -65.0), (0.55, -16.5), (0.80, 16.0), (0.90, 20.0))
 _SWING_RUN = ((0.15, -80.0), (0.38, -84.0), (0.60, -48.0), (0.80, -6.0), (0.93, 10.0))
 _STRIKE_DEG, _LIFT_DEG = (17.5, 8.0), (-61.0, -66.0)  # walking, running
-# How high the lowest point of the foot is in swing, m.
+# Height of the lowest point of the foot in swing, m.
 _CLEARANCE_WALK = ((0.05, 0.006), (0.20, 0.026), (0.40, 0.014), (0.60, 0.023), (0.80, 0.027), (0.95, 0.009))
 _CLEARANCE_RUN = ((0.05, 0.0078), (0.18, 0.05), (0.40, 0.12), (0.60, 0.10), (0.80, 0.05), (0.94, 0.0070))
 # Share of its way that the foot has come in swing.
 _ONWARD_WALK = ((0.2, 0.14), (0.4, 0.42), (0.6, 0.68), (0.8, 0.93))
 _ONWARD_RUN = ((0.2, 0.074), (0.4, 0.336), (0.6, 0.664), (0.8, 0.926))
-# From when on in its swing a leg reaches the ground, and by how much the toes, bent by the lift, stay so.
+# Share of the swing from which a leg reaches the ground; share of the bend at lift that the toes keep.
 _CARRIES, _TOES = (0.97, 0.90), (1.0, 0.0)  # walking, running
 # The least flexion of the knee in stance, degrees.
 _KNEE_WALK = ((0.0, 1.5), (0.22, 17.5), (0.42, 9.0), (0.62, 5.0), (0.76, 8.5), (1.0, 18.0))
 
 
 def running(speed_mps: float) -> float:
-    """How much of a run it is for someone who means to run: 0 walks, 1 runs."""
+    """Return the share of running in the gait of someone who means to run: 0 walks, 1 runs."""
     share = (speed_mps - _RUNNING_FROM_MPS) / (_RUNNING_FULLY_MPS - _RUNNING_FROM_MPS)
     share = min(max(share, 0.0), 1.0)
     return share * share * (3 - 2 * share)
 
 
 def cadence(speed_mps: float, run: float, leg_m: float) -> float:
-    """Steps per second; those of runners hardly depend on their speed."""
+    """Return steps per second; the cadence of runners depends little on their speed."""
     size = _LEG_OF_WALK_RATIO_M / leg_m
     walk = np.sqrt(max(speed_mps, 0.0) * size / _WALK_RATIO_M_S)
     slowest = _SLOWEST_CADENCE * np.sqrt(size)
@@ -64,20 +64,20 @@ def cadence(speed_mps: float, run: float, leg_m: float) -> float:
 
 
 def swing_steps(speed_mps: float, run: float) -> float:
-    """How long a foot is off the ground, in steps (halves of a stride): above 1 both feet fly."""
+    """Return the time of a foot off the ground, in steps (halves of a stride): above 1 both feet fly."""
     walk = 2 * min(max(0.295 + 0.077 * speed_mps, 0.28), 0.43)  # 0.39 of a stride at 1.3 m/s
     jog = 2 * (1 - min(max(0.47 - 0.035 * speed_mps, 0.27), 0.44))  # 0.61 to 0.66 of a stride
     return (1 - run) * walk + run * jog
 
 
 def above_foot(run: float) -> float:
-    """At which share of a stance the pelvis passes above the ankle."""
+    """Return the share of a stance at which the pelvis passes above the ankle."""
     return 0.36 - 0.05 * run
 
 
 @dataclass(frozen=True)
 class Roll:
-    """How a foot is set down, rolls and swings on, as (share of stance or swing, value) keys."""
+    """Strike, roll and swing of a foot, as (share of stance or swing, value) keys."""
 
     strike_deg: float
     lift_deg: float
@@ -86,16 +86,16 @@ class Roll:
     clearance_m: tuple[tuple[float, float], ...]
     onward: tuple[tuple[float, float], ...]
     carries: float  # from this share of a swing on
-    toes: float  # how far they stay bent up in swing: 0 straight, 1 level
+    toes: float  # bend that they keep in swing: 0 straight, 1 level
     knee_deg: tuple[tuple[float, float], ...]
 
 
 def roll(run: float, before: float, after: float) -> Roll:
-    """The roll of a foot.
+    """Compute the roll of a foot.
 
     Args:
         run: 0 for walking, 1 for running.
-        before: how long the swing is that ends with the strike, by that of a full stride.
+        before: length of the swing that ends with the strike, as a share of a full stride's.
         after: the same of the swing that follows.
     """
 
@@ -126,7 +126,7 @@ def roll(run: float, before: float, after: float) -> Roll:
 
 @dataclass(frozen=True)
 class Swing:
-    """What the body above the legs does over a stride, [T] each; angles to the left are positive."""
+    """Motion of the body above the legs over a stride, [T] each; angles to the left are positive."""
 
     pelvis_yaw: Float  # rad: the hip of the leg in front goes with it
     pelvis_list: Float  # rad: the hip of the leg in the air is lower
@@ -139,13 +139,13 @@ class Swing:
 
 
 def swing(stride: Float, speed_mps: Float, run: Float, arm_share: float) -> Swing:
-    """Pelvis, trunk and arms of someone whose left heel strikes at stride angle 0, the right at pi.
+    """Compute pelvis, trunk and arms. The left heel strikes at stride angle 0, the right at pi.
 
     Args:
         stride: [T] rad.
         speed_mps: [T]; all but the arms' rest swells with it and is gone at 0.
         run: [T] 0 for walking, 1 for running.
-        arm_share: how far the arms swing, by the usual.
+        arm_share: amplitude of the arms' swing, as a share of the usual one.
     """
     walk = 1 - run
     size = 1.3 * np.tanh(speed_mps * np.arctanh(1 / 1.3) / WALK_SPEED_MPS)  # 1 at the usual speed
@@ -172,9 +172,9 @@ def swing(stride: Float, speed_mps: Float, run: Float, arm_share: float) -> Swin
 
 
 def bounce_m(stride: Float, step_s: Float, swing_share: Float) -> Float:
-    """How high a runner's pelvis is above its height at the strikes, [T] m.
+    """Compute the height of a runner's pelvis above its height at the strikes, [T] m.
 
-    Free fall while both feet are off, a half sine on the springy leg, of equal speed where they meet
+    Free fall while both feet are off, a half sine on the springy leg; the speeds are equal where they meet
     (the spring-mass runner of Blickhan 1989).
 
     Args:

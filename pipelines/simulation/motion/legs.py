@@ -1,4 +1,4 @@
-"""Limbs of two bones that reach a point, and how high a pelvis is whose legs reach the ground."""
+"""Limbs of two bones that reach a point, and the height of a pelvis whose legs reach the ground."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from pipelines.simulation.rig import BONE, SIDES, Rig
 
 Float = NDArray[np.float64]
 
-_HANGS_FREE_M = 0.02  # how much higher the pelvis may be than a leg reaches that does not carry
-_STRETCHED_M = 0.002  # before a limb is straight, the last of its reach is softened
+_HANGS_FREE_M = 0.02  # allowed height of the pelvis above the reach of a leg that does not carry
+_STRETCHED_M = 0.002  # near a straight limb, its reach is softened over about this length
 
 
 def two_bones(upper: Float, lower: Float, towards: Float, hinge: Float) -> tuple[Float, Float]:
     """Turn two bones so that the end of the second reaches a point; in closed form (law of cosines).
 
-    The limb bends about `hinge` so that what it points away from comes forward: a knee with the hinge to
-    the left goes ahead, an elbow whose hinge points right goes back. Points out of reach are pointed at.
+    The limb bends about `hinge`: a knee with the hinge to the left goes ahead, an elbow whose hinge points
+    right goes back. The limb points at points out of reach.
 
     Args:
         upper: [3] m, the neutral vector from the first joint to the second.
         lower: [3] m, from the second joint to the end.
-        towards: [T, 3] m, from the first joint to where the end shall be.
-        hinge: [T, 3] any vector not along the limb; what is across the limb of it counts.
+        towards: [T, 3] m, from the first joint to the wanted place of the end.
+        hinge: [T, 3] any vector not along the limb; only its part across the limb counts.
 
     Returns:
         [T, 4] world rotations of the two bones, from neutral.
@@ -54,7 +54,10 @@ def two_bones(upper: Float, lower: Float, towards: Float, hinge: Float) -> tuple
 
 
 def _from_neutral(bone: Float) -> Float:
-    """[1, 4] what turns a bone's neutral direction straight down, about an axis square to it and to y."""
+    """Return the rotation [1, 4] of a bone's neutral direction straight down.
+
+    The axis of the rotation is square to the bone and to y.
+    """
     down = bone / np.sqrt(np.sum(bone**2))
     left = np.array([0.0, 1.0, 0.0]) - down[1] * down
     left /= np.sqrt(np.sum(left**2))
@@ -70,15 +73,15 @@ def pelvis_height(
     wanted_m: Float,
     softness_m: Float,
 ) -> Float:
-    """As high as is wanted, or as high as the legs that carry allow with their knees bent as they must be.
+    """Return the wanted height, or as much of it as the carrying legs allow with their least knee flexion.
 
     Args:
-        rig: whose legs.
+        rig: the person's bones.
         place: [T, 2] m of the pelvis's joint.
         pelvis: [T, 4] its rotation.
         feet: left, right.
         wanted_m: [T] height in the world.
-        softness_m: [T] how near two of these bounds are when the one begins to give way to the other.
+        softness_m: [T] distance of two of these bounds within which one blends into the other.
 
     Returns:
         [T] m, world.
@@ -98,7 +101,7 @@ def pelvis_height(
 
 
 def leg_rotations(rig: Rig, root: Float, pelvis: Float, feet: Sequence[Foot]) -> dict[str, Float]:
-    """Thighs and shanks whose ends are at the ankles; knees go where pelvis and foot look."""
+    """Compute rotations of thighs and shanks that end at the ankles; knees point as pelvis and foot do."""
     bones: dict[str, Float] = {}
     left = np.array([0.0, 1.0, 0.0])
     for foot, side in zip(feet, SIDES, strict=True):
@@ -115,6 +118,6 @@ def _length(rig: Rig, bone: str) -> float:
 
 
 def _lower(one: Float, other: Float, softness_m: Float) -> Float:
-    """The smaller one, a parabola where they are within `softness_m`: never above either."""
+    """Return the smaller one, a parabola where they are within `softness_m`: never above either."""
     near = np.maximum(softness_m - np.abs(one - other), 0.0) / softness_m
     return np.asarray(np.minimum(one, other) - near**2 * softness_m / 4, dtype=np.float64)

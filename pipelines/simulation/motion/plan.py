@@ -1,4 +1,4 @@
-"""The plan of a motion: which way the body goes, when which foot steps where, and the keys of every curve."""
+"""The plan of a motion: the body's way, times and places of the footsteps, and the keys of every curve."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Footstep:
 
 @dataclass(frozen=True)
 class Stretch:
-    """A time during which the body goes somewhere or turns: where it is, is a function of time."""
+    """A time during which the body travels or turns; its place is a function of time."""
 
     start_s: float
     end_s: float
@@ -49,7 +49,7 @@ class Stretch:
     turn: tuple[float, float]  # rad, heading from and to, where there is no way
 
     def at(self, t_s: Float) -> tuple[Float, Float]:
-        """[N, 2] m and heading [N] in rad; held before the start and after the end."""
+        """Return the place [N, 2] m and the heading [N] rad; constant before the start and after the end."""
         since = np.clip(t_s - self.start_s, 0.0, self.end_s - self.start_s)
         if self.way is not None and self.along_m is not None:
             return self.way.place(self.along_m(since))
@@ -61,7 +61,7 @@ class Stretch:
 
 @dataclass(frozen=True)
 class _Rhythm:
-    """When the steps of a stretch fall, at N moments from some seconds before it to some behind."""
+    """Times of the steps of a stretch, at N moments from some seconds before it to some seconds after."""
 
     start_s: float
     knots: Float  # [K, 3] seconds since then, m/s, how far it is run
@@ -71,17 +71,17 @@ class _Rhythm:
     places: Float  # [N, 2] m, of the body
 
     def when(self, step: float) -> float:
-        """When so many steps are taken."""
+        """Return the time at which so many steps are taken."""
         return self.start_s + float(np.interp(step, self.steps, self.since_s))
 
     def gait_at(self, t_s: float) -> tuple[float, float]:
-        """Speed in m/s, and how much of the gait is a run."""
+        """Return the speed in m/s and the share of running in the gait."""
         times, speeds, runs = self.knots.T
         speed = float(np.interp(t_s - self.start_s, times, speeds))
         return speed, float(np.interp(t_s - self.start_s, times, runs)) * gait.running(speed)
 
     def outruns(self, step: Footstep, reach_m: float) -> float:
-        """When the body is as far from a foot as a leg reaches."""
+        """Return the first time at which the body is as far from a foot as a leg reaches, or infinity."""
         soonest = int(np.searchsorted(self.moments_s, step.strike_s + 0.1, side="right"))
         for begin in range(soonest, len(self.moments_s), _LOOKED_AHEAD):  # long ways have many steps
             ahead = slice(begin, begin + _LOOKED_AHEAD)
@@ -92,9 +92,9 @@ class _Rhythm:
 
 
 def _reached(stretch: Stretch, strike_s: float, above_s: float, speed: float) -> tuple[Float, float]:
-    """Where the body is, and its heading, when it stands above a foot that has come down."""
+    """Compute the body's place and heading when it stands above a foot that has come down."""
     (now, place), (_, heading) = stretch.at(np.array([strike_s, above_s]))
-    # Who still gains speed does not yet reach as far ahead.
+    # A person who still gains speed does not yet reach as far ahead.
     mean = float(np.hypot(*(place - now))) / (above_s - strike_s)
     if mean > 1.1 * speed:
         early_s = strike_s + (above_s - strike_s) * 1.1 * speed / mean
@@ -104,7 +104,7 @@ def _reached(stretch: Stretch, strike_s: float, above_s: float, speed: float) ->
 
 @dataclass
 class Plan:
-    """What has been planned up to `t_s`; the body stands there at `place`, looking along `heading`."""
+    """The motion planned up to `t_s`; then the body stands at `place` and looks along `heading`."""
 
     place: Float  # [2] m
     heading: float  # rad
@@ -125,7 +125,7 @@ class Plan:
         self.keys.add("stride", (-1.0, 0.0))
 
     def body_at(self, t_s: Float, start: Float, heading: float) -> tuple[Float, Float]:
-        """Where the body is, [T, 2] m, and its heading [T] in rad, from where it began."""
+        """Compute the body's place [T, 2] m and heading [T] rad, from those at the start."""
         place = np.broadcast_to(start, (len(t_s), 2)).copy()
         towards = np.full(len(t_s), heading)
         for stretch in self.stretches:
@@ -133,14 +133,14 @@ class Plan:
             place[later], towards[later] = stretch.at(t_s[later])
         return place, towards
 
-    # --- what a body does with its feet ----------------------------------------------------------------
+    # --- actions of the feet ----------------------------------------------------------------------------
 
     def stay(self, seconds: float) -> None:
         """Leave the feet where they are."""
         self.t_s += seconds
 
     def turn(self, angle: float) -> None:
-        """On the spot by an angle in rad, to the left if positive."""
+        """Turn on the spot by an angle in rad, to the left if positive."""
         if abs(angle) < _STILL_RAD / 20:
             return
         lasting = abs(angle) / _TURN_RATE * 1.4 + 0.3
@@ -151,7 +151,7 @@ class Plan:
         )
 
     def travel(self, parts: Sequence[Part]) -> None:
-        """From a stand to a stand."""
+        """Travel from a stand to a stand."""
         knots = pace(parts).knots
         stretch = self._along(parts, Pace(knots))
         self._step_through(stretch, knots, first=RIGHT)
@@ -168,7 +168,7 @@ class Plan:
         self._walk_steps(stretch, knots, first, count)
 
     def step(self, foot: int, lift_s: float, strike_s: float, at: tuple[Float, float], run: float) -> None:
-        """Put a foot beside where the body is to be: its place [2] in m and its heading in rad."""
+        """Put a foot beside the body's future place: its place [2] in m and its heading in rad."""
         self._put(foot, lift_s, strike_s, self._beside(foot, *at, 0.0, 0.0), run)
 
     # --- how -------------------------------------------------------------------------------------------
@@ -186,7 +186,7 @@ class Plan:
         return Stretch(self.t_s, self.t_s + times[-1], way, along, self.place, (0.0, 0.0))
 
     def _phase(self, knots: Sequence[tuple[float, float, float]], least: float) -> Curve:
-        """Steps since the start, as a function of seconds since then."""
+        """Return a function: steps since the start, by seconds since then."""
         from scipy.interpolate import CubicHermiteSpline
 
         cadence = [max(gait.cadence(v, r * gait.running(v), self.leg_m), least) for _, v, r in knots]
@@ -226,7 +226,7 @@ class Plan:
             strike_s = rhythm.when(number)
             speed, run = rhythm.gait_at(strike_s)
             in_air = gait.swing_steps(speed, run)
-            # Who slows down lifts the foot behind as fast as it then still was.
+            # A person who slows down lifts the foot behind at the speed of the step before.
             before = gait.swing_steps(*rhythm.gait_at(rhythm.when(number - 1)))
             lift_s = max(rhythm.when(number - max(in_air, before)), stretch.start_s)
             lift_s = min(lift_s, rhythm.outruns(self.feet[foot][-1], _REACH * self.leg_m))
@@ -242,7 +242,10 @@ class Plan:
     def _rhythm(
         self, stretch: Stretch, knots: Sequence[tuple[float, float, float]], count: int | None, least: float
     ) -> _Rhythm:
-        """The cadence of the speed, steps shorter where it is steep; `count` of them up to the last knot."""
+        """Compute the cadence from the speed; steps are shorter where it is steep.
+
+        With `count`, so many steps are taken up to the last knot.
+        """
         phase = self._phase(knots, least)
         lasting = stretch.end_s - stretch.start_s
         since_s = np.linspace(-3.0, lasting + 5.0, int((lasting + 8.0) / 0.005))

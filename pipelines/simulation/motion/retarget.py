@@ -1,4 +1,4 @@
-"""Recorded motion of somebody else's skeleton, put on the actor's bones."""
+"""Recorded motion of a foreign skeleton, put on the actor's bones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Float = NDArray[np.float64]
 _END_OF_LIMB = {"thigh": "shank", "shank": "foot", "upper_arm": "forearm", "forearm": "hand", "foot": "toes"}
 _FLAT_FOOT = np.radians(30.0)  # feet that point down by less than this in the rest pose are meant to stand
 _T_POSE_TURN = np.radians(20.0)  # in one frame: nobody turns a joint so fast
-_SEAM_S = 0.5  # the end of a repeated motion is bent to its beginning over this long
+_SEAM_S = 0.5  # time over which the end of a repeated motion is blended to its beginning
 _AT_REST_MPS = 0.3  # a foot that is slower stands
 
 
@@ -37,16 +37,16 @@ def retarget(
 ) -> BodyMotion:
     """Move our bones as those of a recording.
 
-    Bones are matched by name (`match_bones`), and turned as the source's are turned from its rest pose,
-    after the limbs of our neutral pose were laid along those of that rest pose: arms that hang along arms
-    of a T-pose. The rest pose is taken to stand upright. The way of the pelvis is scaled by the length of
-    the legs, begins at `start` and looks along `heading_deg`. Heights are those of the recording over its
-    floor, scaled, over the ground here; a foot that would come below it is lifted, its knee bending. A
-    single frame at the beginning from which the pose jumps, a T-pose put there for calibration, is left out.
+    Bones are matched by name (`match_bones`), and turned as the source's are turned from its rest pose, after
+    the limbs of our neutral pose were laid along those of that rest pose: arms that hang along arms of a
+    T-pose. The rest pose is taken to stand upright. The way of the pelvis is scaled by the length of the
+    legs, begins at `start` and looks along `heading_deg`. Heights over the ground are those of the recording
+    over its floor, scaled. A foot that would come below the ground is lifted, its knee bending. A single
+    frame at the beginning from which the pose jumps (a T-pose for calibration) is left out.
 
     Args:
-        source: what moves.
-        rig: whose bones are to move.
+        source: the recording.
+        rig: the bones to be moved.
         t_s: [T] seconds; beyond the end of the recording its last pose is held, or it begins again.
         ground: heights of places [N, 2].
         start: [2] m.
@@ -95,7 +95,7 @@ def _without_first_pose(source: SkeletalMotion) -> SkeletalMotion:
 
 
 def _angle(one: Float, other: Float) -> Float:
-    """[B] rad between rotations."""
+    """Compute the angles [B] rad between rotations."""
     relative = multiply(conjugate(one), other)
     return np.asarray(
         2 * np.arctan2(np.sqrt(np.sum(relative[..., :3] ** 2, axis=-1)), np.abs(relative[..., 3])),
@@ -104,7 +104,7 @@ def _angle(one: Float, other: Float) -> Float:
 
 
 def _rest_joints(source: SkeletalMotion) -> Float:
-    """[B, 3] m, the joints in the rest pose."""
+    """Compute the joints [B, 3] m in the rest pose."""
     joints = np.zeros((len(source.bones), 3))
     for bone, parent in enumerate(source.parent):
         if parent >= 0:
@@ -128,7 +128,7 @@ def _source_leg_length(rest: Float, match: dict[str, int]) -> float:
 
 
 def _laid_on(rig: Rig, rest: Float, match: dict[str, int]) -> Float:
-    """[B, 4] how our bones are turned when we stand as the source does in its rest pose."""
+    """Compute the rotations [B, 4] of our bones in the pose of the source's rest pose."""
     across = rest[match["left_thigh"]] - rest[match["right_thigh"]]
     facing = about(2, np.array([np.arctan2(-across[0], across[1])]))[0]
     laid = np.broadcast_to(facing, (len(BONES), 4)).copy()
@@ -137,7 +137,7 @@ def _laid_on(rig: Rig, rest: Float, match: dict[str, int]) -> Float:
             name, below = f"{side}_{bone}", f"{side}_{end}"
             theirs = rest[match[below]] - rest[match[name]]
             if float(np.linalg.norm(theirs)) <= 0:
-                continue  # the source ends here: the bone goes on as what it hangs on
+                continue  # the source ends here: the bone moves with its parent
             ours = rotate(facing, rig.offset[BONE[below]])
             if bone == "foot":
                 falls = [np.arctan2(-v[2], np.hypot(v[0], v[1])) for v in (ours, theirs)]
@@ -158,12 +158,12 @@ def _laid_on(rig: Rig, rest: Float, match: dict[str, int]) -> Float:
 class _Pose:
     root: Float  # [T, 3] m, of the source
     rotation: Float  # [T, B, 4] of our bones
-    first: Float  # [3] m, where the root begins
-    heading: float  # rad, where the first pose looks
+    first: Float  # [3] m, first place of the root
+    heading: float  # rad, heading of the first pose
 
 
 def _sampled(source: SkeletalMotion, bones: list[int], laid: Float, t_s: Float, *, repeat: bool) -> _Pose:
-    """Poses at the asked times; every round of a repeated motion begins where the last one ended."""
+    """Interpolate poses at the given times; each round of a repeated motion begins at the end of the last."""
     world = np.empty_like(source.rotation)
     for bone, parent in enumerate(source.parent):
         own = source.rotation[:, bone]
@@ -206,7 +206,7 @@ def _sampled(source: SkeletalMotion, bones: list[int], laid: Float, t_s: Float, 
 def _rounds(
     at: Float, turned: Float, rounds: NDArray[np.int64], moved: Float, first: Float, turn: float
 ) -> tuple[Float, Float]:
-    """Poses of later rounds, each turned and moved on from the last."""
+    """Turn and move the poses of later rounds on from the last."""
     at, turned = at.copy(), turned.copy()
     start = first.copy()
     for number in range(int(rounds.max()) + 1):
@@ -227,7 +227,7 @@ def _heading(rotation: Float) -> float:
 
 
 def _floor(rig: Rig, motion: BodyMotion) -> float:
-    """How high the recording's own floor is, m: where its lower foot is while that is at rest."""
+    """Estimate the height of the recording's own floor, m: that of its lower foot while it is at rest."""
     points = sole_points(rig, motion).reshape(len(motion.t_s), -1, 3)
     which = points[..., 2].argmin(axis=1)
     lowest = points[np.arange(len(points)), which]
@@ -239,7 +239,7 @@ def _floor(rig: Rig, motion: BodyMotion) -> float:
 
 
 def _on_ground(rig: Rig, motion: BodyMotion, floor_m: float, ground: Callable[[Float], Float]) -> BodyMotion:
-    """Stand the motion on the ground: the pelvis follows it, each foot is brought over it by its leg."""
+    """Stand the motion on the ground: the pelvis follows it, and each leg brings its foot over it."""
     root = motion.root.copy()
     root[:, 2] += ground(root[:, :2]) - floor_m
     motion = BodyMotion(motion.t_s, root, motion.rotation)

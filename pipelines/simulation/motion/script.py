@@ -32,7 +32,7 @@ def perform(
     repeat: bool,
     seed: int,
 ) -> BodyMotion:
-    """Do one thing after the other from a stand; whoever is done stands still, or begins again."""
+    """Perform the steps one after the other from a stand; at the end stand still, or begin again."""
     random = np.random.default_rng(seed)
     style = Style(
         sway_m=float(random.uniform(0.003, 0.006)),
@@ -53,7 +53,7 @@ def perform(
 
 
 def _once(steps: Sequence[Step], rig: Rig, plan: Plan, end_s: float) -> None:
-    """One pass over the script, or what of it begins before `end_s`."""
+    """Plan one pass over the script, up to the last step that begins before `end_s`."""
     waiting = list(steps)
     while waiting and plan.t_s <= end_s:
         parts = _ways_on(waiting, plan)
@@ -62,7 +62,7 @@ def _once(steps: Sequence[Step], rig: Rig, plan: Plan, end_s: float) -> None:
             plan.travel(parts)
             plan.stay(_PAUSE_S)
             continue
-        if not waiting:  # ways to where the actor stands already
+        if not waiting:  # only ways to the actor's own place were left
             break
         step = waiting.pop(0)
         if step.stand:
@@ -116,5 +116,5 @@ def _part(travel: Travel, place: Float, heading: float, *, jogs: bool) -> Part:
 
 
 def _nearest(angle: float) -> float:
-    """The same angle between -pi and pi."""
+    """Return the same angle between -pi and pi."""
     return float((angle + np.pi) % (2 * np.pi) - np.pi)

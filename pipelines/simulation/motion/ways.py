@@ -1,4 +1,4 @@
-"""Ways over the ground: lines, arcs and corners that a body can follow, and how fast it goes along them."""
+"""Ways over the ground: lines, arcs and corners that a body can follow, and the speed along them."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ class Part:
     length_m: float
     heading: float  # rad at its beginning, counterclockwise from east
     turn: float  # rad to the left over its length
-    speed_mps: float  # what is asked for
+    speed_mps: float  # as requested
     run: float  # 0 if walked, 1 if run
 
     @property
     def end_heading(self) -> float:
-        """Where it points at its end, rad."""
+        """Heading at the end, rad."""
         return self.heading + self.turn
 
     def end(self, start: Float) -> Float:
-        """Where it ends, [2] m."""
+        """Return the end point [2], m."""
         return np.asarray(self._points(start, np.array([self.length_m]))[0])
 
     def _points(self, start: Float, along_m: Float) -> Float:
-        """[N, 2] m; straight on beyond its ends."""
+        """Return points [N, 2] m of the way; straight on beyond its ends."""
         if abs(self.turn) < 1e-9:
             ahead, left = along_m, np.zeros_like(along_m)
         else:
@@ -52,8 +52,8 @@ class Part:
 class Way:
     """Parts one after the other, smoothed so that position and heading bend without a jerk.
 
-    Every point is the mean, weighed by a raised cosine, of what lies within 0.4 m of it on the way: lines
-    stay what they are, an arc of radius r shrinks by 1 cm^2 / r, corners are cut, and both ends are kept.
+    Every point is the mean, weighed by a raised cosine, of the points within 0.4 m of it on the way: lines
+    stay straight, an arc of radius r shrinks by 1 cm^2 / r, corners are cut, and both ends are kept.
     """
 
     def __init__(self, start: Float, parts: Sequence[Part]) -> None:
@@ -84,7 +84,7 @@ class Way:
         self._heading = CubicSpline(inner, heading)
 
     def place(self, along_m: Float) -> tuple[Float, Float]:
-        """Where it is after some way, [N, 2] m, and the heading [N] in rad."""
+        """Compute the place [N, 2] m after some way, and the heading [N] in rad."""
         return (
             np.asarray(self._spline(along_m), dtype=np.float64),
             np.asarray(self._heading(along_m), dtype=np.float64),
@@ -93,13 +93,15 @@ class Way:
 
 @dataclass(frozen=True)
 class Pace:
-    """When which speed is reached: (time in s from the start, speed in m/s, how much of a run) knots."""
+    """Speeds over time, as knots: time in s from the start, speed in m/s, share of running."""
 
     knots: tuple[tuple[float, float, float], ...]
 
 
 def pace(parts: Sequence[Part], *, walk_mps2: float = 0.9, run_mps2: float = 1.9) -> Pace:
-    """Speeds over time from a stand to a stand, each part at its own where it is long enough for that.
+    """Compute speeds over time from a stand to a stand.
+
+    Each part has its own speed where it is long enough for that.
 
     Speed goes from one knot to the next as a smooth step, at `walk_mps2` or `run_mps2` on average; where a
     part is slower than the next, it is slower to its end.

@@ -1,4 +1,4 @@
-"""From samples to fragments: the pieces of surface that make up a pixel, each to be shaded once."""
+"""Fragments: the pieces of surface that make up a pixel, each to be shaded once, gathered from samples."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Fragments(NamedTuple):
 
 
 def room_for(count: int) -> Fragments:
-    """Fragments to be filled."""
+    """Return fragments to be filled."""
     point, normal, colour = (np.empty((count, 3), np.float32) for _ in range(3))
     pixel, on_ground = np.empty(count, np.int32), np.empty(count, np.uint8)
     share, distance, slant = (np.empty(count, np.float32) for _ in range(3))
@@ -48,21 +48,21 @@ def room_for(count: int) -> Fragments:
 
 
 def gather(band: Band, first_row: int, view: View, mesh: Mesh, fragments: Fragments, sky: Float32) -> int:
-    """Find what a band's pixels are made of.
+    """Find the fragments of a band's pixels.
 
     Samples of one face in one pixel become one fragment at their common centre, which lies on the face
     and inside it. Samples without a face see land below the horizon, and nothing above.
 
     Args:
-        band: what the samples see, drawn with `SHIFTS_PX`.
+        band: the faces that the samples see, drawn with `SHIFTS_PX`.
         first_row: the picture's row that is the band's first.
         view: the camera.
-        mesh: what the band's faces index.
+        mesh: the mesh of the band's faces.
         fragments: room for as many as there are samples; filled.
         sky: [R * W] share of each pixel's samples that see nothing; filled.
 
     Returns:
-        How many fragments there are.
+        The number of fragments.
     """
     return _gather(
         band.nearness,

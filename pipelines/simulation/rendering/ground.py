@@ -17,7 +17,7 @@ UInt8 = NDArray[np.uint8]
 
 TILE_TEXELS, TILE_M = 2048, 10.24
 SITE_TEXELS, SITE_M = 256, 71.3  # no multiple of the tile, so that nothing repeats in sight
-FULL_SCALE = 3.0  # what a texel of 255 multiplies by
+FULL_SCALE = 3.0  # factor of a texel of 255
 
 _TEXELS_PER_M = TILE_TEXELS / TILE_M
 _SITE_TEXELS_PER_M = SITE_TEXELS / SITE_M
@@ -30,16 +30,16 @@ _BLADE_STEPS = 24
 
 
 class GroundTexture(NamedTuple):
-    """What the colour of the ground is multiplied by; 1 on average over the tile, per channel."""
+    """Factors of the ground's colour; 1 on average over the tile, per channel."""
 
     texels: NDArray[np.uint32]  # [T] RGB in 3 bytes, fine to coarse, rows along y; FULL_SCALE at 255
-    first: NDArray[np.int64]  # [L] where each level begins; its side is TILE_TEXELS / 2 ** level
+    first: NDArray[np.int64]  # [L] first texel of each level; its side is TILE_TEXELS / 2 ** level
     site: Float32  # [SITE_TEXELS, SITE_TEXELS, 3], repeats too
 
 
 @lru_cache(maxsize=2)
 def ground_texture(seed: int) -> GroundTexture:
-    """The texture of a seed."""
+    """Make the texture of a seed."""
     rng = np.random.default_rng([seed, 0x67726173])
     levels = [_tile(rng)]
     while len(levels[-1]) > 4:
@@ -54,10 +54,10 @@ def ground_texture(seed: int) -> GroundTexture:
 
 
 def paint(texture: GroundTexture, fragments: Fragments, count: int, view: View) -> None:
-    """Multiply the colours of what is ground by the texture, averaged over each fragment's footprint.
+    """Multiply the colours of ground fragments by the texture, averaged over each fragment's footprint.
 
     A pixel's footprint on the ground is longer than it is wide. Mip maps (Williams, "Pyramidal
-    parametrics", 1983) are square: theirs is taken between the two, at least a third of the length.
+    parametrics", 1983) are square: their side is between the two, at least a third of the length.
     """
     _paint(
         *texture,
@@ -125,7 +125,7 @@ def _paint(
 
 @helper
 def _spread(texel: np.uint32) -> np.uint64:
-    """Three bytes, moved 21 bits apart."""
+    """Move three bytes 21 bits apart."""
     wide = np.uint64(texel)
     return (
         wide & np.uint64(0xFF)
@@ -135,7 +135,7 @@ def _spread(texel: np.uint32) -> np.uint64:
 
 
 def _tile(rng: np.random.Generator) -> Float32:
-    """Blades of grass, thrown one upon the other over soil; the later ones stand higher and are lighter."""
+    """Draw blades of grass, one upon the other over soil; the later ones stand higher and are lighter."""
     n = TILE_TEXELS
     crumbs = _noise(rng, n, 0.6)
     clumps = _noise(rng, n, 2.6)
@@ -174,7 +174,7 @@ def _site(rng: np.random.Generator) -> Float32:
 
 
 def _noise(rng: np.random.Generator, n: int, slope: float) -> Float:
-    """[n, n] periodic noise of mean 0 and deviation 1, its power falling as frequency ** -slope."""
+    """Draw periodic noise [n, n] of mean 0 and deviation 1, its power falling as frequency ** -slope."""
     frequency = np.hypot(np.fft.fftfreq(n)[:, None], np.fft.rfftfreq(n)[None]) * n
     frequency[0, 0] = 1.0
     spectrum = np.fft.rfft2(rng.normal(size=(n, n))) * frequency ** (-slope / 2)

@@ -1,4 +1,4 @@
-"""Several surfaces as one mesh, with what shading needs at every corner."""
+"""Several surfaces as one mesh, with normals, colour and kind for shading."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class Mesh(NamedTuple):
 
 
 def mesh_of(surfaces: Sequence[Surface]) -> Mesh:
-    """The surfaces, one after another; an empty mesh for none."""
+    """Join the surfaces, one after another; an empty mesh for none."""
     parts = [_single(surface) for surface in surfaces]
     return stacked(parts) if parts else _single(_EMPTY)
 
 
 def stacked(meshes: Sequence[Mesh]) -> Mesh:
-    """Meshes, one after another; their corners stay apart."""
+    """Join meshes, one after another; their corners stay apart."""
     first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     return Mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),

@@ -23,7 +23,7 @@ Int32 = NDArray[np.int32]
 SUBROWS = 4
 SHIFTS_PX = np.array([-0.125, 0.375, -0.375, 0.125])
 CENTRES_PX = np.zeros(1)
-"""How far right of the pixel's centre the samples of each sample row lie; their y is evenly spaced."""
+"""Shift in x of the samples of each sample row from the pixel's centre; their y is evenly spaced."""
 
 NEAR_M = 0.05
 NOTHING = -1
@@ -37,7 +37,7 @@ class Projected(NamedTuple):
 
 
 class Band(NamedTuple):
-    """What is seen at the samples of some consecutive sample rows."""
+    """Faces seen at the samples of some consecutive sample rows."""
 
     nearness: Float32  # [R, W] 1/m (or metres towards the sun, in a shadow map)
     source: Int32  # [R, W] the face, or NOTHING
@@ -46,7 +46,7 @@ class Band(NamedTuple):
 def projected(
     vertices: Float, faces: Int32, position: Float, world_from_camera: Float, intrinsics: Intrinsics
 ) -> Projected:
-    """The faces that may touch the picture, cut at `NEAR_M` in front of the camera.
+    """Project the faces that may touch the picture, cut at `NEAR_M` in front of the camera.
 
     Args:
         vertices: [V, 3] m, world.
@@ -62,16 +62,16 @@ def projected(
 
 
 def bands(triangles: Projected, height: int, rows: int) -> tuple[Int32, NDArray[np.int64]]:
-    """Which triangles each band of `rows` pixel rows has to draw.
+    """Find the triangles that each band of `rows` pixel rows has to draw.
 
     Returns:
-        [M] rows of `triangles`, band after band, and [B + 1] where each band begins.
+        [M] rows of `triangles`, band after band, and [B + 1] the start of each band.
     """
     return _sorted_into_bands(triangles.corners, height, rows)
 
 
 def empty_band(sample_rows: int, width: int) -> Band:
-    """Samples that see nothing."""
+    """Return samples that see nothing."""
     nearness = np.full((sample_rows, width), -np.inf, np.float32)
     return Band(nearness, np.full((sample_rows, width), NOTHING, np.int32))
 
@@ -83,7 +83,7 @@ def draw(triangles: Projected, chosen: Int32, shifts_px: Float, first_sample_row
 
     Args:
         triangles: all of the picture's.
-        chosen: which of them, in the order to draw.
+        chosen: rows of the triangles to draw, in that order.
         shifts_px: `SHIFTS_PX` or `CENTRES_PX`.
         first_sample_row: the picture's sample row that is the band's first.
         band: changed in place.

@@ -36,7 +36,7 @@ Bool = NDArray[np.bool_]
 _BAND_ROWS = 16  # pixel rows whose samples fit a processor's cache
 _STATIC_TEXEL_M, _STATIC_TEXELS = 0.02, 2048
 _PERSON_TEXEL_M, _PERSON_TEXELS = 0.008, 1024
-_LEVEL_M = 0.05  # ground that keeps this close to its mean height casts no shadow worth a map
+_LEVEL_M = 0.05  # ground this close to its median height casts no shadow worth a map
 
 
 class Renderer:
@@ -46,7 +46,7 @@ class Renderer:
     the ground ends, land goes on level at the height of its lowest point, to the horizon.
 
     Args:
-        static: what stands still.
+        static: the surfaces that do not move.
         intrinsics: the camera, without distortion.
         sun: [3] direction towards it, of any length.
         seed: of the ground's texture and of the sensor's noise.
@@ -72,12 +72,12 @@ class Renderer:
     def picture(
         self, position: Float, quaternion_xyzw: Float, people: Sequence[Surface], frame: int
     ) -> UInt8:
-        """What the camera sees.
+        """Render the camera's picture.
 
         Args:
             position: [3] m, of the camera in the world.
             quaternion_xyzw: [4] world_from_camera.
-            people: whoever moves.
+            people: the surfaces that move.
             frame: number of the picture; with the seed and the position it fixes the noise.
 
         Returns:
@@ -112,13 +112,13 @@ class Renderer:
     def silhouette(
         self, position: Float, quaternion_xyzw: Float, person: Surface, others: Sequence[Surface] = ()
     ) -> Bool:
-        """The pixels at whose centres the person is what the camera sees.
+        """Return the pixels at whose centres the camera sees the person.
 
         Args:
             position: [3] m, of the camera in the world.
             quaternion_xyzw: [4] world_from_camera.
-            person: whose silhouette.
-            others: who may stand in front, besides what stands still.
+            person: the person's surface.
+            others: other surfaces that may stand in front, besides the static ones.
 
         Returns:
             [H, W].
@@ -129,12 +129,12 @@ class Renderer:
         return mine
 
     def depth(self, position: Float, quaternion_xyzw: Float, people: Sequence[Surface] = ()) -> Float32:
-        """How far what is seen at each pixel's centre lies, along the optical axis.
+        """Return the depth of the surface at each pixel's centre, along the optical axis.
 
         Args:
             position: [3] m, of the camera in the world.
             quaternion_xyzw: [4] world_from_camera.
-            people: whoever moves.
+            people: the surfaces that move.
 
         Returns:
             [H, W] m; infinite where no surface is seen.
@@ -154,7 +154,7 @@ class Renderer:
 
 
 def _land(static: Mesh) -> Float:
-    """[4] height and mean reflectance of the land around the ground; NaN without ground."""
+    """Return height and mean reflectance [4] of the land around the ground; NaN without ground."""
     corners = np.unique(static.faces[static.kind & GROUND != 0])
     if len(corners) == 0:
         return np.full(4, np.nan)
@@ -162,7 +162,7 @@ def _land(static: Mesh) -> Float:
 
 
 def _static_maps(static: Mesh, axes: Float) -> list[ShadowMap]:
-    """One map, over all that stands on the ground or rises from it; none if nothing does."""
+    """Return one map, over all that stands on the ground or rises from it; none if nothing does."""
     ground = np.zeros(len(static.vertices), np.bool_)
     ground[static.faces[static.kind & GROUND != 0]] = True
     height = static.vertices[:, 2]
@@ -178,6 +178,9 @@ def _person_map(person: Mesh, axes: Float) -> ShadowMap:
 
 
 def _noise_key(seed: int, frame: int, position: Float) -> int:
-    """The position sets apart the pictures that several cameras take of one frame."""
+    """Compute the key of a picture's noise.
+
+    The position distinguishes the pictures that several cameras take of one frame.
+    """
     where = np.ascontiguousarray(position).view(np.uint32).tolist()
     return int(np.random.SeedSequence([seed, frame, *where]).generate_state(1, np.uint64)[0])

@@ -1,4 +1,4 @@
-"""From light to the bytes of a picture: the lens's softness, the sensor's noise, the tone curve."""
+"""The sensor, from light to the bytes of a picture: the lens's softness, noise, the tone curve."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ EXPOSURE = 1.6
 NOISE = 1.8  # standard deviation, in steps of 8 bits
 _SOFTNESS = 0.11  # share of the light that goes to either neighbour, per axis: a blur of 0.47 px
 _CURVE_STEPS = 1024
-_BRIGHTEST = 4.0  # of the exposed light that the curve tells apart
+_BRIGHTEST = 4.0  # of the exposed light; the curve is constant above
 
 
 def developed(light: Float32, key: int) -> UInt8:
-    """The picture of a field of light.
+    """Convert a field of light to the bytes of a picture.
 
     Args:
         light: [H, W, 3] linear RGB.
@@ -31,7 +31,7 @@ def developed(light: Float32, key: int) -> UInt8:
 
 
 def _curve() -> Float32:
-    """8-bit values by the square root of the exposed light: sRGB, with a soft shoulder above 0.8."""
+    """Return 8-bit values by the square root of the exposed light: sRGB, with a soft shoulder above 0.8."""
     root = np.linspace(0.0, np.sqrt(_BRIGHTEST), _CURVE_STEPS)
     linear = root**2
     knee = 0.8

@@ -1,6 +1,6 @@
 """Light of fragments and of the sky, with haze between them and the camera.
 
-All light is linear RGB, with about 1 for what a white, level surface reflects in full sun.
+All light is linear RGB, with about 1 for the light that a white, level surface reflects in full sun.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ SKY_RGB = np.array([0.21, 0.25, 0.31])  # from above, on a level surface
 BOUNCE_RGB = np.array([0.09, 0.09, 0.06])  # from the ground, on a surface that faces down
 HORIZON_RGB = np.array([0.50, 0.56, 0.62])
 ZENITH_RGB = np.array([0.14, 0.25, 0.47])
-HAZE_M = 700.0  # where haze has half its effect
+HAZE_M = 700.0  # distance at which haze has half its effect
 
 
 def shade(
     fragments: Fragments, count: int, sun: Float32, sky: Float32, first_row: int, view: View, light: Float32
 ) -> None:
-    """Write the light of the pixels of a band: the mean of what their samples see.
+    """Write the light of the pixels of a band: the mean of the light at their samples.
 
     Args:
         fragments: of the band.
@@ -51,7 +51,7 @@ def shade(
 
 @cached
 def _fill_sky(share: Float32, first_row: int, turn: Float, pinhole: Float, light: Float32) -> None:
-    """Paler towards the horizon, and below it as at it; black where none is seen."""
+    """Fill in the sky: paler towards the horizon, and below it as at it; black where none is seen."""
     width = light.shape[1]
     for row in range(light.shape[0]):
         down = (first_row + row - pinhole[3]) / pinhole[1]

@@ -1,4 +1,4 @@
-"""What the sun sees: orthographic depth maps along its rays (Williams, "Casting curved shadows", 1978)."""
+"""Depth maps of the sun, orthographic along its rays (Williams, "Casting curved shadows", 1978)."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class ShadowMap(NamedTuple):
 
     height: Float32  # [H, W] m towards the sun, -inf where the sun hits nothing
     edge: UInt8  # [H, W] 1 where a filtered look-up may find lit and shaded texels side by side
-    corner: Float  # [2] m, where the first texel begins, along the axes of `sun_axes`
+    corner: Float  # [2] m, corner of the first texel, along the axes of `sun_axes`
     texel_m: float
 
 
 def sun_axes(sun: Float) -> Float:
-    """[3, 3] orthonormal rows, the last one the direction towards the sun."""
+    """Return orthonormal rows [3, 3], the last one the direction towards the sun."""
     towards = sun / np.sqrt(np.sum(sun**2))
     helper = np.array([0.0, 1.0, 0.0]) if abs(towards[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
     across = np.cross(helper, towards)
@@ -40,14 +40,14 @@ def sun_axes(sun: Float) -> Float:
 
 
 def shadow_map(mesh: Mesh, region: Float, axes: Float, *, finest_m: float, most_texels: int) -> ShadowMap:
-    """The map of a mesh over the part of the plane that some points cover.
+    """Draw the map of a mesh over the part of the plane that some points cover.
 
     Args:
-        mesh: what casts shadows; what lies outside the region is left out.
+        mesh: the surfaces that cast shadows; faces outside the region are left out.
         region: [N, 3] m, at least one point; the map covers their projections.
         axes: from `sun_axes`.
-        finest_m: side of a texel, unless the map would grow larger than
-        most_texels: along a side.
+        finest_m: side of a texel; larger if the map needs more than `most_texels`.
+        most_texels: largest number of texels along a side.
     """
     covered = np.einsum("ij,nj->ni", axes[:2], region)
     low, high = covered.min(axis=0), covered.max(axis=0)
@@ -67,7 +67,7 @@ def shadow_map(mesh: Mesh, region: Float, axes: Float, *, finest_m: float, most_
 
 
 def sunlight(maps: Sequence[ShadowMap], axes: Float, fragments: Fragments, count: int) -> Float32:
-    """[N] the cosine of the sun's incidence times the share of the sun that reaches each fragment."""
+    """Compute the cosine of the sun's incidence times its share that reaches each fragment, [N]."""
     sun = np.empty(count, np.float32)
     _face_sun(fragments.normal, axes[2], sun)
     for each in maps:
@@ -93,7 +93,7 @@ def _cast(
     normal: Float32,
     sun: Float32,
 ) -> None:
-    """Take away what one map shades: bilinear comparisons over 3 x 3 texels.
+    """Remove the light that one map shades: bilinear comparisons over 3 x 3 texels.
 
     After Reeves, Salesin & Cook, "Rendering antialiased shadows with depth maps" (1987).
     """
@@ -139,7 +139,7 @@ def _cast(
 
 @cached
 def _edges(height: Float32, step: float) -> UInt8:
-    """Where heights within the 4 x 4 texels of a look-up differ by more than a step."""
+    """Mark texels where heights within the 4 x 4 texels of a look-up differ by more than a step."""
     rows, width = height.shape
     lowest, highest = np.empty((rows, width), np.float32), np.empty((rows, width), np.float32)
     for i in range(rows):

@@ -1,1 +1,1 @@
-"""Studies of what the reconstruction error depends on: what is asked, and what is filmed."""
+"""Studies of the causes of reconstruction error: their settings, and the filmed scenes."""

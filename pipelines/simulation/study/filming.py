@@ -1,10 +1,10 @@
-"""What the studies of formations film: a long walk on level ground, from ideal positions.
+"""Scene of the formation studies: a long walk on level ground, filmed from ideal positions.
 
-A study flies nothing: its cameras stand in their slots about the walking person at every moment and look
-at them, as in the simulated experiments of Ho et al., "3D Human Reconstruction in the Wild with
-Collaborative Aerial Cameras". What errs is the keypoints and the logged poses, and that by known numbers:
-trial k of camera i has the same chance behind it whatever the formation and the size of the errors, so
-that differences between formations are not those of luck.
+A study flies nothing: its cameras stand in their slots about the walking person at every moment and look at
+them, as in the simulated experiments of Ho et al., "3D Human Reconstruction in the Wild with Collaborative
+Aerial Cameras". Only the keypoints and the logged poses have errors, of known size. Trial k of camera i has
+the same random numbers in every formation and for every size of the errors, so that differences between
+formations are not due to chance.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ from pipelines.simulation.rig import BodyMotion
 from pipelines.simulation.scenario import Body, DetectorErrors, Lens, Step, Travel
 
 RANGE_M = 10.0
-"""From the person to every camera."""
+"""Distance from the person to every camera, m."""
 
 LONGEST_S = 600.0
-"""Of a walk."""
+"""Longest duration of a walk, s."""
 
 CIRCLE_M = 15.0
 """Radius of the way: the person is seen from all sides."""
 
 PIXEL_SIGMA = 3.0
-"""Standard deviation of a good keypoint that triangulation is told, as `mocap reconstruct` is by default."""
+"""Standard deviation of a good keypoint for triangulation, px: the default of `mocap reconstruct`."""
 
 MIN_CONFIDENCE = 0.3
-"""Keypoints below are not used, likewise."""
+"""Least confidence of keypoints that are used: the default of `mocap reconstruct`."""
 
 IMITATED = DetectorErrors().detector
-"""The detector whose measured errors modelled keypoints have."""
+"""Detector whose measured errors the modelled keypoints have."""
 
 _SPEED_MPS = 1.2
 _UNDER_WAY_S = 2.0  # the person starts from a stand; filmed is a walk
 _AIM_S, _AIM_STEP_S = 1.0, 0.05  # cameras follow the mean over a stride, not every bob of the hip
-# What chance decides, each with numbers of its own.
+# One random stream for each.
 _POSES, _KEYPOINTS = range(2)
 
 
@@ -83,10 +83,10 @@ class Sightings:
 
 
 def walk(seconds: float, rate_hz: float, seed: int) -> Walk:
-    """A person who walks on a circle at an even pace.
+    """Return a person who walks on a circle at an even pace.
 
     Args:
-        seconds: how long, at most `LONGEST_S`.
+        seconds: duration, at most `LONGEST_S`.
         rate_hz: of the pictures.
         seed: of the person's way of walking.
     """
@@ -116,7 +116,7 @@ def walk(seconds: float, rate_hz: float, seed: int) -> Walk:
 
 
 def _smoothed(at: Callable[[Float], BodyMotion], t_s: Float) -> Float:
-    """The pelvis [T, 3], each moment the mean over `_AIM_S`."""
+    """Compute the pelvis [T, 3], each moment the mean over `_AIM_S`."""
     samples = round(_AIM_S / _AIM_STEP_S) + 1
     middle_s = np.arange(t_s[0] - _AIM_STEP_S, t_s[-1] + 2 * _AIM_STEP_S, _AIM_STEP_S)
     grid_s = middle_s[0] + _AIM_STEP_S * (np.arange(len(middle_s) + samples - 1) - samples // 2)
@@ -127,11 +127,11 @@ def _smoothed(at: Callable[[Float], BodyMotion], t_s: Float) -> Float:
 
 
 def formation(of: Walk, *, cameras: int, tilt_deg: float) -> Formation:
-    """Cameras in their slots: 360/n degrees apart, 90 for two, `RANGE_M` from the person.
+    """Place cameras in their slots: 360/n degrees apart, 90 for two, `RANGE_M` from the person.
 
     Args:
-        of: who is filmed.
-        cameras: how many.
+        of: the filmed person.
+        cameras: number of cameras.
         tilt_deg: of their slots above the person.
     """
     position, quaternion = orbit(
@@ -146,7 +146,7 @@ def formation(of: Walk, *, cameras: int, tilt_deg: float) -> Formation:
 
 
 def exact_keypoints(of: Walk, seen_by: Formation) -> Sightings:
-    """Where the keypoints really are in every picture."""
+    """Compute the true keypoints in every picture."""
     xy = np.stack(
         [
             see(of.joints, *pose, seen_by.lens)
@@ -157,9 +157,9 @@ def exact_keypoints(of: Walk, seen_by: Formation) -> Sightings:
 
 
 def model_keypoints(of: Walk, seen_by: Formation, exact: Sightings, *, seed: int, trial: int) -> Sightings:
-    """What a detector would have found, by the errors that were measured of one (`detector_errors`).
+    """Simulate the keypoints of a detector with measured errors (`detector_errors`).
 
-    They grow with tilt and hold what a body hides of itself; nothing else stands in the way.
+    The errors grow with tilt. They include joints that the body itself hides; there are no obstacles.
     """
     errors = DetectorErrors()
     found = []
@@ -191,15 +191,15 @@ def views_of(
     seed: int,
     trial: int,
 ) -> Views:
-    """What triangulation is given: keypoints, the poses that a log would have stated, and how far it errs.
+    """Return the input of triangulation: keypoints, logged poses, and the sigmas of these poses.
 
     Args:
-        of: who is filmed.
-        seen_by: from where.
-        sightings: what was found.
-        noise: the errors of the logged poses; what is told of them is their own standard deviation.
-        seed: where chance comes from.
-        trial: which draw.
+        of: the filmed person.
+        seen_by: the cameras.
+        sightings: the keypoints found.
+        noise: the errors of the logged poses; their true standard deviation is the pose sigma.
+        seed: source of random numbers.
+        trial: number of the draw.
 
     Returns:
         Views with N = T * J rows, joints fastest.

@@ -1,4 +1,4 @@
-"""An arm that was filmed, measured: what it saw, what was found in that, how far its joints are off."""
+"""Measures of an arm that was filmed: its pictures, the keypoints found, the errors of its joints."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipelines.session.records import Float
 from pipelines.simulation.study.filming import Formation, Sightings, Walk, exact_keypoints
 
 NEAR_SHARE = 0.1
-"""A keypoint is right within this share of the height in pixels of somebody who stands where the actor is."""
+"""Largest error of a right keypoint, as a share of the height in pixels of a person who stands there."""
 
 _NEAR_TILT_DEG = 5.0
 _ERRORS = ("reconstructed_share", "mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm", "pck150")
@@ -30,17 +30,19 @@ def measure_arm(
     range_m: Float,
     desired_tilt_deg: float,
 ) -> dict[str, Any]:
-    """An arm's figures, by their names in film/metrics.json; shares are of pictures, joints in them, moments.
+    """Measure an arm: figures by their names in film/metrics.json.
+
+    Shares are of pictures, of joints in them, or of moments.
 
     Args:
-        of: who was filmed.
-        seen_by: by N cameras at T moments.
-        sightings: what was found in their pictures.
-        views: what triangulation was given, one row for each joint-frame.
-        points: [T, J, 3] m what it made of that, NaN for nothing.
+        of: the filmed person.
+        seen_by: N cameras at T moments.
+        sightings: the keypoints found in their pictures.
+        views: the input of triangulation, one row for each joint-frame.
+        points: [T, J, 3] m, the triangulated joints, NaN where there is none.
         tilt_deg: [N, T] of the cameras above the person.
-        range_m: [N, T] from there.
-        desired_tilt_deg: what planners aimed at.
+        range_m: [N, T] distances of the cameras from the person.
+        desired_tilt_deg: the planners' desired tilt.
     """
     exact = exact_keypoints(of, seen_by).xy
     inside = np.isfinite(exact[..., 0])
@@ -67,7 +69,7 @@ def measure_arm(
 def errors_in_common(
     points: Mapping[str, Float], true_joints: Mapping[str, Float]
 ) -> dict[str, float | None]:
-    """Each arm's MPJPE (mm) on the joint-frames that all arms reconstructed; None where there is none.
+    """Compute each arm's MPJPE (mm) on the joint-frames that all arms reconstructed; None if there are none.
 
     Args:
         points: [T, J, 3] m of every arm, NaN for what was not reconstructed.
@@ -82,7 +84,7 @@ def errors_in_common(
 
 
 def _reprojection_px(views: Views, points: Float) -> dict[str, float] | None:
-    """Between the keypoints that were used and the skeleton, by the poses that the log would state."""
+    """Compute the error between used keypoints and the skeleton, by the poses that the log would have."""
     off_px = reprojection_px(views, points.reshape(-1, 3))
     used = off_px[np.isfinite(off_px)]
     return {"mean": float(used.mean()), "median": float(np.median(used))} if used.size else None

@@ -1,4 +1,4 @@
-"""What a study is asked: which formations, which pose noise, which methods."""
+"""Settings of a study: formations, pose noise, methods."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ class Noise:
     model: str  # as users write it; empty for exact poses
 
     def models(self) -> list[NoiseModel]:
-        """What they are.
+        """Parse the noise models.
 
         Raises:
-            DataError: the text does not read so, or names what there is not.
+            DataError: the text is not a noise model, or a name is unknown.
         """
         return parsed_noise_models("--noise", self.model) if self.model else []
 
 
 @dataclass(frozen=True)
 class Settings:
-    """A study. Made by `settings_for`, which checks what it is given."""
+    """A study. `settings_for` makes it and checks the values."""
 
     study: Study
     tilts_deg: tuple[float, ...]
@@ -76,12 +76,12 @@ def settings_for(
     trials: int = 10,
     seed: int = 0,
 ) -> Settings:
-    """The settings of a study, with those of the paper where nothing else is said.
+    """Return the settings of a study, with the paper's values as defaults.
 
     Args:
         study: `tilt` varies tilts, `robots` the number of drones, `noise` the kind of noise.
         tilts_deg: of the formations; 0 to 60 by 15, or 15.
-        drones: how many fly; 2 to 5, or 2.
+        drones: numbers of drones; 2 to 5, or 2.
         levels: names out of `LEVELS`; all four, or medium.
         noise: models instead of levels, as users write them.
         methods: side by side.
@@ -93,7 +93,7 @@ def settings_for(
         seed: where they come from.
 
     Raises:
-        DataError: something there is not, twice the same, or a number out of range.
+        DataError: an unknown name, a value given twice, or a number out of range.
     """
     if noise and levels is not None:
         raise DataError("--noise", "cannot be given together with --levels", "leave one of them out")
@@ -144,14 +144,14 @@ def settings_for(
 
 
 def command_of(settings: Mapping[str, Any], output: str) -> str:
-    """The `mocap ablate ...` that makes a study again; what it has by default is not said.
+    """Return the `mocap ablate ...` that makes a study again; defaults are left out.
 
     Args:
         settings: as summary.json holds them, the noise as models by label.
         output: the folder.
 
     Raises:
-        KeyError, TypeError, ValueError: they are none of a study.
+        KeyError, TypeError, ValueError: they are not the settings of a study.
     """
     study, drones, tilts = settings["study"], settings["drones"], settings["tilts_deg"]
     seconds, detector, noise = settings["seconds"], settings["detector"], settings["noise"]
@@ -177,12 +177,12 @@ def command_of(settings: Mapping[str, Any], output: str) -> str:
 
 
 def _written(number: float) -> str:
-    """A number as the options take it: whole ones without a point, all of them with every digit."""
+    """Format a number as the options take it: whole ones without a point, all of them with every digit."""
     return str(int(number)) if float(number).is_integer() else repr(float(number))
 
 
 def _noise_words(study: Study, noise: Mapping[str, str], seconds: float) -> list[str]:
-    """The options that ask for this noise."""
+    """Return the options that ask for this noise."""
     levels = [level for level in LEVELS if any(level in label.split() for label in noise)]
     for asked in (levels, *([level] for level in LEVELS)):
         if asked and dict(noise) == {each.label: each.model for each in _levels(study, asked, seconds)}:
@@ -191,7 +191,7 @@ def _noise_words(study: Study, noise: Mapping[str, str], seconds: float) -> list
 
 
 def _levels(study: Study, levels: Sequence[str], seconds: float) -> list[Noise]:
-    """White noise of every level; for the study of noise every kind of it, equally large on the average."""
+    """Return white noise of every level; for the study of noise, every kind with the same mean size."""
     asked: list[Noise] = []
     for level in levels:
         position_m, rotation_deg = LEVELS[level]

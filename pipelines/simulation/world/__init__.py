@@ -1,4 +1,4 @@
-"""The simulated world: what stands around the actor, to look at, to hide behind and to be mapped."""
+"""The simulated world: obstacles around the actor, which are rendered, hide the actor and are mapped."""
 
 from pipelines.simulation.world.scene import World, build_world
 

@@ -1,4 +1,4 @@
-"""The ground to look at: coarse where it is level, fine on mounds, out to the horizon."""
+"""The visible ground: coarse where it is level, fine on mounds, out to the horizon."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _GRASS = (0.115, 0.15, 0.055)  # mean reflectance of a meadow; the texture of th
 
 
 def ground_surface(ground: scenario.Ground, terrain: Terrain) -> Surface:
-    """Triangles over the corners of a quadtree, whose cells are halved until the ground in them is flat.
+    """Triangulate the corners of a quadtree, whose cells are halved until the ground in them is flat.
 
     A linear triangle within a circle of radius r errs by at most curvature r^2 / 2 (r = side / sqrt 2).
     """
@@ -44,7 +44,7 @@ def ground_surface(ground: scenario.Ground, terrain: Terrain) -> Surface:
 
 
 def _corners(ground: scenario.Ground, terrain: Terrain, whole_m: float) -> tuple[Int64, float]:
-    """Corners [V, 2] of the cells, in units of the finest cell's side, and that side in metres."""
+    """Return the cells' corners [V, 2], in units of the finest cell's side, and that side in metres."""
     finest_m = whole_m / 2**_FINEST
     cells, side = np.zeros((1, 2), dtype=np.int64), 2**_FINEST
     found = []
@@ -59,7 +59,7 @@ def _corners(ground: scenario.Ground, terrain: Terrain, whole_m: float) -> tuple
 
 
 def _too_wide(centre: Float, side_m: float, ground: scenario.Ground, terrain: Terrain) -> NDArray[np.bool_]:
-    """Which cells [N] about centres [N, 2], seen from the ground's middle, are to be halved."""
+    """Find the cells [N] to be halved; centres [N, 2] are relative to the ground's middle."""
     outside = np.abs(centre).max(axis=1) - side_m / 2 - ground.size_m / 2
     allowed = np.maximum(1.001 * ground.size_m / _CELLS, _GROWTH * outside)
     # Triangles join corners of neighbouring cells, too: look a cell further.

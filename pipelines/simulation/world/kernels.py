@@ -1,4 +1,4 @@
-"""The compiled part of the world: heights, what is inside of solids, what hides what, which voxels they fill.
+"""The compiled part of the world: heights, insides of solids, lines of sight, occupied voxels.
 
 All kernels stand in this one module: numba's cache watches the file of the outermost function only.
 
@@ -9,7 +9,7 @@ Shapes are rows of numbers, all in metres of the world:
 - crown, an ellipsoid: x, y, z, horizontal semi-axis, vertical semi-axis; crown k belongs to trunk k
 - slab, an upright box: x, y, cos yaw, sin yaw, half length, half thickness, low z, high z
 
-Solids are open sets: what only touches them is neither inside nor hidden.
+Solids are open sets: a point that only touches them is neither inside nor hidden.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 GRAZE_M = 1e-3
-"""How deep a line of sight may lie in the ground unseen; half of what can be overlooked between two steps."""
+"""Allowed depth of a line of sight in the ground, m; steps can overlook another such depth."""
 
 _TOUCH_M = 1e-9  # voxels and solids that share a plane do not overlap for a rounding error
 
@@ -46,14 +46,14 @@ def _height(mounds: Float, x: float, y: float) -> float:
 
 @cached
 def heights(mounds: Float, xy: Float, out: Float) -> None:
-    """Height of the ground [N] at points [N, 2]."""
+    """Compute the height of the ground [N] at points [N, 2]."""
     for n in range(len(xy)):
         out[n] = _height(mounds, xy[n, 0], xy[n, 1])
 
 
 @cached
 def gradients(mounds: Float, xy: Float, out: Float) -> None:
-    """Slope of the ground [N, 2] towards east and north at points [N, 2]; `out` holds zeros before."""
+    """Compute the ground's slope [N, 2] towards east and north at points [N, 2]; `out` must hold zeros."""
     for n in range(len(xy)):
         for k in range(len(mounds)):
             cos, sin = mounds[k, 2], mounds[k, 3]
@@ -71,7 +71,7 @@ def gradients(mounds: Float, xy: Float, out: Float) -> None:
 
 @cached
 def inside(points: Float, mounds: Float, trunks: Float, crowns: Float, slabs: Float, out: Bool) -> None:
-    """Whether points [N, 3] lie below the ground or within a trunk, crown or slab; NaN does not."""
+    """Test if points [N, 3] lie below the ground or within a trunk, crown or slab; False for NaN."""
     for n in range(len(points)):
         x, y, z = points[n]
         out[n] = z < _height(mounds, x, y) or _in_tree(trunks, crowns, x, y, z) or _in_slab(slabs, x, y, z)
@@ -114,10 +114,11 @@ def hidden(
     slabs: Float,
     out: Bool,
 ) -> None:
-    """Whether a solid stands between eyes and targets, [N, 3] each; NaN in either is not hidden.
+    """Test if a solid stands between eyes and targets, [N, 3] each; False for NaN in either.
 
-    Trunks, crowns and slabs are met exactly. The ground hides a line that runs deeper in it than twice
-    `GRAZE_M`, and never one that stays above `GRAZE_M` deep. `slope` and `curvature` bound the ground's.
+    The test is exact for trunks, crowns and slabs. The ground hides a line that runs deeper in it than twice
+    `GRAZE_M`, and never one that stays less than `GRAZE_M` deep. `slope` and `curvature` are upper bounds of
+    the ground's.
     """
     for n in range(len(eye)):
         # From the target: drones look down, so the way to them soon climbs faster than any mound.
@@ -139,7 +140,7 @@ def _meets_ground(
     start: tuple[float, float, float],
     way: tuple[float, float, float],
 ) -> bool:
-    """March along the line: as far as the slope cannot reach it, and at least as the curvature allows.
+    """March along the line in steps that the slope bounds, but no shorter than the curvature allows.
 
     The clearance c(t) = z - height falls by at most `slope * length - rise` per unit of t, so there is
     no crossing before c / fall. A step of s metres over the ground leaves out dips of curvature * s^2 / 8.
@@ -209,7 +210,7 @@ def _meets_slab(slabs: Float, start: tuple[float, float, float], way: tuple[floa
 
 @helper
 def _dips_below_zero(a: float, b: float, c: float, first: float, last: float) -> bool:
-    """Whether a t^2 + 2 b t + c, a >= 0, is negative somewhere in the open interval (first, last)."""
+    """Test if a t^2 + 2 b t + c, a >= 0, is negative somewhere in the open interval (first, last)."""
     if a > 0:
         lowest = min(max(-b / a, first), last)
         return (a * lowest + 2 * b) * lowest + c < 0
@@ -220,7 +221,7 @@ def _dips_below_zero(a: float, b: float, c: float, first: float, last: float) ->
 def _between(
     start: float, way: float, low: float, high: float, first: float, last: float
 ) -> tuple[float, float]:
-    """The part of (first, last) in which low < start + t way < high; empty when first >= last."""
+    """Return the part of (first, last) in which low < start + t way < high; empty when first >= last."""
     if way == 0:
         return (first, last) if low < start < high else (1.0, 0.0)
     enter, leave = (low - start) / way, (high - start) / way
@@ -282,7 +283,7 @@ def mark_slabs(grid: Bool, low: NDArray[np.int64], side: float, slabs: Float) ->
 
 @helper
 def _range(low_m: float, high_m: float, side: float, first: int, count: int) -> tuple[int, int]:
-    """Indices of the voxels that an interval reaches into, cut to the grid."""
+    """Return the range of the voxels that an interval reaches into, cut to the grid."""
     begin = math.floor((low_m + _TOUCH_M) / side) - first
     end = math.ceil((high_m - _TOUCH_M) / side) - first
     return max(begin, 0), min(end, count)
@@ -290,5 +291,5 @@ def _range(low_m: float, high_m: float, side: float, first: int, count: int) -> 
 
 @helper
 def _distance(point: float, low: float, side: float) -> float:
-    """From a point to the interval [low, low + side]."""
+    """Compute the distance from a point to the interval [low, low + side]."""
     return max(low - point, 0.0, point - low - side)

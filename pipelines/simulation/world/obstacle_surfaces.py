@@ -1,4 +1,4 @@
-"""Trees and walls to look at, as large as the solids that they show."""
+"""Visible surfaces of trees and walls, as large as their solids."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ Faces = NDArray[np.int32]
 _SIDES = 10  # of a trunk
 _RINGS = 5
 _CLUSTERS = 16  # of leaves in a crown
-_HEART = 0.8  # radius of what is filled with leaves anyway: no line of sight slips through
+_HEART = 0.8  # radius of the part that is always filled with leaves: no line of sight slips through
 _OUTLINE = 12
-_RAGGED = 0.04  # how far leaves stand out of their cluster, of the crown's radius (sigma)
+_RAGGED = 0.04  # deviation of leaves from their cluster, of the crown's radius (sigma)
 _MANY_TREES = 40  # more are drawn with fewer triangles each
 _BARK = (0.16, 0.115, 0.08)
 _GREENS = ((0.10, 0.19, 0.045), (0.13, 0.22, 0.05), (0.075, 0.155, 0.05), (0.165, 0.22, 0.06))
@@ -28,7 +28,7 @@ _MOST_BLOCKS = (120, 20)  # along and up a wall; longer walls have larger stones
 
 
 def tree_surfaces(obstacles: Obstacles, seed: int) -> list[Surface]:
-    """All trunks as one surface and all crowns as another; nothing without trees."""
+    """Draw all trunks as one surface and all crowns as another; nothing without trees."""
     if not len(obstacles.trunks):
         return []
     sphere = _sphere(3 if len(obstacles.trunks) <= _MANY_TREES else 2)
@@ -41,7 +41,7 @@ def tree_surfaces(obstacles: Obstacles, seed: int) -> list[Surface]:
 
 
 def wall_surfaces(obstacles: Obstacles, seed: int) -> list[Surface]:
-    """All walls as one surface, stone by stone; nothing without walls."""
+    """Draw all walls as one surface, stone by stone; nothing without walls."""
     if not len(obstacles.slabs):
         return []
     walls = [
@@ -52,7 +52,7 @@ def wall_surfaces(obstacles: Obstacles, seed: int) -> list[Surface]:
 
 
 def _drawn_trunk(trunk: Float, rng: np.random.Generator) -> Surface:
-    """A prism of the trunk's cross-section, its bark mottled."""
+    """Draw a prism of the trunk's cross-section, its bark mottled."""
     x, y, low, high, radius = trunk
     bearing = np.arange(_SIDES) * (2 * np.pi / _SIDES)
     # The polygon has the circle's area: sides (1/2) R^2 sin(2 pi / sides) = pi r^2.
@@ -73,7 +73,7 @@ def _drawn_trunk(trunk: Float, rng: np.random.Generator) -> Surface:
 
 
 def _drawn_crown(crown: Float, sphere: tuple[Float, Faces], rng: np.random.Generator) -> Surface:
-    """Clusters of leaves around the middle: the outermost of some balls in every direction.
+    """Draw clusters of leaves around the middle: the outermost of some balls in every direction.
 
     An outline shows the outermost leaves. A high mean of the radius over all directions is therefore scaled
     to 1, so that outlines are as large as the ellipsoid's.
@@ -97,7 +97,7 @@ def _drawn_crown(crown: Float, sphere: tuple[Float, Faces], rng: np.random.Gener
 
 
 def _drawn_wall(slab: Float, rng: np.random.Generator) -> Surface:
-    """Four sides and the top, of stones that differ in tone."""
+    """Draw four sides and the top, of stones that differ in tone."""
     x, y, cos, sin, length, thickness, low, high = slab
     along, across = np.array([cos, sin, 0.0]), np.array([-sin, cos, 0.0])
     up = np.array([0.0, 0.0, 1.0])
@@ -115,7 +115,7 @@ def _drawn_wall(slab: Float, rng: np.random.Generator) -> Surface:
 
 
 def _stones(corner: Float, along: Float, up: Float, rng: np.random.Generator) -> Surface:
-    """A rectangle of stones, each with four corners of its own; seen from `along` x `up`."""
+    """Draw a rectangle of stones, each with four corners of its own; seen from `along` x `up`."""
     columns, rows = (
         min(max(1, round(float(np.sqrt((edge**2).sum())) / size)), most)
         for edge, size, most in zip((along, up), _BLOCK_M, _MOST_BLOCKS, strict=True)
@@ -130,7 +130,7 @@ def _stones(corner: Float, along: Float, up: Float, rng: np.random.Generator) ->
 
 
 def _split(quads: NDArray[np.int64]) -> Faces:
-    """Two triangles [2 Q, 3] of each quadrangle [Q, 4]."""
+    """Split each quadrangle [Q, 4] into two triangles [2 Q, 3]."""
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.int32)
 
 
@@ -139,7 +139,10 @@ def _colours(colour: Float, tone: Float) -> NDArray[np.float32]:
 
 
 def _spread(count: int, rng: np.random.Generator) -> Float:
-    """Unit vectors [count, 3], evenly about the sphere (a Fibonacci spiral), turned at random and shaken."""
+    """Draw unit vectors [count, 3], evenly about the sphere (a Fibonacci spiral).
+
+    They are turned and shaken at random.
+    """
     k = np.arange(count) + 0.5
     z = 1 - 2 * k / count
     bearing = k * (np.pi * (1 + math.sqrt(5))) + rng.uniform(0, 2 * np.pi)
@@ -151,7 +154,10 @@ def _spread(count: int, rng: np.random.Generator) -> Float:
 
 
 def _sphere(halvings: int) -> tuple[Float, Faces]:
-    """Directions and triangles of an icosahedron whose edges were halved some times: 20 * 4^halvings."""
+    """Return directions and triangles of an icosahedron whose edges were halved some times.
+
+    There are 20 * 4^halvings triangles.
+    """
     g = (1 + math.sqrt(5)) / 2
     # Three golden rectangles; every triangle joins three corners that are mutually 2 apart.
     corners = np.array([np.roll((0.0, a, b * g), k) for k in range(3) for a in (-1, 1) for b in (-1, 1)])

@@ -22,7 +22,7 @@ _MOST_BURIED_M = 50.0
 
 @dataclass(frozen=True)
 class Obstacles:
-    """What stands on the ground, as rows of numbers that `kernels` explains. Tree k has trunk and crown k."""
+    """Solids on the ground, as rows of numbers that `kernels` explains. Tree k has trunk and crown k."""
 
     trunks: Float  # [T, 5]
     crowns: Float  # [T, 5]

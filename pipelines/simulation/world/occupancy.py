@@ -29,12 +29,14 @@ def map_world(
     resolution_m: float,
     height_m: float,
 ) -> Occupancy:
-    """Voxels over the ground's square, from one voxel below z = 0 up to `height_m`: 1 occupied, 0 free.
+    """Return voxels over the ground's square: 1 occupied, 0 free.
 
-    A voxel is occupied if the inside of a solid and of the voxel have a point in common, which is decided
-    exactly for trunks, crowns and slabs. Over mounds it errs to occupied: a voxel counts as soon as the
-    ground could reach into it from the sampled heights at its curvature, at most 5 % of a voxel too early
-    unless a mound is narrower than a tenth of one. Voxels lie on multiples of `resolution_m`.
+    They reach from one voxel below z = 0 up to `height_m`.
+
+    A voxel is occupied if the inside of a solid and of the voxel have a point in common. The test is exact
+    for trunks, crowns and slabs. Over mounds it errs towards occupied: a voxel counts as soon as the ground
+    could reach into it, by the sampled heights and the curvature. This is at most 5 % of a voxel too early,
+    unless a mound is narrower than a tenth of a voxel. Voxels lie on multiples of `resolution_m`.
     """
     half = ground.size_m / 2
     middle = np.array(ground.centre)

@@ -1,4 +1,4 @@
-"""Where the trees of a wood stand: at random, clear of the actor's way."""
+"""Places of the trees of a wood: at random, clear of the actor's way."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def plant(
     standing: Sequence[scenario.Tree],
     walls: Sequence[scenario.Wall],
 ) -> list[scenario.Tree]:
-    """Strew a wood's trees evenly over its circle.
+    """Place a wood's trees at random, evenly over its circle.
 
     Args:
-        wood: how many, where.
+        wood: number and place of the trees.
         rng: decides the places and the sizes.
         keep_clear: [K, 2] m, points of the actor's way; no trunk's axis is nearer to one than `clear_m`.
         standing: trees that are there already; new ones keep apart from them and from each other.
@@ -57,7 +57,7 @@ def plant(
 
 
 def _seedling(wood: scenario.Wood, rng: np.random.Generator) -> scenario.Tree:
-    """A tree anywhere in the wood's circle."""
+    """Draw a tree anywhere in the wood's circle."""
     bearing, share, size, girth = rng.uniform(size=4).tolist()
     away = wood.radius_m * math.sqrt(share)  # as many trees on every square metre
     height = wood.height_m * (1 + _HEIGHT_SPREAD * (2 * size - 1))
@@ -89,7 +89,7 @@ def _has_room(
 
 
 def _away_from(wall: scenario.Wall, x: float, y: float) -> float:
-    """From a place to a wall's line."""
+    """Compute the distance from a place to a wall's line."""
     (ax, ay), (bx, by) = wall.start, wall.end
     square = (bx - ax) ** 2 + (by - ay) ** 2
     share = min(max(((x - ax) * (bx - ax) + (y - ay) * (by - ay)) / square, 0), 1) if square else 0.0

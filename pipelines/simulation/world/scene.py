@@ -24,7 +24,7 @@ Bool = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class World:
-    """What stands around: ground with mounds, trees, walls. The ground is there beyond its square, too."""
+    """The surroundings: ground with mounds, trees, walls. The ground goes on beyond its square."""
 
     ground: scenario.Ground
     terrain: Terrain
@@ -32,19 +32,19 @@ class World:
     seed: int
 
     def height(self, xy: Float) -> Float:
-        """Height of the ground [...], m, at points [..., 2]."""
+        """Compute the height of the ground [...], m, at points [..., 2]."""
         return self.terrain.height(xy)
 
     def normal(self, xy: Float) -> Float:
-        """Unit normals [..., 3] of the ground, pointing up, at points [..., 2]."""
+        """Compute unit normals [..., 3] of the ground, pointing up, at points [..., 2]."""
         return self.terrain.normal(xy)
 
     def surfaces(self) -> list[Surface]:
-        """What is to be seen: the ground out to the horizon, then trunks, crowns and walls if there are any.
+        """Return the visible surfaces: the ground out to the horizon, then trunks, crowns and walls if any.
 
         The ground is within 2 cm of `height`, trunks within 4 % of their radius, walls exact. Crowns are
-        ragged, with leaves up to a fifth beyond or three tenths short of the ellipsoid that `solid` and
-        `hidden` know; seen from anywhere, about nine tenths of both outlines' union is common to both.
+        ragged: leaves end up to a fifth beyond or three tenths short of the ellipsoid of `solid` and
+        `hidden`. From any side, the two outlines share about nine tenths of their union.
         """
         return [
             ground_surface(self.ground, self.terrain),
@@ -53,7 +53,7 @@ class World:
         ]
 
     def solid(self, points: Float) -> Bool:
-        """Whether points [..., 3] are below the ground or inside a trunk, crown or wall; NaN is not."""
+        """Test if points [..., 3] are below the ground or inside a trunk, crown or wall; False for NaN."""
         rows = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
         out = np.empty(len(rows), dtype=np.bool_)
         solids = self.obstacles
@@ -61,11 +61,11 @@ class World:
         return out.reshape(np.shape(points)[:-1])
 
     def hidden(self, eye: Float, target: Float) -> Bool:
-        """Whether something solid stands between eyes and targets, [..., 3] each, broadcast.
+        """Test if something solid stands between eyes and targets, [..., 3] each, broadcast.
 
         Exact for trunks, crowns and walls. The ground hides every line that dips more than 2 mm into it and
-        none that dips less than 1 mm, so that what lies on the ground can be seen. What is inside of a
-        solid is hidden, and so is everything from there; NaN is not.
+        none that dips less than 1 mm, so that points on the ground can be seen. Points inside a solid are
+        hidden, and from there everything is hidden; False for NaN.
         """
         eyes, targets = np.broadcast_arrays(eye, target)
         starts, ends = (
@@ -87,7 +87,7 @@ class World:
         return out.reshape(eyes.shape[:-1])
 
     def occupancy(self, resolution_m: float, height_m: float) -> Occupancy:
-        """The map of the ground's square: 1 where a solid reaches into a voxel, else 0; see `map_world`."""
+        """Map the ground's square: 1 where a solid reaches into a voxel, else 0; see `map_world`."""
         return map_world(
             self.ground, self.terrain, self.obstacles, resolution_m=resolution_m, height_m=height_m
         )
@@ -97,10 +97,10 @@ def build_world(spec: scenario.World, seed: int, *, keep_clear: Float) -> World:
     """Raise the mounds, plant the wood, stand trees and walls on the ground.
 
     Args:
-        spec: what there is.
-        seed: of the wood and of how things look.
-        keep_clear: [K, 2] m, points of the actor's way, which the wood keeps clear of. Trees that the
-            scenario places itself stand where it says.
+        spec: the world of the scenario.
+        seed: of the wood and of the looks of things.
+        keep_clear: [K, 2] m, points of the actor's way, which the wood keeps clear of. Trees with a place in
+            the scenario stand at that place.
 
     Raises:
         DataError: the wood does not fit, or a wall has no length.

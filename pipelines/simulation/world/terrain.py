@@ -25,14 +25,14 @@ class Terrain:
     mounds: Float  # [M, 7] as `kernels` explains
 
     def height(self, xy: Float) -> Float:
-        """Height of the ground, m, [...] at points [..., 2]; NaN at NaN where there are mounds."""
+        """Compute the ground's height, m, [...] at points [..., 2]; NaN at NaN where there are mounds."""
         points = _rows(xy, 2)
         out = np.empty(len(points))
         kernels.heights(self.mounds, points, out)
         return out.reshape(np.shape(xy)[:-1])
 
     def normal(self, xy: Float) -> Float:
-        """Unit normals of the ground [..., 3], pointing up, at points [..., 2]."""
+        """Compute unit normals of the ground [..., 3], pointing up, at points [..., 2]."""
         points = _rows(xy, 2)
         slope = np.zeros((len(points), 2))
         kernels.gradients(self.mounds, points, slope)
@@ -42,16 +42,16 @@ class Terrain:
 
     @property
     def slope(self) -> float:
-        """The ground is nowhere steeper: a Gaussian is steepest one sigma out, h / sigma exp(-1/2)."""
+        """Upper bound of the ground's slope: a Gaussian is steepest one sigma out, h / sigma exp(-1/2)."""
         return float((self.mounds[:, 6] / self.mounds[:, 4:6].min(axis=1)).sum() * math.exp(-0.5))
 
     @property
     def curvature(self) -> float:
-        """No second derivative in any direction is larger, 1/m: a Gaussian's is h / sigma^2, at its top."""
+        """Upper bound of second derivatives, any direction, 1/m: a Gaussian's is h / sigma^2, at its top."""
         return float((self.mounds[:, 6] / self.mounds[:, 4:6].min(axis=1) ** 2).sum())
 
     def curvature_within(self, centre: Float, radius_m: float) -> Float:
-        """As `curvature`, within circles about points [N, 2].
+        """Compute an upper bound like `curvature`, within circles about points [N, 2].
 
         r sigmas out, |r^2 - 1| exp(-r^2 / 2) and exp(-r^2 / 2) times h / sigma^2 are the principal second
         derivatives of a round mound; for an oval one they are at most those with its smaller sigma.
@@ -65,7 +65,7 @@ class Terrain:
 
 
 def raise_mounds(mounds: Sequence[scenario.Mound]) -> Terrain:
-    """The ground that a scenario describes."""
+    """Return the ground that a scenario describes."""
     rows = [
         (
             *m.centre,
@@ -80,5 +80,5 @@ def raise_mounds(mounds: Sequence[scenario.Mound]) -> Terrain:
 
 
 def _rows(points: Float, columns: int) -> Float:
-    """Points as [N, columns] for the kernels."""
+    """Return points as [N, columns] for the kernels."""
     return np.ascontiguousarray(points, dtype=np.float64).reshape(-1, columns)
