@@ -1,4 +1,4 @@
-"""One arm of a comparison: flown, filmed, and as rows of a table."""
+"""One arm of a comparison: its flight, its simulated measurements, and its table rows."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 FLOWN = "flown"
-"""The arm that is no planner: what the log says was flown."""
+"""Name of the arm that is no planner: the flight in the log."""
 PLANNED = "planned"
-"""Nor this: where the log says that the planner on board sent the drones."""
+"""Name of the other arm that is no planner: the commands of the planner on board, as logged."""
 LOGGED = (FLOWN, PLANNED)
 
 _LOOK_EVERY_S = 1.0
@@ -42,24 +42,24 @@ _SLOT = ["slot_yaw_rad", "slot_tilt_rad", "slot_range_m"]
 
 @dataclass(frozen=True)
 class ArmFlight:
-    """Where the N cameras of an arm were at the T times of the scene."""
+    """Poses of the N cameras of an arm at the T times of the scene."""
 
     names: tuple[str, ...]
     position: Float  # [N, T, 3] m, world
     quaternion_xyzw: Float  # [N, T, 4] world_from_camera
-    slots: Float  # [N, T, 3] commanded yaw (rad, continuous), tilt (rad), range (m); NaN for what was flown
+    slots: Float  # [N, T, 3] commanded yaw (rad, continuous), tilt (rad), range (m); NaN for `flown`
     known: Bool  # [N, T] False where a log has a gap and the position goes straight on
-    separation: dict[str, int]  # local plans by what kept them apart; empty for what the log says
-    safety: dict[str, int]  # local plannings by what was flown (`guard.Flown`); likewise
+    separation: dict[str, int]  # local plans by `Separation`; empty for logged arms
+    safety: dict[str, int]  # local plannings by `guard.Flown`; likewise
     central_s: Sequence[float] = ()  # measured planning times, different from run to run
     local_s: Sequence[float] = ()
 
 
 def logged_arm(scene: Scene, name: str) -> ArmFlight:
-    """What a log says of one of `LOGGED`.
+    """Return the flight of one of `LOGGED`.
 
-    The drones of `planned` are exactly where they were sent, each with its camera, which looks where a
-    replay's would: at the actor as the Kalman filter estimates it from the log.
+    The drones of `planned` are exactly at their commanded positions. Each has its own camera. The camera
+    looks at the actor as the Kalman filter estimates it from the log, as in a replay.
     """
     if name == FLOWN:
         position, quaternion, known = scene.flown
@@ -73,7 +73,7 @@ def logged_arm(scene: Scene, name: str) -> ArmFlight:
 
 
 def _estimates(scene: Scene) -> Float:
-    """[T, 3] where planners believe the actor to be, who see no later measurement."""
+    """Estimate the actor's positions [T, 3] as planners do, from no later measurement."""
     flight, config = scene.flight, scene.config
     believed = ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m)
     log_s = (flight.actor_t_ns - flight.actor_t_ns[0]) / 1e9
@@ -116,7 +116,7 @@ def fly_arm(scene: Scene, arm: Arm) -> ArmFlight:
 
 
 def film_arm(scene: Scene, flown: ArmFlight, detect: Detect) -> Measured | None:
-    """What its cameras would have measured of the actor's own skeleton; None without a skeleton."""
+    """Simulate what an arm's cameras measure of the actor's skeleton; None without a skeleton."""
     if scene.joints is None:
         return None
     lenses, noise = _equipment(scene, flown)
@@ -142,7 +142,7 @@ def film_arm(scene: Scene, flown: ArmFlight, detect: Detect) -> Measured | None:
 
 
 def _equipment(scene: Scene, flown: ArmFlight) -> tuple[list[Intrinsics], list[tuple[NoiseModel, ...]]]:
-    """Lens and pose noise of each camera."""
+    """Return lens and pose noise of each camera."""
     cameras = scene.flight.cameras
     own = {camera.name: camera for camera in cameras}
     carried = [own.get(name, cameras[k % len(cameras)]) for k, name in enumerate(flown.names)]
@@ -150,7 +150,7 @@ def _equipment(scene: Scene, flown: ArmFlight) -> tuple[list[Intrinsics], list[t
 
 
 def trajectories(scene: Scene, flown: ArmFlight) -> pd.DataFrame:
-    """The rows of `tables.REPLAN`."""
+    """Return the rows of `tables.REPLAN`."""
     import pandas as pd
 
     count, times = flown.position.shape[:2]
@@ -174,7 +174,7 @@ def trajectories(scene: Scene, flown: ArmFlight) -> pd.DataFrame:
 
 
 def seen_joints(scene: Scene, flown: ArmFlight, measured: Measured) -> pd.DataFrame:
-    """The rows of `tables.SEEN`: the skeleton once a second, as each camera would have seen it."""
+    """Return the rows of `tables.SEEN`: the skeleton once a second, as seen by each camera."""
     import pandas as pd
 
     if scene.joints is None or scene.flight.skeleton is None:
@@ -212,5 +212,5 @@ def flight_from(
 
 
 def _rows(values: Float) -> Float:
-    """[N, T, K] as rows sorted by time, then camera."""
+    """Return [N, T, K] as rows sorted by time, then camera."""
     return values.swapaxes(0, 1).reshape(-1, values.shape[2])

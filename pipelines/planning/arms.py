@@ -1,4 +1,4 @@
-"""The arms that are compared: ways to decide which slots the cameras take.
+"""The arms that are compared: ways to choose the slots of the cameras.
 
 All share forecast, local planner and tracking. An arm is one object with a name that starts a
 `FormationPlanner` for a flight; a package adds one by an entry point in `mocap.planner_arms`.
@@ -29,23 +29,23 @@ from pipelines.planning.search_kernels import Formations, Lattice, cheapest_slot
 
 Float = NDArray[np.float64]
 
-_TOO_NEAR = 100.0  # cost of a slot within the separation of another drone's: more than anything it gains
+_TOO_NEAR = 100.0  # cost of a slot within the separation of another drone's: more than any gain
 
 
 class FormationPlanner(Protocol):
-    """Decides for one flight which slots the cameras take."""
+    """Planner that chooses the slots of the cameras during one flight."""
 
     def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:
-        """Decide anew.
+        """Plan anew.
 
         All yaws, those of the path as well, count from `actor.heading_rad`: 0, which is east, unless
-        `yaw_frame` is `heading`. Whoever looks at the field adds it; others need not know of it.
+        `yaw_frame` is `heading`. A planner that samples the field must add it; others can ignore it.
 
         Args:
             t_s: now.
             commanded: [n, 3] the slots that are commanded now (yaw rad, tilt rad, range m).
             actor: forecast at the knots t_s + knot_s, t_s + 2 knot_s, ...
-            field: what stands around.
+            field: the distance field of the obstacles.
         """
 
 
@@ -54,14 +54,14 @@ class Arm(Protocol):
 
     @property
     def name(self) -> str:
-        """What the user writes after `--arms`."""
+        """Name that the user writes after `--arms`."""
 
     @property
     def title(self) -> str:
-        """What reports call it."""
+        """Name in reports."""
 
     def start(self, config: PlannerConfig, *, drones: int, yaw_rad: float) -> FormationPlanner:
-        """A planner for a flight whose first camera starts at that yaw."""
+        """Return a planner for a flight whose first camera starts at that yaw."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ GREEDY: Arm = _GreedyArm()
 
 
 class _Fixed:
-    """The yaw of the start for ever; only the local planner gives way."""
+    """Planner that keeps the yaw of the start; only the local planner gives way."""
 
     def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float) -> None:
         self._slots = formation_slots(
@@ -112,7 +112,10 @@ class _Fixed:
 
 
 class _Formation:
-    """The whole formation as one state: yaw (Ho et al.), or yaw, tilt and range to predict errors."""
+    """Planner with the whole formation as one state.
+
+    The state is the yaw (Ho et al.), or yaw, tilt and range to predict errors.
+    """
 
     def __init__(self, config: PlannerConfig, drones: int, yaw_rad: float, *, predicts_error: bool) -> None:
         tilts = np.radians(config.tilts_deg) if predicts_error else np.array([config.tilt_rad])
@@ -139,11 +142,11 @@ class _Formation:
         if self._predicts_error or config.yaw_frame == "heading":
             costs = _look(field, actor.each(self._every), self._slots, self._offsets, config)
             cost = cost_map(costs, config)
-            if self._predicts_error:  # which does not depend on where yaws count from
+            if self._predicts_error:  # the error does not depend on the zero of yaws
                 cost += config.w_error * error_map(costs, self._offsets, config)
             sequence, _ = best_sequence(cost, self._lattice, commanded[0])
             through = _through(commanded, self._slots[sequence])
-        else:  # the same in one call: between small parts, most of the time went
+        else:  # the same in one call: calls between small parts took most of the time
             position = np.ascontiguousarray(actor.position)
             through = cheapest_slots(
                 field.grid, field.sight, position, self._formations, self._weights, commanded
@@ -152,7 +155,7 @@ class _Formation:
 
 
 class _Greedy:
-    """One drone after the other on a lattice of its own, each for what it adds to those before.
+    """Planner for one drone after the other, each on its own lattice, by its gain over those before.
 
     Bucker et al. 2020 (arXiv 2011.05437), solved sequentially, with the marginal log-det of the ray model's
     information in place of their diversity of views.
@@ -202,21 +205,21 @@ class _Greedy:
 
 
 def _all_states(yaws: Float, tilts: Float, ranges: Float) -> Float:
-    """[S, 3] every combination."""
+    """Return every combination, [S, 3]."""
     return np.stack(np.meshgrid(yaws, tilts, ranges, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _look(
     field: DistanceField, actor: Forecast, slots: Float, offsets: Float, config: PlannerConfig
 ) -> SlotCosts:
-    """Look at slots [S, n, 3], whose offsets from the actor are known where yaws count from east."""
+    """Compute the costs of slots [S, n, 3]; `offsets` [S, n, 3] are valid if yaws count from east."""
     if config.yaw_frame == "heading":
         return costs_in_frame(field, actor, slots, config)
     return costs_of_slots(field, actor.position, offsets, config)
 
 
 def _through(commanded: Float, slots: Float) -> Float:
-    """The commanded slots [n, 3], then slots [T, n, 3], each turn the shorter way round."""
+    """Return the commanded slots [n, 3], then slots [T, n, 3], each turn the shorter way round."""
     through = np.concatenate([commanded[None], slots])
     turn_the_shorter_way(through)
     return through

@@ -1,7 +1,7 @@
-"""Whether one arm is better than another: means, differences, and how sure they are.
+"""Comparison of arms: means, differences, and their confidence intervals.
 
 Intervals are percentiles of bootstrap means (Efron & Tibshirani 1993, 13.3): of the trials for errors, which
-are independent draws, and of stretches of the flight for what the flight's course decides.
+are independent draws, and of stretches of the flight for figures that depend on the flight's course.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ Bool = NDArray[np.bool_]
 RESAMPLES = 2000
 LEVEL = 0.95
 STRETCH_S = 5.0
-"""Neighbouring moments are alike: the flight is resampled in pieces of this length."""
+"""Length of the pieces in which the flight is resampled, because neighbouring moments are alike, s."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean and the interval that holds it with `LEVEL` probability; None where that cannot be told."""
+    """A mean and the interval that holds it with `LEVEL` probability; None where it cannot be computed."""
 
     mean: float
     interval: tuple[float, float] | None
 
     def as_json(self) -> dict[str, object]:
-        """As it stands in metrics.json."""
+        """Return the estimate as stored in metrics.json."""
         return {"mean": self.mean, "interval": None if self.interval is None else list(self.interval)}
 
 
 def mean_of_trials(values: Float, seed: int) -> Estimate | None:
-    """The mean of a figure over trials [K]; None without any, no interval for a single one."""
+    """Compute the mean of a figure over trials [K]; None without any, no interval for a single one."""
     return _weighted(values, np.ones(len(values)), seed)
 
 
 def mean_over_time(values: Float, counted: Bool, stretch: NDArray[np.int64], seed: int) -> Estimate | None:
-    """The mean over the moments that count, with the interval of whole stretches.
+    """Compute the mean over the moments that count, with the interval of whole stretches.
 
     Args:
         values: [T] or [N, T].
@@ -56,19 +56,22 @@ def mean_over_time(values: Float, counted: Bool, stretch: NDArray[np.int64], see
 
 
 def stretches(t_s: Float) -> NDArray[np.int64]:
-    """The stretch [T] that each moment belongs to."""
+    """Return the stretch [T] that each moment belongs to."""
     return (t_s // STRETCH_S).astype(np.int64)
 
 
 def common_frames(errors: Mapping[str, Float32]) -> Bool:
-    """Joint-frames [trials, T, J] that every arm measured; arms that measured none do not count."""
+    """Return the joint-frames [trials, T, J] that every arm measured.
+
+    Arms that measured none do not count.
+    """
     measured = [np.isfinite(error) for error in errors.values() if np.isfinite(error).any()]
     shape = next(iter(errors.values())).shape
     return np.logical_and.reduce(measured) if measured else np.zeros(shape, dtype=np.bool_)
 
 
 def mpjpe_mm(error_m: Float32, counted: Bool) -> Float:
-    """The mean error of each trial over the joint-frames [K, T, J] that count.
+    """Compute the mean error of each trial over the joint-frames [K, T, J] that count.
 
     Returns:
         [K], or fewer: trials in which none counts are left out.
@@ -81,13 +84,13 @@ def mpjpe_mm(error_m: Float32, counted: Bool) -> Float:
 
 
 def coverage(error_m: Float32, joint_frames: int) -> Float:
-    """Share [K] of the joint-frames with a truth that were measured, 0..1."""
+    """Compute the share [K] of the joint-frames with a truth that were measured, 0..1."""
     share: Float = np.isfinite(error_m).sum(axis=(1, 2)) / max(joint_frames, 1)
     return share
 
 
 def _weighted(values: Float, weight: Float, seed: int) -> Estimate | None:
-    """The weighted mean of independent values, and its bootstrap interval."""
+    """Compute the weighted mean of independent values, and its bootstrap interval."""
     if not len(values):
         return None
     mean = float((values * weight).sum() / weight.sum())

@@ -1,4 +1,4 @@
-"""What a planner can be told: weights, distances, rates. docs/planner.md says what they do."""
+"""Settings of a planner: weights, distances, rates. docs/planner.md explains them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class PlannerConfig:
     """Settings of every arm; the defaults are those that docs/planner.md measures.
 
     Raises:
-        ValueError: a value that cannot be meant; the message names it.
+        ValueError: an impossible value; the message names it.
     """
 
     # The formation.
@@ -48,22 +48,22 @@ class PlannerConfig:
     knot_s: float = 1.0
     horizon_knots: int = 10  # T
     yaw_rate_deg_per_s: float = 22.5
-    yaw_frame: Frame = "world"  # or yaws count from where the actor heads (heading.py)
-    heading_speed_mps: float = 0.5  # who is slower stands, and keeps the last heading
+    yaw_frame: Frame = "world"  # or yaws count from the actor's heading (heading.py)
+    heading_speed_mps: float = 0.5  # a slower actor stands, and keeps the last heading
     tilt_rate_deg_per_s: float = 5.0  # tilt and range are searched by `covariance` and `greedy` alone
     range_rate_mps: float = 1.0
     tilts_deg: tuple[float, ...] = (5.0, 15.0, 25.0, 35.0)
     ranges_m: tuple[float, ...] = (8.0, 10.0, 12.0)
-    lattice_yaws: int = 8  # of these two, likewise: their lattice has more dimensions
-    lattice_knots: int = 2  # knots from one of their decisions to the next
+    lattice_yaws: int = 8  # of `covariance` and `greedy`: their lattice has more dimensions
+    lattice_knots: int = 2  # knots between two of their decisions
 
-    # What its search weighs.
+    # Weights of the formation search.
     w_obs: float = 1.0
     w_occ: float = 1.0
     w_turn: float = 0.05  # per 45 deg of yaw, or 2 s of tilting or approaching
     w_error: float = 1.0  # per metre of predicted error, or unit of log det of the information
 
-    # What the local planner weighs.
+    # Weights and distances of the local planner.
     l_obs: float = 50.0
     l_occ: float = 5.0
     l_form: float = 3.0
@@ -74,7 +74,7 @@ class PlannerConfig:
     eps_obs_m: float = 3.0
     eps_occ_m: float = 0.5
     sight_start_m: float = 1.5  # maps contain the actor
-    speed_floor_mps: float = 1.0  # 0 is the literal form, in which obstacles do not push who stands
+    speed_floor_mps: float = 1.0  # 0 is the literal form: obstacles do not push a drone at rest
     separation_m: float = 3.0
     soft_separation_m: float = 4.5
     waypoints: int = 20
@@ -94,20 +94,20 @@ class PlannerConfig:
     speed_mps: float = 8.0
     jerk_mps3: float = 50.0
 
-    # What no drone of an arm ever does.
-    drone_radius_m: float = 0.5  # nearer to an obstacle, or
-    actor_distance_m: float = 3.0  # to the actor
+    # Distances that every drone keeps.
+    drone_radius_m: float = 0.5  # to obstacles
+    actor_distance_m: float = 3.0  # to the actor's position
 
     # The actor's estimate.
     actor_sigma_m: float = 0.2  # of the logged position, per axis
-    actor_q: float = 0.1  # m^2/s^3, how much the velocity wanders
+    actor_q: float = 0.1  # m^2/s^3, spectral density of the acceleration's noise
     actor_noise_m: float = 0.0  # added to the log by a replay, drawn from its seed
 
-    # The ray model of what a camera is worth.
+    # The ray model of a camera's information.
     pixel_sigma_rad: float = 0.003  # 3 px at f = 1000 px
     position_sigma_m: float = 0.3
     rotation_sigma_deg: float = 1.0
-    prior_sigma_m: float = 2.0  # what is known of a joint without any camera
+    prior_sigma_m: float = 2.0  # prior of a joint without any camera
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -143,12 +143,15 @@ class PlannerConfig:
 
     @property
     def slot_rates(self) -> tuple[float, float, float]:
-        """How fast yaw (rad/s), tilt (rad/s) and range (m/s) of a slot change."""
+        """Rates of change of a slot's yaw (rad/s), tilt (rad/s) and range (m/s)."""
         yaw, tilt = math.radians(self.yaw_rate_deg_per_s), math.radians(self.tilt_rate_deg_per_s)
         return yaw, tilt, self.range_rate_mps
 
     def out_of_reach(self) -> list[str]:
-        """Which lattices have cells too wide to reach the next one between two knots: nothing turns there."""
+        """List the lattices whose cells are too wide to reach the next one between two knots.
+
+        There formations do not turn.
+        """
         lattices = (
             ("yaws", self.yaws, self.knot_s, "formations of adaptive keep"),
             (
@@ -169,7 +172,7 @@ class PlannerConfig:
         return told
 
     def flying(self) -> Flying:
-        """Gains, limits and period of the drones."""
+        """Return gains, limits and period of the drones."""
         return Flying(
             self.k_position,
             self.k_velocity,
@@ -181,11 +184,11 @@ class PlannerConfig:
         )
 
     def slot_weights(self) -> SlotWeights:
-        """What the kernels of the formation search take."""
+        """Return the weights of the formation search's kernels."""
         return SlotWeights(self.w_obs, self.w_occ, self.eps_obs_m, self.sight_start_m)
 
     def local_weights(self, resolution_m: float) -> Weights:
-        """What the local planner's kernels take; sight lines from `radius_m` are sampled every half voxel."""
+        """Return the local planner's weights; sight lines from `radius_m` are sampled every half voxel."""
         reach_m = max(self.radius_m - self.sight_start_m, resolution_m)
         return Weights(
             l_obs=self.l_obs,
@@ -206,7 +209,7 @@ class PlannerConfig:
 
 
 def planner_config(values: Mapping[str, object], source: Path | str = "planner settings") -> PlannerConfig:
-    """Settings from a mapping, as read from YAML; what it does not mention keeps its default.
+    """Read settings from a mapping, as from YAML; keys that are missing keep their defaults.
 
     Raises:
         DataError: an unknown key, a value of another type, or one out of range; every problem of the
@@ -232,9 +235,12 @@ def planner_config(values: Mapping[str, object], source: Path | str = "planner s
 
 
 def _like(default: object, value: object) -> object:
-    """A value of the default's type; numbers are not read out of text, nor counts out of fractions."""
+    """Convert a value to the default's type.
+
+    Text is not converted to numbers, nor fractions to counts.
+    """
     if isinstance(default, str):
-        return value  # one of `_WORDS`, as is looked at where it is taken
+        return value  # one of `_WORDS`, checked in `PlannerConfig`
     if isinstance(default, tuple):
         if not isinstance(value, list | tuple):
             raise TypeError("must be a list of numbers")

@@ -1,4 +1,4 @@
-"""The comparison of arms: what metrics.json holds of each, and of the differences between them."""
+"""The comparison of arms in metrics.json: scores of each, and differences between them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 
 REFERENCE = "fixed"
-"""What the others are compared with; the first arm where it is not among them."""
+"""Arm that the others are compared with; the first arm where it is missing."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def _scores(scene: Scene, name: str, entrant: Entrant, shared: Bool | None) -> d
 def _errors(
     scene: Scene, entrant: Entrant, shared: Bool | None
 ) -> tuple[Estimate | None, Estimate | None, Estimate | None]:
-    """The error of all joint-frames that it measured, of the common ones, and its coverage."""
+    """Return the mean error of all measured joint-frames and of the common ones, and the coverage."""
     error, seed = entrant.error_m, scene.rules.seed
     if error is None or shared is None:
         return None, None, None
@@ -120,7 +120,10 @@ def _errors(
 
 
 def _difference(scene: Scene, one: Entrant, other: Entrant, shared: Bool | None) -> dict[str, Any]:
-    """One minus the other, with intervals: same seeds, same moments, same joint-frames as in the table."""
+    """Compute one minus the other, with intervals.
+
+    Both have the same seeds, moments and joint-frames as in the table.
+    """
     tilt_deg, hidden = (
         [np.atleast_2d(of(scene, entrant.flown)).mean(axis=0) for entrant in (one, other)]
         for of in (_tilt_deg, _hidden)
@@ -129,7 +132,7 @@ def _difference(scene: Scene, one: Entrant, other: Entrant, shared: Bool | None)
     seed = scene.rules.seed
     error = cover = None
     if one.error_m is not None and other.error_m is not None and shared is not None:
-        both = shared & np.isfinite(one.error_m) & np.isfinite(other.error_m)  # none may have measured any
+        both = shared & np.isfinite(one.error_m) & np.isfinite(other.error_m)  # one may have measured none
         error = mean_of_trials(mpjpe_mm(one.error_m, both) - mpjpe_mm(other.error_m, both), seed)
         cover = mean_of_trials(
             coverage(one.error_m, one.joint_frames) - coverage(other.error_m, other.joint_frames), seed
@@ -159,7 +162,7 @@ def _hidden(scene: Scene, flown: ArmFlight) -> Float:
 def _verdict(
     arms: Mapping[str, Mapping[str, Any]], differences: Sequence[Mapping[str, Any]], broken: Sequence[str]
 ) -> str:
-    """Say what is violated, and then how the arms compare."""
+    """Name the violated limits, and then compare the arms."""
     if differences:
         wanted = next((each for each in differences if each["arm"] == "adaptive"), differences[0])
         said = verdict(wanted["arm"], wanted["against"], arms, wanted)

@@ -18,20 +18,20 @@ Float = NDArray[np.float64]
 
 
 class SlotCosts(NamedTuple):
-    """Of every slot of every state at every time, [T, S, n]."""
+    """Costs of every slot of every state at every time, [T, S, n]."""
 
     obstacle: Float  # O = clip(1 - M/eps_obs, 0, 1)
     occluded: Float  # share of the sight line that is occupied
 
 
 def costs_of_slots(field: DistanceField, actor: Float, offsets: Float, config: PlannerConfig) -> SlotCosts:
-    """Look at every slot.
+    """Compute the costs of every slot.
 
     The integrand of the obstacle cost that Ho et al. print ignores its variable; here it is one minus the
     signed distance over the local planner's `eps_obs_m`, so that both planners keep the same distance.
 
     Args:
-        field: what stands around.
+        field: the distance field of the obstacles.
         actor: [T, 3] forecast, metres, world.
         offsets: [S, n, 3] metres, the slots of each state from the actor.
         config: `eps_obs_m`, `sight_start_m`.
@@ -42,7 +42,7 @@ def costs_of_slots(field: DistanceField, actor: Float, offsets: Float, config: P
 
 
 def costs_in_frame(field: DistanceField, actor: Forecast, slots: Float, config: PlannerConfig) -> SlotCosts:
-    """Look at slots [S, n, 3] whose yaws count from the actor's heading, which differs from time to time."""
+    """Compute the costs of slots [S, n, 3] whose yaws count from the actor's heading at each time."""
     looks = [
         costs_of_slots(
             field, position[None], slot_offsets(turned(slots, np.full(slots.shape[:-2], heading))), config
@@ -53,12 +53,15 @@ def costs_in_frame(field: DistanceField, actor: Forecast, slots: Float, config: 
 
 
 def cost_map(costs: SlotCosts, config: PlannerConfig) -> Float:
-    """C [T, S] = w_obs sum O + w_occ sum of occupied shares over the drones."""
+    """Compute C [T, S] = w_obs sum O + w_occ sum of occupied shares over the drones."""
     return weighed(costs.obstacle, costs.occluded, config.w_obs, config.w_occ)
 
 
 def error_map(costs: SlotCosts, offsets: Float, config: PlannerConfig) -> Float:
-    """[T, S] predicted error in metres of the views that are free, with a weak prior where too few are."""
+    """Predict the error [T, S] in metres of the views that are free.
+
+    A weak prior limits the error where too few views are free.
+    """
     information = ray_information(offsets, config)
     free = (costs.occluded == 0.0).astype(np.float64)
     total = np.einsum("tsn,snij->tsij", free, information) + np.eye(3) / config.prior_sigma_m**2

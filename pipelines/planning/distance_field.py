@@ -1,4 +1,4 @@
-"""How far it is to the nearest obstacle, and in which direction it becomes farther."""
+"""Signed distance to the nearest obstacle, and its gradient."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ Float = NDArray[np.float64]
 Unknown = Literal["free", "occupied"]
 
 OCCUPIED = 0.5  # probability from which a voxel is an obstacle
-_NOWHERE_M = 1e3  # the distance to obstacles that a map does not have
+_NOWHERE_M = 1e3  # distance everywhere in a map without obstacles
 
 
 @dataclass(frozen=True)
 class DistanceField:
-    """Signed distances to the surface of what is occupied: positive outside, negative inside.
+    """Signed distances to the surface of occupied space: positive outside, negative inside.
 
     Values belong to voxel centres and are trilinear between them. Beyond the outermost centres they are
-    those of the nearest point of the grid: what lies outside the map is as free as its border.
+    those of the nearest point of the grid: space outside the map is as free as its border.
     """
 
     grid: Grid
@@ -32,7 +32,7 @@ class DistanceField:
 
     @cached_property
     def sight(self) -> Sight:
-        """For the sight lines of the cost map; made when it is first asked for, a byte a voxel."""
+        """Field for the sight lines of the cost map; made at first use, one byte per voxel."""
         wide, deep, high = self.grid.distance_m.shape
         bricks = np.zeros((-(-wide // BRICK), -(-deep // BRICK), -(-high // BRICK), BRICK**3), np.uint8)
         fill_bricks(self.grid, bricks)
@@ -40,18 +40,18 @@ class DistanceField:
 
     @property
     def has_obstacles(self) -> bool:
-        """Whether anything is occupied."""
+        """True if anything is occupied."""
         return bool((self.grid.distance_m < 0.0).any())
 
     def covers(self, points: Float) -> NDArray[np.bool_]:
-        """Which points [..., 3] lie in the grid's box."""
+        """Test which points [..., 3] lie in the grid's box."""
         grid = self.grid
         place = (points - grid.origin) / grid.resolution_m
         inside = (place >= 0) & (place < np.array(grid.distance_m.shape))
         return np.asarray(inside.all(axis=-1), dtype=np.bool_)
 
     def sample(self, points: Float) -> tuple[Float, Float]:
-        """Distances [...] and their gradients [..., 3] at points [..., 3], metres, world.
+        """Interpolate distances [...] and their gradients [..., 3] at points [..., 3], metres, world.
 
         The gradient is the exact derivative of the trilinear value, zero along axes on which the point
         is outside the grid. Points must be finite.
@@ -63,7 +63,7 @@ class DistanceField:
 
 
 def distance_field(occupancy: Occupancy, *, unknown: Unknown = "free") -> DistanceField:
-    """The distance field of a voxel map.
+    """Compute the distance field of a voxel map.
 
     M = d_free - res/2 outside and -(d_occ - res/2) inside, with the exact Euclidean distances between voxel
     centres (scipy): the surface lies on the faces between free and occupied voxels. Without the half
@@ -71,7 +71,7 @@ def distance_field(occupancy: Occupancy, *, unknown: Unknown = "free") -> Distan
 
     Args:
         occupancy: probabilities, from 0.5 occupied, NaN unknown.
-        unknown: what voxels count as of which nothing is known.
+        unknown: the state of unknown voxels, free or occupied.
 
     Returns:
         The field; where a map has no obstacle at all, 1 km everywhere.
@@ -103,5 +103,5 @@ def distance_field(occupancy: Occupancy, *, unknown: Unknown = "free") -> Distan
 
 
 def open_space() -> DistanceField:
-    """The field of a world in which nothing is known to stand."""
+    """Return the field of a world without known obstacles."""
     return DistanceField(Grid(np.full((2, 2, 2), _NOWHERE_M, dtype=np.float32), np.zeros(3), 1.0))

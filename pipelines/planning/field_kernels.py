@@ -1,4 +1,4 @@
-"""Reading the distance field, compiled: interpolation, and sight lines through it.
+"""Compiled readers of the distance field: interpolation, and sight lines through it.
 
 No threads and no fastmath: the same numbers give the same bytes.
 """
@@ -15,16 +15,16 @@ from pipelines.geometry.compilation import cached, helper
 
 Float = NDArray[np.float64]
 
-# From a point to the centre of its voxel it is at most half a diagonal; to a corner of the cell in which it
+# A point is at most half a diagonal from its voxel's centre. To a corner of the cell in which it
 # is interpolated, and from the one to the other, at most a whole one. In voxels:
 DIAGONAL = math.sqrt(3.0)
-ROUNDING = 1e-4  # of single precision, by which such bounds are drawn in
+ROUNDING = 1e-4  # margin of such bounds for single precision
 BRICK = 4  # voxels along the side of one of `Sight.bricks`
 _LONGEST_LEAP = 127  # seven bits
 
 
 class Grid(NamedTuple):
-    """A signed distance field as the kernels take it."""
+    """A signed distance field, as the kernels take it."""
 
     distance_m: NDArray[np.float32]  # [X, Y, Z], at least two voxels along each axis
     origin: Float  # [3] m, the corner of voxel (0, 0, 0)
@@ -32,17 +32,17 @@ class Grid(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """The field as sight lines are led through it: which voxels are occupied, and how far all is alike."""
+    """The field for sight lines: occupied voxels, and the distance within which all points are alike."""
 
     bricks: NDArray[np.uint8]
-    """[X/4, Y/4, Z/4, 64] of 4 x 4 x 4 voxels, a line of the processor's memory each: twice the leap, and
-    one more where occupied. All points within as many half voxels of any of the voxel's are as it is."""
+    """Bytes [X/4, Y/4, Z/4, 64] of bricks of 4 x 4 x 4 voxels, one cache line each: twice the leap, plus
+    1 if occupied. All points within `leap` half voxels of any point of the voxel have its state."""
     size: tuple[int, int, int]  # of the grid
 
 
 @helper
 def _cell(coordinate: float, size: int, resolution: float) -> tuple[int, float, float]:
-    """Lower index, fraction and derivative of the fraction along one axis, clamped to the voxel centres."""
+    """Return lower index, fraction and its derivative along one axis, clamped to the voxel centres."""
     index = coordinate / resolution - 0.5
     if not index > 0.0:
         return 0, 0.0, 0.0
@@ -54,7 +54,7 @@ def _cell(coordinate: float, size: int, resolution: float) -> tuple[int, float, 
 
 @helper
 def interpolate(grid: Grid, x: float, y: float, z: float) -> tuple[float, float, float, float]:
-    """Trilinear distance and its exact gradient; along a clamped axis the gradient is zero."""
+    """Interpolate the trilinear distance and its exact gradient; along a clamped axis it is zero."""
     d = grid.distance_m
     i, u, du = _cell(x - grid.origin[0], d.shape[0], grid.resolution_m)
     j, v, dv = _cell(y - grid.origin[1], d.shape[1], grid.resolution_m)
@@ -77,7 +77,7 @@ def interpolate(grid: Grid, x: float, y: float, z: float) -> tuple[float, float,
 
 @helper
 def nearest(grid: Grid, x: float, y: float, z: float) -> float:
-    """Distance stored for the voxel whose centre is nearest to a point."""
+    """Return the distance stored for the voxel whose centre is nearest to a point."""
     d = grid.distance_m
     i = min(max(int((x - grid.origin[0]) / grid.resolution_m), 0), d.shape[0] - 1)
     j = min(max(int((y - grid.origin[1]) / grid.resolution_m), 0), d.shape[1] - 1)
@@ -87,13 +87,15 @@ def nearest(grid: Grid, x: float, y: float, z: float) -> float:
 
 @helper
 def sampling(x: float, y: float, z: float, start_m: float, side_m: float, rule: Float) -> int:
-    """How a sight line is sampled, in voxels of that side: the number of samples, every half voxel at most.
+    """Set the sampling of a sight line, in voxels of that side; return the number of samples.
+
+    Samples are at most half a voxel apart.
 
     Args:
         x: m, the camera from the actor, as the next two.
         y: see there.
         z: see there.
-        start_m: where the line begins.
+        start_m: distance from the actor at which the line begins.
         side_m: of a voxel.
         rule: [11] is filled: the first sample from the actor, the step to the next, one over it by axis,
             all three in voxels; samples per metre; and the length of the line in m.
@@ -114,7 +116,10 @@ def sampling(x: float, y: float, z: float, start_m: float, side_m: float, rule: 
 
 @helper
 def _samples_inside(first: float, per: float, size: int, low: float, high: float) -> tuple[float, float]:
-    """Which of the samples `low` to `high` lie in the grid along an axis; `per` is one over the step."""
+    """Return the range of the samples `low` to `high` inside the grid along an axis.
+
+    `per` is one over the step.
+    """
     if math.isinf(per):
         return (low, high) if 0.0 <= first < size else (high, high)
     one, other = -first * per, (size - first) * per
@@ -123,7 +128,10 @@ def _samples_inside(first: float, per: float, size: int, low: float, high: float
 
 @helper
 def look(sight: Sight, x: float, y: float, z: float) -> tuple[int, int]:
-    """Whether the voxel at a place (voxels) is occupied, and how far, in half voxels, all is as it is."""
+    """Test if the voxel at a place (voxels) is occupied; return 0 or 1, and the leap in half voxels.
+
+    Within the leap all points have the same state.
+    """
     size = sight.size
     i = np.uintp(min(max(int(x), 0), size[0] - 1))
     j = np.uintp(min(max(int(y), 0), size[1] - 1))
@@ -137,11 +145,11 @@ def look(sight: Sight, x: float, y: float, z: float) -> tuple[int, int]:
 def occupied_samples(
     sight: Sight, x: float, y: float, z: float, rule: Float, first: float, end: float
 ) -> int:
-    """How many of the samples `first` to `end` of a sight line lie in occupied voxels.
+    """Count the samples `first` to `end` of a sight line that lie in occupied voxels.
 
     The line begins at an actor, x, y, z in voxels from the grid's corner. Samples are at most half a voxel
-    apart, so that as many as a voxel's leap need no look. Taken from both ends at once, because the processor
-    can follow two leaps that do not depend on each other.
+    apart, so that the next samples within a voxel's leap need no look. Samples are taken from both ends at
+    once, because the processor can run two independent leaps in parallel.
     """
     x, y, z = x + rule[0], y + rule[1], z + rule[2]
     first, end = _samples_inside(x, rule[6], sight.size[0], first, end)
@@ -155,7 +163,7 @@ def occupied_samples(
         near_is, near = look(sight, x + k * rule[3], y + k * rule[4], z + k * rule[5])
         top = stop - 1
         far_is, far = look(sight, x + top * rule[3], y + top * rule[4], z + top * rule[5])
-        if near == 0:  # foreseen by the processor, which need not wait for this look to take the next
+        if near == 0:  # branch prediction: the processor need not wait for this look to take the next
             occupied += near_is
             k += 1
         else:
@@ -175,7 +183,7 @@ def occupied_samples(
 
 @cached
 def sample(grid: Grid, points: Float, distance: Float, gradient: Float) -> None:
-    """Distances [P] and gradients [P, 3] at points [P, 3], written into the last two."""
+    """Compute distances [P] and gradients [P, 3] at points [P, 3], written into the last two."""
     for p in range(points.shape[0]):
         value, gx, gy, gz = interpolate(grid, points[p, 0], points[p, 1], points[p, 2])
         distance[p] = value
@@ -184,11 +192,11 @@ def sample(grid: Grid, points: Float, distance: Float, gradient: Float) -> None:
 
 @cached
 def fill_bricks(grid: Grid, bricks: NDArray[np.uint8]) -> None:
-    """Fill zeros with what `Sight.bricks` holds.
+    """Fill `bricks`, which must be zeros, as `Sight.bricks` explains.
 
-    A voxel's distance is M = D - h/2, D from its centre to the nearest one that is not as it is. From a
-    point of a voxel to its centre it is half a diagonal at most: within M + h/2 - sqrt(3) h of any of the
-    voxel's points all is alike.
+    A voxel's distance is M = D - h/2, D from its centre to the nearest centre of the other state. A point of
+    a voxel is at most half a diagonal from its centre. So all points within M + h/2 - sqrt(3) h of any of the
+    voxel's points have its state.
     """
     d = grid.distance_m
     wide, deep, high = d.shape
@@ -203,7 +211,7 @@ def fill_bricks(grid: Grid, bricks: NDArray[np.uint8]) -> None:
 
 @cached
 def line_shares(grid: Grid, sight: Sight, actor: Float, camera: Float, start_m: float, share: Float) -> None:
-    """Occupied shares [P] of the sight lines between points [P, 3] and [P, 3], written into `share`."""
+    """Compute occupied shares [P] of the sight lines between points [P, 3] and [P, 3], into `share`."""
     rule = np.zeros(11)
     for p in range(actor.shape[0]):
         x, y, z = camera[p, 0] - actor[p, 0], camera[p, 1] - actor[p, 1], camera[p, 2] - actor[p, 2]

@@ -1,4 +1,4 @@
-"""Where the actor is, and will be: a Kalman filter with a constant-velocity model."""
+"""Estimate and forecast of the actor: a Kalman filter with a constant-velocity model."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ class Forecast(NamedTuple):
     """The actor at the T knots of a plan."""
 
     position: Float  # [T, 3] metres, world
-    heading_rad: Float  # [T] what yaws count from, counterclockwise from east: 0 in the world frame
+    heading_rad: Float  # [T] zero of yaws, counterclockwise from east: 0 in the world frame
 
     def each(self, every: int) -> Forecast:
-        """Every so many knots, at least the last one."""
+        """Return every so many knots, at least the last one."""
         rows = slice(every - 1, None, every) if len(self.position) >= every else slice(-1, None)
         return Forecast(self.position[rows], self.heading_rad[rows])
 
@@ -32,7 +32,7 @@ class ActorFilter:
     have the same model and noise, so that one 2x2 covariance serves them all.
 
     Args:
-        q: m^2/s^3, how much the velocity wanders.
+        q: m^2/s^3, spectral density of the acceleration's noise.
         sigma_m: of the measured position, per axis.
     """
 
@@ -44,7 +44,7 @@ class ActorFilter:
         self._covariance = np.diag([self._variance, _FIRST_SPEED_MPS**2])
 
     def measure(self, t_s: float, position: Float) -> None:
-        """Take in one measured position [3], metres, world, not earlier than the last one.
+        """Update with one measured position [3], metres, world, not earlier than the last one.
 
         Raises:
             ValueError: the time goes backwards, or the position is not finite.
@@ -65,7 +65,9 @@ class ActorFilter:
         self._t_s = t_s
 
     def at(self, t_s: float) -> tuple[Float, Float, Float]:
-        """State [2, 3] (position m, velocity m/s) and covariance [2, 2] per axis, at or after the last one.
+        """Predict the state (position m, velocity m/s, [3] each) and covariance [2, 2] per axis.
+
+        The time must be at or after the last measurement.
 
         Raises:
             ValueError: nothing was measured yet, or the time is before the last measurement.
@@ -74,7 +76,7 @@ class ActorFilter:
         return state[0], state[1], covariance
 
     def forecast(self, t_s: Float) -> Float:
-        """Positions [T, 3] at times [T], of which none is before the last measurement."""
+        """Forecast positions [T, 3] at times [T], none of them before the last measurement."""
         if self._t_s is None:
             raise ValueError("nothing was measured yet")
         ahead = t_s - self._t_s

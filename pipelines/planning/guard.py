@@ -1,10 +1,10 @@
-"""What keeps replayed drones out of obstacles, away from each other and from the actor.
+"""Guard that keeps replayed drones out of obstacles, away from each other and from the actor.
 
 Invariant: every drone has a committed motion that ends at rest, keeps `drone_radius_m` from the map and
 `separation_m` from the committed motions of all others. A new plan is flown only if following it until the
 next one, and braking to a stop from there, keeps the invariant. Otherwise the drone follows the last plan
 that does, climbs, gives way, or goes on with its committed motion, which is braking. By induction no drone
-ever leaves free space, whatever the planner asks for. Three cases cannot be promised and are reported by
+ever leaves free space, for any wish of the planner. Three cases cannot be guaranteed and are reported by
 `scores`: an actor who walks at a drone, a map that changes, a start inside the radius.
 """
 
@@ -37,17 +37,17 @@ Float = NDArray[np.float64]
 
 _CHECK_S = 0.05  # motions are checked as often, and every half voxel
 _ROUNDING_M = 1e-6
-_INSIDE_M = 1e-3  # who is nearer to an obstacle by more than this leaves first
+_INSIDE_M = 1e-3  # a drone that is nearer to an obstacle by more than this leaves first
 _DEEPER_M = 0.1  # ways out end this much beyond the radius
 _CLIMB_MPS = 2.0
 _ASIDE_MPS = 1.5
 _CHANGE_SHARE = 0.75  # of the largest acceleration, with which a drone takes up another velocity
-_ACTOR_AHEAD_S = 2.0  # so far ahead plans keep away from where the actor will be
-_WINDOW_M = 4.0  # in which a way out is looked for at first
+_ACTOR_AHEAD_S = 2.0  # plans keep away from the actor's forecast so far ahead
+_WINDOW_M = 4.0  # first window in which a way out is searched
 
 
 class Flown(StrEnum):
-    """What a drone flies after a local planning."""
+    """Motion of a drone after a local planning."""
 
     PLANNED = "planned"
     PREVIOUS = "previous"  # the plan before
@@ -55,20 +55,20 @@ class Flown(StrEnum):
     GAVE_WAY = "gave_way"  # sideways, or away from the actor
     BRAKED = "braked"
     LEFT = "left"  # an obstacle that was within its radius, by the shortest way
-    UNSAFE = "unsafe"  # nothing keeps all distances; what comes nearest to it
+    UNSAFE = "unsafe"  # no motion keeps all distances; the one that comes nearest to that
 
 
 class _Around(NamedTuple):
-    """What a drone must keep away from; K + 1 times, one per period from now on."""
+    """Things that a drone must keep away from; K + 1 times, one per period from now on."""
 
     field: DistanceField
-    others: Float  # [M, K + 1, 3] m, where the other drones are committed to be
-    actor: Float  # [K + 1, 3] m, where the actor will be
+    others: Float  # [M, K + 1, 3] m, committed positions of the other drones
+    actor: Float  # [K + 1, 3] m, forecast of the actor
 
 
 @dataclass(frozen=True)
 class _Motion:
-    """A motion that ends at rest, and how near it comes."""
+    """A motion that ends at rest, and its least distances."""
 
     kind: Flown
     plan: Plan
@@ -79,13 +79,13 @@ class _Motion:
 
 
 class Guard:
-    """The drones of one replayed flight: flies what is safe of the planner's wishes.
+    """The drones of one replayed flight; flies only the safe ones of the planner's wishes.
 
     Args:
-        position: [N, 3] m, where the drones are at rest.
+        position: [N, 3] m, the drones at rest.
         config: distances, limits, gains and rates.
-        exactly: drones are exactly where plans are (`plan-only`). Limits of acceleration and jerk are those
-            of the plans then, and nothing keeps them.
+        exactly: drones are exactly where plans are (`plan-only`). Then the accelerations and jerks are those
+            of the plans, and are not limited.
     """
 
     def __init__(self, position: Float, config: PlannerConfig, *, exactly: bool = False) -> None:
@@ -101,12 +101,12 @@ class Guard:
 
     @property
     def position(self) -> Float:
-        """[N, 3] m, world."""
+        """Positions of the drones [N, 3] m, world."""
         return self._now(POSITION)
 
     @property
     def velocity(self) -> Float:
-        """[N, 3] m/s."""
+        """Velocities of the drones [N, 3] m/s."""
         return self._now(VELOCITY)
 
     def advance(self) -> None:
@@ -114,18 +114,18 @@ class Guard:
         self._age = np.minimum(self._age + 1, self._states.shape[1] - 1)
 
     def committed(self) -> list[Float]:
-        """The motion of each drone from now on, [K, 4, 3], which ends at rest."""
+        """Return the motion of each drone from now on, [K, 4, 3], which ends at rest."""
         return [states[age:] for states, age in zip(self._states, self._age, strict=True)]
 
     def admit(self, drone: int, t_s: float, plan: Plan, actor: ActorFilter, field: DistanceField) -> Plan:
         """Commit a drone to the best safe motion.
 
         Args:
-            drone: which.
+            drone: its index.
             t_s: now.
-            plan: what the local planner wants, from here and now.
-            actor: for where the actor will be.
-            field: what stands around.
+            plan: the local planner's plan, from the drone's place and now.
+            actor: the filter that forecasts the actor.
+            field: the distance field of the obstacles.
 
         Returns:
             The plan that is flown.
@@ -149,13 +149,16 @@ class Guard:
         return now
 
     def _others(self, drone: int) -> Float:
-        """[M, K + 1, 3] where the other drones are committed to be from now on."""
+        """Return the committed positions [M, K + 1, 3] of the other drones from now on."""
         drones, rows = np.arange(len(self._age)), np.arange(self._states.shape[1])
         ahead = np.minimum(self._age[:, None] + rows, rows[-1])
         return np.asarray(np.delete(self._states[drones[:, None], ahead, POSITION], drone, axis=0))
 
     def _least(self, place: Float, around: _Around) -> tuple[float, float, float]:
-        """Distances to map, drones and actor that must be kept: the stated ones, or what there is now."""
+        """Return the distances to map, drones and actor that must be kept.
+
+        They are the configured ones, or the present ones if these are smaller.
+        """
         config = self._config
         now = (
             float(around.field.sample(place)[0]),
@@ -174,7 +177,7 @@ class Guard:
         return map_m, drones_m, actor_m
 
     def _motions(self, drone: int, t_s: float, plan: Plan, around: _Around) -> Iterator[_Motion]:
-        """Motions from the best to the last resort."""
+        """Yield motions from the best to the last resort."""
         here, field = self._states[drone, self._age[drone]], around.field
 
         def follow(kind: Flown, followed: Plan) -> _Motion:
@@ -205,7 +208,7 @@ class Guard:
     def _rolled_out(
         self, t_s: float, here: Float, plan: Plan, ticks: int, exactly: bool
     ) -> tuple[Float, int]:
-        """States [K + 1, 4, 3] of who follows a plan for some periods and stops; and the row of the stop."""
+        """Return states [K + 1, 4, 3] of a drone that follows a plan and stops, and the row of the stop."""
         states = np.empty((ticks + self._states.shape[1] - self._ticks, 4, 3))
         states[0] = here
         after_s = t_s - plan.start_s
@@ -215,7 +218,10 @@ class Guard:
         return states, stopped
 
     def _ways_out(self, here: Float, around: _Around) -> list[tuple[Flown, Float]]:
-        """Velocities to take up: up, up and off what is near, and away from the actor, faster than they."""
+        """Return velocities for ways out.
+
+        Up, up and away from the nearest obstacle, and away from the actor, faster than the actor.
+        """
         actor, place = around.actor, here[POSITION]
         up = np.array([0.0, 0.0, _CLIMB_MPS])
         level = around.field.sample(place)[1] * [1.0, 1.0, 0.0]
@@ -233,9 +239,9 @@ class Guard:
     def _measured(
         self, kind: Flown, plan: Plan, states: Float, stopped: int, ahead: Float, around: _Around
     ) -> _Motion:
-        """Measure how near a motion comes to the map and to drones, and its plan to the actor.
+        """Measure the least distances of a motion to the map and to drones, and of its plan to the actor.
 
-        Standing still is no way to keep away from somebody who walks: there the plan counts, not the stop.
+        A drone at rest cannot keep away from an actor who walks: for the actor the plan counts, not the stop.
         The actor may walk on as forecast, or stop where they are.
         """
         apart = np.linalg.norm(around.others - states[:, POSITION], axis=-1).min(initial=np.inf)
@@ -251,7 +257,7 @@ class Guard:
         )
 
     def _steered(self, t_s: float, here: Float, velocity: Float) -> Plan:
-        """A plan that takes up a velocity [3] m/s with a constant acceleration."""
+        """Return a plan that takes up a velocity [3] m/s with a constant acceleration."""
         after = self._waypoint_times()
         change = velocity - here[VELOCITY]
         until = float(np.linalg.norm(change)) / (_CHANGE_SHARE * self._config.acceleration_mps2)
@@ -261,28 +267,28 @@ class Guard:
         return Plan(t_s, path, here[VELOCITY].copy(), self._config.waypoint_s)
 
     def _plan_of(self, t_s: float, states: Float) -> Plan:
-        """The plan that other drones see of a motion that is committed already."""
+        """Return the plan that other drones see of a motion that is already committed."""
         every = max(round(self._config.waypoint_s * self._config.tracking_hz), 1)
         rows = np.minimum(every * np.arange(self._config.waypoints + 1), len(states) - 1)
         return Plan(t_s, states[rows, POSITION], states[0, VELOCITY].copy(), self._config.waypoint_s)
 
     def _waypoint_times(self) -> Float:
-        """[N + 1, 1] s, from the start of a plan."""
+        """Return the times [N + 1, 1] s of waypoints, from the start of a plan."""
         config = self._config
         return config.waypoint_s * np.arange(config.waypoints + 1, dtype=np.float64)[:, None]
 
 
 def wanted_clearance_m(config: PlannerConfig, grid: Grid) -> float:
-    """The value of the distance field at which a drone keeps its radius from all that is occupied.
+    """Return the field's value at which a drone keeps its radius from all occupied voxels.
 
-    The field says how far the face of the nearest voxel is, as if seen along an axis. Corners are farther out
-    by 0.37 voxels, and trilinear interpolation errs by about a tenth: half a voxel covers both.
+    The field is the distance to the face of the nearest voxel, as if seen along an axis. Corners are farther
+    out by 0.37 voxels, and trilinear interpolation errs by about a tenth: half a voxel covers both.
     """
     return config.drone_radius_m + grid.resolution_m / 2.0
 
 
 def nearest_free(field: DistanceField, point: Float, wanted_m: float) -> Float | None:
-    """The centre [3] of the nearest voxel that is `wanted_m` from obstacles or farther; None without one."""
+    """Find the centre [3] of the nearest voxel at least `wanted_m` from obstacles; None without one."""
     grid = field.grid
     size = np.array(grid.distance_m.shape)
     middle = np.floor((point - grid.origin) / grid.resolution_m).astype(np.int64)
@@ -305,9 +311,9 @@ def nearest_free(field: DistanceField, point: Float, wanted_m: float) -> Float |
 
 @cached
 def least_clearance(grid: Grid, states: Float, last: int, period_s: float) -> float:
-    """The least distance to obstacles along a motion [K + 1, 4, 3] up to a row.
+    """Compute the least distance to obstacles along a motion [K + 1, 4, 3] up to a row.
 
-    Looked at every 0.05 s or every half voxel, whichever is finer, straight between two rows.
+    It is sampled every 0.05 s or every half voxel, whichever is finer, on straight lines between two rows.
     """
     least = math.inf
     for k in range(last + 1):
@@ -327,7 +333,7 @@ _NONE = (0.0, 0.0, 0.0)
 
 
 def _shortfall(motion: _Motion, least: Sequence[float]) -> tuple[float, float, float]:
-    """By how much a motion comes too near to the map, to drones and to the actor; 0 where it does not."""
+    """Return by how much a motion comes too near to the map, to drones and to the actor; 0 if it does not."""
     found = (motion.clearance_m, motion.separation_m, motion.actor_m)
     map_m, drones_m, actor_m = (max(wanted - got, 0.0) for wanted, got in zip(least, found, strict=True))
     return map_m, drones_m, actor_m

@@ -1,4 +1,4 @@
-"""Where the actor heads, and what a formation's yaws count from."""
+"""The actor's heading, and the zero of a formation's yaws."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from pipelines.planning.config import PlannerConfig
 
 Float = NDArray[np.float64]
 
-_SURE = 3.0  # standard deviations of the speed, above which its direction says something
+_SURE = 3.0  # standard deviations of the speed; its direction is used only above
 _FIRST_WAY_M = 1.0
 
 
 class YawZero:
     """The direction that yaws count from, over time: east, or with `yaw_frame` `heading` the actor's.
 
-    The heading is the level direction of the filtered velocity. While the actor stands - a level speed
-    below `heading_speed_mps`, or below three of its standard deviations - the last one holds; before the
-    first, the one that was stated. The zero follows it the shorter way, no faster than a formation turns:
-    somebody who turns on the spot must not send drones through the middle.
+    The heading is the level direction of the filtered velocity. The actor stands if the level speed is below
+    `heading_speed_mps`, or below three of its standard deviations; then the last heading holds, and before
+    the first one `heading_rad`. The zero follows the heading the shorter way, no faster than a formation
+    turns: an actor who turns on the spot must not send drones through the middle.
 
     Args:
         config: `yaw_frame`, `heading_speed_mps`, `yaw_rate_deg_per_s`.
@@ -34,7 +34,7 @@ class YawZero:
         self._from = self._goal = heading_rad if config.yaw_frame == "heading" else 0.0
 
     def follow(self, t_s: float, velocity: Float, covariance: Float) -> None:
-        """Take in what is known of the actor's motion.
+        """Update the zero with the actor's motion.
 
         Args:
             t_s: now, not before an earlier one.
@@ -48,16 +48,16 @@ class YawZero:
             self._goal = self._from + math.remainder(way, 2 * math.pi)
 
     def at(self, t_s: Float) -> Float:
-        """Angles [T] from east, without jumps, at times [T] from the last `follow` on."""
+        """Return angles [T] from east, without jumps, at times [T] from the last `follow` on."""
         most = self._rate * np.maximum(t_s - self._from_s, 0.0)
         zero: Float = self._from + np.clip(self._goal - self._from, -most, most)
         return zero
 
 
 def first_heading(actor: Float) -> float:
-    """Where a logged actor [A, 3] m first walks, counterclockwise from east; rows with NaN were not measured.
+    """Find the direction in which a logged actor [A, 3] m first walks, counterclockwise from east.
 
-    0 for who never comes a metre away from where they stood.
+    Rows with NaN were not measured. 0 for an actor who never comes a metre away from the first position.
     """
     level = actor[np.isfinite(actor).all(axis=1), :2]
     away = level - level[:1]

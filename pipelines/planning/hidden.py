@@ -1,4 +1,4 @@
-"""For how much of a flight the map hid the actor from each camera."""
+"""Shares of a flight during which the map hid the actor from each camera."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def hidden_shares(
     *,
     start_m: float = PlannerConfig().sight_start_m,
 ) -> dict[str, float]:
-    """The share of moments in which an occupied voxel stood between a camera and the actor.
+    """Compute the share of moments in which an occupied voxel stood between a camera and the actor.
 
     Ten moments a second, while the camera's pose is known; true poses and hips where they are known. Each
     map counts from its own time on; unknown voxels are free.
 
     Args:
-        flight: where cameras and actor were.
+        flight: the poses of the cameras and the actor's positions.
         description: the session's.
         maps: in any order, one at least.
         start_m: the end of the sight line next to the actor is left out, this much of it: maps contain the
@@ -58,7 +58,7 @@ def hidden_shares(
 
 
 def _standing(occupancy: Occupancy) -> DistanceField:
-    """A field that knows what is occupied and not how far it is: all that sight lines ask."""
+    """Return a field that has only the occupied voxels, no distances: sight lines need no more."""
     with np.errstate(invalid="ignore"):
         occupied: NDArray[np.bool_] = occupancy.probability >= OCCUPIED
     sign = np.where(occupied, np.float32(-1), np.float32(1))

@@ -1,4 +1,4 @@
-"""What cameras are worth before they have seen anything: the ray model of their information."""
+"""Information of cameras before they have seen anything: the ray model."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _PLACED_SHARE = np.array([0.96, 0.97, 0.91, 0.81, 0.61])
 
 
 def ray_information(offset: Float, config: PlannerConfig) -> Float:
-    """Expected information of one camera on a point: I = p (1 - d d')/s^2, nothing along the ray d.
+    """Compute one camera's expected information on a point: I = p (1 - d d')/s^2, none along the ray d.
 
     s^2 = (rho sigma_px/f)^2 + (rho sigma_rot)^2 + sigma_pos^2, rho the distance; p is the measured share of
-    joints that a detector places at that tilt. By geometry alone steep views would be as welcome.
+    joints that a detector places at that tilt. By geometry alone, steep views would be as good.
 
     Args:
         offset: [..., 3] metres, from the point to the camera, not zero.
@@ -38,23 +38,26 @@ def ray_information(offset: Float, config: PlannerConfig) -> Float:
 
 
 def predicted_error(information: Float) -> Float:
-    """sqrt(tr S), S = I^-1: the expected error in metres of [..., 3, 3]; inf where something is unseen."""
+    """Compute sqrt(tr S), S = I^-1: the expected error in metres of [..., 3, 3].
+
+    It is inf where a direction is unseen.
+    """
     minors, determinant = _minors(information)
     with np.errstate(divide="ignore", invalid="ignore"):
         trace = np.sum(minors, axis=-1) / determinant
-    # Singular up to rounding: the determinant is far below the cube of what it is made of.
+    # Singular up to rounding: the determinant is far below the cube of the trace.
     scale = np.trace(information, axis1=-2, axis2=-1) ** 3
     return np.sqrt(np.where(determinant > 1e-12 * scale, trace, np.inf))
 
 
 def log_determinant(information: Float) -> Float:
-    """Logarithm of the determinant of positive definite [..., 3, 3]."""
+    """Compute the logarithm of the determinant of positive definite [..., 3, 3]."""
     logarithm: Float = np.log(_minors(information)[1])
     return logarithm
 
 
 def _minors(matrix: Float) -> tuple[Float, Float]:
-    """The three principal 2x2 minors [..., 3] and the determinant of symmetric matrices."""
+    """Compute the three principal 2x2 minors [..., 3] and the determinant of symmetric matrices."""
     a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2]
     d, e, f = matrix[..., 1, 1], matrix[..., 1, 2], matrix[..., 2, 2]
     first = d * f - e * e

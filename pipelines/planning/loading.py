@@ -1,4 +1,4 @@
-"""What a replay needs of a session: the actor, the maps, the cameras, and a skeleton to look at."""
+"""Inputs of a replay from a session: the actor, the maps, the cameras, and a skeleton."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ Source = Literal["log", "reconstruction", "truth"]
 
 _LONGEST_STEP_NS = 200_000_000  # joints are interpolated across this much at least: 10 Hz and a missed frame
 _STEPS = 1.5  # or this many median steps
-_GAP_NS = 1_000_000_000  # an actor who is not measured for longer is spoken of
-_COMMAND_HOLDS_NS = 2_000_000_000  # planners send something new several times a second
+_GAP_NS = 1_000_000_000  # longer gaps of the actor's measurements give a warning
+_COMMAND_HOLDS_NS = 2_000_000_000  # longest time for which a command holds; planners send several a second
 _SHORTEST_S = 1.0
 _HIPS = ("left_hip", "right_hip")
 
 
 @dataclass(frozen=True)
 class SessionCamera:
-    """A camera of the session, and what is known of it."""
+    """A camera of the session: lens, poses and pose noise."""
 
     name: str
     intrinsics: Intrinsics
@@ -46,28 +46,31 @@ class SessionCamera:
 
 @dataclass(frozen=True)
 class LoggedFlight:
-    """What was flown, as far as the session knows."""
+    """The logged flight, as far as the session knows it."""
 
     actor_t_ns: Int64  # [A] ascending
-    actor: Float  # [A, 3] m, world: what planners are told, the middle of the hips
+    actor: Float  # [A, 3] m, world: input of the planners, the middle of the hips
     actor_source: Source
     hips: JointMotion | None  # the true hips, [T, 1, 1, 3], NaN where unknown; None without truth
     skeleton: JointMotion | None  # [T, 1, J, 3] of the first person, NaN where unknown
     skeleton_source: Source | None
     cameras: tuple[SessionCamera, ...]
     poses_source: Source
-    noise_source: str  # who states the noise of the poses
+    noise_source: str  # source of the poses' noise
     warnings: tuple[str, ...]
     planned: dict[str, tuple[Int64, Float]] = field(default_factory=dict)
-    """Where cameras were sent: stamps [P] and [P, 3] m, world."""
+    """Positions to which cameras were sent: stamps [P] and [P, 3] m, world."""
 
     @property
     def moves(self) -> bool:
-        """Whether any camera does."""
+        """True if any camera moves."""
         return not all(camera.static for camera in self.cameras)
 
     def scored_actor(self, t_ns: Int64) -> tuple[Float, Source]:
-        """Where the actor was [T, 3], to score against: the true hips where they are known all the time."""
+        """Return the actor's positions [T, 3] to score against.
+
+        These are the true hips if they are known all the time.
+        """
         if self.hips is not None:
             true_hips = points_at(self.hips, t_ns)[:, 0]
             if np.isfinite(true_hips).all():
@@ -79,16 +82,17 @@ class LoggedFlight:
 def load_flight(
     folder: Path, description: Description, reconstructed: StageRecord | None, *, pose_noise: str | None
 ) -> LoggedFlight:
-    """Read it, cut to the time in which the actor and all moving cameras are known.
+    """Read the flight, cut to the time in which the actor and all moving cameras are known.
 
     Args:
         folder: the session.
         description: its session.json.
         reconstructed: the record of stage `reconstruct`, None where that has not run.
-        pose_noise: errors of the poses, in place of what the session states.
+        pose_noise: errors of the poses, in place of those stated in the session.
 
     Raises:
-        DataError: nobody knows where the actor was, or not while the cameras flew; an unknown noise model.
+        DataError: the actor's position is unknown, or not known while the cameras flew; an unknown noise
+            model.
     """
     warnings: list[str] = []
     skeleton, skeleton_source = _skeleton(folder, description, reconstructed)
@@ -124,16 +128,18 @@ def load_flight(
 
 
 def points_at(motion: JointMotion, t_ns: Int64) -> Float:
-    """The first person's joints [T, J, 3] at given times, NaN where they are not known nearby."""
+    """Interpolate the first person's joints [T, J, 3] at given times; NaN where not known nearby."""
     step_ns = float(np.median(np.diff(motion.t_ns))) if len(motion.t_ns) > 1 else 0.0
     longest_ns = max(_LONGEST_STEP_NS, round(_STEPS * step_ns))
     return interpolate_points(motion.t_ns, motion.position[:, 0], t_ns, max_gap_ns=longest_ns)
 
 
 def flown_poses(flight: LoggedFlight, description: Description, t_ns: Int64) -> tuple[Float, Float, Bool]:
-    """Where the cameras really were: positions [N, T, 3], quaternions [N, T, 4] and whether known [N, T].
+    """Interpolate the true poses of the cameras.
 
-    Across gaps of the log positions go straight on, so that a flight can be scored as a whole.
+    Returns positions [N, T, 3], quaternions [N, T, 4] and a mask of known poses [N, T].
+
+    Positions are linear across gaps of the log, so that a flight can be scored as a whole.
     """
     trusted = description.pose_interpolation
     shape = (len(flight.cameras), len(t_ns))
@@ -150,9 +156,9 @@ def flown_poses(flight: LoggedFlight, description: Description, t_ns: Int64) -> 
 
 
 def planned_positions(flight: LoggedFlight, t_ns: Int64) -> tuple[Float, Bool]:
-    """Where the on-board planner sent its cameras [K, T, 3], straight between commands, and whether it did.
+    """Interpolate the on-board planner's commanded positions [K, T, 3], linearly, and mask the valid ones.
 
-    [K, T]: it did not before the first command, after the last one, or between two that lie far apart.
+    The mask [K, T] is False before the first command, after the last one, and between two that lie far apart.
     """
     position, known = np.empty((len(flight.planned), len(t_ns), 3)), []
     for i, (stamps, sent) in enumerate(flight.planned.values()):
@@ -170,7 +176,7 @@ def planned_positions(flight: LoggedFlight, t_ns: Int64) -> tuple[Float, Bool]:
 def _skeleton(
     folder: Path, description: Description, reconstructed: StageRecord | None
 ) -> tuple[JointMotion | None, Source | None]:
-    """The truth, or else what was reconstructed."""
+    """Return the true skeleton, or else the reconstructed one."""
     if description.truth is not None and description.has_true_joints:
         table = read_table(folder / "truth.parquet", TRUTH)
         return motion_from(table, tuple(description.truth.joints)), "truth"
@@ -178,7 +184,7 @@ def _skeleton(
 
 
 def _reconstruction(folder: Path) -> JointMotion:
-    """What was reconstructed; joints that are not `ok` are not known."""
+    """Read the reconstructed skeleton; joints that are not `ok` are NaN."""
     table = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON)
     table = table[table["person"] == 0]
     motion = motion_from(table, tuple(dict.fromkeys(table["joint"])))
@@ -188,7 +194,7 @@ def _reconstruction(folder: Path) -> JointMotion:
 
 
 def _hips(skeleton: JointMotion) -> JointMotion | None:
-    """The middle of the hips of the first person, [T, 1, 1, 3]."""
+    """Compute the middle of the hips of the first person, [T, 1, 1, 3]."""
     names = ("hip",) if "hip" in skeleton.joints else _HIPS
     if not set(names) <= set(skeleton.joints):
         return None
@@ -205,7 +211,7 @@ def _actor(
     reconstructed: StageRecord | None,
     warnings: list[str],
 ) -> tuple[Int64, Float, Source]:
-    """What planners are told of the actor: the log, or where there is none the reconstructed hips."""
+    """Return the planners' input of the actor: the log, or without one the reconstructed hips."""
     logged = logged_actor(folder, description)
     if logged is not None and description.actor is not None:
         if description.actor.point in ("feet", "head"):
@@ -242,7 +248,7 @@ def _measured(folder: Path, t_ns: Int64, position: Float, what: str) -> tuple[In
 
 
 def _cut(folder: Path, t_ns: Int64, actor: Float, spans: dict[str, NDArray[np.int64]]) -> tuple[Int64, Float]:
-    """The actor while all else is known."""
+    """Cut the actor to the time in which all else is known."""
     first_ns = max([int(t_ns[0]), *(int(span[0]) for span in spans.values())])
     last_ns = min([int(t_ns[-1]), *(int(span[1]) for span in spans.values())])
     kept = (t_ns >= first_ns) & (t_ns <= last_ns)
@@ -282,7 +288,7 @@ def _cameras(
 
 
 def _true_poses(folder: Path, description: Description) -> dict[str, Trajectory]:
-    """Where every camera really was, if that is known of all of them."""
+    """Return the true poses of all cameras, if all of them are known."""
     moving = {name for name, entry in description.cameras.items() if not entry.poses.static}
     if description.truth is None or not moving or not moving <= set(description.truth.cameras):
         return {}
@@ -291,7 +297,7 @@ def _true_poses(folder: Path, description: Description) -> dict[str, Trajectory]
 
 
 def _planned(folder: Path, description: Description) -> dict[str, tuple[Int64, Float]]:
-    """Where the on-board planner sent each camera of the session."""
+    """Read the positions to which the on-board planner sent each camera of the session."""
     if not description.plan:
         return {}
     table = read_table(folder / "plan.parquet", PLAN)
@@ -305,7 +311,7 @@ def _planned(folder: Path, description: Description) -> dict[str, tuple[Int64, F
 def _noise(
     name: str, entry: CameraEntry, logged: Trajectory, pose_noise: str | None
 ) -> tuple[tuple[NoiseModel, ...], str]:
-    """What is wrong with a camera's poses, and who says so."""
+    """Return the errors of a camera's poses, and the source of that statement."""
     models = stated_models(name, entry, pose_noise)
     if models is not None:
         return tuple(models), COMMAND_LINE if pose_noise else "flight.yaml"
@@ -321,7 +327,10 @@ def _said_by(stating: set[str]) -> str:
 
 
 def _logged_sigma(trajectory: Trajectory) -> tuple[float, float] | None:
-    """Median standard deviation per axis (m, rad) of the logged covariances; None where they say nothing."""
+    """Compute the median standard deviation per axis (m, rad) of the logged covariances.
+
+    None if they contain no information.
+    """
     if trajectory.covariance is None:
         return None
     variances, known_axes = known_variances(trajectory.covariance)

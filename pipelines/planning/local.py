@@ -1,4 +1,4 @@
-"""Each drone's own trajectory: covariant gradient descent about the slots (Bonatti et al. 2020; CHOMP).
+"""Trajectory of each drone: covariant gradient descent about the slots (Bonatti et al. 2020; CHOMP).
 
 J = J_smooth + l_obs J_obs + l_occ J_occ + l_form J_form + l_sep J_sep over N waypoints, start fixed by
 position and velocity, end free (t_f = N step_s):
@@ -9,9 +9,9 @@ position and velocity, end free (t_f = N step_s):
     J_occ     int int c(p; eps_occ) |dp| s dt along the sight line, up to `sight_start_m` from the actor
     J_sep     1/t_f int sum max(0, soft - distance)^2 / 2 over the other drones' latest plans
 
-c is CHOMP's hinge of the signed distance. With s = |v| (v0 = 0, as published) a drone that stands feels no
-obstacle at all. Gradients are exact derivatives of the discretised sums, so that a step that follows them
-lowers what is compared; in the limit they are the functional gradients of the papers.
+c is CHOMP's hinge of the signed distance. With s = |v| (v0 = 0, as published) obstacles have no effect on a
+drone at rest. Gradients are exact derivatives of the discretised sums, so that a small step along them lowers
+the cost that is compared. In the limit they are the functional gradients of the papers.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from pipelines.planning.tracking import Plan
 Float = NDArray[np.float64]
 
 TERMS = ("smooth", "form", "obs", "occ", "sep")
-_ASTRAY_M = 3.0  # who plans to be farther off the slot in the end may be caught in a local minimum
-_ROUNDS = 10  # of pushing apart, each a little farther than the one before
+_ASTRAY_M = 3.0  # a plan that ends farther off the slot may be in a local minimum
+_ROUNDS = 10  # of projection, each a little farther than the one before
 _MARGIN_M = 0.1  # projected waypoints keep this much more than the least distance
 
 
 class Separation(StrEnum):
-    """What it took to keep the distance to the other drones' plans."""
+    """Action taken to keep the distance to the other drones' plans."""
 
     KEPT = "kept"
     PROJECTED = "projected"  # waypoints were pushed apart
-    REJECTED = "rejected"  # that did not help: the plan before goes on
-    BROKEN = "broken"  # nor does that keep the distance; the better of both is flown
+    REJECTED = "rejected"  # projection failed: the previous plan goes on
+    BROKEN = "broken"  # the previous plan fails as well; the plan with the largest distance is flown
 
 
 @dataclass(frozen=True)
 class LocalPlan:
-    """What the local planner decided."""
+    """Result of the local planner."""
 
     plan: Plan
     cost: float  # of the optimised path, before any projection
@@ -56,7 +56,7 @@ class LocalPlan:
 
 
 class LocalPlanner:
-    """The optimiser of one configuration; factorises its metric once and keeps no other state."""
+    """The optimiser of one configuration; it factorises its metric once and keeps no other state."""
 
     def __init__(self, config: PlannerConfig) -> None:
         self._config = config
@@ -75,17 +75,17 @@ class LocalPlanner:
         field: DistanceField,
         previous: Plan | None,
     ) -> LocalPlan:
-        """Plan from here.
+        """Plan from the drone's place and velocity.
 
         Args:
             t_s: now.
             position: [3] metres, world.
             velocity: [3] m/s.
-            slots: [N, 3] where the drone should be at each waypoint's time.
-            actor: [N, 3] where the actor will be then.
+            slots: [N, 3] wanted places of the drone at each waypoint's time.
+            actor: [N, 3] forecast of the actor then.
             others: the latest plans of the other drones.
-            field: what stands around.
-            previous: this drone's plan before, to begin with; the slots where there is none.
+            field: the distance field of the obstacles.
+            previous: this drone's previous plan, the initial guess; without one it is the slots.
         """
         config = self._config
         times = t_s + config.waypoint_s * np.arange(1, config.waypoints + 1, dtype=np.float64)
@@ -93,7 +93,7 @@ class LocalPlanner:
         guess = slots if previous is None else previous.at(times)[0]
         path, cost, evaluations = self._descended(position, velocity, guess, slots, actor, waypoints, field)
         if previous is not None and np.linalg.norm(path[-1] - slots[-1]) > _ASTRAY_M:
-            # Caught behind something: begin once more where the drone should be, and take what is better.
+            # Caught behind something: descend once more from the slots, and take the better result.
             other = self._descended(position, velocity, slots, slots, actor, waypoints, field)
             evaluations += other[2]
             if other[1] < cost:
@@ -112,7 +112,7 @@ class LocalPlanner:
         others: Float,
         field: DistanceField,
     ) -> tuple[Float, float, int]:
-        """What becomes of a guess [N, 3]: path [N + 3, 3], cost, evaluations. `others` [M, N + 1, 3]."""
+        """Descend from a guess [N, 3]: path [N + 3, 3], cost, evaluations. `others` is [M, N + 1, 3]."""
         config = self._config
         return descend(
             _with_start(position, velocity, guess, config.waypoint_s),
@@ -138,7 +138,7 @@ class LocalPlanner:
         others: Float,
         field: DistanceField,
     ) -> tuple[float, dict[str, float], Float]:
-        """The cost of waypoints [N, 3]: in total, its unweighted terms, and the gradient [N, 3].
+        """Compute the cost of waypoints [N, 3]: in total, its unweighted terms, and the gradient [N, 3].
 
         `others` [M, N, 3] are the other drones' waypoints; the rest is as in `plan`.
         """
@@ -155,14 +155,14 @@ class LocalPlanner:
 
 
 def closest_approach(path: Float, others: Float) -> float:
-    """The least distance in metres between points that fly straight from waypoint to waypoint.
+    """Compute the least distance in metres between points that fly straight between waypoints.
 
     Args:
         path: [N + 1, 3].
         others: [M, N + 1, 3] at the same times.
 
     Returns:
-        inf where there is nobody else.
+        inf without other drones.
     """
     apart = path - others
     start, way = apart[:, :-1], np.diff(apart, axis=1)
@@ -173,7 +173,7 @@ def closest_approach(path: Float, others: Float) -> float:
 
 
 def _with_start(position: Float, velocity: Float, waypoints: Float, step_s: float) -> Float:
-    """[N + 3, 3]: where the drone was and is at its velocity, and the waypoints."""
+    """Return [N + 3, 3]: past and present positions at the drone's velocity, and the waypoints."""
     back = np.array([-2.0, -1.0, 0.0])[:, None] * step_s
     return np.concatenate([position + back * velocity, waypoints])
 
@@ -185,7 +185,7 @@ def _nobody(times: Float) -> Float:
 def _keep_apart(
     path: Float, others: Float, old: Float | None, field: DistanceField, least_m: float
 ) -> tuple[Float, Separation]:
-    """The path [N + 1, 3], if need be pushed away from the others' [M, N + 1, 3], or the one before."""
+    """Return the path [N + 1, 3], pushed away from the others' [M, N + 1, 3] if need be, or the old one."""
     if closest_approach(path, others) >= least_m:
         return path, Separation.KEPT
     pushed = _pushed_apart(path, others, least_m + _MARGIN_M)
@@ -199,11 +199,11 @@ def _keep_apart(
 
 
 def _pushed_apart(path: Float, others: Float, least_m: float) -> Float:
-    """Waypoints moved aside until no way between them comes nearer to the others, the start excepted.
+    """Move waypoints aside until no way between them comes nearer to the others. The start stays.
 
-    All that are near to another drone go the same way, along the line that joins the two where they are
-    nearest. Each straight away from the other would send those before and behind a crossing to its two
-    ends, and the drone through the middle.
+    All waypoints near another drone move in the same direction, along the line that joins the two drones at
+    their nearest. If each moved straight away from the other drone, those before and behind a crossing would
+    move to opposite sides, and the drone would fly through the middle.
     """
     pushed = path.copy()
     for round_ in range(_ROUNDS):
@@ -223,13 +223,13 @@ def _pushed_apart(path: Float, others: Float, least_m: float) -> Float:
 
 
 def _way_aside(apart: Float) -> Float:
-    """Unit vector [3] from the other drone to this one where [N + 1, 3] comes nearest to zero."""
+    """Return the unit vector [3] from the other drone to this one where [N + 1, 3] is nearest to zero."""
     start, way = apart[:-1], np.diff(apart, axis=0)
     u = np.clip(-np.sum(start * way, axis=1) / np.maximum(np.sum(way**2, axis=1), 1e-12), 0.0, 1.0)
     nearest = start + u[:, None] * way
     k = int(np.argmin(np.sum(nearest**2, axis=1)))
     aside = nearest[k]
-    if np.sum(aside**2) < 1e-6:  # straight through each other: to the left of the way, or east
+    if np.sum(aside**2) < 1e-6:  # straight through each other: push to the left of the way, or east
         aside = np.array([-way[k, 1], way[k, 0], 0.0])
     length = float(np.sqrt(np.sum(aside**2)))
     return aside / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])

@@ -24,7 +24,7 @@ _SLOWEST_STEP, _FASTEST_STEP = (
 
 
 class Weights(NamedTuple):
-    """What the local planner weighs, by name; see `PlannerConfig`."""
+    """Weights of the local planner, by name; see `PlannerConfig`."""
 
     l_obs: float
     l_occ: float
@@ -44,7 +44,7 @@ class Weights(NamedTuple):
 
 @helper
 def _hinge(distance: float, eps: float) -> tuple[float, float]:
-    """CHOMP's obstacle cost of a signed distance, and its derivative."""
+    """Compute CHOMP's obstacle cost of a signed distance, and its derivative."""
     if distance < 0.0:
         return eps / 2.0 - distance, -1.0
     if distance <= eps:
@@ -54,7 +54,10 @@ def _hinge(distance: float, eps: float) -> tuple[float, float]:
 
 @helper
 def _add_smoothness(path: Float, w: Weights, gradient: Float) -> float:
-    """Squared velocity, acceleration and jerk; `path` [N + 3, 3] begins with three fixed points."""
+    """Compute the squared velocity, acceleration and jerk, and add to the gradient.
+
+    `path` [N + 3, 3] begins with three fixed points.
+    """
     n = gradient.shape[0]
     h1 = 1.0 / w.step_s
     h2, h3 = h1 * h1, h1 * h1 * h1
@@ -78,7 +81,7 @@ def _add_smoothness(path: Float, w: Weights, gradient: Float) -> float:
 
 @helper
 def _sight_cost(grid: Grid, q: Float, actor: Float, w: Weights) -> tuple[float, float, float, float]:
-    """Hinge cost along the sight line, times its length, and the gradient by the drone's position q.
+    """Compute the hinge cost along the sight line, times its length, and its gradient by the position q.
 
     Points p = q + sigma (L - r L/|L|), L = actor - q, sigma in 0..1: the line ends r off the actor, and
     moves with q by (1 - sigma) I + sigma r/|L| (I - LL'/|L|^2), so that the cost has no steps.
@@ -96,7 +99,7 @@ def _sight_cost(grid: Grid, q: Float, actor: Float, w: Weights) -> tuple[float, 
         sigma = (k + 0.5) / w.samples
         along = sigma * reach
         x, y, z = q[0] + along * lx, q[1] + along * ly, q[2] + along * lz
-        # Far from everything the nearest voxel says enough: there, and as far on, nothing costs.
+        # Far from obstacles the nearest voxel is enough: the cost is zero there and within that distance.
         spare = nearest(grid, x, y, z) - w.eps_occ_m - DIAGONAL * grid.resolution_m
         if spare > 0.0:
             k += 1 + max(0, int((spare - 0.5 * DIAGONAL * grid.resolution_m) / step))
@@ -128,7 +131,7 @@ def _total(
     terms: Float,
     gradient: Float,
 ) -> float:
-    """Cost of a path [N + 3, 3]; fills `terms`, in the order of `local.TERMS`, and `gradient`."""
+    """Compute the cost of a path [N + 3, 3]; fill `terms`, in the order of `local.TERMS`, and `gradient`."""
     n = slots.shape[0]
     gradient[:] = 0.0
     terms[:] = 0.0
@@ -192,13 +195,16 @@ def evaluate(
     terms: Float,
     gradient: Float,
 ) -> float:
-    """`_total`, for who wants to look: cost of path [N + 3, 3], terms [5] and gradient [N, 3] filled."""
+    """Compute `_total`, for inspection: cost of path [N + 3, 3]; fill terms [5] and gradient [N, 3]."""
     return _total(path, slots, actor, others, grid, w, terms, gradient)
 
 
 @cached
 def factorise(n: int, w: Weights) -> Float:
-    """Cholesky factor of (A_smooth + l_form I)/N, banded: [N, 4], column b holds L[i, i - b]."""
+    """Compute the Cholesky factor of (A_smooth + l_form I)/N, banded: [N, 4].
+
+    Column b holds L[i, i - b].
+    """
     h = 1.0 / w.step_s
     stencil = np.array([[1.0, -1.0, 0.0, 0.0], [1.0, -2.0, 1.0, 0.0], [1.0, -3.0, 3.0, -1.0]])
     weight = np.array([w.a_velocity * h**2, w.a_acceleration * h**4, w.a_jerk * h**6])
@@ -249,7 +255,7 @@ def descend(
     tolerance: float,
     step_cap_m: float,
 ) -> tuple[Float, float, int]:
-    """Improve a path [N + 3, 3]: the new path, its cost, and how many evaluations it took."""
+    """Improve a path [N + 3, 3]; return the new path, its cost, and the number of evaluations."""
     n = slots.shape[0]
     path, tried = path.copy(), path.copy()
     gradient, tried_gradient, step = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))

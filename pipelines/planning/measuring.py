@@ -1,7 +1,7 @@
-"""What cameras on given paths would have measured of a skeleton: seen, detected, logged, triangulated.
+"""Simulated measurements of a skeleton by cameras on given paths: seen, detected, logged, triangulated.
 
-Simulated: which joints are visible is exact, by field of view and map; what a detector makes of them and
-what the log makes of the poses is drawn, from the same seeds for every arm of a comparison.
+The visibility of joints is exact, by field of view and map. The errors of the detector and of the logged
+poses are random, with the same seeds for every arm of a comparison.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ Int64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 PIXEL_SIGMA = 3.0
-"""Standard deviation of a good keypoint that triangulation is told: what `mocap reconstruct` begins with."""
+"""Standard deviation of a good keypoint for triangulation, px: the first value in `mocap reconstruct`."""
 MIN_CONFIDENCE = 0.3
-"""Keypoints below are not used, likewise."""
+"""Least confidence of keypoints that are used, as in `mocap reconstruct`."""
 
 
 class Detect(Protocol):
-    """What a keypoint detector makes of one camera's pictures."""
+    """Function that simulates a keypoint detector on one camera's pictures."""
 
     def __call__(
         self,
@@ -43,56 +43,56 @@ class Detect(Protocol):
         focal_px: float,
         rng: np.random.Generator,
     ) -> tuple[Float, Float]:
-        """Keypoints [T, J, 2] px (NaN: missed) and confidences [T, J].
+        """Return keypoints [T, J, 2] px (NaN: missed) and confidences [T, J].
 
         Args:
             pixels: [T, J, 2] exact, NaN outside the picture.
-            free: [T, J] nothing hides the joint.
+            free: [T, J] True where nothing hides the joint.
             camera: [T, 3] m, world.
             target: [T, 3] m, world, the person's middle.
             focal_px: of the camera.
-            rng: draws as many numbers whatever is seen.
+            rng: draws as many numbers for any visibility.
         """
 
 
 @dataclass(frozen=True)
 class Filming:
-    """Cameras N on their paths at the times T of their pictures, and who they film."""
+    """Cameras N on their paths at the times T of their pictures, and the filmed person."""
 
     t_ns: Int64  # [T]
     position: Float  # [N, T, 3] m, world
     quaternion_xyzw: Float  # [N, T, 4] world_from_camera
-    known: Bool  # [N, T] whether the camera has a pose then; without one its picture is of no use
+    known: Bool  # [N, T] True where the camera has a pose; other pictures are not used
     intrinsics: Sequence[Intrinsics]
     noise: Sequence[Sequence[NoiseModel]]
-    joints: Float  # [T, J, 3] m, world; NaN where nobody knows
+    joints: Float  # [T, J, 3] m, world; NaN where unknown
     middle: Float  # [T, 3] m, world, of the person
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What was made of it."""
+    """Result of the simulated measurements."""
 
-    error_m: Float32  # [trials, T, J]; NaN where the joint was not measured or nobody knows the truth
+    error_m: Float32  # [trials, T, J]; NaN where the joint was not measured or the truth is unknown
     first: Float  # [T, J, 3] the measured joints of the first trial
     seen_share: float  # of known joints and cameras: in the picture and not hidden
     joint_frames: int  # with a truth
-    pixels: Float  # [N, T, J, 2] where the joints are in the pictures; NaN outside, or where nobody knows
-    free: Bool  # [N, T, J] nothing stands between camera and joint
+    pixels: Float  # [N, T, J, 2] px of the joints in the pictures; NaN outside, or where unknown
+    free: Bool  # [N, T, J] True where nothing stands between camera and joint
 
 
 def film(
     filming: Filming, field: DistanceField, detect: Detect, *, start_m: float, trials: int, seed: int
 ) -> Measured:
-    """Measure a skeleton, several times over.
+    """Measure a skeleton in several trials.
 
     Args:
         filming: cameras and person.
-        field: what stands in the way.
+        field: the distance field of the obstacles.
         detect: the detector.
         start_m: the end of sight lines next to the joint that is left out: maps contain the person.
         trials: independent draws of all noise.
-        seed: where they come from. Trial k of camera i has the same numbers for any other path.
+        seed: of the random numbers. Trial k of camera i has the same numbers for any other path.
     """
     joints = filming.joints
     cameras, times, count = len(filming.position), *joints.shape[:2]
@@ -139,7 +139,7 @@ def film(
 
 
 def _pixels(filming: Filming, i: int) -> Float:
-    """Exact pixels [T, J, 2] of one camera; NaN outside its picture and where it has no pose."""
+    """Compute the exact pixels [T, J, 2] of one camera; NaN outside its picture and where it has no pose."""
     lens = filming.intrinsics[i]
     camera_from_world = invert(filming.position[i, :, None], filming.quaternion_xyzw[i, :, None])
     pixels = project(transform(camera_from_world, filming.joints), lens)
@@ -148,7 +148,7 @@ def _pixels(filming: Filming, i: int) -> Float:
 
 
 def _pose_sigma(filming: Filming, i: int) -> Float:
-    """[T, 2] per axis (m, rad), what triangulation is told of one camera's poses."""
+    """Compute the sigmas [T, 2] per axis (m, rad) of one camera's poses for triangulation."""
     path, turned = filming.position[i], filming.quaternion_xyzw[i]
     elapsed_s = (filming.t_ns - filming.t_ns[0]) / 1e9
     return sum_sigma(filming.noise[i], elapsed_s, *rates(filming.t_ns, path, turned))

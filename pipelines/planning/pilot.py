@@ -1,4 +1,4 @@
-"""The planner as it flies: measurements in, references out, replanning when it is time."""
+"""The planner in flight: it takes measurements, replans at fixed rates, and returns references."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NOW_S = 1e-6  # times are sums of periods: due this much early is due
 
 @dataclass(frozen=True)
 class Command:
-    """What the drones are asked for at one time; [N, 3] metres, world, but for the slots."""
+    """Commands to the drones at one time; [N, 3] metres, world, but for the slots."""
 
     position: Float
     velocity: Float
@@ -45,17 +45,17 @@ class PlanningTimes:
 
 
 class Pilot:
-    """One arm in flight: call `measure` whenever the actor was measured and `step` at the tracking rate.
+    """One arm in flight. Call `measure` at each measurement and `step` at the tracking rate.
 
     Central planning, local planning and tracking have the rates of the configuration, counted from the
     first step. Drones plan one after the other, each with the latest plans of the others.
 
     Args:
-        arm: which slots the cameras take.
+        arm: the planner of the cameras' slots.
         config: weights and rates.
-        drones: how many, 1 to 16.
+        drones: number of drones, 1 to 16.
         yaw_rad: of the first camera at the start, counterclockwise from east.
-        heading_rad: where the actor heads before walking, if `yaw_frame` is `heading`; likewise.
+        heading_rad: the actor's heading before walking, if `yaw_frame` is `heading`; likewise.
         clock: seconds, for `times`.
 
     Raises:
@@ -87,27 +87,30 @@ class Pilot:
         self._plans: list[Plan | None] = [None] * drones
         self._next_central_s = self._next_local_s = -np.inf
         self.guard: Guard | None = None
-        """Decides what is flown of the local plans, where somebody set it: a replay does."""
+        """Filter of the local plans: it decides which motion is flown. Set by a replay; None otherwise."""
         self.times = PlanningTimes([], [])
         self.separation: Counter[Separation] = Counter()
 
     def measure(self, t_s: float, position: Float) -> None:
-        """The actor was at [3] metres, world (the middle of the hips), at a time that never goes back."""
+        """Take in the actor's position [3] metres, world (the middle of the hips).
+
+        Times must not go back.
+        """
         self._filter.measure(t_s, position)
 
     def slots_now(self, t_s: float) -> tuple[Float, Float]:
-        """Commanded slots [N, 3], and where they are by the actor's estimate, [N, 3] metres, world."""
+        """Return commanded slots [N, 3], and their places about the actor's estimate, [N, 3] m, world."""
         slots = self._slots_at(np.array([t_s]))[0]
         return slots, self._filter.forecast(np.array([t_s]))[0] + slot_offsets(slots)
 
     def step(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> Command:
-        """Replan what is due, and return what to fly now.
+        """Replan what is due, and return the commands for now.
 
         Args:
             t_s: now; at or after the latest measurement, of which there must be one.
-            position: [N, 3] metres, world, where the drones are.
+            position: [N, 3] metres, world, of the drones.
             velocity: [N, 3] m/s.
-            field: what is known of the surroundings now.
+            field: the distance field of the obstacles that are known now.
         """
         self.replan(t_s, position, velocity, field)
         return Command(*self.reference(t_s), *self.wanted(t_s))
@@ -123,18 +126,18 @@ class Pilot:
             self._plan_locally(t_s, position, velocity, field)
 
     def wanted(self, t_s: float) -> tuple[Float, Float]:
-        """Commanded slots [N, 3], yaw from east, and the actor's estimate [3] that cameras aim at."""
+        """Return commanded slots [N, 3], yaw from east, and the actor's estimate [3] that cameras aim at."""
         now = np.array([t_s])
         return self._slots_at(now)[0], self._filter.forecast(now)[0]
 
     def reference(self, t_s: float) -> tuple[Float, Float, Float]:
-        """Position, velocity and acceleration [N, 3] of the latest local plans, after the first step."""
+        """Return position, velocity, acceleration [N, 3] of the latest local plans, after the first step."""
         asked = [plan.at(np.array([t_s])) for plan in self._plans if plan is not None]
         where, speed, change = (np.concatenate(part) for part in zip(*asked, strict=True))
         return where, speed, change
 
     def _slots_at(self, t_s: Float) -> Float:
-        """Commanded slots [T, N, 3], their yaws from east."""
+        """Return commanded slots [T, N, 3], their yaws from east."""
         slots = self._formation.at(t_s)
         return turned(slots, self._zero.at(t_s)) if self._config.yaw_frame == "heading" else slots
 

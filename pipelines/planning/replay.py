@@ -1,4 +1,4 @@
-"""Flying an arm again, offline: against the actor that was logged and the maps that were known then."""
+"""Offline replay of an arm, with the logged actor and the maps that were known at each time."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ class ReplayResult:
     quaternion_xyzw: Float  # [N, T, 4] world_from_camera, aimed at the estimate
     slots: Float  # [N, T, 3] commanded: yaw (rad from east, continuous), tilt (rad), range (m)
     tilt_rad: Float  # [N, T] flown, above the logged actor
-    visible: Bool  # [N, T] nothing stands between camera and logged actor, by the last map
+    visible: Bool  # [N, T] True where nothing is between camera and logged actor, by the last map
     actor: Float  # [T, 3] the log, interpolated
-    estimate: Float  # [T, 3] what the planner believed
-    separation: dict[str, int]  # local plans by what kept them apart
-    safety: dict[str, int]  # local plannings by what was flown (`guard.Flown`)
+    estimate: Float  # [T, 3] the planner's estimate of the actor
+    separation: dict[str, int]  # local plans by `Separation`
+    safety: dict[str, int]  # local plannings by `guard.Flown`
     times: PlanningTimes  # measured, different from run to run
 
     @property
     def t_s(self) -> Float:
-        """[T] seconds since the start."""
+        """Seconds [T] since the start."""
         seconds: Float = (self.t_ns - self.t_ns[0]) / 1e9
         return seconds
 
     @property
     def formation_yaw_rad(self) -> Float:
-        """[T] the yaw of the first camera's slot, continuous."""
+        """Yaw [T] of the first camera's slot, continuous."""
         return self.slots[0, :, YAW]
 
 
@@ -70,24 +70,24 @@ def replay(
     seed: int = 0,
     clock: Callable[[], float] = perf_counter,
 ) -> ReplayResult:
-    """Fly an arm against a log; equal arguments give equal results, but for the measured times.
+    """Fly an arm against a log. Equal arguments give equal results, but for the measured times.
 
     The drones start in their slots, at rest, and fly what `guard.Guard` admits. The actor is measured as
-    logged, with `actor_noise_m` added from the seed; nothing sees a measurement or map before its time.
+    logged, with `actor_noise_m` added from the seed; no measurement or map is used before its time.
 
     Args:
-        arm: which slots the cameras take.
+        arm: the planner of the cameras' slots.
         actor_t_ns: [A] stamps of the log, ascending, at least two.
         actor: [A, 3] metres, world, the middle of the hips; rows with NaN were not measured.
         fields: the maps by the time from which they hold; before the first one nothing is known.
         config: weights and rates, the same for all arms of a comparison.
-        drones: how many cameras.
+        drones: number of cameras.
         yaw_rad: of the first camera at the start, counterclockwise from east.
-        heading_rad: where the actor heads before walking, if `yaw_frame` is `heading`; likewise.
-        mode: `closed-loop` flies point masses with limited acceleration; `plan-only` puts the drones
-            exactly where their local plans want them.
+        heading_rad: the actor's heading before walking, if `yaw_frame` is `heading`; likewise.
+        mode: `closed-loop` flies point masses with limited acceleration; `plan-only` puts the drones exactly
+            on their local plans.
         seed: of the noise.
-        clock: seconds, for how long planning takes.
+        clock: seconds, to measure planning times.
 
     Raises:
         ValueError: times that do not ascend, or fewer than two measurements.
@@ -138,14 +138,14 @@ def replay(
 
 
 def replay_times(actor_t_ns: Int64, config: PlannerConfig) -> Int64:
-    """The times [T] of a replay: every tracking step from the first measurement to the last."""
+    """Return the times [T] of a replay: every tracking step from the first measurement to the last."""
     first_ns, last_ns = int(actor_t_ns[0]), int(actor_t_ns[-1])
     period_ns = round(1e9 / config.tracking_hz)
     return first_ns + period_ns * np.arange((last_ns - first_ns) // period_ns + 1, dtype=np.int64)
 
 
 def _checked(t_ns: Int64, actor: Float) -> tuple[Int64, Float]:
-    """The rows that were measured."""
+    """Return the rows that were measured."""
     rows = np.isfinite(actor).all(axis=1)
     t_ns, actor = t_ns[rows], actor[rows]
     if len(t_ns) < 2 or (np.diff(t_ns) <= 0).any():

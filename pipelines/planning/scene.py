@@ -1,4 +1,4 @@
-"""What all arms of a comparison share: the actor, the maps, the cameras and the times."""
+"""Data that all arms of a comparison share: the actor, the maps, the cameras and the times."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ Bool = NDArray[np.bool_]
 
 MOST_DRONES = 8
 PICTURES_HZ = 25.0
-"""Near enough to the 30 for which the detector's errors are modelled."""
+"""Rate of the pictures: near enough to the 30 Hz for which the detector's errors are modelled."""
 _COST_MAP_HZ, _COST_MAP_YAWS = 2.0, 72
 
 
 @dataclass(frozen=True)
 class Rules:
-    """How arms are compared; None is what the session says."""
+    """Rules of a comparison; None takes the session's value."""
 
     config: PlannerConfig
     drones: int | None = None
-    yaw_rad: float | None = None  # from what yaws count from at the start
+    yaw_rad: float | None = None  # of the first camera at the start, from the zero of yaws
     mode: Mode = "closed-loop"
     trials: int = 20
     seed: int = 0
@@ -49,13 +49,13 @@ class Scene:
     rules: Rules
     drones: int
     yaw_rad: float  # of the first camera at the start, from east
-    heading_rad: float  # where the actor first walks, from east; 0 where yaws count from east
+    heading_rad: float  # of the actor's first way, from east; 0 where yaws count from east
     t_ns: Int64  # [T]
-    actor: Float  # [T, 3] what is scored against
+    actor: Float  # [T, 3] reference of the scores
     actor_source: Source
     fields: tuple[DistanceField, ...]  # by the time from which they hold
-    flown: tuple[Float, Float, Bool]  # positions [C, T, 3], quaternions [C, T, 4], whether logged [C, T]
-    notes: tuple[str, ...]  # what was chosen
+    flown: tuple[Float, Float, Bool]  # positions [C, T, 3], quaternions [C, T, 4], mask of logged ones [C, T]
+    notes: tuple[str, ...]  # choices made for the user
     warnings: tuple[str, ...]
 
     @property
@@ -65,51 +65,51 @@ class Scene:
 
     @property
     def t_s(self) -> Float:
-        """[T] seconds since the start."""
+        """Seconds [T] since the start."""
         seconds: Float = (self.t_ns - self.t_ns[0]) / 1e9
         return seconds
 
     @property
     def field(self) -> DistanceField:
-        """What stands around, as it is known in the end."""
+        """Distance field of the last map."""
         return self.fields[-1] if self.fields else open_space()
 
     @property
     def cameras(self) -> list[SessionCamera]:
-        """What each drone carries: the session's cameras, and then the same again."""
+        """Camera of each drone: the session's cameras, and then the same again."""
         cameras = self.flight.cameras
         return [cameras[k % len(cameras)] for k in range(self.drones)]
 
     @property
     def names(self) -> list[str]:
-        """What the drones are called: as the session's cameras, and then drone1, ... as far as free."""
+        """Names of the drones: those of the session's cameras, and then drone1, ... as far as free."""
         own = [camera.name for camera in self.flight.cameras]
         free = [f"drone{k + 1}" for k in range(self.drones + len(own)) if f"drone{k + 1}" not in own]
         return [*own, *free][: self.drones]
 
     @property
     def stretch(self) -> Int64:
-        """[T] the stretch of the flight that each moment belongs to."""
+        """Stretch [T] of the flight that each moment belongs to."""
         return stretches(self.t_s)
 
     @property
     def pictures(self) -> slice:
-        """The times at which pictures are taken."""
+        """Times at which pictures are taken."""
         return slice(None, None, max(round(self.config.tracking_hz / PICTURES_HZ), 1))
 
     @cached_property
     def near(self) -> Bool:
-        """[T] when an obstacle is near a slot of the formation of the start: the same for all arms."""
+        """True [T] while an obstacle is near a slot of the formation of the start: the same for all arms."""
         return near_obstacle(self.t_s, self._first_slots(), self.actor, self.field)
 
     @cached_property
     def joints(self) -> Float | None:
-        """[P, J, 3] the person at the times of the pictures; None where no skeleton is known."""
+        """Joints [P, J, 3] of the person at the times of the pictures; None where no skeleton is known."""
         skeleton = self.flight.skeleton
         return None if skeleton is None else points_at(skeleton, self.t_ns[self.pictures])
 
     def _first_slots(self) -> Float:
-        """[N, T, 3] where the slots of the start's formation are."""
+        """Compute the places [N, T, 3] of the slots of the start's formation."""
         slots = formation_slots(
             np.array(self.yaw_rad), self.drones, tilt_rad=self.config.tilt_rad, range_m=self.config.radius_m
         )
@@ -122,12 +122,12 @@ class Scene:
 
     @property
     def field_at_start(self) -> DistanceField:
-        """What is known when the replay begins."""
+        """Distance field that is known when the replay begins."""
         known = [field for field in self.fields if field.from_ns <= self.t_ns[0]]
         return known[-1] if known else open_space()
 
     def cost_map(self) -> tuple[Int64, Float, Float]:
-        """Times [M], yaws [D] of the first camera, and what the formation would cost there [M, D]."""
+        """Compute times [M], yaws [D] of the first camera, and the formation's cost [M, D] there."""
         rows = slice(None, None, max(round(self.config.tracking_hz / _COST_MAP_HZ), 1))
         yaws = yaw_set(_COST_MAP_YAWS, self.yaw_rad)
         slots = formation_slots(
@@ -143,7 +143,7 @@ def build_scene(
     description: Description,
     rules: Rules,
 ) -> Scene:
-    """Prepare a comparison: distance fields, times, where the first camera starts, and what is doubtful."""
+    """Prepare a comparison: distance fields, times, the first camera's start, and warnings."""
     notes = []
     unknown: Unknown = "occupied" if description.map and description.map.unknown == "occupied" else "free"
     fields = tuple(
@@ -185,7 +185,7 @@ def build_scene(
 
 
 def _doubts(scene: Scene) -> list[str]:
-    """What is amiss with the maps, the start and the skeleton, one line each."""
+    """List problems of the maps, the start and the skeleton, one line each."""
     doubts = []
     fields = scene.fields
     if fields and not scene.field.has_obstacles:

@@ -1,4 +1,4 @@
-"""What a flight was like: the same figures for every arm, replayed or flown (positions over time in)."""
+"""Scores of a flight from positions over time: the same figures for every arm, replayed or flown."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Scores = dict[str, object]
 NEAR_OBSTACLE_M = 15.0
 _MOTION_HZ = 10.0  # speed, acceleration and jerk are means over this period: plans change at 5 Hz
 _ROUNDING = 1.0 + 1e-6  # differences of positions; drones fly at their limits
-_LOOKS_PER_S = 5.0  # how often obstacles near the slots are looked for
+_LOOKS_PER_S = 5.0  # rate of the search for obstacles near the slots
 
 
 def score(
@@ -32,15 +32,15 @@ def score(
     *,
     near: Bool | None = None,
 ) -> Scores:
-    """Figures of one flight.
+    """Compute the figures of one flight.
 
     Args:
         t_s: [T] seconds, ascending, at least four of them over half a second or more.
         position: [N, T, 3] metres, world, the cameras; finite.
         actor: [T, 3] metres, world; finite.
-        field: what stands around, as well as it is known in the end.
+        field: the distance field of the last map.
         config: limits, `sight_start_m` and the ray model.
-        near: [T] when an obstacle is near (see `near_obstacle`); the same for all arms of a comparison.
+        near: [T] True while an obstacle is near (see `near_obstacle`); the same for all arms of a comparison.
 
     Returns:
         JSON-able: degrees and metres by name; None where there is nothing to count (no pair of drones,
@@ -92,24 +92,24 @@ def score(
 
 
 def predicted_errors(position: Float, actor: Float, field: DistanceField, config: PlannerConfig) -> Float:
-    """[T] sqrt(tr S) in metres of the free views, inf where they do not determine a point."""
+    """Compute sqrt(tr S) [T] in metres of the free views, inf where they do not determine a point."""
     seen = visible(field, position, actor, start_m=config.sight_start_m)
     return predicted_error(_information(position - actor, seen, config))
 
 
 def near_obstacle(t_s: Float, slot_position: Float, actor: Float, field: DistanceField) -> Bool:
-    """When something that stands higher than the actor's hips is within 15 m of a slot, level distance.
+    """Find the times when something higher than the actor's hips is within 15 m of a slot, level distance.
 
-    The ground is always near; what a drone at a low tilt has to give way to rises above the actor.
+    The ground is always near. Obstacles for a drone at a low tilt rise above the actor.
 
     Args:
         t_s: [T] seconds, ascending.
         slot_position: [N, T, 3] metres, world.
         actor: [T, 3] metres, world.
-        field: what stands around.
+        field: the distance field of the obstacles.
 
     Returns:
-        [T]; looked at five times a second, and so until the next look.
+        [T]; tested five times a second, and constant until the next test.
     """
     grid = field.grid
     occupied = grid.distance_m < 0.0
@@ -134,13 +134,13 @@ def near_obstacle(t_s: Float, slot_position: Float, actor: Float, field: Distanc
 
 
 def _information(offset: Float, seen: Bool, config: PlannerConfig) -> Float:
-    """[T, 3, 3] of all cameras that see the actor."""
+    """Sum the information [T, 3, 3] of all cameras that see the actor."""
     total: Float = (ray_information(offset, config) * seen[..., None, None]).sum(axis=0)
     return total
 
 
 def _motion(t_s: Float, position: Float) -> dict[str, Float]:
-    """Magnitudes [N, ...] of the derivatives, from positions at 10 Hz."""
+    """Compute magnitudes [N, ...] of the derivatives, from positions at 10 Hz."""
     even = np.arange(t_s[0], t_s[-1] + 1e-9, 1.0 / _MOTION_HZ)
     value = np.array([[np.interp(even, t_s, axis) for axis in one.T] for one in position])
     motion = {}
@@ -155,6 +155,6 @@ def _spread(values: Float) -> dict[str, float]:
 
 
 def _episodes(broken: Bool) -> int:
-    """How many times in all [N, T] rows something begins to hold."""
+    """Count how many times, in all [N, T] rows, something begins to hold."""
     before = np.concatenate([np.zeros((len(broken), 1), dtype=np.bool_), broken[:, :-1]], axis=1)
     return int((broken & ~before).sum())

@@ -1,7 +1,7 @@
-"""The best sequence of states through a cost map: dynamic programming over neighbours (Ho et al., Alg. 1).
+"""Cheapest sequence of states through a cost map: dynamic programming over neighbours (Ho et al., Alg. 1).
 
-As printed, the algorithm adds the index of the best neighbour where its value is meant, and leaves out the
-time of the costs. Here V[T] = C[T] and V[t, i] = C[t, i] + min over neighbours j of (V[t + 1, j] + move).
+As printed, the algorithm adds the index of the best neighbour instead of its value, and leaves out the time
+of the costs. Here V[T] = C[T] and V[t, i] = C[t, i] + min over neighbours j of (V[t + 1, j] + move).
 """
 
 from __future__ import annotations
@@ -21,10 +21,9 @@ def lattice(states: Float, *, rates: Float, knot_s: float, w_turn: float) -> Lat
 
     Args:
         states: [S, 3] yaw (rad), tilt (rad), range (m).
-        rates: [3] how fast each may change, per second, above 0: reach does not depend on how fine the
-            lattice is.
+        rates: [3] largest change of each per second, above 0: reach does not depend on the lattice's spacing.
         knot_s: the time between knots.
-        w_turn: what 2 s of change at the full rate cost (45 deg at the default 22.5 deg/s).
+        w_turn: cost of 2 s of change at the full rate (45 deg at the default 22.5 deg/s).
     """
     time_s = _time_between(states[:, None], states, rates)
     reach, cost = time_s.max(axis=-1), w_turn / 2.0 * time_s.sum(axis=-1)
@@ -38,14 +37,14 @@ def lattice(states: Float, *, rates: Float, knot_s: float, w_turn: float) -> Lat
 
 
 def _time_between(start: Float, goal: Float, rates: Float) -> Float:
-    """Seconds that each coordinate needs, [..., 3], broadcast."""
+    """Compute the seconds that each coordinate needs, [..., 3], broadcast."""
     way = goal - start
     way[..., YAW] = wrapped(way[..., YAW])
     return np.abs(way) / rates
 
 
 def best_sequence(cost: Float, grid: Lattice, start: Float) -> tuple[Int64, float]:
-    """The cheapest way through a cost map, and its cost.
+    """Find the cheapest way through a cost map, and its cost.
 
     Args:
         cost: [T, S], finite.
@@ -54,7 +53,7 @@ def best_sequence(cost: Float, grid: Lattice, start: Float) -> tuple[Int64, floa
             or else the nearest state.
 
     Returns:
-        [T] indices of states, and the sum of costs and moves. Ties stay where they are, or go to the
-        nearest.
+        [T] indices of states, and the sum of costs and moves. Ties are broken in favour of the same state, or
+        else the nearest one.
     """
     return cheapest_sequence(np.ascontiguousarray(cost), grid, start)

@@ -1,4 +1,4 @@
-"""The formation search, compiled: what slots cost, and the cheapest sequence of them.
+"""The formation search, compiled: costs of slots, and the cheapest sequence of them.
 
 No threads and no fastmath: the same numbers give the same bytes.
 `costs`, `search` and `arms` are the users and explain the methods.
@@ -33,18 +33,18 @@ _YAW = 0  # of a slot: formation.YAW
 
 
 class Lattice(NamedTuple):
-    """States of a formation (or of one drone), and which of them follow which."""
+    """States of a formation (or of one drone), and the neighbours that can follow each."""
 
     states: Float  # [S, 3] yaw, tilt, range
     rates: Float  # [3] per second
     knot_s: float
     w_turn: float
     neighbours: Int64  # [S, K] nearest first, itself at the front; -1 fills up
-    move: Float  # [S, K] what going there costs
+    move: Float  # [S, K] cost of going there
 
 
 class Formations(NamedTuple):
-    """The formations to choose from."""
+    """Formations to choose from."""
 
     lattice: Lattice
     slots: Float  # [S, n, 3] of each state
@@ -52,7 +52,7 @@ class Formations(NamedTuple):
 
 
 class SlotWeights(NamedTuple):
-    """What the search weighs, by name; see `PlannerConfig`."""
+    """Weights of the search, by name; see `PlannerConfig`."""
 
     w_obs: float
     w_occ: float
@@ -71,10 +71,10 @@ def _look_at_slots(
     obstacle: Float,
     share: Float,
 ) -> None:
-    """What `slot_costs` returns, written into arrays of zeros.
+    """Compute the results of `slot_costs`, into arrays of zeros.
 
-    Most sight lines are known to be free from the distances of their two ends: the actor's, of which one
-    look tells for all of them, and the camera's, which the obstacle cost asks for anyway.
+    The distances at the two ends show that most sight lines are free. One look at the actor serves all lines,
+    and the obstacle cost needs the camera's distance anyway.
     """
     times, (states, cameras, _) = actor.shape[0], offsets.shape
     side_m = grid.resolution_m
@@ -95,7 +95,7 @@ def _look_at_slots(
         ax = (actor[t, 0] - grid.origin[0]) / side_m
         ay = (actor[t, 1] - grid.origin[1]) / side_m
         az = (actor[t, 2] - grid.origin[2]) / side_m
-        # Neighbouring sight lines follow each other, and find what they look up near at hand.
+        # Neighbouring sight lines follow each other, so that their look-ups hit the cache.
         for i in range(cameras):
             for s in range(states):
                 rule, count = rules[s, i], counts[s, i]
@@ -116,7 +116,7 @@ def _look_at_slots(
 def slot_costs(
     grid: Grid, sight: Sight, actor: Float, offsets: Float, eps_obs_m: float, start_m: float
 ) -> tuple[Float, Float]:
-    """Obstacle cost and occupied share of the sight line, both [T, S, n].
+    """Compute the obstacle cost and the occupied share of the sight line, both [T, S, n].
 
     Args:
         grid: the distance field.
@@ -124,7 +124,7 @@ def slot_costs(
         actor: [T, 3] forecast.
         offsets: [S, n, 3] slots of every state, from the actor.
         eps_obs_m: the distance from which obstacles count.
-        start_m: how far off the actor sight lines begin.
+        start_m: distance from the actor at which sight lines begin.
     """
     shape = (actor.shape[0], offsets.shape[0], offsets.shape[1])
     obstacle, share = np.zeros(shape), np.zeros(shape)
@@ -134,7 +134,10 @@ def slot_costs(
 
 @helper
 def _weigh(obstacle: Float, share: Float, w_obs: float, w_occ: float) -> Float:
-    """The cost map [T, S] of what `slot_costs` returns: summed over the drones, the first one first."""
+    """Compute the cost map [T, S] from the results of `slot_costs`.
+
+    Costs are summed over the drones, the first one first.
+    """
     times, states, cameras = obstacle.shape
     cost = np.zeros((times, states))
     for t in range(times):
@@ -146,7 +149,7 @@ def _weigh(obstacle: Float, share: Float, w_obs: float, w_occ: float) -> Float:
 
 @helper
 def _search(cost: Float, lattice: Lattice, start: Float) -> tuple[Int64, float]:
-    """See `search.best_sequence`."""
+    """Find the cheapest sequence; see `search.best_sequence`."""
     times, states = cost.shape
     value = cost.copy()
     following = np.zeros((times, states), np.int64)
@@ -201,13 +204,13 @@ def _turn_the_shorter_way(slots: Float) -> None:
 
 @cached
 def weighed(obstacle: Float, share: Float, w_obs: float, w_occ: float) -> Float:
-    """C [T, S] of costs [T, S, n]; see `costs.cost_map`."""
+    """Compute C [T, S] of costs [T, S, n]; see `costs.cost_map`."""
     return _weigh(obstacle, share, w_obs, w_occ)
 
 
 @cached
 def cheapest_sequence(cost: Float, lattice: Lattice, start: Float) -> tuple[Int64, float]:
-    """See `search.best_sequence`."""
+    """Find the cheapest sequence; see `search.best_sequence`."""
     return _search(cost, lattice, start)
 
 
@@ -221,14 +224,14 @@ def turn_the_shorter_way(slots: Float) -> None:
 def cheapest_slots(
     grid: Grid, sight: Sight, actor: Float, formations: Formations, w: SlotWeights, commanded: Float
 ) -> Float:
-    """All of a formation's planning: look at the slots, weigh, search.
+    """Plan a formation in one call: look at the slots, weigh, search.
 
     Args:
         grid: the distance field.
         sight: the same for sight lines.
         actor: [T, 3] forecast.
-        formations: which there are.
-        w: what is weighed.
+        formations: the formations to choose from.
+        w: the weights.
         commanded: [n, 3] the slots that are commanded now.
 
     Returns:

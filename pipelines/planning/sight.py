@@ -1,4 +1,4 @@
-"""Whether a camera sees the actor: exactly, voxel by voxel, and as a share that costs can be made of."""
+"""Visibility of the actor from a camera: exact, voxel by voxel, and as an occupied share for costs."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ Bool = NDArray[np.bool_]
 
 
 def visible(field: DistanceField, camera: Float, actor: Float, *, start_m: float) -> Bool:
-    """Whether no occupied voxel lies on the sight line (Amanatides & Woo 1987, every voxel it crosses).
+    """Test that no occupied voxel lies on the sight line (Amanatides & Woo 1987, every voxel it crosses).
 
     Args:
-        field: what stands around; nothing does outside its grid.
+        field: the distance field of the obstacles; there are none outside its grid.
         camera: [..., 3] metres, world.
         actor: [..., 3] metres, world, broadcast against `camera`.
         start_m: the end of the line next to the actor is left out, this much of it: maps contain the actor.
@@ -34,7 +34,7 @@ def visible(field: DistanceField, camera: Float, actor: Float, *, start_m: float
 
 
 def occupied_share(field: DistanceField, camera: Float, actor: Float, *, start_m: float) -> Float:
-    """How much of the sight line is occupied, 0..1: samples every half voxel at most.
+    """Compute the occupied share of the sight line, 0..1: samples every half voxel at most.
 
     The end next to the actor is left out as in `visible`; arguments as there.
     """

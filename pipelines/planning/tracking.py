@@ -1,7 +1,7 @@
-"""Flying a plan: its reference at a time, and a point mass that a PID keeps on it within its limits.
+"""Tracking of a plan: its reference at a time, and a point mass that a PID keeps on it within limits.
 
-The acceleration is a = a_reference + k_p e + k_v e' + k_i integral of e. Each plan starts from where the
-drone is, so that errors restart small at 5 Hz: without the reference's acceleration a drone would fly less
+The acceleration is a = a_reference + k_p e + k_v e' + k_i integral of e. Each plan starts at the drone's
+position, so that errors restart small at 5 Hz: without the reference's acceleration a drone would fly less
 than half of every planned turn. Acceleration, jerk and speed keep to their limits by construction:
 
     |a| <= A        by shortening
@@ -41,7 +41,7 @@ class Plan:
     step_s: float
 
     def at(self, t_s: Float) -> tuple[Float, Float, Float]:
-        """Position, velocity and acceleration, each [T, 3], at times [T] not before the start.
+        """Evaluate position, velocity and acceleration, each [T, 3], at times [T] not before the start.
 
         Cubic Hermite pieces whose slopes are central differences; after the last waypoint straight on.
         """
@@ -51,7 +51,7 @@ class Plan:
 
 
 class Flying(NamedTuple):
-    """How a drone follows a plan: the gains of its PID, the limits that it keeps, and its period."""
+    """Flight parameters of a drone: the gains of its PID, its limits, and its period."""
 
     k_position: float
     k_velocity: float
@@ -66,7 +66,7 @@ class Flying(NamedTuple):
 def _reference(
     path: Float, start_velocity: Float, h: float, after_s: float, x: Float, v: Float, a: Float
 ) -> None:
-    """Position, velocity and acceleration [3] that a plan asks for at one time."""
+    """Evaluate the position, velocity and acceleration [3] of a plan at one time."""
     last = path.shape[0] - 1
     k = min(max(int(after_s / h), 0), last - 1)
     u = after_s / h - k
@@ -93,7 +93,7 @@ def _evaluate(
 
 @helper
 def _shorten(vector: Float, longest: float) -> bool:
-    """Keep the direction of [3], and the length within `longest`; True if it was longer."""
+    """Limit the length of [3] to `longest`, in place; keep the direction. Return True if it was longer."""
     length = math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
     if length <= longest:
         return False
@@ -103,7 +103,11 @@ def _shorten(vector: Float, longest: float) -> bool:
 
 @helper
 def _fly(wanted: Float, flying: Flying, state: Float, following: Float) -> bool:
-    """Fly one period, accelerated by `wanted` [3] or as near to it as limits allow; True if they did not."""
+    """Fly one period at `wanted` [3], shortened to the limits.
+
+    The drone accelerates by `wanted` or as near to it as the limits allow. Return True if `wanted` was
+    shortened.
+    """
     shortened = _shorten(wanted, flying.acceleration_mps2)
     faster = state[VELOCITY] + wanted * _LOOKAHEAD_S
     if _shorten(faster, flying.speed_mps):
@@ -136,11 +140,11 @@ def roll_out(
         path: [N + 1, 3] m, of the plan, as the next two.
         start_velocity: [3] m/s.
         step_s: between its waypoints.
-        after_s: how long after the start of the plan the drone is in its first state.
-        ticks: for how many periods the plan is followed.
-        exactly: be where the plan is, whatever that takes, in place of tracking it.
+        after_s: time from the start of the plan to the drone's first state.
+        ticks: number of periods for which the plan is followed.
+        exactly: be exactly on the plan, without the limits, in place of tracking it.
         flying: gains, limits and period.
-        states: [K + 1, 4, 3]; the first is where the drone is, the others are written.
+        states: [K + 1, 4, 3]; the first is the drone's state, the others are written.
 
     Returns:
         The row at which the drone stands still; all that follow are like it.
@@ -167,7 +171,7 @@ def roll_out(
                     + flying.k_velocity * (v[axis] - state[VELOCITY, axis])
                     + flying.k_integral * following[INTEGRAL, axis]
                 )
-            if _fly(wanted, flying, state, following):  # what cannot be flown must not pile up
+            if _fly(wanted, flying, state, following):  # anti-windup: the integral stops while a limit holds
                 following[INTEGRAL] = state[INTEGRAL]
             continue
         wanted[:] = -braking * state[VELOCITY]
@@ -183,6 +187,6 @@ def roll_out(
 
 
 def stopping_ticks(flying: Flying) -> int:
-    """Periods that any stop takes at most."""
+    """Return the largest number of periods that any stop takes."""
     slow_s = flying.speed_mps / flying.acceleration_mps2 + flying.acceleration_mps2 / flying.jerk_mps3
     return math.ceil((slow_s + _LONGEST_MARGIN_S) / flying.period_s)

@@ -1,4 +1,4 @@
-"""Plain sentences: which limits an arm violates, and whether the first arm is better than the second."""
+"""Plain sentences: limits that an arm violates, and the comparison of the first arm with the second."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from typing import Any
 
 from pipelines.planning.config import PlannerConfig
 
-_ALIKE_DEG = 2.0  # tilts that differ by less are not worth a word
+_ALIKE_DEG = 2.0  # smaller differences of tilt are not reported
 _ALIKE_PERCENT = 1.0  # of the joints, likewise
 
 
 def verdict(
     arm: str, against: str, arms: Mapping[str, Mapping[str, Any]], difference: Mapping[str, Any]
 ) -> str:
-    """Say it.
+    """Compare an arm with another in one sentence: tilt, reconstruction error, coverage.
 
     Args:
-        arm: of which something is said.
-        against: with which it is compared.
+        arm: the arm that is judged.
+        against: the arm that it is compared with.
         arms: scores by arm, as they stand in metrics.json.
-        difference: of the two, arm minus against, as it stands there.
+        difference: of the two, arm minus against, as in metrics.json.
     """
     return (
         f"{_about_tilt(arm, against, arms)}; {_about_error(difference)}{_about_coverage(arm, against, arms)}"
@@ -63,7 +63,10 @@ def _about_tilt(arm: str, against: str, arms: Mapping[str, Mapping[str, Any]]) -
 
 
 def _about_coverage(arm: str, against: str, arms: Mapping[str, Mapping[str, Any]]) -> str:
-    """Errors are compared on what both measured: who measured more deserves a word."""
+    """Say which arm measured more joints; empty if they are alike.
+
+    Errors are compared on joints that both measured, so the coverage must be reported as well.
+    """
     found = [arms[name]["reconstruction_error"]["coverage"] for name in (arm, against)]
     if None in found:
         return ""
