@@ -1,6 +1,6 @@
-"""What a study says: means with their intervals, tables, and the figure.
+"""Results of a study: means with their intervals, tables, and the figure.
 
-Rows are plain: `tilt_deg`, `drones`, `noise`, `noise_model`, `method`, `trial`, and what was measured.
+Rows are plain: `tilt_deg`, `drones`, `noise`, `noise_model`, `method`, `trial`, and the measured figures.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ METRICS = {
     "reconstructed_share": "Reconstructed, %",
     "fell_back": "Trials in which refined fell back to robust, %",
 }
-"""What tables show of what is measured; the first three on the joint-frames that every method has."""
+"""Titles of the metrics in the tables; the first three are on the joint-frames that every method has."""
 
 _SHARES = {"pck150", "reconstructed_share", "fell_back"}  # in percent there
 _DRAWN = ("mpjpe_mm", "root_mpjpe_mm")
@@ -40,13 +40,13 @@ _NOTHING_MM = 1e-3  # errors below are none: no ratio is taken to them
 
 
 def estimates(rows: Sequence[Row], study: str, *, seed: int) -> list[dict[str, Any]]:
-    """Means over trials of every condition and method.
+    """Compute the means over trials of every condition and method.
 
     Intervals hold 95 % of the means of resampled trials (Efron & Tibshirani 1993, 13.3).
 
     Args:
         rows: of every trial.
-        study: tilt, robots or noise: what the ratio is taken along.
+        study: tilt, robots or noise: the condition that the ratio compares.
         seed: of the resampling.
 
     Returns:
@@ -54,7 +54,7 @@ def estimates(rows: Sequence[Row], study: str, *, seed: int) -> list[dict[str, A
         - `metrics`: by name `mean`, `interval` (None where all trials are alike) and the number of `trials`
           that had the figure; None where none had it;
         - `ratio`: of `mpjpe_mm` to the first tilt or number of drones, or for `noise` to the first method,
-          trials paired; None where that is nothing;
+          trials paired; None where that mean is zero;
         - `per_joint`: means.
     """
     by_condition: dict[tuple[Any, ...], list[Row]] = {}
@@ -81,7 +81,7 @@ def _is_measured(name: str) -> bool:
 
 
 def _resampled(trials: int, seed: int) -> Int64:
-    """Rows of trials [B, K] drawn with replacement."""
+    """Draw rows of trials [B, K] with replacement."""
     return np.random.default_rng([seed, trials]).integers(trials, size=(_RESAMPLES, trials))
 
 
@@ -93,7 +93,7 @@ def _mean(rows: Sequence[Row], name: str, seed: int) -> dict[str, Any] | None:
 
 
 def _ratio(rows: Sequence[Row], others: Sequence[Row], seed: int) -> dict[str, Any] | None:
-    """Mean error as a multiple of another condition's; trials have the same chance behind them in both."""
+    """Compute the mean error as a multiple of another condition's; trials share random numbers in both."""
     pairs = np.array(
         [
             (row["mpjpe_mm"], other["mpjpe_mm"])
@@ -129,7 +129,7 @@ def _per_joint(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
 
 
 def results_csv(rows: Sequence[Row]) -> str:
-    """One line for every condition, trial and method; empty where nothing could be measured."""
+    """Write one line for every condition, trial and method; empty where nothing could be measured."""
     text = io.StringIO()
     columns = [name for name in rows[0] if name != "per_joint"]
     writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
@@ -143,7 +143,7 @@ def results_csv(rows: Sequence[Row]) -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """One figure of a study; what the study varies lies in columns."""
+    """One figure of a study; the varied condition is in columns."""
 
     title: str
     header: list[str]
@@ -151,13 +151,13 @@ class Table:
 
 
 def tables(summary: Mapping[str, Any]) -> list[Table]:
-    """The tables that a person reads, as text; `-` where nothing could be measured."""
+    """Make the tables for readers, as text; `-` where nothing could be measured."""
     head, columns = _heads(summary)
     first = summary["settings"]["methods"][0] if summary["study"] == "noise" else columns[0]
     told = []
     for name, title in [*METRICS.items(), ("ratio", f"MPJPE relative to {first}, on common joint-frames")]:
         lines = _lines(summary)
-        if name == "fell_back":  # of the others there is nothing to say
+        if name == "fell_back":  # only refined can fall back
             lines = [(label, cells) for label, cells in lines if label[-1] == "refined"]
             if not lines:
                 continue
@@ -167,7 +167,7 @@ def tables(summary: Mapping[str, Any]) -> list[Table]:
 
 
 def _heads(summary: Mapping[str, Any]) -> tuple[list[str], list[str]]:
-    """What stands above the names of lines, and above their figures."""
+    """Return the headers of the line names, and of their figures."""
     settings = summary["settings"]
     match summary["study"]:
         case "tilt":
@@ -178,7 +178,7 @@ def _heads(summary: Mapping[str, Any]) -> tuple[list[str], list[str]]:
 
 
 def _lines(summary: Mapping[str, Any]) -> list[tuple[tuple[str, ...], list[Mapping[str, Any]]]]:
-    """The cells that belong together in a line, in the order of what the study varies."""
+    """Group the cells by line, in the order of the varied condition."""
     names = ("method",) if summary["study"] == "noise" else ("noise", "method")
     lines: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
     for cell in summary["cells"]:
@@ -209,7 +209,7 @@ def draw(folder: Path, summary: Mapping[str, Any]) -> None:
 
 
 def setting(summary: Mapping[str, Any]) -> str:
-    """What was filmed, and how often."""
+    """Describe the filmed scene and the number of trials."""
     settings = summary["settings"]
     drones, tilt = f"{settings['drones'][0]} drones", f"tilt {settings['tilts_deg'][0]:g} deg"
     fixed = {"tilt": drones, "robots": tilt}.get(summary["study"], f"{drones}, {tilt}")
@@ -220,7 +220,7 @@ def setting(summary: Mapping[str, Any]) -> str:
 
 
 def drawing(summary: Mapping[str, Any]) -> StudyDrawing:
-    """The study's figure: a row for each of the first two metrics."""
+    """Make the study's figure: a row for each of the first two metrics."""
     study, settings = summary["study"], summary["settings"]
     lines = _lines(summary)
     rows = []

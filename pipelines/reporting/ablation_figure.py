@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 _PANEL_IN, _ROW_IN, _SMALLEST_IN = 2.7, 2.0, 5.4
 _MARKERS = "osD^vPX*"
-_BESIDE = 0.012  # of the axis, between the error bars of neighbouring curves above words
+_BESIDE = 0.012  # of the axis, between the error bars of neighbouring curves if the axis has words
 _LETTERS_PER_IN = 16  # of the title
-_HEADROOM, _LEAST_TOP = 1.04, 1.0  # above the highest marker; of an axis where errors are rounding alone
+_HEADROOM, _LEAST_TOP = 1.04, 1.0  # above the highest marker; least top of the axis
 _DPI = 160
 
 
@@ -41,18 +41,18 @@ class Panel:
 
 @dataclass(frozen=True)
 class StudyDrawing:
-    """What a study's figure shows."""
+    """Contents of a study's figure."""
 
     rows: Sequence[tuple[str, Sequence[Panel]]]
-    """Name of what is measured, and its panels, the same number in every row."""
+    """Name of each measured figure, and its panels, the same number in every row."""
     at: Sequence[float] | Sequence[str]
     """The values along the horizontal axis; words are put side by side."""
     axis: str
-    """What they are."""
+    """Title of the horizontal axis."""
     legend: str
-    """What the curves are."""
+    """Title of the legend of curves."""
     ordered: bool
-    """Whether the curves have an order, which their colours then show."""
+    """True if the curves have an order, which their colours then show."""
 
 
 def save_study(folder: Path, drawing: StudyDrawing, title: str) -> None:
@@ -131,7 +131,7 @@ def _colour(k: int, count: int, ordered: bool) -> Any:
 
 
 def _label(value: float | str, count: int) -> str:
-    """What stands below the axis: words in lines that leave room for those beside them."""
+    """Format a tick label: words are wrapped in lines that leave room for those beside them."""
     if not isinstance(value, str):
         return f"{value:g}"
     return "\n".join(wrap(value.replace(",", ", "), max(int(_LETTERS_PER_IN * _SMALLEST_IN / count) - 1, 1)))

@@ -1,6 +1,6 @@
 """The figures of a comparison of planners.
 
-The colour is the arm's in every figure and in the 3D viewer; the stroke tells the drones apart.
+The colour is the arm's in every figure and in the 3D viewer; the stroke is the drone's.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pipelines.reporting.replanned import Replan
 
 
 def draw_arms(replan: Replan) -> dict[str, Plate]:
-    """Every figure of a comparison, by its key; none where nothing flew."""
+    """Draw every figure of a comparison, by its key; none where nothing flew."""
     if not replan.arms:
         return {}
     plates = [

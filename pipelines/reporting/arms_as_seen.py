@@ -1,4 +1,4 @@
-"""The skeleton as the cameras of each arm would have seen it: what is hidden, what leaves the picture."""
+"""The skeleton as seen by the cameras of each arm: hidden joints, and joints outside the picture."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _ROOM = 1.3  # sides of a panel, in lengths of the largest person
 
 
 def draw_as_seen(replan: Replan) -> Plate | None:
-    """A panel for every arm and camera at a few moments; None where no skeleton was known."""
+    """Draw a panel for every arm and camera at a few moments; None where no skeleton was known."""
     looks = [(arm, arm.seen) for arm in replan.arms if arm.seen is not None and len(arm.seen.t_s)]
     if not looks:
         return None
@@ -65,7 +65,10 @@ def draw_as_seen(replan: Replan) -> Plate | None:
 
 
 def moments(looks: list[tuple[Arm, Seen]]) -> Float:
-    """For each of equally long parts of the flight, when all cameras lose most joints; else tilt most."""
+    """Choose the moment of each equal part of the flight at which all cameras lose most joints.
+
+    Of several such moments, take the one with the largest tilt.
+    """
     t_s = looks[0][1].t_s
     lost, tilt_deg = np.zeros(len(t_s)), np.zeros(len(t_s))
     for arm, seen in looks:
@@ -79,13 +82,13 @@ def moments(looks: list[tuple[Arm, Seen]]) -> Float:
 
 
 def _nearest(t_s: Float, wanted_s: Float) -> Int64:
-    """Rows of ascending times that are nearest to others."""
+    """Find the rows of ascending times that are nearest to others."""
     places: Int64 = np.abs(t_s[:, None] - wanted_s).argmin(axis=0)
     return places
 
 
 def _largest_px(seen: Seen) -> float:
-    """The longest side of any person's box."""
+    """Return the longest side of any person's box, px."""
     flat = seen.pixels.reshape(-1, len(seen.joints), 2)
     flat = flat[np.isfinite(flat).any(axis=(1, 2))]
     if not len(flat):
@@ -117,7 +120,7 @@ def _draw(axes: Axes, arm: Arm, seen: Seen, camera: int, at: int, side_px: float
 
 
 def _frame(axes: Axes) -> None:
-    """A picture's edge in place of axes."""
+    """Draw a picture's edge in place of axes."""
     axes.set_xticks([])
     axes.set_yticks([])
     for spine in axes.spines.values():
@@ -137,7 +140,7 @@ def _enlarge(axes: Axes, pixels: Float, side_px: float) -> None:
 def _draw_skeleton(
     axes: Axes, joints: tuple[str, ...], pixels: Float, status: NDArray[np.str_], colour: str
 ) -> None:
-    """Bones of which both joints are inside the picture, and the joints; open and dotted where hidden."""
+    """Draw the joints, and bones with both joints inside the picture; open and dotted where hidden."""
     inside = np.isfinite(pixels[:, 0])
     place = {joint: k for k, joint in enumerate(joints)}
     for a, b in bones_of(joints):

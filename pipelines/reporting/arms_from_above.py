@@ -44,7 +44,7 @@ _HIDDEN = STATUS_COLOURS["rejected"]
 
 
 def draw_from_above(replan: Replan) -> Plate:
-    """One panel for each arm, all of the same stretch of land."""
+    """Draw one panel for each arm, all of the same stretch of land."""
     from matplotlib.figure import Figure
 
     arms = replan.arms
@@ -85,7 +85,7 @@ def draw_from_above(replan: Replan) -> Plate:
 
 
 def _numbers(arm: Arm) -> pd.DataFrame:
-    """The paths of an arm, and which sight lines were hidden."""
+    """Tabulate the paths of an arm, and its hidden sight lines."""
     tracks = zip(arm.cameras, arm.position, arm.visible, strict=True)
     paths = [
         table(
@@ -110,13 +110,13 @@ def _numbers(arm: Arm) -> pd.DataFrame:
 
 
 def keyframes(arm: Arm) -> NDArray[np.intp]:
-    """Where in an arm's times its keyframes are: evenly spread, the first and the last among them."""
+    """Return the rows of an arm's keyframes: evenly spread, with the first and the last."""
     chosen = np.round(np.linspace(0, len(arm.t_s) - 1, KEYFRAMES)).astype(np.intp)
     return np.unique(chosen)
 
 
 def _draw_panel(axes: Axes, arm: Arm, ground: Heights | None, low: Float, high: Float) -> None:
-    """An arm on its stretch of land, from corner to corner [2] in m."""
+    """Draw an arm on its stretch of land, from corner to corner [2] in m."""
     origin = near_zero(low)
     axes.set_xlim(low[0] - origin[0], high[0] - origin[0])
     axes.set_ylim(low[1] - origin[1], high[1] - origin[1])

@@ -1,4 +1,4 @@
-"""The arms of a comparison over time: tilt, range, what hides the actor, and the error to be expected."""
+"""The arms of a comparison over time: tilt, range, hidden sight lines, and the predicted error."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def draw_arms_over_time(arms: tuple[Arm, ...]) -> Plate:
-    """Four strips, one below the other, of the same time."""
+    """Draw four strips, one below the other, over the same time."""
     from matplotlib.figure import Figure
 
     strips = sum(len(arm.cameras) for arm in arms)
@@ -66,7 +66,7 @@ def draw_arms_over_time(arms: tuple[Arm, ...]) -> Plate:
 
 
 def _numbers(arm: Arm) -> pd.DataFrame:
-    """Every pose of an arm that the bands and rows are drawn from."""
+    """Tabulate every pose of an arm that the bands and rows are drawn from."""
     cameras = len(arm.cameras)
     return table(
         arm=arm.name,
@@ -80,7 +80,7 @@ def _numbers(arm: Arm) -> pd.DataFrame:
 
 
 def _band(axes: Axes, arm: Arm, values: Float) -> None:
-    """The mean over cameras of [C, T] as a line, on the range of all of them."""
+    """Draw the mean over cameras of [C, T] as a line, on the range of all of them."""
     colour = CAMERAS[arm.colour]
     starts = np.arange(0, len(arm.t_s), every(len(arm.t_s), MOST_POINTS))
     seconds, mean = _thinned(arm.t_s, values.mean(axis=0))
@@ -91,7 +91,10 @@ def _band(axes: Axes, arm: Arm, values: Float) -> None:
 
 
 def _thinned(seconds: Float, values: Float) -> tuple[Float, Float]:
-    """Times and means of at most `MOST_POINTS` stretches of equally many values; NaN where one is."""
+    """Return times and means of at most `MOST_POINTS` stretches of equally many values.
+
+    A mean is NaN if one of its values is NaN.
+    """
     starts = np.arange(0, len(seconds), every(len(seconds), MOST_POINTS))
     count = np.diff([*starts, len(seconds)])
     return np.add.reduceat(seconds, starts) / count, np.add.reduceat(values, starts) / count
@@ -110,14 +113,20 @@ def _draw_sight(axes: Axes, arms: tuple[Arm, ...]) -> None:
 
 
 def hidden_spans(seconds: Float, seen: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    """From when to when a drone sees nothing; each moment lasts until the next one."""
+    """Return the start and end of each span in which a drone sees nothing.
+
+    Each moment lasts until the next one.
+    """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ~seen, [False]]).astype(np.int8)))
     ends = np.append(seconds, seconds[-1])
     return [(float(ends[a]), float(ends[b])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _top(arms: tuple[Arm, ...]) -> float:
-    """Where the axis of predicted errors ends: cameras on one line make them grow without bound."""
+    """Return the upper end of the axis of predicted errors.
+
+    Cameras on one line make the errors grow without bound.
+    """
     every_error = np.concatenate([100 * arm.predicted_error_m for arm in arms])
     known = every_error[np.isfinite(every_error)]
     if not len(known):

@@ -1,4 +1,4 @@
-"""The yaw of the formations of a comparison, over what every yaw would have cost."""
+"""The yaw of the formations of a comparison, over the cost of every yaw."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _TURN_DEG = 360.0
 
 
 def draw_yaw(arms: tuple[Arm, ...], costs: CostMap | None) -> Plate:
-    """One drawing of all arms; without a cost map their yaws alone."""
+    """Draw all arms in one figure; without a cost map their yaws alone."""
     from matplotlib.figure import Figure
 
     low, high = _span_deg(arms)
@@ -59,7 +59,7 @@ def draw_yaw(arms: tuple[Arm, ...], costs: CostMap | None) -> Plate:
 
 
 def _span_deg(arms: tuple[Arm, ...]) -> tuple[float, float]:
-    """From below the least yaw to above the largest, one turn at least: no yaw is left out."""
+    """Return a range of yaws from below the least to above the largest, one turn at least."""
     everything = np.concatenate([line for arm in arms for line in (arm.yaw_deg, arm.commanded_yaw_deg)])
     known = everything[np.isfinite(everything)]
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
@@ -68,7 +68,7 @@ def _span_deg(arms: tuple[Arm, ...]) -> tuple[float, float]:
 
 
 def _draw_arm(axes: Axes, arm: Arm) -> None:
-    """Where the first drone was, and solid where it was sent, if it was."""
+    """Draw the yaw of the first drone, and solid the commanded yaw, if there is one."""
     stride = every(len(arm.t_s), MOST_POINTS)
     t_s, colour, name = arm.t_s[::stride], CAMERAS[arm.colour], shortened(arm.name)
     chosen = arm.commanded_yaw_deg[::stride]
@@ -88,7 +88,7 @@ def _draw_arm(axes: Axes, arm: Arm) -> None:
 
 
 def _numbers(arms: tuple[Arm, ...], costs: CostMap | None) -> dict[str, pd.DataFrame]:
-    """Every pose of the arms, and every column of the cost map."""
+    """Tabulate every pose of the arms, and every column of the cost map."""
     yaws = [
         table(arm=arm.name, t_s=arm.t_s, yaw_deg=arm.yaw_deg, commanded_yaw_deg=arm.commanded_yaw_deg)
         for arm in arms
@@ -104,7 +104,7 @@ def _numbers(arms: tuple[Arm, ...], costs: CostMap | None) -> dict[str, pd.DataF
 
 
 def _draw_costs(axes: Axes, costs: CostMap, low: float, high: float) -> tuple[list[float], int]:
-    """Shade the cost map over as many turns as are drawn; its levels, and every how many times were taken."""
+    """Shade the cost map over all drawn turns; return its levels, and the stride of the drawn times."""
     from matplotlib.ticker import MaxNLocator
 
     step = every(len(costs.t_s), _MOST_TIMES)

@@ -1,4 +1,4 @@
-"""The bones whose length is worth watching: rigid in truth, so their spread tells of errors."""
+"""Bones whose lengths are reported: they are rigid in truth, so their spread shows errors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _WATCHED = (
 
 
 def side_of(*joints: str) -> str:
-    """`left` or `right` if all joints lie on that side of the body, else an empty word."""
+    """Return `left` or `right` if all joints lie on that side of the body, else an empty word."""
     sides = {joint.partition("_")[0] for joint in joints}
     return side if len(sides) == 1 and (side := sides.pop()) in {"left", "right"} else ""
 
@@ -46,7 +46,7 @@ class Bone:
 
 
 def watched_bones(motion: Motion) -> list[Bone]:
-    """The bones of which both ends were measured at some time, limb by limb, left before right."""
+    """Measure the bones with both ends measured at some time, limb by limb, left before right."""
     there = [bone for bone in _WATCHED if set(bone[2:]) <= set(motion.joints)]
     lengths = bone_lengths(
         motion.measured_position, motion.joints, [(start, end) for *_, start, end in there]

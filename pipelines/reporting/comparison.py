@@ -1,11 +1,11 @@
-"""Sessions side by side: what every one is worth, and by how much they differ.
+"""Comparison of sessions: measures of each, and the differences between them.
 
 Every measure is a mean over values [T, K] at the skeleton's times: K joints (or bones, or one), NaN where
 there is none. Where two sessions hold the same motion at the same times, they are compared value by value,
-and the interval is that of the mean of those differences. Where they do not, they are compared joint by
-joint: the mean of a joint in one flight against its mean in the other, every joint with the same weight; the
-stretches of the two flights are then drawn apart from each other. Either way the intervals are those of
-`geometry.bootstrap`, and speak of these flights.
+and the interval is that of the mean of those differences. Otherwise they are compared joint by joint: the
+mean of a joint in one flight against its mean in the other, every joint with the same weight; the stretches
+of the two flights are then resampled independently. In both cases the intervals are those of
+`geometry.bootstrap`, and are valid for these flights only.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pipelines.session.skeletons import bones_of
 
 _PCK_M = 0.15
 _LEAST_SHARED = 0.5
-"""Two sessions are at the same times where at least so much of the shorter one has a time in the other."""
+"""Least share of the shorter session's times with a time in the other, for sessions at the same times."""
 _SAME_TRUTH_M = 0.05
 """Truths closer than this (median) are one motion: at a walk, two stamps half a frame apart are 25 mm."""
 _SAME_PLACE_M = 0.5
@@ -38,7 +38,7 @@ _FEWEST_TIMES = 10
 
 @dataclass(frozen=True)
 class Measure:
-    """What sessions are compared by."""
+    """A measure by which sessions are compared."""
 
     key: str
     label: str
@@ -49,7 +49,7 @@ class Measure:
 
     @property
     def name(self) -> str:
-        """The label inside a sentence."""
+        """Label inside a sentence."""
         is_word = self.label[1].islower()
         return self.label[0].lower() + self.label[1:] if is_word else self.label
 
@@ -90,13 +90,13 @@ class Values:
     values: Float
 
     def series(self, columns: Sequence[int] | None = None) -> Series:
-        """Sums and weights [T] for the bootstrap."""
+        """Return sums and weights [T] for the bootstrap."""
         taken = self.values if columns is None else self.values[:, list(columns)]
         there = np.isfinite(taken)
         return np.where(there, taken, 0.0).sum(axis=1), there.sum(axis=1, dtype=np.float64)
 
     def by_name(self) -> dict[str, Series]:
-        """The same of every name; people are put together."""
+        """Return sums and weights of every name; people with that name are summed."""
         return {
             name: self.series([k for k, other in enumerate(self.columns) if other == name])
             for name in dict.fromkeys(self.columns)
@@ -112,7 +112,7 @@ class Estimate:
 
     @property
     def is_clear(self) -> bool:
-        """Whether the interval leaves 0 out."""
+        """True if the interval does not contain 0."""
         return self.interval is not None and (self.interval[0] > 0 or self.interval[1] < 0)
 
 
@@ -129,14 +129,14 @@ class Judged:
 
     @property
     def t_ns(self) -> Int64:
-        """The skeleton's times; none without a skeleton."""
+        """Times of the skeleton; none without a skeleton."""
         motion = self.summary.motion
         return motion.t_ns if motion is not None else np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
 class Difference:
-    """What a session's measure is above that of the first."""
+    """Difference of a session's measure from that of the first."""
 
     estimate: Estimate
     pairs: int  # joint-frames (or moments, bones) that both have; joints where they are paired by joint
@@ -147,7 +147,7 @@ class Difference:
 
     @property
     def joints(self) -> int:
-        """How many joints (bones, cameras) have a difference."""
+        """Number of joints (bones, cameras) with a difference."""
         return len(self.per_joint)
 
 
@@ -163,7 +163,7 @@ class Pair:
 
     @property
     def decisive(self) -> Measure | None:
-        """The measure that the verdict is about: the error where both have truth, else the reprojection."""
+        """Measure of the verdict: the error where both have truth, else the reprojection."""
         return next((_OF[key] for key in ("mpjpe", "reprojection") if key in self.differences), None)
 
 
@@ -176,15 +176,15 @@ class Comparison:
 
     @property
     def measures(self) -> list[Measure]:
-        """Those that any session has."""
+        """Measures that any session has."""
         return [one for one in MEASURES if any(one.key in judged.estimates for judged in self.sessions)]
 
 
 def compare(contents: Mapping[str, SessionContent]) -> Comparison:
-    """Judge sessions, and set every one against the first.
+    """Measure sessions, and compare every one with the first.
 
     Args:
-        contents: by the label that each bears.
+        contents: the sessions, by label.
     """
     sessions = tuple(_judged(label, content) for label, content in contents.items())
     return Comparison(sessions, tuple(_pair(sessions[0], other) for other in sessions[1:]))
@@ -219,7 +219,7 @@ def _estimates(series: Mapping[str, Series], t_ns: Int64) -> dict[str, Estimate]
 
 
 def _values(content: SessionContent, summary: Summary, motion: Motion) -> dict[str, Values]:
-    """Every measure that has a value at all."""
+    """Return every measure that has a value at all."""
     position = motion.measured_position
     listed = motion.status >= 0
     people = position.shape[1]
@@ -248,7 +248,7 @@ def _values(content: SessionContent, summary: Summary, motion: Motion) -> dict[s
 
 
 def _bone_values(motion: Motion) -> Values:
-    """How far each bone of each person is from its own median length, mm."""
+    """Compute the deviation of each bone of each person from its own median length, mm."""
     bones = bones_of(motion.joints)
     lengths = 1e3 * bone_lengths(motion.measured_position, motion.joints, bones)
     lengths = lengths.reshape(len(lengths), -1)
@@ -260,7 +260,7 @@ def _bone_values(motion: Motion) -> Values:
 
 
 def _tilt(content: SessionContent, summary: Summary, motion: Motion) -> Values:
-    """The cameras' mean elevation above the first person, deg [T, 1]; NaN where one has no pose."""
+    """Compute the cameras' mean elevation above the first person, deg [T, 1]; NaN where one has no pose."""
     actor = _middle(motion)
     away = camera_positions(content, summary, motion.t_ns) - actor
     tilt = np.degrees(np.arctan2(away[..., 2], np.linalg.norm(away[..., :2], axis=-1)))
@@ -268,7 +268,7 @@ def _tilt(content: SessionContent, summary: Summary, motion: Motion) -> Values:
 
 
 def _middle(motion: Motion) -> Float:
-    """Coordinate-wise median [T, 3] of the first person's measured joints; NaN where there are none."""
+    """Return the coordinate-wise median [T, 3] of the first person's measured joints; NaN where none are."""
     position = motion.measured_position[:, 0]
     middle = np.full((len(position), 3), np.nan)
     there = np.isfinite(position[..., 0]).any(axis=1)
@@ -296,7 +296,7 @@ def _pair(first: Judged, other: Judged) -> Pair:
 
 
 def _same_motion(first: Judged, other: Judged) -> tuple[Int64, Int64] | None:
-    """Rows of the two that are the same moments of the same motion; None where they are not."""
+    """Find rows of the two that are the same moments of the same motion; None if they are not."""
     a, b = first.summary.motion, other.summary.motion
     if a is None or b is None:
         return None
@@ -317,7 +317,7 @@ def _same_motion(first: Judged, other: Judged) -> tuple[Int64, Int64] | None:
 
 
 def _same_times(a: Int64, b: Int64) -> tuple[Int64, Int64]:
-    """Rows of [A] and [B] stamps within half a step of the denser one, each taken once."""
+    """Match rows of [A] and [B] stamps within half a step of the denser one, each taken once."""
     if len(a) > len(b):
         theirs, ours = _same_times(b, a)
         return ours, theirs
@@ -359,7 +359,7 @@ def _paired_by_time(
 
 
 def _places(columns: Sequence[str]) -> dict[tuple[str, int], int]:
-    """Column by name and how many of that name came before: the person."""
+    """Return the column by name and by how many of that name came before, which is the person."""
     seen: dict[str, int] = {}
     places = {}
     for k, name in enumerate(columns):
@@ -374,7 +374,7 @@ def _paired_by_joint(first: Judged, other: Judged, ours: Values, theirs: Values)
     if not names:
         return None
     means = np.array([[float(one[name][0].sum() / one[name][1].sum()) for one in (a, b)] for name in names])
-    # The two flights have nothing to do with each other: neither have the stretches drawn of them.
+    # The two flights are independent, and so are the stretches drawn from them.
     drawn = [
         resampled({name: series[name] for name in names}, judged.t_ns, seed=seed)
         for seed, (judged, series) in enumerate(((first, a), (other, b)))
@@ -392,10 +392,10 @@ def _paired_by_joint(first: Judged, other: Judged, ours: Values, theirs: Values)
 
 
 def labels_of(names: Sequence[tuple[str, ...]]) -> list[str]:
-    """A label for every session: its name, with as many of the folders above it as tell it from the others.
+    """Return a label for every session: its name, after as many parent folders as make it unique.
 
     Args:
-        names: of each session its name, preceded by those of the folders it lies in.
+        names: of each session its name, after the names of its parent folders.
     """
     for depth in range(1, 1 + max(len(name) for name in names)):
         labels = ["/".join(name[-depth:]) for name in names]

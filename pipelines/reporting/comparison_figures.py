@@ -1,4 +1,4 @@
-"""The figures of a comparison of sessions: errors over time, joint by joint, and all differences at a glance.
+"""The figures of a comparison of sessions: errors over time, joint by joint, and all differences.
 
 The colour is the session's in every figure.
 """
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 _MOST_BINS = 150
 _OVER_TIME = ("predicted", "tilt", "share")
 _MOST_BANDS = 3
-"""With more sessions than this the ranges hide each other."""
+"""Number of sessions above which no ranges are drawn: they would hide each other."""
 
 
 def draw_comparison(comparison: Comparison) -> dict[str, Plate]:
-    """Every figure that there is something to draw for, by its key."""
+    """Draw every figure that has data, by its key."""
     measure = shown_measure(comparison)
     plates = []
     if measure is not None:
@@ -38,7 +38,7 @@ def draw_comparison(comparison: Comparison) -> dict[str, Plate]:
 
 
 def shown_measure(comparison: Comparison) -> Measure | None:
-    """The error from truth where every session with a skeleton has it, else the reprojection."""
+    """Return the error from truth if every session with a skeleton has it, else the reprojection."""
     having = [one for one in comparison.sessions if one.values]
     keys = {measure.key: measure for measure in MEASURES}
     for key in ("mpjpe", "reprojection"):
@@ -48,12 +48,15 @@ def shown_measure(comparison: Comparison) -> Measure | None:
 
 
 def colour_of(comparison: Comparison, session: Judged) -> str:
-    """The colour of a session in all figures."""
+    """Return the colour of a session in all figures."""
     return CAMERAS[comparison.sessions.index(session) % len(CAMERAS)]
 
 
 def seconds_of(comparison: Comparison, session: Judged) -> Float:
-    """Times [T] of a session: from the first frame of all where the motion is the same, else from its own."""
+    """Return the times [T] of a session, in s.
+
+    They count from the first frame of all where the motion is the same, else from its own first frame.
+    """
     together = {id(comparison.sessions[0])} | {id(pair.other) for pair in comparison.pairs if pair.by_time}
     same = [one for one in comparison.sessions if id(one) in together]
     among = same if id(session) in together else [session]
@@ -122,7 +125,7 @@ def _caption_over_time(comparison: Comparison, shown: list[Measure], *, bands: b
 def _draw_over_time(
     axes: Axes, comparison: Comparison, session: Judged, measure: Measure, seconds: Float, *, band: bool
 ) -> pd.DataFrame:
-    """Draw a session's line, and say what was drawn."""
+    """Draw a session's line, and return its numbers."""
     values = session.values[measure.key].values
     bins = time_bins(seconds, _MOST_BINS)
     centres = (bins[:-1] + bins[1:]) / 2
@@ -142,7 +145,7 @@ def _draw_over_time(
 
 
 def means(values: Float, seconds: Float, bins: Float) -> Float:
-    """Mean of the finite values in each bin; NaN in an empty one."""
+    """Compute the mean of the finite values in each bin; NaN in an empty one."""
     edges = np.searchsorted(seconds, bins)
     result = np.full(len(bins) - 1, np.nan)
     for k in range(len(bins) - 1):
@@ -157,7 +160,7 @@ def means(values: Float, seconds: Float, bins: Float) -> Float:
 
 
 def joints_of(comparison: Comparison) -> list[str]:
-    """Every joint of every session, in the order in which the first names them."""
+    """List every joint of every session, in the order in which the first names them."""
     motions = [one.summary.motion for one in comparison.sessions]
     return list(dict.fromkeys(name for motion in motions if motion is not None for name in motion.joints))
 
@@ -279,7 +282,7 @@ def _differences(comparison: Comparison) -> Plate:
 def _draw_pair(
     axes: Axes, pair: Pair, measures: list[Measure], shift: float, colour: str
 ) -> list[tuple[str, str, float, float, float]]:
-    """Draw what a session differs by, a row for each measure, and say what was drawn, in percent."""
+    """Draw a session's differences, a row for each measure, and return them in percent."""
     drawn = []
     for k, measure in enumerate(measures):
         found = pair.differences.get(measure.key)

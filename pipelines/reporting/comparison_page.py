@@ -1,4 +1,4 @@
-"""The page that sets sessions side by side, in one file that needs nothing else."""
+"""The page that compares sessions, as one self-contained file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pipelines.reporting.svg import PALETTE
 from pipelines.reporting.templating import environment
 
 GENERATOR = "mocap: sessions side by side"
-"""By this a page is known as one of ours, which may be written again."""
+"""Mark of a page of ours, which may be overwritten."""
 
 
 @dataclass(frozen=True)
@@ -55,13 +55,13 @@ class PairTable:
 
 
 def render_comparison(contents: Mapping[str, SessionContent]) -> tuple[str, dict[str, Plate]]:
-    """The complete HTML of a comparison, and its figures by their keys.
+    """Render the complete HTML of a comparison; return it and its figures by their keys.
 
-    The same contents give the same bytes; whatever stands in the sessions' files is escaped. The page loads
+    The same contents give the same bytes; all text from the sessions' files is escaped. The page loads
     nothing and runs nothing.
 
     Args:
-        contents: what the sessions hold, by the label that each bears; two at least.
+        contents: the contents of the sessions, by label; two at least.
     """
     comparison = compare(contents)
     measure = shown_measure(comparison)
@@ -142,7 +142,7 @@ def _verdict(measure: Measure, found: Difference) -> str:
 
 
 def _differing_settings(comparison: Comparison) -> list[tuple[str, list[str]]]:
-    """Settings, keys and inputs' hashes of the stages that are not the same in all sessions."""
+    """List settings, keys and inputs' hashes of the stages that differ between the sessions."""
     tables = [_settings_of(one) for one in comparison.sessions]
     names = dict.fromkeys(name for table in tables for name in table)
     rows = [(name, [table.get(name, wording.ABSENT) for table in tables]) for name in names]

@@ -1,4 +1,4 @@
-"""What a comparison of sessions amounts to, in plain sentences: which was better, by how much, how sure."""
+"""Result of a comparison of sessions, in plain sentences: the better one, the difference, the certainty."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SAME_LENS = 1.02
 
 
 def judge(comparison: Comparison) -> Verdict:
-    """The first words of the page."""
+    """Write the first words of the page."""
     sentences = [_sentence(pair) for pair in comparison.pairs]
     lead = sentences[0]
     if len(sentences) > 1:
@@ -33,17 +33,17 @@ def judge(comparison: Comparison) -> Verdict:
 
 
 def named(session: Judged) -> str:
-    """A session in a sentence."""
+    """Return a session's name for a sentence."""
     return f"“{session.label}”"
 
 
 def amount(measure: Measure, value: float) -> str:
-    """A value of a measure with its unit."""
+    """Format a value of a measure with its unit."""
     return quantity(value, measure.unit, measure.digits)
 
 
 def between(measure: Measure, estimate: Estimate, *, sign: float = 1.0) -> str:
-    """`95 % interval 1.2 to 3.4 mm`; of the negative with `sign` -1."""
+    """Format `95 % interval 1.2 to 3.4 mm`; of the negative with `sign` -1."""
     if estimate.interval is None:
         return "no interval: too few moments"
     low, high = sorted(sign * end for end in estimate.interval)
@@ -51,7 +51,7 @@ def between(measure: Measure, estimate: Estimate, *, sign: float = 1.0) -> str:
 
 
 def _best(comparison: Comparison) -> str | None:
-    """Who errs least of three or more; None where not all have the same measure."""
+    """Name the session with the smallest error of three or more; None if they have no common measure."""
     decisive = {pair.decisive for pair in comparison.pairs}
     measure = next(iter(decisive)) if len(decisive) == 1 else None
     if measure is None:
@@ -105,7 +105,7 @@ def _why_not(pair: Pair) -> str:
 
 
 def _also(pair: Pair) -> list[str]:
-    """What else differs by more than chance."""
+    """Describe the other differences that are larger than chance."""
     decisive = pair.decisive
     told = [
         f"{measure.name} {amount(measure, found.other)} against {fixed(found.first, measure.digits)}"
@@ -199,7 +199,7 @@ def _other_lenses(pair: Pair) -> bool:
 
 
 def _unlike(sessions: Sequence[Judged]) -> list[str]:
-    """In what the sessions were made differently."""
+    """List differences in how the sessions were made."""
     told = []
     for what, values in (
         (

@@ -1,4 +1,4 @@
-"""What a page shows, as the stage loads it from a session, and how loose JSON is read."""
+"""Contents of a page, as the stage loads it from a session, and readers of loose JSON."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReplanContent:
-    """What a comparison of planners left in a session."""
+    """Stored results of a comparison of planners."""
 
     metrics: dict[str, object]  # replan/metrics.json
     arms: dict[str, pd.DataFrame]  # arm: tables.REPLAN
-    actor: pd.DataFrame  # tables.ACTOR at the same times: whom the arms were scored against
+    actor: pd.DataFrame  # tables.ACTOR at the same times: the reference of the arms' scores
     cost_map: pd.DataFrame | None = None  # tables.COST_MAP
     map: Occupancy | None = None  # the session's last map
     seen: dict[str, pd.DataFrame] = field(default_factory=dict)  # arm: tables.SEEN, where a skeleton is known
@@ -27,7 +27,7 @@ class ReplanContent:
 
 @dataclass(frozen=True)
 class StudyContent:
-    """What `mocap ablate` left in a folder."""
+    """Results of `mocap ablate` in a folder."""
 
     summary: dict[str, Any]  # its summary.json
     command: str  # that makes it again
@@ -36,7 +36,7 @@ class StudyContent:
 
 @dataclass(frozen=True)
 class SessionContent:
-    """Everything the page of one session needs; what a session does not hold is None or empty."""
+    """Contents of one session's page; a part that the session lacks is None or empty."""
 
     name: str
     session: Description
@@ -52,29 +52,29 @@ class SessionContent:
     true_poses: dict[str, pd.DataFrame] = field(default_factory=dict)  # camera: tables.POSES, where known
     hidden: dict[str, float] = field(default_factory=dict)  # camera: share of moments, where a map is
     made_by: dict[str, dict[str, str]] = field(default_factory=dict)  # stage: program or library, and version
-    outdated: tuple[str, ...] = ()  # stages that were made of what has changed since
+    outdated: tuple[str, ...] = ()  # stages whose inputs have changed since
     studies: tuple[StudyContent, ...] = ()  # that stand beside the flight
 
 
 def section(mapping: Mapping[str, object], key: str) -> dict[str, object]:
-    """The mapping under a key; empty when it is absent or something else."""
+    """Return the mapping under a key; empty when it is absent or something else."""
     value = mapping.get(key)
     return {str(k): v for k, v in value.items()} if isinstance(value, Mapping) else {}
 
 
 def items(mapping: Mapping[str, object], key: str) -> list[object]:
-    """The list under a key; empty when it is absent or something else."""
+    """Return the list under a key; empty when it is absent or something else."""
     value = mapping.get(key)
     return list(value) if isinstance(value, list | tuple) else []
 
 
 def number(mapping: Mapping[str, object], key: str) -> float | None:
-    """The number under a key; None when it is absent, null or something else."""
+    """Return the number under a key; None when it is absent, null or something else."""
     value = mapping.get(key)
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
 def text(mapping: Mapping[str, object], key: str) -> str:
-    """The text under a key; empty when it is absent or something else."""
+    """Return the text under a key; empty when it is absent or something else."""
     value = mapping.get(key)
     return value if isinstance(value, str) else ""

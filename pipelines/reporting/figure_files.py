@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType
 
 MARK = "figures.json"
-"""What a folder of figures is known by: whose they are, titles, captions, and the names of all files."""
+"""Mark of a folder of figures: their flights, titles, captions, and the names of all files."""
 
 _WIDTH_MM = 180.0  # of a figure as wide as the page: two columns of a journal, one being half of that
 _DPI = 300
@@ -42,10 +42,10 @@ def write_figures(
     empty cells are missing numbers.
 
     Args:
-        folder: is there and empty.
+        folder: an existing, empty folder.
         plates: by their keys.
         contents: the sessions that they are of, by label; the mark names their flights.
-        key: equal for equal figures; it stands in the mark.
+        key: equal for equal figures; it is stored in the mark.
     """
     told = []
     for plate in plates.values():
@@ -80,15 +80,15 @@ def _write_drawing(folder: Path, key: str, figure: Figure) -> list[str]:
 
 
 def refuse_foreign(folder: Path, *, overwrite: bool) -> None:
-    """Let nobody's work be written over.
+    """Refuse to overwrite files that are not ours.
 
     Args:
-        folder: where figures shall go; what is there goes.
+        folder: the folder for figures; its old contents are removed.
         overwrite: replace other people's files; sessions and their parts are never replaced.
 
     Raises:
-        DataError: a session, its part, or what holds one; a file, or a folder with more in it than figures
-            that were written before.
+        DataError: a session, a part of one, or a folder that contains one; a file, or a folder that contains
+            more than figures that were written before.
     """
     refuse_sessions(folder, mark=MARK, option="--figures")
     if overwrite or not folder.exists():
@@ -105,7 +105,7 @@ def refuse_foreign(folder: Path, *, overwrite: bool) -> None:
 
 
 def _ours(folder: Path) -> set[str]:
-    """The names of the files that the mark in a folder lists."""
+    """Return the names of the files that the mark in a folder lists."""
     if not (folder / MARK).is_file():
         return set()
     told = read_json(folder / MARK, "remove it, or name another folder with --figures").get("figures")

@@ -1,6 +1,6 @@
 """The figures of a session's page: those of its cameras, joints and bones, and the list of all.
 
-Each function draws one figure from the summary and says in its description what is to be seen.
+Each function draws one figure from the summary and describes the picture in words.
 Long recordings are drawn with at most `MOST_POINTS` points a path and `MOST_BINS` stretches of time;
 the captions say so.
 """
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 
 def draw_all(summary: Summary, poses: Mapping[str, pd.DataFrame]) -> dict[str, Plate]:
-    """Every figure that the session has the data for, by its key."""
+    """Draw every figure that the session has the data for, by its key."""
     motion = summary.motion
     plates = [_timeline(summary.cameras)]
     measured = motion is not None and bool(motion.measured.any())
@@ -135,7 +135,7 @@ def _joint_bars(summary: Summary) -> Plate:
 
 
 def _joint_height_in(summary: Summary) -> float:
-    """The height of the two figures that stand side by side."""
+    """Return the height of the two figures that stand side by side, inches."""
     return 0.6 + 0.175 * max(len(summary.joints), 8)
 
 

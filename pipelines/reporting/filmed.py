@@ -1,4 +1,4 @@
-"""The cameras of a reconstructed session as their pictures are drawn on: frames, poses and keypoints."""
+"""The cameras of a reconstructed session, for drawing on their pictures: frames, poses and keypoints."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def refined_poses(folder: Path, record: StageRecord) -> dict[str, Trajectory]:
-    """The poses of the cameras that a session's reconstruction, of this record, refined."""
+    """Read the poses of the cameras that a session's reconstruction, of this record, refined."""
     name = "reconstruct/cameras.parquet"
     if name not in record.outputs:
         return {}
@@ -33,12 +33,12 @@ def refined_poses(folder: Path, record: StageRecord) -> dict[str, Trajectory]:
 def read_filmed(
     folder: Path, description: Description, record: StageRecord, frames: Mapping[str, pd.DataFrame]
 ) -> dict[str, FilmedCamera]:
-    """Cameras as the reconstruction took them, or as it refined them; frames by the clock that it estimated.
+    """Read cameras with logged or refined poses, and frames by the estimated clocks.
 
     Args:
         folder: the session.
         description: its session.json.
-        record: of its reconstruction: keypoints less sure than it used are left out.
+        record: of its reconstruction: keypoints below its least confidence are left out.
         frames: the frame tables of the cameras that are wanted.
     """
     offset_ns = estimated_clocks(read_json(folder / "reconstruct" / "metrics.json"))

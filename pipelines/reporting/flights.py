@@ -1,4 +1,4 @@
-"""The table over many flights: what became of each, and its figures."""
+"""The table of many flights: the status of each, and its figures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COLUMNS = (
     "pa_mpjpe_mm",
     "reprojection_px",
 )
-"""Of the table as CSV; behind them stand the mean tilt of every planner arm, `warnings` and `report`."""
+"""Columns of the table as CSV; then the mean tilt of every planner arm, `warnings` and `report`."""
 
 _FIGURES = COLUMNS[5:]
 _TILT = "tilt_deg_"
@@ -32,10 +32,10 @@ class FlightRow:
     """One flight."""
 
     flight: str  # its manifest, as seen from the summary
-    name: str | None  # what it calls itself; None if it was not ingested
+    name: str | None  # its own name; None if it was not ingested
     failed_stage: str | None
     error: str | None  # one line; None if all went well
-    figures: dict[str, float]  # by column; what was not measured is not in it
+    figures: dict[str, float]  # by column, without figures that were not measured
     warnings: tuple[str, ...]
     report: str | None  # path of its page, as seen from the summary
 
@@ -46,22 +46,22 @@ class FlightRow:
 
     @property
     def arms(self) -> list[str]:
-        """The columns of the planner arms that it has."""
+        """Columns of the planner arms that the flight has."""
         return [name for name in self.figures if name.startswith(_TILT)]
 
     @property
     def link(self) -> str | None:
-        """The address of its page."""
+        """Address of its page."""
         return None if self.report is None else quote(os.fsencode(self.report))
 
     def cells(self) -> list[object]:
-        """What stands in COLUMNS."""
+        """Return the values of COLUMNS."""
         figures = [self.figures.get(name) for name in _FIGURES]
         return [self.flight, self.name, self.status, self.failed_stage, self.error, *figures]
 
 
 def render_flights(rows: Sequence[FlightRow]) -> str:
-    """The complete HTML of the summary; it loads nothing, and what stands in files is escaped.
+    """Render the complete HTML of the summary; it loads nothing, and text from files is escaped.
 
     Args:
         rows: of every flight, in the order in which they are shown.

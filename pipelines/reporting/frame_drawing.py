@@ -27,7 +27,7 @@ _PAPER: Colour = (255, 255, 255)
 _BONE = 1 / 700  # of the picture's diagonal: 2 px at 1280 x 720
 _TEXT = 1 / 2000  # of it, too: OpenCV's scale, 22 px high at 1
 _LEAST_TEXT = 0.3  # OpenCV's scale below which no letter can be read
-_SPARE, _CORNER = 0.1, 0.15  # of a person's box: to spare at each side, and how long its corners' arms are
+_SPARE, _CORNER = 0.1, 0.15  # of a person's box: spare room at each side, and length of its corners' arms
 _WITH_ELLIPSE = {"nose", "head", "shoulder", "elbow", "wrist", "hip", "knee", "ankle"}  # others lie too close
 _INLET_SHARE = 0.42  # of the picture's height
 CHI2_95 = 5.991
@@ -37,18 +37,17 @@ _FURTHEST_PX = 1e6  # of a point just before the camera's plane; OpenCV counts i
 
 
 def draw_frame(picture: Picture, view: View, caption: Sequence[str]) -> Picture:
-    """A copy of a picture with a view's skeleton and keypoints, and lines of text at its upper left.
+    """Draw a view's skeleton and keypoints, and lines of text at the upper left, on a copy of a picture.
 
-    Bones and joints are coloured by the side of the body; what is NaN is not drawn. Thin ellipses hold a
-    joint of the body with 95 %, as far as its own uncertainty goes. Rings are keypoints that were found,
-    crosses those of joints that were rejected (red) or not reconstructed (grey), small dots the keypoints of
-    other people. Four corners hold the keypoints that were found of a person of the skeleton, with a tenth
-    to spare.
+    Bones and joints are coloured by the side of the body; NaN is not drawn. Thin ellipses are the 95 %
+    regions of the body's joints, by their own uncertainty alone. Rings are keypoints that were found, crosses
+    those of joints that were rejected (red) or not reconstructed (grey), small dots the keypoints of other
+    people. Four corners mark the box of a person's found keypoints, with a tenth to spare.
 
     Args:
-        picture: [height, width, 3]; of another size than the view's camera it is the same view at another
+        picture: [height, width, 3]; if its size differs from the camera's, it is the same view at another
             scale.
-        view: what to draw; its own picture is not looked at.
+        view: the view to draw; its own picture is not used.
         caption: lines of ASCII, or none; left out where the picture is too small to read them.
     """
     drawn = picture.copy()
@@ -75,14 +74,14 @@ def draw_frame(picture: Picture, view: View, caption: Sequence[str]) -> Picture:
 
 
 def blank_frame(width: int, height: int, words: str) -> Picture:
-    """A grey picture that says in its middle why it is none."""
+    """Return a grey picture with words in its middle that say why there is no picture."""
     blank = np.full((height, width, 3), GREY, dtype=np.uint8)
     _write(blank, [words], top=False)
     return blank
 
 
 def caption_of(view: View, status: NDArray[np.int8], method: str) -> tuple[str, str]:
-    """What stands over a frame: camera, frame and time; how many joints came out, and what became of others.
+    """Write the caption of a frame: camera, frame, time, and the number of joints by status.
 
     Args:
         view: the frame.
@@ -99,7 +98,7 @@ def caption_of(view: View, status: NDArray[np.int8], method: str) -> tuple[str, 
 
 
 def padded_to_even(picture: Picture) -> Picture:
-    """The picture with its last column and row once more where their number is odd, as 4:2:0 needs it."""
+    """Repeat the last column and row of a picture where their number is odd, as 4:2:0 needs it."""
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
@@ -108,7 +107,7 @@ def padded_to_even(picture: Picture) -> Picture:
 
 
 def _bones(picture: Picture, joints: tuple[str, ...], people: Float, bone: int) -> None:
-    """The bones of people [P, K, 2]: their dark casing first, so that it covers none of them."""
+    """Draw the bones of people [P, K, 2]: all dark casings first, so that they cover no bone."""
     place = {name: k for k, name in enumerate(joints)}
     bones = [
         (body[place[a]], body[place[b]], SIDES[side_of(a, b)]) for body in people for a, b in bones_of(joints)
@@ -136,7 +135,7 @@ def _dots(picture: Picture, points: Float, radius: float, colour: Colour) -> Non
 def _ellipses(
     picture: Picture, joints: tuple[str, ...], people: Float, spread: Float, thickness: int
 ) -> None:
-    """95 % ellipses of the body's joints [P, K, 2], whose covariances [P, J, 2, 2] are NaN if not known."""
+    """Draw 95 % ellipses of the joints [P, K, 2], with covariances [P, J, 2, 2], NaN if not known."""
     import cv2
 
     most = float(np.hypot(*picture.shape[:2]))
@@ -155,7 +154,7 @@ def _ellipses(
 
 
 def _corners(picture: Picture, found: Float, thickness: int) -> None:
-    """The corners of a box about the points [J, 2] that are known; nothing for fewer than two."""
+    """Draw the corners of a box about the points [J, 2] that are known; nothing for fewer than two."""
     known = found[_drawable(found)]
     if len(known) < 2:
         return
@@ -194,7 +193,7 @@ def _fixed(point: Float) -> tuple[int, int]:
 
 
 def with_inlet(picture: Picture, middle_px: Float, side_px: float) -> Picture:
-    """The square about the middle once more, enlarged, at the lower right; the same without a middle."""
+    """Draw the square about the middle, enlarged, at the lower right; do nothing without a middle."""
     import cv2
 
     height, width = picture.shape[:2]
@@ -215,7 +214,7 @@ def with_inlet(picture: Picture, middle_px: Float, side_px: float) -> Picture:
 
 
 def _write(picture: Picture, lines: Sequence[str], *, top: bool) -> None:
-    """Lines of text, white on darkened ground: at the upper left, or in the middle."""
+    """Write lines of text, white on darkened ground: at the upper left, or in the middle."""
     import cv2
 
     height, width = picture.shape[:2]

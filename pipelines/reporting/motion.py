@@ -29,11 +29,11 @@ class Motion:
     covariance: Float  # [T, P, J, 6] m^2, upper triangle: POINT_COVARIANCE_COLUMNS
     reprojection_px: Float  # [T, P, J]
     status: NDArray[np.int8]  # [T, P, J] index into triangulation.STATUS, -1 where the table has no row
-    views: Int64  # [T, P, J] how many cameras the joint was taken from
+    views: Int64  # [T, P, J] number of cameras that the joint was taken from
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """Where a joint was reconstructed from pictures ([T, P, J]; a filled joint was not)."""
+        """True [T, P, J] where a joint was reconstructed from pictures; a filled joint was not."""
         measured: NDArray[np.bool_] = self.status == STATUS.index("ok")
         return measured
 
@@ -44,7 +44,7 @@ class Motion:
 
     @property
     def sigma_m(self) -> Float:
-        """Standard deviation per axis of measured joints, sqrt(trace / 3), [T, P, J]; NaN if not stated."""
+        """Standard deviation per axis of measured joints, sqrt(trace / 3), [T, P, J]; NaN if unknown."""
         trace = self.covariance[..., [0, 3, 5]].sum(axis=-1)
         return np.where(self.measured, np.sqrt(trace / 3), np.nan)
 
@@ -78,17 +78,17 @@ def motion_from_skeleton(table: pd.DataFrame) -> Motion:
 
 
 def truth_at(truth: pd.DataFrame, motion: Motion) -> Float:
-    """True positions at the motion's times and joints, [T, P, J, 3].
+    """Return the true positions at the motion's times and joints, [T, P, J, 3].
 
-    Each person is compared with the nearest true one, as `true_joints_at` has them; NaN also for joints and
-    people that truth does not hold.
+    Each person is compared with the nearest true one, by `true_joints_at`; NaN also for joints and people
+    that are not in the truth.
     """
     known = motion_from(truth, motion.joints)
     return _own_truth(motion.measured_position, true_joints_at(known, motion.t_ns))
 
 
 def _own_truth(position: Float, truth: Float) -> Float:
-    """For each measured person of [T, P, J, 3] the true one that is nearest on average, each taken once."""
+    """Match each measured person of [T, P, J, 3] to the nearest true one on average, each taken once."""
     from scipy.optimize import linear_sum_assignment
 
     distance = np.linalg.norm(position[:, :, None] - truth[:, None], axis=-1)
@@ -104,13 +104,13 @@ def _own_truth(position: Float, truth: Float) -> Float:
 
 
 def errors_mm(motion: Motion, truth: Float) -> Float:
-    """Distance of every measured joint from truth in mm, [T, P, J]; NaN where either is missing."""
+    """Compute the distance of every measured joint from truth in mm, [T, P, J]; NaN if either is missing."""
     distance: Float = 1000 * np.linalg.norm(motion.measured_position - truth, axis=-1)
     return distance
 
 
 def share_inside_95(motion: Motion, truth: Float) -> float | None:
-    """Share of true joints inside the stated 95 % ellipsoid; None where nothing can be compared.
+    """Compute the share of true joints inside the 95 % ellipsoids; None if nothing can be compared.
 
     e' S^-1 e of a Gaussian in three dimensions is chi-square with 3 degrees of freedom, whose 95 %
     quantile is 7.815: a calibrated covariance gives a share of 0.95.

@@ -1,4 +1,4 @@
-"""The figure of errors over time, and the stretches of time that long recordings are drawn by."""
+"""The figure of errors over time, and the time bins that long recordings are drawn by."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MOST_BINS = 300
 
 
 def draw_over_time(summary: Summary, motion: Motion) -> Plate:
-    """Errors, and the share of joints that were measured; distances from truth where that is known."""
+    """Draw errors, and the share of measured joints; distances from truth where that is known."""
     from matplotlib.figure import Figure
 
     seconds = (motion.t_ns - summary.origin_ns) / 1e9
@@ -75,7 +75,7 @@ def draw_over_time(summary: Summary, motion: Motion) -> Plate:
 
 
 def _draw_errors(axes: Axes, centres: Float, middle: Float, low: Float, high: Float) -> None:
-    """A line on its range, from zero."""
+    """Draw a line on its range, from zero."""
     axes.grid(visible=True, axis="y")
     axes.fill_between(centres, low, high, color=STATUS_COLOURS["ok"], alpha=0.22, linewidth=0)
     axes.plot(centres, middle, color=STATUS_COLOURS["ok"])
@@ -84,7 +84,7 @@ def _draw_errors(axes: Axes, centres: Float, middle: Float, low: Float, high: Fl
 
 
 def _draw_percentages(axes: Axes, bins: Float, shown: Mapping[str, Float]) -> None:
-    """How many joints had which status, one on top of the other."""
+    """Draw the share of joints by status, one on top of the other."""
     base = np.zeros(len(bins) - 1)
     for word, percent in shown.items():
         top = base + percent
@@ -99,7 +99,7 @@ def _draw_percentages(axes: Axes, bins: Float, shown: Mapping[str, Float]) -> No
 
 
 def time_bins(seconds: Float, most: int = MOST_BINS) -> Float:
-    """Edges of at most so many bins; one per stamp if there are fewer stamps."""
+    """Return the edges of at most so many bins; one per stamp if there are fewer stamps."""
     count = min(len(seconds), most)
     step = (seconds[-1] - seconds[0]) / max(len(seconds) - 1, 1) or 1.0
     edges: Float = np.linspace(seconds[0] - step / 2, seconds[-1] + step / 2, count + 1)
@@ -107,7 +107,7 @@ def time_bins(seconds: Float, most: int = MOST_BINS) -> Float:
 
 
 def percentiles(values: Float, seconds: Float, bins: Float) -> tuple[Float, Float, Float]:
-    """Median, 10th and 90th percentile of the finite values in each bin; NaN in an empty one."""
+    """Compute median, 10th and 90th percentile of the finite values in each bin; NaN in an empty one."""
     edges = np.searchsorted(seconds, bins)
     result = np.full((3, len(bins) - 1), np.nan)
     for k in range(len(bins) - 1):
@@ -119,7 +119,7 @@ def percentiles(values: Float, seconds: Float, bins: Float) -> tuple[Float, Floa
 
 
 def _status_shares(seconds: Float, motion: Motion, bins: Float) -> tuple[Float, Float]:
-    """Centres of the bins, and the share of every status in each, [S, bins]; 0 where there are no rows."""
+    """Return the bins' centres, and the share of every status in each, [S, bins]; 0 without rows."""
     edges = np.searchsorted(seconds, bins)
     per_time = np.stack([(motion.status == s).sum(axis=(1, 2)) for s in range(len(STATUS))])
     running = np.concatenate([np.zeros((len(STATUS), 1)), np.cumsum(per_time, axis=1)], axis=1)
@@ -128,6 +128,6 @@ def _status_shares(seconds: Float, motion: Motion, bins: Float) -> tuple[Float, 
 
 
 def _steps(bins: Float, low: Float, high: Float) -> tuple[Float, Float, Float]:
-    """The corners of a step line: a share holds for the whole of its bin."""
+    """Return the corners of a step line: a share holds for the whole of its bin."""
     corners = np.repeat(bins, 2)[1:-1]
     return corners, np.repeat(low, 2), np.repeat(high, 2)

@@ -1,6 +1,6 @@
-"""The skeleton over the pictures as figures for a publication: a moment each, the cameras side by side.
+"""The skeleton over the pictures as figures for a publication: one figure per moment, cameras in columns.
 
-The page draws the same moments by itself (`panels`), for light and dark, with less of each picture.
+The page draws the same moments in its own way (`panels`), for light and dark, with less of each picture.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _CASING = "#ffffff"
 
 
 def draw_overlays(moments: Sequence[Moment]) -> dict[str, Plate]:
-    """A figure for every moment at which any camera has a frame, by its key."""
+    """Draw a figure for every moment at which any camera has a frame, by its key."""
     plates = [_moment(k, moment) for k, moment in enumerate(moments, start=1) if moment.views]
     return {plate.key: plate for plate in plates}
 
@@ -104,7 +104,7 @@ def _draw(axes: Axes, view: View) -> None:
 
 
 def _numbers(view: View) -> pd.DataFrame:
-    """Every joint in the picture; empty where it was not found or not reconstructed."""
+    """Tabulate every joint in the picture; empty where it was not found or not reconstructed."""
     people, joints = view.found.shape[:2]
     reprojected = view.reprojected[:, :joints].reshape(-1, 2)
     found = view.found.reshape(-1, 2)

@@ -1,9 +1,9 @@
-"""The skeleton put back into the pictures: what was found in them, and where its joints would be seen.
+"""The skeleton reprojected into the pictures, beside the keypoints that were found there.
 
-A few moments, spread over the flight; the worst is always among them: that of the largest error where
-truth is known, else the one where the views disagree most. Each camera shows its own frame nearest to the
-moment, with the skeleton and the logged pose interpolated to the time of that frame. `views_of` does the
-same for any stretch of a camera's frames.
+A few moments are shown, spread over the flight. The worst is always among them: that of the largest error
+where truth is known, else the one with the largest disagreement of the views. Each camera shows its own frame
+nearest to the moment, with the skeleton and the logged pose interpolated to the time of that frame.
+`views_of` does the same for any stretch of a camera's frames.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ if TYPE_CHECKING:
 Bool = NDArray[np.bool_]
 Picture = NDArray[np.uint8]  # [height, width, 3] BGR
 ReadFrame = Callable[[str, int], Picture | None]
-"""The picture of a camera's frame; None where there is none."""
+"""Function that returns the picture of a camera's frame; None where there is none."""
 
 MOMENTS = 6
 _LONGEST_STEP = 1.5  # usual steps: the skeleton is not interpolated between times further apart
-_SAME_ERROR_MM = 1.0  # among times with as large an error the views decide which is the worst
+_SAME_ERROR_MM = 1.0  # among times with errors this close, the views decide which is the worst
 _STEP = 1e-4  # of a joint's depth: small against how lenses bend, large against rounding
 _SAME_PERSON = 0.5  # of a body's size in the picture: a detection further away is somebody else
 
 
 @dataclass(frozen=True)
 class View:
-    """What one camera saw at a moment: P people of the skeleton with its J joints."""
+    """The sight of one camera at a moment: P people of the skeleton with its J joints."""
 
     camera: str
     intrinsics: Intrinsics
@@ -70,14 +70,14 @@ class View:
 
     @property
     def median_px(self) -> float | None:
-        """Median of those distances; None where there are none."""
+        """Median of `residual_px`; None where there are none."""
         known = self.residual_px[np.isfinite(self.residual_px)]
         return float(np.median(known)) if known.size else None
 
 
 @dataclass(frozen=True)
 class Moment:
-    """All cameras at one time; those without a frame near it by name alone."""
+    """All cameras at one time; cameras without a frame near it only by name."""
 
     t_s: float
     worst: bool
@@ -89,12 +89,12 @@ class Moment:
 def collect_moments(
     content: SessionContent, summary: Summary, read_frame: ReadFrame | None
 ) -> tuple[Moment, ...]:
-    """What the cameras saw at a few moments; nothing without a skeleton or without keypoints.
+    """Collect the cameras' views at a few moments; nothing without a skeleton or without keypoints.
 
     Args:
         content: with `frames` and `keypoints` of the cameras that have them.
         summary: of the same content.
-        read_frame: gives the pictures, where there are any.
+        read_frame: reads the pictures, where there are any.
     """
     motion = summary.motion
     if motion is None or not motion.measured.any():
@@ -129,13 +129,13 @@ def _largest_mm(error_mm: Float | None, row: int) -> float | None:
 
 
 def choose_moments(motion: Motion, error_mm: Float | None = None) -> tuple[list[int], int]:
-    """Choose rows of the motion to look at, in order, and the worst of them.
+    """Choose rows of the motion to show, in order, and the worst of them.
 
     Each of `MOMENTS` equal stretches gives one: the stretch with the worst time gives that, every other the
     time with the most joints, nearest its middle. Where truth is known, the worst is the time of the largest
-    error of a measured joint: views may agree on legs that were taken for each other. Without truth it is the
+    error of a measured joint: views may agree on legs that were swapped. Without truth it is the
     time with the largest median reprojection error, where at least half of the most joints were measured,
-    just before and after as well: one joint gone astray does not make a moment.
+    just before and after as well: one wrong joint does not make a moment.
 
     Args:
         motion: the skeleton.
@@ -164,7 +164,7 @@ def choose_moments(motion: Motion, error_mm: Float | None = None) -> tuple[list[
 
 
 def match_people(reprojected: Float, found: Float) -> list[int | None]:
-    """Which detection is which person: the nearest one, each taken once, none too far away.
+    """Match people to detections: the nearest one, each taken once, none too far away.
 
     Args:
         reprojected: [P, J, 2] px, NaN where a joint is not known.
@@ -186,7 +186,7 @@ def match_people(reprojected: Float, found: Float) -> list[int | None]:
 
 @dataclass(frozen=True)
 class FilmedCamera:
-    """One camera's F frames, poses and what was found in its pictures."""
+    """Frames F, poses and detected keypoints of one camera."""
 
     name: str
     intrinsics: Intrinsics
@@ -195,22 +195,22 @@ class FilmedCamera:
     keypoints: pd.DataFrame  # tables.KEYPOINTS
     track: Trajectory
     static: bool  # the first pose of the track holds all the time
-    between: Interpolation  # how far the track is trusted
+    between: Interpolation  # limits of the track's interpolation
 
     def nearest_frame(self, t_ns: int) -> int | None:
-        """Row of the frame nearest to a time; None where none lies within a frame period."""
+        """Return the row of the frame nearest to a time; None where none lies within a frame period."""
         nearest = int(np.argmin(np.abs(self.frame_t_ns - t_ns)))
         period = int(np.median(np.diff(self.frame_t_ns))) if len(self.frame_t_ns) > 1 else 0
         return nearest if abs(int(self.frame_t_ns[nearest]) - t_ns) <= period else None
 
     def people_in(self, frames: Int64, joints: tuple[str, ...]) -> list[Float]:
-        """What was found in each of these frames, [D, J, 2] px; NaN where a joint was not."""
+        """Return the detections in each of these frames, [D, J, 2] px; NaN for joints not found."""
         people = detections_from(self.keypoints[self.keypoints["frame"].isin(frames)], joints)
         first, behind = (np.searchsorted(people.frame, frames, side=side) for side in ("left", "right"))
         return [people.xy[start:stop] for start, stop in zip(first, behind, strict=True)]
 
     def poses_at(self, t_ns: Int64) -> tuple[Float, Float]:
-        """world_from_camera at times [N]: position [N, 3] and rotation [N, 3, 3], NaN without a pose."""
+        """Interpolate world_from_camera at times [N]: position [N, 3], rotation [N, 3, 3], NaN if none."""
         position, quaternion = poses_at(self.track, t_ns, self.between, static=self.static)
         return position, matrix_from_quaternion(quaternion)
 
@@ -218,7 +218,7 @@ class FilmedCamera:
 def _camera(camera: CameraRow, content: SessionContent, summary: Summary) -> FilmedCamera:
     frames, keypoints = content.frames[camera.name], content.keypoints[camera.name]
     settings = section(content.stages.get("reconstruct", {}), "settings")
-    # What the reconstruction did not use is no measure of it.
+    # Keypoints that the reconstruction did not use are no measure of it.
     used = keypoints["confidence"] >= (number(settings, "min_confidence") or 0.0)
     return FilmedCamera(
         name=camera.name,
@@ -233,7 +233,7 @@ def _camera(camera: CameraRow, content: SessionContent, summary: Summary) -> Fil
 
 
 def status_at(motion: Motion, t_ns: Int64) -> NDArray[np.int8]:
-    """What became of every joint at the skeleton's time nearest to each of [N] times, [N, P, J].
+    """Return every joint's status at the skeleton's time nearest to each of [N] times, [N, P, J].
 
     -1, as where the table has no row, at times for which the skeleton is not interpolated: outside its own,
     or in a gap.
@@ -247,7 +247,7 @@ def status_at(motion: Motion, t_ns: Int64) -> NDArray[np.int8]:
 
 
 def _nearest_row(motion: Motion, t_ns: Int64) -> Int64:
-    """The skeleton's time nearest to each of [N] times; of two the earlier."""
+    """Find the skeleton's time nearest to each of [N] times; of two the earlier."""
     after = np.clip(np.searchsorted(motion.t_ns, t_ns), min(1, len(motion.t_ns) - 1), len(motion.t_ns) - 1)
     before = np.maximum(after - 1, 0)
     is_after = motion.t_ns[after] - t_ns < t_ns - motion.t_ns[before]
@@ -257,7 +257,7 @@ def _nearest_row(motion: Motion, t_ns: Int64) -> Int64:
 def views_of(
     camera: FilmedCamera, at: Int64, motion: Motion, status: NDArray[np.int8], origin_ns: int
 ) -> list[View]:
-    """The skeleton as it would be seen in frames of a camera, beside what was found there; no pictures.
+    """Reproject the skeleton into frames of a camera, beside the detections there; no pictures.
 
     Args:
         camera: the camera.
@@ -306,9 +306,9 @@ def views_of(
 
 
 def seen_spread(points: Float, covariance: Float, world_from_camera: Float, lens: Intrinsics) -> Float:
-    """How the uncertainty of joints spreads in a picture, to first order: J R' S R J'.
+    """Propagate the covariance of joints into a picture, to first order: J R' S R J'.
 
-    It is that of the joints alone: where the camera was is taken for known.
+    It is that of the joints alone: the camera's pose is taken as exact.
 
     Args:
         points: [..., 3] m, in the camera.
@@ -338,13 +338,13 @@ def _view(
 
 
 def _longest_step_ns(motion: Motion) -> int:
-    """Times of the skeleton further apart have nothing between them."""
+    """Return the longest step of the skeleton's times that is interpolated."""
     usual_ns = float(np.median(np.diff(motion.t_ns))) if len(motion.t_ns) > 1 else 0.0
     return round(_LONGEST_STEP * usual_ns)
 
 
 def _row_median(values: Float) -> Float:
-    """Median of the finite numbers in each row; NaN where there are none."""
+    """Compute the median of the finite numbers in each row; NaN where there are none."""
     medians = np.full(len(values), np.nan)
     known = np.isfinite(values).any(axis=1)
     medians[known] = np.nanmedian(values[known], axis=1)

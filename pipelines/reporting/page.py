@@ -1,4 +1,4 @@
-"""The page of one session: numbers and figures set into the template, in one file that needs nothing else."""
+"""The page of one session: numbers and figures in the template, as one self-contained file."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class KeyFigure:
 
 @dataclass(frozen=True)
 class StageNote:
-    """How one stage made what it made."""
+    """Settings and counts of one stage."""
 
     name: str
     key: str
@@ -51,27 +51,27 @@ class StageNote:
 
 @dataclass(frozen=True)
 class Overlays:
-    """The skeleton in the pictures: the moments, a drawing of every view, and what is to be said of all."""
+    """The skeleton in the pictures: the moments, a drawing of every view, and facts about all of them."""
 
     moments: tuple[Moment, ...]
     drawings: dict[tuple[int, str], Markup]  # (moment, camera)
-    pictures: int  # how many drawings show a picture
-    rejected: bool  # whether any joint is marked so
+    pictures: int  # number of drawings with a picture
+    rejected: bool  # True if any joint is marked so
     unmeasured: bool
-    others: bool  # whether anybody beside the skeleton's people is drawn
-    refined: bool  # whether the cameras stand where the reconstruction found them, not where the log says
+    others: bool  # True if people beside the skeleton's are drawn
+    refined: bool  # True if the cameras' poses are refined, not logged
 
 
 def render_page(content: SessionContent, read_frame: ReadFrame | None = None) -> str:
-    """The complete HTML of a session's report.
+    """Render the complete HTML of a session's report.
 
     The same content gives the same bytes: no dates of making, no paths of this machine.
-    Whatever stands in the session's files is escaped. The page loads nothing; it runs the one script of
+    All text from the session's files is escaped. The page loads nothing; it runs the one script of
     its 3D viewer, which its policy names by hash, and nothing else.
 
     Args:
-        content: what the session holds.
-        read_frame: gives the pictures behind the overlays; without it they are drawn on plain ground.
+        content: the session's contents.
+        read_frame: reads the pictures behind the overlays; without it they are drawn on plain ground.
     """
     summary = summarise(content)
     replan = _replan(summary, content)
@@ -116,11 +116,13 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
 
 
 def draw_session(content: SessionContent, read_frame: ReadFrame | None = None) -> dict[str, Plate]:
-    """Every figure of the page but the 3D viewer, by its key; the overlays' moments are one figure each.
+    """Draw every figure of the page but the 3D viewer, by its key.
+
+    The overlays have one figure for each moment.
 
     Args:
-        content: what the session holds.
-        read_frame: gives the pictures behind the overlays; without it they are drawn on plain ground.
+        content: the session's contents.
+        read_frame: reads the pictures behind the overlays; without it they are drawn on plain ground.
     """
     summary = summarise(content)
     moments = collect_moments(as_reconstructed(content), summary, read_frame)
@@ -139,7 +141,7 @@ def _replan(summary: Summary, content: SessionContent) -> Replan | None:
 
 
 def _policy(script: str, *, pictures: bool) -> str:
-    """What the page may do: its own styles, its own script, and pictures that it holds itself."""
+    """Return the page's policy: its own styles, its own script, and pictures that it holds itself."""
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     rules = ["default-src 'none'", "style-src 'unsafe-inline'", f"script-src 'sha256-{digest}'"]
     return "; ".join(rules + ["img-src data:"] * pictures)
@@ -164,7 +166,7 @@ def _overlays(content: SessionContent, summary: Summary, read_frame: ReadFrame |
 
 
 def _key_figures(summary: Summary) -> list[KeyFigure]:
-    """At most five numbers that say how good a recording is."""
+    """Return at most five numbers that say how good a recording is."""
     if summary.share is None:
         frames = sum(camera.entry.frames.count for camera in summary.cameras)
         return [
@@ -188,7 +190,7 @@ def _key_figures(summary: Summary) -> list[KeyFigure]:
 
 
 def _made_by(content: SessionContent) -> list[tuple[str, str]]:
-    """The stages that the same versions made, and those."""
+    """Group the stages by the versions that made them: stages and versions."""
     made: dict[str, list[str]] = {}
     for stage in content.stages:
         if told := content.made_by.get(stage):

@@ -1,8 +1,8 @@
-"""Drawing what a camera saw: detections and the reprojected skeleton over the picture, as inline SVG.
+"""A camera's view as inline SVG: detections and the reprojected skeleton over the picture.
 
 A square is cut out around the people, so that a distance of a few pixels can be seen; a small map in its
-corner shows where in the picture it lies. Lengths in a drawing are pixels of the picture; what belongs
-to the drawing itself is measured in its own unit, 1/320 of the panel's width.
+corner shows where in the picture it lies. Lengths in a drawing are pixels of the picture; sizes of marks are
+in the drawing's own unit, 1/320 of the panel's width.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from pipelines.reporting.overlays import Picture, View
 from pipelines.session.records import Float
 from pipelines.session.skeletons import bones_of
 
-_MARGIN = 1.3  # a panel is so many times as large as what it shows
+_MARGIN = 1.3  # size of a panel, relative to its contents
 _LEAST_PX = 96.0
 _WHOLE = 0.8  # a panel this wide, by the picture's width, needs no map
 _MAP = 0.27  # width of the map, by the panel's
 _UNITS = 320.0
 _WIDEST_PX, _MAP_WIDTH_PX = 640, 192
 _MOST_PIXELS = 6_000_000
-"""All pictures of a page together: 18 panels of 577 x 577."""
+"""Largest number of pixels of all pictures of a page together: 18 panels of 577 x 577."""
 _JPEG_QUALITY = 80
 
 
@@ -39,18 +39,18 @@ class Window(NamedTuple):
 
 
 def picture_width(panels: int) -> int:
-    """How many pixels wide the picture of a panel may be where there are so many panels."""
+    """Return the largest width in pixels of a panel's picture, for so many panels."""
     return min(_WIDEST_PX, int(np.sqrt(_MOST_PIXELS / max(panels, 1))))
 
 
 def draw_panel(view: View, width_px: int) -> str:
-    """One view as an `<svg>` without a word from the session's files.
+    """Draw one view as an `<svg>` without a word from the session's files.
 
     The same view gives the same bytes, with the same build of OpenCV where there is a picture.
 
     Args:
-        view: what to draw.
-        width_px: how wide the picture in it may be.
+        view: the view to draw.
+        width_px: largest width of its picture.
     """
     size = (view.intrinsics.width, view.intrinsics.height)
     window = window_of(view, size)
@@ -86,7 +86,7 @@ def draw_panel(view: View, width_px: int) -> str:
 
 
 def window_of(view: View, size: tuple[int, int]) -> Window:
-    """What a panel shows: the people of the skeleton with a margin; without any, the whole picture."""
+    """Return the part that a panel shows: the people with a margin; without any, the whole picture."""
     width, height = size
     points = np.concatenate([view.found.reshape(-1, 2), view.reprojected.reshape(-1, 2)])
     inside = points[(points >= 0).all(axis=1) & (points < [width, height]).all(axis=1)]
@@ -99,7 +99,7 @@ def window_of(view: View, size: tuple[int, int]) -> Window:
 
 
 def _centred(middle: Float, width: float, size: tuple[int, int]) -> Window:
-    """A square around a point, on whole pixels, moved into the picture as far as it fits."""
+    """Return a square around a point, on whole pixels, moved into the picture as far as it fits."""
     extent = np.ceil([width, width])
     room = np.array(size) - extent
     corner = np.where(room >= 0, np.clip(np.round(middle - extent / 2), 0, np.maximum(room, 0)), room / 2)
@@ -124,7 +124,7 @@ def _bones(view: View, unit: float) -> list[str]:
 
 
 def _lines(kind: str, unit: float, segments: Iterable[tuple[Float, Float]]) -> str:
-    """All segments as one path; those with a missing end are left out."""
+    """Draw all segments as one path; those with a missing end are left out."""
     steps = [f"M{_numbers(*a)}L{_numbers(*b)}" for a, b in segments if np.isfinite([a, b]).all()]
     if not steps:
         return ""
@@ -165,7 +165,7 @@ def _numbers(*values: float) -> str:
 
 
 def _map(view: View, size: tuple[int, int], window: Window) -> str:
-    """The whole picture in the upper left corner, with a frame where the panel lies, and other people."""
+    """Draw the whole picture in the upper left corner, with the panel's frame, and other people."""
     everything = Window(-0.5, -0.5, *size)
     width = _MAP * window.width
     unit = size[0] / (_MAP * _UNITS)
@@ -183,9 +183,9 @@ def _map(view: View, size: tuple[int, int], window: Window) -> str:
 
 
 def _picture(picture: Picture, size: tuple[int, int], window: Window, width_px: int) -> str:
-    """The part of a picture in a window, as an `<image>` of at most `width_px` for the whole window.
+    """Draw a picture's part in a window, as an `<image>` of at most `width_px` for the whole window.
 
-    A picture of another size than the calibration's is the same view at another scale.
+    If its size differs from the calibration's, it is the same view at another scale.
     """
     import cv2
 
@@ -206,10 +206,12 @@ def _picture(picture: Picture, size: tuple[int, int], window: Window, width_px: 
 def cut_out(
     picture: Picture, size: tuple[int, int], window: Window
 ) -> tuple[Picture, tuple[float, float, float, float]]:
-    """The whole pixels of a picture in a window, and their left, right, bottom and top edge.
+    """Cut out the whole pixels of a picture in a window; return them and the edges.
 
-    A picture of another size than the calibration's is the same view at another scale; edges are in pixels
-    of the calibration.
+    The edges are left, right, bottom and top.
+
+    If the picture's size differs from the calibration's, it is the same view at another scale; edges are in
+    pixels of the calibration.
     """
     scale = np.array([picture.shape[1] / size[0], picture.shape[0] / size[1]])
     corners = (

@@ -1,4 +1,4 @@
-"""The figure of where everybody was, seen from above: the cameras' paths and the actor's."""
+"""The figure of all paths from above: the cameras' and the actor's."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 def draw_paths(
     cameras: tuple[CameraRow, ...], poses: Mapping[str, pd.DataFrame], motion: Motion | None
 ) -> Plate:
-    """The paths on the ground plane; without a motion those of the cameras alone."""
+    """Draw the paths on the ground plane; without a motion those of the cameras alone."""
     from matplotlib.figure import Figure
 
     tracks = {camera.name: trajectory_from(poses[camera.name]) for camera in cameras if camera.name in poses}
@@ -88,7 +88,7 @@ def draw_paths(
 
 
 def _bounds(paths: list[Float]) -> tuple[Float, Float]:
-    """The corners [2] of the box that holds all paths [N, 2]; zero where there is none."""
+    """Return the corners [2] of the box that holds all paths [N, 2]; zero where there is none."""
     everything = np.concatenate([np.full((1, 2), np.nan), *paths])
     everything = everything[np.isfinite(everything).all(axis=1)]
     return (everything.min(axis=0), everything.max(axis=0)) if len(everything) else (np.zeros(2),) * 2
@@ -102,9 +102,9 @@ def _draw_camera(
     style: tuple[str, object],
     extent_m: float,
 ) -> tuple[Float, int]:
-    """A path with strokes in the direction of view; a camera that stands still is a square.
+    """Draw a path with strokes in the direction of view; a camera that stands still is a square.
 
-    Returns the path as drawn, from the origin, and every how many poses were.
+    Returns the path as drawn, from the origin, and the stride of the drawn poses.
     """
     ground = track.position[:, :2] - origin
     look = rotate(track.quaternion_xyzw, np.array([0.0, 0.0, 1.0]))[:, :2]
@@ -126,7 +126,7 @@ def _draw_camera(
 
 
 def _draw_person(axes: Axes, label: str, person: Float, line: object) -> tuple[Float, int]:
-    """A person's path [T, 2] and its start; returns what was drawn of it, and every how many poses were."""
+    """Draw a person's path [T, 2] and its start; return the drawn path, and the stride of its poses."""
     stride = every(len(person), MOST_POINTS)
     path = person[::stride]
     axes.plot(*path.T, color=INK, linewidth=2.0, linestyle=line, label=label, zorder=4)
@@ -136,7 +136,7 @@ def _draw_person(axes: Axes, label: str, person: Float, line: object) -> tuple[F
 
 
 def _drawn_path(t_ns: Int64, path: Float, gap_starts_ns: list[int]) -> tuple[Float, int]:
-    """A decimated path, broken where the poses have a gap, and every how many poses were drawn."""
+    """Return a decimated path, broken where the poses have a gap, and the stride of its poses."""
     stride = every(len(path), MOST_POINTS)
     breaks = np.unique(np.searchsorted(t_ns, gap_starts_ns, side="right"))
     pieces = []
@@ -148,9 +148,9 @@ def _drawn_path(t_ns: Int64, path: Float, gap_starts_ns: list[int]) -> tuple[Flo
 
 
 def _middles(motion: Motion) -> list[Float]:
-    """The middle of each person's measured joints, seen from above, [T, 2]; NaN where there are none.
+    """Compute the middle of each person's measured joints from above, [T, 2]; NaN where there are none.
 
-    Coordinate-wise median: one joint that went astray does not bend the path.
+    It is the coordinate-wise median: one wrong joint does not bend the path.
     """
     middles = []
     for position in np.moveaxis(motion.measured_position[..., :2], 1, 0):

@@ -1,4 +1,4 @@
-"""Where the cameras of a session were: as refined where a reconstruction did, else as logged."""
+"""Poses of the cameras of a session: refined if a reconstruction did that, else as logged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipelines.session.tabular import trajectory_from
 
 
 def estimated_clocks(metrics: Mapping[str, object]) -> dict[str, int]:
-    """How much later than ingested the frames of a camera are, ns, by what a reconstruction estimated.
+    """Read the clock offsets of a reconstruction: the delay of a camera's frames after ingest, ns.
 
     Args:
         metrics: reconstruct/metrics.json.
@@ -25,10 +25,10 @@ def estimated_clocks(metrics: Mapping[str, object]) -> dict[str, int]:
 
 
 def as_reconstructed(content: SessionContent) -> SessionContent:
-    """The session with the poses and the clocks that its skeleton was measured with.
+    """Return the session with the poses and the clocks that its skeleton was measured with.
 
-    Refined poses take the place of the logged ones, and frames come at the times of the clocks that were
-    estimated: only so are residuals those of the reconstruction.
+    Refined poses replace the logged ones, and frames have the times of the estimated clocks. Only then are
+    residuals those of the reconstruction.
     """
     offset_ns = estimated_clocks(content.metrics or {})
     frames = {
@@ -39,7 +39,7 @@ def as_reconstructed(content: SessionContent) -> SessionContent:
 
 
 def camera_positions(content: SessionContent, summary: Summary, t_ns: Int64) -> Float:
-    """[C, T, 3] m of the cameras that have poses; NaN at times without one."""
+    """Interpolate positions [C, T, 3] m of the cameras that have poses; NaN at times without one."""
     between = summary.description.pose_interpolation
     poses = content.poses | content.refined
     positions = []

@@ -1,4 +1,4 @@
-"""A figure with its words and its numbers, and what all figures share."""
+"""A figure with its words and its numbers, and helpers that all figures share."""
 
 from __future__ import annotations
 
@@ -35,54 +35,54 @@ class Plate:
     key: str
     title: str
     caption: str
-    description: str  # what is to be seen, with its numbers, for readers who do not see it
+    description: str  # the picture in words, with its numbers, for readers who cannot see it
     figure: Figure
-    numbers: Mapping[str, pd.DataFrame]  # by what they are; "" for those that need no name
+    numbers: Mapping[str, pd.DataFrame]  # by name; "" for those that need none
 
     @cached_property
     def svg(self) -> str:
-        """The figure as an `<svg>` element for the inside of a page."""
+        """Figure as an `<svg>` element for the inside of a page."""
         return inline_svg(self.figure, f"figure-{self.key}", self.title, self.description)
 
 
 def table(**columns: object) -> pd.DataFrame:
-    """Numbers of a figure by columns of the same length; a single value holds for all rows."""
+    """Return numbers of a figure by columns of the same length; a single value holds for all rows."""
     import pandas as pd
 
     return pd.DataFrame(columns)
 
 
 def tabled(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> pd.DataFrame:
-    """Numbers of a figure by rows."""
+    """Return numbers of a figure by rows."""
     import pandas as pd
 
     return pd.DataFrame(rows, columns=list(columns))
 
 
 def stacked(tables: list[pd.DataFrame]) -> pd.DataFrame:
-    """Tables of the same columns, one below the other."""
+    """Stack tables of the same columns, one below the other."""
     import pandas as pd
 
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
 def every(count: int, most: int) -> int:
-    """The stride that leaves at most `most` of `count`."""
+    """Return the stride that leaves at most `most` of `count`."""
     return max(1, -(-count // most))
 
 
 def near_zero(low: Float) -> Float:
-    """What to subtract from coordinates whose least is `low`: 0, or a round number where they are far."""
+    """Return the offset to subtract from coordinates whose least is `low`: 0, or a round number if far."""
     return np.where(np.abs(low) > _FAR_M, np.floor(low / 1000) * 1000, 0.0)
 
 
 def axis_label(direction: str, origin_m: float) -> str:
-    """`east (m)`, or of which number far from zero."""
+    """Return `east (m)`, or with the subtracted number far from zero."""
     return f"{direction} (m)" if origin_m == 0 else f"{direction} of {fixed(origin_m, 0)} m (m)"
 
 
 def quiet(axes: Axes, *, grid: bool = True) -> None:
-    """Light axes: no frame on the left, a thin line below."""
+    """Make axes light: no frame on the left, a thin line below."""
     axes.spines["left"].set_visible(False)
     axes.tick_params(axis="y", length=0)
     if grid:

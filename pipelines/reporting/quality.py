@@ -1,4 +1,4 @@
-"""How good the data of every camera is: poses, clock, detections, and what hid the actor."""
+"""Data quality of every camera: poses, clock, detections, and how much the map hid the actor."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pipelines.session.tabular import trajectory_from
 if TYPE_CHECKING:
     import pandas as pd
 
-_CONFIDENT = 0.3  # what reconstruct asks of a keypoint where nothing else is stated
+_CONFIDENT = 0.3  # default least confidence of keypoints in reconstruct
 _UNITS = {
     "position_m": ("", "m"),
     "rotation_deg": ("", "deg"),
@@ -30,7 +30,7 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class QualityRow:
-    """One camera, in words and shares; None where nothing is known."""
+    """Quality of one camera, in words and shares; None where nothing is known."""
 
     name: str
     stated: str  # of the poses' errors, per axis
@@ -43,7 +43,7 @@ class QualityRow:
 
 
 def quality(content: SessionContent, summary: Summary) -> tuple[QualityRow, ...]:
-    """The rows of the table of data quality."""
+    """Return the rows of the table of data quality."""
     return tuple(_row(content, summary, camera) for camera in summary.cameras)
 
 
@@ -73,7 +73,7 @@ def _row(content: SessionContent, summary: Summary, camera: CameraRow) -> Qualit
 
 
 def _stated(camera: CameraRow, poses: pd.DataFrame | None) -> str:
-    """Who says how far the poses err, and how far."""
+    """Describe the errors of the poses, by flight.yaml or by the log."""
     if camera.entry.pose_noise:
         return "; ".join(_model(name, told) for name, told in camera.entry.pose_noise.items())
     covariance = logged_covariance(trajectory_from(poses)) if poses is not None else None
@@ -96,7 +96,7 @@ def _model(name: str, told: dict[str, float | str]) -> str:
 
 
 def _measured(logged: pd.DataFrame, true: pd.DataFrame, summary: Summary) -> str:
-    """Root mean square per axis of the logged poses' errors at their own stamps."""
+    """Compute the root mean square per axis of the logged poses' errors at their own stamps."""
     log, truth = trajectory_from(logged), trajectory_from(true)
     between = summary.description.pose_interpolation
     position, quaternion = interpolate_poses(

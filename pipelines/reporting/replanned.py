@@ -1,4 +1,4 @@
-"""The comparison of planners in numbers: how every arm flew, and the rows of its tables."""
+"""The comparison of planners in numbers: the flight of every arm, and the rows of its tables."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ class Seen:
     cameras: tuple[str, ...]
     joints: tuple[str, ...]
     pixels: Float  # [C, K, J, 2]; NaN outside the picture
-    status: NDArray[np.str_]  # [C, K, J] seen, hidden or outside; empty where nobody knows the joint
+    status: NDArray[np.str_]  # [C, K, J] seen, hidden or outside; empty where the joint is unknown
 
 
 @dataclass(frozen=True)
 class Arm:
-    """How one arm flew: T times, C cameras. Angles are continuous where they are drawn over time."""
+    """The flight of one arm: T times, C cameras. Angles are continuous where they are drawn over time."""
 
     name: str
-    simulated: bool  # False for what was flown
+    simulated: bool  # False for logged arms
     colour: int  # of the page's camera colours, one that no camera of the session has if any is free
     t_ns: Int64  # [T]
     t_s: Float  # [T] since the page's zero
@@ -48,14 +48,14 @@ class Arm:
     tilt_deg: Float  # [C, T] of the camera above the actor
     range_m: Float  # [C, T] from the actor
     yaw_deg: Float  # [T] of the first camera around the actor, counterclockwise from east
-    commanded_yaw_deg: Float  # [T] of the formation; NaN for what was flown
+    commanded_yaw_deg: Float  # [T] of the formation; NaN for logged arms
     predicted_error_m: Float  # [T] NaN where the cameras determine nothing
     seen: Seen | None  # None where no skeleton was known
 
 
 @dataclass(frozen=True)
 class CostMap:
-    """What a formation would cost: M times, D yaws of its first camera over one turn, ascending."""
+    """Cost of a formation: M times, D yaws of its first camera over one turn, ascending."""
 
     t_s: Float  # [M]
     yaw_deg: Float  # [D]
@@ -81,7 +81,7 @@ class ArmRow:
 
 @dataclass(frozen=True)
 class DifferenceRow:
-    """One arm less another: what was found, and the interval of each."""
+    """Difference of one arm from another: the mean and the interval of each figure."""
 
     names: tuple[str, str]
     tilt_deg: tuple[str, str]
@@ -106,12 +106,12 @@ class Replan:
 
 
 def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Replan:
-    """Everything that the page says and draws of a comparison.
+    """Collect everything that the page says and draws of a comparison.
 
     Args:
-        content: what is stored of it.
+        content: the stored comparison.
         origin_ns: the page's zero of time.
-        cameras: how many the session has.
+        cameras: number of the session's cameras.
     """
     metrics = content.metrics
     stated = section(metrics, "arms")
@@ -134,7 +134,7 @@ def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Re
 
 
 def bounds_of(arms: tuple[Arm, ...]) -> tuple[Float, Float]:
-    """The corners [2] of the box that holds all arms and the actor, seen from above, in m."""
+    """Return the corners [2] of the box that holds all arms and the actor, seen from above, in m."""
     points = [path[..., :2].reshape(-1, 2) for arm in arms for path in (arm.position, arm.actor)]
     everywhere = np.concatenate([np.zeros((0, 2)), *points])
     everywhere = everywhere[np.isfinite(everywhere).all(axis=1)]
@@ -144,7 +144,7 @@ def bounds_of(arms: tuple[Arm, ...]) -> tuple[Float, Float]:
 
 
 def span_s(arms: tuple[Arm, ...]) -> tuple[float, float]:
-    """From the first to the last moment, or a tenth of a second around a single one."""
+    """Return the first and the last moment, or a tenth of a second around a single one."""
     first, last = min(float(arm.t_s[0]) for arm in arms), max(float(arm.t_s[-1]) for arm in arms)
     return (first, last) if last > first else (first - 0.05, last + 0.05)
 
@@ -205,14 +205,17 @@ def _seen(table: pd.DataFrame | None, cameras: tuple[str, ...], origin_ns: int) 
 
 
 def _at(actor: pd.DataFrame, t_ns: Int64) -> Float:
-    """The actor [T, 3] at the times of an arm."""
+    """Interpolate the actor [T, 3] at the times of an arm."""
     stamps = actor["t_ns"].to_numpy(np.int64)
     seconds, wanted = (stamps - t_ns[0]) / 1e9, (t_ns - t_ns[0]) / 1e9
     return np.stack([np.interp(wanted, seconds, actor[axis].to_numpy(np.float64)) for axis in "xyz"], axis=-1)
 
 
 def _continuous_deg(angle_rad: Float, start_deg: float) -> Float:
-    """Degrees without jumps of a turn, the first one within half a turn of `start_deg`; NaN stays NaN."""
+    """Convert to degrees without jumps of a turn; NaN stays NaN.
+
+    The first one is within half a turn of `start_deg`.
+    """
     known = np.isfinite(angle_rad)
     result = np.full(angle_rad.shape, np.nan)
     if known.any():
@@ -242,7 +245,7 @@ def _terrain(content: ReplanContent, arms: tuple[Arm, ...]) -> Terrain | None:
 
 
 def _setting(metrics: Mapping[str, object]) -> str:
-    """What flew, and against what it was scored."""
+    """Describe the flight and the reference of its scores."""
     names = list(section(metrics, "arms"))
     flown = [name for name in names if section(section(metrics, "arms"), name).get("simulated") is False]
     drones, duration_s = number(metrics, "drones"), number(metrics, "duration_s")
@@ -302,7 +305,7 @@ def _difference(found: object) -> DifferenceRow:
 def _estimate(
     stated: Mapping[str, object], scale: float = 1.0, *, digits: int = 1, signed: bool = False
 ) -> tuple[str, str]:
-    """A mean and its interval, `4.2` and `4.0 to 4.4`; a dash and nothing where there is none."""
+    """Format a mean and its interval, `4.2` and `4.0 to 4.4`; a dash and nothing where there is none."""
     mean = number(stated, "mean")
     if mean is None:
         return ABSENT, ""

@@ -35,12 +35,15 @@ if TYPE_CHECKING:
 
 SNAPSHOTS = 7
 _STRIDE_M = 1.3  # between two snapshots of the body
-# Above a raised hand, and below the ground by more than errors explain: what lies beyond is cut off.
+# Above a raised hand, and below the ground by more than errors explain: points beyond are cut off.
 _TALLEST_M, _DEEPEST_M = 2.6, 0.5
 
 
 def draw_snapshots(summary: Summary, motion: Motion) -> Plate:
-    """The first person's fullest skeletons, side by side; at least one joint was measured."""
+    """Draw the first person's fullest skeletons, side by side.
+
+    At least one joint must have been measured.
+    """
     from matplotlib.figure import Figure
 
     chosen = _fullest_times(motion)
@@ -89,7 +92,7 @@ def draw_snapshots(summary: Summary, motion: Motion) -> Plate:
 
 
 def _fullest_times(motion: Motion) -> list[int]:
-    """Of each of `SNAPSHOTS` equal stretches the time with most measured joints, nearest its middle."""
+    """Choose in each of `SNAPSHOTS` equal stretches the time with most joints, nearest its middle."""
     count = motion.measured[:, 0].sum(axis=1)
     chosen = []
     for rows in np.array_split(np.arange(len(count)), min(SNAPSHOTS, len(count))):
@@ -101,7 +104,7 @@ def _fullest_times(motion: Motion) -> list[int]:
 
 
 def _three_quarter_view(body: Float, joints: tuple[str, ...]) -> tuple[Float, Float]:
-    """Horizontal and vertical picture coordinates in metres of one body [J, 3].
+    """Compute horizontal and vertical picture coordinates in metres of one body [J, 3].
 
     The picture's right is where the body faces, turned 35 degrees towards its left, so that both sides show.
     """

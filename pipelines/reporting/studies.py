@@ -1,4 +1,4 @@
-"""Studies on a session's page: what they show in a sentence, a table of their errors, and their figure."""
+"""Studies on a session's page: their result in a sentence, a table of their errors, and their figure."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ _TITLES = {
     "robots": "Error against the number of drones",
     "noise": "Error against the kind of pose noise",
 }
-_SHOWN = {METRICS["mpjpe_mm"]: True, METRICS["reconstructed_share"]: False}  # whether on common joint-frames
-_BEST = ("refined", "robust", "midpoint", "dlt")  # the one that is spoken of: the first that there is
+_SHOWN = {METRICS["mpjpe_mm"]: True, METRICS["reconstructed_share"]: False}  # True: on common joint-frames
+_BEST = ("refined", "robust", "midpoint", "dlt")  # the sentence is about the first one available
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,12 @@ class StudyTable:
     in_common: bool  # on the joint-frames that every method has
     header: list[str]
     names: int  # columns of names, before those of figures
-    rows: list[list[tuple[str, str]]]  # what was found, and its interval where there is one
+    rows: list[list[tuple[str, str]]]  # the mean, and its interval where there is one
 
 
 @dataclass(frozen=True)
 class Study:
-    """One study as the page tells it."""
+    """One study, for the page."""
 
     key: str  # of its figure
     title: str
@@ -47,10 +47,10 @@ class Study:
 
 
 def summarise_studies(contents: Sequence[StudyContent]) -> tuple[Study, ...]:
-    """Everything that the page says of studies.
+    """Collect everything that the page says of studies.
 
     Raises:
-        KeyError, TypeError, ValueError, IndexError, AttributeError: a summary that is none of a study.
+        KeyError, TypeError, ValueError, IndexError, AttributeError: a summary that is not that of a study.
     """
     return tuple(
         Study(
@@ -71,7 +71,7 @@ def summarise_studies(contents: Sequence[StudyContent]) -> tuple[Study, ...]:
 
 
 def draw_studies(contents: Sequence[StudyContent]) -> dict[str, Plate]:
-    """Their figures, by key."""
+    """Draw the studies' figures, by key."""
     return {_key(k): _plate(_key(k), each.summary) for k, each in enumerate(contents)}
 
 
@@ -108,7 +108,7 @@ def _plate(key: str, summary: Mapping[str, Any]) -> Plate:
 
 
 def what_it_shows(summary: Mapping[str, Any]) -> str:
-    """The ends of what was varied, for one method under the strongest noise."""
+    """Describe the error at the ends of the varied condition, for one method under the strongest noise."""
     measured = [cell for cell in summary["cells"] if cell["metrics"]["mpjpe_mm"]]
     method = min((cell["method"] for cell in measured), key=_BEST.index)
     own = [cell for cell in measured if cell["method"] == method]

@@ -1,4 +1,4 @@
-"""What the session amounts to: the numbers of the page's tables."""
+"""Summary of a session: the numbers of the page's tables."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class CameraRow:
 
     @property
     def gap_total_s(self) -> float:
-        """How long the gaps in the poses last together."""
+        """Total duration of the gaps in the poses."""
         return sum(end - start for start, end in self.gaps_s)
 
 
 @dataclass(frozen=True)
 class JointRow:
-    """One joint over the whole recording; None where there is nothing to state."""
+    """One joint over the whole recording; None where a value is not known."""
 
     name: str
     share: float
@@ -60,7 +60,7 @@ class Measure:
 
 @dataclass(frozen=True)
 class CameraErrors:
-    """How well one camera's keypoints agree with the skeleton, in px; None where it was not measured."""
+    """Agreement of one camera's keypoints with the skeleton, in px; None where it was not measured."""
 
     name: str
     median_px: float | None
@@ -87,27 +87,27 @@ class Summary:
 
     @property
     def total(self) -> int:
-        """How many joint-frames there are."""
+        """Number of joint-frames."""
         return sum(self.counts.values())
 
     @property
     def statuses(self) -> list[str]:
-        """The statuses that any joint-frame has, in their usual order."""
+        """Statuses that any joint-frame has, in their usual order."""
         return [word for word in STATUS if self.counts.get(word)]
 
     @property
     def nothing_measured(self) -> bool:
-        """Whether a reconstruction ran and gave no joint at all."""
+        """True if a reconstruction ran and gave no joint at all."""
         return self.motion is not None and not self.counts.get("ok", 0)
 
     @property
     def duration_s(self) -> float:
-        """From the first to the last frame of all cameras."""
+        """Time from the first to the last frame of all cameras."""
         return max(camera.last_s for camera in self.cameras) - min(camera.first_s for camera in self.cameras)
 
 
 def summarise(content: SessionContent) -> Summary:
-    """Every number that the page shows."""
+    """Compute every number that the page shows."""
     description = content.session
     origin_ns = description.start_ns
     has_rows = content.skeleton is not None and len(content.skeleton) > 0
@@ -183,13 +183,13 @@ def _mean(values: Float) -> float | None:
 
 
 def finite_median(values: Float) -> float | None:
-    """The median of what is known; None where nothing is."""
+    """Compute the median of the finite values; None where there are none."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else None
 
 
 def measures(summary: Summary) -> list[Measure]:
-    """The rows of the error table: every overall number of the metrics, known ones explained."""
+    """Return the rows of the error table: every overall number of the metrics, known ones explained."""
     reprojection = section(summary.metrics, "reprojection_px")
     rows = []
     if summary.share is not None:
@@ -214,7 +214,7 @@ def measures(summary: Summary) -> list[Measure]:
 
 
 def errors_per_camera(summary: Summary) -> list[CameraErrors]:
-    """The rows of the table of reprojection errors; none where the metrics do not tell cameras apart."""
+    """Return the rows of the table of reprojection errors; none if the metrics have none per camera."""
     own = section(summary.metrics, "reprojection_px_per_camera")
     left_out = section(summary.metrics, "leave_one_camera_out_px")
     return [

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 INK, MUTED, GRID, PAPER = "#22262a", "#666d74", "#dddcd6", "#fefdfb"
 LEFT, RIGHT, MIDDLE = "#1f78b5", "#c8561b", "#4a4f55"
 CAMERAS = ("#0072b2", "#d55e00", "#009e73", "#b0528f", "#a87900", "#4f8fc4")
-"""After Okabe and Ito's colours for every kind of sight, darkened to be seen as thin lines on paper."""
+"""Colours of cameras, after Okabe and Ito's for all kinds of colour vision, darkened for thin lines."""
 LEVELS = ("#9db8c9", "#5f97bd", "#1f6da5", "#123f66")
-"""For what has an order, from the least to the most: light to dark, on dark paper dark to light."""
+"""Colours of ordered values, from the least to the most: light to dark, on dark paper dark to light."""
 STATUS_COLOURS = {
     "ok": "#2f6f92",
     "filled": "#9fc6d8",
@@ -48,7 +48,7 @@ PALETTE = {
 }
 
 WIDTH_IN = 9.0
-"""A figure as wide as the page; CSS scales it to the window."""
+"""Width of a figure as wide as the page; CSS scales it to the window."""
 
 _STYLE: dict[RcKeyType, Any] = {
     "svg.fonttype": "none",
@@ -85,7 +85,10 @@ _STYLE: dict[RcKeyType, Any] = {
 
 @contextmanager
 def page_style() -> Iterator[None]:
-    """Make figures in the page's style, whatever matplotlibrc says; names in any script raise no warning."""
+    """Make figures in the page's style, independent of matplotlibrc.
+
+    Names in any script raise no warning.
+    """
     import matplotlib as mpl
 
     with mpl.rc_context(), warnings.catch_warnings():
@@ -98,14 +101,14 @@ def page_style() -> Iterator[None]:
 
 @contextmanager
 def settled(figure: Figure, scale: float = 1.0) -> Iterator[None]:
-    """Lay a figure out at a scale of its size and hold it so meanwhile; call it within `page_style`.
+    """Lay a figure out at a scale of its size and hold that layout; call it within `page_style`.
 
     The layout's solver leaves the last bits of coordinates open; rounded, the same figure gives the same
     bytes.
     """
     size_in = figure.get_size_inches()
     figure.set_size_inches(*(scale * size_in))
-    for axes in figure.axes:  # wherever an earlier layout put them
+    for axes in figure.axes:  # undo the positions of an earlier layout
         if (place := axes.get_subplotspec()) is not None:
             axes.set_position(place.get_position(figure))
         axes.set_in_layout(True)
@@ -122,13 +125,13 @@ def settled(figure: Figure, scale: float = 1.0) -> Iterator[None]:
 
 
 def inline_svg(figure: Figure, key: str, title: str, description: str) -> str:
-    """The figure as an `<svg>` element for the inside of a page.
+    """Return the figure as an `<svg>` element for the inside of a page.
 
     Args:
-        figure: what is drawn.
+        figure: the figure.
         key: prefix of every id, one of its own for each figure of a page.
-        title: what it shows, for readers who do not see it.
-        description: what is to be seen, with its numbers.
+        title: its subject, for readers who cannot see it.
+        description: the picture in words, with its numbers.
     """
     buffer = io.StringIO()
     with page_style(), settled(figure):

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def environment() -> Environment:
-    """Where templates come from; whatever they are given is escaped, and what they lack is an error."""
+    """Make the templates' environment: all inputs are escaped, and a missing one is an error."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     made = Environment(

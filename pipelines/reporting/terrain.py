@@ -1,4 +1,4 @@
-"""What stands around a flight, from its voxel map: heights for the top view, points for the 3D viewer."""
+"""The terrain around a flight, from its voxel map: heights for the top view, points for the 3D viewer."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipelines.session.records import Float, Int64, Occupancy
 
 LOWEST_M = 0.5
-"""What rises less above the ground is ground."""
+"""Least height above the ground of an obstacle; everything lower is ground."""
 MOST_SURFACE_POINTS = 3000
 _MOST_CELLS = 120  # of the top view, along its longer side
 _GROUND_PERCENTILE = 5.0
@@ -28,7 +28,7 @@ class Terrain:
 
 @dataclass(frozen=True)
 class Heights:
-    """How high the highest occupied voxel of each column reaches above the ground."""
+    """Height of the highest occupied voxel of each column above the ground."""
 
     east_m: Float  # [X] middles of the cells, world
     north_m: Float  # [Y]
@@ -37,18 +37,18 @@ class Heights:
 
 @dataclass(frozen=True)
 class Surface:
-    """The surface of what rises above the ground, thinned out."""
+    """The surface of everything that rises above the ground, thinned out."""
 
     points: Float  # [N, 3] m, world: middles of cubes
     cube_m: float  # their side
-    voxels: int  # how many voxels of the surface they stand for
+    voxels: int  # number of surface voxels that they represent
 
 
 def terrain_around(occupancy: Occupancy, low: Float, high: Float) -> Terrain | None:
-    """The columns of a map within a box seen from above; None where nothing in them is occupied.
+    """Cut the columns of a map within a box seen from above; None where nothing in them is occupied.
 
     Args:
-        occupancy: the map; 0.5 and above is occupied, what is not known is not.
+        occupancy: the map; 0.5 and above is occupied, unknown voxels are not.
         low: [2] m, the box's corner in the south-west, world.
         high: [2] m, in the north-east.
     """
@@ -78,7 +78,7 @@ def terrain_around(occupancy: Occupancy, low: Float, high: Float) -> Terrain | N
 
 
 def heights(terrain: Terrain) -> Heights:
-    """Of at most 120 cells along the longer side: each as high as the highest of its columns."""
+    """Compute heights on at most 120 cells along the longer side: each that of its highest column."""
     tops = _tops(terrain.occupied)
     above_m = terrain.corner[2] + terrain.resolution_m * tops - terrain.ground_m
     above_m = np.where(terrain.occupied.any(axis=2), np.maximum(above_m, 0.0), 0.0)
@@ -94,7 +94,7 @@ def heights(terrain: Terrain) -> Heights:
 
 
 def surface(terrain: Terrain, most: int = MOST_SURFACE_POINTS) -> Surface:
-    """The occupied voxels with a free neighbour, as far as they rise `LOWEST_M` above the ground.
+    """Return the occupied voxels with a free neighbour, as far as they rise `LOWEST_M` above the ground.
 
     They are gathered in the smallest cubes of whole voxels of which at most `most` hold any.
     """
@@ -119,6 +119,6 @@ def surface(terrain: Terrain, most: int = MOST_SURFACE_POINTS) -> Surface:
 
 
 def _tops(occupied: NDArray[np.bool_]) -> Int64:
-    """How many voxels above the floor of the grid each column's highest occupied one ends, [X, Y]."""
+    """Count the voxels from the grid's floor to the top of each column's highest occupied one, [X, Y]."""
     tops: Int64 = occupied.shape[2] - occupied[:, :, ::-1].argmax(axis=2).astype(np.int64)
     return tops

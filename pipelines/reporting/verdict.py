@@ -1,4 +1,4 @@
-"""What is to be thought of a session: how good, how sure and what is doubtful, in plain sentences."""
+"""Judgement of a session in plain sentences: quality, certainty and doubts."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MOSTLY_SHARED = 0.6
 
 @dataclass(frozen=True)
 class Verdict:
-    """The page's first words."""
+    """First words of the page."""
 
     lead: str
     quality: tuple[str, ...] = ()
@@ -45,7 +45,7 @@ class Verdict:
 
 
 def give_verdict(content: SessionContent, summary: Summary) -> Verdict:
-    """How good, how sure, and what is doubtful, in sentences that state their numbers."""
+    """Judge quality, certainty and doubts, in sentences that state their numbers."""
     if content.skeleton is None:
         lead = "This session was ingested, but not reconstructed yet: run mocap reconstruct on it."
         return Verdict(lead, doubts=tuple(_doubts(content, summary)))
@@ -146,7 +146,10 @@ def _certainty(summary: Summary) -> list[str]:
 
 
 def _odd_cameras(summary: Summary) -> list[str]:
-    """Cameras that agree far worse with the skeleton than the others do; three at least can tell."""
+    """List cameras that agree far worse with the skeleton than the others.
+
+    This needs at least three cameras.
+    """
     medians = {row.name: row.median_px for row in errors_per_camera(summary) if row.median_px is not None}
     if len(medians) < 3:
         return []

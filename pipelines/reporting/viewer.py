@@ -1,8 +1,8 @@
-"""What the page's 3D viewer plays: the skeleton, its truth and the cameras, packed into a few hundred kB.
+"""Data of the page's 3D viewer: skeleton, truth and cameras, packed into a few hundred kB.
 
 Numbers travel as base64 of little-endian integers. A joint is stored relative to the middle of its body, in
 millimetres and 16 bits; the middle and the cameras in millimetres and 32 bits relative to the scene's
-origin. Missing is the smallest integer of either kind, never 0.
+origin. A missing value is the smallest integer of either kind, never 0.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MOST_BYTES = 2_400_000
-"""Longer flights are thinned out to this; a third more in the page, where it is base64."""
+"""Size to which longer flights are thinned out; a third more in the page, where it is base64."""
 _MOST_TIMES_WITHOUT_SKELETON = 3000
 _FARTHEST_M = 32.767
 _SIDES = ("", "left", "right")
@@ -37,15 +37,15 @@ _SIDES = ("", "left", "right")
 
 @dataclass(frozen=True)
 class Scene:
-    """What the viewer plays, and what the page says about it."""
+    """Data of the viewer, and what the page says about it."""
 
     data: dict[str, object]  # JSON
     people: int
     truth: bool
     ellipsoids: bool
-    notes: tuple[str, ...]  # what is not as the tables have it, in whole sentences
-    arms: tuple[str, ...] = ()  # of a comparison of planners: whose cameras can be shown as well
-    surface: bool = False  # whether the map's surface is there
+    notes: tuple[str, ...]  # differences from the tables, in whole sentences
+    arms: tuple[str, ...] = ()  # of a comparison of planners; their cameras can be shown as well
+    surface: bool = False  # True if the map's surface is there
 
 
 def make_scene(
@@ -53,14 +53,14 @@ def make_scene(
 ) -> Scene | None:
     """Pack a session for the viewer; None where there is nothing to be seen.
 
-    Every camera's pose is interpolated to the times of the skeleton, never across what the session calls
-    a gap. Without a measured skeleton the cameras alone are shown.
+    Every camera's pose is interpolated to the times of the skeleton, never across a gap as the session
+    defines it. Without a measured skeleton the cameras alone are shown.
 
     Args:
         summary: the session in numbers.
         poses: camera: tables.POSES.
         replan: planners that flew again. The cameras of simulated arms are packed beside those of the
-            session, and what the map holds around them.
+            session, with the map around them.
     """
     motion = summary.motion if summary.motion is not None and summary.motion.measured.any() else None
     cameras = [camera for camera in summary.cameras if camera.name in poses]
@@ -105,7 +105,7 @@ def make_scene(
 
 
 def _notes(every: int, times: int, body: _Body | None, around: Surface | None) -> list[str]:
-    """What is not as the tables have it, in whole sentences."""
+    """List differences from the tables, in whole sentences."""
     notes = []
     if every > 1:
         notes.append(
@@ -154,11 +154,11 @@ class _Body:
 
     @property
     def people(self) -> int:
-        """How many there are."""
+        """Number of people."""
         return int(self.middle.shape[1])
 
     def packed(self, kept: slice, origin: Float) -> dict[str, object]:
-        """The body as JSON, at the kept times."""
+        """Return the body as JSON, at the kept times."""
         joints = self.joints
         derived = [
             (name, parents) for name, parents in DERIVED if name not in joints and set(parents) <= set(joints)
@@ -182,7 +182,7 @@ class _Body:
         }
 
     def notes(self) -> list[str]:
-        """How many joints lie too far from their body for 16 bits."""
+        """Count the joints that are too far from their body for 16 bits."""
         far = [
             (int((np.abs(values) > _FARTHEST_M).any(axis=-1).sum()), noun)
             for values, noun in ((self.joint, "joint-frame"), (self.truth, "true joint-frame"))
@@ -197,7 +197,7 @@ class _Body:
 
 
 def _middle(position: Float) -> Float:
-    """Coordinate-wise median [T, P, 3] over the joints that are there; NaN where there is none."""
+    """Return the coordinate-wise median [T, P, 3] over the joints that are there; NaN where none is."""
     there = np.isfinite(position[..., 0]).any(axis=-1)
     middle = np.full((*position.shape[:2], 3), np.nan)
     middle[there] = np.nanmedian(position[there], axis=1)
@@ -205,14 +205,14 @@ def _middle(position: Float) -> Float:
 
 
 def _lowest(position: Float) -> Float:
-    """Height of the lowest joint [T, P]; NaN where there is none."""
+    """Return the height of the lowest joint [T, P]; NaN where there is none."""
     height = position[..., 2]
     lowest = np.where(np.isnan(height), np.inf, height).min(axis=-1)
     return np.where(np.isinf(lowest), np.nan, lowest)
 
 
 def _square_root(covariance: Float) -> Float | None:
-    """Cholesky factors [..., 6] of covariances [..., 6] (upper triangles); None where none is positive."""
+    """Compute Cholesky factors [..., 6] of covariances [..., 6] (upper triangles); None without any."""
     full = covariance[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     known = np.isfinite(full).all(axis=(1, 2))
     positive = np.zeros(len(full), dtype=np.bool_)
@@ -239,7 +239,7 @@ class _Placed:
     of_arm: Mapping[str, object]  # which arm, and its colour; nothing of the session's own
 
     def packed(self, origin: Float) -> dict[str, object]:
-        """The camera as JSON."""
+        """Return the camera as JSON."""
         return {
             "name": self.name,
             "corners": _picture_corners(self.lens),
@@ -256,7 +256,7 @@ def _placed(camera: CameraRow, table: pd.DataFrame, t_ns: Int64, summary: Summar
 
 
 def _placed_again(arm: Arm, a: int, k: int, t_ns: Int64, summary: Summary) -> _Placed:
-    """Camera `k` of arm `a`, which carries what the session's cameras carry, in turn."""
+    """Place camera `k` of arm `a`, with the lenses of the session's cameras, in turn."""
     track = Trajectory(arm.t_ns, arm.position[k], arm.quaternion_xyzw[k])
     poses = poses_at(track, t_ns, summary.description.pose_interpolation)
     lens = summary.cameras[k % len(summary.cameras)]
@@ -264,7 +264,7 @@ def _placed_again(arm: Arm, a: int, k: int, t_ns: Int64, summary: Summary) -> _P
 
 
 def _picture_corners(camera: CameraRow) -> list[float]:
-    """Left, right, top and bottom edge of the picture as x/z and y/z of the camera, without distortion."""
+    """Return the picture's left, right, top and bottom edge as x/z and y/z, without distortion."""
     lens = camera.entry.intrinsics
     edges = [
         (-0.5 - lens.cx) / lens.fx,
@@ -293,7 +293,7 @@ def _bytes_per_time(body: _Body | None, cameras: int) -> int:
 
 
 def _bounds(points: Float) -> tuple[Float, Float]:
-    """The corners of the box that holds all but the farthest hundredth of the points [N, 3] on each side."""
+    """Return the corners of the box that holds all but the farthest 1 % of the points [N, 3] on each side."""
     there = points[np.isfinite(points).all(axis=1)]
     if not len(there):
         return np.zeros(3), np.zeros(3)
@@ -302,7 +302,10 @@ def _bounds(points: Float) -> tuple[Float, Float]:
 
 
 def _packed(values: Float, kind: type[np.int16 | np.int32]) -> str:
-    """Base64 of rounded values; those that are NaN or do not fit are missing, in all their coordinates."""
+    """Encode rounded values in base64.
+
+    Values that are NaN or do not fit are missing, in all their coordinates.
+    """
     limits = np.iinfo(kind)
     fits = np.abs(values) <= limits.max
     if values.ndim > 1:

@@ -42,17 +42,17 @@ STATUS_REMEDIES = {
 
 
 def fixed(value: float | None, digits: int = 1) -> str:
-    """A number with fixed decimals and grouped thousands, no sign before zero; a dash for None."""
+    """Format a number with fixed decimals and grouped thousands, no sign before zero; a dash for None."""
     return ABSENT if value is None else f"{value:z,.{digits}f}".replace(",", THIN).replace("-", "−")
 
 
 def whole(value: float | None) -> str:
-    """A count with grouped thousands; a dash for None."""
+    """Format a count with grouped thousands; a dash for None."""
     return fixed(value, 0)
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """A number of about `digits` significant digits, never in powers of ten above 0.001."""
+    """Format a number with about `digits` significant digits, never in powers of ten above 0.001."""
     if value is None:
         return ABSENT
     if value == 0:
@@ -64,12 +64,12 @@ def significant(value: float | None, digits: int = 3) -> str:
 
 
 def quantity(value: float | None, unit: str, digits: int = 1) -> str:
-    """A number and its unit; a dash for None."""
+    """Format a number and its unit; a dash for None."""
     return ABSENT if value is None else f"{fixed(value, digits)}{THIN}{unit}"
 
 
 def percent(share: float | None) -> str:
-    """A share as percent with one decimal; neither 0 nor 100 unless it is exactly that."""
+    """Format a share as percent with one decimal; neither 0 nor 100 unless it is exactly that."""
     if share is None:
         return ABSENT
     if 0 < share < 0.0005:
@@ -80,18 +80,18 @@ def percent(share: float | None) -> str:
 
 
 def plural(count: float, noun: str, nouns: str = "") -> str:
-    """A count with its noun: `1 frame`, `2 frames`."""
+    """Format a count with its noun: `1 frame`, `2 frames`."""
     return f"{whole(count)} {noun if count == 1 else nouns or noun + 's'}"
 
 
 def listing(words: Iterable[str]) -> str:
-    """`a`, `a and b`, `a, b and c`."""
+    """Join words: `a`, `a and b`, `a, b and c`."""
     *most, last = list(words) or [""]
     return f"{', '.join(most)} and {last}" if most else last
 
 
 def shortened(label: str, length: int = 24) -> str:
-    """A name for a figure's label: printable, on one line, cut in the middle if it is long."""
+    """Shorten a name for a figure's label: printable, on one line, cut in the middle if it is long."""
     clean = "".join(c if c.isprintable() else " " for c in label).strip()
     half = (length - 1) // 2
     return clean if len(clean) <= length else f"{clean[:half]}…{clean[-half:]}"
@@ -108,12 +108,12 @@ def cell_text(value: object) -> object:
 
 
 def joint_label(name: str) -> str:
-    """`left_big_toe` as `left big toe`."""
+    """Write `left_big_toe` as `left big toe`."""
     return name.replace("_", " ")
 
 
 def moment(t_ns: int | None) -> str:
-    """A stamp as a date in UTC if it counts from the epoch, else as seconds of the log's own clock."""
+    """Format a stamp as a date in UTC if it counts from the epoch, else as seconds of the log's clock."""
     if t_ns is None:
         return ABSENT
     if t_ns < _EPOCH_SINCE_NS:
@@ -124,7 +124,7 @@ def moment(t_ns: int | None) -> str:
 
 
 def flattened(value: object, prefix: str = "") -> list[tuple[str, str]]:
-    """Nested settings as rows of a dotted name and a text, in their own order."""
+    """Flatten nested settings to rows of a dotted name and a text, in their own order."""
     if isinstance(value, Mapping):
         if not value:
             return [(prefix, "none")] if prefix else []
@@ -137,7 +137,7 @@ def flattened(value: object, prefix: str = "") -> list[tuple[str, str]]:
 
 
 def plain(value: object) -> str:
-    """A value of JSON as a reader expects it."""
+    """Format a value of JSON for a reader."""
     if value is None:
         return "none"
     if isinstance(value, bool):
