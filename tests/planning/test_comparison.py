@@ -1,4 +1,4 @@
-"""Means, differences and their intervals against what is known of the bootstrap."""
+"""Means, differences and their intervals against known properties of the bootstrap."""
 
 from __future__ import annotations
 

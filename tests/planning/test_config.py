@@ -1,4 +1,4 @@
-"""Settings from mappings: what is taken, and what is refused how."""
+"""Settings from mappings: accepted values, and refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cost map by hand, and what cameras are worth by the ray model."""
+"""The cost map by hand, and the information of cameras by the ray model."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CONFIG = PlannerConfig(w_obs=2.0, w_occ=3.0)
 
 @pytest.mark.slow  # compiles much
 def test_obstacles_count_by_distance_and_sight_by_share() -> None:
-    """Slot for slot what the field and the sight line say, at two places beside the wall."""
+    """The costs follow from field and sight line, slot for slot, at two places beside the wall."""
     field = wall()
     actor = np.array([[5.0, 0.0, 1.0], [12.0, 1.0, 1.0]])
     yaws = np.radians([0, 60, 90, 120, 200])

@@ -1,4 +1,4 @@
-"""Distances to known surfaces, and gradients that are the derivative of what is interpolated."""
+"""Distances to known surfaces, and gradients that are the derivative of the interpolated value."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RES = 0.25
 
 
 def slab(*, unknown_above: bool = False) -> Occupancy:
-    """Occupied up to z = 1 in a box of 4 m; the rest free, or unknown."""
+    """Make a box of 4 m, occupied up to z = 1; the rest is free, or unknown."""
     probability = np.full((16, 16, 16), np.nan if unknown_above else 0.0, dtype=np.float32)
     probability[:, :, :4] = 0.5  # exactly the threshold
     probability[:, :, 4:8] = 0.49

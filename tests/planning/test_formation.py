@@ -1,4 +1,4 @@
-"""Slots, how they are approached, and where cameras look."""
+"""Slots, their approach, and the view of the cameras."""
 
 from __future__ import annotations
 

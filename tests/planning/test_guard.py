@@ -1,4 +1,4 @@
-"""The invariant that keeps replayed drones safe, whatever plans ask for."""
+"""The invariant that keeps replayed drones safe, for any plan."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TICKS = round(CONFIG.tracking_hz / CONFIG.local_hz)
 
 
 def boulders(seed: int, side_m: float = 0.5) -> DistanceField:
-    """A box of 20 x 20 x 10 m with random boulders of one voxel to three."""
+    """Make a box of 20 x 20 x 10 m with random boulders of one voxel to three."""
     rng = np.random.default_rng(seed)
     occupied = np.zeros([round(length / side_m) for length in (20, 20, 10)], dtype=np.float32)
     for corner in rng.integers(0, occupied.shape, (25, 3)):
@@ -38,7 +38,7 @@ def boulders(seed: int, side_m: float = 0.5) -> DistanceField:
 
 
 def slab(thick_m: float, side_m: float) -> DistanceField:
-    """A wall across y = 0, 40 m wide and 8 m high."""
+    """Make a wall across y = 0, 40 m wide and 8 m high."""
     across, along, high = (round(length / side_m) for length in (40.0, 20.0, 12.0))
     y = side_m * (np.arange(along) + 0.5) - 10.0
     z = side_m * (np.arange(high) + 0.5)
@@ -57,7 +57,7 @@ FAR_AWAY = someone_at((0.0, np.array([500.0, 0.0, 0.0])))
 
 
 def free_places(field: DistanceField, count: int, rng: np.random.Generator) -> Float:
-    """[count, 3] random places that keep all distances."""
+    """Draw random places [count, 3] that keep all distances."""
     found: list[Float] = []
     while len(found) < count:
         place = rng.uniform([-10, -10, 1], [10, 10, 9])
@@ -72,7 +72,7 @@ def free_places(field: DistanceField, count: int, rng: np.random.Generator) -> F
 def test_drones_can_always_stop_in_free_space_whatever_plans_ask_for(
     seed: int, side_m: float, drones: int
 ) -> None:
-    """Random plans through boulders: what is flown keeps the distances, and so does every committed stop."""
+    """Random plans through boulders: flown motions keep the distances, and so does every committed stop."""
     rng = np.random.default_rng(seed)
     field = boulders(seed, side_m)
     guard = Guard(free_places(field, drones, rng), CONFIG)
@@ -126,7 +126,7 @@ def test_a_slot_behind_a_wall_is_reached_over_it(thick_m: float, side_m: float) 
 
 
 def test_distances_of_the_field_hold_to_the_corners_of_voxels() -> None:
-    """Where the field has the value of `wanted_clearance_m`, voxels (cubes) are at least a radius away."""
+    """If the field has the value of `wanted_clearance_m`, voxels (cubes) are at least a radius away."""
     for side_m in (0.1, 0.25, 0.5):
         field = boulders(3, side_m)
         points = np.random.default_rng(1).uniform([-10, -10, 0], [10, 10, 10], (300_000, 3))
@@ -247,7 +247,7 @@ def test_worlds_are_those_of_their_seeds() -> None:
 
 
 def test_the_adaptive_arm_that_fell_through_a_wall_before_does_not() -> None:
-    """A wall of one voxel, 12 m high, between the first slot and where the formation turns to."""
+    """A wall of one voxel, 12 m high, between the first slot and the place that the formation turns to."""
     field = slab(0.25, 0.25)
     stamps, hips = walker(25.0, 1.2)
     hips = hips + np.array([-14.0, -8.0, 0.0])

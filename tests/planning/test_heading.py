@@ -1,4 +1,4 @@
-"""Yaws that count from the actor's heading: where that is, and formations that turn with it."""
+"""Yaws that count from the actor's heading: the estimate of the heading, and formations that turn with it."""
 
 from __future__ import annotations
 
@@ -89,7 +89,10 @@ def test_who_walks_straight_east_is_filmed_alike_in_both_frames(arm: Arm) -> Non
 
 
 def on_a_circle(seconds: float) -> tuple[NDArray[np.int64], Float, Float]:
-    """Stamps, hips and headings (rad, continuous) of who walks round 12 m at 1.2 m/s, north at first."""
+    """Return stamps, hips and headings (rad, continuous) of an actor who walks round 12 m at 1.2 m/s.
+
+    The first heading is north.
+    """
     t_s = np.arange(0, seconds, 0.1)
     angle = 0.1 * t_s
     hips = np.stack([12 * np.cos(angle), 12 * np.sin(angle), 0 * angle + 1], axis=1)

@@ -1,4 +1,4 @@
-"""For how much of a flight a wall hides the actor, against similar triangles."""
+"""Share of a flight in which a wall hides the actor, against similar triangles."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EAST_M = 20.0  # of the way, along north = 0
 
 
 def _flight(*positions: tuple[float, float, float]) -> LoggedFlight:
-    """Somebody walks 20 m east in 20 s; cameras stand still."""
+    """Return the flight of an actor who walks 20 m east in 20 s; cameras stand still."""
     t_ns = START_NS + np.arange(WALK_S + 1) * 1_000_000_000
     actor = np.stack(
         [np.linspace(0, EAST_M, WALK_S + 1), *np.zeros((1, WALK_S + 1)), np.ones(WALK_S + 1)], axis=-1
@@ -88,7 +88,10 @@ DESCRIPTION = Description.model_validate(
 
 
 def _wall() -> Occupancy:
-    """From 8 to 12 m east, 9 to 10 m north, 6 m high, in voxels of 0.25 m; all north of it is unknown."""
+    """Make a wall from 8 to 12 m east, 9 to 10 m north, 6 m high, in voxels of 0.25 m.
+
+    All voxels north of it are unknown.
+    """
     probability = np.full((80, 80, 40), 0.1, dtype=np.float32)
     probability[32:48, 36:40, :24] = 0.9
     probability[:, 40:] = np.nan

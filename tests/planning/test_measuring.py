@@ -1,4 +1,4 @@
-"""What replayed cameras measure, where the answer is known."""
+"""Measurements of replayed cameras, where the result is known."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TIMES, JOINTS = 40, 5
 def exact(
     pixels: Float, free: Bool, camera: Float, target: Float, focal_px: float, rng: np.random.Generator
 ) -> tuple[Float, Float]:
-    """A detector without errors that sees nothing that is hidden."""
+    """Detect without errors every joint that is not hidden."""
     found = np.where(free[..., None], pixels, np.nan)
     return found, np.isfinite(found[..., 0]).astype(np.float64)
 
@@ -38,7 +38,7 @@ def two_pixels_off(
 
 
 def filming(*cameras: tuple[float, float, float]) -> Filming:
-    """Cameras that stand and look at somebody who stands at x = 12, y = 0."""
+    """Make cameras at rest that look at a person who stands at x = 12, y = 0."""
     middle = np.tile([12.0, 0.0, 1.0], (TIMES, 1))
     joints = middle[:, None] + np.random.default_rng(0).uniform(-0.5, 0.5, (TIMES, JOINTS, 3))
     position = np.repeat(np.array(cameras)[:, None], TIMES, axis=1)

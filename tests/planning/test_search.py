@@ -1,4 +1,4 @@
-"""Dynamic programming against every sequence there is."""
+"""Dynamic programming against every possible sequence."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def yaw_ring(yaws: int, *, w_turn: float = 0.05, knot_s: float = 2.0) -> Lattice
 
 
 def price(sequence: tuple[int, ...], cost: Float, states: Float, start: Float, w_turn: float) -> float:
-    """Straight from the definition: inf where a rate is exceeded, |turn| in units of 2 s at the full rate."""
+    """Compute the cost by definition: inf where a rate is exceeded, |turn| in units of 2 s at full rate."""
     total, at = 0.0, start
     for t, s in enumerate(sequence):
         way = states[s] - at

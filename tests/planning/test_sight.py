@@ -21,7 +21,7 @@ def random_field(seed: int, share: float) -> tuple[DistanceField, NDArray[np.boo
 
 
 def crossed_boxes(occupied: NDArray[np.bool_], a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Longest piece of the segment inside one occupied box (slab test of every box)."""
+    """Measure the longest piece of the segment inside one occupied box (slab test of every box)."""
     low = np.argwhere(occupied) * RES
     with np.errstate(divide="ignore", invalid="ignore"):
         first, last = (low - a) / (b - a), (low + RES - a) / (b - a)
@@ -61,7 +61,7 @@ def test_leaping_changes_no_sample(seed: int, share: float) -> None:
 
 @given(st.integers(0, 10_000), st.sampled_from([0.001, 0.02, 0.98]))
 def test_within_a_leap_all_is_alike(seed: int, share: float) -> None:
-    """Every voxel that comes within the leap of any point of a voxel is as it is; far off, leaps are long."""
+    """Every voxel within the leap of any point of a voxel has its state; far off, leaps are long."""
     field, occupied = random_field(seed, share)
     bricks = field.sight.bricks
     apart = np.transpose(bricks.reshape(*bricks.shape[:3], 4, 4, 4), (0, 3, 1, 4, 2, 5))
@@ -94,7 +94,7 @@ def test_the_end_at_the_actor_is_left_out() -> None:
 
 
 def test_a_share_is_what_lies_in_the_way() -> None:
-    """5 m of 20 m; each end of the block is met to half a sample of 0.25 m."""
+    """5 m of 20 m are occupied; each end of the block is found to half a sample of 0.25 m."""
     occupied = np.zeros((40, 3, 3), dtype=np.float32)
     occupied[10:20] = 1
     field = distance_field(Occupancy(occupied, np.zeros(3), RES))

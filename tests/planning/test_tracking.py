@@ -53,7 +53,7 @@ def test_derivatives_are_those_of_the_position() -> None:
 
 
 def track(plan: Plan, start: Float, flying: Flying, seconds: float) -> Float:
-    """States [K + 1, 4, 3] of who follows a plan from its start."""
+    """Return states [K + 1, 4, 3] of a drone that follows a plan from its start."""
     ticks = round(seconds / flying.period_s)
     states = np.zeros((ticks + 1, 4, 3))
     states[0] = start
@@ -62,7 +62,7 @@ def track(plan: Plan, start: Float, flying: Flying, seconds: float) -> Float:
 
 
 def still_at(place: Float, *, waypoints: int = 200) -> Plan:
-    """A plan that asks to be at a place."""
+    """Return a plan that stays at a place."""
     return Plan(0.0, np.tile(place, (waypoints, 1)), np.zeros(3), 0.5)
 
 

@@ -15,7 +15,7 @@ SIZE_M = (80.0, 60.0, 30.0)
 
 
 def voxel_centres(resolution_m: float) -> tuple[Float, Float, Float]:
-    """East, north and up of the voxel centres, open grids."""
+    """Return east, north and up of the voxel centres, open grids."""
     x, y, z = (
         ORIGIN[a] + resolution_m * (np.arange(round(SIZE_M[a] / resolution_m)) + 0.5) for a in range(3)
     )
@@ -23,25 +23,25 @@ def voxel_centres(resolution_m: float) -> tuple[Float, Float, Float]:
 
 
 def mound(height_m: float = 6.0, *, resolution_m: float = 0.5) -> DistanceField:
-    """A Gaussian mound, sigma 7 x 3 m, beside the way along y = 0; no ground."""
+    """Make a Gaussian mound, sigma 7 x 3 m, beside the way along y = 0; no ground."""
     x, y, z = voxel_centres(resolution_m)
     return as_field(z < height_m * np.exp(-(((x - 30) / 7) ** 2) / 2 - ((y - 8) / 3) ** 2 / 2), resolution_m)
 
 
 def wall(resolution_m: float = 0.5) -> DistanceField:
-    """A wall 3 m thick and 6 m high, from x = 0 to x = 25 beside the way."""
+    """Make a wall 3 m thick and 6 m high, from x = 0 to x = 25 beside the way."""
     x, y, z = voxel_centres(resolution_m)
     return as_field((np.abs(y - 8) < 1.5) & (x > 0) & (x < 25) & (z < 6), resolution_m)
 
 
 def high_wall(resolution_m: float = 0.5) -> DistanceField:
-    """A wall 1 m thick and 12 m high, from x = 15 to x = 35, 5 m beside the way."""
+    """Make a wall 1 m thick and 12 m high, from x = 15 to x = 35, 5 m beside the way."""
     x, y, z = voxel_centres(resolution_m)
     return as_field((np.abs(y - 5) < 0.5) & (x > 15) & (x < 35) & (z < 12), resolution_m)
 
 
 def trees(resolution_m: float = 0.5) -> DistanceField:
-    """Trunks and crowns on both sides of the way, none nearer than 5 m."""
+    """Make trunks and crowns on both sides of the way, none nearer than 5 m."""
     x, y, z = voxel_centres(resolution_m)
     occupied = np.zeros(np.broadcast_shapes(x.shape, y.shape, z.shape), dtype=np.bool_)
     for east, north in np.random.default_rng(5).uniform([0, 5], [45, 15], (12, 2)):
@@ -53,17 +53,17 @@ def trees(resolution_m: float = 0.5) -> DistanceField:
 
 
 def bare_ground(resolution_m: float = 0.5) -> DistanceField:
-    """One layer of voxels, flat."""
+    """Make one layer of voxels, flat."""
     x, y, z = voxel_centres(resolution_m)
     return as_field(np.broadcast_to(z < resolution_m, (x.size, y.size, z.size)), resolution_m)
 
 
 def as_field(occupied: NDArray[np.bool_], resolution_m: float) -> DistanceField:
-    """The field of a grid at `ORIGIN`."""
+    """Return the field of a grid at `ORIGIN`."""
     return distance_field(Occupancy(occupied.astype(np.float32), ORIGIN, resolution_m))
 
 
 def walker(seconds: float, speed_mps: float = 1.2, rate_hz: float = 10.0) -> tuple[Int64, Float]:
-    """Stamps [T] and hips [T, 3] of who walks east from the origin, hips at 1 m."""
+    """Return stamps [T] and hips [T, 3] of an actor who walks east from the origin, hips at 1 m."""
     t_s = np.arange(0, seconds, 1 / rate_hz)
     return (t_s * 1e9).astype(np.int64), np.stack([speed_mps * t_s, 0 * t_s, 0 * t_s + 1.0], axis=1)

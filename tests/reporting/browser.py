@@ -1,4 +1,4 @@
-"""A headless Chromium that opens a page, is clicked and typed into, and tells of every error.
+"""A headless Chromium that opens a page, clicks and types, and reports every error.
 
 Speaks the DevTools protocol over a pipe: messages of JSON, each ended by a NUL byte, read from the
 browser's descriptor 3 and written to its descriptor 4.
@@ -37,7 +37,7 @@ _COMPLAINTS = {"Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entry
 
 
 class Browser:
-    """One tab. `complaints` holds all that was ever written to its console, by scripts or by the browser."""
+    """One tab. `complaints` holds everything that scripts or the browser wrote to its console."""
 
     def __init__(self, commands: int, answers: int) -> None:
         self.complaints: list[str] = []
@@ -71,7 +71,7 @@ class Browser:
         self.wait_for(f"document.readyState === 'complete' && location.href.startsWith('{page.as_uri()}')")
 
     def evaluate(self, expression: str) -> Any:
-        """The value of an expression in the page."""
+        """Return the value of an expression in the page."""
         answer = self.send("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
@@ -90,7 +90,7 @@ class Browser:
             self.mouse(kind, x, y)
 
     def middle_of(self, selector: str) -> tuple[float, float]:
-        """Where an element is, after scrolling to it."""
+        """Return the middle of an element, after scrolling to it."""
         x, y = self.evaluate(
             f"(() => {{ const e = document.querySelector({json.dumps(selector)});"
             "e.scrollIntoView({block: 'center'}); const r = e.getBoundingClientRect();"
@@ -125,7 +125,7 @@ class Browser:
         )
 
     def picture(self, path: Path) -> None:
-        """Store what the window shows as a PNG."""
+        """Store the window's contents as a PNG."""
         data = self.send("Page.captureScreenshot", format="png")["data"]
         path.write_bytes(base64.b64decode(data))
 
@@ -143,7 +143,7 @@ class Browser:
 
 @contextmanager
 def browser(profile: Path) -> Iterator[Browser]:
-    """A browser with a fresh profile; skips the test where there is none."""
+    """Start a browser with a fresh profile; skip the test where there is none."""
     program = next((found for name in _NAMES if (found := shutil.which(name))), None)
     if program is None:
         pytest.skip(f"no browser is installed (looked for {', '.join(_NAMES)})")

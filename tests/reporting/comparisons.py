@@ -19,9 +19,9 @@ DRONES = ("drone1", "drone2")
 RANGE_M = 10.0
 SPEED_MPS = 1.0
 HIDDEN_S = (2.0, 4.0)
-"""When drone1 of `fixed` sees nothing."""
+"""Seconds from and to which drone1 of `fixed` sees nothing."""
 BLOCK = (slice(20, 28), slice(50, 56), slice(0, 10))
-"""The voxels of 0.5 m that rise from the ground of one layer: 8 x 6 columns, 4.5 m above it."""
+"""Voxels of 0.5 m that rise from the ground of one layer: 8 x 6 columns, 4.5 m above it."""
 
 
 def seconds() -> np.ndarray:
@@ -34,23 +34,23 @@ def stamps() -> np.ndarray:
 
 
 def actor() -> np.ndarray:
-    """[T, 3] m."""
+    """Return the actor's positions [T, 3] m."""
     t_s = seconds()
     return np.stack([SPEED_MPS * t_s, 0 * t_s, 1 + 0 * t_s], axis=-1)
 
 
 def yaw_deg(arm: str) -> np.ndarray:
-    """[T] of the first drone: `adaptive` turns by 10 deg/s, the others stay."""
+    """Return the yaw [T] of the first drone: `adaptive` turns by 10 deg/s, the others stay."""
     return 45 + (10 * seconds() if arm == "adaptive" else 0 * seconds())
 
 
 def tilt_deg(arm: str) -> np.ndarray:
-    """[T] of all drones: 15 deg, and by 1 deg/s more where the arm is not `adaptive`."""
+    """Return the tilt [T] of all drones: 15 deg, rising by 1 deg/s where the arm is not `adaptive`."""
     return 15 + (0 * seconds() if arm == "adaptive" else seconds())
 
 
 def positions(arm: str, drone: int) -> np.ndarray:
-    """[T, 3] m."""
+    """Return a drone's positions [T, 3] m."""
     yaw, tilt = np.radians(yaw_deg(arm) + 90 * drone), np.radians(tilt_deg(arm))
     way = np.stack([np.cos(yaw) * np.cos(tilt), np.sin(yaw) * np.cos(tilt), np.sin(tilt)], axis=-1)
     return actor() + RANGE_M * way
@@ -79,7 +79,7 @@ def make_arm(arm: str) -> pd.DataFrame:
 
 
 def make_cost_map() -> pd.DataFrame:
-    """Cost 1 - cos(yaw) at any time, 72 yaws, twice a second."""
+    """Make a cost map of 1 - cos(yaw) at any time, 72 yaws, twice a second."""
     t_ns, yaws = stamps()[::25], np.radians(np.arange(-175, 181, 5))
     table = pd.DataFrame({"t_ns": np.repeat(t_ns, 72), "yaw_rad": np.tile(yaws, len(t_ns))})
     return table.assign(cost=1 - np.cos(table["yaw_rad"]))
@@ -117,7 +117,7 @@ def make_scores(arm: str) -> dict[str, object]:
 
 
 def make_comparison(*arms: str, verdict: str = "adaptive is better") -> ReplanContent:
-    """What is stored of a comparison of some arms; `adaptive`, `fixed` and `flown` without any."""
+    """Make the stored comparison of some arms; `adaptive`, `fixed` and `flown` by default."""
     arms = arms or ("adaptive", "fixed", "flown")
     metrics: dict[str, Any] = {
         "schema": 1,

@@ -48,19 +48,19 @@ INTRINSICS = {
     "readout_s": 0.0,
 }
 OFFSET_M = np.array([0.02, 0.0, 0.01])
-"""What the skeleton is off by, everywhere: sqrt(500) mm = 22.36 mm."""
+"""Error of the skeleton at every joint and time: sqrt(500) mm = 22.36 mm."""
 ASIDE_PX = np.array([3.0, -4.0])
-"""Where the keypoints lie beside the reprojected skeleton: 5 px."""
+"""Offset of the keypoints from the reprojected skeleton: 5 px."""
 
 
 def _swing(joint: str, phase: np.ndarray) -> np.ndarray:
-    """Forward swing in metres: limbs of the two sides in opposite phase, arms against legs."""
+    """Return the forward swing in metres: limbs of the two sides in opposite phase, arms against legs."""
     reach = {"elbow": -0.12, "wrist": -0.26, "knee": 0.18, "ankle": 0.33}.get(joint.rpartition("_")[2], 0.0)
     return reach * np.sin(phase + (np.pi if joint.startswith("right") else 0.0))
 
 
 def true_positions(t_s: np.ndarray) -> np.ndarray:
-    """[T, J, 3]: a walk at 1.2 m/s on a circle of 6 m around (2, 1)."""
+    """Return the positions [T, J, 3] of a walk at 1.2 m/s on a circle of 6 m around (2, 1)."""
     angle = 1.2 / 6.0 * t_s
     centre = np.stack([2 + 6 * np.cos(angle), 1 + 6 * np.sin(angle)], axis=-1)
     forward = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
@@ -85,7 +85,7 @@ def _long(t_ns: np.ndarray, position: np.ndarray) -> pd.DataFrame:
 
 
 def statuses(frames: int) -> np.ndarray:
-    """[T, J]: ok, but for losses that can be counted on paper."""
+    """Return the statuses [T, J]: ok, but for losses that can be counted on paper."""
     status = np.full((frames, len(JOINTS)), "ok", dtype=object)
     status[: frames // 2, JOINTS.index("left_wrist")] = "rejected"
     status[frames // 10 * 3 : frames // 10 * 4, :] = "few_views"
@@ -131,7 +131,7 @@ def _looking_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _camera_at(k: int, t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position [T, 3] and quaternion [T, 4]: the drones look at the actor, the mast stands still."""
+    """Return position [T, 3] and quaternion [T, 4]: the drones look at the actor, the mast stands still."""
     hip = np.column_stack([2 + 6 * np.cos(0.2 * t_s), 1 + 6 * np.sin(0.2 * t_s), np.ones_like(t_s)])
     if CAMERAS[k] == "mast":
         position = np.tile([11.0, -7.0, 3.0], (len(t_s), 1))
@@ -161,7 +161,7 @@ def make_frames(frames: int = FRAMES, rate_hz: float = RATE_HZ) -> dict[str, pd.
 
 
 def true_pixels(k: int, t_s: np.ndarray) -> np.ndarray:
-    """Where camera k sees the skeleton of `make_skeleton`, [T, J, 2] px: a pinhole without distortion."""
+    """Project the skeleton of `make_skeleton` to camera k, [T, J, 2] px: a pinhole without distortion."""
     from scipy.spatial.transform import Rotation
 
     position, quaternion = _camera_at(k, t_s)
@@ -172,7 +172,10 @@ def true_pixels(k: int, t_s: np.ndarray) -> np.ndarray:
 
 
 def make_keypoints(frames: int = FRAMES, rate_hz: float = RATE_HZ) -> dict[str, pd.DataFrame]:
-    """What every camera found: each joint `ASIDE_PX` beside the skeleton; drone2 sees a bystander as well."""
+    """Make every camera's keypoints: each joint `ASIDE_PX` beside the skeleton.
+
+    drone2 sees a bystander as well.
+    """
     t_s = np.arange(frames) / rate_hz
     tables = {}
     for k, name in enumerate(CAMERAS):

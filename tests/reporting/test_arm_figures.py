@@ -1,4 +1,4 @@
-"""The figures of a comparison show what its tables hold."""
+"""The figures of a comparison show the values of its tables."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_descriptions_state_the_numbers_of_the_tables(plates: dict[str, Plate]) 
 
 
 def _path(svg: str, colour: str, width: str) -> np.ndarray:
-    """The points of the first line of a colour and width, [N, 2] in the drawing's units."""
+    """Return the points of the first line of a colour and width, [N, 2] in the drawing's units."""
     style = rf'style="[^"]*stroke: var\({colour}\)[^"]*stroke-width: {re.escape(width)}[;"]'
     for d, tag in re.findall(r'<path d="([^"]*)"([^>]*)>', svg):
         if re.search(style, tag) and "fill: none" in tag:
@@ -58,7 +58,7 @@ def _path(svg: str, colour: str, width: str) -> np.ndarray:
 
 
 def _ticks(svg: str, axis: str) -> dict[float, float]:
-    """Where the numbers beside an axis stand, by number."""
+    """Return the positions of the numbers beside an axis, by number."""
     anchor = {"x": "middle", "y": "end"}[axis]
     found = re.findall(
         rf'<text style="font-size: 7.2px; text-anchor: {anchor}[^"]*"'

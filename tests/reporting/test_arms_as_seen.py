@@ -1,4 +1,4 @@
-"""The skeleton as arms see it: which moments are shown, what is hidden, and the numbers behind it."""
+"""The skeleton as arms see it: the moments shown, the hidden joints, and the numbers of the figure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ LOOKS_S = np.arange(11)
 
 
 def make_seen(arm: str) -> pd.DataFrame:
-    """Once a second four joints; drone1 of `fixed` sees none in its hidden stretch, `flown` loses a hip."""
+    """Make four joints once a second.
+
+    drone1 of `fixed` sees none in its hidden stretch, `flown` loses a hip.
+    """
     rows = []
     for t_s in LOOKS_S.tolist():
         for camera in DRONES:

@@ -45,7 +45,7 @@ def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def page(content: SessionContent, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The report with pictures behind the overlays, as a file."""
+    """Render the report with pictures behind the overlays, as a file."""
     path = tmp_path_factory.mktemp("report") / "index.html"
     picture = np.full((1080, 1920, 3), 90, dtype=np.uint8)
     path.write_text(render_page(content, lambda _camera, _frame: picture), encoding="utf-8")
@@ -54,7 +54,7 @@ def page(content: SessionContent, tmp_path_factory: pytest.TempPathFactory) -> P
 
 @pytest.fixture
 def opened(chromium: Browser, page: Path) -> Iterator[Browser]:
-    """The page, just opened; after the test nothing may stand on its console."""
+    """Open the page; after the test its console must be empty."""
     chromium.complaints.clear()
     chromium.show_as()
     chromium.open(page)

@@ -1,4 +1,4 @@
-"""Sessions side by side: differences that are known in closed form, and the page that tells them."""
+"""Sessions side by side: differences that are known in closed form, and the page that shows them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NORMAL_95 = 1.959964
 
 
 def _moved(content: SessionContent, times: float) -> SessionContent:
-    """The skeleton at so many times its distance from truth."""
+    """Move the skeleton to so many times its distance from truth."""
     assert content.skeleton is not None
     extra = dict(zip("xyz", (times - 1) * OFFSET_M, strict=True))
     return replace(
@@ -33,7 +33,7 @@ def _moved(content: SessionContent, times: float) -> SessionContent:
 
 
 def _later(content: SessionContent, seconds: int) -> SessionContent:
-    """The same at another time: another flight, as far as the stamps tell."""
+    """Return the same session at another time: another flight, by its stamps."""
 
     def later(table: pd.DataFrame | None) -> pd.DataFrame | None:
         return None if table is None else table.assign(t_ns=table["t_ns"] + seconds * 1_000_000_000)
@@ -42,7 +42,7 @@ def _later(content: SessionContent, seconds: int) -> SessionContent:
 
 
 def _wandering(content: SessionContent, distance_mm: np.ndarray) -> SessionContent:
-    """One sample a second, all joints as far east of the truth as is stated for each."""
+    """Return one sample a second, all joints east of the truth by the distance given for each sample."""
     frames = len(distance_mm)
     skeleton, truth = make_skeleton(frames, 1.0), make_truth(frames, 1.0)
     skeleton["status"] = "ok"
@@ -52,7 +52,7 @@ def _wandering(content: SessionContent, distance_mm: np.ndarray) -> SessionConte
 
 
 def _told(contents: dict[str, SessionContent]) -> str:
-    """Every sentence of the verdict."""
+    """Return every sentence of the verdict."""
     found = judge(compare(contents))
     sentences = [found.lead, *found.quality, *found.certainty, *found.doubts]
     return " ".join(sentences).replace(THIN, " ")

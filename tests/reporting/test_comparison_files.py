@@ -1,4 +1,4 @@
-"""The comparison as a file: where it goes, and that nothing of somebody else's is written over."""
+"""The comparison as a file: its place, and no overwriting of foreign files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipelines.session.errors import DataError
 
 @pytest.fixture
 def sessions(tmp_path: Path, content: SessionContent, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """Two folders, whose contents and page are stood in for: here it is about files alone."""
+    """Make two folders whose contents and page are stand-ins: these tests are about files alone."""
     folders = [tmp_path / f"{name}.session" for name in ("a", "b")]
     for folder in folders:
         folder.mkdir()

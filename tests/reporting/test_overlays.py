@@ -33,7 +33,7 @@ def _views(content: SessionContent, camera: str) -> list[View]:
 
 
 def _with_error(at: int, joints: list[str], px: float) -> pd.DataFrame:
-    """The skeleton, of which some joints are this far from their keypoints at one time."""
+    """Return the skeleton with some joints this far from their keypoints at one time."""
     table = make_skeleton()
     rows = (table["t_ns"] == START_NS + round(at / 30 * 1e9)) & table["joint"].isin(joints)
     table.loc[rows & (table["status"] == "ok"), "reprojection_px"] = px

@@ -272,7 +272,7 @@ HOSTILE = [
 
 
 def _named(content: SessionContent, name: str) -> SessionContent:
-    """A session and a comparison in which everything that is a text is `name`."""
+    """Return a session and a comparison in which every text is `name`."""
     session = make_session(60)
     session |= {"flight": name, "warnings": [f"w {name}"], "sources": {name: "0" * 64}}
     description = described(session)

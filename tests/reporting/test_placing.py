@@ -1,4 +1,4 @@
-"""The cameras as a reconstruction took them: refined poses before logged ones, frames by estimated clocks."""
+"""The cameras as used by a reconstruction: refined poses before logged ones, frames by estimated clocks."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from pipelines.reporting.summary import summarise
 from .conftest import ASIDE_PX, CAMERAS, START_NS, _camera_at
 
 TURN_RAD = 0.01
-"""By which the logged pose of drone1 is wrong: 14 px at a focal length of 1400 px."""
+"""Error of the logged pose of drone1: 14 px at a focal length of 1400 px."""
 OFFSET_S = 0.2
 
 
 def _misplaced(content: SessionContent) -> SessionContent:
-    """The log turns drone1 about its own x axis; the reconstruction has found where it was."""
+    """Turn the logged drone1 about its own x axis; the refined poses are right."""
     from scipy.spatial.transform import Rotation
 
     logged = content.poses["drone1"].copy()

@@ -1,4 +1,4 @@
-"""What the page says of a study, against summaries whose numbers are chosen."""
+"""The page's words about a study, against summaries with chosen numbers."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def _scene(content: SessionContent) -> Scene:
 
 
 def _numbers(text: Any, kind: type[np.int16 | np.int32], columns: int) -> np.ndarray:
-    """What a page decodes, [N, columns]; NaN where it is missing."""
+    """Decode numbers as the page does, [N, columns]; NaN where one is missing."""
     raw = np.frombuffer(base64.b64decode(text), dtype=np.dtype(kind).newbyteorder("<"))
     values = raw.astype(np.float64).reshape(-1, columns)
     missing = values == np.iinfo(kind).min
@@ -49,7 +49,7 @@ def _numbers(text: Any, kind: type[np.int16 | np.int32], columns: int) -> np.nda
 
 
 def _joints(scene: Scene, which: str = "joint") -> np.ndarray:
-    """Positions [T, P, J, 3] in the world, but for the scene's origin."""
+    """Decode the positions [T, P, J, 3] in the world, without the scene's origin."""
     body: Any = scene.data["body"]
     middle = _numbers(body["middle"], np.int32, 3) / 1000
     people, joints = body["people"], len(body["joints"])
@@ -58,7 +58,7 @@ def _joints(scene: Scene, which: str = "joint") -> np.ndarray:
 
 
 def _origin(scene: Scene, content: SessionContent) -> np.ndarray:
-    """The scene's origin, from the camera that stands still."""
+    """Compute the scene's origin from the camera that stands still."""
     cameras: Any = scene.data["cameras"]
     mast = _numbers(cameras[CAMERAS.index("mast")]["position"], np.int32, 3) / 1000
     origin: np.ndarray = content.poses["mast"][["x", "y", "z"]].to_numpy()[0] - mast[0]

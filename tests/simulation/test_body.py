@@ -29,7 +29,7 @@ def person(request: pytest.FixtureRequest) -> Person:
 
 
 def random_motion(person: Person, frames: int = 5, seed: int = 0) -> BodyMotion:
-    """Every bone turned by up to about a right angle from the neutral pose."""
+    """Turn every bone by up to about a right angle from the neutral pose."""
     draw = np.random.default_rng(seed)
     rotation = quaternion_from_rotation_vector(draw.normal(0.0, 0.5, (frames, len(BONES), 3)))
     return BodyMotion(np.arange(frames) / 30, draw.normal(0.0, 5.0, (frames, 3)), rotation)
@@ -98,7 +98,7 @@ def test_hands_hang_beside_the_hips_not_in_them(person: Person) -> None:
 
 
 def test_transforms_agree_with_the_rig(person: Person) -> None:
-    """A joint is where both its bones put it, and where `joint_centres` says."""
+    """Both bones of a joint put it at the same place, that of `joint_centres`."""
     motion = random_motion(person)
     matrix, translation = person.skinning.transforms(motion.root, motion.rotation)
     centres = joint_centres(person.rig, motion)
@@ -236,7 +236,7 @@ def test_every_look_is_a_sound_surface(sex: str, build: str, outfit: str) -> Non
 def first_hits(
     vertices: Float, faces: NDArray[np.int32], across: int, at: Float
 ) -> tuple[NDArray[np.intp], Float]:
-    """The nearest face along -x (`across` 1) or -y (`across` 0) of level rays, and how it faces the viewer.
+    """Find the nearest face along -x (`across` 1) or -y (`across` 0) of level rays, and its facing.
 
     Rays pass through (`across` coordinate, z) `at` [R, 2]. A face of -1 is a ray that hits nothing.
     """

@@ -11,7 +11,7 @@ Float = NDArray[np.float64]
 
 
 def sheet(n: int = 6) -> Patch:
-    """The unit square at z = 0, of n x n squares, seen from above, with what is linear on it."""
+    """Make the unit square at z = 0, of n x n squares, seen from above, with values linear on it."""
     x, y = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1), indexing="ij")
     corner = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
     quads = np.stack([corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]], axis=-1)

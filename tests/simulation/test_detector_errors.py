@@ -54,7 +54,7 @@ def detect(
     seed: int = 0,
     table: ErrorTable | None = EXAMPLE,
 ) -> tuple[Float, Float]:
-    """Keypoints of a person who stands still, 200 px tall."""
+    """Detect keypoints of a person who stands still, 200 px tall."""
     return detect_keypoints(
         np.tile(PLACES, (frames, 1, 1)),
         np.full((frames, 17), not hidden),
@@ -68,7 +68,7 @@ def detect(
 
 
 def lengths(xy: Float) -> Float:
-    """How far every found joint lies from the truth, NaN where missed."""
+    """Compute the distance of every found joint from the truth, NaN where missed."""
     length: Float = np.sqrt(np.sum((xy - PLACES) ** 2, axis=-1))
     return length
 

@@ -1,4 +1,4 @@
-"""Formations: where the cameras are, and that the person is in their pictures."""
+"""Formations: the places of the cameras, and the person in their pictures."""
 
 from __future__ import annotations
 

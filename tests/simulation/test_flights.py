@@ -1,4 +1,4 @@
-"""Flights written for the command tests: what is read back from a clean one is the truth."""
+"""Flights written for the command tests: reading back a clean one gives the truth."""
 
 from __future__ import annotations
 
@@ -38,7 +38,10 @@ TOLERANCE_M = 2.5e-5
 
 
 def closest_points(position: Float, quaternion: Float, pixels: Float) -> Float:
-    """[T, J, 3] least squares of the viewing rays; [N, T, 3], [N, T, 4], [N, T, J, 2] in."""
+    """Compute the least-squares points [T, J, 3] of the viewing rays.
+
+    Inputs are positions [N, T, 3], quaternions [N, T, 4] and pixels [N, T, J, 2].
+    """
     rays = np.concatenate([undistort(pixels, LENS), np.ones((*pixels.shape[:-1], 1))], axis=-1)
     rays = rotate(quaternion[:, :, None], rays / np.linalg.norm(rays, axis=-1, keepdims=True))
     across = np.eye(3) - rays[..., None] * rays[..., None, :]

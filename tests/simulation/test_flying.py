@@ -1,4 +1,4 @@
-"""Drones that fly: within their limits, where control theory says, leaning and looking as they should."""
+"""Drones that fly: within their limits, as control theory predicts, leaning and looking as they should."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SETTLED = T_S > 10.0  # the slowest mode of the loops decays within a second
 
 
 def circling() -> DronePaths:
-    """Three drones on a ring around a standing actor."""
+    """Fly three drones on a ring around a standing actor."""
     return fly(ring_slots(RING, 3, MIDDLE, T_S), MIDDLE, T_S, Limits())
 
 
@@ -82,7 +82,7 @@ def test_slots_are_those_of_the_orbit() -> None:
 
 
 def test_behind_a_circling_slot_a_drone_lags_as_its_loops_say() -> None:
-    """Of the slot's path s and the error e: lag e''' + e'' + kv e' + kv kp e = lag s''' + s''.
+    """The slot's path s and the error e obey lag e''' + e'' + kv e' + kv kp e = lag s''' + s''.
 
     The integration holds each push for a step, which delays the velocity loop by at most one: kv STEP_S
     = 2 % of it.
@@ -160,7 +160,7 @@ def test_moments_may_be_coarse_and_uneven() -> None:
 
 
 def swaying(t_s: Float | float) -> tuple[Float, Float]:
-    """A slot that swings by 2 m along east with 0.2 rad/s, at rest at first: place and velocity [..., 3]."""
+    """Return place and velocity [..., 3] of a slot that swings 2 m along east with 0.2 rad/s, from rest."""
     t = np.asarray(t_s)[..., None]
     east = np.array([1.0, 0.0, 0.0])
     return [5.0, 5.0, 5.0] + 2 * (1 - np.cos(0.2 * t)) * east, 0.4 * np.sin(0.2 * t) * east

@@ -29,7 +29,7 @@ Float = NDArray[np.float64]
 
 
 def flight(rate_hz: int = 100) -> DronePaths:
-    """Two drones that circle a walking actor for ten seconds."""
+    """Fly two drones that circle a walking actor for ten seconds."""
     t_s = moments(-1.0, 10.0)[:: 100 // rate_hz]
     actor = np.stack([1.2 * t_s, 0 * t_s, 1.0 + 0 * t_s], axis=1)
     formation = Formation(yaw_rate_deg_per_s=15.0, variation=1.0)

@@ -28,14 +28,14 @@ they fly the same way some millimetres apart (7 on another processor), after the
 
 @pytest.fixture(scope="module")
 def again(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The flight made again, without its videos: logs and truth do not depend on them."""
+    """Make the flight again, without its videos: logs and truth do not depend on them."""
     folder = tmp_path_factory.mktemp("sample") / "flight"
     simulate(SAMPLE_DATA / "mound_walk.yaml", folder, video=False)
     return folder
 
 
 def logged_poses(path: Path, topic: str) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Stamps and poses [M, 8] of an odometry topic."""
+    """Read stamps and poses [M, 8] of an odometry topic."""
     rows = []
     with MCAP.open_log([path]) as log:
         for message in log.messages([topic]):

@@ -35,7 +35,7 @@ def length(joints: Float, one: str, other: str) -> Float:
 
 
 def flexion_deg(joints: Float, upper: str, middle: str, lower: str) -> Float:
-    """The angle by which a limb is bent at its middle joint, 0 when straight."""
+    """Compute the angle by which a limb is bent at its middle joint, 0 when straight."""
     first = joint(joints, middle) - joint(joints, upper)
     second = joint(joints, lower) - joint(joints, middle)
     cosine = np.sum(first * second, axis=1) / np.sqrt(np.sum(first**2, axis=1) * np.sum(second**2, axis=1))
@@ -44,7 +44,7 @@ def flexion_deg(joints: Float, upper: str, middle: str, lower: str) -> Float:
 
 
 def strides(count: int = 3, speed_mps: float = 1.2, per_stride: int = 400) -> Float:
-    """Times over whole strides."""
+    """Return times over whole strides."""
     return np.linspace(0.0, count * stride_m() / speed_mps, count * per_stride + 1)
 
 

@@ -1,4 +1,4 @@
-"""A performance and what is measured on it."""
+"""Simulated performances of scripts, and measures of them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def slope(places: Float) -> Float:
 
 
 def mound(places: Float) -> Float:
-    """1.2 m high: at most 0.6 x 1.2 / 2 m = 20 deg steep."""
+    """Return the height of a mound 1.2 m high: at most 0.6 x 1.2 / 2 m = 20 deg steep."""
     x, y = places.T
     height: Float = 1.2 * np.exp(-((x - 6.0) ** 2 / 8.0 + y**2 / 12.5))
     return height
@@ -58,7 +58,7 @@ def performed(
 
 
 def bent_deg(motion: BodyMotion, above: str, below: str) -> Float:
-    """[T] how far a bone is turned forward about the axis to the left, against the one it hangs on."""
+    """Measure the turn [T] of a bone forward about the axis to the left, relative to its parent."""
     relative = multiply(conjugate(motion.rotation[:, BONE[above]]), motion.rotation[:, BONE[below]])
     angle = np.degrees(2 * np.arctan2(relative[:, 1], relative[:, 3]))
     wrapped: Float = (angle + 180.0) % 360.0 - 180.0
@@ -66,9 +66,10 @@ def bent_deg(motion: BodyMotion, above: str, below: str) -> Float:
 
 
 def leg_angles_deg(motion: BodyMotion, side: int, rig: Rig = RIG) -> dict[str, Float]:
-    """[T] flexion of hip and knee, dorsiflexion of the ankle of somebody who walks east.
+    """Measure flexion of hip and knee, and dorsiflexion of the ankle, [T], of a person who walks east.
 
-    Read off where joints, heel and ball are, in the vertical plane of the way; the hip against upright.
+    They follow from the places of joints, heel and ball in the vertical plane of the way; the hip is relative
+    to upright.
     """
     centres, soles = joint_centres(rig, motion), sole_points(rig, motion)[:, side]
     hip, knee, ankle = (centres[:, BONE[f"{SIDES[side]}_{bone}"]] for bone in ("thigh", "shank", "foot"))
@@ -79,19 +80,19 @@ def leg_angles_deg(motion: BodyMotion, side: int, rig: Rig = RIG) -> dict[str, F
 
 
 def angles_of_leg_deg(hip: Float, knee: Float, ankle: Float) -> dict[str, Float]:
-    """[T] flexion of hip and knee from where they are, [T, 3] m, of somebody who walks east."""
+    """Compute flexion [T] of hip and knee from joints [T, 3] m of a person who walks east."""
     thigh = _forward_deg(knee - hip)
     return {"hip": thigh, "knee": thigh - _forward_deg(ankle - knee)}
 
 
 def _forward_deg(down: Float) -> Float:
-    """[T] how far vectors [T, 3] that point down are turned forward."""
+    """Compute the angle [T] by which vectors [T, 3] that point down are turned forward."""
     turned: Float = np.degrees(np.arctan2(down[:, 0], -down[:, 2]))
     return turned
 
 
 def clearance_m(motion: BodyMotion, ground: Callable[[Float], Float] = flat, rig: Rig = RIG) -> Float:
-    """[T, 2, 3] how high heel, ball and tip of both feet are above the ground."""
+    """Measure the heights [T, 2, 3] of heel, ball and tip of both feet above the ground."""
     points = sole_points(rig, motion)
     under = ground(points[..., :2].reshape(-1, 2)).reshape(points.shape[:-1])
     height: Float = points[..., 2] - under
@@ -99,7 +100,7 @@ def clearance_m(motion: BodyMotion, ground: Callable[[Float], Float] = flat, rig
 
 
 def slid_m(motion: BodyMotion, touching_m: float, rig: Rig = RIG) -> list[float]:
-    """How far each contact's point moved over the ground: in every frame the slowest point that touches."""
+    """Measure the slip of each contact over the ground: in every frame that of the slowest contact point."""
     points = sole_points(rig, motion)
     touches = clearance_m(motion, rig=rig) < touching_m
     slid = []

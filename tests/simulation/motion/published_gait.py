@@ -1,4 +1,4 @@
-"""What walking people do at their usual speed: when hip, knee and ankle are bent how far.
+"""Published gait at usual speed: angles of hip, knee and ankle, and their times in the stride.
 
 Three published measurements, each read as numbers at the place named:
 
@@ -51,12 +51,12 @@ class Event(NamedTuple):
 
     @property
     def share(self) -> Band:
-        """Where the extreme lies."""
+        """Range of the extreme's share of the stride."""
         return min(low for low, _ in self.near_extreme), max(high for _, high in self.near_extreme)
 
 
 def stance_share(speed: float) -> Band:
-    """Of a stride; the speed is over sqrt(g x length of the leg).
+    """Return the range of the stance's share of a stride; the speed is over sqrt(g x length of the leg).
 
     At 0.43 the same rule: Winter 0.615, Schwartz 0.59 with a standard deviation of 0.02, the person 0.60. It
     changes with speed as Schwartz's does.

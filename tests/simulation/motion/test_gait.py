@@ -61,7 +61,7 @@ def test_feet_stay_on_top_of_the_ground_and_one_is_on_it(ground) -> None:  # typ
 
 
 def stride_of(motion: BodyMotion, side: int, rig: Rig = RIG) -> tuple[slice, float]:
-    """A stride at steady speed, from strike to strike, and the share of it that the foot is on the ground."""
+    """Find a stride at steady speed, from strike to strike, and its share with the foot on the ground."""
     low = clearance_m(motion, rig=rig)[:, side]
     (strikes,) = np.nonzero(np.diff((low[:, 0] < ON_GROUND_M).astype(int)) == 1)
     first, last = (strikes + 1)[motion.t_s[strikes] > 3.0][:2]
@@ -70,7 +70,7 @@ def stride_of(motion: BodyMotion, side: int, rig: Rig = RIG) -> tuple[slice, flo
 
 
 def published(angles: dict[str, Float], toe_off: float, events: Sequence[Event]) -> dict[str, bool]:
-    """Which extremes are as far, and where, as measured people's."""
+    """Test which extremes have the angle and the time in the stride of measured people."""
     share = np.linspace(0.0, 1.0, len(angles["knee"]), endpoint=False)
     within = {}
     for event in events:
@@ -93,7 +93,7 @@ def assert_stance_is_as_long_as_published(toe_off: float, speed_mps: float) -> N
 @pytest.mark.parametrize("side", [0, 1])
 @pytest.mark.parametrize("speed", [1.2, 1.3, 1.4])
 def test_walking_angles_lie_in_the_published_bands(speed: float, side: int) -> None:
-    """At people's usual speed, from where joints, heels and balls are."""
+    """At people's usual speed, from the places of joints, heels and balls."""
     motion = performed({"walk": {"distance_m": 9 * speed, "speed_mps": speed}}, seconds=7.0, step_s=0.002)
     stride, toe_off = stride_of(motion, side)
     angles = {joint: curve[stride] for joint, curve in leg_angles_deg(motion, side).items()}

@@ -70,7 +70,7 @@ def named(style: str) -> tuple[str, ...]:
 
 
 def recorded(style: str = "mixamo", scale: float = 1.0, arms_up_deg: float = 90.0) -> SkeletalMotion:
-    """Our own walk, as a file would hold it whose rest pose spreads the arms."""
+    """Return our own walk as a recording whose rest pose spreads the arms."""
     motion = performed({"walk": {"distance_m": 5}}, {"turn": {"deg": 60}}, seconds=9.0, step_s=0.02)
     rest = np.zeros((len(BONES), 4))
     rest[:, 3] = 1.0

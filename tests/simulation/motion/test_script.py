@@ -1,4 +1,4 @@
-"""Scripts of actions: where they end, what they do, and that nothing jumps."""
+"""Scripts of actions: their ends, their effects, and no jumps."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ EVERYTHING: list[dict[str, Any]] = [
 
 
 def test_nothing_jumps() -> None:
-    """Velocity is continuous: what it changes by in a step shrinks with the step.
+    """Velocity is continuous: its change in a step shrinks with the step.
 
     A jump of the velocity would change it by as much within 1 ms as within 4 ms; accelerations that are
     bounded make it a quarter. Half lies between the two.

@@ -1,4 +1,4 @@
-"""Rendered pictures against the geometry of what they show."""
+"""Rendered pictures against the geometry of the scene."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FLOAT32 = 2.0**-23
 
 
 def looking(position: tuple[float, float, float], at: tuple[float, float, float]) -> Pose:
-    """A camera that looks at a point with its x axis level (along world x when it looks straight down)."""
+    """Return a camera that looks at a point with its x axis level (world x if it looks straight down)."""
     forward = np.array(at, float) - position
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -42,7 +42,7 @@ def looking(position: tuple[float, float, float], at: tuple[float, float, float]
 
 
 def rays(pose: Pose, intrinsics: Intrinsics = CAMERA) -> Float:
-    """[H, W, 3] directions in the world through the pixels' centres, of depth 1."""
+    """Return directions [H, W, 3] in the world through the pixels' centres, of depth 1."""
     x, y = np.meshgrid(np.arange(intrinsics.width), np.arange(intrinsics.height))
     normalised = undistort(np.stack([x, y], axis=-1).astype(float), intrinsics)
     return rotate(pose[1], np.concatenate([normalised, np.ones((*x.shape, 1))], axis=-1))
@@ -53,7 +53,7 @@ def surface(vertices: Float, faces: NDArray[np.int32], grey: float = 0.5, *, smo
 
 
 def rectangle(centre: Float, along: Float, across: Float, grey: float = 0.5) -> Surface:
-    """Of two triangles; `along` and `across` are half its sides."""
+    """Make a rectangle of two triangles; `along` and `across` are half its sides."""
     corners = np.stack(
         [centre - along - across, centre + along - across, centre + along + across, centre - along + across]
     )
@@ -67,7 +67,7 @@ def level(half_m: float, height_m: float = 0.0, grey: float = 0.5) -> Surface:
 
 
 def box(low: Float, high: Float) -> Surface:
-    """Twelve triangles."""
+    """Make a box of twelve triangles."""
     corner = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = [face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]
@@ -75,7 +75,7 @@ def box(low: Float, high: Float) -> Surface:
 
 
 def sphere(centre: Float, radius: float, sectors: int = 48, rings: int = 24) -> Surface:
-    """Corners on the sphere, counted once."""
+    """Make a sphere with corners on its surface, each counted once."""
     polar = np.linspace(0, np.pi, rings + 1)[1:-1, None]
     turn = np.arange(sectors) * 2 * np.pi / sectors
     z, rho = np.broadcast_to(np.cos(polar), (rings - 1, sectors)), np.sin(polar)
@@ -224,7 +224,7 @@ def test_a_person_hides_what_lies_behind_the_nearest_surface() -> None:
 
 
 def linear(picture: NDArray[np.uint8]) -> Float:
-    """Light from bytes, below the tone curve's shoulder: the inverse of sRGB."""
+    """Convert bytes to light, below the tone curve's shoulder: the inverse of sRGB."""
     value = picture.astype(float) / 255
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4) / EXPOSURE
 
@@ -362,7 +362,7 @@ def test_the_ground_texture_is_seamless_and_does_not_change_the_mean() -> None:
 
 
 def test_far_ground_does_not_shimmer() -> None:
-    """Where a pixel covers metres of grass, moving by a fraction of that changes nothing but the noise.
+    """If a pixel covers metres of grass, a shift by a fraction of that changes nothing but the noise.
 
     The site's slow changes have features of several metres; over 0.05 m they move by less than 2 %.
     """

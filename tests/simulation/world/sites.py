@@ -27,11 +27,11 @@ WALLS = [
 
 
 def site(**parts: object) -> World:
-    """Whatever parts of a scenario's world are named, on a ground of 20 m."""
+    """Build a world of the named parts, on a ground of 20 m."""
     spec = scenario.World.model_validate({"ground": {"size_m": 20.0}, **parts})
     return build_world(spec, 3, keep_clear=NOBODY)
 
 
 def everything() -> World:
-    """Two mounds that overlap, two trees, two walls."""
+    """Build two mounds that overlap, two trees, two walls."""
     return site(mounds=MOUNDS, trees=TREES, walls=WALLS)

@@ -1,4 +1,4 @@
-"""What is drawn is where the solids are."""
+"""Drawn surfaces against the solids."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Float = NDArray[np.float64]
 
 
 def within_faces(surface: Surface, per_face: int) -> Float:
-    """Random points of every triangle [F, K, 3]."""
+    """Draw random points of every triangle [F, K, 3]."""
     shares = np.random.default_rng(4).dirichlet([1, 1, 1], (len(surface.faces), per_face))
     points: Float = np.einsum("fkc,fcd->fkd", shares, surface.vertices[surface.faces])
     return points

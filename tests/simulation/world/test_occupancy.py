@@ -13,7 +13,7 @@ Float = NDArray[np.float64]
 
 
 def points_within(occupancy: Occupancy, per_side: int) -> Float:
-    """Evenly strewn points inside of every voxel [X, Y, Z, K, 3], from its walls to its middle."""
+    """Return evenly spaced points inside every voxel [X, Y, Z, K, 3], from its walls to its middle."""
     inner = np.linspace(1e-6, 1 - 1e-6, per_side)
     place = np.stack(np.meshgrid(inner, inner, inner), axis=-1).reshape(-1, 3)
     index = np.moveaxis(np.indices(occupancy.probability.shape), 0, -1)
@@ -44,7 +44,7 @@ def test_where_a_point_is_solid_its_voxel_is_occupied(resolution_m: float) -> No
 def test_every_occupied_voxel_holds_a_solid_point() -> None:
     """Trees and walls are exact: voxels without a solid among 8 points show one among 64,000.
 
-    A corner may reach in by less than the points' spacing: then what is solid lies within two spacings.
+    A corner may reach in by less than the points' spacing: then a solid point lies within two spacings.
     """
     world = site(trees=TREES, walls=WALLS)
     occupancy = world.occupancy(0.2, 6.0)

@@ -126,7 +126,7 @@ coordinates = st.tuples(*[st.floats(-9, 9)] * 2, st.floats(0.02, 6))
 def test_hidden_agrees_with_marching_through_what_is_solid(
     eye: tuple[float, float, float], target: tuple[float, float, float]
 ) -> None:
-    """A solid sample hides (deeper than what the ground forgives), and what hides shows itself in samples.
+    """A solid sample hides (deeper than the ground's tolerance), and what hides shows itself in samples.
 
     Samples are 1 mm apart. A line that is hidden without a solid sample touches a shape for less than that:
     then one in a bundle moved by 2 cm must be solid, since every solid here is wider than that.

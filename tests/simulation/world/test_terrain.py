@@ -13,7 +13,7 @@ Float = NDArray[np.float64]
 
 
 def closed_form(xy: Float) -> Float:
-    """h exp(-d' S^-1 d / 2) with S = R diag(sigma^2) R', mound by mound."""
+    """Compute h exp(-d' S^-1 d / 2) with S = R diag(sigma^2) R', mound by mound."""
     total = np.zeros(xy.shape[:-1])
     for mound in map(scenario.Mound.model_validate, MOUNDS):
         yaw = np.radians(mound.yaw_deg)
@@ -48,7 +48,10 @@ def test_normals_are_those_of_finite_differences() -> None:
 
 
 def second_derivatives(terrain: Terrain, xy: Float) -> Float:
-    """The largest in any direction, [N], by differences of slopes: the spectral norm of the Hessian."""
+    """Compute the largest second derivative in any direction, [N].
+
+    It is the spectral norm of the Hessian, by differences of slopes.
+    """
     step = 1e-4
     normals = [terrain.normal(xy + sign * shift) for shift in step * np.eye(2) for sign in (1, -1)]
     slopes = [-normal[..., :2] / normal[..., 2:] for normal in normals]
