@@ -83,7 +83,7 @@ class PlannerConfig:
     tolerance: float = 1e-3
     step_cap_m: float = 0.5
 
-    # Rates, and how plans are flown.
+    # Rates, and tracking of plans.
     central_hz: float = 10.0
     local_hz: float = 5.0
     tracking_hz: float = 50.0

@@ -55,7 +55,7 @@ class Pilot:
         config: weights and rates.
         drones: number of drones, 1 to 16.
         yaw_rad: of the first camera at the start, counterclockwise from east.
-        heading_rad: the actor's heading before walking, if `yaw_frame` is `heading`; likewise.
+        heading_rad: the actor's heading before walking, from east, if `yaw_frame` is `heading`.
         clock: seconds, for `times`.
 
     Raises:
@@ -104,10 +104,10 @@ class Pilot:
         return slots, self._filter.forecast(np.array([t_s]))[0] + slot_offsets(slots)
 
     def step(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> Command:
-        """Replan what is due, and return the commands for now.
+        """Replan if a plan is due, and return the commands for now.
 
         Args:
-            t_s: now; at or after the latest measurement, of which there must be one.
+            t_s: now; at or after the latest measurement. There must be at least one.
             position: [N, 3] metres, world, of the drones.
             velocity: [N, 3] m/s.
             field: the distance field of the obstacles that are known now.
@@ -116,7 +116,7 @@ class Pilot:
         return Command(*self.reference(t_s), *self.wanted(t_s))
 
     def replan(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
-        """Replan what is due; arguments as in `step`."""
+        """Replan if a plan is due; arguments as in `step`."""
         config = self._config
         if t_s >= self._next_central_s - _NOW_S:
             self._next_central_s = max(self._next_central_s, t_s) + 1.0 / config.central_hz

@@ -83,7 +83,7 @@ def replay(
         config: weights and rates, the same for all arms of a comparison.
         drones: number of cameras.
         yaw_rad: of the first camera at the start, counterclockwise from east.
-        heading_rad: the actor's heading before walking, if `yaw_frame` is `heading`; likewise.
+        heading_rad: the actor's heading before walking, from east, if `yaw_frame` is `heading`.
         mode: `closed-loop` flies point masses with limited acceleration; `plan-only` puts the drones exactly
             on their local plans.
         seed: of the noise.

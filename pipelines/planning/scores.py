@@ -155,6 +155,6 @@ def _spread(values: Float) -> dict[str, float]:
 
 
 def _episodes(broken: Bool) -> int:
-    """Count how many times, in all [N, T] rows, something begins to hold."""
+    """Count the episodes in all [N, T] rows: the times at which a condition begins to hold."""
     before = np.concatenate([np.zeros((len(broken), 1), dtype=np.bool_), broken[:, :-1]], axis=1)
     return int((broken & ~before).sum())

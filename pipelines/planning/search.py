@@ -49,8 +49,8 @@ def best_sequence(cost: Float, grid: Lattice, start: Float) -> tuple[Int64, floa
     Args:
         cost: [T, S], finite.
         grid: the states.
-        start: [3] commanded now, anywhere between the states. The first step reaches what its rates allow,
-            or else the nearest state.
+        start: [3] commanded now, anywhere between the states. The first step reaches the states that the
+            rates allow, or else the nearest state.
 
     Returns:
         [T] indices of states, and the sum of costs and moves. Ties are broken in favour of the same state, or

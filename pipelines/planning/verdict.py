@@ -19,7 +19,7 @@ def verdict(
     Args:
         arm: the arm that is judged.
         against: the arm that it is compared with.
-        arms: scores by arm, as they stand in metrics.json.
+        arms: scores by arm, as in metrics.json.
         difference: of the two, arm minus against, as in metrics.json.
     """
     return (
@@ -32,7 +32,7 @@ def broken_limits(arm: str, scores: Mapping[str, Any], config: PlannerConfig) ->
 
     Args:
         arm: its name.
-        scores: of the arm, as they stand in metrics.json.
+        scores: of the arm, as in metrics.json.
         config: the limits.
     """
     kinds = {

@@ -142,7 +142,7 @@ class Difference:
     pairs: int  # joint-frames (or moments, bones) that both have; joints where they are paired by joint
     first: float  # the two means over those pairs
     other: float
-    lower: int  # of `joints`, how many are lower than in the first session
+    lower: int  # number of `joints` that are lower than in the first session
     per_joint: dict[str, float]
 
     @property
@@ -359,7 +359,7 @@ def _paired_by_time(
 
 
 def _places(columns: Sequence[str]) -> dict[tuple[str, int], int]:
-    """Return the column by name and by how many of that name came before, which is the person."""
+    """Return columns by name and person. The person is the number of earlier columns with that name."""
     seen: dict[str, int] = {}
     places = {}
     for k, name in enumerate(columns):

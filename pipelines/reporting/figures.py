@@ -62,7 +62,7 @@ def draw_all(summary: Summary, poses: Mapping[str, pd.DataFrame]) -> dict[str, P
     return {plate.key: plate for plate in plates}
 
 
-# --- what was ingested ---------------------------------------------------------------------------------
+# --- cameras -------------------------------------------------------------------------------------------
 
 
 def _timeline(cameras: tuple[CameraRow, ...]) -> Plate:

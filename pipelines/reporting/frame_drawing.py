@@ -85,7 +85,7 @@ def caption_of(view: View, status: NDArray[np.int8], method: str) -> tuple[str, 
 
     Args:
         view: the frame.
-        status: [P, J] index into triangulation.STATUS, -1 where the skeleton says nothing.
+        status: [P, J] index into triangulation.STATUS, -1 where the skeleton has no row.
         method: of the reconstruction.
     """
     counts = np.bincount(status[status >= 0].ravel(), minlength=len(STATUS))

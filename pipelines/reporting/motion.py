@@ -16,7 +16,7 @@ from pipelines.session.true_joints import true_joints_at
 if TYPE_CHECKING:
     import pandas as pd
 
-_NEVER_TOGETHER_M = 1e9  # people who share no time are matched last
+_NEVER_TOGETHER_M = 1e9  # distance of people without a common time: they are matched last
 
 
 @dataclass(frozen=True)

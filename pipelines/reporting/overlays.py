@@ -38,8 +38,8 @@ ReadFrame = Callable[[str, int], Picture | None]
 MOMENTS = 6
 _LONGEST_STEP = 1.5  # usual steps: the skeleton is not interpolated between times further apart
 _SAME_ERROR_MM = 1.0  # among times with errors this close, the views decide which is the worst
-_STEP = 1e-4  # of a joint's depth: small against how lenses bend, large against rounding
-_SAME_PERSON = 0.5  # of a body's size in the picture: a detection further away is somebody else
+_STEP = 1e-4  # of a joint's depth: small against lens distortion, large against rounding
+_SAME_PERSON = 0.5  # of a body's size in the picture: a detection further away is another person
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,7 @@ class View:
     others: Float  # [D, J, 2] px: people who are not part of the skeleton
     has_pose: bool
     picture: Picture | None
-    spread: Float | None = (
-        None  # [P, J, 2, 2] px^2 covariance of reprojected joints; NaN where none is stated
-    )
+    spread: Float | None = None  # [P, J, 2, 2] px^2 covariance of reprojected joints; NaN where unknown
 
     @property
     def residual_px(self) -> Float:

@@ -98,7 +98,7 @@ class Replan:
     costs: CostMap | None
     terrain: Terrain | None
     verdict: str
-    setting: str  # a sentence on what was compared
+    setting: str  # a sentence about the comparison
     rows: tuple[ArmRow, ...]
     differences: tuple[DifferenceRow, ...]
     level: str  # of the intervals

@@ -51,7 +51,7 @@ class JointRow:
 
 @dataclass(frozen=True)
 class Measure:
-    """A number of the error table, with what it means."""
+    """A number of the error table, and its meaning."""
 
     label: str
     value: str

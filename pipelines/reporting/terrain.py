@@ -96,7 +96,7 @@ def heights(terrain: Terrain) -> Heights:
 def surface(terrain: Terrain, most: int = MOST_SURFACE_POINTS) -> Surface:
     """Return the occupied voxels with a free neighbour, as far as they rise `LOWEST_M` above the ground.
 
-    They are gathered in the smallest cubes of whole voxels of which at most `most` hold any.
+    They are grouped in cubes of whole voxels, the smallest with which at most `most` cubes are occupied.
     """
     occupied = np.pad(terrain.occupied, 1)
     inner = occupied[1:-1, 1:-1, 1:-1].copy()

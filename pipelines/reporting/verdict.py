@@ -163,7 +163,7 @@ def _odd_cameras(summary: Summary) -> list[str]:
 
 
 def _large_errors(summary: Summary) -> list[str]:
-    """State how many measured joint-frames are far from truth, which joints those are and when."""
+    """State the number, the joints and the times of measured joint-frames that are far from truth."""
     if summary.motion is None or summary.errors_mm is None:
         return []
     large = np.nan_to_num(summary.errors_mm) > LARGE_ERROR_MM
@@ -211,4 +211,4 @@ def _doubts(content: SessionContent, summary: Summary) -> list[str]:
     doubts += summary.description.warnings
     for record in content.stages.values():
         doubts += [str(warning) for warning in items(record, "warnings")]
-    return list(dict.fromkeys(doubts))  # a stage repeats what ingest said
+    return list(dict.fromkeys(doubts))  # a stage repeats the warnings of ingest

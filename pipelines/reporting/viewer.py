@@ -172,7 +172,7 @@ class _Body:
             "sides": [_SIDES.index(side_of(name)) for name in joints],
             "derived": [[place[parent] for parent in parents] for _, parents in derived],
             "bones": [[place[a], place[b], _SIDES.index(side_of(a, b))] for a, b in bones_of(known)],
-            # The first time that shows nearly as many joints as any: what the page opens with, and prints.
+            # The first time with nearly the most joints: the page opens with it, and prints it.
             "start": int(np.argmax(counts >= 0.9 * counts.max())),
             "middle": _packed(1000 * (self.middle[kept] - origin), np.int32),
             "joint": _packed(1000 * self.joint[kept], np.int16),

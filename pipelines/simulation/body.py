@@ -41,7 +41,7 @@ class Person:
     """A person who can be posed.
 
     `rig` is measured from this very mesh. Arms hang straight, leaning outward just enough to clear the
-    hips; all else is as `rig` says of the neutral pose.
+    hips; the rest is the neutral pose of `rig`.
     """
 
     rig: Rig

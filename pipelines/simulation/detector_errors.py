@@ -163,25 +163,26 @@ def detect_keypoints(
 
     Errors have the measured median length and no preferred direction; from frame to frame they follow a
     first-order autoregression (`KEPT_PER_FRAME`). Misses and outliers come one by one, more of them the
-    steeper the camera looks. Hidden joints are mostly missed (`HIDDEN_MISSED_SHARE`, whatever the scenario
-    says), else badly found. Swapped limbs (elbow to hand, knee to foot) stay so for `SWAP_FRAMES`. The mean
+    steeper the camera looks. Hidden joints are mostly missed (`HIDDEN_MISSED_SHARE`, in every scenario), else
+    found with large errors. Swapped limbs (elbow to hand, knee to foot) stay so for `SWAP_FRAMES`. The mean
     confidence of visible joints is the measured one; a joint's own falls with the rank of its error among
     errors of its kind, and outliers lose up to `_OUTLIER_DOUBT` more, so that some of them look good.
 
-    With `errors.scale` 0 there are neither outliers nor swaps: what is found is exact.
+    With `errors.scale` 0 there are neither outliers nor swaps: all found keypoints are exact.
 
     Args:
-        pixels: [T, J, 2] exact pixels; NaN for what is not in the picture, which is never found.
+        pixels: [T, J, 2] exact pixels; NaN for joints outside the picture, which are never found.
         visible: [T, J] True where nothing hides the joint.
         tilt_deg: [T] elevation of the camera above the person.
         apparent_height_px: [T] (`view_of`).
         errors: the scenario's; its shares hold for visible joints.
-        rng: draws as many numbers for what is seen as for what is not.
+        rng: draws as many numbers for visible joints as for others.
         joints: the joints' names.
         table: measured errors; by default those of `errors.detector`.
 
     Returns:
-        [T, J, 2] px, NaN for what was missed, and confidences [T, J] above 0 and at most 1; 0 for those.
+        [T, J, 2] px, NaN for missed joints, and confidences [T, J] above 0 and at most 1; 0 for missed
+        joints.
 
     Raises:
         ValueError: a joint without measured errors.

@@ -41,7 +41,7 @@ Moving = Callable[[Float], BodyMotion]
 LEAD_S = 0.2
 """Time that logs run, and the actor moves, before the first picture and after the last, s."""
 
-_PLANNER_HZ = 50.0  # how often a planner is asked; it replans as often as it likes
+_PLANNER_HZ = 50.0  # rate of the planner's calls; it may replan less often
 _WAY_S = 0.25  # between the points of the actor's way that the wood keeps clear of
 # What chance decides, each with numbers of its own: changing one thing leaves the others as they were.
 _FRAMES, _LOG, _NOISE, _ACTOR, _KEYPOINTS, _MOTION = range(6)
@@ -142,7 +142,7 @@ def fly_scenario(
     """Let the actors move, the drones fly, and the recorders run.
 
     Args:
-        scenario: who, where and how.
+        scenario: the actor, the world and the drones.
         noise: the errors of the logged poses.
         bvh: recorded motions by the name of the actor whose scenario names one.
         planner: makes a planner for a world; without one drones fly on a ring about where the first actor
@@ -203,7 +203,7 @@ def keypoints_of(
     """What a detector would find of a person in a drone's pictures, by the measured errors of one.
 
     Returns:
-        [F, J, 2] px, NaN for what was missed, and [F, J] confidences.
+        [F, J, 2] px, NaN for missed joints, and [F, J] confidences.
     """
     scenario, truth = flight.scenario, drone.at_frames
     rows = flight.moments_of(drone)

@@ -61,7 +61,7 @@ def write_alphapose(path: Path, people: Iterable[Sighting]) -> None:
     """Write keypoints as AlphaPose does with its tracker: a list of people, picture by picture.
 
     Frame k is picture `00000k.jpg`. Joints that were missed are 0, 0, 0; frames in which all of a person's
-    joints were missed have no entry. Within a picture people stand in the order given.
+    joints were missed have no entry. Within a picture people keep the given order.
     """
     entries = [
         (frame, _alphapose_entry(frame, person)) for person in people for frame in _frames_with(person)

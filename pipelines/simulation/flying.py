@@ -1,9 +1,9 @@
 """Flight model of drones: point masses that track moving slots, bodies that lean, gimbals that aim.
 
-A drone is a mass that a cascade of two loops steers, as autopilots do: the distance to its slot asks for a
-velocity, the error in velocity for an acceleration, and the attitude needs time to give it. There is no wind.
-Only speed and acceleration saturate. The attitude follows from the motion: a multirotor leans so that its
-thrust makes the acceleration; its nose turns to the actor. The camera hangs in a gimbal.
+A drone is a mass that a cascade of two loops steers, as autopilots do: the distance to its slot commands a
+velocity, the error in velocity commands an acceleration, and the attitude follows with a delay. There is no
+wind. Only speed and acceleration saturate. The attitude follows from the motion: a multirotor leans so that
+its thrust makes the acceleration; its nose turns to the actor. The camera hangs in a gimbal.
 
 Everything is integrated in equal steps of at most `STEP_S` between the requested moments.
 """

@@ -47,13 +47,13 @@ def detect(pixels: Float, noise: KeypointNoise, rng: np.random.Generator) -> tup
     """Simulate the keypoints that a detector reports.
 
     Args:
-        pixels: [..., 2] exact pixels, NaN for what cannot be seen.
+        pixels: [..., 2] exact pixels, NaN for joints that cannot be seen.
         noise: the detector's errors.
         rng: draws as many numbers for joints that are seen as for those that are not.
 
     Returns:
-        [..., 2] px with NaN for what was missed, and [...] confidences: 0 for those, 0.7 to 1 for good
-        ones, 0.3 to 0.9 for outliers, because detectors are often sure of what is wrong.
+        [..., 2] px with NaN for missed joints, and [...] confidences: 0 for those, 0.7 to 1 for good
+        ones, 0.3 to 0.9 for outliers, because detectors often have high confidence in wrong keypoints.
     """
     shape = pixels.shape[:-1]
     offset = noise.pixel_px * rng.standard_normal(pixels.shape)

@@ -243,7 +243,7 @@ class Formation(Part):
     tilt_deg: float = Field(15.0, ge=-10, le=85)
     yaw_deg: float = 0.0
     yaw_rate_deg_per_s: float = Field(0.0, ge=-90, le=90)  # of the ring
-    variation: float = Field(0.0, ge=0, le=3)  # how far each strays from its slot
+    variation: float = Field(0.0, ge=0, le=3)  # deviation of each drone from its slot
 
 
 class Limits(Part):
@@ -286,7 +286,7 @@ class DetectorErrors(Part):
 
     detector: ModelledDetector = "blazepose"  # whose measured errors
     scale: float = Field(1.0, ge=0, le=100)  # of the measured pixel error; 0 gives exact keypoints
-    # At 15 degrees of tilt; together what was measured there as missed or grossly wrong.
+    # At 15 degrees of tilt; their sum is the measured share of missed or grossly wrong joints.
     missed_share: float = Field(0.008, ge=0, lt=1)
     outlier_share: float = Field(0.004, ge=0, lt=1)
     swap_share: float = Field(0.005, ge=0, lt=1)  # of frames, left for right in one limb pair

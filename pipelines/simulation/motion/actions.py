@@ -48,7 +48,7 @@ def reach(plan: Plan, side: str, height_m: float, seconds: float, shoulder_m: fl
     there = plan.t_s + _REACH_S
     back = there + seconds
     end = back + _REACH_S
-    # Without bending the hand comes down to where the arm, ahead by a third, hangs.
+    # Without bending, the hand comes down as far as an arm that hangs ahead by a third.
     missing = max(shoulder_m - 0.85 * arm_m - height_m, 0.0) / plan.leg_m
     bends = min(missing / 0.62, 1.0)
     for name, value in (

@@ -34,10 +34,10 @@ def match_bones(source: SkeletalMotion) -> dict[str, int]:
     Names are compared without prefix (`mixamorig:`, `Bip01_`), case and separators; a side is `left`,
     `right`, or a lone `l` or `r` before or after. The trunk is the chain from the pelvis to the bone that
     both arms hang on; spine, back and chest are its first, middle and last bone. A part that the source lacks
-    moves with what it hangs on: toes with the foot, hands with the forearm, clavicles with the chest.
+    moves with its parent: toes with the foot, hands with the forearm, clavicles with the chest.
 
     Raises:
-        DataError: essential bones were not found; lists them and what there is.
+        DataError: essential bones were not found; the message lists them and the source's bones.
     """
     named: dict[tuple[str, str], int] = {}
     for index, name in enumerate(source.bones):

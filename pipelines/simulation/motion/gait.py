@@ -48,7 +48,7 @@ _KNEE_WALK = ((0.0, 1.5), (0.22, 17.5), (0.42, 9.0), (0.62, 5.0), (0.76, 8.5), (
 
 
 def running(speed_mps: float) -> float:
-    """Return the share of running in the gait of someone who means to run: 0 walks, 1 runs."""
+    """Return the share of running in the gait at a speed, for a person in a jog: 0 walks, 1 runs."""
     share = (speed_mps - _RUNNING_FROM_MPS) / (_RUNNING_FULLY_MPS - _RUNNING_FROM_MPS)
     share = min(max(share, 0.0), 1.0)
     return share * share * (3 - 2 * share)

@@ -64,7 +64,7 @@ class _Rhythm:
     """Times of the steps of a stretch, at N moments from some seconds before it to some seconds after."""
 
     start_s: float
-    knots: Float  # [K, 3] seconds since then, m/s, how far it is run
+    knots: Float  # [K, 3] seconds since then, m/s, share of running
     since_s: Float  # [N] since then
     moments_s: Float  # [N]
     steps: Float  # [N] since then, and parts of one
@@ -171,7 +171,7 @@ class Plan:
         """Put a foot beside the body's future place: its place [2] in m and its heading in rad."""
         self._put(foot, lift_s, strike_s, self._beside(foot, *at, 0.0, 0.0), run)
 
-    # --- how -------------------------------------------------------------------------------------------
+    # --- steps of a stretch ----------------------------------------------------------------------------
 
     def _along(self, parts: Sequence[Part], speeds: Pace) -> Stretch:
         from scipy.interpolate import CubicHermiteSpline

@@ -20,7 +20,7 @@ Float = NDArray[np.float64]
 
 _END_OF_LIMB = {"thigh": "shank", "shank": "foot", "upper_arm": "forearm", "forearm": "hand", "foot": "toes"}
 _FLAT_FOOT = np.radians(30.0)  # feet that point down by less than this in the rest pose are meant to stand
-_T_POSE_TURN = np.radians(20.0)  # in one frame: nobody turns a joint so fast
+_T_POSE_TURN = np.radians(20.0)  # in one frame: no person turns a joint so fast
 _SEAM_S = 0.5  # time over which the end of a repeated motion is blended to its beginning
 _AT_REST_MPS = 0.3  # a foot that is slower stands
 

@@ -18,7 +18,7 @@ Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 
 _MARGIN = 4  # texels around the region
-_STEP = 6.0  # texels of height between neighbours, beyond what slopes that the sun lights well have
+_STEP = 6.0  # texels of height between neighbours: more than on slopes that the sun lights well
 
 
 class ShadowMap(NamedTuple):

@@ -1,10 +1,10 @@
 """Scene of the formation studies: a long walk on level ground, filmed from ideal positions.
 
-A study flies nothing: its cameras stand in their slots about the walking person at every moment and look at
-them, as in the simulated experiments of Ho et al., "3D Human Reconstruction in the Wild with Collaborative
-Aerial Cameras". Only the keypoints and the logged poses have errors, of known size. Trial k of camera i has
-the same random numbers in every formation and for every size of the errors, so that differences between
-formations are not due to chance.
+No drone flies in a study: the cameras are exactly in their slots about the walking person at every moment and
+look at the person, as in the simulated experiments of Ho et al., "3D Human Reconstruction in the Wild with
+Collaborative Aerial Cameras". Only the keypoints and the logged poses have errors, of known size. Trial k of
+camera i has the same random numbers in every formation and for every size of the errors, so that differences
+between formations are not due to chance.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Formation:
 class Sightings:
     """Keypoints of the person in every camera."""
 
-    xy: Float  # [N, T, J, 2] px, NaN for what was not found
+    xy: Float  # [N, T, J, 2] px, NaN for joints that were not found
     confidence: Float  # [N, T, J], 0 for that
 
 

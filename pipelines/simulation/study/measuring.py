@@ -13,7 +13,7 @@ from pipelines.session.records import Float
 from pipelines.simulation.study.filming import Formation, Sightings, Walk, exact_keypoints
 
 NEAR_SHARE = 0.1
-"""Largest error of a right keypoint, as a share of the height in pixels of a person who stands there."""
+"""Largest error of a right keypoint, as a share of the height in pixels of a person at that place."""
 
 _NEAR_TILT_DEG = 5.0
 _ERRORS = ("reconstructed_share", "mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm", "pck150")
@@ -72,8 +72,8 @@ def errors_in_common(
     """Compute each arm's MPJPE (mm) on the joint-frames that all arms reconstructed; None if there are none.
 
     Args:
-        points: [T, J, 3] m of every arm, NaN for what was not reconstructed.
-        true_joints: [T, J, 3] m likewise.
+        points: [T, J, 3] m of every arm, NaN for joints that were not reconstructed.
+        true_joints: [T, J, 3] m of every arm.
     """
     shared = common(*(own[:, None] for own in points.values()))[:, 0]
     found: dict[str, float | None] = {}

@@ -17,7 +17,7 @@ Int64 = NDArray[np.int64]
 _FAR_M = 2000.0  # beyond, the horizon is less than two pixels away for a drone at 5 m
 _CELLS = 16  # along the ground's square, at least
 _GROWTH = 0.5  # cells outside are at most half as wide as their distance from it
-_FLATNESS_M = 0.02  # how far triangles may be from the ground
+_FLATNESS_M = 0.02  # largest distance of triangles from the ground
 _FINEST = 17  # halvings of the whole: cells of 3 to 6 cm, however steep a mound
 _GRASS = (0.115, 0.15, 0.055)  # mean reflectance of a meadow; the texture of the ground varies it
 

@@ -1,6 +1,6 @@
 """The compiled part of the world: heights, insides of solids, lines of sight, occupied voxels.
 
-All kernels stand in this one module: numba's cache watches the file of the outermost function only.
+All kernels are in this one module: numba's cache watches the file of the outermost function only.
 
 Shapes are rows of numbers, all in metres of the world:
 

@@ -17,7 +17,7 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 _TOUCH_M = 1e-9  # level ground on the border between two voxels fills the lower one alone
-_FINE_ENOUGH = 0.05  # of a voxel: how far the ground may rise unseen between samples
+_FINE_ENOUGH = 0.05  # of a voxel: allowed rise of the ground between samples
 _MOST_SAMPLES = 16  # along a voxel
 
 
