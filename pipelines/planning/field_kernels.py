@@ -15,8 +15,8 @@ from pipelines.geometry.compilation import cached, helper
 
 Float = NDArray[np.float64]
 
-# A point is at most half a diagonal from its voxel's centre. To a corner of the cell in which it
-# is interpolated, and from the one to the other, at most a whole one. In voxels:
+# A point is at most half a diagonal from its voxel's centre. It is at most a whole one from the corners
+# of the cell in which it is interpolated, and so are the corners from each other. In voxels:
 DIAGONAL = math.sqrt(3.0)
 ROUNDING = 1e-4  # margin of such bounds for single precision
 BRICK = 4  # voxels along the side of one of `Sight.bricks`

@@ -4,7 +4,7 @@ Invariant: every drone has a committed motion that ends at rest, keeps `drone_ra
 `separation_m` from the committed motions of all others. A new plan is flown only if following it until the
 next one, and braking to a stop from there, keeps the invariant. Otherwise the drone follows the last plan
 that does, climbs, gives way, or goes on with its committed motion, which is braking. By induction no drone
-ever leaves free space, for any wish of the planner. Three cases cannot be guaranteed and are reported by
+ever leaves free space, for any plan. Three cases cannot be guaranteed and are reported by
 `scores`: an actor who walks at a drone, a map that changes, a start inside the radius.
 """
 
@@ -220,7 +220,7 @@ class Guard:
     def _ways_out(self, here: Float, around: _Around) -> list[tuple[Flown, Float]]:
         """Return velocities for ways out.
 
-        Up, up and away from the nearest obstacle, and away from the actor, faster than the actor.
+        They go up, up and off the nearest obstacle, or away from the actor, faster than the actor.
         """
         actor, place = around.actor, here[POSITION]
         up = np.array([0.0, 0.0, _CLIMB_MPS])

@@ -15,7 +15,7 @@ from pipelines.session.tabular import trajectory_from
 
 
 def estimated_clocks(metrics: Mapping[str, object]) -> dict[str, int]:
-    """Read the clock offsets of a reconstruction: the delay of a camera's frames after ingest, ns.
+    """Read the estimated clock offsets, ns: the amounts to add to the cameras' ingested frame times.
 
     Args:
         metrics: reconstruct/metrics.json.

@@ -72,9 +72,9 @@ class Known(NamedTuple):
 
 
 Planner = Callable[[Known], tuple[Float, Float]]
-"""Function that returns every drone's slot [N, 3] m and the slot's velocity [N, 3] m/s, at a fixed rate.
+"""Function, called at a fixed rate, that returns every drone's slot [N, 3] m and its velocity [N, 3] m/s.
 
-Until it is asked again the slots move on in straight lines. A planner that plans trajectories samples its
+Until it is called again the slots move on in straight lines. A planner that plans trajectories samples its
 latest one here and replans as often as it likes; it keeps its own state.
 """
 
