@@ -1,1 +1,1 @@
-"""Lenses and places of cameras, as programs that calibrate write them."""
+"""Intrinsics and poses of cameras, as calibration programs write them."""

@@ -1,8 +1,8 @@
 """Calibrations as TOML: anipose, Pose2Sim and caliscope write the same tables, one for each camera.
 
-`matrix`, `distortions` (OpenCV's order), `size` (floats in Pose2Sim's files), `rotation` (Rodrigues) and
-`translation` map world to camera, whatever metres mean to the file: Pose2Sim and caliscope use metres,
-anipose the unit of its board.
+`matrix`, `distortions` (OpenCV's order) and `size` (floats in Pose2Sim's files) are the intrinsics.
+`rotation` (Rodrigues) and `translation` map world to camera. Lengths are in the file's unit: metres for
+Pose2Sim and caliscope, the unit of the board for anipose.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pipelines.session.records import CalibratedCamera, Float
 
 
 class AniposeToml:
-    """Cameras are called what `name` says, or else as their table is.
+    """Reader of anipose's tables; a camera has the name in `name`, or else the name of its table.
 
     Tables without a matrix (`[metadata]`, uncalibrated cameras) and those with `ignore = true` are
     left out. A camera without rotation and translation has intrinsics alone.
@@ -32,14 +32,14 @@ class AniposeToml:
     suffixes: tuple[str, ...] = (".toml",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether a TOML file speaks of a matrix and distortions."""
+        """Return True if a TOML file has the keys `matrix` and `distortions`."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         head = read_head(path)
         return all(re.search(rf"(?m)^\s*{key}\s*=", head) for key in ("matrix", "distortions"))
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Every camera, and the tables that look like cameras but are left out."""
+        """Describe every camera, and name the tables that look like cameras but are left out."""
         summary = describe_cameras(self.read_calibration(path))
         left_out = [
             key for key, table in _tables(path).items() if "size" in table and not _is_calibrated(table)
@@ -94,7 +94,7 @@ def _camera(path: Path, name: str, table: dict[str, object]) -> CalibratedCamera
 
 
 def _numbers(path: Path, camera: str, table: dict[str, object], key: str) -> Float:
-    """A value of the table as an array of finite numbers."""
+    """Return a value of the table as an array of finite numbers."""
     try:
         values = np.array(table.get(key), dtype=np.float64)
     except (TypeError, ValueError, OverflowError):

@@ -1,4 +1,4 @@
-"""Writing camera calibrations as ROS's camera_info_manager does."""
+"""Writer of camera calibrations in the form of ROS's camera_info_manager."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pipelines.geometry.cameras import Intrinsics
 
 
 def write_camera_info(path: Path, name: str, intrinsics: Intrinsics) -> None:
-    """Write one camera; numbers are exact."""
+    """Write one camera; numbers keep their full precision."""
     model, distortion = ros_distortion(intrinsics)
     fx, fy, cx, cy = (float(v) for v in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
     matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
@@ -27,7 +27,7 @@ def write_camera_info(path: Path, name: str, intrinsics: Intrinsics) -> None:
 
 
 def ros_distortion(intrinsics: Intrinsics) -> tuple[str, list[float]]:
-    """The model's name in ROS, and as many coefficients as it takes there."""
+    """Return the model's name in ROS, and as many coefficients as that model takes there."""
     coefficients = [float(v) for v in intrinsics.distortion]
     if intrinsics.model == "fisheye":
         return "equidistant", coefficients

@@ -1,4 +1,4 @@
-"""Camera matrices, Rodrigues vectors and camera_from_world poses to our records, checked.
+"""Checked conversion of camera matrices, Rodrigues vectors and camera_from_world poses to our records.
 
 A matrix counts pixels as we do, the centre of the top left one at (0, 0), which is OpenCV's convention.
 Readers of files that count otherwise (COLMAP) shift (cx, cy) before.
@@ -17,7 +17,7 @@ from pipelines.session.records import Float
 
 # k1 k2 p1 p2 k3 k4 k5 k6; the further ones of OpenCV (prism, tilt) are rare and mostly zero.
 _MOST_COEFFICIENTS = 8
-_LARGEST = 1e12  # numbers beyond any length or angle, which overflow further on
+_LARGEST = 1e12  # beyond any length or angle; larger numbers overflow in later steps
 
 
 def intrinsics(
@@ -29,7 +29,7 @@ def intrinsics(
     distortion: Sequence[float],
     fisheye: bool,
 ) -> Intrinsics:
-    """Intrinsics of a camera matrix and OpenCV's coefficients, all in pixels.
+    """Build intrinsics from a camera matrix and OpenCV's coefficients, all in pixels.
 
     Args:
         source: the file, for messages.
@@ -37,7 +37,7 @@ def intrinsics(
         size: width, height.
         matrix: [3, 3], last row 0 0 1, without skew.
         distortion: OpenCV's order; all zero, or none, is no distortion (unless fisheye: then equidistant).
-        fisheye: whether the coefficients are those of cv2.fisheye.
+        fisheye: True if the coefficients are those of cv2.fisheye.
 
     Raises:
         DataError: the numbers describe no camera, or one with skew, thin prism or tilt.
@@ -73,7 +73,7 @@ def build_intrinsics(
     model: DistortionModel,
     coefficients: tuple[float, ...],
 ) -> Intrinsics:
-    """The record, with what is wrong about it as a DataError."""
+    """Build the record; raise a DataError if its numbers are wrong."""
     width, height = (int(value) if float(value).is_integer() else 0 for value in size)
     fx, fy, cx, cy = (float(value) for value in (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
     try:
@@ -83,7 +83,7 @@ def build_intrinsics(
 
 
 def invert_pose(source: Path, camera: str, quaternion_xyzw: Float, translation: Float) -> tuple[Float, Float]:
-    """Position [3] and quaternion [4] of world_from_camera, given camera_from_world.
+    """Return position [3] and quaternion [4] of world_from_camera, given camera_from_world.
 
     Raises:
         DataError: not finite, absurdly large, or a quaternion of length zero.
@@ -100,7 +100,7 @@ def invert_pose(source: Path, camera: str, quaternion_xyzw: Float, translation: 
 
 
 def invert_rodrigues(source: Path, camera: str, rotation: Float, translation: Float) -> tuple[Float, Float]:
-    """`invert_pose` for a rotation vector [3] (Rodrigues, rad)."""
+    """Apply `invert_pose` to a rotation vector [3] (Rodrigues, rad)."""
     from scipy.spatial.transform import Rotation
 
     if rotation.shape != (3,) or not (np.abs(rotation) < _LARGEST).all():
@@ -109,7 +109,7 @@ def invert_rodrigues(source: Path, camera: str, rotation: Float, translation: Fl
 
 
 def invert_matrix(source: Path, camera: str, rotation: Float, translation: Float) -> tuple[Float, Float]:
-    """`invert_pose` for a rotation matrix [3, 3].
+    """Apply `invert_pose` to a rotation matrix [3, 3].
 
     Raises:
         DataError: the matrix is not a rotation to within 1e-3 (files carry few decimals).

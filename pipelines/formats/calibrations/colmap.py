@@ -36,12 +36,12 @@ _BINARY_MODELS = (
     "RADIAL_FISHEYE",
     "THIN_PRISM_FISHEYE",
 )
-"""Names by the number that binary files use (colmap/sensor/models.h)."""
+"""Names of camera models; the index is the number that binary files use (colmap/sensor/models.h)."""
 
 
 @dataclass(frozen=True)
 class _Model:
-    """What a camera model's parameters are: one or two focal lengths, cx, cy, then coefficients."""
+    """Layout of a camera model's parameters: one or two focal lengths, cx, cy, then coefficients."""
 
     focals: int
     distortion: DistortionModel
@@ -76,9 +76,9 @@ class _Image:
 
 
 class ColmapModel:
-    """One camera for each image, called by the image's name without folder and suffix.
+    """Reader of COLMAP models: one camera for each image, named after it without folder and suffix.
 
-    Where two images would get one name (cam1/000.jpg, cam2/000.jpg), all that share it keep
+    If two images would get one name (cam1/000.jpg, cam2/000.jpg), all images of that name keep
     their folder: "cam1/000", "cam2/000".
     """
 
@@ -87,18 +87,18 @@ class ColmapModel:
     suffixes: tuple[str, ...] = ("",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether it is a folder that holds cameras and images, both as text or both binary."""
+        """Return True if a folder holds cameras and images, both as text or both binary."""
         return _suffix_of(path) is not None
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Every image's camera."""
+        """Describe every image's camera."""
         return describe_cameras(self.read_calibration(path))
 
     def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
         """Read the camera and pose of every image; binary files before text, as COLMAP does.
 
         Raises:
-            DataError: files are missing, truncated or malformed, a camera model that is not ours, no image.
+            DataError: files are missing, truncated or malformed, a camera model is unsupported, or no image.
         """
         suffix = _suffix_of(path)
         if suffix is None:
@@ -117,7 +117,7 @@ class ColmapModel:
 
 
 def _suffix_of(path: Path) -> str | None:
-    """Which of the two forms a folder holds."""
+    """Return the suffix of the form that a folder holds, .bin before .txt; None if it holds neither."""
     return next(
         (s for s in (".bin", ".txt") if all((path / (n + s)).is_file() for n in ("cameras", "images"))), None
     )
@@ -166,7 +166,7 @@ def _layout(source: Path, camera: int, model: str) -> _Model:
 
 
 def _text_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Every line with its number, as cells; comments are left out, blank lines are not."""
+    """Yield every line with its number, as cells; skip comments, but not blank lines."""
     for number, line in enumerate(read_text(path).split("\n"), start=1):
         if not line.lstrip().startswith("#"):
             yield number, line.split()
@@ -197,7 +197,7 @@ def _text_images(path: Path) -> Iterator[_Image]:
         except (ValueError, IndexError) as error:
             raise _bad_line(path, number, "an image: id, qw qx qy qz, tx ty tz, camera, name") from error
         yield image
-        # The line below holds the image's points; it is there even when it is blank.
+        # The line below holds the image's points. It exists even if it is blank.
         points_number, points = next(lines, (number + 1, []))
         if len(points) % 3:
             raise _bad_line(path, points_number, f"the points of image {image.name} (threes of numbers)")
@@ -208,7 +208,7 @@ def _bad_line(path: Path, number: int, expected: str) -> DataError:
 
 
 class _Bytes:
-    """A binary file read in order. Counts in it are promises, kept or not: nothing is allocated by them."""
+    """Binary file, read in order. No memory is allocated by the counts in it, because they may be wrong."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -219,17 +219,17 @@ class _Bytes:
         self._at = 0
 
     def take(self, layout: str) -> tuple[float, ...]:
-        """The next numbers, little-endian."""
+        """Return the next numbers, little-endian."""
         start = self._at
         self.skip(struct.calcsize("<" + layout))
         return struct.unpack_from("<" + layout, self._content, start)
 
     def integer(self, layout: str) -> int:
-        """The next whole number."""
+        """Return the next integer."""
         return int(self.take(layout)[0])
 
     def name(self) -> str:
-        """The next text, which ends with a zero byte."""
+        """Return the next text, which ends with a zero byte."""
         end = self._content.find(b"\0", self._at)
         if end < 0:
             raise self._truncated()
@@ -238,7 +238,7 @@ class _Bytes:
         return text
 
     def skip(self, size: int) -> None:
-        """Move on."""
+        """Skip `size` bytes."""
         self._at += size
         if self._at > len(self._content):
             raise self._truncated()

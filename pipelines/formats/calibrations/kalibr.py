@@ -1,4 +1,4 @@
-"""Kalibr's camera chains: the intrinsics of cam0, cam1, ..."""
+"""Reader of Kalibr's camera chains: the intrinsics of cam0, cam1, ..."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _DISTORTIONS = {"radtan": 4, "equidistant": 4, "none": 0}
 
 
 class KalibrFormat:
-    """camchain.yaml: each camera has camera_model, intrinsics, distortion_model and _coeffs, resolution.
+    """Reader of camchain.yaml: camera_model, intrinsics, distortion_model and _coeffs, resolution by camera.
 
-    Cameras bear the chain's names, cam0 and so on, and have no pose: T_cam_imu and T_cn_cnm1 tie them to
+    Cameras keep the chain's names (cam0 and so on) and have no pose. T_cam_imu and T_cn_cnm1 relate them to
     the body and to each other, not to the world.
     """
 
@@ -32,21 +32,21 @@ class KalibrFormat:
     suffixes: tuple[str, ...] = (".yaml", ".yml")
 
     def recognises(self, path: Path) -> bool:
-        """Whether it has a cam0, cam1, ... at the top that names its camera_model."""
+        """Return True if the file has a cam0, cam1, ... at the top and a camera_model."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         head = read_head(path)
         return bool(re.search(r"(?m)^cam\d+\s*:", head) and re.search(r"(?m)^\s+camera_model\s*:", head))
 
     def describe(self, path: Path) -> dict[str, object]:
-        """The cameras."""
+        """Describe the cameras."""
         return describe_cameras(self.read_calibration(path))
 
     def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
         """Read every camera of the chain.
 
         Raises:
-            DataError: no valid YAML, no camera, keys that are missing, a projection other than pinhole, a
+            DataError: no valid YAML, no camera, missing keys, a projection other than pinhole, a
                 distortion other than radtan, equidistant or none, or numbers that are no camera.
         """
         chain = {name: block for name, block in read_yaml(path).items() if re.fullmatch(r"cam\d+", name)}

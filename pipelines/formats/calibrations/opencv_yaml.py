@@ -1,4 +1,4 @@
-"""Calibrations that OpenCV's FileStorage wrote, as YAML or XML: one camera each.
+"""Reader of calibrations that OpenCV's FileStorage wrote, as YAML or XML: one camera each.
 
 ROS's camera_info YAML looks alike but has no `!!opencv-matrix`: it is another format.
 """
@@ -21,11 +21,11 @@ _MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K")
 _DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D")
 _WIDTH = ("image_width", "image_Width", "width")
 _HEIGHT = ("image_height", "image_Height", "height")
-_MOST_CELLS = 64  # of a calibration's matrices; a stated size beyond is a mistake, never allocated
+_MOST_CELLS = 64  # of a calibration's matrices; a larger size is a mistake and is never allocated
 
 
 class OpencvStorage:
-    """Keys: camera_matrix, distortion_coefficients, image_width, image_height.
+    """Reader of the keys camera_matrix, distortion_coefficients, image_width, image_height.
 
     Optional: camera_name (else "camera"), `fisheye_model: 1` or `distortion_model: equidistant`, and the pose
     camera_from_world as R (3 x 3) or rvec with T or tvec, in metres.
@@ -36,7 +36,7 @@ class OpencvStorage:
     suffixes: tuple[str, ...] = (".yaml", ".yml", ".xml")
 
     def recognises(self, path: Path) -> bool:
-        """Whether FileStorage wrote it and it names a camera matrix."""
+        """Return True if FileStorage wrote the file and it names a camera matrix."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         head = read_head(path)
@@ -44,7 +44,7 @@ class OpencvStorage:
         return stored and re.search(rf"(?m)^\s*<?(?:{'|'.join(_MATRIX)})\b", head) is not None
 
     def describe(self, path: Path) -> dict[str, object]:
-        """The camera."""
+        """Describe the camera."""
         return describe_cameras(self.read_calibration(path))
 
     def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
@@ -85,7 +85,7 @@ def _with_pose(path: Path, name: str, storage: _Storage, camera: CalibratedCamer
 
 
 class _Storage:
-    """The top of a FileStorage, read with care."""
+    """Checked access to the top level of a FileStorage."""
 
     def __init__(self, path: Path) -> None:
         import cv2
@@ -106,24 +106,24 @@ class _Storage:
             raise DataError(path, "is empty", "write the calibration again")
 
     def text(self, key: str) -> str:
-        """A string; empty if there is none."""
+        """Return a string; empty if there is none."""
         node = self._root.getNode(key)
         return str(node.string()) if node.isString() else ""
 
     def number(self, keys: tuple[str, ...]) -> float:
-        """The first of the keys that holds a number; 0 if none does."""
+        """Return the number of the first key that has one; 0 if none does."""
         nodes = (self._root.getNode(key) for key in keys)
         return next((float(node.real()) for node in nodes if node.isInt() or node.isReal()), 0.0)
 
     def vector(self, key: str) -> list[float]:
-        """A list of numbers; empty if there is none."""
+        """Return a list of numbers; empty if there is none."""
         node = self._root.getNode(key)
         if not node.isSeq() or node.size() > _MOST_CELLS:
             return []
         return [float(node.at(i).real()) for i in range(node.size())]
 
     def matrix(self, *keys: str) -> Float | None:
-        """The first of the keys that holds a matrix."""
+        """Return the matrix of the first key that has one; None if none does."""
         for key in keys:
             node = self._root.getNode(key)
             if node.isMap():

@@ -15,17 +15,18 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera, Float
 
 _FISHEYE = {"equidistant", "fisheye"}
-# An empty model is what a driver writes that was never calibrated, or whose lens has no distortion.
+# Drivers write an empty model if they were never calibrated, or if the lens has no distortion.
 _RADTAN = {"plumb_bob", "rational_polynomial", ""}
 _YAML = (".yaml", ".yml")
 
 
 class RosCameraInfo:
-    """One camera each, of the name that the file states (else "camera"); the raw picture's, not rectified.
+    """Reader of one camera per file, for the raw picture (not rectified).
 
     YAML: image_width, image_height, camera_matrix, distortion_model, distortion_coefficients, camera_name.
     INI: [image] with width and height, then the camera's section with camera matrix and distortion.
-    Rectification and projection are left out: pictures are taken as the camera delivers them.
+    Rectification and projection are ignored, because pictures are used as the camera delivers them.
+    The camera has the name that the file gives, else "camera".
     """
 
     name = "camera_info"
@@ -33,7 +34,7 @@ class RosCameraInfo:
     suffixes: tuple[str, ...] = (*_YAML, ".ini", ".txt")
 
     def recognises(self, path: Path) -> bool:
-        """Whether it has the keys of a camera_info, and OpenCV's FileStorage did not write it."""
+        """Return True if the file has the keys of a camera_info and OpenCV's FileStorage did not write it."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         head = read_head(path)
@@ -43,15 +44,15 @@ class RosCameraInfo:
         return "!!opencv-matrix" not in head and all(re.search(rf"(?m)^{key}\s*:", head) for key in keys)
 
     def describe(self, path: Path) -> dict[str, object]:
-        """The camera."""
+        """Describe the camera."""
         return describe_cameras(self.read_calibration(path))
 
     def read_calibration(self, path: Path) -> dict[str, CalibratedCamera]:
         """Read the one camera.
 
         Raises:
-            DataError: no valid file, keys that are missing, a distortion model other than plumb_bob,
-                rational_polynomial, equidistant (fisheye), or numbers that are no camera.
+            DataError: no valid file, missing keys, a distortion model other than plumb_bob,
+                rational_polynomial or equidistant (fisheye), or numbers that are no camera.
         """
         return _read_yaml(path) if path.suffix.lower() in _YAML else _read_ini(path)
 
@@ -73,11 +74,11 @@ def _read_yaml(path: Path) -> dict[str, CalibratedCamera]:
 
 
 def _matrix(path: Path, name: str, value: object) -> Float:
-    """A matrix as rows, cols, data."""
+    """Read a matrix from its rows, cols and data."""
     block = value if isinstance(value, dict) else {}
     cells = numbers(path, f"{name}.data", block.get("data"))
     rows, columns = block.get("rows"), block.get("cols")
-    # `true` is an integer to isinstance, and to nobody else.
+    # isinstance takes `true` for an integer, so compare the type itself.
     if type(rows) is not int or type(columns) is not int or min(rows, columns) < 0:
         raise DataError(path, f"{name} states no rows and cols", "write the calibration again")
     if rows * columns != len(cells):
@@ -86,7 +87,7 @@ def _matrix(path: Path, name: str, value: object) -> Float:
 
 
 def _read_ini(path: Path) -> dict[str, CalibratedCamera]:
-    """Sections in brackets, a line of words for each key, and lines of numbers below it."""
+    """Read sections in brackets, a line of words for each key, and lines of numbers below it."""
     blocks: dict[str, list[list[str]]] = {}
     name, key = "", ""
     for line in read_text(path).split("\n"):

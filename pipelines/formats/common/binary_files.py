@@ -1,4 +1,4 @@
-"""Reading files that are numbers below a few lines of text."""
+"""Readers of files that hold binary numbers below a few lines of text."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Bytes = NDArray[np.uint8]
 
 
 def read_bytes(path: Path) -> bytes:
-    """The whole file.
+    """Read the whole file.
 
     Raises:
         DataError: missing or unreadable.
@@ -29,7 +29,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def first_bytes(path: Path, count: int = LONGEST_HEADER) -> bytes:
-    """The beginning of a file, for recognising it; empty when it cannot be read. Never raises."""
+    """Read the beginning of a file, to recognise it; empty if the file cannot be read. Never raises."""
     if is_special(path):
         return b""
     try:
@@ -40,12 +40,12 @@ def first_bytes(path: Path, count: int = LONGEST_HEADER) -> bytes:
 
 
 def split_header(path: Path, content: bytes, last: str) -> tuple[list[list[str]], Bytes]:
-    """The words of every line of a text header, and the bytes below it.
+    """Split a file into the words of each header line and the bytes below the header.
 
     Args:
         path: the file, for messages.
         content: all of it.
-        last: the word with which the header's last line begins.
+        last: the first word of the header's last line.
 
     Raises:
         DataError: no such line within the first 64 KiB.

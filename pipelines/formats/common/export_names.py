@@ -1,4 +1,4 @@
-"""What exported files are called, and which of them a recording gives."""
+"""Names of exported files, and the choice of files that a recording gives."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from pipelines.session.records import JointMotion, Recording, Trajectory
 
 
 def safe_file_name(name: str) -> str:
-    """A recording's free-text name as part of a file name: letters, digits, dot, dash, underscore."""
+    """Turn a free-text name into part of a file name: letters, digits, dot, dash, underscore."""
     return re.sub(r"[^\w.-]+", "_", name).strip("._")[:80] or "recording"
 
 
 def people_of(recording: Recording, folder: Path, suffix: str) -> tuple[JointMotion, dict[int, Path]]:
-    """A recording's motion, and a file for each person of whom a joint is known.
+    """Return a recording's motion, and a file for each person with at least one known joint.
 
-    `<name>.trc`, or `<name>_person<k>.trc` where there are several people.
+    The file is `<name>.trc`, or `<name>_person<k>.trc` if there are several people (for the suffix `.trc`).
 
     Raises:
-        DataError: nobody is known.
+        DataError: no joint of any person is known.
     """
     motion = recording.motion
     if motion is None or np.isnan(motion.position).all():
@@ -36,7 +36,7 @@ def people_of(recording: Recording, folder: Path, suffix: str) -> tuple[JointMot
 
 
 def tracks_of(recording: Recording) -> dict[str, Trajectory]:
-    """The cameras' poses by the name of their file: `<camera>` as logged, `<camera>_refined` as corrected."""
+    """Return the cameras' poses by file name: `<camera>` as logged, `<camera>_refined` as corrected."""
     tracks = dict(recording.cameras)
     tracks |= {f"{camera}_refined": track for camera, track in recording.refined.items()}
     return {name: track for name, track in tracks.items() if len(track.t_ns)}
@@ -49,7 +49,7 @@ def write_tables(
     write_joints: Callable[[Path, JointMotion], None],
     write_poses: Callable[[Path, Trajectory], None],
 ) -> list[Path]:
-    """Write what a recording has as tables: `<name>` of the joints, `<name>_<camera>` of its poses.
+    """Write a recording's tables: `<name>` with the joints, `<name>_<camera>` with a camera's poses.
 
     Raises:
         DataError: it has neither joints nor camera poses.

@@ -1,4 +1,4 @@
-"""Time stamps as text to int64 nanoseconds and back, without ever passing through a float.
+"""Conversion of time stamps between text and int64 nanoseconds, without any float in between.
 
 A float64 holds 1700000000.123456789 s only to 0.2 us, so seconds are read as text and split at the dot.
 """
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Bool = NDArray[np.bool_]
 
 SECONDS, MILLISECONDS, MICROSECONDS, NANOSECONDS = 9, 6, 3, 0
-"""A unit as the number of decimals of it that make nanoseconds."""
+"""Units of time, each as the power of ten by which it exceeds a nanosecond."""
 
 _UNITS = {"s": SECONDS, "sec": SECONDS, "ms": MILLISECONDS, "us": MICROSECONDS, "ns": NANOSECONDS}
 _STAMP_NAMES = {"t", "time", "timestamp", "stamp"}
@@ -33,7 +33,7 @@ _LARGEST = 2**63 - 1
 def parse_stamps(
     source: Path | str, texts: Sequence[str] | pa.ChunkedArray, unit: int = SECONDS
 ) -> tuple[Int64, Bool]:
-    """Stamps as nanoseconds, rounded to the nearest (halves away from zero).
+    """Parse stamps as nanoseconds, rounded to the nearest (halves away from zero).
 
     Args:
         source: the file, for messages.
@@ -41,11 +41,11 @@ def parse_stamps(
         unit: SECONDS, MILLISECONDS, MICROSECONDS or NANOSECONDS.
 
     Returns:
-        [N] nanoseconds, and [N] whether the text was a finite number that int64 nanoseconds can hold
-        (0 where it was not).
+        [N] nanoseconds (0 if the text is unusable), and [N] True if the text is a finite number that
+        int64 nanoseconds can hold.
 
     Raises:
-        DataError: most stamps are too large for their unit (after the year 2262), so it is another.
+        DataError: most stamps are too large for the unit (after the year 2262), so the unit is wrong.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -70,14 +70,14 @@ def parse_stamps(
 
 
 def _parse_plain(column: pa.ChunkedArray, unit: int) -> tuple[Int64, Bool]:
-    """The stamps without an exponent, vectorised: sign, digits, dot, digits."""
+    """Parse the stamps without an exponent, vectorised: sign, digits, dot, digits."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
     parts = pc.extract_regex(column, r"^(?P<sign>[+-]?)(?P<whole>\d*)\.?(?P<fraction>\d*)$")
     sign, whole, fraction = (pc.fill_null(pc.struct_field(parts, [k]), "") for k in range(3))
     digits = pc.add(pc.utf8_length(whole), pc.utf8_length(fraction))
-    # Below 10 ** (18 - unit) whole units nothing overflows; 10-digit seconds are all of today's.
+    # Below 10 ** (18 - unit) whole units nothing overflows; 10 digits suffice for today's seconds.
     safe_whole = pc.less_equal(pc.utf8_length(whole), 18 - unit if unit < SECONDS else 10)
     plain = np.asarray(pc.and_(pc.greater(digits, 0), safe_whole).to_numpy(), dtype=np.bool_)
 
@@ -112,12 +112,12 @@ def _wrong_unit(source: Path | str, typical: Decimal) -> DataError:
 
 
 def format_seconds(t_ns: Int64) -> list[str]:
-    """Stamps as seconds with nine decimals, exact."""
+    """Format stamps as seconds with nine decimals, exactly."""
     return [f"{'-' * (t < 0)}{abs(t) // 10**9}.{abs(t) % 10**9:09d}" for t in t_ns.tolist()]
 
 
 def cell_name(cell: str) -> tuple[str, str]:
-    """A column heading as its lower-case name and its unit: "#timestamp [ns]" is ("timestamp", "ns")."""
+    """Split a column heading into lower-case name and unit: "#timestamp [ns]" is ("timestamp", "ns")."""
     match = re.fullmatch(
         r"#?\s*[\"']?([^\[(\"']*?)\s*(?:[\[(]([^\])]*)[\])])?\s*[\"']?", cell.strip().lower()
     )
@@ -127,9 +127,9 @@ def cell_name(cell: str) -> tuple[str, str]:
 
 
 def stamp_column(header: Sequence[str]) -> tuple[int, int] | None:
-    """Which heading names the time, and its unit: t, time, timestamp or stamp, with _ns or [ns] and so on.
+    """Find the time column and its unit: t, time, timestamp or stamp, with _ns or [ns] and so on.
 
-    Seconds when no unit is named; a column in nanoseconds is taken before one in seconds.
+    A heading without a unit means seconds. If there are several columns, the finest unit is taken.
     """
     found: dict[int, int] = {}
     for index, cell in enumerate(header):

@@ -1,4 +1,4 @@
-"""Paths that files state: one that is relative must not lead out of the file's own folder."""
+"""Check of paths that files state: a relative path must not lead out of the file's own folder."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from pathlib import Path
 
 
 def leads_out(stated: str) -> bool:
-    """Whether a relative path leads out of where it begins; links, which a file cannot bring along, may."""
+    """Return True if a relative path leads out of its folder; links may, as a file cannot bring any."""
     return Path(os.path.normpath(stated)).parts[:1] == (os.pardir,)

@@ -1,4 +1,4 @@
-"""What `mocap info` says of trajectories, calibrations and joints, in one wording for every format."""
+"""Summaries of trajectories, calibrations and joints for `mocap info`, in one wording for every format."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ GAP_STEPS = 5
 
 
 def median_step_ns(t_ns: Int64) -> float | None:
-    """The median time between rows; None for fewer than two."""
+    """Return the median time between rows; None for fewer than two rows."""
     return float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else None
 
 
 def describe_times(t_ns: Int64) -> dict[str, object]:
-    """Where the stamps begin, how long they last, how often they come and where they pause.
+    """Return first and last stamp, span, rate, and the number and the longest of the gaps.
 
     Args:
         t_ns: [N] strictly increasing.
@@ -40,7 +40,7 @@ def describe_times(t_ns: Int64) -> dict[str, object]:
 
 
 def describe_trajectory(trajectory: Trajectory) -> dict[str, object]:
-    """Rows, times, box of the positions, and what was left out and why."""
+    """Return rows, times, bounding box of the positions, and the rows dropped, by cause."""
     return {
         "rows": len(trajectory.t_ns),
         **describe_times(trajectory.t_ns),
@@ -51,7 +51,7 @@ def describe_trajectory(trajectory: Trajectory) -> dict[str, object]:
 
 
 def describe_cameras(cameras: dict[str, CalibratedCamera]) -> dict[str, object]:
-    """Every camera by name, on one line each."""
+    """Describe every camera by name, on one line each."""
     return {"cameras": len(cameras), **{name: _camera_line(camera) for name, camera in cameras.items()}}
 
 
@@ -65,7 +65,7 @@ def _camera_line(camera: CalibratedCamera) -> str:
 
 
 def describe_motion(motion: JointMotion) -> dict[str, object]:
-    """Joints, people, times, share of missing joints, box of the positions."""
+    """Return joints, people, times, share of missing joints, bounding box of the positions."""
     return {
         "rows": len(motion.t_ns),
         "people": motion.position.shape[1],
@@ -77,7 +77,7 @@ def describe_motion(motion: JointMotion) -> dict[str, object]:
 
 
 def _box(position: Float) -> dict[str, object]:
-    """Smallest and largest coordinates of the finite points [N, 3]."""
+    """Return the smallest and largest coordinates of the finite points [N, 3]."""
     finite = position[np.isfinite(position).all(axis=1)]
     if not len(finite):
         return {}

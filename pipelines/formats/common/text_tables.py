@@ -1,4 +1,4 @@
-"""Reading numbers out of text files: whole, strict about columns, exact to the last digit."""
+"""Readers of numbers in text files: whole files, strict about columns, exact to the last digit."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 HEAD_BYTES = 64 * 1024
-"""What `recognises` looks at: enough for any header, little enough to be instant."""
+"""Bytes that `recognises` reads: enough for any header, few enough to be instant."""
 
 
 def read_text(path: Path) -> str:
-    r"""The whole file as UTF-8 without a byte order mark, lines ending in "\n".
+    r"""Read the whole file as UTF-8 without a byte order mark, lines ending in "\n".
 
     Raises:
         DataError: missing, unreadable, or not text.
@@ -40,7 +40,7 @@ def read_text(path: Path) -> str:
 
 
 def read_head(path: Path) -> str:
-    """The first lines of a file, for recognising it; empty when it cannot be read. Never raises."""
+    """Read the first lines of a file, to recognise it; empty if the file cannot be read. Never raises."""
     if is_special(path):
         return ""
     try:
@@ -58,10 +58,10 @@ class TextTable:
 
     text: dict[str, pa.ChunkedArray]
     numbers: dict[str, Float]
-    truncated: int  # 1 when the last line broke off and was left out
+    truncated: int  # 1 if the last line was incomplete and was left out
 
     def stack(self, names: Sequence[str]) -> Float:
-        """Some number columns side by side, [N, len(names)]."""
+        """Return some number columns side by side, [N, len(names)]."""
         return np.stack([self.numbers[name] for name in names], axis=-1)
 
 
@@ -77,20 +77,20 @@ def parse_table(
 ) -> TextTable:
     """Read delimited rows.
 
-    A last line that does not parse is taken for one that broke off while it was written: it is left
-    out and said in `truncated`. Blank lines and lines that begin with # are skipped.
+    If the last line does not parse, its writing was probably interrupted: it is left out and counted in
+    `truncated`. Blank lines and lines that begin with # are skipped.
 
     Args:
         path: the file, for messages.
         body: its text below the header.
         delimiter: one character.
-        columns: how many cells every row has.
+        columns: number of cells in every row.
         text: columns to keep as text, name to index.
         numbers: columns to read as numbers, name to index. Blank, "nan" and the like become NaN.
         first_line: the number of the body's first line in the file, for messages.
 
     Raises:
-        DataError: another line has the wrong number of cells, or one that is not a number.
+        DataError: another line has the wrong number of cells, or a cell that is not a number.
     """
     import pyarrow as pa
 
@@ -123,7 +123,7 @@ def parse_table(
 def _parse_csv(
     body: str, delimiter: str, columns: int, text: dict[str, int], numbers: dict[str, int]
 ) -> pa.Table:
-    """Rows as an Arrow table whose columns are named by their index."""
+    """Parse rows into an Arrow table whose columns are named by their index."""
     import pyarrow as pa
     import pyarrow.csv
 
@@ -142,13 +142,13 @@ def _parse_csv(
 def _first_bad_line(
     lines: Sequence[str], delimiter: str, columns: int, numbers: dict[str, int]
 ) -> tuple[int, str] | None:
-    """Index of the first line that is no row, and what is wrong with it."""
+    """Return the index of the first line that is no valid row, and its problem; None if all are valid."""
     for index, line in enumerate(lines):
         if not line.strip():
             continue
         try:
             cells = next(csv.reader([line], delimiter=delimiter), [])
-        except csv.Error as error:  # a cell of more than 131072 characters, most of all
+        except csv.Error as error:  # most often a cell of more than 131072 characters
             return index, str(error)
         if len(cells) != columns:
             return index, f"{len(cells)} columns instead of {columns}"

@@ -1,4 +1,4 @@
-"""Safe YAML of other people's tools: plain mappings, lists and numbers."""
+"""Safe reading of other tools' YAML: plain mappings, lists and numbers."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Float
 from pipelines.session.yaml_reading import plain_yaml
 
-_LARGEST = 1 << 20  # bytes; the parser is slow, and no calibration comes near
+_LARGEST = 1 << 20  # characters; the parser is slow, and calibrations are far smaller
 
 
 def read_yaml(path: Path) -> dict[str, object]:
-    """The mapping at the top of a YAML file, built of plain types only.
+    """Read the mapping at the top of a YAML file, built of plain types only.
 
     The first line `%YAML:1.0` of old OpenCV and Kalibr files, which is no YAML, is skipped.
 
@@ -34,10 +34,10 @@ def read_yaml(path: Path) -> dict[str, object]:
 
 
 def numbers(source: Path, name: str, value: object) -> Float:
-    """A list of numbers [N]; `name` is said where it is none.
+    """Return a list of numbers as an array [N]; `name` is for the message if it is none.
 
     Raises:
-        DataError: no list, or something in it is no number.
+        DataError: not a list, or an element is not a number.
     """
     if not isinstance(value, list) or not all(
         isinstance(cell, int | float) and not isinstance(cell, bool) for cell in value
