@@ -1,1 +1,1 @@
-"""Logs of drones that are not of ROS: PX4, ArduPilot, DJI; and what all of them hold."""
+"""Logs of drones without ROS (PX4, ArduPilot, DJI), and the rules that all of them share."""

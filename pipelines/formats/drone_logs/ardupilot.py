@@ -1,7 +1,7 @@
 """ArduPilot's DataFlash logs (.bin), by pymavlink (extra `drones`): estimates, GPS, mounts and pictures.
 
-pymavlink finds the messages, past damage too; their numbers are then read many at a time. ArduPilot has
-its world in NED and its body in FRD, and stamps in microseconds since boot (docs/drones.md).
+pymavlink finds the messages, also behind damaged bytes. Their numbers are then read in one step for each
+name. ArduPilot's world is NED, its body FRD, and its stamps count microseconds since boot (docs/drones.md).
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ _3D_FIX = 3
 _GPS_EPOCH_NS = 315_964_800_000_000_000  # 1980-01-06, UTC
 _WEEK_NS = 7 * 24 * 3600 * 1_000_000_000
 _LEAP_SECONDS = ((1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16))
-"""UTC from which on GPS time is ahead by so many seconds, as announced by the IERS up to 2026."""
+"""UTC second from which GPS time is ahead by so many seconds (IERS announcements up to 2026)."""
 
-# What a format's letters stand for, and what their numbers are to be multiplied with (AP_Logger's README).
+# Number type and scale factor of each format letter (AP_Logger's README).
 _LETTERS: dict[str, tuple[str, float]] = {
     "b": ("i1", 1),
     "B": ("u1", 1),
@@ -71,12 +71,12 @@ _LETTERS: dict[str, tuple[str, float]] = {
 
 @dataclass(frozen=True)
 class _Rows:
-    """The messages of one name, in the order of the log."""
+    """Messages of one name, in the order of the log."""
 
     name: str
     raw: NDArray[np.void]  # [N] a field for each column
     scales: Mapping[str, float]
-    lost: int  # cut off at the end
+    lost: int  # number of messages cut off at the end
 
     def __len__(self) -> int:
         return len(self.raw)
@@ -85,11 +85,11 @@ class _Rows:
         return bool(self.scales.get(field))  # texts have none
 
     def integers(self, field: str) -> Int64:
-        """[N] a field as it stands."""
+        """Return a field [N] without its scale factor."""
         return np.asarray(self.raw[field]).astype(np.int64)
 
     def numbers(self, *fields: str) -> Float:
-        """[N] of one field, [N, F] of several, in their units; NaN where there is no such field."""
+        """Return one field [N], or several [N, F], in their units; NaN if there is no such field."""
         columns = [
             np.asarray(self.raw[field]).astype(np.float64) * self.scales[field]
             if self.scales.get(field)
@@ -100,20 +100,20 @@ class _Rows:
 
     @property
     def clock(self) -> tuple[str, int] | None:
-        """The field with the time since boot, and its unit in ns; None without one.
+        """Field with the time since boot, and its unit in ns; None without one.
 
-        Until 2014 it was TimeMS, but in GPS messages T, where TimeMS is that of the GPS week.
+        Until 2014 the field was TimeMS; in GPS messages it was T, as their TimeMS was that of the GPS week.
         """
         units = (("TimeUS", 1000), ("T" if "Week" in self else "TimeMS", 1_000_000))
         return next((unit for unit in units if unit[0] in self), None)
 
     def t_ns(self) -> Int64:
-        """[N] since boot; 0 without a time."""
+        """Return stamps [N] since boot; 0 without a time."""
         field, unit_ns = self.clock or ("", 0)
         return self.integers(field) * unit_ns if field else np.zeros(len(self), np.int64)
 
     def of(self, instance: int, *columns: str) -> _Rows:
-        """Those of one instance, by the first of some columns that there is; all of them without any."""
+        """Keep the rows of one instance, by the first of `columns` that exists; all rows if none does."""
         for column in columns:
             if column in self:
                 return replace(self, raw=self.raw[self.integers(column) == instance])
@@ -121,14 +121,14 @@ class _Rows:
 
 
 class ArduPilotFormat:
-    """DataFlash logs of ArduPilot autopilots."""
+    """Reader of the DataFlash logs of ArduPilot autopilots."""
 
     name = "ardupilot"
     title = "ArduPilot log"
     suffixes: tuple[str, ...] = (".bin",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether it begins with the definition of its own definitions."""
+        """Return True if the file begins with the FMT message that defines FMT itself."""
         if not path.is_file():
             return False
         try:
@@ -139,7 +139,7 @@ class ArduPilotFormat:
         return head.startswith(_START) and head[5:9].rstrip(b"\0") == b"FMT"
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Messages by name, times, GPS, and what was lost."""
+        """Describe messages by name, times, GPS, and lost messages."""
         log = _Log(path)
         timed = [rows for name in log.counts if (rows := log.rows(name)) is not None and rows.clock]
         every = np.concatenate([np.zeros(0, np.int64), *(rows.t_ns() for rows in timed)])
@@ -156,7 +156,7 @@ class ArduPilotFormat:
         return facts
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
-        """Position, attitude and mount.
+        """Read position, attitude and mount.
 
         The position is POS (`global`), else that of the estimator XKF1 or NKF1 (`local`, metres from ORGN),
         else GPS.
@@ -174,7 +174,7 @@ class ArduPilotFormat:
         return on_one_clock(path, position, body, gimbal, fit=fit, notes=notes, dropped=dropped)
 
     def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
-        """When pictures were taken: CAM, by the camera's feedback where it has one, else TRIG.
+        """Read the times of pictures: CAM (by the camera's feedback if it has one), else TRIG.
 
         Raises:
             DataError: no DataFlash log, pymavlink is missing, or nothing was triggered.
@@ -189,7 +189,7 @@ class ArduPilotFormat:
         raise DataError(path, "holds no CAM or TRIG message", "take the times of frames otherwise")
 
 
-# --- what a log says -----------------------------------------------------------------------------------
+# --- content of a log ----------------------------------------------------------------------------------
 
 
 def _position(
@@ -246,7 +246,7 @@ def _position(
 
 
 def _estimators_origin(log: _Log) -> Place | None:
-    """Where the estimator's metres count from: ORGN of type 0."""
+    """Return the origin of the estimator's metres (ORGN of type 0); None without one."""
     rows = log.first(["ORGN"], 0, "Type")
     return None if rows is None else Place(*rows.numbers("Lat", "Lng", "Alt")[0].tolist())
 
@@ -263,9 +263,9 @@ def _body(log: _Log, dropped: MutableMapping[str, int]) -> AttitudeTrack | None:
 def _mount(
     log: _Log, body: AttitudeTrack | None, dropped: MutableMapping[str, int], notes: list[str]
 ) -> AttitudeTrack | None:
-    """MNT: roll and pitch against the horizon, yaw from north where it is stated, else from the nose.
+    """Read MNT: roll and pitch against the horizon, yaw from north if it is logged, else from the nose.
 
-    Of several mounts the first: `instance` is that of an estimator or a receiver.
+    Of several mounts the first is taken: `instance` means an estimator or a receiver, not a mount.
     """
     every = log.rows("MNT")
     if every is None or "TimeUS" not in every or "Pitch" not in every:
@@ -290,7 +290,7 @@ def _mount(
 
 
 def _gps_time(log: _Log) -> ClockFit | None:
-    """From time since boot to UTC, by the first receiver; None without a time of it."""
+    """Fit UTC to the time since boot, by the first receiver; None if it gives no time."""
     rows = log.first(["GPS"], 0, "I")
     names = (("GWk", "GMS"), ("Week", "TimeMS"))  # today's, and those until 2014
     stated = next((pair for pair in names if rows is not None and all(name in rows for name in pair)), None)
@@ -303,7 +303,7 @@ def _gps_time(log: _Log) -> ClockFit | None:
 
 
 def _leap_ns(gps_ns: Int64) -> Int64:
-    """By how much GPS time is ahead of UTC; it has no leap seconds."""
+    """Return by how many ns GPS time is ahead of UTC; GPS time has no leap seconds."""
     ahead = np.full(len(gps_ns), _LEAP_SECONDS[-1][1] - 1, dtype=np.int64)
     for since_s, seconds in reversed(_LEAP_SECONDS):
         ahead[gps_ns >= (since_s + seconds) * 1_000_000_000] = seconds
@@ -314,10 +314,10 @@ def _leap_ns(gps_ns: Int64) -> Int64:
 
 
 class _Log:
-    """The messages of a log, found once, read by name.
+    """Messages of a log, found once, read by name.
 
     Raises:
-        DataError: pymavlink is missing, or cannot make sense of the file.
+        DataError: pymavlink is missing, or cannot read the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -333,7 +333,7 @@ class _Log:
         self.counts = {name: len(places) for name, places in self._places.items() if len(places)}
 
     def first(self, names: Sequence[str], instance: int = 0, *columns: str) -> _Rows | None:
-        """The messages of the first of some names that has any of an instance."""
+        """Return the messages of the first of `names` that has any of the instance; None without any."""
         for name in names:
             rows = self.rows(name)
             if rows is not None and rows.clock and len(found := rows.of(instance, *columns)):
@@ -341,7 +341,7 @@ class _Log:
         return None
 
     def rows(self, name: str) -> _Rows | None:
-        """The messages of a name; None without any, or where their definition makes no sense."""
+        """Return the messages of a name; None without any, or if their definition is not consistent."""
         places = self._places.get(name)
         if places is None or not len(places):
             return None
@@ -364,7 +364,7 @@ class _Log:
 
 
 def _index(path: Path) -> Any:
-    """Where each message is, as pymavlink lists it."""
+    """Return pymavlink's reader, which lists the position of each message in the file."""
     try:
         with path.open("rb") as file:
             if file.read(len(_START)) != _START:
@@ -372,14 +372,14 @@ def _index(path: Path) -> Any:
     except OSError as error:
         raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
     kind = need("pymavlink.DFReader", "drones").DFReader_binary
-    reader = kind.__new__(kind)  # first without the file, which it leaves open where it fails
+    reader = kind.__new__(kind)  # first without the file, which a failing __init__ leaves open
     try:
         with _silence():
             reader.__init__(str(path), zero_time_base=True)
     except OSError as error:
         _close(reader)
         raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
-    except Exception as error:  # whatever damage makes of a parser that expects none
+    except Exception as error:  # damaged files raise many kinds of errors in this parser
         _close(reader)
         problem = " ".join(str(error).split())[:100] or type(error).__name__
         raise DataError(path, f"is damaged ({problem})", "download it from the autopilot again") from error
@@ -388,14 +388,14 @@ def _index(path: Path) -> Any:
 
 
 def _close(reader: Any) -> None:
-    """Close the file; the map of it goes with the last that looks at it."""
+    """Close the file; its memory map is freed with the last reference to it."""
     if file := getattr(reader, "filehandle", None):
         file.close()
 
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Keep what pymavlink prints of each damaged byte from the terminal; its compiled part prints too."""
+    """Keep pymavlink's output about damaged bytes off the terminal; its compiled part prints too."""
     quiet = io.StringIO()
     stderr = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)

@@ -1,11 +1,11 @@
-"""DJI's subtitles: where the drone was and where its gimbal looked, written beside the video.
+"""Reader of DJI's subtitles, which log the drone's position and the gimbal's angles beside the video.
 
-Generations differ in everything but the subtitles' own form; all of these are read:
+Generations have only the form of subtitles in common. All of these are read:
 
 - `[latitude: 41.4] [longitude: 2.2] [rel_alt: 3.6 abs_alt: 6.4] [gb_yaw: 30.0 gb_pitch: -45.0 gb_roll: 0.0]`
-  (since 2018), with blanks before the colons or without, `longitude` spelt `longtitude` by some, gimbal
-  angles only from enterprise models; one height called `altitude` by others, which does not say what it
-  counts from (a Mavic Air 2 counts from the take-off);
+  (since 2018). Blanks before the colons are optional; some drones spell `longitude` as `longtitude`. Only
+  enterprise models log gimbal angles. Some log one height called `altitude`, without its reference (for a
+  Mavic Air 2 it is the take-off);
 - `GPS(149.0251,-20.2533,16)`: longitude, latitude, satellites (until 2018), with `Hb:1.9`, `BAROMETER:20.1`
   or `H 85.80m` as height above take-off, and `F.PRY (...)`, `G.PRY (...)` as the angles of body and gimbal;
 - `GPS(36.6146,-6.1120,0.0M)`: latitude, longitude, height (Matrice 300): the M tells them apart.
@@ -68,12 +68,12 @@ _COLUMNS = (
     *("gb_yaw", "gb_pitch", "gb_roll", "drone_yaw", "drone_pitch", "drone_roll"),
 )
 _HEIGHTS = {"rel_alt": "relative", "abs_alt": "absolute"}
-_HIGHEST_M = 500  # above the take-off: DJI's drones climb no higher
+_HIGHEST_M = 500  # above the take-off: the largest height that DJI's drones reach
 
 
 @dataclass(frozen=True)
 class Subtitles:
-    """The subtitles of a video: when each is shown, and the clock time that it shows."""
+    """Subtitles of a video, with their display times and the clock times in their text."""
 
     media_ns: Int64  # [B] since the video's start
     clock_ns: Int64  # [B] since the epoch, local time taken as UTC; 0 where none is shown
@@ -81,25 +81,25 @@ class Subtitles:
 
     @property
     def has_clock(self) -> Bool:
-        """[B] whether a clock time is shown."""
+        """[B] True if a clock time is shown."""
         shown: Bool = self.clock_ns != 0
         return shown
 
     @property
     def are_slow(self) -> bool:
-        """Whether they come about once a second, and not with each frame."""
+        """True if subtitles come about once a second, and not with each frame."""
         return len(self.media_ns) > 1 and float(np.median(np.diff(self.media_ns))) >= _SLOW_NS
 
     def start_ns(self) -> int | None:
-        """What the clock showed when the video began, by the first subtitle with a clock; None without."""
+        """Return the clock time at the video's start, by the first subtitle with a clock; None without."""
         shown = np.flatnonzero(self.has_clock)
         return int(self.clock_ns[shown[0]] - self.media_ns[shown[0]]) if len(shown) else None
 
     def times(self) -> tuple[Int64, Bool]:
-        """[B] when each was written, and whether that is known.
+        """Return the time at which each subtitle was written [B], and True if that is known [B].
 
-        Subtitles of each frame: what their clock shows. Slow ones show whole seconds: the start, and then
-        the video's own time. Without any clock it is the video's own time.
+        Subtitles of each frame: the time on their clock. Slow ones show whole seconds, so the video's own
+        time is added to the clock time of its start. Without any clock it is the video's own time.
         """
         start_ns = self.start_ns()
         if start_ns is None:
@@ -110,20 +110,20 @@ class Subtitles:
 
 
 class DjiSrtFormat:
-    """Subtitles that say where the drone was."""
+    """Reader of subtitles that hold the drone's position."""
 
     name = "dji"
     title = "DJI telemetry (subtitles)"
     suffixes: tuple[str, ...] = (".srt",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether there are subtitles, and one of the first says a position."""
+        """Return True if there are subtitles and one of the first holds a position."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         return bool(np.isfinite(_columns(parse_subtitles(read_head(path)).texts)["latitude"]).any())
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Subtitles, times, box of the positions, heights, angles, and what was left out."""
+        """Describe subtitles, times, ranges of the positions, heights and angles."""
         subtitles = read_subtitles(path)
         columns = _columns(subtitles.texts)
         t_ns, timed = subtitles.times()
@@ -152,12 +152,12 @@ class DjiSrtFormat:
         return facts
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
-        """Positions, and the angles of body and gimbal where the subtitles have them.
+        """Read positions, and the angles of body and gimbal if the subtitles have them.
 
-        Positions that are repeated until the next measurement are taken as lines between the two.
+        A position that is repeated until the next measurement is replaced by linear interpolation.
 
         Raises:
-            DataError: no subtitles, no position in any, or no height where none is stated.
+            DataError: no subtitles, no position in any, or no height while the user states none.
         """
         subtitles = read_subtitles(path)
         columns = _columns(subtitles.texts)
@@ -186,7 +186,7 @@ class DjiSrtFormat:
 
 
 def read_subtitles(path: Path) -> Subtitles:
-    """Read them all; bytes that are no UTF-8 become signs that no number has.
+    """Read all subtitles of a file; bytes that are not UTF-8 become a sign that no number contains.
 
     Raises:
         DataError: the file cannot be read, or holds no subtitles.
@@ -204,7 +204,7 @@ def read_subtitles(path: Path) -> Subtitles:
 
 
 def parse_subtitles(text: str) -> Subtitles:
-    """The subtitles of a text; none where it has none."""
+    """Parse the subtitles of a text; the result is empty if it has none."""
     blocks = list(_BLOCK.finditer(text))
     ends = [block.start() for block in blocks[1:]] + [len(text)]
     texts = [text[block.end() : end] for block, end in zip(blocks, ends, strict=False)]
@@ -216,7 +216,7 @@ def parse_subtitles(text: str) -> Subtitles:
 
 
 def _clock_ns(text: str) -> int | None:
-    """The clock time in a subtitle: 2022-08-07 13:40:40,774,808 and its variants."""
+    """Parse the clock time of a subtitle: 2022-08-07 13:40:40,774,808 and its variants."""
     match = _CLOCK.search(text)
     if match is None:
         return None
@@ -233,11 +233,11 @@ def _timecode_ns(block: re.Match[str]) -> int:
     return (((hours * 60 + minutes) * 60 + seconds) * 1000 + milliseconds) * 1_000_000
 
 
-# --- what a subtitle says ------------------------------------------------------------------------------
+# --- content of a subtitle -----------------------------------------------------------------------------
 
 
 def _columns(texts: Sequence[str]) -> dict[str, Float]:
-    """Every number that is wanted, [B] each, NaN where a subtitle does not say it."""
+    """Return all columns of `_COLUMNS`, [B] each, NaN if a subtitle does not hold the value."""
     rows = [_said(text) for text in texts]
     return {name: np.array([row.get(name, np.nan) for row in rows]) for name in _COLUMNS}
 
@@ -250,7 +250,7 @@ def _said(text: str) -> dict[str, float]:
             said[_HEIGHTS.get(name) or _NAMES.get(name, name)] = float(number)
     if "GPS" in text and (gps := _GPS.search(text)):
         first, second, third = (float(part) for part in gps.groups()[:3])
-        if gps[4]:  # a height: only those that write it begin with the latitude
+        if gps[4]:  # the M of a height: only this form begins with the latitude
             said |= {"latitude": first, "longitude": second, "absolute": third}
         else:
             said |= {"longitude": first, "latitude": second}
@@ -260,15 +260,15 @@ def _said(text: str) -> dict[str, float]:
             if angles := pattern.search(text):
                 pitch, roll, yaw = (float(angle) for angle in angles.groups())
                 said |= {f"{part}_pitch": pitch, f"{part}_roll": roll, f"{part}_yaw": yaw}
-    if "latitude" not in said or "longitude" not in said:  # one of them broke off
+    if "latitude" not in said or "longitude" not in said:  # the text was cut between the two
         said.pop("latitude", None)
     return said
 
 
 def _height(path: Path, columns: Mapping[str, Float], choice: TelemetryChoice) -> tuple[Float, Height, str]:
-    """Choose the height of each position; say what it counts from, and that in words.
+    """Choose the height of each position; return it with its reference and a note about the choice.
 
-    An `altitude` that names no reference stands for whichever of the two heights has no name of its own.
+    An `altitude` without a reference is used for each of the two heights that has no field of its own.
     """
     stated, unnamed = choice.altitude, columns["altitude"]
     if isinstance(stated, int | float):
@@ -301,7 +301,7 @@ def _height(path: Path, columns: Mapping[str, Float], choice: TelemetryChoice) -
 
 
 def _angles(columns: Mapping[str, Float], part: str) -> Float:
-    """[B, 3] yaw, pitch, roll in degrees; a roll that is not written is 0."""
+    """Return yaw, pitch, roll [B, 3] in degrees; a missing roll is 0."""
     yaw, pitch, roll = (columns[f"{part}_{angle}"] for angle in ("yaw", "pitch", "roll"))
     return np.stack(
         [yaw, pitch, np.where(np.isnan(roll), np.where(np.isnan(yaw), np.nan, 0.0), roll)], axis=1
@@ -320,7 +320,7 @@ def _range(values: Float, decimals: int) -> list[float]:
 def _attitude(
     name: str, t_ns: Int64, yaw_pitch_roll_deg: Float, dropped: MutableMapping[str, int]
 ) -> AttitudeTrack | None:
-    """The attitude that angles [B, 3] state; None where there are none."""
+    """Build the attitude from angles [B, 3]; None if there are none."""
     stated = np.isfinite(yaw_pitch_roll_deg).all(axis=1)
     if not stated.any():
         return None
@@ -341,7 +341,7 @@ def _clock_name(subtitles: Subtitles) -> str:
 
 
 def _notes(subtitles: Subtitles, height: str, moved: int, rows: int) -> list[str]:
-    """What was chosen, and what is doubtful."""
+    """List notes about the choices made and about doubtful data."""
     notes = []
     if not subtitles.has_clock.any():
         notes.append("shows no clock: its times count from the video's start")

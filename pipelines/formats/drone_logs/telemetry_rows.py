@@ -1,4 +1,4 @@
-"""Rows of telemetry to clean tracks: one set of rules for every drone's log."""
+"""Cleaning of telemetry rows into tracks: one set of rules for every drone's log."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Int64
 from pipelines.session.telemetry import AttitudeTrack, Height, PositionTrack, Telemetry
 
-_HELD_NS = 1_000_000_000  # receivers that drones carry report at least once a second
-_LEAST_REFRESHES = 4  # times between changes, before their regularity says anything
+_HELD_NS = 1_000_000_000  # receivers on drones report at least once a second
+_LEAST_REFRESHES = 4  # intervals between changes that are needed to judge their regularity
 
 
 def position_track(
@@ -39,7 +39,7 @@ def position_track(
     origin: Place | None = None,
     unusable: dict[str, Bool] | None = None,
 ) -> PositionTrack:
-    """Positions without the rows that cannot be used, each counted in `dropped` under its first cause.
+    """Drop the positions that cannot be used; count each in `dropped` under its first cause.
 
     The causes of `unusable` come first, then "not finite", "not on Earth" (latitude beyond 90, longitude
     beyond 360), "no fix (0, 0)", "duplicate stamp" and "stamp out of order" as in `clean_poses`.
@@ -79,15 +79,15 @@ def attitude_track(
     relative_to: RelativeTo = "world",
     stated: Mapping[RelativeTo, Float] | None = None,
 ) -> AttitudeTrack | None:
-    """Attitudes without the rows that cannot be used, counted as "attitude ...", or None without any.
+    """Drop the attitudes that cannot be used, counted as "attitude ..."; return None if none is left.
 
     Args:
-        name: what the log calls it.
+        name: name of the attitude in the log.
         t_ns: [N] stamps.
-        quaternion_xyzw: [N, 4] of an FLU thing in an ENU world or an FLU body.
-        dropped: where losses are counted.
-        relative_to: which of the two.
-        stated: of a gimbal, its angles as the log states them, as in `AttitudeTrack`.
+        quaternion_xyzw: [N, 4] of an FLU body in an ENU world, or of an FLU gimbal in an FLU body.
+        dropped: counts of dropped rows by cause.
+        relative_to: reference of the quaternions, world or body.
+        stated: of a gimbal, its angles as the log gives them, as in `AttitudeTrack`.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         norm = np.linalg.norm(quaternion_xyzw, axis=1)
@@ -106,29 +106,29 @@ def attitude_track(
 
 
 def turned_as_stated(yaw_pitch_roll_deg: Float, *, relative_to: RelativeTo = "world") -> Float:
-    """Quaternions [N, 4] of angles [N, 3] as autopilots state them: FRD in NED, yaw from north to east."""
+    """Return quaternions [N, 4] of autopilots' angles [N, 3]: FRD in NED, yaw from north to east."""
     return attitude_in_enu(of_angles(yaw_pitch_roll_deg), relative_to=relative_to, axes="ned")
 
 
 def of_angles(yaw_pitch_roll_deg: Float) -> Float:
-    """Quaternions [N, 4] of angles [N, 3] in the axes that they are stated in."""
+    """Return quaternions [N, 4] of angles [N, 3], in the axes of the angles."""
     with np.errstate(invalid="ignore"):
         return attitude_from_angles(yaw_pitch_roll_deg, order="ypr", units="deg")
 
 
 def whatever_from(attitude: Float) -> Mapping[RelativeTo, Float]:
-    """Angles of which a log does not say what they count from: the same for whatever the user says."""
+    """Return the same angles for every reference, because the log does not name one and the user may."""
     return {"world": attitude, "body": attitude, "heading": attitude}
 
 
 def placed_by(track: PositionTrack, fixes: PositionTrack) -> tuple[PositionTrack, str]:
-    """A track in metres with the place on Earth that it counts from, by fixes of the same drone.
+    """Give a track in metres its origin on Earth, by GPS fixes of the same drone.
 
-    The median of what lies between the two, so that wild fixes do not count; a constant error of the fixes
-    stays in it.
+    The origin comes from the median difference of the two, so that single wild fixes do not matter. A
+    constant error of the fixes stays in it.
 
     Returns:
-        The track, and in words how well the two agree.
+        The track, and a sentence about the agreement of the two.
     """
     near = Place(*fixes.values[0].tolist())
     latitude, longitude, height = fixes.values.T
@@ -144,18 +144,18 @@ def placed_by(track: PositionTrack, fixes: PositionTrack) -> tuple[PositionTrack
 
 
 def world_from_heading(body: AttitudeTrack, t_ns: Int64, heading_from_gimbal: Float) -> Float:
-    """Attitudes [N, 4] of an FLU gimbal in an ENU world, of angles that count yaw from the drone's nose.
+    """Return attitudes [N, 4] of an FLU gimbal in an ENU world, from angles with yaw relative to the nose.
 
-    Autopilots state them so: pitch and roll against the horizon, yaw against the heading.
+    Autopilots log such angles: pitch and roll against the horizon, yaw against the heading.
 
     Args:
-        body: how the body was turned in the world.
+        body: attitude of the body in the world.
         t_ns: [N] stamps.
-        heading_from_gimbal: [N, 4] as stated: of an FRD gimbal in a level frame, x where the nose points,
+        heading_from_gimbal: [N, 4] as logged: an FRD gimbal in a level frame with x along the nose and
             z down.
 
     Returns:
-        NaN where the body's attitude is not known within a second.
+        [N, 4], NaN if the body's attitude is not known within a second.
     """
     _, turned = interpolate_poses(
         body.t_ns,
@@ -179,7 +179,7 @@ def on_one_clock(
     notes: Iterable[str],
     dropped: dict[str, int],
 ) -> Telemetry:
-    """What a log says of a drone, all of it on GPS time where the fit of its clock is used."""
+    """Assemble the telemetry of a log; convert all stamps to UTC if there is a fit of its clock."""
     if fit is not None:
         position = replace(position, t_ns=fit.other_ns(position.t_ns))
         body = replace(body, t_ns=fit.other_ns(body.t_ns)) if body else None
@@ -198,7 +198,7 @@ def on_one_clock(
 def on_gps_time(
     source: Path, fit: ClockFit | None, wanted: Literal["gps", "boot"] | None, notes: list[str]
 ) -> ClockFit | None:
-    """The fit to GPS time if it is to be used: where there is one, unless time since boot is asked for.
+    """Return the fit to GPS time if it exists and the user did not ask for time since boot; else None.
 
     Raises:
         DataError: GPS time is asked for, and there is none.
@@ -216,7 +216,7 @@ def on_gps_time(
 
 
 def said_of_fit(fit: ClockFit) -> str:
-    """How a log's own clock goes against GPS time, in words."""
+    """Describe clock offset and drift between a log's own clock and GPS time, in words."""
     return (
         f"GPS time is {fit.offset_ns / 1e9:.3f} s ahead of its clock, drifting {fit.drift_ppm:.1f} ppm"
         f" (+- {min(fit.drift_sigma_ppm, 1e6):.2g}; {fit.events} fixes, scatter"
@@ -225,30 +225,30 @@ def said_of_fit(fit: ClockFit) -> str:
 
 
 def between_repeats(t_ns: Int64, values: Float) -> tuple[Float, int]:
-    """Draw lines between the positions of a log that repeats each measurement until the next one comes.
+    """Interpolate the positions of a log that repeats each measurement until the next one comes.
 
-    A value that stays the same for longer than a second before it changes is taken to have stayed so until
-    one second before.
+    If a value stays the same for longer than a second before it changes, the hold is kept until one second
+    before the change.
 
     Args:
         t_ns: [N] increasing stamps.
         values: [N, D].
 
     Returns:
-        [N, D], and how many rows were moved.
+        [N, D], and the number of changed rows.
     """
     smooth = np.stack([_between_changes(t_ns, column, len(t_ns)) for column in values.T], axis=1)
     return smooth, int(np.count_nonzero((smooth != values).any(axis=1)))
 
 
 def between_refreshed_angles(t_ns: Int64, angles: Float) -> Float:
-    """Draw lines between the angles of a log that repeats each measurement until the next one comes.
+    """Interpolate the angles of a log that repeats each measurement until the next one comes.
 
-    A gimbal that keeps an angle states the same number again and again, and each time it was measured. So an
-    angle counts as repeated only for as long as the log needs to refresh it: a hold that is longer ends in a
-    line over the last such time, and a step stays where it was logged but for that. The time is the shortest
-    between two changes, because a log that repeats cannot change sooner. It is believed where most changes
-    follow each other so soon; a log that changes now and then is left as it is.
+    A gimbal that keeps an angle gives the same number at each measurement. So an angle counts as repeated
+    only for one refresh interval of the log. If a hold is longer, only its last refresh interval becomes a
+    line to the new angle, and the rest stays as logged. The refresh interval is the shortest time between two
+    changes, because a log that repeats cannot change sooner. It is used only if most changes follow each
+    other so soon; a log that changes only now and then stays as it is.
 
     Args:
         t_ns: [N] increasing stamps.
@@ -261,7 +261,7 @@ def between_refreshed_angles(t_ns: Int64, angles: Float) -> Float:
 
 
 def _refreshed_rows(values: Float) -> int:
-    """Return for how many rows a log repeats each measurement; 1 where nothing shows that it does."""
+    """Return for how many rows a log repeats each measurement; 1 if there is no evidence of repeats."""
     apart = np.diff(np.flatnonzero(np.diff(values) != 0))
     if len(apart) < _LEAST_REFRESHES or apart.min() == 1:
         return 1
@@ -270,7 +270,7 @@ def _refreshed_rows(values: Float) -> int:
 
 
 def _between_changes(t_ns: Int64, values: Float, most_rows: int) -> Float:
-    """Draw a line to each change of a column, over at most so many rows and a second of what was held."""
+    """Interpolate to each change of a column, over at most `most_rows` rows and a second of the hold."""
     changes = np.flatnonzero(np.diff(values) != 0) + 1
     if not len(changes):
         return values

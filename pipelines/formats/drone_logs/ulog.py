@@ -1,6 +1,6 @@
-"""PX4's .ulg logs, by pyulog (extra `drones`): estimates, GPS, gimbal and camera triggers.
+"""Reader of PX4's .ulg logs, by pyulog (extra `drones`): estimates, GPS, gimbal and camera triggers.
 
-PX4 has its world in NED and its body in FRD, and stamps in microseconds since boot (docs/drones.md).
+PX4's world is NED, its body FRD, and its stamps count microseconds since boot (docs/drones.md).
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64  # GIMBAL_DEVICE_FLAGS of
 
 
 class UlogFormat:
-    """Logs of PX4 autopilots."""
+    """Reader of the logs of PX4 autopilots."""
 
     name = "ulog"
     title = "PX4 log"
     suffixes: tuple[str, ...] = (".ulg", ".ulog")
 
     def recognises(self, path: Path) -> bool:
-        """Whether it begins as every ULog does."""
+        """Return True if the file begins with ULog's magic bytes."""
         if not path.is_file():
             return False
         try:
@@ -55,7 +55,7 @@ class UlogFormat:
             return False
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Topics and their messages, times, GPS, what of the estimates is valid, and damage."""
+        """Describe topics and their messages, times, GPS, valid estimates, and damage."""
         log = open_ulog(path, None)
         topics = topics_of(log)
         stamps = [np.asarray(topic.columns["timestamp"]).astype(np.int64) for topic in topics]
@@ -89,10 +89,10 @@ class UlogFormat:
         return facts
 
     def read_telemetry(self, path: Path, choice: TelemetryChoice) -> Telemetry:
-        """Position, attitude and gimbal.
+        """Read position, attitude and gimbal.
 
-        The position is the estimator's own (`local`) where it ever calls it valid, else its global one,
-        else that of GPS; a local one that is never valid is taken last, and doubted.
+        The position is the estimator's local one (`local`) if the estimator ever marks it valid, else its
+        global one, else that of GPS. A local position that is never valid is the last choice, with a note.
 
         Raises:
             DataError: no ULog, pyulog is missing, or no position in it.
@@ -107,7 +107,7 @@ class UlogFormat:
         return on_one_clock(path, position, body, gimbal, fit=fit, notes=notes, dropped=dropped)
 
     def picture_times(self, path: Path, choice: TelemetryChoice) -> Int64:
-        """When pictures were taken: by the camera's feedback, else by the trigger.
+        """Read the times of pictures: by the camera's feedback, else by the trigger.
 
         Raises:
             DataError: no ULog, pyulog is missing, or nothing was triggered.
@@ -141,7 +141,7 @@ _POSITIONS = {
     "gps": _GPS,
 }
 
-# --- what a log says -----------------------------------------------------------------------------------
+# --- content of a log ----------------------------------------------------------------------------------
 
 
 def _position(
@@ -194,7 +194,7 @@ def _position(
 
 
 def _likeliest(found: Mapping[str, Topic]) -> str:
-    """The estimator's own where it is ever valid, else what is on Earth."""
+    """Choose the estimator's local position if it is ever valid, else a position on Earth."""
     if "local" in found and _local_is_valid(found["local"]).any():
         return "local"
     if "global" in found:
@@ -205,7 +205,7 @@ def _likeliest(found: Mapping[str, Topic]) -> str:
 
 
 def _local(path: Path, topic: Topic, dropped: MutableMapping[str, int], notes: list[str]) -> PositionTrack:
-    """The estimator's metres, and where on Earth they count from: it may move that in flight."""
+    """Read the estimator's metres and their origin on Earth, which the estimator may move in flight."""
     enu = topic.numbers("y", "x", "z") * [1, 1, -1]
     valid = _local_is_valid(topic)
     if not valid.any():
@@ -249,7 +249,7 @@ def _resets(topic: Topic, valid: Bool) -> int:
 
 
 def _fixes(topic: Topic) -> tuple[Float, Bool]:
-    """Latitude, longitude and height [N, 3], and whether there was a fix in 3D."""
+    """Return latitude, longitude and height [N, 3], and True where there was a 3D fix [N]."""
     if "latitude_deg" in topic:
         values = topic.numbers("latitude_deg", "longitude_deg", "altitude_msl_m")
     else:
@@ -291,7 +291,7 @@ def _gimbal(
     dropped: MutableMapping[str, int],
     notes: list[str],
 ) -> AttitudeTrack | None:
-    """The gimbal's own attitude, or else what it was told relative to the body."""
+    """Read the gimbal's own attitude, or else its commanded angles relative to the body."""
     devices = sorted(_there(topics, ["gimbal_device_attitude_status"]), key=lambda topic: topic.instance)
     if devices:
         if len(devices) > 1:
@@ -314,7 +314,7 @@ def _gimbal(
 def _gimbal_device(
     topic: Topic, body: AttitudeTrack | None, dropped: MutableMapping[str, int]
 ) -> AttitudeTrack | None:
-    """MAVLink's GIMBAL_DEVICE_ATTITUDE_STATUS: pitch and roll against the horizon, yaw as its flags say."""
+    """Read GIMBAL_DEVICE_ATTITUDE_STATUS: pitch and roll against the horizon, yaw by its flags (MAVLink)."""
     stated = topic.numbers("q[1]", "q[2]", "q[3]", "q[0]")
     flags = np.asarray(topic.columns.get("device_flags", np.zeros(len(topic)))).astype(np.int64)
     framed = (flags & (_YAW_IN_VEHICLE | _YAW_IN_EARTH)) != 0
@@ -329,7 +329,7 @@ def _gimbal_device(
 
 
 def _gps_time(topics: Sequence[Topic]) -> ClockFit | None:
-    """From time since boot to UTC, by what the receiver says; None without a time of it."""
+    """Fit UTC to the time since boot, by the receiver's time; None if it gives no time."""
     for topic in sorted(topics, key=lambda topic: (topic.name not in _GPS[:1], topic.instance)):
         if topic.name in _GPS and "time_utc_usec" in topic:
             utc_ns = np.asarray(topic.columns["time_utc_usec"]).astype(np.int64) * 1000
@@ -342,12 +342,12 @@ def _gps_time(topics: Sequence[Topic]) -> ClockFit | None:
 def _instance(
     path: Path, topics: Sequence[Topic], names: Sequence[str], choice: TelemetryChoice, *, wanted: bool
 ) -> Topic | None:
-    """The topic of the instance asked for, the first by default; None where there is none.
+    """Return the topic of the instance asked for, the first by default; None if there is none.
 
-    vehicle_* is what the autopilot flew by, estimator_* what each of several estimators thought.
+    vehicle_* is the estimate that the autopilot flew by, estimator_* that of each single estimator.
 
     Raises:
-        DataError: this kind is wanted, and has no such instance.
+        DataError: the user asks for this kind, and it has no such instance.
     """
     of_kind = _there(topics, names)
     if not of_kind or choice.instance is None:
@@ -359,7 +359,7 @@ def _instance(
 
 
 def _there(topics: Sequence[Topic], names: Sequence[str]) -> list[Topic]:
-    """Those of some names that hold messages."""
+    """Return the topics with these names that hold messages."""
     return [topic for name in names for topic in topics if topic.name == name and len(topic)]
 
 
@@ -369,7 +369,7 @@ def _no_instance(path: Path, instance: int, what: str, there: Sequence[Topic]) -
 
 
 def _far_off(t_ns: Int64, among: Bool) -> Bool:
-    """Which stamps lie behind nearly all of some by more than a tenth of their span and some seconds."""
+    """Return True for stamps later than nearly all `among`, by a tenth of their span plus `_FAR_OFF_NS`."""
     if not among.any():
         return np.zeros(len(t_ns), dtype=np.bool_)
     first, last = np.percentile(t_ns[among], [0, 99.5])

@@ -1,6 +1,6 @@
-"""ULog files, as PX4 writes them, by pyulog (extra `drones`): their topics as columns.
+"""Reader of ULog files, as PX4 writes them, by pyulog (extra `drones`): their topics as columns.
 
-Definitions are looked at before pyulog unfolds them: damaged or malicious ones stand for billions of fields.
+Definitions are checked before pyulog expands them: damaged or malicious ones mean billions of fields.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from pipelines.session.extras import need
 from pipelines.session.records import Float, Int64
 
 MAGIC = b"ULog\x01\x12\x35"
-_MOST_FIELDS = 20_000  # of one message, with what is nested in it; PX4's largest has some hundreds
+_MOST_FIELDS = 20_000  # of one message with its nested types; PX4's largest has some hundreds
 
-Columns = Mapping[str, Any]  # by field name, arrays [N] of whatever type the log has
+Columns = Mapping[str, Any]  # by field name, arrays [N] in the log's own number types
 
 
 @dataclass(frozen=True)
@@ -42,17 +42,17 @@ class Topic:
         return field in self.columns
 
     def numbers(self, *fields: str) -> Float:
-        """[N] of one field, [N, F] of several, NaN throughout where the log has no such field."""
+        """Return one field [N], or several [N, F]; NaN throughout if the log has no such field."""
         missing = np.full(len(self), np.nan)
         columns = [np.asarray(self.columns.get(field, missing), dtype=np.float64) for field in fields]
         return columns[0] if len(columns) == 1 else np.stack(columns, axis=1)
 
     def flags(self, field: str) -> Bool:
-        """[N] whether a field is set; True throughout where the log has no such field."""
+        """Return True where a field is set [N]; True throughout if the log has no such field."""
         return np.asarray(self.columns.get(field, np.ones(len(self))) != 0, dtype=np.bool_)
 
     def t_ns(self) -> Int64:
-        """[N] since boot: when it was sampled where the log says so, else when it was published."""
+        """Return stamps [N] since boot: the time of sampling if the log has it, else of publishing."""
         published = np.asarray(self.columns["timestamp"]).astype(np.int64)
         sampled = np.asarray(self.columns.get("timestamp_sample", published)).astype(np.int64)
         stamps: Int64 = np.where(sampled > 0, sampled, published) * 1000
@@ -60,7 +60,7 @@ class Topic:
 
 
 def open_ulog(path: Path, wanted: Collection[str] | None) -> Any:
-    """A log with some topics, or all of them.
+    """Open a log with some topics, or all of them.
 
     Raises:
         DataError: pyulog is missing, or cannot read the file.
@@ -68,25 +68,25 @@ def open_ulog(path: Path, wanted: Collection[str] | None) -> Any:
     core = need("pyulog", "drones")
     _refuse_bombs(path)
     try:
-        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):  # it prints its doubts
+        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):  # pyulog prints warnings
             return core.ULog(file, None if wanted is None else sorted(wanted))
     except DataError:
         raise
     except OSError as error:
         raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
-    except Exception as error:  # whatever damage makes of a parser that expects none
+    except Exception as error:  # damaged files raise many kinds of errors in this parser
         problem = " ".join(str(error).split())[:100] or type(error).__name__
         raise DataError(path, f"is damaged ({problem})", "download it from the autopilot again") from error
 
 
 def topics_of(log: Any) -> list[Topic]:
-    """By name and instance; those without a stamp say nothing."""
+    """Return the topics with a stamp, sorted by name and instance."""
     found = [Topic(str(d.name), int(d.multi_id), d.data) for d in log.data_list if "timestamp" in d.data]
     return sorted(found, key=lambda topic: (topic.name, topic.instance))
 
 
 def _refuse_bombs(path: Path) -> None:
-    """Refuse definitions that unfold without end: nested arrays may stand for billions of fields.
+    """Refuse definitions that expand without end: nested arrays may mean billions of fields.
 
     Raises:
         DataError: no ULog, or a definition beyond reason.
@@ -115,7 +115,7 @@ def _refuse_bombs(path: Path) -> None:
 
 
 def _definitions(path: Path) -> list[tuple[str, list[tuple[str, int]]]]:
-    """What messages consist of: (type, how many), by name; up to where the data begin."""
+    """Read the message definitions, (type, count) of the fields by name, up to the start of the data."""
     found: list[tuple[str, list[tuple[str, int]]]] = []
     with path.open("rb") as file:
         if file.read(16)[: len(MAGIC)] != MAGIC:
