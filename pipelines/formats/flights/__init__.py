@@ -1,1 +1,1 @@
-"""What a manifest names, as records, whichever format holds it."""
+"""Readers of the parts that a manifest names, as records, independent of their format."""

@@ -1,4 +1,4 @@
-"""The calibration of a camera, from whatever its manifest names, for pictures of their size."""
+"""Calibration of a camera from the source in its manifest, fitted to the size of its pictures."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from pipelines.session.manifest import Camera, IntrinsicsSource
 from pipelines.session.records import CalibratedCamera, Detections, VideoIndex
 from pipelines.session.registries import CalibrationFormat, recognise
 
-# Of keypoints. Detectors extrapolate people whom the border cuts, to all sides alike. Pictures of another
-# size show beyond the right and the lower border only: all pictures begin at 0.
+# Shares of keypoints. Detectors extrapolate people whom the border cuts, to all sides alike. But if the
+# pictures have another size, keypoints lie beyond the right and the lower border only: all begin at 0.
 _LARGEST_SHARE_BEYOND = 0.2
 _LARGEST_SHARE_OUTSIDE = 0.5
 
 
 class CalibrationSources:
-    """Reads the calibrations of one flight, each file once.
+    """Reader of the calibrations of one flight; each file is read once.
 
     Args:
         manifest: the path of the manifest.
         logs: of the flight.
-        note: told what is doubtful, one line each.
+        note: receives each doubt, one line each.
     """
 
     def __init__(self, manifest: Path, logs: FlightLogs, note: Callable[[str], None]) -> None:
@@ -40,10 +40,10 @@ class CalibrationSources:
     def intrinsics(
         self, name: str, camera: Camera, video: VideoIndex | None, detections: Detections | None
     ) -> Intrinsics:
-        """The intrinsics of a camera, fitted to the size of its pictures.
+        """Return the intrinsics of a camera, fitted to the size of its pictures.
 
         Raises:
-            DataError: not there, of pictures of another shape, or too small for the keypoints.
+            DataError: missing, for pictures of another shape, or too small for the keypoints.
         """
         source = camera.intrinsics
         place = f"{self._manifest}: cameras.{name}.intrinsics"
@@ -75,7 +75,7 @@ class CalibrationSources:
     def _picture_size(
         self, camera: Camera, video: VideoIndex | None, detections: Detections | None
     ) -> tuple[int, int] | None:
-        """The size of the pictures themselves, or that which the keypoints state."""
+        """Return the size of the pictures themselves, or the size that the keypoints file gives."""
         if video is not None:
             return video.width, video.height
         logged = camera.video.log if camera.video else None
@@ -84,7 +84,7 @@ class CalibrationSources:
         return detections.image_size if detections else None
 
     def camera(self, name: str, path: str, camera: str | None) -> CalibratedCamera:
-        """The camera of a calibration file that is asked for, bears this name, or is the only one."""
+        """Return the camera that is asked for, or the one of this name, or the only one of the file."""
         if path not in self._read:
             file = self._base / path
             self._read[path] = recognise(file, CalibrationFormat, "calibration").read_calibration(file)
@@ -102,7 +102,7 @@ class CalibrationSources:
 
 
 def _inline_intrinsics(source: IntrinsicsSource, place: str) -> Intrinsics:
-    # Without coefficients a fisheye is the equidistant projection, as in calibration files; no pinhole.
+    # A fisheye without coefficients is the equidistant projection, as in calibration files, not a pinhole.
     coefficients = tuple(source.distortion) or ((0.0,) * 4 if source.model == "fisheye" else ())
     try:
         return Intrinsics(
@@ -120,9 +120,9 @@ def _inline_intrinsics(source: IntrinsicsSource, place: str) -> Intrinsics:
 
 
 def _refuse_keypoints_outside(place: str, intrinsics: Intrinsics, detections: Detections) -> None:
-    """Refuse a calibration that keypoints as a whole cannot belong to: it is for pictures of another size.
+    """Refuse a calibration for pictures of another size, if too many keypoints lie outside its picture.
 
-    Keypoints count by their confidence: what a detector made up of a person whom the border cuts has little.
+    Keypoints are weighted by confidence: those that a detector extrapolates beyond the border have little.
     """
     found = ~np.isnan(detections.xy[..., 0])
     xy, weight = detections.xy[found], np.maximum(detections.confidence[found], 0.0)

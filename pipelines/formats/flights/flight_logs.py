@@ -1,6 +1,6 @@
-"""What a manifest takes from logs: which recording, which topic, and what it holds there.
+"""Readers of the parts that a manifest takes from logs: the recording, the topic, and its content.
 
-A topic that is left out is the only candidate of its kind, and what was chosen is said. Every reading
+If no topic is stated, the only candidate of its kind is taken, and a note names it. Every reading
 is one pass over the messages of one topic: logs of any size stream.
 """
 
@@ -57,7 +57,7 @@ from pipelines.session.registries import Log
 from pipelines.session.telemetry import PositionTrack, Telemetry, TelemetryChoice
 
 _MAY_DISAGREE_S = 0.5  # header and receive stamps: transport and decoding take less
-_MAY_JUMP_S = 1.0  # from one message to the next, beyond what time itself passed
+_MAY_JUMP_S = 1.0  # from one message to the next, in addition to the time that passed
 
 _Wanted = Kind | Literal["maps"]
 
@@ -71,12 +71,12 @@ _NOUNS: dict[_Wanted, str] = {
 }
 
 DEFAULT_HEIGHT_M = 2.5
-"""Of what stands on a floor plan: an ordinary storey."""
+"""Height of the cells of a floor plan: an ordinary storey."""
 
 
 @dataclass(frozen=True)
 class Frames:
-    """The pictures of a topic: when each was taken, strictly increasing."""
+    """Pictures of a topic, with the time at which each was taken, strictly increasing."""
 
     topic: str
     t_ns: Int64
@@ -84,12 +84,12 @@ class Frames:
 
 
 class FlightLogs:
-    """The logs of one flight; a context manager that closes those that it keeps open.
+    """Logs of one flight; a context manager that closes those that it keeps open.
 
     Args:
         flight: the manifest.
         base: the folder that its paths are relative to.
-        note: told what was chosen and what is doubtful, one line each.
+        note: receives each choice and each doubt, one line each.
     """
 
     def __init__(self, flight: Flight, base: Path, note: Callable[[str], None]) -> None:
@@ -99,7 +99,7 @@ class FlightLogs:
         self._logs = OpenLogs()
 
     def __enter__(self) -> Self:
-        """The logs themselves."""
+        """Return the logs themselves."""
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -107,17 +107,17 @@ class FlightLogs:
         self._logs.close()
 
     def settings(self, log: str) -> LogSource:
-        """What the manifest says of a log: one of its names, or a path."""
+        """Return the manifest's settings of a log, given by its name or by a path."""
         return self._flight.logs.get(log) or LogSource(path=[log])
 
     def paths(self, log: str) -> list[Path]:
-        """The files of a log."""
+        """Return the files of a log."""
         return [self._base / path for path in self.settings(log).path]
 
     def trajectory(
         self, log: str, topic: str | None, parent: str | None, child: str | None, *, max_gap_ns: int
     ) -> Trajectory:
-        """Poses in the log's own world and axes, at world times.
+        """Read poses in the log's own world and axes, at world times.
 
         Raises:
             DataError: no such topic or frame, several candidates, or nothing usable.
@@ -133,7 +133,7 @@ class FlightLogs:
         return self._at_world_times(log, source, gathered, lost, started_ns)
 
     def telemetry(self, pose: PoseSource, choice: TelemetryChoice) -> Telemetry:
-        """What a driver's usual topics, or two that are named, say of a drone, at the log's own times.
+        """Read a drone's telemetry from a driver's usual topics, or two named ones, at the log's own times.
 
         Raises:
             DataError: no such topics, those of several drones, or nothing usable.
@@ -151,7 +151,7 @@ class FlightLogs:
         return replace(found, dropped=dict(Counter(found.dropped) + lost))
 
     def triggers(self, log: str, topic: str | None) -> Frames | None:
-        """When a topic says that pictures were taken, at world times; None where it is none of triggers."""
+        """Read trigger times of pictures from a topic, at world times; None if it is no topic of triggers."""
         with self._open(log) as (recording, source):
             types = {known.name: known.type for known in recording.topics}
             if topic is None or types.get(topic) not in TRIGGER_TYPES:
@@ -164,7 +164,7 @@ class FlightLogs:
         return Frames(topic, self._world_times(log, t_ns, started_ns), dict(lost))
 
     def positions(self, log: str, topic: str | None) -> tuple[PositionTrack, dict[str, int]] | None:
-        """Positions on Earth of a topic, at world times, and what was lost; None where it is no NavSatFix."""
+        """Read positions on Earth from a topic, at world times, and losses; None if it is no NavSatFix."""
         with self._open(log) as (recording, source):
             types = {known.name: known.type for known in recording.topics}
             if topic is None or types.get(topic) != NAV_SAT_FIX:
@@ -176,7 +176,7 @@ class FlightLogs:
         return replace(track, t_ns=self._world_times(log, track.t_ns, started_ns)), dict(lost)
 
     def commands(self, log: str, topic: str) -> Trajectory | None:
-        """Where setpoints or plans sent a drone, at world times; None where they are poses, or nothing."""
+        """Read commanded positions of a drone, at world times; None if the topic holds no command type."""
         with self._open(log) as (recording, source):
             types = {known.name: known.type for known in recording.topics}
             if types.get(topic) not in COMMAND_TYPES:
@@ -195,7 +195,7 @@ class FlightLogs:
         order: Literal["ypr", "rpy", "pry"],
         units: Literal["deg", "rad"],
     ) -> Trajectory:
-        """A gimbal's attitude in the log's axes, at world times; its positions mean nothing."""
+        """Read a gimbal's attitude in the log's axes, at world times; its positions have no meaning."""
         with self._open(log) as (recording, source):
             name = self._choose(recording, source, "angles", topic)
             gathered = attitudes_of(
@@ -212,10 +212,10 @@ class FlightLogs:
         return self._at_world_times(log, source, gathered, lost, started_ns)
 
     def intrinsics(self, log: str, topic: str | None) -> IntrinsicsSample:
-        """The first camera info of a topic.
+        """Return the first camera info of a topic.
 
         Raises:
-            DataError: no such topic, or it is empty or changes during the flight.
+            DataError: no such topic, or it is empty or its calibration changes during the flight.
         """
         with self._open(log) as (recording, source):
             name = self._choose(recording, source, "intrinsics", topic)
@@ -235,7 +235,7 @@ class FlightLogs:
         return first
 
     def frames(self, log: str, topic: str | None) -> Frames:
-        """When the pictures of a topic were taken, at world times.
+        """Read the times at which the pictures of a topic were taken, at world times.
 
         Raises:
             DataError: no such topic, or no picture in it.
@@ -254,7 +254,7 @@ class FlightLogs:
         return Frames(name, self._world_times(log, t_ns, started_ns), dict(lost))
 
     def picture_size(self, log: str, topic: str | None) -> tuple[int, int] | None:
-        """Width and height of the pictures of a topic, by the first that is whole; None without any.
+        """Return width and height of a topic's pictures, from the first readable one; None without any.
 
         Raises:
             DataError: no such topic.
@@ -273,16 +273,16 @@ class FlightLogs:
     def maps(
         self, stated: MapSource, to_world: Callable[[Trajectory], Trajectory], *, max_gap_ns: int
     ) -> LoggedMaps:
-        """The maps of a topic, in the world, at world times.
+        """Read the maps of a topic, in the world, at world times.
 
         Args:
             stated: the log and topic.
-            to_world: takes poses from the axes and origin of the log to those of the world.
-            max_gap_ns: the longest stretch between two transforms that is bridged.
+            to_world: converts poses from the axes and origin of the log to those of the world.
+            max_gap_ns: the longest gap between two transforms that is interpolated.
 
         Raises:
-            DataError: no such topic, several candidates, no map that could be read, or one in a frame of
-                which the log does not say where it is.
+            DataError: no such topic, several candidates, no readable map, or a map in a frame that the
+                log does not connect with its world.
         """
         log = stated.log or ""
         with self._open(log) as (recording, source):
@@ -333,7 +333,7 @@ class FlightLogs:
         )
 
     def _poses_taken(self, log: str) -> list[tuple[str | None, str | None]]:
-        """Topic and parent of all poses that the flight takes from a log."""
+        """Return topic and parent of all poses that the flight takes from a log."""
         paths = self.paths(log)
         poses = [camera.pose for camera in self._flight.cameras.values()]
         taken = [(pose.log, pose.topic, pose.parent) for pose in poses]
@@ -343,13 +343,13 @@ class FlightLogs:
 
     @contextmanager
     def _open(self, log: str) -> Iterator[tuple[Log, str]]:
-        """A recording for one reading, and what it is called."""
+        """Open a recording for one reading; yield it with its name for messages."""
         paths = self.paths(log)
         with self._logs.reading(paths) as recording:
             yield recording, str(paths[0])
 
     def _choose(self, recording: Log, source: str, kind: _Wanted, topic: str | None) -> str:
-        """The topic that is named, or the only one of its kind."""
+        """Return the topic that is named, or the only one of its kind."""
         there = {candidate.name: candidate for candidate in recording.topics if _kind_of(candidate) == kind}
         listed = ", ".join(sorted(there)) or "none"
         if topic is not None:
@@ -369,7 +369,7 @@ class FlightLogs:
         return only
 
     def _poses(self, log: str, recording: Log, source: str, topic: str) -> Gathered:
-        """The poses of a topic: all at once where its messages are alike, else one by one."""
+        """Read the poses of a topic: all at once if its messages have one layout, else one by one."""
         place, stamps = f"{source} {topic}", self.settings(log).stamps
         arrays = poses_at_once(recording, topic)
         if arrays is not None:
@@ -424,7 +424,7 @@ def _kind_of(topic: Topic) -> _Wanted | None:
 
 
 def _start_ns(recording: Log) -> int:
-    """When the first message of a recording was received: what its clock's drift counts from."""
+    """Return the receipt time of a recording's first message, from which the drift of its clock counts."""
     return min((topic.first_ns for topic in recording.topics if topic.first_ns is not None), default=0)
 
 

@@ -1,4 +1,4 @@
-"""The parts of a flight as a session stores them: tables, what session.json says of each, what is doubted."""
+"""Parts of a flight as a session stores them: tables, their entries in session.json, and doubts."""
 
 from __future__ import annotations
 
@@ -51,17 +51,17 @@ from pipelines.session.tables import (
 )
 from pipelines.session.tabular import actor_table, frames_table, keypoints_table, motion_table, pose_table
 
-_MUCH_SHORTER = 0.9  # a video that covers less than this share of its pose log is worth a word
+_MUCH_SHORTER = 0.9  # a video that covers less than this share of its pose log gets a note
 _SHORTER_S = 1.0
-# Of a picture's sides. Detectors look at the box of a person, which most of them pad to 1.25 of its size: a
-# box as large as the picture reaches an eighth beyond it, and what lies further out nobody looked at.
+# Share of a picture's sides. Detectors search the box of a person; most of them pad it to 1.25 of its size.
+# If the box is as large as the picture, it then reaches an eighth beyond it: no detector looked further.
 _EXTRAPOLATED = 1 / 8
-_AHEAD_ROWS = 200_000  # of cameras read while their sources are hashed: some 70 MB
+_AHEAD_ROWS = 200_000  # of cameras that are read during hashing: some 70 MB
 
 
 @dataclass(frozen=True)
 class _CameraData:
-    """What was read of one camera."""
+    """Data of one camera, as read."""
 
     detections: Detections | None
     detector_format: str
@@ -72,7 +72,7 @@ class _CameraData:
 
     @property
     def rows(self) -> int:
-        """About how many rows it will have in all tables."""
+        """Approximate number of its rows in all tables."""
         return (
             len(self.frames.t_ns)
             + len(self.trajectory.t_ns)
@@ -81,9 +81,9 @@ class _CameraData:
 
 
 class FlightReader:
-    """Reads and stores the parts of one flight; what is doubted is collected as notes.
+    """Reader that stores the parts of one flight and collects doubts as notes.
 
-    A context manager that closes the logs.
+    It is a context manager that closes the logs.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class FlightReader:
         self._ahead: dict[str, _CameraData] = {}
 
     def __enter__(self) -> Self:
-        """The reader itself."""
+        """Return the reader itself."""
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -108,9 +108,9 @@ class FlightReader:
         self._sources.__exit__(*exception)
 
     def read_ahead(self) -> Iterator[str]:
-        """Read one camera after the other for `store_camera` to take, up to some amount of memory.
+        """Read cameras in advance for `store_camera`, one after the other, up to `_AHEAD_ROWS` rows.
 
-        A fault ends it, and shows again when that camera is stored.
+        An error ends it. The same error is raised again when that camera is stored.
         """
         for name in self._flight.cameras:
             if sum(data.rows for data in self._ahead.values()) > _AHEAD_ROWS:
@@ -123,13 +123,13 @@ class FlightReader:
             yield name
 
     def take_notes(self) -> list[str]:
-        """What was noted since the last time this was asked."""
+        """Return the notes since the last call, each once."""
         taken = list(dict.fromkeys(self._notes))
         self._notes.clear()
         return taken
 
     def store_camera(self, name: str, folder: Path) -> None:
-        """Write the tables of one camera and what is to be said of them."""
+        """Write the tables of one camera, its entry and its warnings."""
         camera = self._flight.cameras[name]
         data = self._ahead.pop(name, None) or self._read_camera(name)
         detections, frames, trajectory = data.detections, data.frames, data.trajectory
@@ -176,7 +176,7 @@ class FlightReader:
         write_json(folder / "entry.json", {"entry": entry.model_dump(mode="json"), "warnings": warnings})
 
     def _read_camera(self, name: str) -> _CameraData:
-        """Everything that is read of one camera, checked against each other."""
+        """Read everything about one camera, and check the parts against each other."""
         camera, sources = self._flight.cameras[name], self._sources
         video = sources.video(camera)
         detections, detector_format = None, ""
@@ -200,7 +200,7 @@ class FlightReader:
         return _CameraData(detections, detector_format, intrinsics, frames, trajectory, self.take_notes())
 
     def origin(self) -> OriginEntry | None:
-        """Where on Earth the world lies, and what is doubtful about heights counted from there."""
+        """Return the world's origin on Earth, if known; note cameras with different height references."""
         found = self._sources.origin()
         if found is None:
             return None
@@ -213,7 +213,7 @@ class FlightReader:
         )
 
     def store_truth(self, folder: Path, entries: Mapping[str, CameraEntry]) -> TruthEntry | None:
-        """Write what is known to be true and say what it spans."""
+        """Write the ground truth, and return its entry with its joints, cameras and time span."""
         truth = self._flight.truth
         if truth is None:
             return None
@@ -246,7 +246,7 @@ class FlightReader:
         )
 
     def _note_truth_missing(self, motion: JointMotion) -> tuple[int, dict[str, int]]:
-        """Count true positions that are missing, and those of them that were dropped; note both."""
+        """Count the true positions that are missing, and those of them that were dropped; note both."""
         is_missing = np.isnan(motion.position[..., 0])
         missing = int(is_missing.sum())
         if motion.dropped:
@@ -256,7 +256,7 @@ class FlightReader:
         return missing, motion.dropped
 
     def store_actor(self, folder: Path, entries: Mapping[str, CameraEntry]) -> ActorEntry | None:
-        """Write where the actor was, as logged."""
+        """Write the actor's logged positions."""
         actor = self._flight.actor
         if actor is None:
             return None
@@ -275,7 +275,7 @@ class FlightReader:
         )
 
     def store_map(self, folder: Path, entries: Mapping[str, CameraEntry]) -> MapEntry | None:
-        """Write what stands around: one map, or those of a log that replaced each other."""
+        """Write the map of obstacles: one from a file, or those of a log that replaced each other."""
         stated = self._flight.map
         if stated is None:
             return None
@@ -303,7 +303,7 @@ class FlightReader:
         )
 
     def store_plan(self, folder: Path, entries: Mapping[str, CameraEntry]) -> dict[str, PlannedEntry] | None:
-        """Write where the on-board planner sent the drones."""
+        """Write the positions that the on-board planner commanded."""
         plan = self._flight.plan
         if plan is None:
             return None
@@ -403,7 +403,7 @@ def _keypoints_entry(
 
 
 def _near_picture(detections: Detections, intrinsics: Intrinsics) -> Detections:
-    """Leave out and count keypoints further outside the picture than a detector may extrapolate."""
+    """Drop and count keypoints further outside the picture than a detector may extrapolate."""
     size = np.array([intrinsics.width, intrinsics.height])
     margin = _EXTRAPOLATED * size
     with np.errstate(invalid="ignore"):
@@ -428,7 +428,7 @@ def _near_picture(detections: Detections, intrinsics: Intrinsics) -> Detections:
 
 
 def _within(detections: Detections, frames: CameraFrames) -> Detections:
-    """The detections of frames that there are; the others are counted."""
+    """Keep the detections in frames that have a time; count the others."""
     known = np.isin(detections.frame, frames.frame)
     if known.all():
         return detections
@@ -444,7 +444,7 @@ def _within(detections: Detections, frames: CameraFrames) -> Detections:
 
 
 def _clock_sigma_s(camera: Camera, frames: CameraFrames) -> float:
-    """Return what the manifest states; before the default of a clock comes what was found out."""
+    """Return the clock sigma of the manifest; one estimated by motion comes before the manifest's default."""
     clock = camera.clock
     if clock is None or (frames.start_sigma_s and "sigma_s" not in clock.model_fields_set):
         return frames.start_sigma_s
@@ -465,11 +465,11 @@ def _rate(t_ns: Int64) -> float | None:
 
 
 def _span_of_pictures(entries: Mapping[str, CameraEntry]) -> tuple[int, int]:
-    """The first and the last frame of all cameras, ns."""
+    """Return the first and the last frame time of all cameras, ns."""
     frames = [entry.frames for entry in entries.values()]
     return min(each.first_t_ns for each in frames), max(each.last_t_ns for each in frames)
 
 
 def span_words(first_ns: int, last_ns: int) -> str:
-    """A stretch of time as messages say it."""
+    """Format a time span for messages."""
     return f"{first_ns / 1e9:.3f} to {last_ns / 1e9:.3f} s"

@@ -1,7 +1,6 @@
-"""What a manifest names, read as records: in world axes (ENU), at world times, of the picture's size.
+"""Readers of a manifest's sources as records: in world axes (ENU), at world times, for the pictures' size.
 
-Everything a user may have got wrong between two sources shows here, and is refused with the file at fault
-or said as a note.
+Contradictions between two sources show here. They are refused with the name of the faulty file, or noted.
 """
 
 from __future__ import annotations
@@ -60,18 +59,18 @@ from pipelines.session.registries import (
     recognise,
 )
 
-_FARTHEST_M = 10_000  # a person's joints stay nearer to their median than this in any flight
+_FARTHEST_M = 10_000  # in any flight a person's joints are closer to their median than this
 _LARGEST_M = 1e8  # metric grids have coordinates up to 1e7
 
 
 class FlightSources:
-    """Reads the parts of one flight; a context manager that closes the logs.
+    """Reader of the parts of one flight; a context manager that closes the logs.
 
     Args:
         flight: the manifest.
         manifest: its path.
-        max_gap_ns: the longest stretch between two logged poses or angles that is bridged.
-        note: told what was chosen and what is doubtful, one line each.
+        max_gap_ns: the longest gap between two logged poses or angles that is interpolated.
+        note: receives each choice and each doubt, one line each.
     """
 
     def __init__(
@@ -90,7 +89,7 @@ class FlightSources:
         )
 
     def __enter__(self) -> Self:
-        """The sources themselves."""
+        """Return the sources themselves."""
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -98,16 +97,16 @@ class FlightSources:
         self._logs.__exit__(*exception)
 
     def origin(self) -> Origin | None:
-        """Where on Earth the world lies, where that is known; heights that do not go together are noted."""
+        """Return the world's origin on Earth, if known; note cameras with different height references."""
         self._telemetry.doubt_heights()
         return self._telemetry.origin()
 
     def log_clock(self, camera: Camera) -> ClockFit | None:
-        """How the clock of a drone's own log was taken to GPS time; None where it was not."""
+        """Return the fit of a drone's log clock to GPS time; None without one."""
         return self._telemetry.fit(camera.pose) if camera.pose.is_telemetry else None
 
     def stamps(self, log: str) -> str:
-        """Which stamps of a log's messages count: header or receive."""
+        """Return which stamps of a log's messages are used: header or receive."""
         return self._logs.settings(log).stamps
 
     def files(self, log: str) -> list[str]:
@@ -117,7 +116,7 @@ class FlightSources:
     # --- keypoints and pictures ------------------------------------------------------------------------
 
     def keypoints(self, source: KeypointSource) -> tuple[Detections, str]:
-        """The keypoints that came with a camera, and the name of their format."""
+        """Read the keypoints that the manifest gives for a camera; return them with their format's name."""
         path = self._base / source.path
         if source.format:
             reader = FORMATS.get(source.format)
@@ -133,7 +132,7 @@ class FlightSources:
         return detections, reader.name
 
     def video(self, camera: Camera) -> VideoIndex | None:
-        """The index of a camera's video file; None where it has none."""
+        """Return the index of a camera's video file; None if it has none."""
         if camera.video is None or camera.video.path is None:
             return None
         path = self._base / camera.video.path
@@ -142,7 +141,7 @@ class FlightSources:
     def intrinsics(
         self, name: str, camera: Camera, video: VideoIndex | None, detections: Detections | None
     ) -> Intrinsics:
-        """The intrinsics of a camera; see `CalibrationSources`."""
+        """Return the intrinsics of a camera; see `CalibrationSources`."""
         return self._calibrations.intrinsics(name, camera, video, detections)
 
     def frames(
@@ -153,11 +152,11 @@ class FlightSources:
         detections: Detections | None,
         intrinsics: Intrinsics,
     ) -> CameraFrames:
-        """When each picture was taken; see `FrameSources`."""
+        """Read the time at which each picture was taken; see `FrameSources`."""
         return self._frames.frames(name, camera, video, detections, intrinsics)
 
     def media(self, camera: Camera, frames: CameraFrames, session: Path) -> MediaEntry | None:
-        """Where the pictures lie, as seen from the session: it is moved together with its flight."""
+        """Return the paths of the pictures relative to the session, which moves together with its flight."""
         video = camera.video
         if video is None:
             return None
@@ -172,10 +171,10 @@ class FlightSources:
     # --- poses -----------------------------------------------------------------------------------------
 
     def trajectory(self, name: str, camera: Camera, first_frame_ns: int) -> Trajectory:
-        """world_from_camera over time; a still camera has one row, at its first frame.
+        """Read world_from_camera over time; a static camera has one row, at its first frame.
 
         Raises:
-            DataError: nothing usable, or the camera's place on the body is not stated.
+            DataError: nothing usable, or the manifest does not state the camera's mount on the body.
         """
         pose = camera.pose
         if pose.static:
@@ -201,7 +200,7 @@ class FlightSources:
         return self._on_body(name, camera, turned)
 
     def _local(self, source: Path | str, trajectory: Trajectory) -> Trajectory:
-        """The same trajectory; refused where it counts from another place than a world on Earth does."""
+        """Return the same trajectory; refuse projected coordinates if the world has an origin on Earth."""
         self._refuse_projected(source, trajectory.position)
         return trajectory
 
@@ -240,7 +239,7 @@ class FlightSources:
         return moved if of_camera else self._on_body(name, camera, moved)
 
     def _mounted(self, name: str, mount: Mount | None) -> tuple[Float, Float]:
-        """Lever arm [3] and rotation [4] of a camera in its body, or in its gimbal if there is one."""
+        """Return lever arm [3] and rotation [4] of a camera in its body, or in its gimbal if there is one."""
         try:
             return _mounted(mount)
         except ValueError as error:
@@ -248,7 +247,7 @@ class FlightSources:
             raise DataError(place, str(error), "say how the camera sits on the body") from None
 
     def _on_body(self, name: str, camera: Camera, body: Trajectory) -> Trajectory:
-        """The poses of the camera, from those of the body that carries it."""
+        """Compute the poses of the camera from those of the body that carries it."""
         lever_arm, rotation = self._mounted(name, camera.mount)
         world_from_body = (body.position, body.quaternion_xyzw)
         dropped = dict(body.dropped)
@@ -279,7 +278,7 @@ class FlightSources:
     def _on_gimbal(
         self, camera: Camera, body: Trajectory, lever_arm: Float, rotation: Float
     ) -> tuple[Float, Float, dict[str, int]]:
-        """Positions, rotations, and what was lost on the way."""
+        """Compute positions and rotations of a camera on a gimbal; also return losses by cause."""
         gimbal = camera.gimbal
         if gimbal is None:
             raise ValueError("the camera has no gimbal")
@@ -300,7 +299,7 @@ class FlightSources:
     # --- actor, map, truth -----------------------------------------------------------------------------
 
     def actor(self, log: str, topic: str | None) -> Trajectory:
-        """Where the actor was, as logged; its rotation means nothing."""
+        """Read the actor's logged positions; the rotation has no meaning."""
         if (found := self._logs.positions(log, topic)) is not None:
             track, lost = found
             return replace(self._telemetry.points("actor", log, track), dropped=lost)
@@ -311,7 +310,7 @@ class FlightSources:
         )
 
     def planned(self, camera: str, plan: Plan) -> Trajectory:
-        """Where a drone was sent; its rotation means nothing."""
+        """Read the commanded positions of a drone; the rotation has no meaning."""
         if camera in plan.files:
             path = self._base / plan.files[camera]
             filed = recognise(path, TrajectoryFormat, "file of commanded poses").read_trajectory(path)
@@ -326,14 +325,14 @@ class FlightSources:
         )
 
     def map(self, stated: str, resolution_m: float | None) -> Occupancy:
-        """What stands around, from a file."""
+        """Read the map of obstacles from a file."""
         path = self._base / stated
         occupancy = recognise(path, MapFormat, "map").read_map(path, resolution_m=resolution_m)
         self._refuse_projected(path, occupancy.origin[None])
         return occupancy
 
     def logged_maps(self, stated: Map) -> LoggedMaps:
-        """What stands around, from a log: maps that replace each other, in ENU axes at world times."""
+        """Read the maps of a log, which replace each other, in ENU axes at world times."""
         settings = self._logs.settings(stated.log or "")
         axes = self._axes(settings.axes)
         found = self._logs.maps(
@@ -349,10 +348,10 @@ class FlightSources:
         return replace(found, maps=map(in_place, found.maps))
 
     def true_joints(self, source: TruthJoints) -> JointMotion:
-        """Read the true joints; positions too far from the others to be true are left out and counted.
+        """Read the true joints; drop and count positions too far from the others to be true.
 
         Raises:
-            DataError: the file cannot be used, its axes are not known, or no position is left.
+            DataError: the file cannot be used, its axes are unknown, or no position is left.
         """
         path = self._base / source.path
         named = FORMATS.get(source.format) if source.format else None
@@ -377,14 +376,14 @@ class FlightSources:
         return replace(motion, t_ns=motion.t_ns + round(source.offset_s * 1e9))
 
     def true_poses(self, stated: str) -> Trajectory:
-        """The true poses of one camera."""
+        """Read the true poses of one camera."""
         path = self._base / stated
         trajectory = recognise(path, TrajectoryFormat, "camera trajectory").read_trajectory(path)
         return self._local(path, in_enu(trajectory, self._flight.world.frame))
 
 
 def _without_far_joints(motion: JointMotion) -> JointMotion:
-    """Make positions missing that are incomplete, or too far from the median of all to be true."""
+    """Set positions to NaN that are incomplete, or too far from the median of all to be true."""
     position = np.where(np.isfinite(motion.position).all(axis=-1, keepdims=True), motion.position, np.nan)
     known = position[~np.isnan(position[..., 0])]
     if not len(known):
@@ -403,20 +402,20 @@ def _without_far_joints(motion: JointMotion) -> JointMotion:
 
 
 def source_files(path: Path) -> list[Path]:
-    """A stated source and the files that it leads to: a floor plan is a YAML and a picture."""
+    """Return a source and the files that it refers to: a floor plan is a YAML and a picture."""
     if path.suffix.lower() in {".yaml", ".yml"} and ROS_MAP.recognises(path):
         return [path, *ROS_MAP.pictures(path)]
     return [path]
 
 
 def losses(dropped: dict[str, int]) -> str:
-    """What was dropped, in words."""
+    """Format the losses by cause, in words."""
     return ", ".join(f"{count} {cause}" for cause, count in dropped.items()) or "it is empty"
 
 
 def _mounted(mount: Mount | None) -> tuple[Float, Float]:
-    """Lever arm [3] and rotation [4] of a camera in its body, or in its gimbal if there is one."""
-    if mount is None:  # the manifest makes sure that there is a gimbal then
+    """Return lever arm [3] and rotation [4] of a camera in its body, or in its gimbal if there is one."""
+    if mount is None:  # the manifest's checks guarantee a gimbal in this case
         return np.zeros(3), body_from_camera("forward")
     if mount.body_from_camera is not None:
         stated = mount.body_from_camera

@@ -1,4 +1,4 @@
-"""When the pictures of a camera were taken, by whatever its manifest says of it."""
+"""Times at which the pictures of a camera were taken, from the source in its manifest."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ from pipelines.session.errors import DataError
 from pipelines.session.manifest import Camera, FrameTimes
 from pipelines.session.records import Detections, Int64, Trajectory, VideoIndex
 
-_MOST_FRAMES = 20_000_000  # a week at 30 Hz: more is a frame number misread from a date
-_WATCHED_NS = 120 * 10**9  # of a video, to find out when it began
+_MOST_FRAMES = 20_000_000  # a week at 30 Hz; a larger number was misread from a date
+_WATCHED_NS = 120 * 10**9  # of a video, to estimate when it began
 
 
 @dataclass(frozen=True)
 class CameraFrames:
-    """The pictures of a camera in world time; numbers and times strictly increase."""
+    """Pictures of a camera in world time; numbers and times strictly increase."""
 
-    frame: Int64  # [F] numbers, as keypoints count them
+    frame: Int64  # [F] frame numbers as in the keypoints
     t_ns: Int64  # [F]
     pts_ns: Int64  # [F] since the first picture of the video
-    topic: str | None = None  # the pictures themselves lie in this topic of a log
-    dropped: dict[str, int] = field(default_factory=dict)  # pictures that are not among them, by cause
-    start_sigma_s: float = 0.0  # of all times together, where it was found out
+    topic: str | None = None  # the topic of the log that holds the pictures themselves
+    dropped: dict[str, int] = field(default_factory=dict)  # pictures that were left out, by cause
+    start_sigma_s: float = 0.0  # sigma of the common offset of all times, if it was estimated
 
 
 class FrameSources:
-    """Reads the frame times of one flight.
+    """Reader of the frame times of one flight.
 
     Args:
         manifest: the path of the manifest.
         logs: of the flight.
         telemetry: of the flight.
-        trajectory: the poses of a camera, by name and manifest, for a video whose start is found by motion.
-        max_gap_ns: the longest stretch between two poses that is bridged.
-        note: told what was chosen and what is doubtful, one line each.
+        trajectory: reads the poses of a camera, by name and manifest, for a video whose start is estimated.
+        max_gap_ns: the longest gap between two poses that is interpolated.
+        note: receives each choice and each doubt, one line each.
     """
 
     def __init__(
@@ -76,15 +76,16 @@ class FrameSources:
         detections: Detections | None,
         intrinsics: Intrinsics,
     ) -> CameraFrames:
-        """When each picture was taken.
+        """Read the time at which each picture was taken.
 
-        By what the manifest states: `fps` from `start` on, a file or topic of frame times, the stamps of
-        pictures in a log, or the container's own stamps from `start` on. The offset of the camera's clock is
-        added. Where the start is to be found by motion, it is the time at which the pictures move as the
-        poses do: world time, to which nothing is added. A stated start and offset say where to look for it.
+        The source is the one that the manifest states: `fps` from `start` on, a file or topic of frame times,
+        the stamps of pictures in a log, or the container's own stamps from `start` on. The offset of the
+        camera's clock is added. If the start is estimated by motion, it is the time at which the motion in
+        the pictures fits the poses. That is world time, so no offset is added. A stated start, with the
+        offset, then only says where to search.
 
         Raises:
-            DataError: nothing says when the pictures were taken, or what does is unusable.
+            DataError: there is no source of frame times, or it is unusable.
         """
         offset_ns = camera.clock.offset_ns if camera.clock else 0
         unclocked = self._unclocked_frames(name, camera, video, detections)
@@ -168,9 +169,9 @@ class FrameSources:
         )
 
     def _start_ns(self, name: str, camera: Camera, times: FrameTimes) -> int:
-        """When a video begins that has stamps of its own."""
+        """Return the start of a video that has stamps of its own."""
         if times.start_from == "motion":
-            return 0  # found when the pictures and the poses are there
+            return 0  # estimated later, from the pictures and the poses
         if times.start_from is None:
             return times.start_ns
         path = self._base / (camera.video.path or "") if camera.video else None
@@ -191,7 +192,7 @@ class FrameSources:
     def _begun_by_motion(
         self, name: str, camera: Camera, frames: CameraFrames, intrinsics: Intrinsics, near_ns: int | None
     ) -> CameraFrames:
-        """Frames of a video at the times at which its pictures turn as the poses do."""
+        """Shift the frames of a video in time so that the motion in its pictures fits the poses."""
         place = f"{self._manifest}: cameras.{name}.frame_times"
         remedy = "say start: SECONDS instead, or give the stamps of a log"
         if camera.video is None or camera.video.path is None or camera.pose.static:
@@ -220,7 +221,7 @@ class FrameSources:
     def _frames_by_stamps(
         self, t_ns: Int64, dropped: dict[str, int], pictures: CameraFrames | None
     ) -> CameraFrames:
-        """Frame times that a log states, for the frames of a video in the same order."""
+        """Assign the frame times of a log to the frames of a video, in the same order."""
         if pictures is None:
             since_start = t_ns - t_ns[0]
             return CameraFrames(np.arange(len(since_start)), t_ns, since_start, dropped=dropped)
@@ -238,7 +239,7 @@ class FrameSources:
 
 
 def _pictures(video: VideoIndex | None, logged: Frames | None) -> CameraFrames | None:
-    """The pictures of a video or a topic, by their own stamps; None where there are none."""
+    """Return the pictures of a video or a topic, by their own stamps; None if there are none."""
     if video is not None:
         return CameraFrames(np.arange(video.count), video.pts_ns, video.pts_ns, dropped=video.dropped)
     if logged is not None:
@@ -249,6 +250,6 @@ def _pictures(video: VideoIndex | None, logged: Frames | None) -> CameraFrames |
 
 
 def _ticks_ns(count: int, fps: Fraction) -> Int64:
-    """Exact times of `count` frames from 0, each rounded to a ns; Python's integers cannot overflow here."""
+    """Return the times of `count` frames from 0, each rounded to a ns; Python's integers never overflow."""
     period = Fraction(1_000_000_000) / fps
     return np.array([round(k * period) for k in range(count)], dtype=np.int64)

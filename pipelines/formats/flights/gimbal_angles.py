@@ -1,4 +1,4 @@
-"""Gimbals as a manifest states them: angles of a topic, or fixed ones."""
+"""Gimbal attitudes as a manifest states them: angles of a topic, or fixed angles."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _FIXED = "fixed angles"
 
 
 def stated_angles(gimbal: Gimbal, logs: FlightLogs, frame: Axes) -> AttitudeTrack:
-    """The attitude of a gimbal with a topic or fixed angles, in our axes at world times.
+    """Return the attitude of a gimbal with a topic or fixed angles, in our axes at world times.
 
     Args:
         gimbal: its part of the manifest.
-        logs: the flight's.
-        frame: the axes where neither gimbal nor log state any; fixed angles are NED always.
+        logs: the flight's logs.
+        frame: the axes if neither gimbal nor log state any; fixed angles are always NED.
 
     Raises:
         DataError: the topic cannot be read.
@@ -43,7 +43,7 @@ def stated_angles(gimbal: Gimbal, logs: FlightLogs, frame: Axes) -> AttitudeTrac
 
 
 def attitudes_at(track: AttitudeTrack, t_ns: Int64, *, max_gap_ns: int) -> Float:
-    """Attitudes [N, 4] at some times, NaN where the track says nothing; fixed angles hold always."""
+    """Interpolate attitudes [N, 4] at given times, NaN outside the track; fixed angles always hold."""
     if track.name == _FIXED:
         return np.repeat(track.quaternion_xyzw, len(t_ns), axis=0)
     return interpolate_poses(

@@ -1,4 +1,4 @@
-"""Times of logs: taken to world time by the clock that is stated, and what makes their stamps doubtful."""
+"""Conversion of log times to world time by the stated clock, and doubts about stamps."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pipelines.session.records import Int64
 
 
 def world_times(clock: LogClock, t_ns: Int64, since_ns: int) -> Int64:
-    """World times [N] of a log's own.
+    """Convert a log's own times to world times [N].
 
     Args:
-        clock: as the manifest states it.
+        clock: the log's clock in the manifest.
         t_ns: [N].
-        since_ns: what the drift counts from.
+        since_ns: the time from which the drift counts.
     """
     drift_ns = np.round((t_ns - since_ns) * (clock.drift_ppm * 1e-6)).astype(np.int64)
     world_ns: Int64 = t_ns + drift_ns + round(clock.offset_s * 1e9)
@@ -23,11 +23,11 @@ def world_times(clock: LogClock, t_ns: Int64, since_ns: int) -> Int64:
 
 
 def doubts_of_stamps(check: StampCheck, stamps: str) -> list[str]:
-    """How the stamps of a log disagree with each other, a line each.
+    """Describe how the stamps of a log disagree with each other, one line each.
 
     Args:
-        check: what was found of them.
-        stamps: which are used, header or receive.
+        check: statistics of the stamps.
+        stamps: the stamps in use, header or receive.
     """
     used, doubts = f"{stamps} stamps are used", []
     if check.without_header:

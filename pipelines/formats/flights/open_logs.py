@@ -1,4 +1,4 @@
-"""Logs that stay open from one reading to the next, so that their indices are read once."""
+"""Logs that stay open between readings, so that their indices are read once."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _KEPT_FILES = 64
 
 
 class OpenLogs:
-    """Recordings by their files; those of our own formats stay open, as far as the bounds allow."""
+    """Recordings by their files; those of our own formats stay open, within the bounds."""
 
     def __init__(self) -> None:
-        self._kept: dict[tuple[Path, ...], OpenLog] = {}  # the one that was used last comes last
+        self._kept: dict[tuple[Path, ...], OpenLog] = {}  # the most recently used one is last
 
     @contextmanager
     def reading(self, files: Sequence[Path]) -> Iterator[Log]:
-        """A recording for one reading.
+        """Yield a recording for one reading.
 
         Raises:
             DataError: a file is missing, damaged beyond use, or no log.
@@ -36,7 +36,7 @@ class OpenLogs:
             return
         self._kept[paths] = recording
         self._close_all_beyond_bounds()
-        recording.forget()  # what was lost in reading another topic
+        recording.forget()  # losses counted while another topic was read
         yield recording
 
     def close(self) -> None:

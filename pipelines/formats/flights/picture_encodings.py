@@ -1,6 +1,6 @@
-"""Pictures of logs as BGR: compressed ones, and pixels as ROS names their layouts.
+"""Conversion of logged pictures to BGR: compressed ones, and raw pixels in ROS's layouts.
 
-Names and layouts are those of ROS' sensor_msgs/image_encodings.hpp, which Foxglove's RawImage shares.
+Names and layouts are those of ROS' sensor_msgs/image_encodings.hpp, which Foxglove's RawImage also uses.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ _LAYOUTS: dict[str, tuple[int, str | None]] = {
     "yuv422_yuy2": (2, "YUV2BGR_YUY2"),
     "yuyv": (2, "YUV2BGR_YUY2"),
 }
-"""Of every encoding: bytes of a pixel, and what OpenCV calls its conversion."""
+"""Bytes of a pixel and the name of OpenCV's conversion (None if none is needed), by encoding."""
 
 KNOWN = tuple(_LAYOUTS)
-"""The encodings of raw pictures that can be decoded."""
+"""Encodings of raw pictures that can be decoded."""
 
 
 def is_known(sample: PictureSample) -> bool:
-    """Whether pictures like this one can be decoded at all; of compressed ones only trying tells."""
+    """Return True if pictures like this one can be decoded; compressed ones must be tried (True)."""
     return sample.width is None or sample.encoding.lower() in _LAYOUTS
 
 
 def decode(sample: PictureSample) -> Picture | None:
-    """A picture of a log as BGR [H, W, 3]; None where its bytes are damaged or its encoding is not known."""
+    """Decode a logged picture to BGR [H, W, 3]; None if its bytes are damaged or its encoding is unknown."""
     import cv2
 
     try:

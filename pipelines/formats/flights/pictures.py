@@ -1,4 +1,4 @@
-"""The pictures of a camera by frame number, wherever they lie: in a video file or in a topic of a log."""
+"""Pictures of a camera by frame number, from a video file or from a topic of a log."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ from pipelines.session.registries import Log, LogFormat, recognise
 from pipelines.session.run_notes import noted_stamps
 from pipelines.session.storage import file_stamp, sha256_of
 
-_MAY_LEAP_NS = 1_000_000_000  # transport and decoding take less
+_MAY_LEAP_NS = 1_000_000_000  # transport and decoding take less time
 
 
 class Pictures(Protocol):
-    """Pictures at hand; a context manager."""
+    """Reader of pictures; a context manager."""
 
     def read(self, number: int) -> Picture | None:
-        """One picture, BGR; None where it cannot be decoded."""
+        """Read one picture, BGR; None if it cannot be decoded."""
 
     def __enter__(self) -> Self:
-        """The pictures themselves."""
+        """Return the reader itself."""
 
     def __exit__(self, *exception: object) -> None:
         """Close the files."""
 
 
 class Stamped(Protocol):
-    """What is known of a picture without its pixels."""
+    """Stamps of a picture, without its pixels."""
 
     @property
     def stamp_ns(self) -> int:
-        """Of its header; 0 without one."""
+        """Stamp of its header; 0 without one."""
 
     @property
     def receive_ns(self) -> int:
-        """Of its receipt."""
+        """Stamp of its receipt."""
 
 
 class _Stamps(NamedTuple):
@@ -61,15 +61,15 @@ _Stamped = TypeVar("_Stamped", bound=Stamped)
 
 @contextmanager
 def open_pictures(session: Path, description: Description, camera: str) -> Iterator[Pictures]:
-    """Open the pictures that a session was made from, and see that they stay those while they are read.
+    """Open the pictures that a session was made from; check before and after that they did not change.
 
     Args:
         session: its folder.
         description: its session.json.
-        camera: one that has pictures.
+        camera: name of a camera that has pictures.
 
     Raises:
-        DataError: they are not there any more, are not those that were ingested, or cannot be read.
+        DataError: they are missing, differ from those that were ingested, or cannot be read.
     """
     media = _media(description, camera)
     refuse_changed_pictures(session, description, [camera])
@@ -83,18 +83,18 @@ def open_pictures(session: Path, description: Description, camera: str) -> Itera
 
 
 def refuse_changed_pictures(session: Path, description: Description, cameras: Iterable[str]) -> None:
-    """Refuse pictures that are not those that were ingested.
+    """Refuse pictures that differ from those that were ingested.
 
-    A file of the size and the time of change that ingest noted is taken to be the same. Of any other the
-    content is hashed: copies pass. So do pictures that are gone, which whoever opens them refuses.
+    A file with the size and the time of change that ingest noted is taken to be the same. The content of any
+    other file is hashed, so copies pass. Missing files pass too; opening them fails later.
 
     Args:
         session: its folder.
         description: its session.json.
-        cameras: the names of some that have pictures.
+        cameras: names of cameras that have pictures.
 
     Raises:
-        DataError: another content lies in the place of what was ingested.
+        DataError: a file has other content than the one that was ingested.
     """
     noted = noted_stamps(session, description.sources)
     for camera in cameras:
@@ -113,8 +113,8 @@ def refuse_changed_pictures(session: Path, description: Description, cameras: It
 
 
 @cache
-def _content(path: Path, stamp: str) -> str:  # noqa: ARG001  # another stamp asks for another reading
-    """The SHA-256 of a source, read once as long as its stamp stays."""
+def _content(path: Path, stamp: str) -> str:  # noqa: ARG001  # the stamp is part of the cache key
+    """Compute the SHA-256 of a source; the result is cached for as long as its stamp stays."""
     return sha256_of(path)
 
 
@@ -126,7 +126,7 @@ def _media(description: Description, camera: str) -> MediaEntry:
 
 
 class LoggedPictures:
-    """Pictures of a topic, numbered as ingest numbers them; reading forward is cheap, backward starts anew.
+    """Pictures of a topic, numbered as in ingest; reading forward is cheap, reading backward restarts.
 
     Args:
         paths: the files of the recording.
@@ -134,7 +134,7 @@ class LoggedPictures:
         stamps: which stamps order the pictures: header or receive.
 
     Raises:
-        DataError: the log cannot be opened, or nobody knows how its pictures are encoded.
+        DataError: the log cannot be opened, or the encoding of its pictures is unknown.
     """
 
     def __init__(self, paths: list[Path], topic: str, stamps: str) -> None:
@@ -152,7 +152,7 @@ class LoggedPictures:
             unless_known.pop_all()
 
     def __enter__(self) -> Self:
-        """The pictures themselves."""
+        """Return the pictures themselves."""
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -160,7 +160,7 @@ class LoggedPictures:
         self._stack.close()
 
     def read(self, number: int) -> Picture | None:
-        """One picture, BGR; None where it cannot be decoded or the log ends before it."""
+        """Read one picture, BGR; None if it cannot be decoded or the log ends before it."""
         if number < self._next:
             self._next, self._samples = 0, self._begin()
         for sample in self._samples:
@@ -170,7 +170,7 @@ class LoggedPictures:
         return None
 
     def _refuse_unknown(self) -> None:
-        """All pictures of a camera are encoded alike: better said at once than found damaged one by one."""
+        """Refuse a topic with an unknown encoding at once, because all its pictures share the encoding."""
         first = next(self._begin(), None)
         if first is not None and not is_known(first):
             raise DataError(
@@ -186,7 +186,7 @@ class LoggedPictures:
 
 
 def picture_samples(recording: Log, topic: str, source: Path | str) -> Iterator[Sample]:
-    """What a topic of pictures holds, in the order of receipt; see `all_samples`.
+    """Yield the samples of a topic of pictures, in the order of receipt; see `all_samples`.
 
     Args:
         recording: an open log.
@@ -199,12 +199,12 @@ def picture_samples(recording: Log, topic: str, source: Path | str) -> Iterator[
 
 
 def picture_stamps(recording: Log, topic: str, source: Path | str) -> tuple[Int64, Int64]:
-    """When the pictures of a topic were taken (0 where it does not say) and received: [N] and [N].
+    """Return header stamps [N] (0 without one) and stamps of receipt [N] of a topic's pictures.
 
-    In the order of receipt.
+    The order is that of receipt.
 
-    Of the same pictures as `picture_samples` gives. Where their messages are laid out alike, only the
-    beginning of each is looked at.
+    The pictures are the same as those of `picture_samples`. If their messages have one layout, only the
+    beginning of each is read.
 
     Raises:
         DataError: the topic holds something else.
@@ -228,15 +228,15 @@ def _stamps_at_once(recording: Log, topic: str) -> tuple[Int64, Int64] | None:
 
 
 def later_pictures(pictures: Iterator[_Stamped], stamps: str) -> Iterator[_Stamped]:
-    """The pictures whose stamp is above all before: frame k of a topic is the k-th of these."""
+    """Yield the pictures whose stamp is above all before: frame k of a topic is the k-th of these."""
     newest: _Stamped | None = None
     leapt: _Stamped | None = None
     for picture in pictures:
         if newest is not None:
             if stamp_of(picture, stamps) <= stamp_of(newest, stamps):
                 continue
-            # One damaged stamp far ahead must not cost all the pictures behind it; a clock that was set
-            # forward shows in the next picture too.
+            # One damaged stamp far ahead must not cost all the pictures after it. If the clock was really set
+            # forward, the next picture shows the same jump.
             if _leap_ns(newest, picture) > _MAY_LEAP_NS and (
                 leapt is None or abs(_leap_ns(leapt, picture)) > _MAY_LEAP_NS
             ):
@@ -247,7 +247,7 @@ def later_pictures(pictures: Iterator[_Stamped], stamps: str) -> Iterator[_Stamp
 
 
 def later_times(header_ns: Int64, receive_ns: Int64, stamps: str) -> Int64:
-    """The stamps of the `later_pictures`, [n], strictly increasing.
+    """Return the stamps of the `later_pictures`, [n], strictly increasing.
 
     Args:
         header_ns: [N] stamps of the headers of all pictures, in the order of receipt; 0 without one.
@@ -257,18 +257,18 @@ def later_times(header_ns: Int64, receive_ns: Int64, stamps: str) -> Int64:
     times = np.where((header_ns != 0) & (stamps == "header"), header_ns, receive_ns)
     leaps = np.where((header_ns[1:] != 0) & (header_ns[:-1] != 0), np.diff(header_ns - receive_ns), 0)
     if (np.diff(times) > 0).all() and (leaps <= _MAY_LEAP_NS).all():
-        return times  # as those of a camera are
+        return times  # the usual case
     pictures = map(_Stamps, header_ns.tolist(), receive_ns.tolist())
     return np.array([stamp_of(picture, stamps) for picture in later_pictures(pictures, stamps)], np.int64)
 
 
 def _leap_ns(before: Stamped, after: Stamped) -> int:
-    """How much more the header's clock went on between two pictures than that of receipt."""
+    """Return by how much the header clock advanced more than the receipt clock between two pictures, ns."""
     if not before.stamp_ns or not after.stamp_ns:
         return 0
     return (after.stamp_ns - before.stamp_ns) - (after.receive_ns - before.receive_ns)
 
 
 def stamp_of(picture: Stamped, stamps: str) -> int:
-    """The stamp that counts: that of the header where it has one and it is wanted."""
+    """Return the header stamp if it exists and is wanted, else the stamp of receipt."""
     return picture.stamp_ns if stamps == "header" and picture.stamp_ns else picture.receive_ns

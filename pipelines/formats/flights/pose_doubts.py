@@ -1,4 +1,4 @@
-"""What makes the poses of a log doubtful although each of them can be used."""
+"""Doubts about the poses of a log, although each of them can be used."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import numpy as np
 from pipelines.session.records import Trajectory
 
 _FASTEST_MPS = 100.0  # no camera that films a person flies faster
-_FROZEN_S, _FROZEN_POSES = 1.0, 10  # a pose that stays the same for longer, and for as many messages
+_FROZEN_S, _FROZEN_POSES = 1.0, 10  # a frozen pose stays the same for longer, and for as many messages
 
 
 def doubts_of_speed(trajectory: Trajectory) -> list[str]:
-    """Where poses jump further than anything flies, in one line or none."""
+    """Report poses that jump further than anything flies, in one line or none."""
     step_s = np.diff(trajectory.t_ns) / 1e9
     speed = np.linalg.norm(np.diff(trajectory.position, axis=0), axis=1) / step_s
     too_fast = speed > _FASTEST_MPS
@@ -25,10 +25,10 @@ def doubts_of_speed(trajectory: Trajectory) -> list[str]:
 
 
 def doubts_of_stillness(trajectory: Trajectory) -> list[str]:
-    """Where poses that otherwise change are the same to the last bit for over a second, in one line or none.
+    """Report poses that otherwise change but are bit-identical for over a second, in one line or none.
 
-    No drone is so still, but the estimator may have frozen. The poses stay in use: nothing but their
-    sameness is against them, and a camera on the ground is as still in a log without noise.
+    No drone is so still, so its estimator may have frozen. The poses stay in use, because identical poses
+    are no proof: a camera on the ground is as still in a log without noise.
     """
     pose = np.concatenate([trajectory.position, trajectory.quaternion_xyzw], axis=1)
     changes = np.flatnonzero((np.diff(pose, axis=0) != 0).any(axis=1))

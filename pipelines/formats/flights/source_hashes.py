@@ -1,4 +1,4 @@
-"""The hashes of all files that a manifest names, and whether they are what their own checksums say."""
+"""Hashes of all files that a manifest names, and the check of the files' own checksums."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ _HASHERS = 4
 def hash_sources(
     flight: Flight, base: Path, progress: Progress, meanwhile: Iterator[object]
 ) -> tuple[dict[str, str], dict[str, dict[str, int]]]:
-    """The sha256 of every file that is read, by the path that the manifest states, and what is damaged.
+    """Compute the sha256 of every file that is read, and the damage, both by the manifest's path.
 
     Args:
         flight: the manifest.
         base: the folder that its paths are relative to.
-        progress: who watches.
-        meanwhile: steps to take until all is hashed.
+        progress: receives the progress.
+        meanwhile: steps to run until all is hashed.
     """
     unique = stated_paths(flight)
     for path in unique:  # before anything waits for one of them
         refuse_special(base / path)
     progress.start("Hashing sources", len(unique))
     hashes, damage = {}, {}
-    with ThreadPoolExecutor(_HASHERS) as pool:  # hashing releases the interpreter: long logs side by side
+    with ThreadPoolExecutor(_HASHERS) as pool:  # hashing releases the GIL, so long logs run in parallel
         hashing = {path: pool.submit(_hash_of, base / path) for path in unique}
         try:
             while not all(digest.done() for digest in hashing.values()) and next(meanwhile, None):
@@ -50,7 +50,7 @@ def hash_sources(
 
 
 def source_stamps(flight: Flight, base: Path) -> dict[str, str]:
-    """The stamp of every file that is read, by the path that the manifest states.
+    """Return the stamp of every file that is read, by the manifest's path.
 
     Args:
         flight: the manifest.
@@ -64,10 +64,10 @@ def source_stamps(flight: Flight, base: Path) -> dict[str, str]:
 
 
 def refuse_written(flight: Flight, base: Path, stamps: Mapping[str, str]) -> None:
-    """Refuse sources that were written to since they had these stamps: what was hashed is not what was read.
+    """Refuse sources that changed since they had these stamps, so that the hash fits what was read.
 
     Raises:
-        DataError: one of them was, or is gone.
+        DataError: a source changed, or is missing.
     """
     for path, stamp in source_stamps(flight, base).items():
         if stamp != stamps[path]:
@@ -79,7 +79,7 @@ def refuse_written(flight: Flight, base: Path, stamps: Mapping[str, str]) -> Non
 
 
 def stated_paths(flight: Flight) -> list[str]:
-    """Every path that a manifest states, each once, as it states it."""
+    """Return every path that a manifest states, each once, spelled as in the manifest."""
     stated: list[str] = []
 
     def take(*paths: str | None) -> None:
@@ -118,7 +118,7 @@ def stated_paths(flight: Flight) -> list[str]:
 
 
 def _hash_of(path: Path) -> tuple[str, int]:
-    """The sha256 of a source, and how many of its files are not what their own checksum says.
+    """Compute the sha256 of a source, and count its files that differ from their own checksum.
 
     A floor plan's YAML is hashed together with the picture that it names.
     """

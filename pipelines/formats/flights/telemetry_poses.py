@@ -1,7 +1,7 @@
-"""Drones' own logs to the poses of their cameras, all in one world: ENU about one origin on Earth.
+"""Camera poses from drones' own logs, all in one world: ENU about one origin on Earth.
 
-A drone logs where it was and how its body and gimbal were turned apart from each other, each at a rate of
-its own; here they come together.
+A drone logs its position and the attitudes of its body and gimbal separately, each at its own rate. This
+module joins them.
 """
 
 from __future__ import annotations
@@ -50,21 +50,21 @@ _ADD_MOUNT = "say how the camera sits on the body, mount: {looks: forward, down_
 
 @dataclass(frozen=True)
 class Origin:
-    """Where on Earth the world's origin lies."""
+    """Origin of the world on Earth."""
 
     place: Place
     source: str  # "world.origin", or the log whose first position it is
 
 
 class TelemetryPoses:
-    """Poses of cameras whose drones say themselves where they were.
+    """Poses of cameras whose drones log their own position.
 
     Args:
         flight: the manifest.
         manifest: its path.
         logs: the flight's logs, for presets and gimbals.
-        max_gap_ns: the longest stretch between two positions or angles that is bridged.
-        note: told what was chosen and what is doubtful, one line each.
+        max_gap_ns: the longest gap between two positions or angles that is interpolated.
+        note: receives each choice and each doubt, one line each.
     """
 
     def __init__(
@@ -84,10 +84,10 @@ class TelemetryPoses:
         self._origin: Origin | None = None
         self._read: dict[str, Telemetry] = {}
 
-    # --- what is read ----------------------------------------------------------------------------------
+    # --- reading ---------------------------------------------------------------------------------------
 
     def telemetry(self, pose: PoseSource) -> Telemetry:
-        """What a drone's own log says, at its own times; read once."""
+        """Read a drone's own log, at its own times; each log is read once."""
         stated = _stated(pose)
         choice = TelemetryChoice(pose.position, pose.instance, pose.time, pose.altitude)
         key = pose.model_dump_json(exclude={"of"})
@@ -103,11 +103,11 @@ class TelemetryPoses:
         return self._read[key]
 
     def fit(self, pose: PoseSource) -> ClockFit | None:
-        """How the log's own clock was taken to GPS time."""
+        """Return the fit of the log's own clock to GPS time."""
         return self.telemetry(pose).fit
 
     def triggers(self, kind: Literal["ulog", "ardupilot"], stated: str) -> Int64:
-        """When a drone's own log says that pictures were triggered, at world times."""
+        """Read the trigger times of pictures from a drone's own log, at world times."""
         reader, path = FORMATS.get(kind), self._one_file(stated)
         if not isinstance(reader, TriggerFormat):
             raise DataError(path, f"the format {kind} reads no triggers")
@@ -121,16 +121,16 @@ class TelemetryPoses:
         return paths[0]
 
     def _world_times(self, stated: str, t_ns: Int64, since_ns: int) -> Int64:
-        """Times of a log with its stated clock; `since_ns` is what the drift counts from."""
+        """Convert a log's times to world times by its stated clock; the drift counts from `since_ns`."""
         return world_times(self._logs.settings(stated).clock, t_ns, since_ns)
 
     # --- the origin ------------------------------------------------------------------------------------
 
     def origin(self) -> Origin | None:
-        """Where the world lies: as stated, or the first position of the first camera that has one on Earth.
+        """Return the world's origin: the stated one, or the first position on Earth of the first camera.
 
-        None where no camera has. Its height is that of the first camera with heights that are no heights
-        above the take-off, for these say nothing of where the ground lies.
+        None if no camera has a position on Earth. The origin's height is 0 if that camera's heights count
+        from the take-off (or are stated), because these do not give the height of the ground.
         """
         if self._origin is not None:
             return self._origin
@@ -149,7 +149,7 @@ class TelemetryPoses:
         return None
 
     def doubt_heights(self) -> None:
-        """Note cameras that count their heights from different things."""
+        """Note cameras whose heights have different references."""
         kinds = {
             name: self.telemetry(camera.pose).position.height
             for name, camera in self._flight.cameras.items()
@@ -160,7 +160,7 @@ class TelemetryPoses:
             self._note(f"heights are counted from different things ({said}): expect metres between them")
 
     def _in_world(self, name: str, track: PositionTrack) -> tuple[Float, Float]:
-        """Positions [N, 3] m in the world, and how the track's own ENU is turned in it (unit quaternion)."""
+        """Return positions [N, 3] m in the world, and the rotation of the track's own ENU in it [4]."""
         level = np.array([0.0, 0.0, 0.0, 1.0])
         origin = self.origin()
         if not track.on_earth and (track.origin is None or origin is None):
@@ -177,15 +177,15 @@ class TelemetryPoses:
             turned = quaternion_from_matrix(rotation)
             return compose((position, turned), (track.values, level))[0], turned
         latitude, longitude, height = track.values.T
-        if track.height in _ABOVE_TAKE_OFF:  # z counts from the take-off, wherever that lies
+        if track.height in _ABOVE_TAKE_OFF:  # z counts from the take-off, at any height on Earth
             height = height + origin.place.altitude_m
         return enu_from_geodetic(latitude, longitude, height, origin.place), level
 
     def points(self, name: str, log: str, track: PositionTrack) -> Trajectory:
-        """Where something without a direction was, in the world; its rotation means nothing.
+        """Return positions without a rotation in the world, as a trajectory; its rotation has no meaning.
 
         Raises:
-            DataError: nothing says where on Earth the world lies.
+            DataError: the world's origin on Earth is unknown.
         """
         if self.origin() is None:
             raise DataError(
@@ -200,20 +200,20 @@ class TelemetryPoses:
     # --- poses of cameras ------------------------------------------------------------------------------
 
     def trajectory(self, name: str, camera: Camera, mounted: tuple[Float, Float]) -> Trajectory:
-        """world_from_camera over time.
+        """Compute world_from_camera over time.
 
-        At the stamps of positions or of attitudes, whichever come faster; the others are taken between
-        theirs, never across a gap.
+        The stamps are those of positions or of attitudes, whichever have the higher rate. The others are
+        interpolated, never across a gap.
 
         Args:
             name: the camera's.
             camera: its part of the manifest.
             mounted: lever arm [3] m in the body, and rotation [4] of the camera in its gimbal, or in the
-                body where there is none.
+                body if there is no gimbal.
 
         Raises:
-            DataError: the log cannot be used, says nothing of how the camera was turned, or its parts
-                share no time.
+            DataError: the log cannot be used, does not give the camera's rotation, or its parts share
+                no time.
         """
         pose = camera.pose
         telemetry = self.telemetry(pose)
@@ -240,7 +240,7 @@ class TelemetryPoses:
             position, quaternion = compose_mount((position, world_from_body), (lever_arm, rotation))
         elif attitude is not None and gimbal is not None:
             if world_from_body is None:
-                world_from_body = level_heading(attitude)  # all that is known of it
+                world_from_body = level_heading(attitude)  # the heading is all that is known of it
                 if lever_arm.any():
                     self._note(f"{name}: {stated} does not say how its body was turned: taken as level")
             position, quaternion = compose_gimbal(
@@ -252,7 +252,7 @@ class TelemetryPoses:
         return self._complete(name, settings, dropped, t_ns, position, multiply(turned, quaternion))
 
     def _gimbal(self, name: str, camera: Camera, telemetry: Telemetry) -> AttitudeTrack | None:
-        """The angles that the manifest names, or those of the drone's own log unless it asks for the body."""
+        """Return the manifest's angles, or those of the drone's own log unless the body's are asked for."""
         gimbal, own = camera.gimbal, telemetry.gimbal
         if gimbal is None:
             if own is None or camera.pose.of == "body":
@@ -366,7 +366,7 @@ def _kind(pose: PoseSource) -> str:
 
 
 def _stated(pose: PoseSource) -> str:
-    """The log as the manifest names it."""
+    """Return the log as the manifest names it."""
     return pose.dji or pose.ulog or pose.ardupilot or pose.log or ""
 
 
@@ -376,7 +376,7 @@ def _first_place(track: PositionTrack) -> Place:
 
 
 def _fastest(position_t_ns: Int64, others: Sequence[Int64]) -> Int64:
-    """The stamps that come fastest; positions win a tie."""
+    """Return the stamps with the highest rate; positions win a tie."""
 
     def step(t_ns: Int64) -> float:
         return float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else np.inf

@@ -1,4 +1,4 @@
-"""Poses of logs in the world: in its axes, east-north-up, and from its origin."""
+"""Conversion of logged poses to the world: to its axes (east-north-up) and its origin."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, Log
 from pipelines.session.records import Float, Trajectory
 
-_FARTHEST_M = 100_000.0  # from the origin: no drone flies so far, and eastings of UTM begin at 166 km
+_FARTHEST_M = 100_000.0  # from the origin: no drone flies so far, and UTM eastings begin at 166 km
 
 
 def in_enu(trajectory: Trajectory, axes: Axes) -> Trajectory:
-    """The same poses in an ENU world; the axes of the thing itself stay."""
+    """Convert poses to an ENU world; the axes of the body itself stay."""
     if axes == "enu":
         return trajectory
     position, quaternion = enu_from_ned(trajectory.position, trajectory.quaternion_xyzw)
@@ -37,7 +37,7 @@ def in_enu(trajectory: Trajectory, axes: Axes) -> Trajectory:
 
 
 def body_in_enu(trajectory: Trajectory, axes: Axes) -> Trajectory:
-    """The poses of a body: a log in NED has its body in FRD."""
+    """Convert the poses of a body: a log in NED has its body in FRD."""
     turned = in_enu(trajectory, axes)
     if axes == "enu":
         return turned
@@ -46,7 +46,7 @@ def body_in_enu(trajectory: Trajectory, axes: Axes) -> Trajectory:
 
 
 def in_world(trajectory: Trajectory, log: Log) -> Trajectory:
-    """A trajectory in the ENU axes of its log, moved to where the log's origin lies in the world."""
+    """Move a trajectory in the ENU axes of its log to the position of the log's origin in the world."""
     place = log.world_from_log
     turn = quaternion_from_rotation_vector(np.array([0.0, 0.0, np.radians(place.yaw_deg)]))
     position, quaternion = compose(
@@ -65,11 +65,11 @@ def refuse_projected(source: Path | str, position: Float, origin: Place) -> None
 
     Args:
         source: the file or log, for the message.
-        position: [N, 3] m in the world; rows of NaN do not count.
-        origin: where on Earth the world's origin lies.
+        position: [N, 3] m in the world; rows of NaN are ignored.
+        origin: the world's origin on Earth.
 
     Raises:
-        DataError: the middle of the positions is further from the origin than anything flies.
+        DataError: the median position is more than 100 km from the origin.
     """
     across = position[np.isfinite(position[:, :2]).all(axis=1), :2]
     if not len(across):
