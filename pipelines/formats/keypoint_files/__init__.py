@@ -1,1 +1,1 @@
-"""People in pictures, as other detectors write them."""
+"""People in pictures, in the files of other detectors."""

@@ -1,9 +1,9 @@
 """AlphaPose results: one JSON list with an entry for every person in every picture.
 
 An entry is `{"image_id": "12.jpg", "category_id": 1, "keypoints": [x, y, score, ...], "score": s,
-"box": [...], "idx": n}`. The frame is the last digits of `image_id`. `idx` is the tracker's id of the person,
-as a number, `[n]`, or `[[n], [m]]` where AlphaPose merged poses (the first counts). Without its tracker
-AlphaPose writes 0 for everybody; then people are numbered by their place within the frame.
+"box": [...], "idx": n}`. The frame is the last digits of `image_id`. `idx` is the tracker's id of the person:
+a number, `[n]`, or `[[n], [m]]` if AlphaPose merged poses (the first is used). Without its tracker
+AlphaPose writes 0 for everybody; then people are numbered by their position within the frame.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from pipelines.session.records import Detections
 
 
 class AlphaPose:
-    """`alphapose-results.json` of AlphaPose, old and new."""
+    """Reader of AlphaPose's `alphapose-results.json`, old and new."""
 
     name = "alphapose"
     title = "AlphaPose keypoints"
     suffixes = (".json",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether it is a list of results that name pictures, or have AlphaPose's `box` or `idx`."""
+        """Return True for a list of results that name pictures, or have AlphaPose's `box` or `idx`."""
         return path.is_file() and any(is_alphapose_entry(first_entry(s)) for s in samples(path))
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Frames, people, the skeleton guessed from the number of keypoints, and confidences."""
+        """Describe frames, people, the skeleton guessed from the number of keypoints, and confidences."""
         return describe_detections(self.read_keypoints(path, skeleton=None, first_frame=0))
 
     def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
         """Read every person; pixels and keypoint scores as AlphaPose wrote them.
 
         Raises:
-            DataError: not such a file, no keypoints, or another number of them than `skeleton` has.
+            DataError: not such a file, no keypoints, or a number of keypoints that differs from `skeleton`.
         """
         people = Gathering(path)
         for where, entry in objects(load_json(path), path, "results"):

@@ -1,11 +1,11 @@
-"""COCO keypoints: a list of results, or an annotation file.
+"""Reader of COCO keypoints: a list of results, or an annotation file.
 
 Results are `[{"image_id": 12, "category_id": 1, "keypoints": [x, y, score, ...], "score": s}, ...]`.
 Annotation files are `{"images": [{"id": 3, "file_name": "0012.jpg", "width": 640, "height": 480}],
-"annotations": [...]}`; there the frame is the last digits of `file_name` (of the id without one), and the
+"annotations": [...]}`. There the frame is the last digits of `file_name` (of the id without one). The
 third value is a visibility: 0 is missing, 1 (hidden, but placed) and 2 (seen) become confidence 0.5 and 1.
-`track_id` numbers people where every annotation has it. A list with AlphaPose's marks is recognised as
-AlphaPose's; `format: coco` reads it all the same.
+`track_id` numbers people if every annotation has it. A list with AlphaPose's fields is recognised as
+AlphaPose's; `format: coco` reads it too.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ Float = NDArray[np.float64]
 
 
 class Coco:
-    """COCO keypoint results and annotations."""
+    """Reader of COCO keypoint results and annotations."""
 
     name = "coco"
     title = "COCO keypoints"
     suffixes = (".json",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether it is a COCO file, even one of boxes only or an empty list: reading says what is amiss."""
+        """Return True for a COCO file, even with boxes only or an empty list; reading reports the fault."""
         return path.is_file() and any(_is_annotations(s) or _is_results(s) for s in samples(path))
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Frames, people, the skeleton, and confidences."""
+        """Describe frames, people, the skeleton, and confidences."""
         return describe_detections(self.read_keypoints(path, skeleton=None, first_frame=0))
 
     def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
         """Read every person; an annotation file also gives the joint names and the picture size.
 
         Raises:
-            DataError: no keypoints, boxes only, or another number of keypoints than `skeleton` has.
+            DataError: no keypoints, boxes only, or a number of keypoints that differs from `skeleton`.
         """
         people = Gathering(path)
         content = load_json(path)
@@ -119,7 +119,7 @@ def _check_keypoints(people: Gathering, boxes: int) -> None:
 
 
 def _with_confidence(rows: Float, where: str) -> Float:
-    """Rows of x, y, visibility as x, y, confidence."""
+    """Convert rows of x, y, visibility to x, y, confidence."""
     visibility = rows[:, 2:]
     if not np.isin(visibility, (0, 1, 2)).all():
         raise DataError(
@@ -129,7 +129,7 @@ def _with_confidence(rows: Float, where: str) -> Float:
 
 
 def _joint_names(content: dict[str, object]) -> tuple[str, ...] | None:
-    """What the first category calls its keypoints, in the way this program spells joints."""
+    """Return the first category's keypoint names in this program's spelling of joints; None without names."""
     names = first_entry(content.get("categories")).get("keypoints")
     if not isinstance(names, list):
         return None
@@ -137,7 +137,7 @@ def _joint_names(content: dict[str, object]) -> tuple[str, ...] | None:
 
 
 def _picture_size(content: dict[str, object], path: Path) -> tuple[int, int] | None:
-    """The size of the pictures, if all state the same."""
+    """Return the size of the pictures if all state the same; else None."""
     sizes = {
         (whole_number(image.get("width")), whole_number(image.get("height")))
         for _, image in objects(content.get("images"), path, "images")

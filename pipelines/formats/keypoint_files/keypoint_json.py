@@ -1,4 +1,4 @@
-"""Careful reading of JSON keypoint files: content, samples that tell the format, numbers, frame numbers."""
+"""Careful reading of JSON keypoint files: content, samples to recognise a format, numbers, frame numbers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SUFFIX = re.compile(r"\.[A-Za-z]\w*$")
 
 
 def load_json(path: Path) -> object:
-    """The content of a JSON file; NaN and Infinity are accepted, as Python writes them.
+    """Read a JSON file; NaN and Infinity are accepted, as Python writes them.
 
     Raises:
         DataError: it cannot be opened, is empty, is not JSON, or is nested too deeply.
@@ -42,14 +42,14 @@ def load_json(path: Path) -> object:
 
 
 def json_files(folder: Path) -> list[Path]:
-    """The JSON files of a folder, by name; hidden ones (what macOS leaves on shared disks) are not data."""
+    """Return the JSON files of a folder, by name, without hidden ones (macOS leaves such on shared disks)."""
     return sorted(p for p in folder.glob("*.json") if p.is_file() and not p.name.startswith("."))
 
 
 def samples(path: Path) -> list[object]:
-    """Enough of a JSON file, or of a few files across a folder, to tell the format.
+    """Read enough of a JSON file, or of a few files across a folder, to recognise the format.
 
-    Lists are cut after their first entry, at the top and one level below. What cannot be read is left out.
+    Lists are cut after their first entry, at the top and one level below. Unreadable files are skipped.
     """
     if path.is_dir():
         files = json_files(path)
@@ -68,7 +68,7 @@ def samples(path: Path) -> list[object]:
 
 @lru_cache(maxsize=64)
 def _outline(path: Path, size: int, modified_ns: int) -> object:  # noqa: ARG001 - the key of the cache
-    """The beginnings of a file's lists, kept because every format asks about the same file in turn."""
+    """Return the beginnings of a file's lists; cached, because every format asks for the same file."""
     content = load_json(path)
     if isinstance(content, dict):
         return {key: value[:1] if isinstance(value, list) else value for key, value in content.items()}
@@ -76,15 +76,15 @@ def _outline(path: Path, size: int, modified_ns: int) -> object:  # noqa: ARG001
 
 
 def first_entry(sample: object) -> dict[str, object]:
-    """The first entry of a list of objects; empty for anything else."""
+    """Return the first entry of a list of objects; empty for anything else."""
     entry = sample[0] if isinstance(sample, list) and sample else None
     return entry if isinstance(entry, dict) else {}
 
 
 def is_alphapose_entry(entry: dict[str, object]) -> bool:
-    """Whether a result entry is AlphaPose's rather than COCO's, whose layout it borrows.
+    """Return True if a result entry is AlphaPose's rather than COCO's, which has the same layout.
 
-    AlphaPose adds `box` and `idx` (its old versions neither) and names pictures; COCO numbers them.
+    AlphaPose adds `box` and `idx` (not in old versions) and names pictures; COCO numbers them.
     """
     image = entry.get("image_id")
     names_picture = isinstance(image, str) and _SUFFIX.search(image) is not None
@@ -94,7 +94,7 @@ def is_alphapose_entry(entry: dict[str, object]) -> bool:
 
 
 def objects(content: object, where: object, what: str) -> Iterator[tuple[str, dict[str, object]]]:
-    """Each entry of a list of JSON objects, with the words that name it in a message.
+    """Yield each entry of a list of JSON objects, with its name for messages.
 
     Raises:
         DataError: not a list, or an entry is not an object.
@@ -109,7 +109,7 @@ def objects(content: object, where: object, what: str) -> Iterator[tuple[str, di
 
 
 def numbers(values: object, where: str) -> Float:
-    """A JSON array of numbers; null is NaN.
+    """Convert a JSON array of numbers; null is NaN.
 
     Raises:
         DataError: it is ragged or holds something else.
@@ -121,7 +121,7 @@ def numbers(values: object, where: str) -> Float:
 
 
 def triples(values: object, where: str) -> Float:
-    """A flat array x, y, confidence, x, y, ... as rows [K, 3]."""
+    """Reshape a flat array x, y, confidence, x, y, ... to rows [K, 3]."""
     flat = numbers(values, where)
     if flat.ndim != 1 or flat.size % 3 or not flat.size:
         raise DataError(where, f"{flat.size} values are not x, y, confidence for each keypoint")
@@ -129,14 +129,14 @@ def triples(values: object, where: str) -> Float:
 
 
 def whole_number(value: object) -> int | None:
-    """A JSON number as int, where it is one and of a sane size."""
+    """Return a JSON number as int, if it is an integer of plausible size; else None."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     return int(value) if abs(value) < _FRAME_LIMIT and value == int(value) else None
 
 
 def frame_number(name: object) -> int | None:
-    """The frame that an image id or a name means: the number itself, or the last digits before the suffix."""
+    """Return the frame of an image id or a name: the number itself, or the last digits before the suffix."""
     if not isinstance(name, str):
         return whole_number(name)
     digits = re.findall(r"[0-9]+", _SUFFIX.sub("", name))

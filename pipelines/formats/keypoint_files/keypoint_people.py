@@ -1,4 +1,4 @@
-"""Gathering the people of a keypoint file into Detections: skeleton, identities, missing joints, counts."""
+"""Collection of the people of a keypoint file into Detections: skeleton, ids, missing joints, counts."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from pipelines.session.skeletons import SKELETONS, Skeleton, get_skeleton, skele
 
 Float = NDArray[np.float64]
 
-_FARTHEST_PX = 1_000_000  # no picture is nearly as large: beyond is no detection but a fault of the file
+_FARTHEST_PX = 1_000_000  # far larger than any picture: beyond it the file is faulty
 
 
 def choose_skeleton(
     path: Path, count: int, stated: str | None, names: tuple[str, ...] | None = None
 ) -> Skeleton:
-    """The skeleton of `count` keypoints: as the user states, as the file's joint names say, or the likeliest.
+    """Choose the skeleton of `count` keypoints: the user's, the one with the file's names, or the likeliest.
 
     Raises:
-        DataError: the stated skeleton is unknown or has another number of joints, or no skeleton fits.
+        DataError: the user's skeleton is unknown or has another number of joints, or no skeleton fits.
     """
     known = ", ".join(f"{s.name} ({len(s.joints)})" for s in SKELETONS.values())
     if stated is not None:
@@ -50,7 +50,7 @@ def choose_skeleton(
 
 
 class Gathering:
-    """People and frames of one camera as a reader meets them, in any order."""
+    """People and frames of one camera, in the order in which a reader adds them (any order)."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -63,16 +63,16 @@ class Gathering:
         self._rows: list[Float] = []
 
     def __len__(self) -> int:
-        """How many people there are so far, over all frames."""
+        """Return the number of people so far, over all frames."""
         return len(self._rows)
 
     def contents(self) -> Iterator[tuple[Path, object]]:
-        """The content of the file, or of every JSON file of the folder, one at a time.
+        """Yield the content of the file, or of every JSON file of the folder, one at a time.
 
-        In a folder, files that cannot be read are left out and counted.
+        In a folder, files that cannot be read are skipped and counted.
 
         Raises:
-            DataError: the file cannot be read, or none of the folder.
+            DataError: the file cannot be read, or no file of the folder can.
         """
         if not self.path.is_dir():
             yield self.path, load_json(self.path)
@@ -90,15 +90,15 @@ class Gathering:
             raise DataError(self.path, problem, "check the folder, or export the keypoints again")
 
     def frame_of(self, name: object, where: str, file: Path | None = None) -> int:
-        """List the frame that a picture's name or number means.
+        """Return the frame number of a picture's name or number, and list that frame.
 
         Args:
             name: the name or number.
-            where: the words for the entry in a message.
-            file: the one file among several that counts frames by itself.
+            where: name of the entry for messages.
+            file: the file, if each of several files counts frames by itself.
 
         Raises:
-            DataError: it has no number, or another picture has the same (several cameras in one place).
+            DataError: it has no number, or another picture has the same number (two cameras in one file?).
         """
         frame = frame_number(name)
         if frame is None:
@@ -116,13 +116,13 @@ class Gathering:
     def add(
         self, frame: int, rows: Float, where: str, *, rank: int | None = None, own_id: int | None = None
     ) -> None:
-        """Take one person.
+        """Add one person.
 
         Args:
-            frame: as `frame_of` gave it.
+            frame: result of `frame_of`.
             rows: [K, 3] x, y, confidence.
-            where: the words for the entry in a message.
-            rank: the place within the frame, where the file groups people by frame; else the next one.
+            where: name of the entry for messages.
+            rank: position within the frame, if the file groups people by frame; else the next one.
             own_id: the tracker's id of the person.
 
         Raises:
@@ -138,15 +138,15 @@ class Gathering:
         self._rows.append(rows)
 
     def keypoints(self) -> Float:
-        """All people so far [M, K, 3]; DataError without people."""
+        """Return all people so far [M, K, 3]; DataError without people."""
         self.count()
         return np.stack(self._rows)
 
     def count(self) -> int:
-        """How many keypoints each person has.
+        """Return the number of keypoints of each person.
 
         Raises:
-            DataError: there are no people; the message says in how many frames, and what was left out.
+            DataError: there are no people; the message gives the number of frames and the losses.
         """
         if not self._rows:
             causes = [f"{number} x {cause}" for cause, number in sorted(self.dropped.items()) if number]
@@ -160,13 +160,14 @@ class Gathering:
     def detections(
         self, skeleton: Skeleton, first_frame: int, image_size: tuple[int, int] | None = None
     ) -> Detections:
-        """Everything gathered, cleaned and sorted.
+        """Return everything collected, cleaned and sorted.
 
-        Frames before `first_frame` are left out, and so is a detection that repeats another one of its frame
-        number by number. A joint is missing (NaN, confidence 0) if its position is not finite or further than
-        `_FARTHEST_PX` from the top left pixel, or if its confidence is 0, which is how detectors write
-        "not found" wherever they put it. A confidence that is not finite or below 0 becomes 0. All of it but
-        "not found" is counted in `dropped`. A confidence above 1 becomes 1 and is counted in `adjusted`.
+        Frames before `first_frame` are dropped. A detection that repeats another one of its frame number by
+        number is dropped too. A joint is missing (NaN, confidence 0) if its position is not finite or
+        further than `_FARTHEST_PX` from the top left pixel. It is also missing if its confidence is 0:
+        detectors write this for "not found", with any position. A confidence that is not finite or below 0
+        becomes 0. All of this except "not found" is counted in `dropped`. A confidence above 1 becomes 1 and
+        is counted in `adjusted`.
 
         Raises:
             DataError: no joint of any person is left.
@@ -210,9 +211,9 @@ class Gathering:
         )
 
     def _repeats(self, keypoints: Float) -> NDArray[np.bool_]:
-        """Mark the people [M] whose keypoints [M, K, 3] and id are those of an earlier one of their frame."""
+        """Mark the people [M] with the keypoints [M, K, 3] and id of an earlier person of the same frame."""
         repeats = np.zeros(len(keypoints), dtype=np.bool_)
-        # People who were not found are all 0, and thus all alike.
+        # People who were not found have zeros only, so they are all equal.
         found = (keypoints[..., :2] != 0).any(axis=(1, 2))
         seen: set[tuple[int, int | None, bytes]] = set()
         for row in np.flatnonzero(found).tolist():
@@ -224,9 +225,9 @@ class Gathering:
         return repeats
 
     def _person_numbers(self, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Number the kept people by the detector's own ids, or by their places within the frame.
+        """Number the kept people by the detector's own ids, or by their positions within the frame.
 
-        The places count where somebody has no id, or where several people of a frame share the only id.
+        The positions are used if somebody has no id, or if several people of a frame share the only id.
         """
         rows = np.flatnonzero(kept)
         own = [own_id for row in rows if (own_id := self._own_id[row]) is not None]
@@ -236,7 +237,7 @@ class Gathering:
 
 
 def _checked(keypoints: Float) -> tuple[Float, Float, Counter[str], Counter[str]]:
-    """Positions [M, K, 2] and confidences [M, K] of keypoints [M, K, 3]; what was dropped, and adjusted."""
+    """Return checked positions [M, K, 2], confidences [M, K], and counts of dropped and adjusted values."""
     xy, confidence = keypoints[..., :2].copy(), keypoints[..., 2].copy()
     not_found = confidence == 0
     not_finite = ~np.isfinite(xy).all(axis=-1)
@@ -258,7 +259,7 @@ def _checked(keypoints: Float) -> tuple[Float, Float, Counter[str], Counter[str]
 
 
 def describe_detections(detections: Detections) -> dict[str, object]:
-    """What `mocap info` says of a keypoint file."""
+    """Describe a keypoint file for `mocap info`."""
     found = np.isfinite(detections.xy).all(axis=-1)
     confidence = detections.confidence[found]
     fits = next(s for s in SKELETONS.values() if s.joints == detections.joints)

@@ -1,4 +1,4 @@
-"""MMPose predictions: what its inferencer and its demos save, for a video or for pictures.
+"""Reader of MMPose predictions, as its inferencer and its demos save them, for a video or for pictures.
 
 People are `{"keypoints": [[x, y], ...], "keypoint_scores": [...], "bbox": ...}`. They come as
 
@@ -27,25 +27,25 @@ from pipelines.session.records import Detections
 
 
 class MMPose:
-    """A file of MMPose predictions, or a folder of one file for every picture."""
+    """Reader of a file of MMPose predictions, or of a folder with one file for every picture."""
 
     name = "mmpose"
     title = "MMPose keypoints"
     suffixes = (".json",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether a file, or some files across a folder, hold MMPose's frames or people."""
+        """Return True if a file, or some files across a folder, hold MMPose's frames or people."""
         return any(_is_prediction(sample) for sample in samples(path))
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Frames, people, the skeleton, and confidences."""
+        """Describe frames, people, the skeleton, and confidences."""
         return describe_detections(self.read_keypoints(path, skeleton=None, first_frame=0))
 
     def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
         """Read every person, file by file; pixels and scores as MMPose wrote them.
 
         Raises:
-            DataError: no file can be read, no keypoints, or another number of them than `skeleton` has.
+            DataError: no readable file, no keypoints, or a number of keypoints that differs from `skeleton`.
         """
         people = Gathering(path)
         names = None
@@ -63,7 +63,7 @@ def _is_prediction(sample: object) -> bool:
 
 
 def _read_file(file: Path, content: object, people: Gathering) -> tuple[str, ...] | None:
-    """Add the people of one file; the joint names, where it states them."""
+    """Add the people of one file; return the joint names if it states them."""
     names = None
     if isinstance(content, dict):
         names = _joint_names(content.get("meta_info"))
@@ -93,7 +93,7 @@ def _add_people(frame: int, instances: object, where: str, people: Gathering) ->
 
 
 def _joint_names(meta: object) -> tuple[str, ...] | None:
-    """The joints in order, from the data set's `keypoint_id2name`, if it is there."""
+    """Return the joints in order, from the data set's `keypoint_id2name`; None without it."""
     by_id = meta.get("keypoint_id2name") if isinstance(meta, dict) else None
     if not isinstance(by_id, dict):
         return None

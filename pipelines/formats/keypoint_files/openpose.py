@@ -1,10 +1,10 @@
-"""OpenPose keypoints: a folder with one JSON file for every frame.
+"""Reader of OpenPose keypoints: a folder with one JSON file for every frame.
 
 A file is `{"version": 1.3, "people": [{"person_id": [-1], "pose_keypoints_2d": [x, y, confidence, ...]}]}`.
 Its frame is the last digits of its name (`input_000000000012_keypoints.json`, `cam01.0012.json`). Joints
 that were not found are 0, 0, 0. Pose2Sim writes the same files for every detector it runs (25, 17 or 26
-keypoints), and `{}` for a person who was not seen, so that `people[0]` stays the same person: the place in
-the list is the person's number, unless OpenPose tracked and gives `person_id`s.
+keypoints). It writes `{}` for a person who was not seen, so that `people[0]` stays the same person. So the
+position in the list is the person's number, unless OpenPose tracked people and gives `person_id`s.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ Float = NDArray[np.float64]
 
 
 class OpenPose:
-    """A folder of OpenPose JSON files, or one of them."""
+    """Reader of a folder of OpenPose JSON files, or of one of them."""
 
     name = "openpose"
     title = "OpenPose keypoints"
     suffixes = (".json",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether a file, or some files across a folder, are objects with a list `people`."""
+        """Return True if a file, or some files across a folder, are objects with a list `people`."""
         return any(_is_frame(sample) for sample in samples(path))
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Frames, people, the skeleton guessed from the keypoints, and confidences."""
+        """Describe frames, people, the skeleton guessed from the keypoints, and confidences."""
         return describe_detections(self.read_keypoints(path, skeleton=None, first_frame=0))
 
     def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
-        """Read every person, file by file. Files that cannot be read are left out and counted.
+        """Read every person, file by file; skip and count files that cannot be read.
 
         Raises:
-            DataError: no file can be read, no keypoints, two files of one frame, or another number of
-                keypoints than `skeleton` has.
+            DataError: no readable file, no keypoints, two files of one frame, or a number of keypoints
+                that differs from `skeleton`.
         """
         people = Gathering(path)
         for file, content in people.contents():
@@ -64,7 +64,7 @@ def _is_frame(content: object) -> bool:
 
 
 def _read_frame(file: Path, content: object, people: Gathering) -> None:
-    """Add the people of one file; a file that is not a frame is counted instead."""
+    """Add the people of one file; count the file instead if it is no frame."""
     name = file.stem.removesuffix("_keypoints")
     if frame_number(name) is None:
         people.dropped["file without a frame number"] += 1
@@ -85,11 +85,11 @@ def _track(person_id: object) -> int | None:
 
 
 def _order_of_25(keypoints: Float) -> str:
-    """Tell BODY_25 from BODY_25B, which has the same number of keypoints in another order.
+    """Distinguish BODY_25 from BODY_25B, which has the same number of keypoints in another order.
 
     BODY_25's MidHip is the midpoint of its hips. Measured on real files, relative to the person's extent in
-    the picture: median distance 0.003 (99th percentile 0.010) in BODY_25, and a median of at least 0.28 when
-    BODY_25B is read as BODY_25. Without a person whose hips were found it stays BODY_25.
+    the picture: median distance 0.003 (99th percentile 0.010) in BODY_25, and a median of at least 0.28 if
+    BODY_25B is read as BODY_25. If no person's hips were found, the result is BODY_25.
     """
     xy = np.where(keypoints[..., 2:] > 0, keypoints[..., :2], np.nan)
     joints = SKELETONS["body25"].joints
