@@ -1,1 +1,1 @@
-"""Recordings of messages (ROS 1, ROS 2, MCAP), and what their messages say."""
+"""Recordings of messages (ROS 1, ROS 2, MCAP), and the conversion of their messages."""

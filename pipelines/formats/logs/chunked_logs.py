@@ -1,8 +1,8 @@
-"""Logs that are a row of records, most of them inside compressed chunks: what ROS 1 bags and MCAP share.
+"""Logs as a sequence of records, most of them in compressed chunks: the common part of ROS 1 bags and MCAP.
 
-The file is walked from record to record, without its summary: the same way leads through a whole file
-and through one that ends early. Chunks are stepped over, for the index behind each says where its
-messages are; a chunk without one is looked into.
+The file is read from record to record, without its summary: the same code reads a whole file
+and one that ends early. Chunks are skipped, because the index after each gives the positions of its
+messages. Only a chunk without an index is decompressed to find them.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from pipelines.formats.logs.recordings import (
 )
 from pipelines.session.records import Int64
 
-CHUNK_LIMIT = 1 << 30  # bytes of a chunk, compressed or not: what is larger is taken for damage
-_CACHE = 64 << 20  # bytes of chunks held, for files whose chunks overlap in time
+CHUNK_LIMIT = 1 << 30  # bytes of a chunk, compressed or not: a larger one is taken for damage
+_CACHE = 64 << 20  # bytes of chunks kept in memory, for files whose chunks overlap in time
 
 
 _KEPT = 16 << 20  # bytes that freed chunks may hold
@@ -43,30 +43,30 @@ _KEPT = 16 << 20  # bytes that freed chunks may hold
 
 @dataclass
 class Chunk:
-    """Where a chunk's content is in the file, and where the index says that its messages are."""
+    """Position of a chunk's content in the file, and the positions of its messages by the index."""
 
     offset: int
     length: int  # bytes in the file
     compression: str
     size: int  # bytes once decompressed
-    crc: int = 0  # 0: not stated
-    cut: bool = False  # the file ends within it
+    crc: int = 0  # 0: the file has none
+    cut: bool = False  # the file ends within this chunk
     index: list[Int64] = field(default_factory=list)  # a channel's [n, 3] each: channel, stamp, place
 
 
 @dataclass(frozen=True)
 class RecordShape:
-    """How the record of a message is laid out, from its place in the chunk on."""
+    """Layout of a message's record, from its place in the chunk on."""
 
     head: int  # bytes before the message
     message: int  # bytes of the message
     stamp: slice  # the stamp in the head
-    free: slice  # what differs from record to record of one channel, the stamp among it
+    free: slice  # the bytes that differ between records of one channel, with the stamp
 
 
 @dataclass(frozen=True)
 class Content:
-    """What a look into a chunk found."""
+    """Records found in a chunk."""
 
     channels: dict[int, Channel]
     index: list[tuple[int, int, int]]  # channel, stamp, place
@@ -74,9 +74,9 @@ class Content:
 
 
 class ChunkedPart(LogPart):
-    """One file of chunks. A format walks its records, looks into chunks and finds a message's bytes."""
+    """File of chunks. A format walks its records, searches chunks and finds a message's bytes."""
 
-    record_overhead: int  # bytes of a message's record that are not the message
+    record_overhead: int  # bytes of a message's record besides the message
 
     def __init__(self, path: Path, file: IO[bytes], file_size: int) -> None:
         super().__init__(path, file_size)
@@ -84,9 +84,9 @@ class ChunkedPart(LogPart):
         self.chunks: list[Chunk] = []
         self.messages_stated: int | None = None  # by the file's summary
         self._cache: dict[int, memoryview | None] = {}
-        # glibc gives freed memory back to the system and takes it again, page by page, for every chunk;
-        # once it has freed a block of this size, it keeps as much (mallopt(3), M_MMAP_THRESHOLD). Reading
-        # ROS 1 chunks of 1 MB: 8 GB/s instead of 2.7.
+        # glibc returns freed memory to the system and gets it again, page by page, for every chunk. Once it
+        # has freed a block of this size, it keeps as much (mallopt(3), M_MMAP_THRESHOLD). So ROS 1 chunks
+        # of 1 MB are read at 8 GB/s instead of 2.7.
         bytes(_KEPT)
         try:
             end, closed = self.walk()
@@ -101,7 +101,7 @@ class ChunkedPart(LogPart):
 
     @abstractmethod
     def walk(self) -> tuple[int, bool]:
-        """Find chunks, index and channels; where the last complete record ends, and whether it is the end.
+        """Find chunks, index and channels; return the end of the last complete record, and True if closed.
 
         Raises:
             DataError: the file is not of this format, or of an unknown version.
@@ -113,27 +113,27 @@ class ChunkedPart(LogPart):
 
     @abstractmethod
     def payload(self, content: memoryview, place: int, channel: int, stamp_ns: int) -> memoryview:
-        """The bytes of the message that the index says is here; ValueError if it is not."""
+        """Return the bytes of the message at the index's place; ValueError if it is not there."""
 
     @abstractmethod
     def shape(self, content: memoryview, place: int) -> RecordShape:
-        """The shape of the record of a message; ValueError or struct.error if it is none."""
+        """Return the shape of the record of a message; ValueError or struct.error if it is none."""
 
     @abstractmethod
     def stamp_bytes(self, stamp_ns: Int64) -> NDArray[np.uint8]:
-        """Stamps [n] as a record's head writes them [n, 8]."""
+        """Return stamps [n] as bytes in the form of a record's head [n, 8]."""
 
     def close(self) -> None:
         """Close the file."""
         self.file.close()
 
     def forget(self) -> None:
-        """Forget what was lost, and the chunks that a reading left behind."""
+        """Forget the losses, and free the chunks of the last reading."""
         super().forget()
         self._cache.clear()
 
     def read(self, rows: Int64) -> Iterator[tuple[int, memoryview]]:
-        """The bytes of messages, as views into their chunk."""
+        """Yield the bytes of messages, as views into their chunk."""
         table = self.table
         blocks = table.block[rows].tolist()
         last_of_block = dict(zip(blocks, range(len(blocks)), strict=True))
@@ -147,7 +147,7 @@ class ChunkedPart(LogPart):
         for k, (block, place, channel, stamp_ns) in enumerate(places):
             content = self._content(block)
             if last_of_block[block] == k:
-                # The next chunk then takes the same memory, which is in the processor's cache.
+                # The next chunk then uses the same memory, which is in the processor's cache.
                 del self._cache[block]
             if content is None:
                 self.lose(int(rows[k]), DAMAGED)
@@ -160,7 +160,7 @@ class ChunkedPart(LogPart):
             yield k, data
 
     def read_alike(self, rows: Int64) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
-        """Gathered from each chunk at once; the heads of the records must be those of the index."""
+        """Read all messages of a chunk at once; the heads of the records must agree with the index."""
         table = self.table
         shape: RecordShape | None = None
         first: NDArray[np.uint8] | None = None
@@ -190,7 +190,7 @@ class ChunkedPart(LogPart):
         table = self.table
         place = int(table.place[row])
         try:
-            # Says whether it is of this channel, which no other record is asked again: their heads are alike.
+            # Check the channel once. Other records are not checked again, because their heads must be equal.
             self.payload(content, place, int(table.channel[row]), int(table.stamp_ns[row]))
             shape = self.shape(content, place)
         except (ValueError, struct.error, KeyError, IndexError) as error:
@@ -200,7 +200,7 @@ class ChunkedPart(LogPart):
         return shape
 
     def bytes_at(self, offset: int, length: int) -> bytes:
-        """Bytes of the file; fewer at its end."""
+        """Read bytes of the file; fewer at its end."""
         self.file.seek(offset)
         return self.file.read(max(0, min(length, self.file_size - offset)))
 
@@ -218,7 +218,7 @@ class ChunkedPart(LogPart):
 
     def _look_into_chunks(self, closed: bool) -> None:
         for number, chunk in enumerate(self.chunks):
-            # The index of the last chunk may be half written.
+            # The index of the last chunk may be incomplete.
             unindexed = not chunk.index or (not closed and chunk is self.chunks[-1])
             mentioned = {int(rows[0, 0]) for rows in chunk.index if len(rows)}
             if not unindexed and mentioned <= self.channels.keys():
@@ -270,9 +270,9 @@ class ChunkedPart(LogPart):
 
 
 def _records(content: memoryview, places: Int64, length: int) -> NDArray[np.uint8]:
-    """The bytes [n, length] at some places; UnlikeError if one ends outside."""
+    """Return the bytes [n, length] at the given places; UnlikeError if one ends outside."""
     if int(places.min()) < 0 or int(places.max()) + length > len(content):
         raise UnlikeError
-    # Every stretch of that length, as a view: row k begins at byte k.
+    # A view of all windows of that length: row k begins at byte k.
     windows = np.ndarray((len(content) - length + 1, length), np.uint8, content, strides=(1, 1))
     return windows[places]

@@ -1,7 +1,7 @@
-"""Clouds of points in logs (sensor_msgs/PointCloud2) as maps that grow.
+"""Conversion of point clouds in logs (sensor_msgs/PointCloud2) to maps that grow.
 
-A voxel is occupied from the first point in it on; the maps are what had been seen by a few moments of the
-flight. What moves, the actor above all, leaves its trace in them.
+A voxel is occupied from the time of its first point on. Each map holds all points up to one of a few times
+of the flight. Moving things, above all the actor, leave a trace of occupied voxels.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from pipelines.session.maps import MOST_VOXELS
 from pipelines.session.records import Float, Message
 
 MOST_CLOUD_MAPS = 10
-"""Moments of a flight at which what its clouds had shown by then becomes a map."""
+"""Largest number of times at which the points so far become a map."""
 
-# sensor_msgs/PointField: the types that coordinates can have.
+# Types that coordinates can have, by the numbers of sensor_msgs/PointField.
 _FLOAT_TYPES = {7: "f4", 8: "f8"}
 
 
 def accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:
-    """The maps that the clouds of a topic make, in the world's axes and by the log's times.
+    """Accumulate the clouds of a topic to maps, in the world's axes and by the log's times.
 
     Raises:
         DataError: no point is usable, or their box is too large.
@@ -61,7 +61,7 @@ def accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:
         if pose is None:
             lost.counts[PLACELESS] += 1
             continue
-        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite stays so, and is counted
+        with np.errstate(invalid="ignore", over="ignore"):  # NaN and infinity stay, and are counted
             voxels.add(points if _is_the_world(pose) else transform(pose, points), t_ns)
         clouds += 1
     lost.counts.update(voxels.dropped)
@@ -79,10 +79,10 @@ def accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:
 
 
 def cloud_points(value: Any, source: str) -> Float:
-    """The points [N, 3] of a PointCloud2 in its own frame, NaN where it has NaN.
+    """Return the points [N, 3] of a PointCloud2 in its own frame; NaN stays NaN.
 
     Raises:
-        DataError: no x, y, z of float32 or float64, or fewer bytes than it states.
+        DataError: no x, y, z of float32 or float64, or fewer bytes than the message states.
     """
     width, height, stride = int(value.width), int(value.height), int(value.point_step)
     order = ">" if value.is_bigendian else "<"
@@ -105,11 +105,11 @@ def cloud_points(value: Any, source: str) -> Float:
         raise DataError(
             source, f"a cloud breaks off: {len(data)} bytes for {width} x {height} points", RECORD_AGAIN
         )
-    # Rows may be padded, and the values may begin anywhere: they are copied where they belong.
+    # Rows may be padded, and values may be unaligned, so they are copied.
     rows = np.ascontiguousarray(data[: row_bytes * height].reshape(height, row_bytes)[:, : width * stride])
     records = rows.reshape(-1, stride) if width * height else rows.reshape(0, stride)
     points = np.empty((len(records), 3))
-    with np.errstate(invalid="ignore"):  # a NaN that signals becomes one that does not
+    with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN warns
         for axis, (kind, offset) in enumerate(columns.values()):
             values = np.ascontiguousarray(records[:, offset : offset + np.dtype(kind).itemsize])
             points[:, axis] = values.view(kind)[:, 0] if len(values) else 0
@@ -117,5 +117,5 @@ def cloud_points(value: Any, source: str) -> Float:
 
 
 def _is_the_world(pose: Pose) -> bool:
-    """Whether a frame is the world's: points then keep every bit."""
+    """Return True for the identity pose: points of the world's own frame then keep every bit."""
     return not pose[0].any() and pose[1].tolist() == [0.0, 0.0, 0.0, 1.0]

@@ -1,8 +1,8 @@
-"""Where drones were sent: setpoints, and plans that replace each other, as planners on board publish them.
+"""Reader of commanded positions: setpoints, and plans that replace each other, from on-board planners.
 
 A plan (nav_msgs/Path with times, MultiDOFJointTrajectory) looks ahead and is replaced by the next one: each
-holds from its first point to the first point of the next. mavros_msgs/PositionTarget is one setpoint in
-the log's axes, as `setpoint_raw` takes it.
+is valid from its first point to the first point of the next. mavros_msgs/PositionTarget is one setpoint in
+the log's axes, as `setpoint_raw` expects it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PATH = "nav_msgs/msg/Path"
 TRAJECTORY = "trajectory_msgs/msg/MultiDOFJointTrajectory"
 TARGET = "mavros_msgs/msg/PositionTarget"
 COMMAND_TYPES = (PATH, TRAJECTORY, TARGET)
-"""What is read here; setpoints that are poses (PoseStamped, Odometry) are read as poses."""
+"""Message types that are read here; setpoints that are poses (PoseStamped, Odometry) are read as poses."""
 
 _LOCAL_FRAME, _NO_POSITION = 1, 0b111  # PositionTarget: coordinate_frame, and type_mask of x, y, z
 
@@ -34,14 +34,14 @@ _Point = tuple[int, float, float, float]
 
 
 class _Way:
-    """Points in the order of time, of which later plans replace what they begin before."""
+    """Points in the order of time; a later plan replaces all points from its beginning on."""
 
     def __init__(self) -> None:
         self._t_ns = array("q")
         self._position = array("d")
 
     def replace_from(self, points: list[_Point]) -> None:
-        """Take a plan: what was planned for its first moment and later no longer holds."""
+        """Add a plan: it replaces all earlier points from its first time on."""
         kept = bisect_left(self._t_ns, points[0][0])
         del self._t_ns[kept:], self._position[3 * kept :]
         for t_ns, *place in points:
@@ -49,7 +49,7 @@ class _Way:
             self._position.extend(place)
 
     def trajectory(self, source: str) -> Trajectory:
-        """The points, cleaned; no rotation."""
+        """Return the points as a clean trajectory; the rotation is the identity."""
         position = np.frombuffer(self._position, dtype=np.float64).reshape(-1, 3)
         level = np.tile([0.0, 0.0, 0.0, 1.0], (len(position), 1))
         readable = np.ones(len(position), dtype=np.bool_)
@@ -59,20 +59,20 @@ class _Way:
 def read_commands(
     recording: Log, source: str, topic: str, stamps: Literal["header", "receive"]
 ) -> Trajectory:
-    """The positions that a topic of one of `COMMAND_TYPES` commanded, in the axes of the log.
+    """Read the positions that a topic of one of `COMMAND_TYPES` commanded, in the axes of the log.
 
-    Setpoints that leave the position open or are relative to the body are dropped and counted, empty
-    plans likewise. The rotation is the identity: it means nothing.
+    Setpoints without a position or relative to the body are dropped and counted, and so are empty
+    plans. The rotation is the identity and has no meaning.
 
     Args:
         recording: the log.
         source: its path, for messages.
-        topic: of one of these types.
-        stamps: whose clock counts; a plan that is timed by its receipt begins then.
+        topic: its name; one of these types.
+        stamps: the stamps to use; with receipt, a plan begins at the time of its receipt.
 
     Raises:
-        DataError: a message cannot be read, the points of a plan have no times of their own, a plan is of
-            several things, or nothing is usable.
+        DataError: a message cannot be read, the points of a plan have no increasing times, a plan moves
+            several bodies, or nothing is usable.
     """
     way, dropped = _Way(), Counter[str]()
     for message in recording.messages([topic]):

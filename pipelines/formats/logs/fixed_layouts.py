@@ -1,8 +1,8 @@
-"""Poses straight from the bytes of a whole topic, where every message has the same layout.
+"""Poses straight from the bytes of a whole topic, if every message has the same layout.
 
-The messages of one topic of poses differ in nothing but numbers: the same frames, the same length. Then a
-thousand of them are one array, read ten times as fast as one at a time. Wherever that does not hold,
-nothing is said here and the messages are decoded one by one.
+The messages of one topic of poses usually differ in numbers only: they have the same frames and the same
+length. Then a thousand of them are one array, which is read ten times as fast as single messages. In all
+other cases the result here is None, and the messages are decoded one by one.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from pipelines.session.registries import Log
 Messages = tuple[Int64, NDArray[np.uint8]]
 """Stamps of receipt [n], and the bytes of messages of one length [n, length]."""
 
-_LATEST_NS = 2**62  # stamps beyond are no times, which is for others to say
+_LATEST_NS = 2**62  # later stamps are invalid; the general decoder reports them
 _CDR_LITTLE_ENDIAN = (0, 1, 0, 0)
 
 
 @dataclass(frozen=True)
 class _Fields:
-    """What follows the header of a message."""
+    """Layout of the fields after the header of a message."""
 
     has_child: bool  # the id of a second frame
     has_covariance: bool
@@ -46,7 +46,7 @@ _KNOWN = {
 
 @dataclass(frozen=True)
 class PoseArrays:
-    """Poses of one topic as it states them."""
+    """Poses of one topic as logged."""
 
     frames: tuple[str, str]  # target and source
     header_ns: Int64  # [N]
@@ -56,29 +56,29 @@ class PoseArrays:
 
 
 class _OtherLayoutError(Exception):
-    """A message that is not laid out as the first."""
+    """Error for a message whose layout differs from the first one's."""
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where things are in every message of a topic."""
+    """Positions of the fields in every message of a topic."""
 
     is_cdr: bool
     length: int
     stamp: slice  # seconds, signed as rosbags reads them, then nanoseconds
-    text: slice  # lengths and characters of the frames' names, with what pads them
+    text: slice  # lengths and characters of the frames' names, with their padding
     text_bytes: NDArray[np.uint8]
     names: tuple[str, str]
     doubles: slice  # position, quaternion xyzw, and the covariance of types that have one
 
 
 def read_poses(schema: Schema, messages: Iterable[Messages]) -> PoseArrays | None:
-    """All poses of a topic in the order of receipt; None where they are not of one known layout.
+    """Read all poses of a topic in the order of receipt; None unless all have one known layout.
 
     Args:
         schema: of the topic.
-        messages: in any order; those of equal stamps keep theirs. Read to the end, or to the first that
-            differs.
+        messages: in any order; messages of equal stamps keep theirs. Read to the end, or to the first
+            one with another layout.
     """
     fields = _KNOWN.get(schema.type)
     if fields is None or schema.encoding not in {"cdr", "ros1"} or not is_standard(schema):
@@ -115,7 +115,7 @@ def read_poses(schema: Schema, messages: Iterable[Messages]) -> PoseArrays | Non
 
 
 def _refuse_another_layout(layout: _Layout, raw: NDArray[np.uint8]) -> None:
-    """All but the numbers that are used must be as in the first message."""
+    """Refuse messages that differ from the first one in anything but the numbers that are used."""
     if raw.shape[1] != layout.length or (raw[:, layout.text] != layout.text_bytes).any():
         raise _OtherLayoutError
     if layout.is_cdr and (raw[:, :4] != _CDR_LITTLE_ENDIAN).any():
@@ -123,17 +123,17 @@ def _refuse_another_layout(layout: _Layout, raw: NDArray[np.uint8]) -> None:
 
 
 def _stamps(raw: NDArray[np.uint8]) -> Int64:
-    """Stamps of headers [n] from their bytes [n, 8]: seconds, signed, then nanoseconds."""
+    """Convert the bytes of header stamps [n, 8] (seconds, signed, then nanoseconds) to ns [n]."""
     words = np.ascontiguousarray(raw).view("<u4")
     stamps: Int64 = words[:, 0].view("<i4").astype(np.int64) * 1_000_000_000 + words[:, 1]
     return stamps
 
 
 def _layout(encoding: str, fields: _Fields, first: bytes) -> _Layout:
-    """The layout of a message, by its first one.
+    """Find the layout of a topic's messages from the first one.
 
-    CDR (OMG DDSI-RTPS 2.5, section 10) aligns to the size of a number, counted behind its four bytes of
-    head, and ends text with a zero; ROS 1 does neither.
+    CDR (OMG DDSI-RTPS 2.5, section 10) aligns each number to its size, counted from the end of its four bytes
+    of head, and ends text with a zero. ROS 1 does neither.
     """
     cdr = encoding == "cdr"
     stamp_at = 4  # behind the head of CDR, or the sequence number of ROS 1
@@ -167,6 +167,6 @@ def _layout(encoding: str, fields: _Fields, first: bytes) -> _Layout:
 
 
 def poses_at_once(recording: Log, topic: str) -> PoseArrays | None:
-    """All poses of a topic, if one file format of ours holds it and its messages are alike."""
+    """Read all poses of a topic at once, if our own reader opened the log and the messages are alike."""
     alike = messages_alike(recording, topic)
     return None if alike is None else read_poses(alike.schema, alike.log.arrays(alike.topic))

@@ -1,4 +1,4 @@
-"""In which frame something of a log lies, and where that is in the log's world."""
+"""Frames of logged data, and their poses in the log's world."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import PoseSample, Trajectory
 from pipelines.session.registries import Log
 
-_FIXED_FRAMES = ("world", "map", "odom", "earth")  # as REP 105 names what does not move
+_FIXED_FRAMES = ("world", "map", "odom", "earth")  # names of fixed frames in REP 105
 
 _THE_WORLD = Trajectory(np.zeros(1, np.int64), np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]))
-"""A frame that is the log's world."""
+"""Identity pose, for a frame that is the log's world."""
 
 
 def transforms_in(recording: Log, source: str, topic: str | None = None) -> TransformLog:
-    """Every transform of a log, or of one topic; those of topics whose names end in `static` hold always.
+    """Read every transform of a log, or of one topic; those of topics named `...static` always hold.
 
     Raises:
         DataError: messages that cannot be read.
@@ -37,13 +37,13 @@ def transforms_in(recording: Log, source: str, topic: str | None = None) -> Tran
 
 
 def frames_of_poses(recording: Log, source: str, taken: Iterable[tuple[str | None, str | None]]) -> list[str]:
-    """The frames in which a log states poses, each once, without the leading slash of ROS 1.
+    """Return the frames of a log's poses, each once, without the leading slash of ROS 1.
 
     Args:
         recording: the log.
         source: its name, for messages.
-        taken: topic and parent of each; a parent names the frame itself, a topic that is left out is the
-            only one. What does not fit the log says nothing here: reading the poses tells why.
+        taken: topic and parent of each; a parent names the frame itself, and a missing topic means the
+            only one. Entries that do not fit the log are ignored; reading the poses reports them.
     """
     topics = [topic.name for topic in recording.topics if kind_of(topic) == "poses"]
     frames: list[str] = []
@@ -70,25 +70,25 @@ def place_of_frame(
     max_gap_ns: int,
     note: Callable[[str], None],
 ) -> Trajectory:
-    """Where a frame is in the log's world; a single row where it is that world, or never moves in it.
+    """Return the pose of a frame in the log's world; one row if it is that world or never moves in it.
 
-    The log's world is the frame that is stated, else that of the poses which are taken from this log, else
-    one with a name for what does not move. A map in such a frame that nothing connects with that of the
-    poses is taken to lie in the same, and it is said.
+    The log's world is the stated frame, else the frame of the poses that are taken from this log, else
+    one with the name of a fixed frame. If a map lies in such a fixed frame and no transforms connect it with
+    the frame of the poses, both are taken for one frame, and a note says so.
 
     Args:
         recording: the log.
         source: its name, for messages.
         place: log and topic, for messages.
-        frame: what is looked for; nothing stated is the world.
-        parent: the world, if it is stated.
+        frame: the frame to find; an empty name means the world.
+        parent: the world's frame, if it is stated.
         poses_in: the frames of the poses.
-        stamps: which stamps of the transforms count.
-        max_gap_ns: the longest stretch between two transforms that is bridged.
-        note: told what was found.
+        stamps: which stamps of the transforms are used.
+        max_gap_ns: the longest gap between two transforms that is interpolated.
+        note: receives the result in words.
 
     Raises:
-        DataError: nothing says where the frame is.
+        DataError: nothing connects the frame with the log's world.
     """
     known = [parent.lstrip("/")] if parent is not None else [*poses_in] or list(_FIXED_FRAMES)
     if not frame or frame in known:

@@ -1,4 +1,4 @@
-"""Decompression that trusts no stated size: bounded output, and what there is of data that is cut off."""
+"""Decompression that trusts no size in the file: bounded output, also of data that is cut off."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ class _Decompressor(Protocol):
 
 
 def inflate(data: memoryview | bytes, compression: str, size: int) -> tuple[memoryview | bytes, bool]:
-    """Decompress at most `size` bytes; whether that was all there is, neither cut off nor longer.
+    """Decompress at most `size` bytes; also return True if that was all, neither cut off nor longer.
 
     Args:
-        data: one compressed frame, maybe cut off.
+        data: one compressed frame, perhaps cut off.
         compression: none (or empty), bz2, lz4 or zstd.
-        size: how long the result may be.
+        size: largest length of the result.
 
     Raises:
-        ValueError: an unknown compression, or bytes that are not compressed so.
+        ValueError: an unknown compression, or bytes that are not in this compression.
     """
     if compression in {"", "none"}:
         return data[:size], len(data) <= size
@@ -43,7 +43,7 @@ def _bounded(
     decompressor: _Decompressor, data: memoryview | bytes, size: int, failure: type[Exception]
 ) -> tuple[bytes, bool]:
     try:
-        # One byte more than allowed shows whether the data goes on.
+        # One byte more than allowed shows if the data goes on.
         content = decompressor.decompress(data, max_length=size + 1)
     except (failure, EOFError) as error:
         raise ValueError(str(error)) from error

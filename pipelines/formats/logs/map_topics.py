@@ -1,4 +1,4 @@
-"""What messages of every kind of map have in common: their time, their frame, where it is, their losses."""
+"""Common parts of all map messages: time, frame, pose of the frame, and losses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ DAMAGED = "map messages that cannot be used"
 PLACELESS = "map messages at whose time no transform is known"
 RECORD_AGAIN = "check what wrote the log"
 
-# What rosbags does not know: logs of ROS 2 up to Humble carry no definitions.
+# Definition that rosbags lacks: logs of ROS 2 up to Humble carry no definitions.
 _OCTOMAP_DEFINITION = """std_msgs/Header header
 bool binary
 string id
@@ -42,16 +42,16 @@ string frame_id
 
 @dataclass(frozen=True)
 class MapTopic:
-    """How the messages of a topic are to be read.
+    """Settings to read the messages of a topic of maps.
 
     Args:
         source: log and topic, for messages.
         frame: of all its messages.
-        stamps: which of their stamps counts: header or receive.
-        world_from_frame: where that frame is; a single row holds always.
-        max_gap_ns: the longest stretch between two rows of it that is bridged.
-        resolution_m: of the voxels, if it is stated.
-        height_m: how high what is on a floor plan stands.
+        stamps: the stamps in use: header or receive.
+        world_from_frame: poses of that frame; a single row always holds.
+        max_gap_ns: the longest gap between two of its rows that is interpolated.
+        resolution_m: side of the voxels, if it is stated.
+        height_m: height of the cells of a floor plan.
     """
 
     source: str
@@ -65,7 +65,7 @@ class MapTopic:
 
 @dataclass(frozen=True)
 class LoggedMaps:
-    """The maps of a topic in the order of their times, and what it holds besides."""
+    """Maps of a topic in the order of their times, with losses and notes."""
 
     maps: Iterator[Occupancy]  # made one at a time
     from_ns: Int64  # [K] of each, strictly increasing
@@ -74,17 +74,17 @@ class LoggedMaps:
 
 
 def map_messages(recording: Log, topic: str) -> Iterator[Message]:
-    """The messages of a topic of maps, in the order of receipt."""
+    """Yield the messages of a topic of maps, in the order of receipt."""
     if isinstance(recording, OpenLog):
         return recording.messages([topic], _decoder)
     return recording.messages([topic])
 
 
 def frame_of(message: Message, source: str) -> str:
-    """The frame in which a map lies, without the leading slash of ROS 1.
+    """Return the frame of a map, without the leading slash of ROS 1.
 
     Raises:
-        DataError: it states none that could be read.
+        DataError: the message has no readable frame.
     """
     try:
         return str(message.value.header.frame_id).lstrip("/")
@@ -93,10 +93,10 @@ def frame_of(message: Message, source: str) -> str:
 
 
 class Losses:
-    """What of a topic could not be used.
+    """Messages of a topic that could not be used.
 
     Attributes:
-        counts: how many messages, by cause.
+        counts: number of messages by cause.
     """
 
     def __init__(self, source: str, counts: Mapping[str, int] | None = None) -> None:
@@ -105,18 +105,18 @@ class Losses:
         self._first: DataError | None = None
 
     def damaged(self, fault: DataError) -> None:
-        """Count a message that cannot be read; the first one stands for all."""
+        """Count a message that cannot be read; keep the first fault for the note."""
         self.counts[DAMAGED] += 1
         self._first = self._first or fault
 
     def notes(self) -> list[str]:
-        """What is to be said of the messages that cannot be read."""
+        """Return a note about the messages that cannot be read; empty if all can."""
         if self._first is None:
             return []
         return [f"{self._source}: {self._first.problem} ({self.counts[DAMAGED]} such messages)"]
 
     def nothing_usable(self) -> DataError:
-        """What to say where the topic gives no map: the first fault, else what was lost."""
+        """Return the error for a topic without a usable map: the first fault, else the losses."""
         if self._first is not None:
             return self._first
         causes = ", ".join(f"{count} {cause}" for cause, count in (+self.counts).items())
@@ -128,7 +128,7 @@ class Losses:
 
 
 def evenly(count: int, most: int) -> list[int]:
-    """Rows of `count`, the last one always among them."""
+    """Return at most `most` of `count` rows, evenly spaced, always with the last one."""
     if count <= most:
         return list(range(count))
     rows: list[int] = np.linspace(count - 1, 0, most).round().astype(int)[::-1].tolist()
@@ -136,7 +136,7 @@ def evenly(count: int, most: int) -> list[int]:
 
 
 def time_of(message: Message, about: MapTopic) -> int:
-    """The stamp that counts.
+    """Return the stamp to use.
 
     Raises:
         DataError: the message lies in another frame than those before it.
@@ -150,7 +150,7 @@ def time_of(message: Message, about: MapTopic) -> int:
 
 
 def place_at(t_ns: int, about: MapTopic) -> Pose | None:
-    """Where the frame of a topic is in the world; None where nothing says it."""
+    """Return the pose of a topic's frame in the world; None if no transform gives it."""
     poses = about.world_from_frame
     if len(poses.t_ns) == 1:
         return poses.position[0], poses.quaternion_xyzw[0]
@@ -168,7 +168,7 @@ def place_at(t_ns: int, about: MapTopic) -> Pose | None:
 
 
 def _decoder(schema: Schema) -> Decoder:
-    """As `decoder`, also for octomap_msgs/Octomap that the log does not define."""
+    """Make a decoder like `decoder`, also for octomap_msgs/Octomap without a definition in the log."""
     if schema.type == OCTOMAP and not schema.definition and schema.encoding in {"ros1", "cdr"}:
         is_ros1 = schema.encoding == "ros1"
         text = _OCTOMAP_DEFINITION.format(sequence="uint32 seq\n" if is_ros1 else "")

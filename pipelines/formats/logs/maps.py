@@ -1,8 +1,8 @@
-"""Maps in logs: octomap_msgs/Octomap, nav_msgs/OccupancyGrid, and by `log_clouds` sensor_msgs/PointCloud2.
+"""Maps in logs: octomap_msgs/Octomap, nav_msgs/OccupancyGrid, and by `clouds` sensor_msgs/PointCloud2.
 
-Maps that follow each other on a topic replace each other, as they did in flight: every change is a map of its
-own, with the stamp from which it holds. A log of any length needs the memory of its largest map; its messages
-are read twice where there is more than one map.
+Consecutive maps of a topic replace each other, as they did in flight. So every change is a map of its own,
+with the stamp from which it is valid. A log of any length needs the memory of its largest map only; its
+messages are read twice if there is more than one map.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from pipelines.session.maps import MOST_VOXELS, check_resolution
 from pipelines.session.records import Message, Occupancy
 
 MOST_MAPS = 100
-"""A replay needs the distance field of each: seconds for large ones."""
+"""Limit of the maps kept; a replay computes the distance field of each, which takes seconds if large."""
 
 _EMPTY = "empty maps"
 _LATE = "maps without a later stamp"
@@ -44,12 +44,12 @@ _NOT_KEPT = "maps between those that are kept"
 
 
 class _EmptyMapError(Exception):
-    """Nothing in a map is known."""
+    """Error for a map without any known cell."""
 
 
 @dataclass(frozen=True)
 class _Change:
-    """A map that differs from the one before."""
+    """Map that differs from the one before."""
 
     row: int  # of its message
     t_ns: int
@@ -57,15 +57,15 @@ class _Change:
 
 
 def read_maps(read: Callable[[], Iterator[Message]], type_: str, about: MapTopic) -> LoggedMaps:
-    """The maps of a topic, in the world's axes and by the log's times.
+    """Read the maps of a topic, in the world's axes and by the log's times.
 
     Args:
-        read: the messages in the order of receipt, as often as it is called.
+        read: returns the messages in the order of receipt, anew at each call.
         type_: of the messages.
-        about: how they are to be read.
+        about: settings to read them.
 
     Raises:
-        DataError: none is usable, or they make too large a map.
+        DataError: no map is usable, or one is too large.
     """
     if type_ == POINT_CLOUD:
         return accumulated(read(), about)
@@ -121,7 +121,7 @@ def _changing(read: Callable[[], Iterator[Message]], about: MapTopic) -> LoggedM
 
 
 def _made(message: Message, about: MapTopic) -> Occupancy | None:
-    """The map of one message; None where it has no place."""
+    """Make the map of one message; None if the pose of its frame is unknown."""
     try:
         t_ns = time_of(message, about)
         pose = place_at(t_ns, about)
@@ -147,7 +147,7 @@ def _made_again(
 
 
 def _spread(changes: list[_Change]) -> list[_Change]:
-    """As many as may be kept, evenly, with the first and the last."""
+    """Choose as many changes as may be kept, evenly spaced, with the first and the last."""
     most = max(1, min(MOST_MAPS, MOST_VOXELS // max(change.voxels for change in changes)))
     return [changes[row] for row in evenly(len(changes), most)]
 
@@ -160,7 +160,7 @@ def _digest(occupancy: Occupancy) -> bytes:
 
 
 def _octomap(value: Any, about: MapTopic, pose: Pose) -> Occupancy:
-    # A copy: the compiled walk wants its numbers where they belong, messages begin anywhere.
+    # A copy, because the compiled walk needs aligned numbers and messages may begin at any byte.
     payload = np.frombuffer(bytes_of(value.data).tobytes(), np.uint8)
     if not len(payload):
         raise _EmptyMapError
@@ -183,7 +183,7 @@ def _plan(value: Any, about: MapTopic, pose: Pose) -> Occupancy:
         raise DataError(source, f"holds a cell of {worst}", "-1 is unknown, else 0 to 100 percent")
     if not (cells >= 0).any():
         raise _EmptyMapError
-    # The message has a float32: 0.05 is meant where it says 0.0500000007.
+    # The message has a float32: 0.0500000007 stands for 0.05.
     cell_m = check_resolution(source, float(str(np.float32(info.resolution))))
     plan = np.where(cells < 0, np.nan, cells / 100).astype(np.float32).reshape(height, width).T
     return extruded(
@@ -197,7 +197,7 @@ def _plan(value: Any, about: MapTopic, pose: Pose) -> Occupancy:
 
 
 def _origin(stated: Any, source: str) -> Pose:
-    """The pose of a plan's corner; a quaternion of zeros, which many leave, is no rotation."""
+    """Return the pose of a plan's corner; a quaternion of zeros, which is common, means no rotation."""
     at, turned = stated.position, stated.orientation
     position = np.array([at.x, at.y, at.z], dtype=np.float64)
     quaternion = np.array([turned.x, turned.y, turned.z, turned.w], dtype=np.float64)

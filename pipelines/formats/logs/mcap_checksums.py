@@ -1,7 +1,7 @@
-"""The checksum of an MCAP file's data section, taken while the whole file is hashed anyway.
+"""Checksum of an MCAP file's data section, computed while the whole file is hashed anyway.
 
-Record DataEnd states the CRC-32 of everything before it, or 0 (mcap.dev/spec, "Data End"). Checking it takes
-a reading of the whole file, which reading a topic or two does not; hashing a source is one.
+Record DataEnd has the CRC-32 of everything before it, or 0 (mcap.dev/spec, "Data End"). A check needs the
+whole file. Reading a topic or two does not read it all, but hashing a source does.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ _FOOTER_KIND, _FOOTER_LENGTH, _DATA_END_KIND, _DATA_END_LENGTH = 2, 20, 15, 4
 
 @dataclass(frozen=True)
 class StatedChecksum:
-    """What a file says of its own bytes."""
+    """Checksum that a file states of its own data section."""
 
     crc: int
     size: int  # of the data section: bytes from the beginning of the file
 
 
 class CheckedHash:
-    """A hash for `hashlib.file_digest` that takes the checksum of the first bytes as well."""
+    """Hash for `hashlib.file_digest` that also computes the checksum of the first bytes."""
 
     def __init__(self, stated: StatedChecksum | None) -> None:
         self._sha256 = hashlib.sha256()
@@ -40,11 +40,11 @@ class CheckedHash:
 
     @property
     def differs(self) -> bool:
-        """Whether a checksum is stated and is not that of the bytes."""
+        """True if the file states a checksum and its bytes have another one."""
         return self._stated is not None and self._crc != self._stated.crc
 
     def update(self, data: memoryview) -> None:
-        """Take some more bytes."""
+        """Add some more bytes."""
         self._sha256.update(data)
         if self._left:
             begin = data[: self._left]
@@ -52,15 +52,15 @@ class CheckedHash:
             self._left -= len(begin)
 
     def digest(self) -> bytes:
-        """The SHA-256 of all bytes."""
+        """Return the SHA-256 of all bytes."""
         return self._sha256.digest()
 
 
 def checksum_is_right(path: Path) -> bool | None:
-    """Whether the data section is what its checksum says, which reads it all; None where none is stated.
+    """Return True if the data section has the stated checksum; reads it all. None if none is stated.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     stated = stated_checksum(path)
     if stated is None:
@@ -74,10 +74,10 @@ def checksum_is_right(path: Path) -> bool | None:
 
 
 def stated_checksum(path: Path) -> StatedChecksum | None:
-    """The checksum that a file states; None where it states none, is no MCAP, or has lost its end.
+    """Return the checksum that a file states; None if it has none, is no MCAP, or has lost its end.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     with path.open("rb") as file:
         if file.read(len(_MAGIC)) != _MAGIC:
@@ -89,7 +89,7 @@ def stated_checksum(path: Path) -> StatedChecksum | None:
         kind, length, summary_at, _, _, magic = _FOOTER.unpack(file.read(_FOOTER.size))
         if (kind, length, magic) != (_FOOTER_KIND, _FOOTER_LENGTH, _MAGIC):
             return None
-        # The summary follows the end of the data; without one the footer does.
+        # The summary follows the end of the data. Without a summary the footer does.
         end = (summary_at or footer_at) - _DATA_END.size
         if not len(_MAGIC) <= end <= footer_at - _DATA_END.size:
             return None

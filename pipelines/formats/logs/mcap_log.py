@@ -1,7 +1,7 @@
 """MCAP files (mcap.dev/spec), whole or cut off, chunked or not, with any profile.
 
-The records are parsed by the mcap library. Its readers stop at the first damage, and the one for files
-without an index ignores checksums and size limits, so the file is walked here.
+The mcap library parses the records. But its readers stop at the first damage, and the one for files
+without an index ignores checksums and size limits. So this module walks the file itself.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from pipelines.session.storage import is_special
 
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _STATISTICS = 2, 3, 4, 5, 6, 7, 11
-_DAMAGE = (McapError, struct.error, ValueError)  # what the library raises for records that are none
+_DAMAGE = (McapError, struct.error, ValueError)  # errors of the library for invalid records
 _HEAD = struct.Struct("<BQ")  # kind and length of a record
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # then channel, sequence, log time, publish time
 _CHUNK_HEAD = struct.Struct("<QQQII")  # first and last stamp, size, checksum, length of what follows
 _INDEX_ROW = np.dtype([("stamp", "<u8"), ("place", "<u8")])
 _NO_SCHEMA = records.Schema(id=0, data=b"", encoding="", name="")
-_RUN = 1 << 20  # bytes of messages outside chunks that are read together
+_RUN = 1 << 20  # bytes of messages outside chunks that are read at once
 _STAMP_LIMIT = 1 << 63  # our stamps are int64
 
 
 class McapLog:
-    """MCAP files with messages in ros1, cdr, json or protobuf.
+    """Reader of MCAP files with messages in ros1, cdr, json or protobuf.
 
-    Checksums of chunks are verified; that of the whole data section is where the whole file is hashed or
-    described (`mcap_checksums`).
+    Checksums of chunks are verified here. That of the whole data section is verified when the file is
+    hashed or described (`mcap_checksums`).
     """
 
     name = "mcap"
@@ -49,7 +49,7 @@ class McapLog:
     suffixes: tuple[str, ...] = (".mcap",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether the file begins as MCAP does, or is an empty one."""
+        """Return True if the file begins with MCAP's magic bytes, or is empty and named `.mcap`."""
         if is_special(path):
             return False
         try:
@@ -60,7 +60,7 @@ class McapLog:
         return head == _MAGIC or (not head and path.suffix.lower() in self.suffixes)
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Messages, times, storage, topics, what was lost, and whether its bytes are those written."""
+        """Describe messages, times, storage, topics, losses, and the checksum's result."""
         with self.open_log([path]) as log:
             facts = describe_log(log)
         right = checksum_is_right(path)
@@ -72,7 +72,7 @@ class McapLog:
         """Open one file, or the parts of a split one.
 
         Raises:
-            DataError: no file can be read as MCAP, or holds anything.
+            DataError: no file can be read as MCAP, or all are without content.
         """
         return OpenLog(*open_parts(paths, open_mcap))
 
@@ -81,18 +81,18 @@ def open_mcap(path: Path) -> McapPart:
     """Open one file as a part of a recording.
 
     Raises:
-        DataError: it is no MCAP, or damaged without a message that can be read.
+        DataError: the file is no MCAP, or damaged without any readable message.
     """
     return McapPart(path, *open_file(path))
 
 
 class McapPart(ChunkedPart):
-    """One MCAP file. Messages outside chunks are taken as chunks that are not compressed."""
+    """MCAP file. Messages outside chunks are handled as uncompressed chunks."""
 
     record_overhead = _MESSAGE_HEAD.size
 
     def walk(self) -> tuple[int, bool]:
-        """Walk the records up to the end of the file or to the first that is not whole."""
+        """Walk the records up to the end of the file or to the first incomplete one."""
         if self.bytes_at(0, len(_MAGIC)) != _MAGIC:
             raise DataError(self.path, "is no MCAP file (it does not begin with its magic bytes)")
         self._schemas: dict[int, records.Schema] = {}
@@ -145,7 +145,7 @@ class McapPart(ChunkedPart):
         return Content(channels, index, position)
 
     def payload(self, content: memoryview, place: int, channel: int, stamp_ns: int) -> memoryview:
-        """The bytes of a message."""
+        """Return the bytes of a message."""
         try:
             kind, length, of_channel, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content, place)
         except struct.error as error:
@@ -156,13 +156,13 @@ class McapPart(ChunkedPart):
         return content[place + _MESSAGE_HEAD.size : end]
 
     def shape(self, content: memoryview, place: int) -> RecordShape:
-        """Sequence number, log time and publish time differ."""
+        """Return the shape of a record: sequence number, log time and publish time differ."""
         head = _MESSAGE_HEAD.size
         length = _MESSAGE_HEAD.unpack_from(content, place)[1]
         return RecordShape(head, length - (head - _HEAD.size), slice(15, 23), slice(11, head))
 
     def stamp_bytes(self, stamp_ns: Int64) -> NDArray[np.uint8]:
-        """One unsigned number."""
+        """Return stamps as one unsigned number each."""
         return stamp_ns.astype("<u8").view(np.uint8).reshape(-1, 8)
 
     def _take_chunk(self, content_at: int, length: int) -> None:
@@ -182,7 +182,7 @@ class McapPart(ChunkedPart):
             self.storage.append(name or "uncompressed")
 
     def _extended(self, run: Chunk | None, position: int, end: int) -> Chunk:
-        """The run of messages outside chunks, with one more; a new one if there is none or it is full."""
+        """Add a message outside chunks to the run; begin a new run if there is none or it is full."""
         if run is None or run.length >= _RUN:
             run = Chunk(position, 0, "", 0)
             self.chunks.append(run)

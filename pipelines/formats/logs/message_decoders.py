@@ -1,4 +1,4 @@
-"""From the bytes of a message to a value with the schema's fields as attributes, for every encoding."""
+"""Decoders from the bytes of a message to a value with the schema's fields as attributes, by encoding."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Decoder = Callable[[memoryview | bytes], Any]
 
-MESSAGE_LIMIT = 1 << 28  # bytes of one message that was compressed by itself
+MESSAGE_LIMIT = 1 << 28  # bytes of a message that is compressed by itself
 ARRAY_LIMIT = 1 << 20  # entries of a fixed array; rosbags unrolls arrays of messages into code
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)+", re.ASCII)
 _BASE64 = "base64"
@@ -29,23 +29,23 @@ _BASE64 = "base64"
 
 @dataclass(frozen=True)
 class Schema:
-    """How the messages of a channel are written."""
+    """Encoding and definition of the messages of a channel."""
 
     type: str  # in the spelling of ROS 2, or the schema's own
-    encoding: str  # of the messages: ros1, cdr, json, protobuf, or what the file says
-    definition_encoding: str = ""  # ros1msg, ros2msg, ros2idl, jsonschema, protobuf; empty without
+    encoding: str  # of the messages: ros1, cdr, json, protobuf, or another name from the file
+    definition_encoding: str = ""  # ros1msg, ros2msg, ros2idl, jsonschema, protobuf; empty if there is none
     definition: bytes = b""
 
 
 def ros2_name(name: str) -> str:
-    """The spelling of ROS 2 for a type of either ROS: nav_msgs/Odometry is nav_msgs/msg/Odometry."""
+    """Return a type's name in ROS 2 spelling: nav_msgs/Odometry is nav_msgs/msg/Odometry."""
     package, _, rest = name.partition("/")
     return f"{package}/msg/{rest}" if rest and "/" not in rest else name
 
 
 @lru_cache(maxsize=256)
 def decoder(schema: Schema) -> Decoder:
-    """A function that decodes messages of a schema; it raises ValueError for bytes that do not fit.
+    """Make the function that decodes messages of a schema; it raises ValueError for bytes that do not fit.
 
     ros1 and cdr: dataclasses of rosbags, numeric arrays as views into the message. Without a definition
     in the file, the types of ROS 1 Noetic or of the newest ROS 2 that rosbags knows are used. Messages of
@@ -53,7 +53,7 @@ def decoder(schema: Schema) -> Decoder:
     of the schema as bytes. protobuf: messages of the protobuf library.
 
     Raises:
-        ValueError: why messages of this schema cannot be decoded.
+        ValueError: messages of this schema cannot be decoded; the text gives the reason.
     """
     if schema.encoding in {"ros1", "cdr"}:
         return _ros_decoder(schema)
@@ -66,7 +66,7 @@ def decoder(schema: Schema) -> Decoder:
 
 @lru_cache(maxsize=256)
 def is_standard(schema: Schema) -> bool:
-    """Whether a type of ROS is defined in this log as ROS itself defines it, with all that it is made of."""
+    """Return True if the log defines a ROS type, with all its nested types, exactly as ROS does."""
     from rosbags.typesys import Stores, get_typestore
 
     ours = get_typestore(Stores.ROS1_NOETIC if schema.encoding == "ros1" else Stores.LATEST)
@@ -111,7 +111,7 @@ def _inflate_message(data: memoryview | bytes) -> memoryview | bytes:
 
 
 def _typestore(schema: Schema) -> Typestore:
-    """A store that knows the type of a channel, and every type that it is made of."""
+    """Return a store that knows the type of a channel and all its nested types."""
     from rosbags.typesys import Stores, TypesysError, get_typestore
 
     if not _TYPE_NAME.fullmatch(schema.type):
@@ -177,7 +177,7 @@ def _json_decoder(schema: Schema) -> Decoder:
 
 
 def _binary_fields(schema: Schema) -> dict[str, Any]:
-    """The fields that hold base64: names to `_BASE64`, or to the fields of the objects below them."""
+    """Return the fields that hold base64: names to `_BASE64`, or to the fields of the objects below them."""
     if not schema.definition and schema.type.startswith("foxglove."):
         return {"data": _BASE64}
     try:
@@ -239,7 +239,7 @@ def _protobuf_decoder(schema: Schema) -> Decoder:
 
 
 def _by_dependency(files: Any) -> list[FileDescriptorProto]:
-    """The files so that each comes after those that it imports; a pool takes them in no other order."""
+    """Sort the files so that each comes after those that it imports, as the descriptor pool requires."""
     waiting = {file.name: file for file in files}
     ordered: list[FileDescriptorProto] = []
 

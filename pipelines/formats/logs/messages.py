@@ -1,7 +1,7 @@
-"""Decoded log messages to samples: poses, transforms, gimbal angles, intrinsics and pictures.
+"""Conversion of decoded log messages to samples: poses, transforms, gimbal angles, intrinsics and pictures.
 
-Messages of ROS 1 and ROS 2 and Foxglove's schemas (in protobuf, JSON or ROS) say the same things under
-slightly different names; what differs is settled here and nowhere else. A sample whose `stamp_ns` is 0
+Messages of ROS 1 and ROS 2 and Foxglove's schemas (in protobuf, JSON or ROS) have the same content under
+slightly different names. This module alone handles the differences. A sample whose `stamp_ns` is 0
 comes from a message without a header stamp: it has only the time of its receipt.
 """
 
@@ -35,7 +35,7 @@ from pipelines.session.records import (
 Kind = Literal["poses", "transforms", "angles", "intrinsics", "pictures"]
 Source = Path | str
 
-# Stamps beyond (the year 2116) are no times, and their differences would not fit int64.
+# Larger stamps (after the year 2116) are no times, and their differences would not fit int64.
 _LARGEST_STAMP_NS = 2**62
 
 _FISHEYE_MODELS = {"equidistant", "fisheye"}
@@ -45,22 +45,22 @@ _SIGNATURES = {b"\xff\xd8\xff": "jpeg", b"\x89PNG": "png"}
 
 
 def kind_of(topic: Topic) -> Kind | None:
-    """What a topic's messages hold, by the name of their type; None for what is not read.
+    """Return the kind of a topic's messages by the name of their type; None for types that are not read.
 
-    "poses" are those of one thing, "transforms" those of any number of frames. Left out are arrays of
-    poses at one moment (PoseArray, foxglove.PosesInFrame): they say not which thing each pose is of.
-    Nor maps, which are no samples: see `log_maps`.
+    "poses" are those of one body, "transforms" those of any number of frames. Arrays of poses at one
+    moment (PoseArray, foxglove.PosesInFrame) are left out, because they do not name the body of each pose.
+    Maps are left out too, because they are no samples: see `maps`.
     """
     known = _READERS.get(topic.type)
     return known[0] if known else None
 
 
 def samples(message: Message, source: Source) -> Iterator[Sample]:
-    """What one message says.
+    """Convert one message to samples.
 
-    A nav_msgs/Path gives every pose at its own stamp, in the message's order. It is taken as received when
-    its last pose was new, so earlier ones get their receive stamp set back by as much as their own stamps lie
-    before the last one's.
+    A nav_msgs/Path gives every pose at its own stamp, in the message's order. The receive stamp belongs to
+    its last pose. Each earlier pose gets an earlier receive stamp, by the difference of its own stamp to the
+    last one's.
 
     A CameraInfo's K is of the full sensor; region of interest and binning are applied, so that the
     intrinsics are those of the pictures beside it.
@@ -71,7 +71,7 @@ def samples(message: Message, source: Source) -> Iterator[Sample]:
 
     Raises:
         DataError: the type is not read, a field is missing or no number, a camera is not calibrated
-            (K is zero) or distorts in a way that is not known, or a path's poses have no stamps.
+            (K is zero) or has an unknown distortion model, or a path's poses have no stamps.
     """
     known = _READERS.get(message.topic.type)
     if known is None:
@@ -84,11 +84,11 @@ def samples(message: Message, source: Source) -> Iterator[Sample]:
 
 
 def all_samples(messages: Iterable[Message], source: Source) -> Iterator[Sample]:
-    """What many messages say, in order; see `samples`.
+    """Convert many messages to samples, in order; see `samples`.
 
-    A nav_msgs/Path repeats what earlier ones said and adds to it. Of each only the poses later than all
+    A nav_msgs/Path repeats earlier paths and adds to them. Of each path only the poses later than all
     before on its topic are given: the poses as they were first published, as an odometry topic would have
-    them. Where a later path moves earlier poses (a loop was closed), that is not taken over.
+    them. If a later path moves earlier poses (loop closure), the new positions are ignored.
     """
     newest: dict[str, int] = {}
     for message in messages:
@@ -102,11 +102,11 @@ def all_samples(messages: Iterable[Message], source: Source) -> Iterator[Sample]
 
 
 FAULTS = (AttributeError, TypeError, ValueError, OverflowError)
-"""What a message without a field, or with something else in it, raises when it is read."""
+"""Exceptions from reading a message with a missing field or with a value of another type."""
 
 
 def unreadable(message: Message, source: Source, error: Exception) -> DataError:
-    """Say what is wrong with a message that raised one of `FAULTS`."""
+    """Return the error for a message that raised one of `FAULTS`."""
     topic = message.topic
     problem = f"cannot be read ({error})"
     if isinstance(error, AttributeError):
@@ -272,7 +272,7 @@ def _lens(message: Message, source: Source) -> Intrinsics:
 
 
 def _of_the_picture(full: Intrinsics, value: Any) -> Intrinsics:
-    """The sensor's intrinsics cut to the region of interest, then binned (sensor_msgs/CameraInfo)."""
+    """Cut the sensor's intrinsics to the region of interest, then bin them (sensor_msgs/CameraInfo)."""
     bin_x, bin_y = max(getattr(value, "binning_x", 0), 1), max(getattr(value, "binning_y", 0), 1)
     region = getattr(value, "roi", None)
     if region is None or not region.width or not region.height:  # zero means the whole sensor
@@ -340,7 +340,7 @@ def _encoded_picture(stamp: Any, message: Message) -> PictureSample:
 
 
 def _codec(data: NDArray[np.uint8], stated: str) -> str:
-    """By the first bytes: the stated format may say "jpeg", "bgr8; jpeg compressed bgr8" or nothing."""
+    """Return the codec by the first bytes; `stated` may be "jpeg", "bgr8; jpeg compressed bgr8" or empty."""
     start = data[:4].tobytes()
     for signature, name in _SIGNATURES.items():
         if start.startswith(signature):
@@ -365,7 +365,7 @@ def _raw_picture(stamp: Any, message: Message) -> PictureSample:
 
 
 def nanoseconds(stamp: Any) -> int:
-    """A stamp of ROS (sec, nanosec), protobuf (seconds, nanos) or Foxglove's JSON (sec, nsec)."""
+    """Convert a stamp to ns: ROS (sec, nanosec), protobuf (seconds, nanos), Foxglove's JSON (sec, nsec)."""
     if hasattr(stamp, "seconds"):
         whole, fraction = stamp.seconds, stamp.nanos
     elif hasattr(stamp, "nanosec"):
@@ -394,7 +394,7 @@ def _covariance(value: Any) -> Float:
 
 
 def bytes_of(data: Any) -> NDArray[np.uint8]:
-    """An array as it is, bytes viewed, base64 (JSON) decoded."""
+    """Return data as an array of bytes: arrays as views, base64 (JSON) decoded."""
     if isinstance(data, np.ndarray):
         if data.dtype.itemsize != 1:
             raise ValueError(f"its data are {data.dtype}, not bytes")

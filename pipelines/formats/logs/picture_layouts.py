@@ -1,7 +1,7 @@
-"""The fields of a picture straight from the bytes of its message.
+"""Fields of a picture straight from the bytes of its message.
 
-Of a picture in a log, most readers want little more than the stamp. Where its message is laid out as ROS
-writes it, that takes a fifth of the time of a decoding; wherever it is not, it is decoded.
+Most readers need little more than a picture's stamp. If the message has ROS's usual layout, this takes
+a fifth of the time of decoding. Otherwise the message is decoded.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ _BEGIN = struct.Struct(
     "<4siI"
 )  # head of CDR or number of ROS 1, then the stamp, signed as rosbags reads both
 _SIZE = struct.Struct("<II")
-_LATEST_NS = 2**62  # stamps beyond are no times, which is for others to say
+_LATEST_NS = 2**62  # later stamps are invalid; the general decoder reports them
 
 
 class PictureFields(NamedTuple):
-    """What a message of pictures states; sizes are None where the picture is compressed."""
+    """Fields of a picture message; sizes are None if the picture is compressed."""
 
     stamp_ns: int
     format: str  # or the encoding of pixels
@@ -40,27 +40,27 @@ class PictureFields(NamedTuple):
 
 
 Heads = tuple[Int64, Int64, NDArray[np.uint8]]
-"""Stamps of receipt [n] of messages, how many bytes they have [n], and the first of these [n, length]."""
+"""Receipt stamps [n] of messages, their lengths in bytes [n], and their first bytes [n, length]."""
 
 HEAD_LENGTH = 256
-"""Bytes of a message of pictures that hold what comes before the picture, but for long names."""
+"""Bytes at the start of a picture message that hold all fields before the picture, unless names are long."""
 
 
 class _OtherLayoutError(Exception):
-    """A message that is not laid out as usual."""
+    """Error for a message with an unusual layout."""
 
 
 def picture_decoder(schema: Schema) -> Decoder:
-    """As `decoder`, but a picture of the usual layout comes as `PictureFields`.
+    """Make a decoder like `decoder` that returns a picture of the usual layout as `PictureFields`.
 
     Raises:
-        ValueError: why messages of this schema cannot be decoded.
+        ValueError: messages of this schema cannot be decoded; the text gives the reason.
     """
     general = decoder(schema)
     if not _is_known(schema):
         return general
 
-    like: _Layout | None = None  # as the last picture was laid out, so is the next
+    like: _Layout | None = None  # layout of the last picture, tried first for the next one
 
     def decode(data: memoryview | bytes) -> object:
         nonlocal like
@@ -76,15 +76,15 @@ def picture_decoder(schema: Schema) -> Decoder:
 
 
 def read_stamps(schema: Schema, messages: Iterable[Heads]) -> tuple[Int64, Int64] | None:
-    """Stamps of the headers [N] and of receipt [N] of all pictures of a topic, in the order of receipt.
+    """Return header stamps [N] and receipt stamps [N] of all pictures of a topic, in the order of receipt.
 
-    None where they are not all laid out alike and as usual, or a stamp of receipt is no time: then
+    The result is None if not all have the same usual layout, or if a stamp of receipt is invalid. Then
     messages must be decoded one by one.
 
     Args:
         schema: of the topic.
-        messages: in any order; those of equal stamps keep theirs. Read to the end, or to the first that
-            differs.
+        messages: in any order; messages of equal stamps keep theirs. Read to the end, or to the first
+            one with another layout.
     """
     if not _is_known(schema):
         return None
@@ -113,10 +113,10 @@ def _is_known(schema: Schema) -> bool:
 
 @dataclass(frozen=True)
 class _Layout:
-    """How a picture's message is laid out, and what it states besides stamp and data."""
+    """Layout of a picture's message, and its fields besides stamp and data."""
 
-    parts: struct.Struct  # head or number, stamp, what lies between, length of the data
-    head: bytes | None  # None where any will do
+    parts: struct.Struct  # head or number, stamp, bytes in between, length of the data
+    head: bytes | None  # None if it may have any value
     between: bytes
     format: str
     width: int | None
@@ -124,7 +124,7 @@ class _Layout:
     step: int | None
 
     def picture(self, data: memoryview | bytes) -> PictureFields | None:
-        """The fields; None if the message is laid out or states things otherwise."""
+        """Return the fields; None if the message has another layout or other fixed fields."""
         at = self.parts.size
         if len(data) <= at:
             return None
@@ -136,7 +136,7 @@ class _Layout:
         return PictureFields(stamp_ns, self.format, self.width, self.height, self.step, pixels)
 
     def stamps(self, heads: NDArray[np.uint8], sizes: Int64) -> Int64 | None:
-        """The stamps [n] of messages by their heads; None if one is laid out or states things otherwise."""
+        """Return the stamps [n] of messages by their heads; None if one has another layout or fields."""
         at = self.parts.size
         if at > heads.shape[1]:
             return None
@@ -152,29 +152,29 @@ class _Layout:
 
 
 def _column(heads: NDArray[np.uint8], at: int, kind: str) -> Int64:
-    """The numbers of four bytes that stand at one place of every head."""
+    """Return the four-byte numbers at one position of every head."""
     return heads[:, at : at + 4].copy().view(kind)[:, 0].astype(np.int64)
 
 
 def _layout(schema: Schema, data: memoryview | bytes, size: int) -> _Layout:
-    """Found field by field: CDR aligns numbers to four bytes and ends text with a zero, unlike ROS 1.
+    """Find the layout field by field: CDR aligns numbers to four bytes and ends text with a zero, ROS 1 not.
 
     Args:
         schema: of the message.
         data: its bytes, or its first ones.
-        size: how many bytes it has.
+        size: number of bytes of the message.
     """
     is_cdr = schema.encoding == "cdr"
     head = bytes(data[:4])
     if is_cdr and head != _CDR_LITTLE_ENDIAN:
         raise _OtherLayoutError
     width = height = step = None
-    _, at = _text(data, _BEGIN.size, is_cdr)  # of the frame, which must be text all the same
+    _, at = _text(data, _BEGIN.size, is_cdr)  # the frame's name, checked to be text but not used
     if schema.type == _RAW:
         at += -at % 4 if is_cdr else 0
         height, width = _SIZE.unpack_from(data, at)
         stated, at = _text(data, at + _SIZE.size, is_cdr)
-        at += 1  # whether it is big endian
+        at += 1  # is_bigendian
         at += -at % 4 if is_cdr else 0
         (step,) = _U32.unpack_from(data, at)
         at += 4
@@ -190,7 +190,7 @@ def _layout(schema: Schema, data: memoryview | bytes, size: int) -> _Layout:
 
 
 def _text(data: memoryview | bytes, at: int, is_cdr: bool) -> tuple[str, int]:
-    """A text, and where it ends."""
+    """Read a text; return it with its end."""
     (length,) = _U32.unpack_from(data, at)
     end = at + 4 + length
     text = bytes(data[at + 4 : end])

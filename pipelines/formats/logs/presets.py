@@ -1,6 +1,6 @@
-"""The topics of known drivers: which hold position, attitude and gimbal, in what units and axes.
+"""Topics of known drivers that hold position, attitude and gimbal, with their units and axes.
 
-What the drivers' sources say (docs/drones.md):
+From the drivers' sources (docs/drones.md):
 
 `dji_osdk` (dji_sdk, dji_osdk_ros since 3.3): attitude is FLU in ENU; gps_position is NavSatFix;
 local_position is metres east, north, up of a reference set in flight; gimbal_angle is degrees in NED,
@@ -65,7 +65,7 @@ _VECTORS = ("geometry_msgs/msg/Vector3Stamped",)
 
 @dataclass(frozen=True)
 class _Driver:
-    """Where a driver's topics lie below its own name; the first that is there is taken."""
+    """Topics of a driver below its own name; the first one in the log is taken."""
 
     names: tuple[str, ...]
     positions: dict[Position, tuple[str, ...]]
@@ -116,7 +116,7 @@ class _Rows:
 
 
 def namespaces(names: Sequence[str]) -> list[tuple[Preset, str]]:
-    """The drivers whose positions and attitudes are among some topics, each with what stands before its name.
+    """Find drivers whose positions are among some topics; return each with the prefix of its name.
 
     `/uav1/mavros/imu/data` is mavros of `/uav1`.
     """
@@ -139,7 +139,7 @@ class Parts(NamedTuple):
 
 
 def parts_of(preset: Preset, namespace: str, names: Sequence[str]) -> Parts:
-    """Those of some topics that a preset reads in a namespace."""
+    """Return the topics among `names` that a preset reads in a namespace."""
     driver = DRIVERS[preset]
 
     def among(parts: Iterable[str]) -> list[str]:
@@ -158,15 +158,15 @@ def read_preset(
     choice: TelemetryChoice,
     stamps: Stamps,
 ) -> Telemetry:
-    """Position, attitude and gimbal of a drone, from the usual topics of its driver.
+    """Read position, attitude and gimbal of a drone, from the usual topics of its driver.
 
     Args:
         recording: the log.
         source: its name, for messages.
-        preset: which driver.
-        namespace: what stands before the driver's name, where the log holds several drones.
-        choice: which of the positions.
-        stamps: which stamps of its messages count.
+        preset: the driver.
+        namespace: the prefix of the driver's name, if the log holds several drones.
+        choice: the kind of position, if the user chose one.
+        stamps: the stamps to use: header or receive.
 
     Raises:
         DataError: no such topics, several drones, or nothing usable.
@@ -220,7 +220,7 @@ def read_preset(
 def read_pair(
     recording: Log, source: str, position: str, attitude: str, axes: Axes, stamps: Stamps
 ) -> Telemetry:
-    """A topic of positions (NavSatFix, PointStamped) and one of attitudes (Imu, QuaternionStamped).
+    """Read a topic of positions (NavSatFix, PointStamped) and one of attitudes (Imu, QuaternionStamped).
 
     Args:
         recording: the log.
@@ -228,7 +228,7 @@ def read_pair(
         position: the topic of the positions.
         attitude: the topic of the attitudes, of the body in the world.
         axes: of attitudes and of positions in metres.
-        stamps: which stamps of its messages count.
+        stamps: the stamps to use: header or receive.
 
     Raises:
         DataError: no such topics, or nothing usable in them.
@@ -257,7 +257,7 @@ def read_pair(
 def read_positions(
     recording: Log, source: str, topic: str, stamps: Stamps, dropped: dict[str, int]
 ) -> PositionTrack:
-    """A topic of positions alone; what cannot be used is counted in `dropped`.
+    """Read a topic of positions alone; unusable rows are counted in `dropped`.
 
     Raises:
         DataError: nothing usable in it.
@@ -348,7 +348,7 @@ def _gimbal(
 
 
 def _gps_time(recording: Log, source: str, topic: str, counts: dict[str, int]) -> str:
-    """How the recorder's clock goes against the time that the autopilot has from GPS; empty without it."""
+    """Describe offset and drift of the log's stamps to the autopilot's GPS time; empty without GPS time."""
     if not counts.get(topic) or _type_of(recording, topic) != _TIME_REFERENCE:
         return ""
     pairs = []
@@ -372,10 +372,10 @@ def _type_of(recording: Log, topic: str) -> str:
 
 
 def _read(recording: Log, source: str, topic: str, numbers: Callable[[Any], Sequence[float]]) -> _Rows:
-    """The numbers of every message of a topic.
+    """Read the numbers of every message of a topic.
 
     Raises:
-        DataError: the topic is empty or holds something else, a message lacks a field, or holds what is no
+        DataError: the topic is empty or of another kind, a message lacks a field, or a field is not a
             number.
     """
     rows = _Rows()
@@ -399,7 +399,7 @@ def _read(recording: Log, source: str, topic: str, numbers: Callable[[Any], Sequ
 def _no_such(
     recording: Log, source: str, message: Message, error: Exception, noun: str, types: Sequence[str]
 ) -> DataError:
-    """Say of a message that its type holds nothing of the kind, or else what is wrong with it."""
+    """Return the error for a message: its type has no such data, or else its own fault."""
     topic = message.topic
     if isinstance(error, AttributeError) and topic.type not in types:
         there = [known.name for known in recording.topics if known.type in types]
@@ -413,7 +413,7 @@ def _no_such(
 
 
 def _point_of(value: Any) -> Sequence[float]:
-    """PointStamped, PoseStamped or Odometry."""
+    """Return the position of a PointStamped, PoseStamped or Odometry."""
     if hasattr(value, "point"):
         point = value.point
     else:
@@ -423,7 +423,7 @@ def _point_of(value: Any) -> Sequence[float]:
 
 
 def _fix_of(value: Any) -> Sequence[float]:
-    """Latitude, longitude, altitude, status, and variances across and in height (0 where unknown)."""
+    """Return latitude, longitude, altitude, status, and horizontal and vertical variance (0 if unknown)."""
     covariance = np.asarray(value.position_covariance, dtype=np.float64).reshape(3, 3)
     known = bool(value.position_covariance_type)
     across = (covariance[0, 0] + covariance[1, 1]) / 2
@@ -432,7 +432,7 @@ def _fix_of(value: Any) -> Sequence[float]:
 
 
 def _quaternion_of(value: Any) -> Sequence[float]:
-    """Quaternion, QuaternionStamped, Imu, PoseStamped or Odometry."""
+    """Return the rotation of a Quaternion, QuaternionStamped, Imu, PoseStamped or Odometry."""
     turned = value
     for part in ("quaternion", "orientation"):
         turned = getattr(turned, part, turned)
@@ -452,4 +452,4 @@ _READ: dict[Callable[[Any], Sequence[float]], tuple[str, tuple[str, ...]]] = {
     _quaternion_of: ("attitude", _ATTITUDES),
     _vector_of: ("gimbal angles", _VECTORS),
 }
-"""What each of them reads, and the types that hold it."""
+"""Kind of data that each of these functions reads, and the message types that hold it."""

@@ -1,7 +1,7 @@
-"""A log as files that each list their messages: topics, order of receipt over all files, and what is lost.
+"""Log as files that each list their messages: topics, order of receipt over all files, and losses.
 
-A part (one file) knows where every message lies before any is read. So messages come in order and
-filtered without being held, and every loss has a cause and a number.
+A part (one file) knows the position of every message before any is read. So messages come in order and
+filtered without being kept in memory, and every loss has a cause and a count.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ TRUNCATED = "file truncated"
 UNCLOSED = "recording not closed"
 TAIL = "bytes after the last complete record"
 
-_BATCH = 1 << 16  # messages whose places are plain numbers at a time: 10 MB
+_BATCH = 1 << 16  # messages whose places are Python integers at a time: 10 MB
 _HEADS = 4096  # messages whose heads are read at a time
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A topic as one file names it, and how its messages are written."""
+    """Topic as one file names it, with the schema of its messages."""
 
     topic: str
     schema: Schema
@@ -46,28 +46,28 @@ class Channel:
 
 @dataclass(frozen=True)
 class MessageTable:
-    """Where the messages of a file are, in the order of the file; all arrays are [M]."""
+    """Positions of the messages of a file, in the order of the file; all arrays are [M]."""
 
     channel: Int64
     stamp_ns: Int64  # of receipt
-    block: Int64  # what must be read together; 0 where there are no blocks
+    block: Int64  # block that must be read as a whole; 0 if there are no blocks
     place: Int64  # within the block
-    size: Int64  # bytes, uncompressed; what lies between two messages counts to the first of them
+    size: Int64  # bytes, uncompressed; bytes between two messages count to the first of them
 
 
 class UnlikeError(Exception):
-    """Messages that cannot be read as one array."""
+    """Error for messages that cannot be read as one array."""
 
 
 class LogPart(ABC):
-    """One open file of a log."""
+    """Open file of a log."""
 
     def __init__(self, path: Path, file_size: int) -> None:
         self.path = path
         self.file_size = file_size
         self.channels: dict[int, Channel] = {}
-        self.storage: list[str] = []  # how it is stored, for `mocap info`
-        self.lost: Counter[str] = Counter()  # of the file as a whole
+        self.storage: list[str] = []  # kinds of storage, for `mocap info`
+        self.lost: Counter[str] = Counter()  # losses of the file as a whole
         self.table = _empty_table()
         self._fates: NDArray[np.uint8] = np.zeros(0, np.uint8)
         self._causes = [""]
@@ -78,30 +78,30 @@ class LogPart(ABC):
 
     @abstractmethod
     def read(self, rows: Int64) -> Iterator[tuple[int, memoryview | bytes]]:
-        """The bytes of messages, by rows of the table; rows that cannot be read are given to `lose`."""
+        """Yield the bytes of messages, by rows of the table; pass unreadable rows to `lose`."""
 
     @abstractmethod
     def read_alike(self, rows: Int64) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
-        """The bytes of messages that are all of one length, many at a time.
+        """Yield the bytes of messages that are all of one length, many at a time.
 
         Yields:
-            Rows of the table, increasing, and their messages [n, length]. Rows that cannot be read are
-            given to `lose`.
+            Rows of the table, increasing, and their messages [n, length]. Unreadable rows are passed to
+            `lose`.
 
         Args:
             rows: of one channel, increasing.
 
         Raises:
-            UnlikeError: their records or lengths differ, or one is not where the index says.
+            UnlikeError: their records or lengths differ, or one is not at the index's position.
         """
 
     def read_heads(self, rows: Int64, length: int) -> Iterator[tuple[Int64, Int64, NDArray[np.uint8]]]:
-        """The first bytes of messages, many at a time.
+        """Yield the first bytes of messages, many at a time.
 
         Yields:
-            Rows of the table, in the order given; how many bytes each message has [n]; its first ones
-            [n, length], zeros behind the end of a shorter one. Rows that cannot be read, be it behind
-            their heads, are given to `lose`.
+            Rows of the table, in the order given; the length of each message in bytes [n]; its first bytes
+            [n, length], with zeros after the end of a shorter one. Unreadable rows are passed to `lose`,
+            also if the damage is after their heads.
         """
         for start in range(0, len(rows), _HEADS):
             batch = rows[start : start + _HEADS]
@@ -111,7 +111,7 @@ class LogPart(ABC):
                 yield batch[list(which)], np.array(sizes, np.int64), joined_heads(heads, length)
 
     def take(self, table: MessageTable) -> None:
-        """Hold the messages that were found, without those of channels that nothing names."""
+        """Keep the table of found messages, without those of undefined channels, which are counted."""
         named = np.isin(table.channel, list(self.channels))
         if strangers := int(np.count_nonzero(~named)):
             self.lost[UNNAMED] += strangers
@@ -126,29 +126,29 @@ class LogPart(ABC):
         self._fates = np.zeros(len(table.channel), np.uint8)
 
     def lose(self, rows: Int64 | int, cause: str) -> None:
-        """Note why messages could not be read; noting it again, on a second reading, changes nothing."""
+        """Note why messages could not be read; a second reading counts them once only."""
         if cause not in self._causes:
             self._causes.append(cause)
         self._fates[rows] = self._causes.index(cause)
 
     def forget(self) -> None:
-        """Forget what the readings so far lost; what the file as a whole lost stays."""
+        """Forget the losses of the readings so far; those of the file as a whole stay."""
         self._fates[:] = 0
 
     @property
     def dropped(self) -> Counter[str]:
-        """Everything that was lost so far, by cause."""
+        """All losses so far, by cause."""
         counts = np.bincount(self._fates, minlength=len(self._causes))[1:]
         return self.lost + Counter(dict(zip(self._causes[1:], counts.tolist(), strict=True)))
 
     def rows_of(self, channels: Collection[int]) -> Int64:
-        """The rows of some channels, in the order of receipt; at equal stamps in the order of the file."""
+        """Return the rows of some channels, in the order of receipt; equal stamps keep the file's order."""
         rows = np.flatnonzero(np.isin(self.table.channel, list(channels)))
         return rows[np.argsort(self.table.stamp_ns[rows], kind="stable")].astype(np.int64)
 
 
 class OpenLog:
-    """An open log of one or more parts."""
+    """Open log of one or more parts."""
 
     def __init__(self, parts: Sequence[LogPart], lost: Counter[str]) -> None:
         self.parts = parts
@@ -156,7 +156,7 @@ class OpenLog:
         self._topics = {key: self._summary(*key) for key in sorted(self._keys())}
 
     def __enter__(self) -> OpenLog:
-        """The log itself."""
+        """Return the log itself."""
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -166,24 +166,24 @@ class OpenLog:
 
     @property
     def topics(self) -> Sequence[Topic]:
-        """The channels, by name; a name whose messages are of two types stands there twice."""
+        """Channels, by name; a name whose messages are of two types is there twice."""
         return list(self._topics.values())
 
     @property
     def dropped(self) -> dict[str, int]:
-        """What could not be read so far, counted by cause: of the files, then of the messages asked for."""
+        """Losses so far, counted by cause: of the files, then of the messages asked for."""
         total = sum((part.dropped for part in self.parts), Counter(self._lost))
         return dict(sorted(total.items()))
 
     def forget(self) -> None:
-        """Forget what the readings so far lost, so that `dropped` is of the next one alone."""
+        """Forget the losses of the readings so far, so that `dropped` describes the next one alone."""
         for part in self.parts:
             part.forget()
 
     def messages(
         self, topics: Collection[str], decoder_of: Callable[[Schema], Decoder] = decoder
     ) -> Iterator[Message]:
-        """The messages of some topics in the order of receipt; others are neither read nor decoded.
+        """Yield the messages of some topics in the order of receipt; others are neither read nor decoded.
 
         Args:
             topics: their names.
@@ -193,7 +193,7 @@ class OpenLog:
         return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("receive_ns"))
 
     def arrays(self, topic: Topic) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
-        """The messages of a topic as arrays: stamps of receipt [n] and bytes [n, length].
+        """Yield the messages of a topic as arrays: stamps of receipt [n] and bytes [n, length].
 
         In the order of the files; a stable sort by the stamps gives that of `messages`.
 
@@ -208,10 +208,10 @@ class OpenLog:
                 yield part.table.stamp_ns[rows], data
 
     def heads(self, topic: Topic, length: int) -> Iterator[tuple[Int64, Int64, NDArray[np.uint8]]]:
-        """How the messages of a topic begin: stamps of receipt [n], sizes [n], first bytes [n, length].
+        """Yield the heads of a topic's messages: stamps of receipt [n], sizes [n], first bytes [n, length].
 
-        In the order of the files; a stable sort by the stamps gives that of `messages`. Behind the end of
-        a message that is shorter stand zeros.
+        In the order of the files; a stable sort by the stamps gives that of `messages`. Shorter messages
+        are padded with zeros.
         """
         for part in self.parts:
             rows = part.rows_of(_channels_of(part, topic.name, topic.type, topic.encoding))
@@ -219,7 +219,7 @@ class OpenLog:
                 yield part.table.stamp_ns[found], sizes, heads
 
     def schemas(self, topic: Topic) -> set[Schema]:
-        """How the messages of a topic are written; parts may differ."""
+        """Return the schemas of a topic's messages; parts may differ."""
         return {
             part.channels[channel].schema
             for part in self.parts
@@ -227,7 +227,7 @@ class OpenLog:
         }
 
     def stamps(self, topic: Topic) -> Int64:
-        """When the messages of a topic were received, sorted."""
+        """Return the stamps of receipt of a topic's messages, sorted."""
         stamps = [
             part.table.stamp_ns[part.rows_of(_channels_of(part, topic.name, topic.type, topic.encoding))]
             for part in self.parts
@@ -235,7 +235,7 @@ class OpenLog:
         return np.sort(np.concatenate(stamps))
 
     def size(self, topic: Topic) -> int:
-        """How many bytes the messages of a topic have, uncompressed."""
+        """Return the size of a topic's messages in bytes, uncompressed."""
         return sum(
             int(
                 part.table.size[
@@ -246,7 +246,7 @@ class OpenLog:
         )
 
     def problem(self, topic: Topic) -> str:
-        """Why the messages of a topic cannot be decoded; empty if they can."""
+        """Return why the messages of a topic cannot be decoded; empty if they can."""
         for part in self.parts:
             for channel in _channels_of(part, topic.name, topic.type, topic.encoding):
                 try:
@@ -289,12 +289,12 @@ class OpenLog:
 
 
 def joined_heads(heads: Sequence[bytes], length: int) -> NDArray[np.uint8]:
-    """The first bytes of messages as one array [n, length], zeros behind those that are shorter."""
+    """Join the first bytes of messages to one array [n, length]; shorter ones are padded with zeros."""
     return np.array(heads, f"S{length}").view(np.uint8).reshape(-1, length)
 
 
 def open_file(path: Path) -> tuple[IO[bytes], int]:
-    """A file and its size.
+    """Open a file; return it with its size.
 
     Raises:
         DataError: missing, not a file, not allowed, or empty.
@@ -311,10 +311,10 @@ def open_file(path: Path) -> tuple[IO[bytes], int]:
 def open_parts(
     paths: Sequence[Path], open_part: Callable[[Path], LogPart]
 ) -> tuple[list[LogPart], Counter[str]]:
-    """Open the files of a recording; those that cannot be read are counted.
+    """Open the files of a recording; count those that cannot be read.
 
     Raises:
-        DataError: none can be read; the first one's reason.
+        DataError: none can be read; the reason is that of the first one.
     """
     parts: list[LogPart] = []
     refusals: list[DataError] = []
@@ -333,10 +333,10 @@ def open_parts(
 
 
 def require_content(part: LogPart) -> None:
-    """Refuse a damaged file that gave nothing; a whole file without messages is fine.
+    """Refuse a damaged file without any readable message; an undamaged file may be empty.
 
     Raises:
-        DataError: something was lost and nothing is there.
+        DataError: there are losses and no message.
     """
     if part.lost and not len(part.table.stamp_ns):
         causes = ", ".join(f"{cause}: {count}" for cause, count in sorted(part.lost.items()))
@@ -347,7 +347,7 @@ def require_content(part: LogPart) -> None:
 
 
 class Alike(NamedTuple):
-    """A topic whose messages can be read many at a time: they are all written alike."""
+    """Topic whose messages can be read many at a time, because all have the same schema."""
 
     log: OpenLog
     topic: Topic
@@ -355,7 +355,7 @@ class Alike(NamedTuple):
 
 
 def messages_alike(recording: Log, name: str) -> Alike | None:
-    """The topic of that name, if a file format of ours holds it and its messages are alike."""
+    """Return the topic of that name, if our own reader opened the log and its messages have one schema."""
     if not isinstance(recording, OpenLog):
         return None
     of_that_name = [topic for topic in recording.topics if topic.name == name]
@@ -366,7 +366,7 @@ def messages_alike(recording: Log, name: str) -> Alike | None:
 
 
 def describe_log(log: OpenLog) -> dict[str, object]:
-    """Files, messages, times and storage of a log, each topic, and what was lost by cause."""
+    """Describe files, messages, times and storage of a log, each topic, and losses by cause."""
     topics = log.topics
     first = min((t.first_ns for t in topics if t.first_ns is not None), default=None)
     last = max((t.last_ns for t in topics if t.last_ns is not None), default=None)

@@ -1,7 +1,7 @@
 """ROS 1 bags, version 2.0 (wiki.ros.org/Bags/Format/2.0), whole or cut off.
 
-rosbags decodes the messages. Its reader refuses bags whose index was not written and bags that end early,
-so the records are walked here.
+rosbags decodes the messages. But its reader refuses bags without an index and bags that end early.
+So this module walks the records itself.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pipelines.session.storage import is_special
 
 _MAGIC = re.compile(rb"#ROSBAG V(\d+)\.(\d+)\n")
 _MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
-_HEADER_LIMIT = 1 << 20  # bytes of a record's header; real ones have some hundred
+_HEADER_LIMIT = 1 << 20  # bytes of a record's header; usual ones have some hundred
 _U32 = struct.Struct("<I")
 _U64 = struct.Struct("<Q")
 _STAMP = struct.Struct("<II")
@@ -34,14 +34,14 @@ Fields = dict[bytes, bytes]
 
 
 class Ros1Bag:
-    """ROS 1 bags; chunks uncompressed, bz2 or lz4."""
+    """Reader of ROS 1 bags; chunks uncompressed, bz2 or lz4."""
 
     name = "ros1"
     title = "ROS 1 bag"
     suffixes: tuple[str, ...] = (".bag",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether the file begins as a bag does, or is an empty one."""
+        """Return True if the file begins with a bag's first line, or is empty and named `.bag`."""
         if is_special(path):
             return False
         try:
@@ -52,7 +52,7 @@ class Ros1Bag:
         return bool(_MAGIC.match(head)) or (not head and path.suffix.lower() in self.suffixes)
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Messages, times, storage, topics, and what was lost."""
+        """Describe messages, times, storage, topics, and losses."""
         with self.open_log([path]) as log:
             return describe_log(log)
 
@@ -60,21 +60,21 @@ class Ros1Bag:
         """Open one bag, or several as one recording.
 
         Raises:
-            DataError: no file can be read as a bag, or holds anything.
+            DataError: no file can be read as a bag, or all are without content.
         """
         return OpenLog(*open_parts(paths, _open_part))
 
 
 @dataclass(frozen=True)
 class _Head:
-    """The head of a channel's messages, which differ in the stamp alone where one writer wrote them."""
+    """Head of a channel's messages, which differ only in the stamp if one writer wrote them."""
 
-    layout: struct.Struct  # what stands before the stamp, the stamp, what stands behind it, the length
+    layout: struct.Struct  # bytes before the stamp, the stamp, bytes after it, the length
     before: bytes
     behind: bytes
 
     def message(self, content: memoryview, place: int, stamp_ns: int) -> memoryview | None:
-        """The message whose head is here and has this stamp; None if another thing is."""
+        """Return the message if this head with this stamp is here; else None."""
         data_at = place + self.layout.size
         if place < 0 or data_at > len(content):
             return None
@@ -89,7 +89,7 @@ class _Bag(ChunkedPart):
     record_overhead = 46  # lengths of header and message, and the header's fields op, conn and time
 
     def walk(self) -> tuple[int, bool]:
-        """Walk the records up to the end of the file or to the first that is not whole."""
+        """Walk the records up to the end of the file or to the first incomplete one."""
         self._heads: dict[int, _Head] = {}
         position, chunks_stated = self._bag_header()
         while position < self.file_size:
@@ -132,7 +132,7 @@ class _Bag(ChunkedPart):
         return Content(channels, index, position)
 
     def payload(self, content: memoryview, place: int, channel: int, stamp_ns: int) -> memoryview:
-        """The bytes of a message; some writers let the index point to the connection before it."""
+        """Return the bytes of a message; some writers let the index point to the connection before it."""
         head = self._heads.get(channel)
         if head is not None and (data := head.message(content, place, stamp_ns)) is not None:
             return data
@@ -155,18 +155,18 @@ class _Bag(ChunkedPart):
         return content[data_at : data_at + length]
 
     def shape(self, content: memoryview, place: int) -> RecordShape:
-        """Only the stamp differs."""
+        """Return the shape of a record: only the stamp differs."""
         fields, data_at, length = _parse_record(content, place)
         head = _head(bytes(content[place:data_at]), fields[b"time"])
         stamp = slice(len(head.before), len(head.before) + _STAMP.size)
         return RecordShape(head.layout.size, length, stamp, stamp)
 
     def stamp_bytes(self, stamp_ns: Int64) -> NDArray[np.uint8]:
-        """Seconds and nanoseconds."""
+        """Return stamps as seconds and nanoseconds."""
         return np.stack(np.divmod(stamp_ns, 10**9), axis=1).astype("<u4").view(np.uint8)
 
     def _bag_header(self) -> tuple[int, int]:
-        """Where the first record after the bag's header begins, and how many chunks that header states."""
+        """Return the position after the bag's header, and its number of chunks (-1 if unknown)."""
         head = self.bytes_at(0, 16)
         match = _MAGIC.match(head)
         if not match:
@@ -183,7 +183,7 @@ class _Bag(ChunkedPart):
             return match.end(), -1
 
     def _record(self, position: int) -> tuple[Fields, int, int]:
-        """Fields of the record's header; where its data begins in the file; how long it is said to be."""
+        """Return the fields of a record's header, the position of its data in the file, and its length."""
         header_length = _U32.unpack(self.bytes_at(position, 4))[0]
         if header_length > _HEADER_LIMIT:
             raise ValueError("no header")
@@ -211,14 +211,14 @@ class _Bag(ChunkedPart):
 
 
 def _parse_record(content: memoryview, position: int) -> tuple[Fields, int, int]:
-    """Fields of the header of a record; where its data begins; how long it is said to be."""
+    """Return the fields of a record's header, the position of its data, and its length."""
     header_end = position + 4 + _U32.unpack_from(content, position)[0]
     (length,) = _U32.unpack_from(content, header_end)
     return _fields(bytes(content[position + 4 : header_end])), header_end + 4, length
 
 
 def _head(head: bytes, stamp: bytes) -> _Head:
-    """What stands about the stamp in the bytes from a message's place to its data."""
+    """Split the bytes from a message's place to its data into the parts before and after the stamp."""
     before, name, behind = head.partition(b"time=")
     behind = behind[len(stamp) : -_U32.size]
     layout = struct.Struct(f"<{len(before + name)}sII{len(behind)}sI")

@@ -1,7 +1,7 @@
-"""ROS 2 bags: folders of sqlite3 or MCAP files with or without metadata.yaml, and sqlite3 files alone.
+"""Reader of ROS 2 bags: folders of sqlite3 or MCAP files with or without metadata.yaml, and sqlite3 files.
 
-rosbags decodes the messages. Its reader needs metadata.yaml to be there and right, and a file that can be
-read to its end, so sqlite is asked here.
+rosbags decodes the messages. But its reader needs a correct metadata.yaml and files that can be
+read to their end. So this module reads the files itself.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ _SUFFIXES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 
 
 class Ros2Bag:
-    """ROS 2 bags. A folder is one recording; its files are merged in the order of receipt."""
+    """Reader of ROS 2 bags. A folder is one recording; its files are merged in the order of receipt."""
 
     name = "ros2"
     title = "ROS 2 bag"
     suffixes: tuple[str, ...] = (".db3",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether it is a bag's folder, with metadata.yaml or without, or sqlite3 with a bag's tables."""
+        """Return True for a bag's folder, with or without metadata.yaml, or sqlite3 with a bag's tables."""
         try:
             if path.is_dir():
                 return _states_a_bag(path / "metadata.yaml") or _is_one_bag(_storage_files(path))
@@ -57,7 +57,7 @@ class Ros2Bag:
         return has_bag_tables(path)
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Messages, times, storage, topics, what was lost, and where metadata.yaml says something else."""
+        """Describe messages, times, storage, topics, losses, and differences from metadata.yaml."""
         with self.open_log([path]) as log:
             facts = describe_log(log)
         stated = _contents(path).stated
@@ -69,7 +69,7 @@ class Ros2Bag:
         """Open a bag's folder, or its files.
 
         Raises:
-            DataError: no file can be read, or holds anything.
+            DataError: no file can be read, or all are without content.
         """
         contents = [_contents(path) for path in paths]
         parts, lost = open_parts([file for c in contents for file in c.files], _open_part)
@@ -83,7 +83,7 @@ class Ros2Bag:
 
 @dataclass(frozen=True)
 class _Metadata:
-    """What metadata.yaml says of the whole bag."""
+    """Content of metadata.yaml about the whole bag."""
 
     files: list[str]
     messages: int
@@ -120,7 +120,7 @@ def _open_compressed(path: Path) -> LogPart:
                     shutil.copyfileobj(content, target)
             except (ZstdError, EOFError):
                 whole = False
-        # The folder goes when the part is open: it holds the file by its handle.
+        # The folder is deleted while the part is open, which keeps its file by the handle.
         part = _open_part(inflated)
     part.path = path
     part.file_size = path.stat().st_size
@@ -131,7 +131,7 @@ def _open_compressed(path: Path) -> LogPart:
 
 
 def _contents(path: Path) -> _Contents:
-    """The files of a bag's folder, in order, and what its metadata.yaml says beyond; a file is itself."""
+    """Return the files of a bag's folder, in order, with its metadata.yaml; a file stands for itself."""
     if not path.is_dir():
         return _Contents([path], Counter())
     lost: Counter[str] = Counter()
@@ -151,7 +151,7 @@ def _contents(path: Path) -> _Contents:
 
 
 def _read_metadata(path: Path) -> _Metadata:
-    """Read metadata.yaml; ValueError if it does not say what it must."""
+    """Read metadata.yaml; ValueError if a required value is missing or invalid."""
     try:
         with path.open(encoding="utf-8") as file:
             content: Any = plain_yaml(path, file.read(_METADATA_LIMIT))
@@ -176,13 +176,13 @@ def _states_a_bag(metadata: Path) -> bool:
 
 
 def _storage_files(folder: Path) -> list[Path]:
-    """The files that may be of a bag, by the number at the end of their names."""
+    """Return the files that may belong to a bag, by the number at the end of their names."""
     files = [f for f in folder.iterdir() if f.is_file() and f.name.lower().endswith(_SUFFIXES)]
     return sorted(files, key=lambda file: (_numbered(file) or ("", 0), file.name))
 
 
 def _is_one_bag(files: Sequence[Path]) -> bool:
-    """Whether names say that files are the parts of one bag: NAME_0, NAME_1, ... or FOLDER_n, or one file.
+    """Return True if files are named like parts of one bag: NAME_0, NAME_1, ... or FOLDER_n, or one file.
 
     The logs of several drones in one folder, each a file, must not pass for one recording.
     """

@@ -1,4 +1,4 @@
-"""Writing MCAP logs of ROS 2 messages, as a recorder on a drone does; Foxglove and `ros2 bag` open them."""
+"""Writer of MCAP logs of ROS 2 messages, like a recorder on a drone; Foxglove and `ros2 bag` open them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _CHUNK_BYTES = 1 << 20
 
 
 class Ros2Recording:
-    """A log that is being written; a context manager. The same messages give the same bytes.
+    """Log that is being written; a context manager. The same messages give the same bytes.
 
     Raises:
-        OSError: where it cannot be written.
+        OSError: the file cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -32,7 +32,7 @@ class Ros2Recording:
         self._sequence: dict[str, int] = {}
 
     def __enter__(self) -> Ros2Recording:
-        """The recording itself."""
+        """Return the recording itself."""
         return self
 
     def __exit__(
@@ -51,8 +51,8 @@ class Ros2Recording:
         Args:
             topic: its topic, of one type throughout.
             type_: in the spelling of ROS 2 (nav_msgs/msg/Odometry).
-            receive_ns: when the recorder received it; not before what was written already.
-            fields: those that are not zero; a stamp is a plain number of nanoseconds.
+            receive_ns: time of receipt; not before that of the messages written so far.
+            fields: all fields that are not zero; a stamp is a plain number of nanoseconds.
         """
         data = bytes(self._store.serialize_cdr(build(self._store, type_, fields), type_))
         number = self._sequence.get(topic, 0)

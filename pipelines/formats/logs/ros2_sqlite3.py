@@ -1,7 +1,7 @@
-"""The files of ROS 2 bags that are sqlite3 databases.
+"""Reader of the files of ROS 2 bags that are sqlite3 databases.
 
-A file that is damaged, or shorter than it says, gives what its pages still hold. APSW is what rosbags
-reads them with, too: its SQLite reads a long message from the disk without keeping the pages.
+From a damaged or shortened file, all rows on readable pages are read. rosbags reads these files
+with APSW too. APSW's SQLite reads a long message from the disk without keeping the pages in memory.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ MAGIC = b"SQLite format 3\0"
 _LARGEST_ROWID = 1 << 48
 _BATCH = 4096  # rows at a time
 _LISTED = 1 << 14  # rows that are listed at a time
-_SMALLEST_ROW = 6  # bytes a row takes in a file at the least: its length, its number, a header of four
-_MOST_ATTEMPTS = 10_000  # to go on behind damage
-_UNREADABLE = (apsw.Error, UnicodeDecodeError)  # text of a damaged file need not be text
+_SMALLEST_ROW = 6  # smallest size of a row in a file, in bytes: length, number, a header of four
+_MOST_ATTEMPTS = 10_000  # attempts to continue after damage
+_UNREADABLE = (apsw.Error, UnicodeDecodeError)  # text in a damaged file may be invalid UTF-8
 
 
 class Sqlite3Part(LogPart):
-    """One sqlite3 file; its table `messages` is read row by row, so that damage costs only what it hits."""
+    """sqlite3 file; its table `messages` is read row by row, so that damage costs only the rows it hits."""
 
     def __init__(self, path: Path, database: Path, file_size: int) -> None:
         super().__init__(path, file_size)
@@ -67,7 +67,7 @@ class Sqlite3Part(LogPart):
         self.database.close()
 
     def read(self, rows: Int64) -> Iterator[tuple[int, bytes]]:
-        """The bytes of messages: by one query where they lie in the order of receipt, else one by one."""
+        """Yield the bytes of messages: by one query if they are in the order of receipt, else one by one."""
         places = self.table.place[rows].tolist()
         done = 0
         if places and np.all(np.diff(places) > 0):
@@ -82,7 +82,7 @@ class Sqlite3Part(LogPart):
                 yield k, message
 
     def read_alike(self, rows: Int64) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
-        """Joined from the rows of one query; where a row cannot be read, the messages count as unlike."""
+        """Join the rows of one query; if a row cannot be read, the messages count as unlike."""
         if not len(rows):
             return
         places = self.table.place[rows]
@@ -102,8 +102,8 @@ class Sqlite3Part(LogPart):
             raise UnlikeError from error
 
     def read_heads(self, rows: Int64, length: int) -> Iterator[tuple[Int64, Int64, NDArray[np.uint8]]]:
-        """By queries that name the rows; from the first damage on, one by one."""
-        # sqlite reads the messages to their ends all the same, so that damage behind a head shows.
+        """Read by queries that name the rows; after the first damage read one by one."""
+        # sqlite still reads the messages to their ends, so that damage after a head is found.
         query = (
             "SELECT messages.rowid, length(data), substr(data, 1, ?) "
             "FROM json_each(?) AS wanted CROSS JOIN messages ON messages.rowid = wanted.value"
@@ -124,7 +124,7 @@ class Sqlite3Part(LogPart):
         yield from super().read_heads(rows[done:], length)
 
     def _query(self, rows: Int64, places: Sequence[int]) -> apsw.Cursor:
-        """The rows of the table from the first place to the last, of the topics of some messages."""
+        """Query the rows from the first place to the last, of the topics of some messages."""
         query = (
             "SELECT rowid, data FROM messages WHERE rowid BETWEEN ? AND ? "
             "AND topic_id IN (SELECT value FROM json_each(?)) ORDER BY rowid"
@@ -133,7 +133,7 @@ class Sqlite3Part(LogPart):
         return self.database.execute(query, (places[0], places[-1], topics))
 
     def _in_one_query(self, rows: Int64, places: Sequence[int]) -> Iterator[tuple[int, bytes]]:
-        """The messages up to the first that is damaged."""
+        """Yield the messages up to the first damaged one."""
         try:
             found = self._query(rows, places)
             for k, (place, (found_place, data)) in enumerate(zip(places, found, strict=False)):
@@ -159,7 +159,7 @@ class Sqlite3Part(LogPart):
             self.channels[number] = Channel(str(name), schema)
 
     def _definitions(self) -> dict[str, tuple[str, bytes]]:
-        """The definitions of types, which bags have since ROS 2 Iron."""
+        """Read the definitions of types, which bags have since ROS 2 Iron; empty without them."""
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
         try:
             return {
@@ -171,7 +171,7 @@ class Sqlite3Part(LogPart):
             return {}
 
     def _list_messages(self) -> MessageTable:
-        # A row without a stamp gets a topic that no bag has, and is counted with those of unknown topics.
+        # A row without a stamp gets an unused topic number, so that it counts as one of an unknown topic.
         query = (
             "SELECT rowid AS place, CASE typeof(timestamp) WHEN 'integer' "
             "THEN ifnull(CAST(topic_id AS INTEGER), -1) ELSE -1 END AS topic, "
@@ -179,7 +179,7 @@ class Sqlite3Part(LogPart):
             "FROM messages WHERE rowid > ? ORDER BY rowid"
         )
         numbers = array("q")
-        # Pages of a damaged file can lead in circles and show rows without end.
+        # Pages of a damaged file can form a loop and give rows without end.
         most = 4 * (self.file_size // _SMALLEST_ROW)
         whole = self._take_joined(query, numbers, most)
         attempts = 0
@@ -191,16 +191,16 @@ class Sqlite3Part(LogPart):
             if len(numbers) > begin:
                 last, step = numbers[-4], 1
             if not whole:
-                # A page is missing or damaged: go on behind it, in growing steps.
+                # A page is missing or damaged: continue after it, in growing steps.
                 self.lost["gaps in the table of messages"] += step == 1
                 last, step = last + step, 2 * step
         rows = np.array(numbers, np.int64).reshape(-1, 4)
         return MessageTable(rows[:, 1], rows[:, 2], np.zeros(len(rows), np.int64), rows[:, 0], rows[:, 3])
 
     def _take_joined(self, query: str, numbers: array[int], most: int) -> bool:
-        """Append rows as `_take_rows` does, in half its time; up to the first damage. Whether that was all.
+        """Append rows like `_take_rows`, in half its time, up to any damage; return True if that was all.
 
-        sqlite makes one text of each column of many rows, which is less work than an object for each number.
+        sqlite joins each column of many rows to one text, which is less work than an object for each number.
         """
         columns = (
             "count(*), group_concat(place), group_concat(topic), group_concat(stamp), group_concat(size)"
@@ -224,13 +224,13 @@ class Sqlite3Part(LogPart):
         return False
 
     def _take_rows(self, query: str, last: int, numbers: array[int], most: int) -> bool:
-        """Append rows of four numbers, the first of which must rise from `last` on; whether that was all."""
+        """Append rows of four numbers; the first must rise from `last` on. Return True if that was all."""
         try:
             found = self.database.execute(query, (last,))
             while len(numbers) < most:
                 begin = len(numbers)
                 try:
-                    # What was taken before an error stays.
+                    # Rows that were read before an error stay.
                     numbers.extend(chain.from_iterable(islice(found, _BATCH)))
                 finally:
                     risen = np.diff(np.array(numbers[begin::4], np.int64), prepend=last) > 0
@@ -246,7 +246,7 @@ class Sqlite3Part(LogPart):
         return False
 
     def _check_length(self, database: Path) -> None:
-        """Compare the file with the size its header states (sqlite.org/fileformat2.html, section 1.3)."""
+        """Compare the file's size with that in its header (sqlite.org/fileformat2.html, section 1.3)."""
         with database.open("rb") as file:
             header = file.read(100)
         page_size = int.from_bytes(header[16:18], "big")
@@ -261,16 +261,16 @@ class Sqlite3Part(LogPart):
 
 
 def _connect(path: Path) -> apsw.Connection:
-    # Immutable: sqlite neither locks nor writes beside the user's file.
+    # Immutable: sqlite neither locks the user's file nor writes beside it.
     flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
     database = apsw.Connection(f"{path.resolve().as_uri()}?immutable=1", flags=flags)
-    # Read only all the same; but now sqlite opens a file that is shorter than its header says.
+    # The file stays read only, but now sqlite also opens a file shorter than its header states.
     database.execute("PRAGMA writable_schema = ON")
     return database
 
 
 def has_bag_tables(path: Path) -> bool:
-    """Whether a sqlite3 file has the tables of a bag; one that cannot be asked goes by its name."""
+    """Return True if a sqlite3 file has the tables of a bag; if it is unreadable, judge by its suffix."""
     query = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('messages', 'topics')"
     database = _connect(path)
     try:

@@ -1,4 +1,4 @@
-"""Messages of ROS from nested dicts of their fields, to be written into logs."""
+"""ROS messages built from nested dicts of their fields, for writing logs."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ _BYTES = {"bool": "bool", "byte": "uint8", "char": "uint8", "octet": "uint8"}
 
 
 def build(store: Typestore, type_: str, fields: Mapping[str, Any]) -> Any:
-    """A message of a ROS type.
+    """Build a message of a ROS type.
 
     Args:
-        store: the types.
+        store: the type definitions.
         type_: in the spelling of ROS 2.
-        fields: what is not zero, in the spelling of ROS 2. A stamp is a plain number of nanoseconds.
+        fields: all fields that are not zero, in ROS 2 spelling. A stamp is a plain number of nanoseconds.
     """
     if type_ in _STAMPS:
         raise TypeError("stamps are plain numbers")
     _, described = store.fielddefs[type_]
-    # ROS 1 wrote CameraInfo's d, k, r and p large.
+    # ROS 1 spells CameraInfo's d, k, r and p in capitals.
     values = [_value(store, kind, fields.get(name, fields.get(name.lower()))) for name, kind in described]
     return store.types[type_](*values)
 

@@ -1,6 +1,6 @@
-"""Samples of a log to trajectories: of poses, of a chain of transforms, of a gimbal.
+"""Conversion of a log's samples to trajectories: of poses, of a chain of transforms, of a gimbal.
 
-Samples are taken one at a time into flat arrays (72 bytes a pose, 288 more with a covariance), so a log
+Samples are read one at a time into flat arrays (72 bytes a pose, 288 more with a covariance), so a log
 of any length streams through.
 """
 
@@ -31,7 +31,7 @@ Edge = tuple[str, str]
 
 @dataclass(frozen=True)
 class ClockJump:
-    """Where header stamps jump against the stamps of receipt."""
+    """Jump of header stamps relative to the stamps of receipt."""
 
     index: int  # of the first sample after the jump, in the order of receipt
     header_ns: int  # its header stamp
@@ -40,35 +40,35 @@ class ClockJump:
 
 @dataclass(frozen=True)
 class StampCheck:
-    """How header stamps and stamps of receipt go together."""
+    """Comparison of header stamps and stamps of receipt."""
 
     count: int  # samples
-    without_header: int  # had no header stamp: that of receipt stands for it
-    disagreeing: int  # of the others, header and receipt further apart than they may
+    without_header: int  # samples without a header stamp: that of receipt replaces it
+    disagreeing: int  # others whose header and receipt stamps are further apart than allowed
     largest_disagreement_s: float  # header - receipt, where that is largest in size
     jumps: tuple[ClockJump, ...]
-    drift: ClockFit | None = None  # from receipt to header, where both are stated
+    drift: ClockFit | None = None  # from receipt to header, for samples with both
 
 
 @dataclass(frozen=True)
 class Gathered:
-    """A trajectory from a log, and what is to be said of its stamps."""
+    """Trajectory from a log, with the check of its stamps."""
 
     trajectory: Trajectory
     stamps: StampCheck
-    frames: Edge  # as the log names them; empty where it does not
+    frames: Edge  # as the log names them; empty if it names none
 
 
 @dataclass(frozen=True)
 class TransformLog:
-    """Every transform that a log states, by target and source."""
+    """All transforms of a log, by target and source."""
 
     moving: Mapping[Edge, SampleRows]
     static: Mapping[Edge, SampleRows]
 
 
 class SampleRows:
-    """Samples of one thing, gathered into flat arrays."""
+    """Samples of one body, gathered into flat arrays."""
 
     def __init__(self) -> None:
         self._header_ns = array("q")
@@ -80,27 +80,27 @@ class SampleRows:
         return len(self._header_ns)
 
     def add(self, sample: PoseSample | AngleSample, values: Iterable[float]) -> None:
-        """One more; always as many values."""
+        """Add one sample; the number of values must always be the same."""
         self._header_ns.append(sample.stamp_ns)
         self._receive_ns.append(sample.receive_ns)
         self._values.extend(values)
 
     def add_pose(self, pose: PoseSample) -> None:
-        """One more pose; always with a covariance, or never."""
+        """Add one pose; either all poses have a covariance or none."""
         self.add(pose, pose.position + pose.quaternion_xyzw)
         if pose.covariance is not None:
             self._covariances.frombytes(pose.covariance.tobytes())
 
     def values(self, width: int) -> Float:
-        """[N, width]."""
+        """Return the values [N, width]."""
         return np.frombuffer(self._values, dtype=np.float64).reshape(-1, width)
 
     def times(self, stamps: Stamps) -> Int64:
-        """[N] the stamps asked for; where the header has none, those of receipt."""
+        """Return the stamps asked for [N]; without a header stamp, that of receipt."""
         return _times(*self._stamps(), stamps)
 
     def trajectory(self, source: Source, stamps: Stamps) -> Trajectory:
-        """The poses, cleaned.
+        """Return the poses, cleaned.
 
         Raises:
             DataError: none is usable.
@@ -124,7 +124,7 @@ def trajectory_of(
     may_disagree_s: float = 0.5,
     may_jump_s: float = 1.0,
 ) -> Gathered:
-    """Poses of one thing, in the axes of the log; covariances turned to ours (rotation in the body).
+    """Build the trajectory of one body, in the axes of the log; covariances in ours (rotation in the body).
 
     Rows are cleaned by `clean_poses`, every loss counted. A covariance that is zero throughout is unknown
     and left out.
@@ -132,12 +132,12 @@ def trajectory_of(
     Args:
         samples: poses in the order of receipt.
         source: the log and topic, for messages.
-        stamps: which stamp is the time of a pose. A header without one (0) takes that of receipt.
-        may_disagree_s: header and receipt may lie this far apart, for what is transmitted late.
-        may_jump_s: their difference may change by this much from one sample to the next.
+        stamps: which stamp is the time of a pose. A pose without a header stamp (0) takes that of receipt.
+        may_disagree_s: largest allowed difference of header and receipt, for delayed transmission.
+        may_jump_s: largest allowed change of that difference from one sample to the next.
 
     Raises:
-        DataError: no usable pose, samples that are no poses, or poses of several things.
+        DataError: no usable pose, samples that are no poses, or poses of several bodies.
     """
     rows = SampleRows()
     frames: Edge | None = None
@@ -165,7 +165,7 @@ def trajectory_of_arrays(
     may_disagree_s: float = 0.5,
     may_jump_s: float = 1.0,
 ) -> Gathered:
-    """The same of poses that were read at once; arguments as those of `trajectory_of`."""
+    """Build the trajectory of poses that were read at once; arguments like those of `trajectory_of`."""
     t_ns = _times(poses.header_ns, poses.receive_ns, stamps)
     trajectory = _cleaned(source, t_ns, poses.pose, poses.covariance)
     check = _compared(poses.header_ns, poses.receive_ns, may_disagree_s, may_jump_s)
@@ -182,19 +182,19 @@ def attitudes_of(
     may_disagree_s: float = 0.5,
     may_jump_s: float = 1.0,
 ) -> Gathered:
-    """A gimbal's attitude over time, in the axes of the log, about its own pivot (every position is 0).
+    """Build a gimbal's attitude over time, in the axes of the log, about its own pivot (positions are 0).
 
     Args:
         samples: angles or quaternions in the order of receipt.
         source: the log and topic, for messages.
-        stamps: as of `trajectory_of`, like the last two.
-        order: how the log lists angles (`attitude_from_angles`); nothing to quaternions.
+        stamps: as in `trajectory_of`, like the last two.
+        order: order of the angles in the log (`attitude_from_angles`); ignored for quaternions.
         units: of the angles.
         may_disagree_s: see there.
         may_jump_s: see there.
 
     Raises:
-        DataError: no usable attitude, or samples that are none.
+        DataError: no usable attitude, or samples that are no angles.
     """
     rows, of_angles = SampleRows(), False
     for sample in samples:
@@ -203,7 +203,7 @@ def attitudes_of(
         of_angles = sample.angles is not None
         rows.add(sample, sample.angles or sample.quaternion_xyzw or ())
     if of_angles:
-        with np.errstate(invalid="ignore"):  # an infinite angle becomes NaN and is dropped as such
+        with np.errstate(invalid="ignore"):  # an infinite angle becomes NaN and is dropped
             quaternion = attitude_from_angles(rows.values(3), order=order, units=units)
     else:
         quaternion = rows.values(4)
@@ -220,12 +220,12 @@ def attitudes_of(
 def transforms_of(
     samples: Iterable[Sample], source: Source, *, static: Iterable[Sample] = ()
 ) -> TransformLog:
-    """Every transform of a log, whatever it is between; cleaned when it is used.
+    """Collect every transform of a log, between any frames; they are cleaned when used.
 
     Args:
-        samples: of /tf and its like, in the order of receipt.
+        samples: of /tf and similar topics, in the order of receipt.
         source: the log, for messages.
-        static: of /tf_static: these hold always.
+        static: of /tf_static: these always hold.
 
     Raises:
         DataError: samples that are no transforms.
@@ -244,25 +244,25 @@ def chained(
     may_disagree_s: float = 0.5,
     may_jump_s: float = 1.0,
 ) -> Gathered:
-    """The pose of one frame in another over time, through the log's tree of transforms.
+    """Compute the pose of one frame in another over time, through the log's tree of transforms.
 
-    At the stamps of the fastest transform on the way. A transform is static if it was given as such, or
-    is stated once only, as Foxglove's logs do. Losses are counted by cause and transform; stamps
-    at which another transform on the way says nothing under "no transform".
+    The stamps are those of the transform with the highest rate on the route. A transform is static if it was
+    given as such, or is logged only once, as in Foxglove's logs. Losses are counted by cause and transform.
+    Stamps at which another transform on the route is unknown are counted under "no transform".
 
     Args:
-        transforms: what the log states.
+        transforms: the transforms of the log.
         source: the log, for messages.
-        parent: the frame in which the poses are wanted; a leading slash is of no account.
+        parent: the frame in which the poses are wanted; a leading slash is ignored.
         child: the frame whose poses are wanted.
-        stamps: as of `trajectory_of`, like the last two.
-        max_gap_ns: a moving transform says nothing between stamps further apart than this.
+        stamps: as in `trajectory_of`, like the last two.
+        max_gap_ns: a moving transform is unknown between stamps further apart than this.
         may_disagree_s: see there.
         may_jump_s: see there.
 
     Raises:
-        DataError: an unknown frame, frames that nothing connects, or no moment at which all the
-            transforms on the way are known.
+        DataError: an unknown frame, frames that nothing connects, or no time at which all the
+            transforms on the route are known.
     """
     parent, child = parent.lstrip("/"), child.lstrip("/")
     every = {**transforms.static, **transforms.moving}
@@ -298,14 +298,14 @@ def chained(
 
 
 def _times(header_ns: Int64, receive_ns: Int64, stamps: Stamps) -> Int64:
-    """The stamps asked for [N]; where the header has none, those of receipt."""
+    """Return the stamps asked for [N]; without a header stamp, that of receipt."""
     return receive_ns if stamps == "receive" else np.where(header_ns == 0, receive_ns, header_ns)
 
 
 def _cleaned(source: Source, t_ns: Int64, pose: Float, covariance: Float | None) -> Trajectory:
-    """Poses [N, 7] and covariances [N, 36] as logged, cleaned, with rotation errors about the body's axes."""
+    """Clean logged poses [N, 7] and covariances [N, 36]; turn rotation errors to the body's axes."""
     if covariance is not None and not covariance.any():
-        covariance = None  # zero throughout says nothing
+        covariance = None  # zero throughout means unknown
     poses = clean_poses(
         source,
         t_ns,

@@ -1,4 +1,4 @@
-"""Topics that say when pictures were taken, without the pictures."""
+"""Topics of trigger times of pictures, without the pictures."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ TRIGGER_TYPES = (
 
 
 def read_triggers(recording: Log, source: str, topic: str) -> tuple[Int64, int]:
-    """When pictures were triggered, increasing, and how many messages said nothing new.
+    """Read the times at which pictures were triggered, increasing, and count messages without a new time.
 
-    By the message's own stamp: of its header, or as CamIMUStamp's frame_stamp.
+    The time is the message's own stamp: that of its header, or CamIMUStamp's frame_stamp.
 
     Raises:
         DataError: a message cannot be read, or none states a time.
