@@ -1,1 +1,1 @@
-"""Voxels, clouds and floor plans."""
+"""Readers and writers of voxel maps, point clouds and floor plans."""

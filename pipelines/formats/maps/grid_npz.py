@@ -1,8 +1,8 @@
-"""Voxel maps as npz: the layout of a session's own maps, simple enough to write from any script.
+"""Reader of voxel maps as npz: the layout of a session's own maps, simple enough to write from any script.
 
     np.savez_compressed("site.npz", probability=p, origin=[x, y, z], resolution_m=0.2)
 
-`pipelines.session.maps` says what each array holds; this makes it a format for `map:`.
+`pipelines.session.maps` documents each array; this module makes it a format for `map:`.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from pipelines.session.records import Occupancy
 
 
 class GridNpz:
-    """A dense grid in its own voxels."""
+    """Reader of a dense grid in its own voxels."""
 
     name = "npz"
     title = "voxel map (npz)"
     suffixes: tuple[str, ...] = (".npz",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether it is an npz that holds a grid and its place."""
+        """Return True for an npz that holds a grid and its place."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         try:
@@ -35,14 +35,14 @@ class GridNpz:
         return "origin.npy" in names and bool(names & {"probability.npy", "occupancy.npy"})
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Box, voxels and their states, read part after part."""
+        """Describe box, voxels and their states; the arrays are read part by part."""
         return describe_stored(path)
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
         """Read the grid as it is.
 
         Raises:
-            DataError: damaged, not the layout, too large, or `resolution_m` is not its own.
+            DataError: damaged, another layout, too large, or `resolution_m` differs from its own.
         """
         occupancy = read_grid(path)
         if resolution_m is not None and not math.isclose(resolution_m, occupancy.resolution_m, rel_tol=1e-6):

@@ -1,6 +1,6 @@
 """LZF decompression, compiled; `pcd` is its only user.
 
-The stream (liblzf by Marc Lehmann, lzf_d.c) is a row of instructions that begin with a control byte c:
+The stream (liblzf by Marc Lehmann, lzf_d.c) is a sequence of instructions that begin with a control byte c:
 
 - c < 32: copy the c + 1 bytes that follow;
 - else: repeat (c >> 5) + 2 bytes of the output (if c >> 5 is 7, a byte to add to the length follows) from
@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from pipelines.geometry.compilation import cached
 
 MOST_EXPANSION = 88
-"""Three bytes stand for 264 at most: a stated size beyond this is not believed."""
+"""Largest ratio of output to input (264 bytes for 3); a file that states more is refused."""
 
 
 @cached
 def decompress(packed: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
-    """Fill `target`; the bytes written, or -1 where the stream breaks off, points outside or is too long."""
+    """Fill `target`; return the bytes written, or -1 if the stream is cut off, too long or points outside."""
     read, written = 0, 0
     while read < len(packed):
         control = int(packed[read])
@@ -42,7 +42,7 @@ def decompress(packed: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
             read += 1
             if source < 0 or written + length > len(target):
                 return -1
-            for k in range(length):  # one by one: the two may overlap
+            for k in range(length):  # one by one, because the two ranges may overlap
                 target[written + k] = target[source + k]
         written += length
     return written

@@ -1,4 +1,4 @@
-"""What can be seen of a voxel map: its occupied voxels that have a neighbour which is not occupied."""
+"""Visible surface of a voxel map: its occupied voxels that have a neighbour which is not occupied."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from pipelines.session.records import Float, Int64, Occupancy
 
 MOST_CUBES = 1_000_000
-_SLAB = 16  # layers that are looked at together
+_SLAB = 16  # layers that are searched together
 
 
 @dataclass(frozen=True)
 class MapSurface:
-    """N cubes that stand for the surface."""
+    """N cubes that cover the surface."""
 
     middle: Float  # [N, 3] m, world
     cube_m: float  # their side
@@ -22,9 +22,9 @@ class MapSurface:
 
 
 def surface_of(occupancy: Occupancy, most: int = MOST_CUBES) -> MapSurface:
-    """The surface of a map, gathered in the smallest cubes of whole voxels of which at most `most` hold any.
+    """Find the surface of a map, in cubes of as few whole voxels as give at most `most` cubes.
 
-    Beyond the map's box nothing is occupied, and what is not known is not either.
+    Voxels beyond the map's box and unknown voxels count as not occupied.
     """
     layers = occupancy.probability.shape[0]
     found: list[Int64] = []

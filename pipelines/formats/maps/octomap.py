@@ -1,4 +1,4 @@
-"""OctoMap trees: `.bt` (each leaf occupied or free) and `.ot` (each node's log odds).
+"""Reader of OctoMap trees: `.bt` (each leaf occupied or free) and `.ot` (each node's log odds).
 
 Layout (octomap 1.10, OcTreeBaseImpl.hxx and OccupancyOcTreeBase.hxx), little-endian, nodes depth first:
 
@@ -6,9 +6,9 @@ Layout (octomap 1.10, OcTreeBaseImpl.hxx and OccupancyOcTreeBase.hxx), little-en
   or, in the oldest .bt, 16 bytes: int32 3, float64 res, uint32 size.
 - .bt: two bytes for every inner node, two bits for every child: 0 unknown, 1 free, 2 occupied, 3 inner.
 - .ot: for every node its float32 log odds (then three bytes of colour in a ColorOcTree) and a byte whose bits
-  say which children follow. What inner nodes say is a summary of their leaves and ignored.
+  mark the children that follow. The values of inner nodes summarise their leaves and are ignored.
 
-Child i lies on the upper side of x, y, z where its bits 0, 1, 2 are set. The root is 2 ** 16 finest voxels
+Child i lies on the upper side of x, y, z if its bits 0, 1, 2 are set. The root is 2 ** 16 finest voxels
 wide and centred on the world's origin; a leaf above the finest depth stands for all voxels within it.
 """
 
@@ -30,8 +30,8 @@ from pipelines.session.records import Occupancy
 DEPTH = 16
 _CENTRE = 1 << (DEPTH - 1)
 
-# A .bt does not say how sure it was: its leaves get the limits to which OctoMap clamps by default
-# (AbstractOccupancyOcTree's constructor), which is what OctoMap itself gives them.
+# A .bt has no probabilities. Its leaves get the limits to which OctoMap clamps by default
+# (AbstractOccupancyOcTree's constructor), as in OctoMap itself.
 FREE_PROBABILITY, OCCUPIED_PROBABILITY = 0.1192, 0.971
 
 _BINARY = b"# Octomap OcTree binary file"
@@ -44,7 +44,7 @@ _COPY_AGAIN = "copy or export it again"
 
 @dataclass(frozen=True)
 class Leaves:
-    """What a tree knows, leaf by leaf."""
+    """Known leaves of a tree."""
 
     key: NDArray[np.int32]  # [L, 3] lowest corner, in finest voxels, 0 at the lower end of the tree
     depth: NDArray[np.uint8]  # [L] 0 root, 16 finest
@@ -53,22 +53,22 @@ class Leaves:
 
     @property
     def occupied(self) -> NDArray[np.bool_]:
-        """OctoMap's threshold: a probability of at least one half."""
+        """[L] True for leaves of a probability of at least one half (OctoMap's threshold)."""
         return self.log_odds >= 0
 
     def voxels(self, chosen: NDArray[np.bool_]) -> int:
-        """How many finest voxels some of the leaves stand for."""
+        """Count the finest voxels that the chosen leaves stand for."""
         counts = np.bincount(self.depth[chosen], minlength=DEPTH + 1).tolist()
         return sum(count * 8 ** (DEPTH - depth) for depth, count in enumerate(counts))
 
     def box(self, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Lowest and highest corner of some of the leaves, in finest voxels from the world's origin."""
+        """Return the lowest and highest corner of chosen leaves, in finest voxels from the world's origin."""
         key, depth = self.key[chosen].astype(np.int64), self.depth[chosen].astype(np.int64)
         corner = key + (1 << (DEPTH - depth))[:, None]
         return key.min(axis=0) - _CENTRE, corner.max(axis=0) - _CENTRE
 
     def extent(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """The box of all leaves."""
+        """Return the box of all leaves."""
         return self.box(np.ones(len(self.depth), dtype=bool))
 
 
@@ -81,9 +81,9 @@ class _Header:
 
 
 class OctomapFormat:
-    """Probabilities in the tree's own voxels, or in voxels 2, 4, 8, ... times as wide if the user says so.
+    """Reader into the tree's own voxels, or into voxels 2, 4, 8, ... times as wide if the user states so.
 
-    Then a voxel has the largest probability of what is known within it: an obstacle is never lost.
+    A wider voxel has the largest probability of the known leaves within it: an obstacle is never lost.
     """
 
     name = "octomap"
@@ -91,14 +91,14 @@ class OctomapFormat:
     suffixes: tuple[str, ...] = (".bt", ".ot")
 
     def recognises(self, path: Path) -> bool:
-        """Whether it begins as OctoMap's files do."""
+        """Return True if the file begins like OctoMap's files."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         head = first_bytes(path, 64)
         return head.startswith((_BINARY, _FULL)) or _is_legacy(head)
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Header, nodes, leaves, voxels and boxes; the grid itself is not made."""
+        """Describe header, nodes, leaves, voxels and boxes; the grid itself is not built."""
         header, leaves = _read(path)
         occupied = leaves.occupied
         low, high = leaves.extent()
@@ -124,7 +124,7 @@ class OctomapFormat:
         """Read the whole tree into a grid of its box.
 
         Raises:
-            DataError: no OctoMap, broken off or damaged, another kind of tree, nothing known in it,
+            DataError: no OctoMap, cut off or damaged, another kind of tree, nothing known in it,
                 `resolution_m` is not its own times a power of two, or too many voxels.
         """
         header, leaves = _read(path)
@@ -134,7 +134,7 @@ class OctomapFormat:
 def occupancy_from(
     source: Path | str, leaves: Leaves, finest_m: float, resolution_m: float | None
 ) -> Occupancy:
-    """The dense grid of a tree's box.
+    """Build the dense grid of a tree's box.
 
     Args:
         source: the file or topic, for messages.
@@ -143,7 +143,7 @@ def occupancy_from(
         resolution_m: the side of the grid's voxels, `finest_m` times a power of two; None for the finest.
 
     Raises:
-        DataError: `resolution_m` is none of those, or the grid is too large.
+        DataError: `resolution_m` is no such multiple, or the grid is too large.
     """
     from pipelines.formats.maps.octree_kernels import fill
 
@@ -161,16 +161,16 @@ def occupancy_from(
 
 
 def leaves_of(source: Path | str, payload: Bytes, *, is_binary: bool, tree: str) -> Leaves:
-    """The leaves of a tree without a header, as octomap_msgs/Octomap carries it.
+    """Find the leaves of a tree without a header, as in octomap_msgs/Octomap.
 
     Args:
         source: the file or topic, for messages.
-        payload: what follows the header in a file.
-        is_binary: whether it is laid out as in a .bt, else as in a .ot.
-        tree: what kind of tree it is; a .bt has one layout for all.
+        payload: the bytes that follow the header in a file.
+        is_binary: True for the layout of a .bt, else that of a .ot.
+        tree: the kind of tree; a .bt has one layout for all.
 
     Raises:
-        DataError: as `binary_leaves` and `full_leaves`, or nodes of a kind that is not known.
+        DataError: as in `binary_leaves` and `full_leaves`, or nodes of an unknown kind.
     """
     if is_binary:
         return binary_leaves(source, payload)
@@ -184,10 +184,10 @@ def leaves_of(source: Path | str, payload: Bytes, *, is_binary: bool, tree: str)
 
 
 def binary_leaves(source: Path | str, payload: Bytes) -> Leaves:
-    """The leaves of a .bt's data, also as octomap_msgs/Octomap carries it.
+    """Find the leaves of a .bt's data, also as in octomap_msgs/Octomap.
 
     Raises:
-        DataError: broken off, damaged, or bytes beyond the tree.
+        DataError: cut off, damaged, or bytes beyond the tree.
     """
     from pipelines.formats.maps.octree_kernels import walk_binary
 
@@ -204,10 +204,10 @@ def binary_leaves(source: Path | str, payload: Bytes) -> Leaves:
 
 
 def full_leaves(source: Path | str, payload: Bytes, record_bytes: int) -> Leaves:
-    """The leaves of a .ot's data, also as octomap_msgs/Octomap carries it.
+    """Find the leaves of a .ot's data, also as in octomap_msgs/Octomap.
 
     Raises:
-        DataError: broken off, damaged, bytes beyond the tree, or log odds that are not finite.
+        DataError: cut off, damaged, bytes beyond the tree, or log odds that are not finite.
     """
     from pipelines.formats.maps.octree_kernels import walk_full
 
@@ -279,7 +279,7 @@ def _log_odds(probability: float) -> float:
 
 
 def _halvings(source: Path | str, finest_m: float, resolution_m: float | None) -> int:
-    """How many levels of the tree are merged to reach a resolution."""
+    """Return the number of tree levels that are merged to reach a resolution."""
     if resolution_m is None:
         return 0
     halvings = round(math.log2(check_resolution(source, resolution_m) / finest_m))

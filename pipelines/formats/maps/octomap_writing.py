@@ -1,4 +1,4 @@
-"""Writing OctoMap's binary trees (.bt), whose layout `octomap` explains.
+"""Writer of OctoMap's binary trees (.bt); module `octomap` explains the layout.
 
 The tree is built from the grid upwards, level by level: eight children that are all free or all occupied
 become one leaf, as OctoMap's own prune() makes them. A .bt keeps no probabilities, only free and occupied.
@@ -21,7 +21,7 @@ Int64 = NDArray[np.int64]
 
 _UNKNOWN = 0
 _CENTRE = 1 << (DEPTH - 1)
-_OFF_GRID = 1e-4  # of a voxel; origins are sums and products of decimal numbers
+_OFF_GRID = 1e-4  # of a voxel; origins are sums and products of rounded decimal numbers
 
 _HEADER = """# Octomap OcTree binary file
 # (feel free to add / change comments, but leave the first line as it is!)
@@ -38,8 +38,8 @@ def write_octomap(path: Path, occupancy: Occupancy) -> None:
 
     Raises:
         ValueError: the origin is not a multiple of the resolution, or nothing in the map is known.
-        DataError: the map reaches further from the world's origin than an OctoMap of these voxels can,
-            32768 voxels.
+        DataError: the map reaches further from the world's origin than an OctoMap of these voxels can
+            (32768 voxels).
     """
     side_m = float(occupancy.resolution_m)
     first = _first_key(occupancy.origin, side_m)
@@ -57,7 +57,7 @@ def write_octomap(path: Path, occupancy: Occupancy) -> None:
 
 
 def _first_key(origin: Float, side_m: float) -> Int64:
-    """The finest voxel's key at the grid's corner, counted from the tree's lower end."""
+    """Return the finest voxel's key at the grid's corner, counted from the tree's lower end."""
     steps = np.asarray(origin, dtype=np.float64) / side_m
     nearest = np.rint(steps)
     if not (np.abs(steps - nearest) <= _OFF_GRID).all():
@@ -82,10 +82,10 @@ def _check_reach(path: Path, first: Int64, shape: tuple[int, ...], side_m: float
 
 
 def _levels(states: States, first: Int64) -> tuple[States, Int64, Int64, Int64]:
-    """The nodes of every level within the grid's box, root first.
+    """Compute the nodes of every level within the grid's box, root first.
 
     Returns:
-        All states one level after another; where each level begins [DEPTH + 1]; the key of its first node
+        All states one level after another; the start of each level [DEPTH + 1]; the key of its first node
         [DEPTH + 1, 3], in nodes of that level; and its shape [DEPTH + 1, 3].
     """
     levels, lows = [states], [first]
@@ -100,7 +100,7 @@ def _levels(states: States, first: Int64) -> tuple[States, Int64, Int64, Int64]:
 
 
 def _merged(states: States, first: Int64) -> tuple[States, Int64]:
-    """The level above: a node is its children's state if they share one, else it has them below it."""
+    """Merge to the level above: a node has its children's state if they share one, else it is inner."""
     before = first % 2
     after = (before + states.shape) % 2
     padded = np.pad(states, np.stack([before, after], axis=1), constant_values=_UNKNOWN)
@@ -115,7 +115,7 @@ def _merged(states: States, first: Int64) -> tuple[States, Int64]:
 def _write_depth_first(
     flat: States, begin: Int64, low: Int64, shape: Int64, words: NDArray[np.uint16]
 ) -> int:
-    """Write one word for every inner node, children after their parent; returns how many leaves there are."""
+    """Write one word for every inner node, children after their parent; return the number of leaves."""
     stack = np.empty((8 * (DEPTH + 1), 4), dtype=np.int64)
     stack[0] = 0
     waiting, written, leaves = 1, 0, 0
@@ -124,7 +124,7 @@ def _write_depth_first(
         level = stack[waiting, 0] + 1  # of the children
         x0, y0, z0 = 2 * stack[waiting, 1], 2 * stack[waiting, 2], 2 * stack[waiting, 3]
         word = np.int64(0)
-        for child in range(7, -1, -1):  # the first child is then on top
+        for child in range(7, -1, -1):  # downwards, so that the first child is on top
             x, y, z = x0 + (child & 1), y0 + ((child >> 1) & 1), z0 + (child >> 2)
             i, j, k = x - low[level, 0], y - low[level, 1], z - low[level, 2]
             if not (0 <= i < shape[level, 0] and 0 <= j < shape[level, 1] and 0 <= k < shape[level, 2]):

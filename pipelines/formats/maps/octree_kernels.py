@@ -1,6 +1,6 @@
-"""The compiled walks of `octomap`, which explains the formats and is the only user.
+"""Compiled walks of `octomap`, which explains the formats and is the main user.
 
-All kernels stand in this one module: numba's cache watches the file of the outermost function only.
+All kernels are in this one module, because numba's cache watches the file of the outermost function only.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from pipelines.geometry.compilation import cached
 
 DEPTH = 16
-FREE, OCCUPIED, INNER = 1, 2, 3  # of the two bits that a .bt has for every child
+FREE, OCCUPIED, INNER = 1, 2, 3  # values of the two bits that a .bt has for every child
 BREAKS_OFF, TOO_DEEP = -1, -2
 
 Int32 = NDArray[np.int32]
 Float32 = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
-# Nodes wait on a stack with at most seven siblings of every level above them, and eight children.
+# The stack holds at most seven siblings of every level above the current node, and its eight children.
 _STACK = 8 * (DEPTH + 1)
 
 
@@ -28,7 +28,7 @@ def walk_binary(
 ) -> int:
     """Write the leaves of a .bt tree, one word per inner node, depth first.
 
-    `key` [L, 3], `depth` [L] and `log_odds` [L] have room for exactly the leaves that all words name.
+    `key` [L, 3], `depth` [L] and `log_odds` [L] have room for exactly the leaves in all words.
     Returns the number of words that the tree has, or `BREAKS_OFF` or `TOO_DEEP`.
     """
     stack = np.empty((_STACK, 4), dtype=np.int64)
@@ -42,7 +42,7 @@ def walk_binary(
         word = np.int64(words[read])
         read += 1
         half = 1 << (DEPTH - 1 - level)
-        for child in range(7, -1, -1):  # the first child is then on top
+        for child in range(7, -1, -1):  # downwards, so that the first child is on top
             state = (word >> (2 * child)) & 3
             if state == 0:
                 continue
@@ -69,10 +69,10 @@ def walk_binary(
 
 @cached
 def walk_full(children: Bytes, node: Int32, key: Int32, depth: Bytes) -> int:
-    """Find the leaves of a .ot tree: which record each one is, and where it lies.
+    """Find the leaves of a .ot tree: the record and the position of each.
 
     `children` [N] are the bit masks of the records, depth first; `node`, `key` [L, 3] and `depth` have
-    room for exactly the records without children. Returns as `walk_binary`.
+    room for exactly the records without children. Returns like `walk_binary`.
     """
     stack = np.empty((_STACK, 4), dtype=np.int64)
     stack[0] = 0
@@ -108,7 +108,7 @@ def walk_full(children: Bytes, node: Int32, key: Int32, depth: Bytes) -> int:
 def fill(
     grid: Float32, key: Int32, depth: Bytes, probability: Float32, low: NDArray[np.int64], halvings: int
 ) -> None:
-    """Give every voxel of `grid` (NaN before) the largest probability of the leaves within it.
+    """Set every voxel of `grid` (NaN before) to the largest probability of the leaves within it.
 
     A voxel is 2 ** halvings finest voxels wide; the first one's key, counted in such voxels, is `low`.
     """
@@ -121,5 +121,5 @@ def fill(
         for x in range(x0, x0 + side):
             for y in range(y0, y0 + side):
                 for z in range(z0, z0 + side):
-                    if not grid[x, y, z] >= value:  # also where nothing was known
+                    if not grid[x, y, z] >= value:  # also true for NaN, the unknown voxels
                         grid[x, y, z] = value

@@ -1,9 +1,9 @@
-"""Point Cloud Library's PCD, versions .5 to .7: ascii, binary and binary_compressed.
+"""Reader of Point Cloud Library's PCD, versions .5 to .7: ascii, binary and binary_compressed.
 
 Layout (PCL documentation, "The PCD file format"): lines VERSION, FIELDS (in old files COLUMNS), SIZE, TYPE,
 COUNT, WIDTH, HEIGHT, VIEWPOINT, POINTS, DATA, then the points. binary: records, packed, little-endian.
 binary_compressed: two uint32, bytes compressed and uncompressed, and an LZF stream of all values of the first
-field, all of the second, and so on. VIEWPOINT, where the sensor stood, is not applied to the points.
+field, all of the second, and so on. VIEWPOINT, the pose of the sensor, is not applied to the points.
 """
 
 from __future__ import annotations
@@ -54,21 +54,21 @@ class _Header:
 
 
 class PcdFormat:
-    """Fields in any order and of any type; x, y and z are metres. Points that are not finite are counted."""
+    """Reader of fields in any order and type, x, y, z in metres; points that are not finite are counted."""
 
     name = "pcd"
     title = "point cloud (PCD)"
     suffixes: tuple[str, ...] = (".pcd",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether it has the lines that every PCD has."""
+        """Return True if the file has the lines that every PCD has."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         head = first_bytes(path)
         return bool(re.search(rb"(?m)^(FIELDS|COLUMNS) ", head) and re.search(rb"(?m)^DATA ", head))
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Header, points, and their map at the default resolution."""
+        """Describe header, points, and their map at the default resolution."""
         header, points = _read(path)
         summary: dict[str, object] = {
             "version": header.version,
@@ -82,10 +82,10 @@ class PcdFormat:
         return {**summary, **describe_points(path, points)}
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
-        """Voxels with a point in them are occupied (1.0), all others unknown; 0.2 m unless stated.
+        """Read points as voxels: occupied (1.0) with a point in it, else unknown; 0.2 m unless stated.
 
         Raises:
-            DataError: no PCD, broken off, no fields x, y, z, no finite point, or a box that is too large.
+            DataError: no PCD, cut off, no fields x, y, z, no finite point, or a box that is too large.
         """
         return occupancy_of(path, _read(path)[1], resolution_m)
 

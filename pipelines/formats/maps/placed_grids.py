@@ -1,11 +1,11 @@
-"""Voxel grids and floor plans of one frame, put on the axes of the world.
+"""Conversion of voxel grids and floor plans of one frame to the axes of the world.
 
 A grid that is turned by a multiple of a right angle keeps its voxels: they are only counted along other axes.
-Any other turn about the vertical samples the grid so densely that every voxel is met, and a voxel takes the
-largest probability met in it: a wall may grow by a voxel, never vanish. What is tilted is refused.
+For any other turn about the vertical the grid is sampled so densely that every voxel is met. A voxel takes
+the largest probability met in it: a wall may grow by a voxel, but never vanishes. A tilted grid is refused.
 
-A turn is taken to be the nearest of these if no voxel moves by more than half its side, which is what
-counting in voxels rounds anyway.
+A turn is rounded to the nearest of these if no voxel moves by more than half its side, because
+counting in voxels rounds by as much anyway.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ Pose = tuple[Float, Float]
 """Position [3] and quaternion [4] of one frame in another."""
 
 _UPSIDE_DOWN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])  # its own inverse; NED to ENU and back
-_SLAB_VALUES = 1 << 22  # how much of a turned grid is sampled at a time
+_SLAB_VALUES = 1 << 22  # values of a turned grid that are sampled at a time
 
 
 def placed(
     source: str, grid: Occupancy, world_from_grid: Pose, *, resolution_m: float | None = None
 ) -> Occupancy:
-    """A voxel grid in the world.
+    """Convert a voxel grid to the world's axes.
 
     Args:
         source: the log and topic, for messages.
         grid: its origin and axes are those of its frame.
-        world_from_grid: where that frame is.
+        world_from_grid: the pose of that frame.
         resolution_m: another side for the voxels, for a grid of one layer.
 
     Raises:
@@ -67,15 +67,15 @@ def extruded(
     side_m: float,
     height_m: float,
 ) -> Occupancy:
-    """A floor plan in the world, raised from its own plane.
+    """Convert a floor plan to the world's axes, extruded upwards from its own plane.
 
     Args:
         source: the log and topic, for messages.
         plan: probabilities [X, Y], the corner of the first at the plan's origin.
         resolution_m: the side of its cells.
-        world_from_plan: where its origin is.
+        world_from_plan: the pose of its origin.
         side_m: of the voxels.
-        height_m: how high what is on the plan stands, rounded up to whole voxels.
+        height_m: height of the cells, rounded up to whole voxels.
 
     Raises:
         DataError: the plan is tilted, or the grid too large.
@@ -85,7 +85,7 @@ def extruded(
     if abs(rotation[2, 2]) < 0.5:  # on edge: `placed` would turn it squarely
         raise _tilted(source, rotation)
     layer = Occupancy(plan[:, :, None], np.array([0.0, 0.0, -resolution_m / 2]), resolution_m)
-    layers = max(1, math.ceil(height_m / side_m - 1e-6))  # 3.0000001 voxels are three
+    layers = max(1, math.ceil(height_m / side_m - 1e-6))  # 3.0000001 voxels count as three
     sides = [*(math.ceil(cells * resolution_m / side_m) for cells in plan.shape), layers]
     check_size(source, sides, side_m, f"state resolution_m: {2 * side_m:g} or more")
     flat = placed(source, layer, world_from_plan, resolution_m=side_m)
@@ -114,7 +114,7 @@ def _moved(grid: Occupancy, translation: Float) -> Occupancy:
 
 
 def _moves_little(grid: Occupancy, difference: Float) -> bool:
-    """Whether two rotations about the centre of a grid, of which this is the difference, are one to it."""
+    """Return True if no voxel moves by over half a side between two rotations of this difference."""
     half = np.array(grid.probability.shape) * grid.resolution_m / 2
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8)
     apart = np.linalg.norm(difference @ (signs * half[:, None]), axis=0)
@@ -122,7 +122,7 @@ def _moves_little(grid: Occupancy, difference: Float) -> bool:
 
 
 def _squarely_turned(grid: Occupancy, rotation: Float) -> Occupancy:
-    """By a rotation each of whose rows and columns has one entry, 1 or -1."""
+    """Turn by a rotation whose rows and columns each have one entry, 1 or -1."""
     axes = np.abs(rotation).argmax(axis=1)
     backward = rotation.sum(axis=1) < 0
     probability = grid.probability.transpose(axes)
@@ -133,10 +133,10 @@ def _squarely_turned(grid: Occupancy, rotation: Float) -> Occupancy:
 
 
 def _turned(source: str, grid: Occupancy, world_from_plane: Float, side: float) -> Occupancy:
-    """By a rotation [2, 2] about the vertical axis through the origin of its frame.
+    """Turn by a rotation [2, 2] about the vertical axis through the origin of its frame.
 
-    Samples stand on a square lattice of pitch p, whose covering radius is p / sqrt(2); the disc within a
-    voxel has half its side as radius: with p at most 1 / sqrt(2) of a voxel every voxel is met.
+    Samples form a square lattice of pitch p with the covering radius p / sqrt(2). The disc within a
+    voxel has half its side as radius. So every voxel is met if p is at most 1 / sqrt(2) of a voxel.
     """
     columns, rows, layers = grid.probability.shape
     extent = np.array([columns, rows]) * grid.resolution_m
@@ -160,7 +160,7 @@ def _turned(source: str, grid: Occupancy, world_from_plane: Float, side: float) 
 
 
 def _looked_up(grid: Occupancy, world_from_plane: Float, x: Float, y: Float) -> NDArray[np.float32]:
-    """The columns of voxels [X, Y, Z] at x [X, 1] and y [1, Y] in the world's axes; NaN outside."""
+    """Look up the columns of voxels [X, Y, Z] at x [X, 1] and y [1, Y] in the world's axes; NaN outside."""
     (c, minus_s), _ = world_from_plane
     column = np.floor((c * x - minus_s * y - grid.origin[0]) / grid.resolution_m).astype(np.int64)
     row = np.floor((c * y + minus_s * x - grid.origin[1]) / grid.resolution_m).astype(np.int64)

@@ -1,8 +1,8 @@
-"""Stanford's PLY: the vertices of a cloud or mesh, ascii or binary of either byte order.
+"""Reader of Stanford's PLY: the vertices of a cloud or mesh, ascii or binary of either byte order.
 
 Layout (Turk, "The PLY Polygon File Format", 1994): `ply`, `format`, then each `element` with its count and
-its `property` lines, `end_header`, then the elements one after the other. Only `vertex` is read: a mesh
-counts by its corners, so sample its faces densely before it becomes a map.
+its `property` lines, `end_header`, then the elements one after the other. Only `vertex` is read, so a mesh
+gives its corners only: sample its faces densely before use as a map.
 """
 
 from __future__ import annotations
@@ -51,25 +51,25 @@ class _Element:
 
     @property
     def stride(self) -> int:
-        """Bytes of one; meaningless with lists."""
+        """Bytes of one element; meaningless with lists."""
         return sum(int(kind[1:]) for kind in self.properties.values() if kind != "list")
 
 
 class PlyFormat:
-    """x, y and z are metres. Vertices that are not finite are counted."""
+    """Reader of vertices; x, y and z are metres. Vertices that are not finite are counted."""
 
     name = "ply"
     title = "point cloud (PLY)"
     suffixes: tuple[str, ...] = (".ply",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether it begins as every PLY does."""
+        """Return True if the file begins with the line `ply`."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         return first_bytes(path, 16).split(b"\n")[0].strip() == b"ply"
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Elements, properties, vertices, and their map at the default resolution."""
+        """Describe elements, properties, vertices, and their map at the default resolution."""
         encoding, elements, points = _read(path)
         return {
             "data": encoding,
@@ -79,10 +79,10 @@ class PlyFormat:
         }
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
-        """Voxels with a vertex in them are occupied (1.0), all others unknown; 0.2 m unless stated.
+        """Read vertices as voxels: occupied (1.0) with a vertex in it, else unknown; 0.2 m unless stated.
 
         Raises:
-            DataError: no PLY, broken off, no vertices with x, y, z, lists before or in them, no finite
+            DataError: no PLY, cut off, no vertices with x, y, z, lists before or in them, no finite
                 vertex, or a box that is too large.
         """
         return occupancy_of(path, _read(path)[2], resolution_m)
@@ -134,7 +134,7 @@ def _header(path: Path, lines: list[list[str]]) -> tuple[str, list[_Element]]:
 
 
 def _vertex(path: Path, elements: list[_Element]) -> tuple[list[_Element], _Element]:
-    """The elements before the vertices, and the vertices."""
+    """Return the elements before the vertices, and the vertices."""
     names = [element.name for element in elements]
     if "vertex" not in names:
         raise DataError(path, "has no vertices", _EXPORT_AGAIN)

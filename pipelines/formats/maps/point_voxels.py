@@ -1,6 +1,6 @@
-"""Point clouds as voxel maps: a voxel with a point in it is occupied, of all others nothing is known.
+"""Conversion of point clouds to voxel maps: a voxel with a point in it is occupied, all others are unknown.
 
-A cloud says where something was hit, not what the rays passed through: no voxel of it is free.
+A cloud gives the points that rays hit, not the space they passed through, so no voxel is free.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from pipelines.session.records import Float, Occupancy
 
 DEFAULT_RESOLUTION_M = 0.2
 
-_BITS = 20  # of a voxel's index along each axis: three fit an int64
+_BITS = 20  # of a voxel's index along each axis, so that three fit an int64
 _REACH = 1 << (_BITS - 1)  # voxels from the world's origin
 
 
 def occupancy_of(source: Path | str, points: Float, resolution_m: float | None) -> Occupancy:
-    """Voxels of a point cloud, their corners at whole multiples of the resolution.
+    """Make the voxels of a point cloud; their corners are whole multiples of the resolution.
 
     Args:
         source: the file or topic, for messages.
@@ -47,7 +47,7 @@ def occupancy_of(source: Path | str, points: Float, resolution_m: float | None) 
 
 
 class VoxelSet:
-    """The voxels of many clouds, each with the time at which a point was first seen in it.
+    """Voxels of many clouds, each with the earliest time of a point in it.
 
     Memory grows with the voxels, not with the points.
 
@@ -68,7 +68,7 @@ class VoxelSet:
         self.dropped: Counter[str] = Counter()
 
     def add(self, points: Float, t_ns: int) -> None:
-        """Take in the points [N, 3] of one moment; those without a place are left out and counted.
+        """Add the points [N, 3] of one time; points that are not finite or too far are dropped and counted.
 
         Raises:
             DataError: the box of all voxels is too large.
@@ -98,17 +98,17 @@ class VoxelSet:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """How many voxels the box of all points has along x, y, z."""
+        """Size in voxels of the box of all points along x, y, z."""
         x, y, z = np.maximum(self._high - self._low + 1, 0).tolist()
         return x, y, z
 
     @property
     def grew_ns(self) -> NDArray[np.int64]:
-        """The times at which something new was seen, ascending; empty while there is no voxel."""
+        """Times at which new voxels appeared, ascending; empty while there is no voxel."""
         return np.unique(self._since_ns)
 
     def occupancy(self, at_ns: int) -> Occupancy:
-        """What was seen by some time, in the box of everything; the map holds from that time."""
+        """Return the map of all points up to a time, in the box of all voxels; it is valid from that time."""
         keys = self._keys[self._since_ns <= at_ns]
         mask = (1 << _BITS) - 1
         index = np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], axis=1) - _REACH
@@ -118,7 +118,7 @@ class VoxelSet:
 
 
 def describe_points(source: Path | str, points: Float) -> dict[str, object]:
-    """Points, their box and centre, and the map that they make at 0.2 m (which is not made for it).
+    """Describe points, their box and centre, and their map at 0.2 m (without building it).
 
     Raises:
         DataError: no finite point.
@@ -145,17 +145,17 @@ def describe_points(source: Path | str, points: Float) -> dict[str, object]:
 def packed_points(
     path: Path, body: Bytes, count: int, columns: dict[str, tuple[str, int]], stride: int
 ) -> Float:
-    """Points [N, 3] out of binary records.
+    """Extract points [N, 3] from binary records.
 
     Args:
         path: the file, for messages.
         body: the bytes from the first record on; more may follow the last.
-        count: how many records the header states.
-        columns: of x, y and z each the numpy type and the offset within a record.
+        count: number of records in the header.
+        columns: numpy type and offset within a record, for each of x, y and z.
         stride: bytes of a record.
 
     Raises:
-        DataError: the file breaks off before the last record.
+        DataError: the file ends before the last record.
     """
     check_count(path, count, len(body) // stride)
     names = ("x", "y", "z")
@@ -172,20 +172,20 @@ def packed_points(
 
 
 def joined(columns: Sequence[NDArray[Any]]) -> Float:
-    """Columns of any numeric type side by side, [N, len(columns)]."""
-    with np.errstate(invalid="ignore"):  # damaged floats that signal; they become NaN and are counted
+    """Stack columns of any numeric type, [N, len(columns)]."""
+    with np.errstate(invalid="ignore"):  # signalling NaNs of damaged floats warn; they are counted later
         return np.stack([column.astype(np.float64) for column in columns], axis=1)
 
 
 def written_points(path: Path, body: Bytes, skipped: int, count: int, columns: tuple[int, int, int]) -> Float:
-    """Points [N, 3] out of rows of text.
+    """Parse points [N, 3] from rows of text.
 
     Args:
         path: the file, for messages.
         body: the text below the header.
-        skipped: rows of other things before the points.
-        count: how many rows of points the header states.
-        columns: where x, y and z stand in a row.
+        skipped: rows of other elements before the points.
+        count: number of rows of points in the header.
+        columns: indices of x, y and z in a row.
 
     Raises:
         DataError: fewer rows, or a cell that is missing or no number.
@@ -203,10 +203,10 @@ def written_points(path: Path, body: Bytes, skipped: int, count: int, columns: t
 
 
 def check_count(path: Path, stated: int, there: int) -> None:
-    """Refuse a cloud that has fewer points than its header states.
+    """Refuse a cloud with fewer points than its header states.
 
     Raises:
-        DataError: it has.
+        DataError: there are fewer.
     """
     if stated > there:
         raise DataError(
@@ -223,8 +223,8 @@ def _finite(source: Path | str, points: Float) -> tuple[Float, dict[str, int]]:
 
 
 def _box(points: Float, side: float) -> tuple[Float, Float]:
-    """The lowest voxel, counted from the world's origin, and the number of voxels along each axis."""
-    with np.errstate(over="ignore", invalid="ignore"):  # absurd coordinates: the size is then refused
+    """Return the lowest voxel, counted from the world's origin, and the number of voxels along each axis."""
+    with np.errstate(over="ignore", invalid="ignore"):  # huge coordinates: `check_size` refuses them
         low, high = np.floor(points.min(axis=0) / side), np.floor(points.max(axis=0) / side)
         return low, high - low + 1
 

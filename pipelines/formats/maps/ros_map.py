@@ -1,9 +1,9 @@
-"""Floor plans of ROS's map_server: a YAML file and the PGM or PNG that it names.
+"""Reader of floor plans of ROS's map_server: a YAML file and the PGM or PNG that it names.
 
-The rules are nav2_map_server's (map_io.cpp): the picture's last row is the lowest y; `origin` is x, y, yaw of
-the lower left corner; darkness is 1 - shade, with `negate` the shade itself. Modes: trinary - above
+The rules are nav2_map_server's (map_io.cpp). The picture's last row is the lowest y. `origin` is x, y, yaw of
+the lower left corner. Darkness is 1 - shade, with `negate` the shade itself. Modes: trinary - above
 `occupied_thresh` occupied, below `free_thresh` free, between them unknown; scale - between them in
-proportion, where transparent unknown; raw - values 0 to 100 are percent, others unknown.
+proportion, transparent pixels unknown; raw - values 0 to 100 are percent, others unknown.
 
 A plan has no heights: it is extruded from z = 0 to `HEIGHT_M`.
 """
@@ -29,7 +29,7 @@ from pipelines.session.maps import check_resolution, check_size, describe_grid
 from pipelines.session.records import Float, Occupancy
 
 HEIGHT_M = 2.5
-"""Of the walls: an ordinary storey. Drones above it are above the map."""
+"""Height of the walls: an ordinary storey. Drones above it are above the map."""
 
 _MOST_PIXELS = 100_000_000
 _MODES = ("trinary", "scale", "raw")
@@ -55,10 +55,10 @@ class _Plan:
 
 
 class RosMap:
-    """Voxels of the plan's own resolution, or of a stated one.
+    """Reader into voxels of the plan's own resolution, or of a stated one.
 
     A plan that is turned (yaw), or read at another resolution, is sampled so densely that every pixel is
-    met, and a voxel takes the largest probability met in it: a wall may grow by a voxel, never vanish.
+    met. A voxel takes the largest probability met in it: a wall may grow by a voxel, but never vanishes.
     """
 
     name = "ros_map"
@@ -66,7 +66,7 @@ class RosMap:
     suffixes: tuple[str, ...] = (".yaml", ".yml")
 
     def recognises(self, path: Path) -> bool:
-        """Whether it has the keys that map_server asks for."""
+        """Return True if the file has the keys that map_server requires."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         head = read_head(path)
@@ -74,11 +74,11 @@ class RosMap:
         return all(re.search(rf"(?m)^{key}\s*:", head) for key in keys)
 
     def pictures(self, path: Path) -> list[Path]:
-        """The files that the YAML leads to: they decide the map as much as it does."""
+        """Return the files that the YAML refers to, because they too determine the map."""
         return [_read_plan(path).image]
 
     def describe(self, path: Path) -> dict[str, object]:
-        """The YAML's values, pixels by state, and the extruded map."""
+        """Describe the YAML's values, pixels by state, and the extruded map."""
         plan = _read_plan(path)
         pixels = _probabilities(path, plan)
         summary: dict[str, object] = {"image": plan.image.name}
@@ -109,7 +109,7 @@ class RosMap:
         """Read, turn and extrude the plan; the grid's axes are the world's.
 
         Raises:
-            DataError: keys are missing or impossible, the picture is missing, damaged or no PGM or PNG, or
+            DataError: keys are missing or invalid, the picture is missing, damaged or no PGM or PNG, or
                 the grid is too large.
         """
         plan = _read_plan(path)
@@ -137,7 +137,7 @@ def _read_plan(path: Path) -> _Plan:
         [values[k] for k in ("resolution", "occupied_thresh", "free_thresh")],
     ).tolist()
     mode, image = values.get("mode", "trinary"), values["image"]
-    if len(origin) != 3 or not np.abs(origin).max() < 1e9:  # also where it is not a number
+    if len(origin) != 3 or not np.abs(origin).max() < 1e9:  # also true for NaN
         raise DataError(path, f"origin is {origin.tolist()} instead of x, y, yaw", _MEND)
     if not 0 <= free <= occupied <= 1:
         raise DataError(path, f"free_thresh {free:g} and occupied_thresh {occupied:g} are not 0..1", _MEND)
@@ -161,19 +161,19 @@ def _read_plan(path: Path) -> _Plan:
 
 
 def _find_image(path: Path, image: str) -> Path:
-    """The picture that is named, or else the one beside the YAML with its name: both are often renamed."""
+    """Find the picture that is named, or one beside the YAML with its stem, as both are often renamed."""
     named = [] if leads_out(image) else [path.parent / image]
     candidates = [*named, *(path.with_suffix(suffix) for suffix in _SUFFIXES)]
     try:
         return next(candidate for candidate in candidates if candidate.is_file())
-    except (StopIteration, OSError, ValueError):  # too long a name, or one that no file can have
+    except (StopIteration, OSError, ValueError):  # OSError, ValueError: too long or invalid a name
         raise DataError(
             path, f"its picture {image[:200]} is not there", "put it beside the YAML file"
         ) from None
 
 
 def _probabilities(path: Path, plan: _Plan) -> NDArray[np.float32]:
-    """[W, H] from the lower left corner, NaN unknown."""
+    """Read probabilities [W, H] from the lower left corner; NaN is unknown."""
     shade, opaque = _picture(plan.image)
     if plan.mode == "raw":
         percent = np.rint(shade * 255)
@@ -193,7 +193,7 @@ def _probabilities(path: Path, plan: _Plan) -> NDArray[np.float32]:
 
 
 def _picture(image: Path) -> tuple[Float, NDArray[np.bool_]]:
-    """Shade 0 black to 1 white [H, W], the mean of the colours, and where the picture is opaque."""
+    """Read the mean of the colours [H, W], 0 black to 1 white, and True where the picture is opaque."""
     head = first_bytes(image, 32)
     if head[:2] in {b"P2", b"P5"}:
         shade = _read_pgm(image)
@@ -205,7 +205,7 @@ def _picture(image: Path) -> tuple[Float, NDArray[np.bool_]]:
 
 def _read_pgm(image: Path) -> Float:
     content = read_bytes(image)
-    # Four words (P5, width, height, greatest value) with comments between them, and one blank after them.
+    # Four words (P5, width, height, largest value) with comments between them, and one blank after them.
     head = re.match(rb"P[25](?:(?:\s|#[^\n]*\n)+(\d{1,9})){3}\s", content)
     words = re.sub(rb"#[^\n]*\n", b" ", head[0]).split() if head else []
     if not head or len(words) != 4:
@@ -266,11 +266,11 @@ def _check_pixels(image: Path, width: int, height: int) -> None:
 
 
 def _box(plan: _Plan, pixels: tuple[int, ...], side: float) -> tuple[Float, tuple[int, int, int]]:
-    """The lowest corner of the grid that holds the turned plan, and its voxels along x, y, z."""
+    """Return the lowest corner of the grid that holds the turned plan, and its voxels along x, y, z."""
     extent = np.array(pixels) * plan.resolution_m
     corners = _world_from_plan(plan) @ (np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * extent).T
     low, high = corners.min(axis=1), corners.max(axis=1)
-    # Less a millionth: 3.0000000001 voxels are three.
+    # Less a millionth, so that 3.0000000001 voxels count as three.
     columns, rows, layers = np.ceil(np.array([*(high - low), HEIGHT_M]) / side - 1e-6).astype(int).tolist()
     return np.array([*(low + plan.origin), 0.0]), (max(columns, 1), max(rows, 1), max(layers, 1))
 
@@ -281,10 +281,10 @@ def _world_from_plan(plan: _Plan) -> Float:
 
 
 def _plane(plan: _Plan, pixels: NDArray[np.float32], side: float) -> NDArray[np.float32]:
-    """The turned plan on the world's axes, [X, Y] from the corner that `_box` states.
+    """Turn the plan to the world's axes, [X, Y] from the corner that `_box` returns.
 
-    Samples stand on a square lattice of pitch p, whose covering radius is p / sqrt(2); the disc within a
-    pixel has half its side as radius: with p at most 1 / sqrt(2) of a pixel every pixel is met.
+    Samples form a square lattice of pitch p with the covering radius p / sqrt(2). The disc within a
+    pixel has half its side as radius. So every pixel is met if p is at most 1 / sqrt(2) of a pixel.
     """
     if plan.yaw == 0 and side == plan.resolution_m:
         return pixels
@@ -301,7 +301,7 @@ def _plane(plan: _Plan, pixels: NDArray[np.float32], side: float) -> NDArray[np.
 
 
 def _looked_up(plan: _Plan, pixels: NDArray[np.float32], x: Float, y: Float) -> NDArray[np.float32]:
-    """What the plan says at x [X, 1], y [1, Y], metres from its origin in the world's axes; NaN outside."""
+    """Look up the plan at x [X, 1], y [1, Y], metres from its origin in the world's axes; NaN outside."""
     c, s = math.cos(plan.yaw), math.sin(plan.yaw)
     column = np.floor((c * x + s * y) / plan.resolution_m).astype(np.int64)
     row = np.floor((c * y - s * x) / plan.resolution_m).astype(np.int64)

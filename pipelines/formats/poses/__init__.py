@@ -1,1 +1,1 @@
-"""Trajectories as text."""
+"""Readers and writers of trajectories as text."""

@@ -24,18 +24,18 @@ _QUATERNION_PREFIX = r"q|q_|quat_|quaternion_|orientation_|q_rs_|pose_orientatio
 
 @dataclass(frozen=True)
 class Header:
-    """Where the columns of a pose file are."""
+    """Positions of the columns of a pose file."""
 
     line: int  # its index in the file
     delimiter: str
     columns: int
     stamp: int
     stamp_unit: int
-    poses: dict[str, int]  # x, y, z, qx, qy, qz, qw and, if they are there, c00..c55
+    poses: dict[str, int]  # x, y, z, qx, qy, qz, qw and, if present, c00..c55
 
 
 class PoseCsvFormat:
-    """CSV with a header, separated by commas, semicolons or tabs; the order of columns is free.
+    """Reader of CSV with a header, separated by commas, semicolons or tabs; the order of columns is free.
 
     Needed: t_ns, or t, time, timestamp, stamp in seconds or with a unit (`time_ms`, `timestamp [ns]`);
     x y z (also tx, p_x, pos_x, position_x); qx qy qz qw (also q_x, orientation_x, q_RS_x).
@@ -48,17 +48,17 @@ class PoseCsvFormat:
     suffixes: tuple[str, ...] = (".csv", ".txt", ".tsv")
 
     def recognises(self, path: Path) -> bool:
-        """Whether its header names a time, a position and a quaternion."""
+        """Return True if the header names a time, a position and a quaternion."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         return find_header(read_head(path)) is not None
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Rows, times, gaps, box and what was dropped."""
+        """Describe rows, times, gaps, bounding box and losses."""
         return describe_trajectory(self.read_trajectory(path))
 
     def read_trajectory(self, path: Path) -> Trajectory:
-        """Read every pose; `clean_poses` says which rows are dropped.
+        """Read every pose; `clean_poses` documents which rows are dropped.
 
         Raises:
             DataError: not text, no such header, some covariance columns but not all, a line with another
@@ -102,10 +102,10 @@ class PoseCsvFormat:
 
 
 def find_header(text: str) -> Header | None:
-    """The line above the numbers that names the columns of a pose, if there is one.
+    """Find the line above the numbers that names the columns of a pose; None if there is none.
 
-    It is the first line that is no comment, or a comment whose cells are separated by more than
-    spaces (`#timestamp [ns],p_RS_R_x [m],...`); TUM files carry prose and spaced names in comments.
+    It is the first line that is no comment. It may also be a comment whose cells are separated by more than
+    spaces (`#timestamp [ns],p_RS_R_x [m],...`). Comments of TUM files, with spaces only, do not count.
     """
     for index, line in enumerate(text.split("\n", 100)[:100]):
         stripped = line.strip()
@@ -131,7 +131,7 @@ def _parse_header(line: int, cells: Sequence[str], delimiter: str) -> Header | N
 
 
 def pose_column(name: str) -> str | None:
-    """The table column that a heading means."""
+    """Return the table column of a heading; None if it is none of a pose."""
     covariance = re.fullmatch(r"c([0-5])([0-5])", name)
     if name in _POSITION or (covariance and covariance[1] <= covariance[2]):
         return name
@@ -143,7 +143,7 @@ def pose_column(name: str) -> str | None:
 
 
 def _covariance(table: TextTable) -> Float:
-    """The symmetric matrices [N, 6, 6] of the upper triangles."""
+    """Build symmetric matrices [N, 6, 6] from their upper triangles."""
     from pipelines.session.tables import COVARIANCE_COLUMNS
 
     upper = table.stack(COVARIANCE_COLUMNS)
@@ -155,7 +155,7 @@ def _covariance(table: TextTable) -> Float:
 
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
-    """Write `t_ns,x,y,z,qx,qy,qz,qw` and the covariance, if there is one, so that reading gives the same."""
+    """Write `t_ns,x,y,z,qx,qy,qz,qw` and any covariance, so that reading gives the same numbers."""
     import pandas as pd
 
     from pipelines.session.tables import COVARIANCE_COLUMNS

@@ -1,4 +1,4 @@
-"""Rows of poses as logs have them to a clean trajectory: one set of rules for every text format."""
+"""Cleaning of logged poses into a trajectory: one set of rules for every text format."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Int64, Trajectory
 
 FARTHEST_M = 1e9
-"""Beyond the Moon: no pose of a flight, and squares of what lies much further overflow."""
+"""Largest coordinate: beyond the Moon, so no pose of a flight; squares of much larger ones overflow."""
 
 NORM_TOLERANCE = 0.1
-"""Quaternions this far from unit length are rounding or few decimals; further off they are no rotations."""
+"""Largest deviation of a quaternion from unit length: up to this rounding explains it, beyond not."""
 
 
 def clean_poses(
@@ -27,24 +27,24 @@ def clean_poses(
     covariance: Float | None = None,
     truncated: int = 0,
 ) -> Trajectory:
-    """Leave out the rows that cannot be used, each counted under the first cause that applies.
+    """Drop the rows that cannot be used, each counted under the first cause that applies.
 
-    - "truncated last line": what the reader already left out;
+    - "truncated last line": rows that the reader already left out;
     - "not finite": a stamp or a number that is missing, NaN or infinite. A covariance that is blank
       as a whole is unknown (all zero) and keeps its row;
-    - "zero quaternion", "quaternion not unit" (off by more than NORM_TOLERANCE; closer ones are normalised);
+    - "zero quaternion", "quaternion not unit" (off by more than NORM_TOLERANCE; others are normalised);
     - "absurd position": further from the origin than FARTHEST_M;
-    - "duplicate stamp", "stamp out of order": of the rows left, the longest chain of rising stamps is
-      kept, so that one wrong stamp costs one row; of equal stamps the first stays.
+    - "duplicate stamp", "stamp out of order": of the other rows, the longest chain of rising stamps is
+      kept, so that one wrong stamp costs one row. Of equal stamps the first stays.
 
     Args:
         source: the file, for messages.
         t_ns: [N] stamps.
-        readable: [N] whether the stamp was one.
+        readable: [N] True if the stamp could be read.
         position: [N, 3] m.
         quaternion_xyzw: [N, 4].
         covariance: [N, 6, 6], if there is one.
-        truncated: rows the reader left out at the end.
+        truncated: number of rows that the reader left out at the end.
 
     Raises:
         DataError: no row is left.
@@ -53,7 +53,7 @@ def clean_poses(
         blank: Bool = np.asarray(np.isnan(covariance).all(axis=(1, 2)))
         if blank.any():
             covariance = np.where(blank[:, None, None], 0.0, covariance)
-    with np.errstate(over="ignore"):  # what overflows becomes infinite and is dropped as such
+    with np.errstate(over="ignore"):  # an overflow gives infinity, which is dropped
         norm = np.linalg.norm(quaternion_xyzw, axis=1)
     causes = {
         "not finite": ~(readable & np.isfinite(position).all(axis=1) & np.isfinite(norm)),
@@ -84,21 +84,21 @@ def clean_poses(
         t_ns=t_ns[keep],
         position=position[keep],
         quaternion_xyzw=quaternion_xyzw[keep] / norm[keep, None],
-        # The largest part of a long log, so not copied where all of it is kept.
+        # The largest part of a long log, so it is not copied if all rows are kept.
         covariance=covariance if covariance is None or keep.all() else covariance[keep],
         dropped=dropped,
     )
 
 
 def longest_rising(stamps: Int64) -> Bool:
-    """The longest strictly rising chain of stamps: one stamp far ahead must not cost all rows behind it.
+    """Mark the longest strictly rising chain of stamps, so that one wrong stamp costs one row only.
 
-    Fredman 1975 (patience sorting); of equally long chains that whose stamps are smallest at the end.
+    Patience sorting (Fredman 1975). Of equally long chains, the one with the smallest last stamp is taken.
     """
     if (np.diff(stamps) > 0).all():
         return np.ones(len(stamps), dtype=np.bool_)
     tails: list[int] = []  # smallest last stamp of a chain of each length
-    places: list[int] = []  # where it stands
+    places: list[int] = []  # and the row of that stamp
     before = np.full(len(stamps), -1, dtype=np.int64)
     for place, stamp in enumerate(stamps.tolist()):
         length = bisect_left(tails, stamp)
@@ -116,7 +116,7 @@ def longest_rising(stamps: Int64) -> Bool:
 
 
 def _drop(keep: Bool, bad: Bool, cause: str, dropped: dict[str, int]) -> None:
-    """Take the rows out of `keep`, in place, and count those that were still in."""
+    """Remove the rows from `keep`, in place, and count those that were still in it."""
     count = int(np.count_nonzero(keep & bad))
     if count:
         dropped[cause] = count

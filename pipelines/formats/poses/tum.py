@@ -1,7 +1,7 @@
 """TUM trajectories: `t x y z qx qy qz qw`, one pose per line, t in seconds (TUM RGB-D benchmark).
 
-Some writers keep the layout and change the order; they say so in a line above the numbers, such as
-`# timestamp tx ty tz qw qx qy qz`. That line counts.
+Some writers keep the layout but change the order. They name it in a line above the numbers, such as
+`# timestamp tx ty tz qw qx qy qz`. Such a line is followed.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ _HEADING = re.compile(r"[^\s,;\[(]+(?:\s*(?:\[[^\]]*\]|\([^)]*\)))?")  # a name,
 
 
 class TumFormat:
-    """Eight numbers a line, separated by spaces, tabs or commas; # begins a comment line.
+    """Reader of eight numbers a line, separated by spaces, tabs or commas; # begins a comment line.
 
-    Stamps are read exactly to the nanosecond; positions are metres in the axes of whoever wrote them.
+    Stamps are read exactly to the nanosecond; positions are metres in the axes of the file's writer.
     """
 
     name = "tum"
@@ -35,7 +35,7 @@ class TumFormat:
     suffixes: tuple[str, ...] = (".tum", ".txt", ".csv", ".log")
 
     def recognises(self, path: Path) -> bool:
-        """Whether the first line of numbers has eight, and no CSV's header stands above."""
+        """Return True if the first line of numbers has eight, without a CSV header above."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         head, _, _ = _take_header(_spaced(read_head(path)))
@@ -43,13 +43,13 @@ class TumFormat:
         return find_header(read_head(path)) is None and _is_eight_numbers(first)
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Rows, times, gaps, box and what was dropped."""
+        """Describe rows, times, gaps, bounding box and losses."""
         return describe_trajectory(self.read_trajectory(path))
 
     def read_trajectory(self, path: Path) -> Trajectory:
         """Read every pose in the order of columns that the header states, else in TUM's.
 
-        `clean_poses` says which rows are dropped.
+        `clean_poses` documents which rows are dropped.
 
         Raises:
             DataError: not text, a line without eight numbers, stamps not in seconds, or no usable row.
@@ -76,26 +76,26 @@ class TumFormat:
 
 
 class TumExport:
-    """One file for each camera and for each joint, in metres, z up, stamps with nine decimals.
+    """Writer of one file for each camera and for each joint, in metres, z up, stamps with nine decimals.
 
-    `<name>_<camera>.tum` is world_from_camera as logged, `<name>_<camera>_refined.tum` as the reconstruction
-    corrected it; `<name>_<joint>.tum` (with several people `<name>_person<k>_<joint>.tum`) a joint without
-    a rotation (0 0 0 1). A time at which a joint is missing has no row.
+    `<name>_<camera>.tum` is world_from_camera as logged, `<name>_<camera>_refined.tum` as corrected by the
+    reconstruction. `<name>_<joint>.tum` (with several people `<name>_person<k>_<joint>.tum`) is a joint with
+    the identity as rotation (0 0 0 1). A time at which a joint is missing has no row.
     """
 
     name = "tum"
     title = "trajectories of the cameras and of every joint, for evo"
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write the cameras that have poses and the joints that were ever measured.
+        """Write the cameras that have poses and the joints that are known at any time.
 
         Raises:
-            DataError: there is neither.
+            DataError: there are no such cameras or joints.
         """
         paths: list[Path] = []
         for what, trajectory in {**tracks_of(recording), **_joint_tracks(recording.motion)}.items():
             path = folder / f"{safe_file_name(recording.name)}_{safe_file_name(what)}.tum"
-            while path in paths:  # names that differ in what no file name has
+            while path in paths:  # different names may give the same safe file name
                 path = path.with_stem(f"{path.stem}_")
             write_trajectory(path, trajectory)
             paths.append(path)
@@ -107,7 +107,7 @@ class TumExport:
 
 
 def _joint_tracks(motion: JointMotion | None) -> dict[str, Trajectory]:
-    """The times at which each joint of each person is known, without rotation."""
+    """Return each joint of each person as a trajectory of its known times, without rotation."""
     tracks: dict[str, Trajectory] = {}
     if motion is None:
         return tracks
@@ -124,7 +124,7 @@ def _joint_tracks(motion: JointMotion | None) -> dict[str, Trajectory]:
 
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
-    """Write poses so that reading them gives the same stamps and, to the last bit, the same numbers."""
+    """Write poses so that reading them gives the same stamps and bit-identical numbers."""
     lines = ["# " + " ".join(_COLUMNS)]
     for stamp, position, quaternion in zip(
         format_seconds(trajectory.t_ns),
@@ -137,7 +137,7 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
 
 
 def _spaced(text: str) -> str:
-    """The text with single spaces between cells and none around lines."""
+    """Return the text with single spaces between cells and none around lines."""
     text = text.replace("\t", " ").replace(",", " ")
     if "  " in text:
         text = re.sub(" {2,}", " ", text)
@@ -151,8 +151,8 @@ def _take_header(text: str) -> tuple[str, tuple[str, ...], int]:
         text: spaced lines.
 
     Returns:
-        The text with a header that is no comment made one, the names of the columns in their order (TUM's
-        where no line states another), and the unit of the stamps.
+        The text, with any heading line turned into a comment, the names of the columns in their order (TUM's
+        if no line states another), and the unit of the stamps.
     """
     start, order = 0, _COLUMNS
     for line in text.split("\n", 100)[:100]:
@@ -168,7 +168,7 @@ def _take_header(text: str) -> tuple[str, tuple[str, ...], int]:
 
 
 def _find_columns(headings: list[str]) -> tuple[tuple[str, ...], int] | None:
-    """Find a time, three coordinates and a quaternion side by side; the quaternion may be w x y z alone."""
+    """Find a time, three coordinates and a quaternion side by side; its parts may be called w x y z only."""
     names = [cell_name(heading)[0] for heading in headings]
     for k in range(len(headings) - len(_COLUMNS) + 1):
         stamp = stamp_column(headings[k : k + 1])
@@ -181,7 +181,7 @@ def _find_columns(headings: list[str]) -> tuple[tuple[str, ...], int] | None:
 
 
 def _find_quaternion(headings: list[str]) -> tuple[str, ...] | None:
-    """Find qx qy qz qw side by side, in any order, where the other columns have names of their own."""
+    """Find qx qy qz qw side by side, in any order; the names of the other columns are free."""
     names = [pose_column(cell_name(heading)[0]) or "" for heading in headings]
     for k in range(len(names) - 3):
         if sorted(names[k : k + 4]) == sorted(_COLUMNS[4:]):
