@@ -1,1 +1,1 @@
-"""Whole flights for programs that show them: skeleton, cameras, map and pictures in one recording."""
+"""Exports of whole flights for viewers: skeleton, cameras, map and pictures in one recording."""

@@ -1,4 +1,4 @@
-"""Pictures as they go into recordings: small JPEGs, with the lens of that size."""
+"""Pictures for recordings: small JPEGs, with the intrinsics of that size."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _QUALITY = 85
 
 
 def as_jpeg(camera: str, picture: NDArray[np.uint8], lens: Intrinsics) -> tuple[Intrinsics, bytes]:
-    """A picture [height, width, 3] BGR of at most 960 px in width, encoded, and the lens of that size.
+    """Shrink a BGR picture [height, width, 3] to at most 960 px in width; return its intrinsics and JPEG.
 
     Raises:
-        DataError: it cannot be encoded.
+        DataError: the picture cannot be encoded.
     """
     import cv2
 

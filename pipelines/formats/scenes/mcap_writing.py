@@ -1,4 +1,4 @@
-"""The mcap export: one log of ROS 2 messages, for Foxglove and RViz.
+"""Export to mcap: one log of ROS 2 messages, for Foxglove and RViz.
 
 | topic | type | |
 | --- | --- | --- |
@@ -6,14 +6,14 @@
 | /uncertainty | visualization_msgs/MarkerArray | 95 % ellipsoids of the joints, at most 10 times a second |
 | /tf | tf2_msgs/TFMessage | the cameras in `world`, at most 50 times a second |
 | /frustums | visualization_msgs/MarkerArray | the cameras' views, in their own frames, every second |
-| /CAMERA/path | nav_msgs/Path | where it flew, at most 10 poses a second, once |
+| /CAMERA/path | nav_msgs/Path | the camera's path, at most 10 poses a second, written once |
 | /CAMERA/camera_info | sensor_msgs/CameraInfo | with every picture, else every second |
 | /CAMERA/image/compressed | sensor_msgs/CompressedImage | JPEG, at most 960 px wide |
 | /map | sensor_msgs/PointCloud2 | the middles of the map's surface voxels |
 
 World axes as in the session (z up), cameras with x right, y down, z forward; metres. Poses are the refined
-ones where there are any. A joint that is missing is not in its message. The same recording gives the same
-bytes; frames are written one after the other and never all in memory.
+ones if there are any. A missing joint is not in its message. The same recording gives the same
+bytes; frames are written one after the other and are never all in memory.
 """
 
 from __future__ import annotations
@@ -50,16 +50,16 @@ Entry = tuple[int, str, str, Mapping[str, Any]]  # time, topic, type, fields
 
 
 class McapExport:
-    """`<name>.mcap`: skeleton, uncertainty, cameras, pictures and map."""
+    """Writer of `<name>.mcap`: skeleton, uncertainty, cameras, pictures and map."""
 
     name = "mcap"
     title = "a log of ROS 2 messages to look at in Foxglove: skeleton, cameras, map, pictures"
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write what the recording has; rows from before 1970 are left out and counted.
+        """Write all parts of the recording; drop and count rows from before 1970.
 
         Raises:
-            DataError: it has neither joints nor camera poses, or times that ROS cannot count.
+            DataError: there are neither joints nor camera poses, or times that ROS cannot represent.
         """
         tracks = {name: _countable(recording, name, track) for name, track in recording.tracks.items()}
         tracks = {name: track for name, track in tracks.items() if len(track.t_ns)}
@@ -93,7 +93,7 @@ class McapExport:
 
 
 def _countable(recording: Recording, name: str, track: Trajectory) -> Trajectory:
-    """Without the rows from before 0: logs without a time of day may begin before their first picture."""
+    """Drop rows from before time 0: logs without a time of day may begin before their first picture."""
     early = int(np.count_nonzero(track.t_ns < 0))
     if not early:
         return track
@@ -102,7 +102,7 @@ def _countable(recording: Recording, name: str, track: Trajectory) -> Trajectory
 
 
 def _topics(cameras: list[str]) -> dict[str, str]:
-    """What ROS lets a topic be called, different for different cameras."""
+    """Return a valid ROS topic name for each camera, without duplicates."""
     topics: dict[str, str] = {}
     for name in cameras:
         word = re.sub(r"[^A-Za-z0-9_]", "_", name)
@@ -228,7 +228,7 @@ def _frustums(
 
 
 def _frustum(lens: Intrinsics) -> Float:
-    """Eight lines as pairs of points [16, 3]: from the eye to the picture's corners 1 m away, and around."""
+    """Return eight lines as pairs of points [16, 3]: from the eye to the corners 1 m away, and around."""
     across = [(-0.5 - lens.cx) / lens.fx, (lens.width - 0.5 - lens.cx) / lens.fx]
     down = [(-0.5 - lens.cy) / lens.fy, (lens.height - 0.5 - lens.cy) / lens.fy]
     corners = [(across[0], down[0]), (across[1], down[0]), (across[1], down[1]), (across[0], down[1])]
@@ -240,7 +240,7 @@ def _frustum(lens: Intrinsics) -> Float:
 def _pictures(
     recording: Recording, name: str, topic: str, lens: Intrinsics, span_ns: tuple[int, int]
 ) -> Iterator[Entry]:
-    """Pictures with their CameraInfo; the latter alone every second where there are none."""
+    """Yield pictures with their CameraInfo; without pictures the CameraInfo alone, every second."""
     is_empty = True
     for t_ns, picture in recording.pictures(name):
         if span_ns[0] <= t_ns <= span_ns[1]:
@@ -273,7 +273,7 @@ def _camera_info(lens: Intrinsics) -> dict[str, Any]:
     }
 
 
-# --- what stands around --------------------------------------------------------------------------------
+# --- the map -------------------------------------------------------------------------------------------
 
 
 def _map(recording: Recording, start_ns: int) -> Iterator[Entry]:

@@ -1,15 +1,15 @@
-"""The rerun export: a recording for Rerun's viewer. Needs rerun-sdk.
+"""Export to Rerun: a recording for its viewer. Needs rerun-sdk.
 
     world                             z up, metres
     world/map                         surface voxels of the map
     world/person<k>/skeleton          joints with their bones, at every time of the skeleton
     world/person<k>/uncertainty       95 % ellipsoids
-    world/cameras/<camera>            where it is (the refined pose where there is one), over time
+    world/cameras/<camera>            its pose (the refined one if there is one), over time
     world/cameras/<camera>/image      pinhole, and pictures with the skeleton drawn into them (JPEG, 960 px)
-    world/paths/<camera>              where it flew
+    world/paths/<camera>              its path
 
-The timeline `time` is the session's own: a date, or seconds where the flight knows no date. A joint that is
-missing is not there. The viewer's pinhole has no distortion; the pictures are as the lens showed them.
+The timeline `time` is the session's own: a date, or seconds if the flight has no date. Missing joints
+are left out. The viewer's pinhole has no distortion, but the pictures keep the lens's distortion.
 Recordings of the same session differ in their bytes (rerun numbers its chunks at random).
 """
 
@@ -39,13 +39,13 @@ _LAST_WITHOUT_DATE_NS = 10**9 * 10**8  # 1973: smaller stamps count from the sta
 
 
 class RerunExport:
-    """`<name>.rrd`: skeleton, uncertainty, cameras, pictures with the skeleton, and map."""
+    """Writer of `<name>.rrd`: skeleton, uncertainty, cameras, pictures with the skeleton, and map."""
 
     name = "rerun"
     title = "a recording to look at in Rerun: skeleton, cameras, map, pictures (extra rerun)"
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write what the recording has.
+        """Write all parts of the recording.
 
         Raises:
             DataError: rerun-sdk is not installed, or there are neither joints nor camera poses.
@@ -176,7 +176,7 @@ def _log_map(rr: Any, stream: Any, recording: Recording) -> None:
 
 
 def _blueprint(rr: Any, cameras: list[str]) -> Any:
-    """The world beside the pictures."""
+    """Make a blueprint with the world beside the pictures."""
     views = need("rerun.blueprint", "rerun")
     scene = views.Spatial3DView(origin="/world", name="World")
     pictures = [

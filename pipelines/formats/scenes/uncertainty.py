@@ -1,4 +1,4 @@
-"""Covariances of points as ellipsoids, for programs that draw them."""
+"""Covariances of points as ellipsoids, for viewers."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.session.records import Float
 
 CHI2_95 = 7.815
-"""Of a Gaussian in three dimensions 95 % lie within {x : x' S^-1 x = 7.815} (chi-square)."""
+"""95 % of a Gaussian in three dimensions lie within {x : x' S^-1 x = 7.815} (chi-square)."""
 
 
 def ellipsoids_95(covariance: Float) -> tuple[Float, Float]:
-    """Half axes [..., 3] in m and world_from_axes quaternions [..., 4] of 95 % ellipsoids.
+    """Compute half axes [..., 3] in m and world_from_axes quaternions [..., 4] of 95 % ellipsoids.
 
     Args:
         covariance: [..., 6] m^2, upper triangle: xx, xy, xz, yy, yz, zz; NaN gives NaN.
@@ -22,7 +22,7 @@ def ellipsoids_95(covariance: Float) -> tuple[Float, Float]:
     half = np.full((*known.shape, 3), np.nan)
     turn = np.full((*known.shape, 4), np.nan)
     values, vectors = np.linalg.eigh(full[known])
-    vectors[..., 0] *= np.sign(np.linalg.det(vectors))[..., None]  # a rotation, no mirror
+    vectors[..., 0] *= np.sign(np.linalg.det(vectors))[..., None]  # a rotation, not a reflection
     half[known] = np.sqrt(CHI2_95 * np.maximum(values, 0.0))
     turn[known] = quaternion_from_matrix(vectors)
     return half, turn

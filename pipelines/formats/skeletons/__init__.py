@@ -1,1 +1,1 @@
-"""Joints over time, as biomechanics and animation take them."""
+"""Joints over time, in the formats of biomechanics and animation."""

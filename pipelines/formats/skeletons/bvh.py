@@ -1,14 +1,15 @@
-"""Biovision's BVH: a skeleton of bones, then one line of channels per frame.
+"""Reader of Biovision's BVH: a skeleton of bones, then one line of channels per frame.
 
 Layout (Biovision; Meredith & Maddock, "Motion Capture File Formats Explained", 2001): `HIERARCHY`, then
 `ROOT`, `JOINT` and `End Site` blocks in braces, each with its `OFFSET` from the parent and its `CHANNELS`;
 `MOTION`, `Frames:`, `Frame Time:`, then the channels of all bones in the order of the hierarchy. Rotations
 are degrees and apply in the order in which they stand: `Zrotation Yrotation Xrotation` is Rz Ry Rx. Position
-channels take the place of the bone's offset (so do Blender and the readers of published data sets), except
-where they are zero throughout.
+channels replace the bone's offset (as in Blender and in the readers of published data sets), except
+if they are zero throughout.
 
-The file states neither unit nor axes. A y-up file's (x, y, z) becomes the world's (z, x, y), as in TRC: who
-faces the file's +z, with the left hand towards +x, faces the world's +x (east) with the left towards +y.
+The file states neither unit nor axes. A y-up file's (x, y, z) becomes the world's (z, x, y), as in TRC. A
+person who faces the file's +z, with the left hand towards +x, faces the world's +x (east) with the left
+towards +y.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 AXES = ("y-up", "z-up")
 
 _MOST_STRETCH_M = 0.05
-"""How far a bone may move against its parent, either way, before its mean place no longer stands for it."""
+"""Largest movement of a bone against its parent, either way, for which its mean position is used."""
 
 _EXPORT_AGAIN = "export it again"
-_IN_WORLD = {"y-up": [2, 0, 1], "z-up": [0, 1, 2]}  # which of the file's axes are the world's x, y, z
+_IN_WORLD = {"y-up": [2, 0, 1], "z-up": [0, 1, 2]}  # indices of the file's axes that are the world's x, y, z
 
 
 @dataclass
@@ -53,20 +54,20 @@ class _Contents:
 
 
 class BvhFormat:
-    """What `mocap info` says of a BVH file; lengths are in the file's own unit, which it does not state."""
+    """Description of a BVH file for `mocap info`; lengths are in the file's own, unstated unit."""
 
     name = "bvh"
     title = "Biovision motion (BVH)"
     suffixes: tuple[str, ...] = (".bvh",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether it begins as every BVH does."""
+        """Return True if the file begins with HIERARCHY and ROOT."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         return read_head(path).split(maxsplit=2)[:2] == ["HIERARCHY", "ROOT"]
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Bones, frames, rate, seconds, how large the resting skeleton is, and how far its root goes."""
+        """Describe bones, frames, rate, seconds, the extent of the rest pose, and the box of its root."""
         contents = _read(path)
         frames, bones = len(contents.values), contents.bones
         places = _rest_places(bones)
@@ -87,9 +88,9 @@ class BvhFormat:
 def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:
     """Read a BVH file as metres with z up.
 
-    Bones above the one that moves, each with a single child (an export's `Reference` or scene root), are
-    merged into it: its motion is then the root's. A bone further down whose position channels move stands
-    at their mean, if none is further than 5 cm from it.
+    Some exports have bones above the first moving one, each with a single child (a `Reference` or scene
+    root). They are merged into it, and its motion is then the root's. If a bone further down has moving
+    position channels, it is put at their mean, if it is never further than 5 cm from it.
 
     Args:
         path: the file.
@@ -98,8 +99,8 @@ def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:
 
     Raises:
         DataError: an unknown unit or unknown axes; no BVH, an unfinished hierarchy, names that occur twice,
-            unknown channels; frames that are missing, too many or broken off, or hold what is no finite
-            number; a bone that moves against its parent by more than 5 cm.
+            unknown channels; frames that are missing, too many or cut off, or with a number that is not
+            finite; a bone that moves against its parent by more than 5 cm.
     """
     if unit not in METRES:
         raise DataError(path, f"the unit {unit!r} is none of {', '.join(METRES)}", "state one of them")
@@ -141,7 +142,7 @@ def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:
 
 
 def _bone_places(bone: _Bone, values: Float) -> tuple[Float, bool]:
-    """Where a bone's joint is in its parent's, [T, 3] in the file's unit, and whether it moves there."""
+    """Return a bone's joint in its parent's frame [T, 3] in the file's unit, and True if it moves there."""
     place = np.tile(bone.offset, (len(values), 1))
     columns = {
         "xyz".index(channel[0]): bone.first_channel + k
@@ -156,7 +157,7 @@ def _bone_places(bone: _Bone, values: Float) -> tuple[Float, bool]:
 
 
 def _rotation(bone: _Bone, values: Float) -> Float:
-    """parent_from_bone [T, 4] in the file's axes: the channels' turns, one after the other."""
+    """Compute parent_from_bone [T, 4] in the file's axes: the product of the channels' turns."""
     total = np.tile([0.0, 0.0, 0.0, 1.0], (len(values), 1))
     for k, channel in enumerate(bone.channels):
         if channel.endswith("rotation"):
@@ -169,7 +170,7 @@ def _rotation(bone: _Bone, values: Float) -> Float:
 
 
 def _carriers(bones: list[_Bone], moves: list[bool]) -> int:
-    """How many bones above the body only carry it: a lone child moves against each of them."""
+    """Count the bones above the body that only carry it: each has one child, which moves against it."""
     count = 0
     while sum(bone.parent == count for bone in bones) == 1 and bones[count].end is None and moves[count + 1]:
         count += 1
@@ -189,7 +190,7 @@ def _fixed_place(path: Path, bone: _Bone, place: Float) -> Float:
 
 
 def _rest_places(bones: list[_Bone]) -> Float:
-    """Joints and end sites of the unturned skeleton [N, 3]."""
+    """Return joints and end sites of the rest pose [N, 3]."""
     places: list[Float] = []
     ends = []
     for bone in bones:
@@ -222,7 +223,7 @@ def _read(path: Path) -> _Contents:
 
 
 def _bones(path: Path, lines: list[str]) -> list[_Bone]:
-    """The hierarchy, parents first, in the order of the file."""
+    """Parse the hierarchy, parents first, in the order of the file."""
     bones: list[_Bone] = []
     open_blocks: list[int | None] = []  # bones, and None for an end site
     coming: int | None = None
@@ -308,7 +309,7 @@ def _bad_line(path: Path, number: int, line: str) -> DataError:
 
 
 def _stated(path: Path, line: str, key: str, number: int) -> float:
-    """The number behind `Frames:` or `Frame Time:`."""
+    """Return the number after `Frames:` or `Frame Time:`."""
     words = line.split()
     named = key.split()
     if [word.lower() for word in words[: len(named)]] == [word.lower() for word in named]:
@@ -322,10 +323,10 @@ def _stated(path: Path, line: str, key: str, number: int) -> float:
 
 
 def _numbers(path: Path, body: str, channels: int, frames: float, first_line: int) -> Float:
-    """The frames [T, channels]: all at once, and line by line only to find what is wrong."""
+    """Parse the frames [T, channels]: all at once, and line by line only to find a fault."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # how numpy says that text is no number
+            warnings.simplefilter("error", DeprecationWarning)  # numpy's sign for text that is no number
             values = np.fromstring(body, sep=" ")
     except (DeprecationWarning, ValueError):
         values = np.empty(0)

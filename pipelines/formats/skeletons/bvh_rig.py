@@ -1,23 +1,23 @@
-"""A rig of constant bones for a measured skeleton, and how its bones turn: what animation programs take.
+"""Rig of constant bones for a measured skeleton, with the rotations of its bones, for animation programs.
 
-The bones are as long as they were in the median of all times at which both ends were measured. At rest the
+A bone has the median length over all times at which both its ends were measured. At rest the
 body stands in a T: arms to the sides, legs down, facing +x with the left towards +y (in a y-up file +z and
-+x). The turns follow in closed form, bone by bone from the root:
++x). The rotations follow in closed form, bone by bone from the root:
 
-- Hips stand in the middle of the two hips. Their left is the line between the hips, exactly; their up is as
-  near to the neck as that allows.
-- Spine, at the same place, points from there to the neck, exactly; its left is as near to the line between
+- Hips are at the middle of the two hips. Their left axis is exactly the line between the hips. Their up axis
+  is as near to the direction of the neck as that allows.
+- Spine, at the same place, points exactly to the neck. Its left axis is as near to the line between
   the shoulders as that allows.
-- Every other bone points from its joint to the next by the smallest turn from where its parent leaves it:
-  it has no twist of its own (joint positions do not show any). A turn of 180 degrees is about the bone's
-  own x, or y where the bone lies along x.
+- Every other bone points from its joint to the next by the smallest turn from the direction its parent gives
+  it. It has no twist of its own, because joint positions do not show any. A turn of 180 degrees is about the
+  bone's own x, or y if the bone lies along x.
 
-So each joint lies in its measured direction from the one before, at the rig's distance: what is left between
-rig and measurement is how far the measured lengths vary.
+So each joint lies in its measured direction from the one before, at the rig's distance. The remaining
+difference between rig and measurement is the variation of the measured lengths.
 
-BVH has no word for missing. Times before the hips are first seen and after they are last seen are left out;
-in between, hips that are not seen stay where they were last, and a bone with a missing end keeps its last
-turn against its parent (before the first, its first). All of this is counted.
+BVH cannot mark missing values. Times before the first and after the last known hips are left out. In between,
+unknown hips keep their last position, and a bone with a missing end keeps its last
+rotation against its parent (before the first, its first). All of this is counted.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _LEFT, _RIGHT, _DOWN, _UP, _HERE = (0, 1, 0), (0, -1, 0), (0, 0, -1), (0, 0, 1),
 
 @dataclass(frozen=True)
 class _Bone:
-    """A bone as files name it: the joint it begins at, and which way that lies from its parent's at rest."""
+    """Bone as files name it, with its first joint, and that joint's direction at rest from its parent's."""
 
     name: str
     parent: str | None
@@ -81,26 +81,26 @@ _MUST = ("left_hip", "right_hip", "neck")
 
 @dataclass(frozen=True)
 class Rigged:
-    """A motion on a rig, and what had to be made up for it."""
+    """Motion on a rig, with counts of the values that were filled in."""
 
     motion: SkeletalMotion
-    joints: tuple[str, ...]  # at which each bone begins
-    first: int  # of the frames: those before it are left out
-    without_hips: int  # frames in which the hips stay where they were
-    turns_held: int  # bones' turns that are those of a frame before (or after)
-    turns: int  # of all
+    joints: tuple[str, ...]  # the joint at which each bone begins
+    first: int  # index of the first frame; those before it are left out
+    without_hips: int  # frames in which the hips keep their last position
+    turns_held: int  # rotations of bones that are kept from a frame before (or after)
+    turns: int  # number of all rotations
 
 
 def fit_rig(source: str, motion: JointMotion, person: int) -> Rigged:
     """Fit a rig to one person's joints at a constant rate.
 
     Args:
-        source: what messages call it.
+        source: name for messages.
         motion: at least one time; missing joints are NaN.
-        person: which one.
+        person: index of the person.
 
     Raises:
-        DataError: hips, shoulders or neck are never seen together.
+        DataError: hips and neck are never known at the same time.
     """
     joints, position = with_derived(motion.joints, motion.position[:, person])
     middle = take_joints(position, joints, ("left_hip", "right_hip")).mean(axis=1)
@@ -132,7 +132,7 @@ def fit_rig(source: str, motion: JointMotion, person: int) -> Rigged:
 
 
 def joint_positions(motion: SkeletalMotion) -> Float:
-    """Where the bones of a rig begin, [T, B, 3] m, world."""
+    """Compute the positions at which the bones of a rig begin, [T, B, 3] m, world."""
     place = np.empty((len(motion.t_s), len(motion.bones), 3))
     turned = np.empty((len(motion.t_s), len(motion.bones), 4))
     for bone, parent in enumerate(motion.parent):
@@ -145,7 +145,7 @@ def joint_positions(motion: SkeletalMotion) -> Float:
 
 
 def _bones(place: dict[str, Float]) -> tuple[list[_Bone], list[float]]:
-    """The bones whose joints are there, parents first, and how far each begins from its parent's joint."""
+    """Choose the bones with known joints, parents first; return median distances from the parents' joints."""
     head = next((bone for bone in _HEADS if bone.joint in place), None)
     candidates = [*_TRUNK, *([head] if head else []), *_LIMBS]  # in the order in which files have them
     kept: dict[str, _Bone] = {}
@@ -153,7 +153,7 @@ def _bones(place: dict[str, Float]) -> tuple[list[_Bone], list[float]]:
     for bone in candidates:
         parent = kept.get(bone.parent or "")
         if bone.parent is not None and parent is None:
-            continue  # what hangs on a joint that is never seen
+            continue  # its parent's joint is never known
         if bone.joint not in place:
             continue
         start = place[parent.joint] if parent is not None else place[bone.joint]
@@ -167,7 +167,7 @@ def _bones(place: dict[str, Float]) -> tuple[list[_Bone], list[float]]:
 def _turns(
     bones: list[_Bone], parent: tuple[int, ...], place: dict[str, Float]
 ) -> tuple[Float, tuple[int, int]]:
-    """parent_from_bone [T, B, 4], and how many of them are held, of how many."""
+    """Compute parent_from_bone [T, B, 4]; also count the rotations that are held, and all rotations."""
     frames = len(place["hip"])
     local, world = (np.zeros((frames, len(bones), 4)) for _ in range(2))
     held = turns = 0
@@ -207,7 +207,7 @@ def _spine(place: dict[str, Float]) -> Float:
 
 
 def _frame(left: Float, up: Float, *, up_first: bool = False) -> Float:
-    """world_from_bone [T, 4] with y along `left` and z near `up`, or z along `up` and y near `left`."""
+    """Build world_from_bone [T, 4]: y along `left` and z near `up`, or z along `up` and y near `left`."""
     exact, near = (up, left) if up_first else (left, up)
     first = _unit(exact)
     second = _unit(near - (near * first).sum(axis=1, keepdims=True) * first)
@@ -220,7 +220,7 @@ def _frame(left: Float, up: Float, *, up_first: bool = False) -> Float:
 
 
 def _swing(start: Float, towards: Float) -> Float:
-    """The smallest turns [T, 4] that bring the unit vector `start` [3] to the directions [T, 3]."""
+    """Compute the smallest turns [T, 4] from the unit vector `start` [3] to the directions [T, 3]."""
     end = _unit(towards)
     turn = np.concatenate([np.cross(start, end), 1 + (end @ start)[:, None]], axis=1)
     size = np.linalg.norm(turn, axis=1, keepdims=True)
@@ -232,16 +232,16 @@ def _swing(start: Float, towards: Float) -> Float:
 
 
 def _unit(vectors: Float) -> Float:
-    """Of length 1; NaN where there is no direction."""
+    """Scale vectors to length 1; NaN for the zero vector."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(length > 0, length, np.nan)
 
 
 def _held(rows: Float) -> tuple[Float, Bool]:
-    """Rows [T, N] with the last known one in the place of a missing one, and which are."""
+    """Replace missing rows [T, N] by the last known one; return the rows and the mask of missing ones."""
     missing = np.asarray(np.isnan(rows).any(axis=1), np.bool_)
     known = np.flatnonzero(~missing)
-    if not len(known):  # a bone whose parent and child were never seen at once with it
+    if not len(known):  # a bone that is never known at a time together with its parent and child
         return np.tile(np.eye(rows.shape[1])[-1], (len(rows), 1)), missing
     last = np.maximum(np.searchsorted(known, np.arange(len(rows)), side="right") - 1, 0)
     return rows[known[last]], missing

@@ -1,4 +1,4 @@
-"""Writing BVH, and the bvh export: a rig that follows the skeleton, for Blender and MotionBuilder."""
+"""Writer of BVH, and the bvh export: a rig that follows the skeleton, for Blender and MotionBuilder."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Recording, SkeletalMotion
 
-_IN_FILE = {"y-up": [1, 2, 0], "z-up": [0, 1, 2]}  # which of the world's axes are the file's x, y, z
+_IN_FILE = {"y-up": [1, 2, 0], "z-up": [0, 1, 2]}  # indices of the world's axes that are the file's x, y, z
 _DECIMALS = 6  # of a degree and of the unit
-_LOCKED = 1e-7  # cosine of the middle angle below which the outer two turn about one axis
+_LOCKED = 1e-7  # gimbal lock: cosine of the middle angle below which the outer two share one axis
 
 
 class BvhExport:
-    """`<name>.bvh`, or `<name>_person<k>.bvh` for each of several people: centimetres and y up unless asked.
+    """Writer of `<name>.bvh`, or `<name>_person<k>.bvh` for each of several people; default cm and y up.
 
-    `bvh_rig` says how the rig is fitted, and what becomes of what is missing.
+    `bvh_rig` documents the fit of the rig and the handling of missing joints.
     """
 
     name = "bvh"
@@ -31,10 +31,10 @@ class BvhExport:
     axes = ("y-up", "z-up")
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write every person to whom a rig can be fitted; for the others a note says why not.
+        """Write every person to whom a rig can be fitted; a note gives the reason for each other one.
 
         Raises:
-            DataError: there is none, or the times are too scattered for a rate.
+            DataError: no rig can be fitted, or the times are too scattered for a rate.
         """
         motion, files = people_of(recording, folder, ".bvh")
         even = at_even_times("bvh", motion, recording.progress)
@@ -55,7 +55,7 @@ class BvhExport:
 
 
 def _made_up(name: str, rigged: Rigged, frames: int) -> str:
-    """What the file says without anybody having seen it."""
+    """Report the parts of the file that were not measured."""
     kept = len(rigged.motion.t_s)
     parts = [f"{name}: BVH has no word for missing"]
     if frames > kept:
@@ -68,10 +68,10 @@ def _made_up(name: str, rigged: Rigged, frames: int) -> str:
 def write_motion(path: Path, motion: SkeletalMotion, *, unit: str, axes: str) -> None:
     """Write a motion at the constant rate of its first and last time; `bvh.read_motion` reads it back.
 
-    The hierarchy of bones, then one line of channels per frame; the module `bvh` says more of the layout.
+    The hierarchy of bones comes first, then one line of channels per frame; see module `bvh` for the layout.
 
-    The root has position and rotation channels, every other bone rotations in the order Z, X, Y (Rz Rx Ry);
-    angles go on without jumps of 360 degrees. A bone without children ends in a site of length 0.
+    The root has position and rotation channels, every other bone rotations in the order Z, X, Y (Rz Rx Ry).
+    Angles are unwrapped (no jumps of 360 degrees). A bone without children ends in a site of length 0.
     """
     order = _IN_FILE[axes]
     scale = 1 / METRES[unit]
@@ -116,10 +116,10 @@ def write_motion(path: Path, motion: SkeletalMotion, *, unit: str, axes: str) ->
 
 
 def euler_zxy_deg(quaternion_xyzw: Float) -> Float:
-    """Angles (z, x, y) in degrees with Rz Rx Ry the rotation, [T, B, 3]; continuous over time.
+    """Compute angles (z, x, y) in degrees of the rotation Rz Rx Ry, [T, B, 3]; continuous over time.
 
     From the product's entries: m21 = sin x, m01 = -sin z cos x, m11 = cos z cos x, m20 = -cos x sin y,
-    m22 = cos x cos y. Where x is +-90 degrees, z and y turn about the same axis, and y is 0.
+    m22 = cos x cos y. If x is +-90 degrees, z and y turn about the same axis, and y is set to 0.
     """
     m = matrix_from_quaternion(quaternion_xyzw)
     x = np.arctan2(m[..., 2, 1], np.hypot(m[..., 2, 0], m[..., 2, 2]))

@@ -1,12 +1,13 @@
-"""C3D, the file of biomechanics laboratories: 3D points at a constant rate, in 32-bit floats. Needs ezc3d.
+"""C3D, the format of biomechanics laboratories: 3D points at a constant rate, in 32-bit floats. Needs ezc3d.
 
-Layout: C3D.org's user guide (2021). A point that is missing has the residual -1; any other residual is how
-far the point can be trusted: here its standard deviation per axis, sqrt(trace / 3) of its covariance, in
-whole millimetres up to 255. Header and POINT:FRAMES count to 65535; what lies beyond is counted by
+Layout: C3D.org's user guide (2021). A missing point has the residual -1. Any other residual measures the
+uncertainty of the point. Here it is the standard deviation per axis, sqrt(trace / 3) of its covariance, in
+whole millimetres up to 255. Header and POINT:FRAMES count to 65535; larger numbers are in
 TRIAL:ACTUAL_END_FIELD (two 16-bit words).
 
-A C3D knows no time of day. Files of ours say in MOCAP:FIRST_T_NS and LAST_T_NS when they begin and end, as
-text because its numbers are too short; other files begin at the time of their first frame's number.
+A C3D has no time of day. Our own files give the times of their first and last frame in MOCAP:FIRST_T_NS and
+LAST_T_NS, as text because C3D's numbers are too short. Other files begin at the time of their first frame's
+number.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ from pipelines.session.storage import as_data_error
 
 _BLOCK = 512
 _MAGIC = 0x50  # the second byte of every C3D
-_DEC, _MIPS = 85, 86  # processors, by which numbers are stored
-_LONGEST_LABEL = 30  # what the programs of laboratories show
+_DEC, _MIPS = 85, 86  # processor types, which determine the storage of numbers
+_LONGEST_LABEL = 30  # characters that laboratory programs show
 _LONGEST_TEXT = 255  # bytes
 _MOST_RESIDUAL = 255
 _MOST_FIRST_FRAME = 1_000_000_000
@@ -41,10 +42,10 @@ _EXPORT_AGAIN = "export it again"
 
 
 class C3dFormat:
-    """One person. Labels that Pose2Sim names get our joint names (RHip is right_hip), others keep theirs.
+    """Reader of one person. Pose2Sim's labels get our joint names (RHip is right_hip), others keep theirs.
 
-    POINT:UNITS counts unless the user states the unit; POINT:Y_SCREEN says what is up (+Z or +Y), and
-    z is without it. Analog channels are not read.
+    POINT:UNITS is used unless the user states the unit. POINT:Y_SCREEN gives the up axis (+Z or +Y);
+    without it z is up. Analog channels are not read.
     """
 
     name = "c3d"
@@ -52,7 +53,7 @@ class C3dFormat:
     suffixes: tuple[str, ...] = (".c3d",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether its second byte is that of every C3D."""
+        """Return True if the second byte is that of every C3D."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         with path.open("rb") as file:
@@ -60,7 +61,7 @@ class C3dFormat:
         return len(start) == 2 and start[1] == _MAGIC
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Unit, axes and rate as stated, points, times, what is missing, and the box in the world (z up)."""
+        """Describe stated unit, axes and rate, points, times, missing values, and the world box (z up)."""
         contents = _open(path)
         stated: dict[str, object] = {
             "POINT:UNITS": _text(contents, "POINT", "UNITS"),
@@ -71,11 +72,11 @@ class C3dFormat:
         return {**said, **describe_motion(_motion(path, contents, unit=None, axes=None))}
 
     def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
-        """Read every frame; a point whose residual is negative is NaN.
+        """Read every frame; a point with a negative residual is NaN.
 
         Raises:
-            DataError: ezc3d is not installed, or the file is no C3D, is damaged or breaks off, has no
-                points, no rate, or no unit that we know.
+            DataError: ezc3d is not installed, or the file is no C3D, is damaged or cut off, has no
+                points, no rate, or an unknown unit.
         """
         return _motion(path, _open(path), unit=unit, axes=axes)
 
@@ -90,16 +91,16 @@ def _open(path: Path) -> Any:
 
 
 def _check_layout(path: Path) -> None:
-    """Refuse a file that is shorter than its header says, or whose parameters run into each other.
+    """Refuse a file that is shorter than its header states, or whose parameters overlap.
 
-    ezc3d searches minutes for what is not there, or dies of it.
+    ezc3d would search such a file for minutes, or crash.
     """
     try:
         with path.open("rb") as file:
             head = file.read(_BLOCK)
             file.seek(max(head[0] - 1, 0) * _BLOCK if head else 0)
             section = file.read(_BLOCK)
-            # Some writers count no blocks; the data's own block, then, says where the section ends.
+            # Some writers do not count the blocks. Then the section ends where the data begin.
             until_data = max(head[16 if section[3] != _MIPS else 17] - head[0], 0) if len(section) > 3 else 0
             section += file.read(max(*section[2:3], until_data, 1) * _BLOCK - _BLOCK)
             size = file.seek(0, 2)
@@ -124,10 +125,10 @@ def _check_layout(path: Path) -> None:
 
 
 def _is_chain(section: bytes, order: str) -> bool:
-    """Whether the parameters follow each other within their section, each as long as it says.
+    """Return True if the parameters follow each other within their section, with consistent lengths.
 
     A record is the length of its name (negative: locked), a group's number (negative: the group itself), the
-    name, how far it is to the next, then of a parameter its type, its dimensions and its values.
+    name, and the distance to the next record. A parameter then has its type, its dimensions and its values.
     """
     at, groups = 4, set()
     asked: set[int] = set()
@@ -176,7 +177,7 @@ def _motion(path: Path, contents: Any, *, unit: str | None, axes: str | None) ->
 
 
 def _frames(contents: Any) -> int:
-    """How many there are, by whatever counts furthest."""
+    """Return the number of frames, by the largest of its counts."""
     read = int(np.shape(contents["data"]["points"])[2])
     first, last = (_words(contents, f"ACTUAL_{end}_FIELD") for end in ("START", "END"))
     return max(read, last - first + 1) if first is not None and last is not None else read
@@ -191,7 +192,7 @@ def _words(contents: Any, name: str) -> int | None:
 
 
 def _beyond(path: Path, contents: Any, read: int, frames: int) -> Float:
-    """[T, N, 3] the frames that ezc3d leaves out because the header cannot count them."""
+    """Read the frames [T, N, 3] that ezc3d leaves out because the header cannot count them."""
     points = int(np.shape(contents["data"]["points"])[1])
     first = _number(contents, "POINT", "DATA_START")
     scale = _number(contents, "POINT", "SCALE") or 0.0
@@ -208,7 +209,7 @@ def _beyond(path: Path, contents: Any, read: int, frames: int) -> Float:
 
 
 def _labels(contents: Any, count: int) -> tuple[str, ...]:
-    """The points' names; ours in full, where a label was cut for others' sake."""
+    """Return the points' names; for our own files the full ones, where labels were shortened."""
     labels = [*_texts(contents, "LABELS"), *(f"point{k + 1}" for k in range(count))][:count]
     if _text(contents, "MOCAP", "FIRST_T_NS") is not None:
         labels = [
@@ -218,7 +219,7 @@ def _labels(contents: Any, count: int) -> tuple[str, ...]:
 
 
 def _texts(contents: Any, name: str) -> list[str]:
-    """A list of POINT, which goes on in LABELS2, LABELS3 after 255 of them."""
+    """Return a list of POINT, which continues in LABELS2, LABELS3 after 255 entries."""
     more = [f"{name}{k}" if k > 1 else name for k in range(1, 100)]
     return [str(text) for part in more for text in _values(contents, "POINT", part)]
 
@@ -263,7 +264,7 @@ def _number(contents: Any, group: str, name: str) -> float | None:
 
 
 class C3dExport:
-    """`<name>.c3d`, or `<name>_person<k>.c3d` for each of several people, at a constant rate."""
+    """Writer of `<name>.c3d`, or `<name>_person<k>.c3d` for each of several people, at a constant rate."""
 
     name = "c3d"
     title = "C3D points with their uncertainty as residual; float32 (extra c3d)"
@@ -271,10 +272,10 @@ class C3dExport:
     axes = ("z-up", "y-up")
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write every person of whom a joint is known.
+        """Write every person with at least one known joint.
 
         Raises:
-            DataError: there is none, ezc3d is not installed, or the times are too scattered for a rate.
+            DataError: no such person, ezc3d is not installed, or the times are too scattered for a rate.
         """
         motion, files = people_of(recording, folder, ".c3d")
         need("ezc3d", "c3d")
@@ -289,7 +290,7 @@ class C3dExport:
 
 
 def write_joints(path: Path, even: EvenMotion, person: int, *, unit: str, axes: str) -> None:
-    """Write one person's joints; see the module for what residuals mean."""
+    """Write one person's joints; the module explains the residuals."""
     ezc3d = need("ezc3d", "c3d")
     motion = even.motion
     position = motion.position[:, person]
@@ -323,18 +324,18 @@ def write_joints(path: Path, even: EvenMotion, person: int, *, unit: str, axes: 
 
 
 def _residuals(motion: JointMotion, person: int, missing: Any, step: float) -> Float:
-    """[N, T] standard deviations in whole steps; 0 where none is stated, -1 where there is no point."""
+    """Return standard deviations [N, T] in whole steps; 0 if unknown, -1 if the point is missing."""
     steps = np.zeros(missing.shape)
     if motion.covariance is not None:
         trace = motion.covariance[:, person][..., [0, 3, 5]].sum(axis=-1).T
         sigma_mm = 1000 * np.sqrt(np.where(np.isfinite(trace), np.maximum(trace, 0.0), 0.0) / 3)
         steps = np.minimum(np.rint(sigma_mm), _MOST_RESIDUAL)
-    # ezc3d cuts off what lies behind the point: a quarter keeps 7 from becoming 6.9999.
+    # ezc3d truncates the decimals: a quarter more keeps 7 from becoming 6.9999.
     return np.where(missing, -1.0, (steps + 0.25) * step)
 
 
 def _short(names: Sequence[str]) -> list[str]:
-    """Labels of at most 30 bytes, as programs show them; those that would be alike are numbered."""
+    """Return labels of at most 30 bytes, as programs show them; equal ones get a number."""
     return _unique([_cut(name, _LONGEST_LABEL) for name in names], _LONGEST_LABEL)
 
 

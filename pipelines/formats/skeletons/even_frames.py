@@ -1,4 +1,4 @@
-"""Motion at a constant rate, for formats that number their frames and know no times."""
+"""Resampling of motion to a constant rate, for formats that number their frames and store no times."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress
 from pipelines.session.records import Float, Int64, JointMotion
 
-_KEPT_NS = 500_000  # a sample this near to its frame is taken for it: 1 mm of a hand at 2 m/s
-_LONGEST_STEP = 1.5  # usual steps: nothing is interpolated between times further apart
+_KEPT_NS = 500_000  # a sample this near to its frame keeps its position: 1 mm of a hand at 2 m/s
+_LONGEST_STEP = 1.5  # in frame steps: nothing is interpolated between times further apart
 _MOST_FRAMES = 10_000_000
 _MOST_EMPTY = 100  # frames per sample
 
 
 @dataclass(frozen=True)
 class EvenMotion:
-    """A motion whose times are equally far apart."""
+    """Motion with a constant time step."""
 
     motion: JointMotion
     rate_hz: float
-    empty: int  # frames between the samples at which nothing was measured
+    empty: int  # frames between the samples without any measurement
 
 
 def at_even_times(source: str, motion: JointMotion, progress: Progress) -> EvenMotion:
-    """Frames at the usual distance of a motion's times, from its first to its last.
+    """Assign a motion to frames at its usual step, from its first time to its last.
 
-    Every sample belongs to a frame, and a pause is frames without anything. Samples within half a
-    millisecond of their frames are taken as they are; if any lies further off, all positions are interpolated
-    linearly between neighbours (never across a missing one), and what else is known comes from the nearest
-    sample. Both are said, unless the stamps differ by rounding alone.
+    Every sample gets a frame, and a pause becomes empty frames. Samples within half a
+    millisecond of their frames stay as they are. If any is further off, all positions are interpolated
+    linearly between neighbours (never across a missing one), and the covariances are those of the nearest
+    sample. Both are noted, unless the stamps differ by rounding alone.
 
     Args:
-        source: what messages call the motion.
+        source: name of the motion for messages.
         motion: at least one time.
-        progress: who is told.
+        progress: receives the notes.
 
     Raises:
         DataError: the times are too scattered for a rate.
@@ -46,7 +46,7 @@ def at_even_times(source: str, motion: JointMotion, progress: Progress) -> EvenM
     if len(t_ns) == 1:
         return EvenMotion(motion, 1.0, 0)
     steps = np.diff(t_ns)
-    # A long pause must not decide the rate, nor the rounding of single stamps: both are counted in steps.
+    # Steps are counted, so that neither a long pause nor the rounding of single stamps changes the rate.
     index = np.concatenate([[0], np.cumsum(np.maximum(np.rint(steps / np.median(steps)), 1))]).astype(
         np.int64
     )
@@ -74,7 +74,7 @@ def at_even_times(source: str, motion: JointMotion, progress: Progress) -> EvenM
 
 
 def _spread(motion: JointMotion, even_ns: Int64, index: Int64) -> JointMotion:
-    """The samples as they are, each at its frame; NaN in between."""
+    """Put the samples as they are at their frames; NaN in between."""
     row = np.full(len(even_ns), -1)
     row[index] = np.arange(len(index))
     return _taken(motion, row, replace(motion, t_ns=even_ns, position=_rows(motion.position, row)))
@@ -88,7 +88,7 @@ def _interpolated(motion: JointMotion, even_ns: Int64, longest_ns: int) -> Joint
 
 
 def _taken(motion: JointMotion, row: Int64, even: JointMotion) -> JointMotion:
-    """The new positions with the covariances of these rows, where there is a position."""
+    """Return the new positions with the covariances of these rows, where there is a position."""
     if motion.covariance is None:
         return replace(even, status=None, reprojection_px=None, views=None)
     missing = np.isnan(even.position).any(axis=-1, keepdims=True)
@@ -103,7 +103,7 @@ def _rows(values: Float, row: Int64) -> Float:
 
 
 def thinned(t_ns: Int64, rate_hz: float) -> Int64:
-    """Rows of sorted times: the first of every 1 / rate_hz seconds since the first; none at 0."""
+    """Choose rows of sorted times: the first of every 1 / rate_hz seconds; none for a rate of 0."""
     if not rate_hz or not len(t_ns):
         return np.zeros(0, np.int64)
     period = np.floor((t_ns - t_ns[0]) * (rate_hz / 1e9) + 1e-6)

@@ -1,4 +1,4 @@
-"""Joint positions of any unit and axes to metres with z up."""
+"""Conversion of joint positions of any unit and axes to metres with z up."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ AXES = ("z-up", "y-up")
 
 
 def to_metres_z_up(source: Path, position: Float, unit: str, axes: str) -> Float:
-    """Convert positions [..., 3]; a point of which any coordinate is not finite is missing, all NaN.
+    """Convert positions [..., 3]; a point with a coordinate that is not finite is missing (all NaN).
 
     y-up files (OpenSim, TRC) turn into world = (z, x, y), a rotation: x forward becomes y, y up becomes z.
 
@@ -35,5 +35,5 @@ def to_metres_z_up(source: Path, position: Float, unit: str, axes: str) -> Float
 
 
 def to_y_up(position: Float) -> Float:
-    """World positions [..., 3] in OpenSim's axes, y up: (y, z, x) of the world."""
+    """Convert world positions [..., 3] to OpenSim's axes, y up: (y, z, x) of the world."""
     return position[..., [1, 2, 0]]

@@ -1,4 +1,4 @@
-"""3D joints as a long CSV, one row per time, person and joint; and the csv export, which adds the cameras."""
+"""3D joints as a long CSV, one row per time, person and joint; and the csv export, also of camera poses."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Int64, JointMoti
 if TYPE_CHECKING:
     import pyarrow as pa
 
-_MOST_EMPTY = 100  # dense cells per row before a file is refused as scattered
+_MOST_EMPTY = 100  # dense cells per row above which a file is refused as scattered
 
 
 class JointsCsvFormat:
-    """Header `t_ns,[person,]joint,x,y,z` in any order; the time may be t, time, ... in seconds.
+    """Reader of the header `t_ns,[person,]joint,x,y,z` in any order; the time may be t, time, ... in seconds.
 
-    Metres and z up unless the user says otherwise. Rows may come in any order. People are ranked by
-    their number, joints in order of appearance. A position that is blank, infinite or not there at all is
+    Metres and z up unless the user states otherwise. Rows may come in any order. People are ranked by
+    their number, joints in order of appearance. A position that is blank, infinite or absent is
     missing (NaN).
     """
 
@@ -37,13 +37,13 @@ class JointsCsvFormat:
     suffixes: tuple[str, ...] = (".csv", ".txt")
 
     def recognises(self, path: Path) -> bool:
-        """Whether its header names a time, a joint and x y z."""
+        """Return True if the header names a time, a joint and x y z."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         return _find_columns(read_head(path).split("\n", 1)[0]) is not None
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Joints, people, times, what is missing, and the box as if in metres with z up."""
+        """Describe joints, people, times, missing values, and the box as if in metres with z up."""
         return describe_motion(self.read_joints(path, unit=None, axes=None))
 
     def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
@@ -51,7 +51,7 @@ class JointsCsvFormat:
 
         Raises:
             DataError: not text, no such header, a malformed or truncated line, a time or person that is no
-                number, a joint stated twice, or rows too scattered for a dense table.
+                number, a joint that occurs twice at one time, or rows too scattered for a dense table.
         """
         first, _, body = read_text(path).partition("\n")
         columns = _find_columns(first)
@@ -81,7 +81,7 @@ class JointsCsvFormat:
 
 @dataclass(frozen=True)
 class _Columns:
-    """Where the columns are, and how many there are in all."""
+    """Positions of the columns, and their total number."""
 
     count: int
     stamp: int
@@ -92,7 +92,7 @@ class _Columns:
 
 
 def _find_columns(line: str) -> _Columns | None:
-    """The columns that a header names; None if one of those needed is absent."""
+    """Find the columns that a header names; None if a required one is absent."""
     cells = line.split(",")
     stamp = stamp_column(cells)
     index = {cell_name(cell)[0]: column for column, cell in reversed(list(enumerate(cells)))}
@@ -103,7 +103,7 @@ def _find_columns(line: str) -> _Columns | None:
 
 
 def _people(path: Path, column: pa.ChunkedArray | None, rows: int) -> Int64:
-    """[N] whole numbers; 0 where the file has no such column."""
+    """Return people [N] as whole numbers; 0 if the file has no such column."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -123,7 +123,7 @@ def _people(path: Path, column: pa.ChunkedArray | None, rows: int) -> Int64:
 def _dense(
     path: Path, stamps: Int64, people: Int64, names: pa.ChunkedArray, position: NDArray[np.float64]
 ) -> JointMotion:
-    """Long rows [N] to [T, P, J, 3]."""
+    """Convert long rows [N] to dense arrays [T, P, J, 3]."""
     import pandas as pd
 
     t_ns, row = np.unique(stamps, return_inverse=True)
@@ -155,7 +155,7 @@ def _dense(
 
 
 def write_joints(path: Path, motion: JointMotion) -> None:
-    """Write `t_ns,person,joint,x,y,z` and what else is known of each (covariance in m^2); NaN is blank."""
+    """Write `t_ns,person,joint,x,y,z` and all other known values (covariance in m^2); NaN is blank."""
     import pandas as pd
 
     times, people, joints = motion.position.shape[:3]
@@ -178,16 +178,16 @@ def write_joints(path: Path, motion: JointMotion) -> None:
 
 
 class CsvExport:
-    """`<name>.csv`, the skeleton as a long table, and `<name>_<camera>.csv`, the poses of each camera."""
+    """Writer of `<name>.csv`, the skeleton as a long table, and `<name>_<camera>.csv`, a camera's poses."""
 
     name = "csv"
     title = "long tables of the skeleton and of each camera's poses, as text"
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write what the recording has.
+        """Write all tables of the recording.
 
         Raises:
-            DataError: it has neither joints nor camera poses.
+            DataError: there are neither joints nor camera poses.
         """
         return write_tables(recording, folder, ".csv", write_joints, pose_csv.write_trajectory)
 

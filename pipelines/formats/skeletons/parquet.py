@@ -1,4 +1,4 @@
-"""The parquet export: the skeleton's table and the cameras' poses, as pandas, polars and DuckDB read them."""
+"""Export to parquet: the skeleton's table and the cameras' poses, for pandas, polars and DuckDB."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from pipelines.session.tabular import pose_table
 
 
 class ParquetExport:
-    """`<name>.parquet`, the session's skeleton table, and `<name>_<camera>.parquet`, its tables of poses.
+    """Writer of `<name>.parquet` (the session's skeleton table) and `<name>_<camera>.parquet` (its poses).
 
-    Metres, z up; one row for each time, person and joint, NaN and a status where it is missing. The same
+    Metres, z up; one row for each time, person and joint, with NaN and a status if it is missing. The same
     recording gives the same bytes.
     """
 
@@ -23,22 +23,22 @@ class ParquetExport:
     title = "the same tables, typed and small, for pandas"
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write what the recording has.
+        """Write all tables of the recording.
 
         Raises:
-            DataError: it has neither joints nor camera poses.
+            DataError: there are neither joints nor camera poses.
         """
         return write_tables(recording, folder, ".parquet", write_joints, write_poses)
 
 
 def write_poses(path: Path, trajectory: Trajectory) -> None:
-    """Write `tables.POSES`, with the covariances where the trajectory has them."""
+    """Write `tables.POSES`, with covariances if the trajectory has them."""
     schema = POSES if trajectory.covariance is None else POSES_WITH_COVARIANCE
     write_table(path, pose_table(trajectory), schema)
 
 
 def write_joints(path: Path, motion: JointMotion) -> None:
-    """Write `tables.SKELETON`; what a motion does not know of its joints is NaN, 0 views and no status."""
+    """Write `tables.SKELETON`; unknown values become NaN, 0 views or an empty status."""
     import pandas as pd
 
     times, people, joints = shape = motion.position.shape[:3]

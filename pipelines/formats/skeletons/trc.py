@@ -1,9 +1,9 @@
-"""OpenSim's TRC: marker positions over time, tab-separated below five header lines.
+"""OpenSim's TRC: marker positions over time, tab-separated, below five header lines.
 
 Layout (OpenSim documentation, "Marker (.trc) Files"): 1 file type and name, 2 keys, 3 values (rates, counts,
 unit), 4 `Frame#`, `Time` and marker names, 5 X1 Y1 Z1 ..., an optional blank line, then one row per frame.
-Coordinates are y up by OpenSim's convention. A marker that was not seen has blank cells or NaN. We write NaN:
-OpenSim 4.6 does not count blank cells at the end of a line, and refuses a file whose last marker is missing.
+Coordinates are y up by OpenSim's convention. A marker that was not seen has blank cells or NaN. We write NaN,
+because OpenSim 4.6 ignores blank cells at the end of a line and refuses a file whose last marker is missing.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ _UNITS = {
     "mm": "mm",
     "millimeters": "mm",
 }
-_DECIMALS = 7  # of a metre: far below anything measured, and rows stay readable
+_DECIMALS = 7  # of a metre: far below any measurement error, and rows stay readable
 
 
 def metric_unit(stated: str) -> str:
-    """m, cm or mm for what files call them; anything else as it is."""
+    """Return m, cm or mm for a unit's name in files; any other name as it is."""
     return _UNITS.get(stated.lower(), stated)
 
 
 def marker_name(joint: str) -> str:
-    """How Pose2Sim and its OpenSim models call a joint of ours: right_big_toe is RBigToe, nose is Nose.
+    """Return Pose2Sim's and OpenSim's name of our joint: right_big_toe is RBigToe, nose is Nose.
 
-    Joints that no skeleton of ours has are left as they are.
+    Names that are in no skeleton of ours stay as they are.
     """
     return _MARKERS.get(joint, joint)
 
@@ -75,10 +75,10 @@ class _Header:
 
 
 class TrcFormat:
-    """One person. Markers that Pose2Sim names get our joint names (RHip is right_hip), others keep theirs.
+    """Reader of one person. Pose2Sim's markers get our joint names (RHip is right_hip), others keep theirs.
 
-    `unit` stated by the user overrides the header, because files that say m and mean mm are common;
-    without it the header's Units count. `axes` is y-up unless stated: world = (z, x, y) of the file.
+    A `unit` stated by the user overrides the header's Units, because files in mm often claim m.
+    `axes` is y-up unless stated: world = (z, x, y) of the file.
     """
 
     name = "trc"
@@ -86,13 +86,13 @@ class TrcFormat:
     suffixes: tuple[str, ...] = (".trc",)
 
     def recognises(self, path: Path) -> bool:
-        """Whether it begins as every TRC does."""
+        """Return True if the file begins like every TRC."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         return read_head(path).startswith("PathFileType")
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Header, joints, times, what is missing, and the box in the world (z up)."""
+        """Describe header, joints, times, missing values, and the box in the world (z up)."""
         header, _, _ = _split(path, read_text(path))
         stated = {key: header.keys[key] for key in ("Units", "DataRate", "NumFrames") if key in header.keys}
         return {
@@ -104,7 +104,7 @@ class TrcFormat:
         """Read every row; blank cells and NaN are missing.
 
         Raises:
-            DataError: no TRC header, no unit that we know, a row with another number of cells or
+            DataError: no TRC header, an unknown unit, a row with another number of cells or
                 cells that are no numbers, times that do not increase, or no rows.
         """
         header, rows, first_line = _split(path, read_text(path))
@@ -122,7 +122,7 @@ class TrcFormat:
 
 
 def _split(path: Path, text: str) -> tuple[_Header, list[str], int]:
-    """Header, the lines below it, and the number of the first of those in the file."""
+    """Return the header, the lines below it, and the line number of the first of those in the file."""
     lines = text.split("\n")
     if len(lines) < 5 or not lines[0].startswith("PathFileType") or not lines[3].startswith("Frame#"):
         raise DataError(
@@ -142,7 +142,7 @@ def _split(path: Path, text: str) -> tuple[_Header, list[str], int]:
 
 
 def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tuple[list[str], Float]:
-    """Times as text, and coordinates [T, M, 3]."""
+    """Read times as text, and coordinates [T, M, 3]."""
     times: list[str] = []
     values: list[list[float]] = []
     for number, line in enumerate(lines, start=first_line):
@@ -166,7 +166,7 @@ def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tup
 
 
 def joint_names(markers: tuple[str, ...]) -> tuple[str, ...]:
-    """Our names where they are known and free: of Hip and MidHip in one file only the first becomes hip."""
+    """Return our names of known markers; if two markers mean one joint, only the first gets its name."""
     names: list[str] = []
     for marker in markers:
         joint = _JOINTS.get(marker, marker)
@@ -175,10 +175,10 @@ def joint_names(markers: tuple[str, ...]) -> tuple[str, ...]:
 
 
 class TrcExport:
-    """`<name>.trc`, or `<name>_person<k>.trc` for each of several people: metres and y up unless asked.
+    """Writer of `<name>.trc`, or `<name>_person<k>.trc` for each of several people; default metres and y up.
 
     OpenSim's (x, y, z) is our world's (y, z, x). The header states the unit; no TRC states its axes. Times
-    are the session's own (seconds, nine decimals), so that a file lines up with its flight and reads back
+    are the session's own (seconds, nine decimals), so that a file fits its flight and can be read
     as truth.
     """
 
@@ -188,10 +188,10 @@ class TrcExport:
     axes = ("y-up", "z-up")
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write every person of whom a joint is known.
+        """Write every person with at least one known joint.
 
         Raises:
-            DataError: there is none.
+            DataError: there is no such person.
         """
         motion, files = people_of(recording, folder, ".trc")
         for person, path in files.items():
@@ -202,7 +202,7 @@ class TrcExport:
 def write_joints(
     path: Path, motion: JointMotion, person: int, *, unit: str = "m", axes: str = "y-up"
 ) -> None:
-    """Write one person's joints; a joint that is missing at a time has NaN in its three cells."""
+    """Write one person's joints; a missing joint has NaN in its three cells."""
     step = median_step_ns(motion.t_ns)
     rate = f"{1e9 / step:.6g}" if step else "1"
     markers = [re.sub(r"\s+", " ", marker_name(joint)) for joint in motion.joints]

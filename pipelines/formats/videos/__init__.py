@@ -1,1 +1,1 @@
-"""Videos, and when their frames were taken."""
+"""Readers and writers of videos, and of the times of their frames."""

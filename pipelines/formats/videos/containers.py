@@ -1,4 +1,4 @@
-"""The containers that videos come in: which one a file is, its largest stream, the coded frames in it."""
+"""Containers of videos: their kind, their largest stream, and the coded frames in it."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.stream import VideoStream
 
-_MOST_PIXELS = 1 << 27  # 16384 x 8192; a header that states more is damaged, and memory is finite
+_MOST_PIXELS = 1 << 27  # 16384 x 8192; a larger size in a header is damage and would exhaust the memory
 _MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide")
 _PACKET_TS, _PACKET_M2TS = 188, 192
 
 
 def open_container(path: Path) -> tuple[InputContainer, VideoStream]:
-    """A container and its largest video stream, ready to decode; cover pictures are none.
+    """Open a container and its largest video stream, ready to decode; cover pictures are ignored.
 
     Raises:
-        DataError: missing, empty, no container that is known here, without its table or a video stream, a
-            codec that cannot be decoded, or a picture size beyond reason.
+        DataError: missing, empty, no known container, without its table or a video stream, a
+            codec that cannot be decoded, or a picture size beyond the limit.
     """
     import av
     from av.error import FFmpegError
@@ -31,7 +31,7 @@ def open_container(path: Path) -> tuple[InputContainer, VideoStream]:
 
     kind = _kind(path)
     try:
-        # Named format and protocol: a playlist under this name must not make FFmpeg open other files.
+        # Named format and protocol, because a playlist under this name must not make FFmpeg open other files.
         container = av.open(f"file:{path.absolute()}", format=kind, metadata_errors="replace")
     except FFmpegError as error:
         raise _unreadable(path, kind, "cannot be opened as a video") from error
@@ -52,13 +52,13 @@ def open_container(path: Path) -> tuple[InputContainer, VideoStream]:
             "its header is damaged: copy it again",
         )
     stream.codec_context.options = {"max_pixels": str(_MOST_PIXELS)}
-    # Not frame by frame: then what is made of a damaged frame depends on the number of processors.
+    # Not frame by frame: then the output for a damaged frame would depend on the number of processors.
     stream.thread_type = "SLICE"
     return container, stream
 
 
 def _has_decoder(stream: VideoStream) -> bool:
-    context: object = stream.codec_context  # None for an unknown codec, whatever its annotation says
+    context: object = stream.codec_context  # None for an unknown codec, despite its annotation
     return context is not None
 
 
@@ -73,7 +73,7 @@ def _unreadable(path: Path, kind: str, problem: str) -> DataError:
 
 
 def _kind(path: Path) -> str:
-    """FFmpeg's name of the container, by its first bytes."""
+    """Return FFmpeg's name of the container, by its first bytes."""
     try:
         size = path.stat().st_size
         kind = container_format(path)
@@ -89,10 +89,10 @@ def _kind(path: Path) -> str:
 
 
 def container_format(path: Path) -> str | None:
-    """FFmpeg's name of the container that a file begins as; None for one that is not known here.
+    """Return FFmpeg's name of the container by a file's first bytes; None for an unknown one.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     with path.open("rb") as file:
         head = file.read(2 * _PACKET_M2TS)
@@ -109,7 +109,7 @@ def container_format(path: Path) -> str | None:
 
 
 def _has_table(path: Path) -> bool:
-    """Whether an MP4 has its `moov` box, whole."""
+    """Return True if an MP4 has its complete `moov` box."""
     size = path.stat().st_size
     start = 0
     with path.open("rb") as file:
@@ -128,12 +128,12 @@ def _has_table(path: Path) -> bool:
 
 
 def packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
-    """The coded frames as they are stored, as far as the container can be read."""
+    """Yield the coded frames in the order of storage, as far as the container can be read."""
     from av.error import FFmpegError
 
     try:
         for packet in container.demux(stream):
-            if packet.size:  # the last, empty one only tells the decoder that it is the last
+            if packet.size:  # the last packet is empty and only tells the decoder that it is the last
                 yield packet
     except FFmpegError:
         return
@@ -155,7 +155,7 @@ def is_shown(packet: Packet[VideoStream], codec: str) -> bool:
 
 
 def _vp9_frames(content: bytes) -> list[int]:
-    """List where the frames of a VP9 packet begin; more than one with an index behind them."""
+    """List the starts of the frames of a VP9 packet; several if there is an index at its end."""
     last = content[-1]
     count, width = (last & 7) + 1, (last >> 3 & 3) + 1
     length = 2 + count * width

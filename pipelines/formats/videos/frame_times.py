@@ -1,4 +1,4 @@
-"""When each frame of a video was taken: a CSV, or the subtitles that DJI drones write beside the video."""
+"""Times at which a video's frames were taken: a CSV, or DJI drones' subtitles beside the video."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ _FRAME_NAMES = {"frame", "frame_id", "frame_index", "frame_number"}
 class FrameStamps:
     """Times of frames, sorted: frame numbers and times both strictly increase; frames may be absent.
 
-    Where `media_ns` is there, it tells the frames apart better than `frame` does: a recorder that skipped a
-    frame leaves a hole in it and in the video's own stamps, but not in the numbers of the video's frames.
+    `media_ns`, if present, identifies frames better than `frame` does. If a recorder skips a frame, there is
+    a gap in `media_ns` and in the video's own stamps, but not in the numbers of the video's frames.
     """
 
     frame: Int64  # [N] from 0
-    t_ns: Int64  # [N] since the epoch, or whatever the file counts from
-    media_ns: Int64 | None = None  # [N] the place in the video that the file itself states
+    t_ns: Int64  # [N] since the epoch, or since the file's own zero
+    media_ns: Int64 | None = None  # [N] the time in the video that the file itself gives
     dropped: dict[str, int] = field(default_factory=dict)  # rows left out, by cause
 
 
 class FrameTimesFormat:
-    """Frame times as CSV or as DJI's .srt; `read_frame_times` says how they are read."""
+    """Reader of frame times as CSV or as DJI's .srt; `read_frame_times` documents both."""
 
     name = "frame_times"
     title = "frame times"
     suffixes: tuple[str, ...] = (".csv", ".srt", ".txt", ".tsv")
 
     def recognises(self, path: Path) -> bool:
-        """Whether it is a table of times, with frame numbers or without, or subtitles of each frame."""
+        """Return True for a table of times, with or without frame numbers, or subtitles of each frame."""
         if path.suffix.lower() not in self.suffixes or not path.is_file():
             return False
         head = read_head(path)
@@ -51,7 +51,7 @@ class FrameTimesFormat:
         return header is not None and header.columns == (1 if header.frame is None else 2)
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Rows, frame numbers, times, gaps, and what was left out."""
+        """Describe rows, frame numbers, times, gaps, and losses."""
         stamps = read_frame_times(path)
         return {
             "rows": len(stamps.frame),
@@ -69,10 +69,10 @@ def read_frame_times(path: Path) -> FrameStamps:
     seconds or with a unit (`time_ms`, `timestamp [ns]`); the frame is frame, frame_id, frame_index or
     frame_number, from 0. Without a frame column row k is frame k. Other columns are ignored.
 
-    SRT: the clock time that each subtitle shows, taken as UTC since DJI writes local time without its
-    zone; frames are numbered by the subtitles' own times, so that a missing one leaves a hole.
+    SRT: the clock time in each subtitle, taken as UTC because DJI writes local time without its
+    zone. Frames are numbered by the subtitles' own times, so that a missing one leaves a gap.
 
-    Rows are left out and counted under the first cause that applies: "truncated last line", "no time" (blank,
+    Rows are dropped and counted under the first cause that applies: "truncated last line", "no time" (blank,
     no number, no clock in the subtitle), "no frame number" (blank, negative, not whole), "duplicate
     frame" (the first stays), "time not increasing" (of rows sorted by frame, each time must be above the
     largest before it).
@@ -85,17 +85,17 @@ def read_frame_times(path: Path) -> FrameStamps:
 
 
 def times_of_frames(stamps: FrameStamps, pts_ns: Int64) -> tuple[Int64, Bool]:
-    """The time of each frame of a video.
+    """Assign a time to each frame of a video.
 
-    By `media_ns` where the stamps have it, each frame taking the nearest within half a frame (subtitles
-    round to a millisecond); else by frame number.
+    If the stamps have `media_ns`, each frame takes the nearest one within half a frame, because subtitles
+    round to a millisecond. Else frames are matched by number.
 
     Args:
-        stamps: what was read beside the video.
+        stamps: the frame times that were read.
         pts_ns: [N] the video's presentation times since its first frame.
 
     Returns:
-        [N] times, 0 where unknown, and [N] whether each is known.
+        [N] times, 0 if unknown, and [N] True if the time is known.
     """
     keys, wanted = stamps.frame, np.arange(len(pts_ns), dtype=np.int64)
     tolerance = 0
@@ -123,7 +123,7 @@ class _Header:
 
 
 def _find_header(text: str) -> _Header | None:
-    """The first line that is not blank, when it names a time."""
+    """Parse the first line that is not blank; None if it names no time."""
     for index, line in enumerate(text.split("\n", 100)[:100]):
         if not line.strip():
             continue
@@ -166,7 +166,7 @@ def _read_csv(path: Path) -> FrameStamps:
 
 
 def _frame_numbers(cells: list[str]) -> tuple[Int64, Bool]:
-    """Whole numbers, also as 12.0; 0 and False where a cell is none."""
+    """Parse whole numbers, also as 12.0; 0 and False for any other cell."""
     matches = [re.fullmatch(r"\s*(\d{1,18})(?:\.0*)?\s*", cell or "") for cell in cells]
     frame = np.array([int(match[1]) if match else 0 for match in matches], dtype=np.int64)
     return frame, np.array([match is not None for match in matches], dtype=np.bool_)
@@ -193,16 +193,16 @@ def _read_subtitles(path: Path) -> FrameStamps:
 
 
 def _plain_seconds(t_ns: int) -> str:
-    """Seconds without zeros behind the dot."""
+    """Format seconds without trailing zeros."""
     return format_seconds(np.array([t_ns]))[0].rstrip("0").rstrip(".")
 
 
 def _slots(media_ns: Int64) -> Int64:
-    """Frame numbers from the subtitles' own times, one or more for each step.
+    """Compute frame numbers from the subtitles' own times, one or more for each step.
 
-    Counted step by step: 33, 33, 34 ms do not add up to multiples of their median.
+    Steps are rounded one by one, because 33, 33, 34 ms do not add up to multiples of their median.
     """
-    steps = np.diff(np.maximum.accumulate(media_ns))  # a subtitle that goes back has its frame twice
+    steps = np.diff(np.maximum.accumulate(media_ns))  # a subtitle that goes back repeats its frame
     typical = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
     counts = np.where(steps > 0, np.maximum(np.rint(steps / typical), 1), 0)
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
@@ -216,7 +216,7 @@ def _clean(
     causes: dict[str, Bool],
     dropped: dict[str, int],
 ) -> FrameStamps:
-    """Sort by frame, then leave out what `read_frame_times` says."""
+    """Sort by frame, then drop the rows that `read_frame_times` lists."""
     order = np.argsort(frame, kind="stable")
     keep = np.ones(len(order), dtype=np.bool_)
 
@@ -237,7 +237,7 @@ def _clean(
 
 
 def _not_rising(values: Int64, among: Bool) -> Bool:
-    """Which of some rows are not above the largest before them."""
+    """Mark the rows among `among` that are not above the largest before them."""
     rows = np.flatnonzero(among)
     bad = np.zeros(len(values), dtype=np.bool_)
     if len(rows) > 1:

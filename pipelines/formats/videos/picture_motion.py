@@ -1,4 +1,4 @@
-"""Points that are followed through the pictures of a video: what the motion of its camera shows by."""
+"""Points that are tracked through the pictures of a video, as a measure of its camera's motion."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from pipelines.geometry.cameras import Intrinsics, rescaled, undistort
 from pipelines.geometry.film_start import Followed
 from pipelines.session.records import Float, Int64
 
-_WIDTH_PX = 320  # pictures are made so wide: motion shows as well
+_WIDTH_PX = 320  # width to which pictures are reduced: motion is still visible
 _STRETCH_NS = 200_000_000
 _CORNERS = 100
 _LEAST_CORNERS = 12
 _CORNER_QUALITY, _CORNERS_APART_PX = 0.01, 8
 
 _Grey = NDArray[np.uint8]
-_Pixels = NDArray[np.float32]  # [C, 1, 2], as OpenCV has them
+_Pixels = NDArray[np.float32]  # [C, 1, 2], OpenCV's layout
 
 
 def followed_points(path: Path, intrinsics: Intrinsics, pts_ns: Int64) -> Followed:
-    """Corners of the first pictures, each followed for a fifth of a second.
+    """Find corners in the first pictures, and track each for a fifth of a second.
 
-    From picture to picture, with pyramids (Lucas and Kanade 1981; Bouguet 2000). A stretch that misses a
-    picture, or loses all but a few corners, is left out.
+    Tracking is from picture to picture, with pyramids (Lucas and Kanade 1981; Bouguet 2000). A stretch that
+    misses a picture, or loses all but a few corners, is dropped.
 
     Args:
         path: the video.
         intrinsics: of its pictures.
-        pts_ns: [F] strictly increasing stamps of as many pictures as are to be looked at.
+        pts_ns: [F] strictly increasing stamps of the pictures to use, from the first on.
 
     Raises:
         DataError: the video cannot be read.
@@ -79,7 +79,7 @@ def _corners(grey: _Grey) -> _Pixels:
 
 
 def _followed(before: _Grey, after: _Grey, begin: _Pixels, here: _Pixels) -> tuple[_Pixels, _Pixels]:
-    """Where corners began, and where they are one picture later; without those that were lost."""
+    """Return the first positions of corners and those one picture later, without the lost ones."""
     import cv2
 
     if not len(here):
@@ -93,6 +93,6 @@ def _joined(pts_ns: Int64, spans: list[tuple[int, int]], begins: list[Float], en
     nothing = np.zeros((0, 2))
     begin, end = np.concatenate([nothing, *begins]), np.concatenate([nothing, *ends])
     stretch = np.repeat(np.arange(len(begins)), [len(points) for points in begins])
-    known = np.isfinite(begin).all(axis=1) & np.isfinite(end).all(axis=1)  # a lens need not reach all pixels
+    known = np.isfinite(begin).all(axis=1) & np.isfinite(end).all(axis=1)  # a lens may not cover all pixels
     pictures = np.array(spans, np.int64).reshape(-1, 2)
     return Followed(pts_ns[pictures[:, 0]], pts_ns[pictures[:, 1]], stretch[known], begin[known], end[known])

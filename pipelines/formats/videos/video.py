@@ -1,7 +1,7 @@
-"""Video files through FFmpeg's libraries: the exact time of every frame, and any frame exactly.
+"""Reader of video files through FFmpeg's libraries: the exact time of every frame, and any frame exactly.
 
-Frames are told apart by their presentation stamps alone. Counting decoded pictures goes wrong where one is
-damaged, and index / rate where the rate varies; a seek may land behind the frame it was asked for.
+Frames are identified by their presentation stamps alone. Counting decoded pictures fails if one is
+damaged, and index / rate fails if the rate varies. A seek may land after the wanted frame.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ if TYPE_CHECKING:
 
 Picture = NDArray[np.uint8]  # [height, width, 3] blue, green, red
 
-_LATEST_S = 4 * 10**9  # after the year 2096, counted from the epoch; int64 ns hold 292 years
+_LATEST_S = 4 * 10**9  # the year 2096, counted from the epoch; int64 ns hold 292 years
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _NO_DATE_BEFORE = timedelta(days=365 * 15)  # 1985: there were no drones
-_MOST_KEY_FRAMES = 3  # to seek before a frame counts as undecodable
+_MOST_KEY_FRAMES = 3  # seeks that are tried before a frame counts as undecodable
 
 
 class VideoContainer:
-    """MP4, MOV, MKV, WebM, AVI and MPEG transport streams, with whatever codec FFmpeg decodes."""
+    """Reader of MP4, MOV, MKV, WebM, AVI and MPEG transport streams, with any codec that FFmpeg decodes."""
 
     name = "video"
     title = "video"
     suffixes: tuple[str, ...] = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".ts", ".mts", ".m2ts")
 
     def recognises(self, path: Path) -> bool:
-        """Whether it begins as one of these containers does; or is empty, but was to become one."""
+        """Return True if the file begins like one of these containers, or is empty with such a suffix."""
         try:
             if not path.is_file():
                 return False
@@ -54,7 +54,7 @@ class VideoContainer:
             return False
 
     def describe(self, path: Path) -> dict[str, object]:
-        """Frames, times, rate, gaps, picture, codec, and what the file lost."""
+        """Describe frames, times, rate, gaps, picture size, codec, and losses."""
         index = self.index(path)
         times = describe_times(index.pts_ns)
         return {
@@ -72,38 +72,38 @@ class VideoContainer:
         }
 
     def index(self, path: Path) -> VideoIndex:
-        """What `index_video` says."""
+        """Return the index of `index_video`."""
         return index_video(path)
 
 
 def index_video(path: Path) -> VideoIndex:
-    """When each frame is shown, from the container; only the first picture is decoded.
+    """Read the time at which each frame is shown, from the container; only the first picture is decoded.
 
-    The largest video stream counts, cover pictures do not; frames that an edit list hides are none,
-    nor are those that VP8 and VP9 code for reference only.
+    The largest video stream is used; cover pictures are ignored. Frames that an edit list hides do not count,
+    nor do those that VP8 and VP9 code for reference only.
     pts_ns[k] is the stamp of frame k less that of frame 0, rounded to a nanosecond once.
 
-    Counted in `dropped`: "cut off" (the container's table lists them, the file ends before; with them the
-    last few frames that come later in time than the first one lost, whose numbers nobody can tell),
+    Counted in `dropped`: "cut off" (frames in the container's table after the end of the file; also the
+    last few frames shown later than the first lost one, because their numbers are unknown),
     "no stamp", "duplicate stamp".
 
     Raises:
         DataError: missing, empty, no video container, without its table (an MP4 that was never closed),
             without a video stream, a codec that cannot be decoded, no frame with a stamp, no frame that can
-            be decoded, or a picture size beyond reason.
+            be decoded, or a picture size beyond the limit.
     """
     with VideoReader(path) as reader:
         return reader.index
 
 
 def created_ns(path: Path) -> int | None:
-    """When a video says that it was made, ns since the epoch; None where it does not say.
+    """Return the time in a video's metadata at which it was made, ns since the epoch; None without one.
 
-    MP4 and MOV hold whole seconds of UTC, by definition; some cameras write local time, some the moment
-    when they closed the file.
+    By definition, MP4 and MOV hold whole seconds of UTC. But some cameras write local time, and some the
+    time at which they closed the file.
 
     Raises:
-        DataError: it cannot be opened as a video.
+        DataError: the file cannot be opened as a video.
     """
     container, stream = open_container(path)
     with container:
@@ -116,7 +116,7 @@ def created_ns(path: Path) -> int | None:
         except ValueError:
             continue
         elapsed = (made if made.tzinfo else made.replace(tzinfo=UTC)) - _EPOCH
-        if elapsed > _NO_DATE_BEFORE:  # 1904 is the zero of MP4, 1970 that of a clock that was never set
+        if elapsed > _NO_DATE_BEFORE:  # MP4 counts from 1904, and a clock that was never set from 1970
             return elapsed // timedelta(microseconds=1) * 1000
     return None
 
@@ -124,24 +124,24 @@ def created_ns(path: Path) -> int | None:
 def frames(
     path: Path, start: int = 0, stop: int | None = None, step: int = 1
 ) -> Iterator[tuple[int, Picture]]:
-    """Frames start, start + step, ... before stop, one at a time; as `VideoReader.frames` says."""
+    """Yield frames start, start + step, ... before stop, one at a time; see `VideoReader.frames`."""
     with VideoReader(path) as reader:
         yield from reader.frames(start, stop, step)
 
 
 class VideoReader:
-    """A video at hand: `index`, and its frames by number, in any order.
+    """Open video with its `index`; frames are read by number, in any order.
 
-    A context manager. Pictures are BGR, uint8, turned as players and OpenCV show them, so that their size
-    is that of the index. `missing` holds the numbers of the frames found undecodable so far.
+    A context manager. Pictures are BGR, uint8, turned as in players and OpenCV, so that their size
+    is that of the index. `missing` holds the numbers of the undecodable frames found so far.
 
     Raises:
-        DataError: as `index_video` says.
+        DataError: as in `index_video`.
     """
 
     index: VideoIndex
     missing: set[int]
-    _next: tuple[int, VideoFrame] | None  # comes out next
+    _next: tuple[int, VideoFrame] | None  # the frame that is returned next
 
     def __init__(self, path: Path) -> None:
         from av.video.reformatter import VideoReformatter
@@ -150,7 +150,7 @@ class VideoReader:
         self._path = path
         self._reformatter = VideoReformatter()
         self._scan = _scan(path)
-        self._reader: object = None  # whose turn it is among the iterations of `frames`
+        self._reader: object = None  # the iteration of `frames` that moved the decoder last
         self._begin()
         if self._next is None:
             self.close()
@@ -159,7 +159,7 @@ class VideoReader:
         self.index = _index(self._scan, self._stream, self._next[1])
 
     def __enter__(self) -> Self:
-        """The reader itself."""
+        """Return the reader itself."""
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -171,7 +171,7 @@ class VideoReader:
         self._container.close()
 
     def read(self, number: int) -> Picture | None:
-        """One frame; None where it cannot be decoded.
+        """Read one frame; None if it cannot be decoded.
 
         Raises:
             DataError: no such frame, or it has another size than the first.
@@ -179,10 +179,10 @@ class VideoReader:
         return next((picture for _, picture in self.frames(number, number + 1)), None)
 
     def frames(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[tuple[int, Picture]]:
-        """Numbers and pictures of the frames start, start + step, ... before stop (default: all), in order.
+        """Yield numbers and pictures of frames start, start + step, ... before stop (default: all), in order.
 
-        Pictures come one at a time. Frames that cannot be decoded are left out, the others keep their
-        numbers. Iterations may take turns.
+        Pictures come one at a time. Frames that cannot be decoded are skipped; the others keep their
+        numbers. Several iterations may alternate.
 
         Raises:
             DataError: no such frames, or a picture of another size than the first.
@@ -205,13 +205,13 @@ class VideoReader:
                 self.missing.add(number)
 
     def _go_to(self, number: int) -> None:
-        """Have that frame come out next, or the first after it that can be decoded."""
+        """Move so that this frame comes next, or the first decodable one after it."""
         keys = self._scan.key_frames
         before = keys[: bisect.bisect_right(keys, number)]
         nearest = before[-1] if before else 0
         if self._next is not None and nearest <= self._next[0] <= number:
             return
-        # A seek may land too late; and after some key frames (intra refresh) it takes a while to recover.
+        # A seek may land too late. After some key frames (intra refresh) the decoder needs time to recover.
         for key in before[: -_MOST_KEY_FRAMES - 1 : -1]:
             self._seek(key)
             self._skip_to(number)
@@ -232,7 +232,7 @@ class VideoReader:
         self._next = next(self._coming, None)
 
     def _seek(self, number: int) -> None:
-        """Decode from about a key frame on, or from the beginning where the container cannot seek."""
+        """Decode from near a key frame on, or from the beginning if the container cannot seek."""
         from av.error import FFmpegError
 
         try:
@@ -257,7 +257,7 @@ class VideoReader:
         return picture
 
 
-# --- what the container says ---------------------------------------------------------------------------
+# --- content of the container --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -269,7 +269,7 @@ class _Scan:
 
 
 class _Packet(NamedTuple):
-    """One coded frame as it is stored."""
+    """Coded frame as it is stored."""
 
     position: int | None  # in the file
     pts: int | None
@@ -277,7 +277,7 @@ class _Packet(NamedTuple):
 
 
 def _scan(path: Path) -> _Scan:
-    """The stamps of all packets, in the order of showing."""
+    """Read the stamps of all packets, in the order of showing."""
     container, stream = open_container(path)
     with container:
         size = path.stat().st_size
@@ -286,13 +286,13 @@ def _scan(path: Path) -> _Scan:
             for packet in packets(container, stream)
             if not packet.is_discard and is_shown(packet, stream.codec_context.codec.canonical_name)
         ]
-        # Only a whole table, as of MP4, lists frames beyond the file's end.
+        # Only a complete table, like that of MP4, lists frames beyond the file's end.
         lost = {e.pos: e.timestamp for e in stream.index_entries if e.size > 0 and e.pos + e.size > size}
         tick_s = Fraction(stream.time_base or 0)
     whole = [packet for packet in stored if packet.position not in lost]
     stamped = [(packet.pts, packet.key) for packet in whole if packet.pts is not None]
     first_lost = min(lost.values(), default=0)
-    # No frame is shown before it is decoded: what is shown before the first lost one's decoding is complete.
+    # No frame is shown before it is decoded. So all frames shown before the first lost decoding are here.
     sure = [(pts, key) for pts, key in stamped if not lost or pts < first_lost]
     if not sure:
         problem = "its frames bear no time stamps" if whole else "holds no frames"
@@ -332,7 +332,7 @@ def _index(scan: _Scan, stream: VideoStream, first: VideoFrame) -> VideoIndex:
 
 
 def _nanoseconds(ticks: Int64, tick_s: Fraction, origin: int = 0) -> Int64:
-    """Since the origin, to the nearest ns. In Python's integers: the products need more than 64 bits."""
+    """Convert ticks to ns since the origin, rounded; Python integers, because products exceed 64 bits."""
     above, below = (tick_s * 10**9).as_integer_ratio()
     return np.array(
         [(2 * (t - origin) * above + below) // (2 * below) for t in ticks.tolist()], dtype=np.int64
@@ -340,7 +340,7 @@ def _nanoseconds(ticks: Int64, tick_s: Fraction, origin: int = 0) -> Int64:
 
 
 def _is_variable(ticks: Int64) -> bool:
-    """Whether a frame is off the even grid by more than the container's clock and 1 % of a frame."""
+    """Return True if a frame deviates from the even grid by more than one tick and 1 % of a frame."""
     count = len(ticks)
     if count < 3:
         return False
@@ -354,10 +354,10 @@ def _is_variable(ticks: Int64) -> bool:
 def _numbered(
     container: InputContainer, stream: VideoStream, ticks: Int64, *, sought: bool
 ) -> Iterator[tuple[int, VideoFrame]]:
-    """Numbers and frames in the order of showing; those that cannot be decoded do not come.
+    """Yield numbers and frames in the order of showing; undecodable frames are skipped.
 
-    After a seek, from the first key frame that is met: what a decoder delivers for frames shown before it
-    refers to pictures that were not decoded.
+    After a seek, frames begin with the first key frame: frames shown before it may depend on
+    pictures that were not decoded.
     """
     from av.error import FFmpegError
 
@@ -369,14 +369,14 @@ def _numbered(
                 continue
             first = packet.pts
         try:
-            frames_ready = stream.decode(packet)  # None: what the decoder still holds
+            frames_ready = stream.decode(packet)  # packet None: the frames that the decoder still holds
         except FFmpegError:
             continue
         for frame in frames_ready:
             if frame.pts is None or frame.pts < first or frame.is_corrupt:
                 continue
             number = int(np.searchsorted(ticks, frame.pts))
-            # The stamps of a cut-off end are not in the index.
+            # Stamps of a cut-off end are not in the index.
             if last < number < len(ticks) and ticks[number] == frame.pts:
                 last = number
                 yield number, frame

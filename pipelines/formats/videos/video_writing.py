@@ -1,4 +1,4 @@
-"""Writing H.264 videos whose frames carry their own time stamps, in parts that join without loss."""
+"""Writer of H.264 videos whose frames carry their own time stamps, in parts that join without loss."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from av import Packet, VideoStream
 
 TICK_S = Fraction(1, 90_000)
-"""The unit of the stamps: what MPEG uses; a stamp is off by up to 5.6 microseconds."""
+"""Unit of the stamps, as in MPEG; a stamp is off by up to 5.6 microseconds."""
 
 # The edit list that shifts a part to its start counts in the movie's own unit, by default 1 ms.
 _OPTIONS = {"movflags": "faststart", "movie_timescale": str(TICK_S.denominator)}
@@ -43,7 +43,7 @@ def write_h264(
         width: of the pictures, even.
         height: of the pictures, even.
         quality: x264's constant rate factor; 18 looks lossless, 28 poor.
-        key_every: frames from one key frame to the next; seeking goes by them.
+        key_every: frames from one key frame to the next; a seek goes to a key frame.
     """
     import av
 
@@ -62,7 +62,7 @@ def write_h264(
 
 
 def join_videos(path: Path, parts: Sequence[Path]) -> None:
-    """One video from parts that were encoded alike, whose stamps go on from part to part.
+    """Join parts that were encoded alike to one video; their stamps continue from part to part.
 
     The coded pictures are copied, so nothing is lost.
 
@@ -83,7 +83,7 @@ def join_videos(path: Path, parts: Sequence[Path]) -> None:
 
 
 def ticks_of(pts_ns: Int64) -> list[int]:
-    """Stamps in units of `TICK_S`, rounded to the nearest."""
+    """Convert stamps to units of `TICK_S`, rounded to the nearest."""
     return [round(Fraction(stamp, 10**9) / TICK_S) for stamp in pts_ns.tolist()]
 
 
