@@ -71,7 +71,7 @@ def test_real_sizes_and_names() -> None:
     assert lens is not None
     assert (lens.width, lens.height, lens.model) == (1088, 1920, "radtan")
     assert isinstance(lens.width, int)
-    # What an independent reader noted for this file, to its six decimals.
+    # Values noted by an independent reader for this file, to its six decimals.
     position = cameras["cam01"].position
     assert position is not None
     np.testing.assert_allclose(position, [1.460232, -1.909159, 1.896506], atol=1e-6)

@@ -32,7 +32,7 @@ POINTS = np.array([[0.1, -0.2, 2.0], [0.6, 0.4, 2.0], [-0.5, 0.3, 1.5]])
 
 
 def model(cameras: dict[int, tuple[str, list[float]]], images: dict[str, int]) -> pycolmap.Reconstruction:
-    """A reconstruction made by pycolmap: camera id to model, image name to camera id, poses by rank."""
+    """Make a reconstruction with pycolmap: camera id to model, image name to camera id, poses by rank."""
     reconstruction = pycolmap.Reconstruction()
     for camera, (name, parameters) in cameras.items():
         reconstruction.add_camera_with_trivial_rig(
@@ -140,7 +140,7 @@ def test_counts_are_not_believed(tmp_path: Path) -> None:
     path.write_bytes(struct.pack("<Q", 2**62) + whole[8:])
     with pytest.raises(DataError, match="ends early"):
         READER.read_calibration(tmp_path)
-    points = len(whole) - 8 - 24  # one image with one point: its count stands before the last 24 bytes
+    points = len(whole) - 8 - 24  # one image with one point: its count is before the last 24 bytes
     path.write_bytes(whole[:points] + struct.pack("<Q", 2**63) + whole[points + 8 :])
     with pytest.raises(DataError, match="ends early"):
         READER.read_calibration(tmp_path)

@@ -1,4 +1,4 @@
-"""Kalibr camera chains: a real one, and what is wrong with others."""
+"""Kalibr camera chains: a real one, and faulty ones."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CAMERA = {
 
 
 def chain(path: Path, **keys: str | None) -> Path:
-    """A chain of one camera with some keys changed; None leaves one out."""
+    """Write a chain of one camera with some keys changed; None leaves one out."""
     lines = [f"  {key}: {value}" for key, value in {**CAMERA, **keys}.items() if value is not None]
     path.write_text("\n".join(["cam0:", *lines, ""]))
     return path

@@ -1,4 +1,4 @@
-"""ROS camera calibrations: real files of both forms, and what is wrong with others."""
+"""ROS camera calibrations: real files of both forms, and faulty ones."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ rectification
 
 
 def stored(path: Path, **keys: str | None) -> Path:
-    """A calibration with some keys changed; None leaves one out."""
+    """Write a calibration with some keys changed; None leaves one out."""
     lines = [f"{key}: {value}" for key, value in {**KEYS, **keys}.items() if value is not None]
     path.write_text("\n".join([*lines, ""]))
     return path

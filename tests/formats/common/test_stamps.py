@@ -1,4 +1,4 @@
-"""Stamps keep every nanosecond, whatever their form."""
+"""Time stamps that keep every nanosecond, in every form."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pipelines.formats.common.stamps import (
 )
 from pipelines.session.errors import DataError
 
-# Whole seconds of an epoch stamp leave no room for the nanoseconds in a float64 (0.2 us there).
+# An epoch stamp in float64 seconds has no room for nanoseconds (its step is 0.2 us).
 STAMPS = st.lists(st.integers(-(2**62), 2**62), min_size=1, max_size=30)
 
 
@@ -53,7 +53,7 @@ def test_exponents_and_plain_forms_agree(values: list[int], unit: int) -> None:
         ("-0.25", -250_000_000),
         ("+1.5e-3", 1_500_000),
         ("  7 ", 7_000_000_000),
-        ("0.0166666666666666666", 16_666_667),  # the eleventh digit rounds it up
+        ("0.0166666666666666666", 16_666_667),  # the eleventh digit rounds up
         ("0.0000000004", 0),
         ("0.0000000005", 1),
         ("0.9999999996", 1_000_000_000),

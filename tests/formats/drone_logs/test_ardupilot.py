@@ -1,4 +1,4 @@
-"""ArduPilot's logs, written byte for byte by the published format, with known truth."""
+"""ArduPilot's logs, written byte by byte in the published format, with known truth."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_attitudes(tmp_path: Path, truth: DroneTruth) -> None:
     assert telemetry.body is not None
     assert telemetry.gimbal is not None
     off = multiply(conjugate(truth.body), telemetry.body.quaternion_xyzw)
-    # Three angles rounded to 0.01 deg: 0.009 deg together at worst, half of that in the quaternion.
+    # Three angles rounded to 0.01 deg: at most 0.009 deg together, half of that in the quaternion.
     assert np.abs(off[:, :3]).max() < np.radians(0.009) / 2
     ahead = rotate(telemetry.gimbal.quaternion_xyzw, np.array([1.0, 0, 0]))
     yaw = np.degrees(np.arctan2(ahead[:, 0], ahead[:, 1]))
@@ -89,7 +89,7 @@ def test_time_by_gps(tmp_path: Path, truth: DroneTruth) -> None:
     path = write_dataflash(tmp_path / "a.bin", truth)
     telemetry = read(path)
     assert telemetry.clock == "UTC by GPS"
-    # GPS states whole ms, cut: half a ms in the middle, and the autopilot's clock 1 us.
+    # GPS gives truncated ms: half a ms on average, and the autopilot's clock 1 us.
     assert np.abs(telemetry.position.t_ns - truth.t_ns).max() < 1_000_000
     np.testing.assert_array_equal(read(path, time="boot").position.t_ns, truth.boot_us * 1000)
     assert np.abs(FORMAT.picture_times(path, TelemetryChoice()) - truth.t_ns).max() < 1_000_000
@@ -108,12 +108,12 @@ def test_a_clock_that_drifts_is_found(tmp_path: Path) -> None:
     telemetry = read(path)
     assert telemetry.fit is not None
     assert telemetry.fit.drift_ppm == pytest.approx(35.0, abs=1.0)
-    # 35 ppm of 600 s are 21 ms; whole ms of GPS are left.
+    # 35 ppm of 600 s are 21 ms; the truncation of GPS to whole ms remains.
     assert np.abs(telemetry.position.t_ns - t_ns).max() < 1_500_000
 
 
 def test_a_log_from_2014_as_pymavlink_reads_it() -> None:
-    # Times are ms since boot, in GPS messages of the GPS week.
+    # Stamps are ms since boot, but ms of the GPS week in GPS messages.
     path = real_data("second/erle_25.bin")
     mavutil = pytest.importorskip("pymavlink.mavutil")
     theirs = mavutil.mavlink_connection(str(path))
@@ -143,8 +143,8 @@ def test_a_log_from_2014_as_pymavlink_reads_it() -> None:
     yaw = np.degrees(np.arctan2(ahead[:, 0], ahead[:, 1])) % 360
     known = np.isin([t for t, _ in turned], telemetry.body.t_ns)
     np.testing.assert_allclose(yaw, np.array([y for _, y in turned])[known], atol=1e-4)
-    # Week 1813 and 16 leap seconds. Its own clock goes 9 % slow, which no fit of clocks takes for a drift:
-    # only the middle fits.
+    # Week 1813 and 16 leap seconds. Its own clock is 9 % slow, more than the clock fit accepts as a drift,
+    # so only the middle fits.
     utc_s = 315_964_800 + 1813 * 604_800 - 16 + np.array([ms / 1e3 for _, _, _, _, ms in fixes])
     late_s = read(path).position.t_ns / 1e9 - utc_s
     assert abs(np.median(late_s)) < 0.2
@@ -157,7 +157,7 @@ def test_damage(tmp_path: Path, truth: DroneTruth, capfd: pytest.CaptureFixture[
     path.write_bytes(whole[:middle] + b"\x00\xa3\x17garbage" + whole[middle:-5])
     telemetry = read(path)
     assert len(telemetry.position.t_ns) >= len(truth.t_ns) - 2
-    assert capfd.readouterr().err == ""  # pymavlink prints each byte that it does not understand
+    assert capfd.readouterr().err == ""  # pymavlink prints each byte that it cannot read
     path.write_bytes(whole[:700])
     with pytest.raises(DataError, match="has no POS, XKF1, NKF1 or GPS"):
         read(path)
@@ -188,7 +188,7 @@ def test_without_pymavlink_it_is_said_what_to_install(
 def test_an_instance_is_that_of_an_estimator_and_never_that_of_a_mount(
     tmp_path: Path, truth: DroneTruth
 ) -> None:
-    """Another estimator has the drone 50 m further north, and another mount looks straight down."""
+    """Use a second estimator 50 m further north, and a second mount that looks straight down."""
     path = write_dataflash(tmp_path / "a.bin", truth)
     with path.open("ab") as log:
         for us, (east, north, up) in zip(truth.boot_us.tolist(), truth.enu.tolist(), strict=True):

@@ -1,4 +1,4 @@
-"""DJI's subtitles: every generation on real files, and what each of them means."""
+"""DJI's subtitles: real files of every generation, and the meaning of their fields."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_real_files_hold_what_they_are_said_to(name: str) -> None:
         assert described["height_above_take_off_m"] == [relative["min"], relative["max"]]
     telemetry = read(path, altitude=None if name != "mavic_2pro_new.SRT" else 50)
     assert len(telemetry.position.t_ns) + sum(telemetry.dropped.values()) == told["blocks"]
-    # The first fix is not moved; what it is read from is printed as it stands.
+    # The first fix is not moved, and the file gives it with these digits.
     assert telemetry.position.values[0, :2].tolist() == told["lat_lon_first"]
     assert (telemetry.gimbal is not None) == ("gimbal_pry_first" in told)
 
@@ -136,7 +136,7 @@ def test_yaw_is_followed_across_north(tmp_path: Path) -> None:
     gimbal = read(subtitles(tmp_path / "a.srt", *texts)).gimbal
     assert gimbal is not None
     ahead = rotate(gimbal.quaternion_xyzw, np.array([1.0, 0, 0]))
-    np.testing.assert_allclose(ahead[:, 1], -1, atol=2e-4)  # south throughout, never by way of north
+    np.testing.assert_allclose(ahead[:, 1], -1, atol=2e-4)  # south throughout, never through north
 
 
 def test_angles_whose_clock_goes_back_are_dropped(tmp_path: Path) -> None:
@@ -192,7 +192,7 @@ def test_an_altitude_that_names_no_reference(
 
 
 def test_a_mavic_air_2_counts_from_its_take_off() -> None:
-    # It hovers over ground that lies more than 50 m above the sea.
+    # It hovers above ground that is more than 50 m above the sea.
     path = real_data("second/mavic_air2.srt")
     assert FORMAT.describe(path)["height_m"] == [27.3, 29.2]
     for stated in (None, "relative"):
@@ -211,7 +211,7 @@ def test_subtitles_of_one_moment(tmp_path: Path) -> None:
     assert (described["subtitles"], described["span_s"]) == (3, 0.0)
     assert "rate_hz" not in described
     assert read(path).dropped == {"duplicate stamp": 2}
-    # Of subtitles without a clock beside others the time is not known: not the year 1970.
+    # A subtitle without a clock, among others with one, has an unknown time, not the year 1970.
     path.write_text("".join(blocks).replace("2024-05-01 10:00:01.000", "", 1))
     assert FORMAT.describe(path)["first_ns"] == 1_714_557_601_000_000_000
 
@@ -229,7 +229,7 @@ def test_losses_are_counted(tmp_path: Path) -> None:
     telemetry = read(path)
     assert len(telemetry.position.t_ns) == 2
     assert telemetry.dropped == {"no position": 1, "not on Earth": 1, "no fix (0, 0)": 1}
-    # Cut in the middle of a character of two bytes.
+    # Cut in the middle of a two-byte character.
     path.write_bytes(path.read_bytes()[:-60] + b"\xc2")
     assert len(read(path).position.t_ns) == 1
 
@@ -245,14 +245,14 @@ def test_times_are_those_of_frame_times(tmp_path: Path) -> None:
 
 
 def test_repeated_measurements_become_lines() -> None:
-    # 30 pictures a second, a fix every fifth: a drone that flies straight is on a line again.
+    # 30 pictures a second, a fix every fifth: the positions of a straight flight are on a line again.
     t_ns = np.arange(31, dtype=np.int64) * 33_000_000
     true = np.stack([2.0 * t_ns / 1e9, -t_ns / 1e9], axis=1)
     seen = true[np.arange(31) // 5 * 5]
     smooth, moved = between_repeats(t_ns, seen)
     np.testing.assert_allclose(smooth, true, atol=1e-12)
     assert moved == 24
-    # One that hovers for three seconds and then moves at once did not drift there all the while.
+    # A drone that hovers for three seconds and then moves at once did not drift during those seconds.
     t_ns = np.arange(40, dtype=np.int64) * 100_000_000
     seen = np.where(t_ns >= 3_000_000_000, 5.0, 0.0)[:, None]
     smooth, _ = between_repeats(t_ns, seen)
@@ -262,7 +262,7 @@ def test_repeated_measurements_become_lines() -> None:
 
 
 def test_an_angle_that_is_held_and_steps_does_so_where_it_was_logged(tmp_path: Path) -> None:
-    """Held for three seconds, or twice for half a second: no number before the step knows of it."""
+    """Hold an angle for three seconds, or twice for half a second; rows before the step must not change."""
     pitch = np.where(np.arange(150) < 90, -10.0, np.where(np.arange(150) < 105, -40.0, -80.0))
     texts = [
         f"[latitude: 47.5] [longitude: 8.25] [rel_alt: 3.5] [gb_yaw: 0.0 gb_pitch: {each} gb_roll: 0.0]"
@@ -289,7 +289,7 @@ def test_a_slew_that_every_picture_shows_stays_where_it_was_logged() -> None:
 
 @pytest.mark.parametrize("rows", [2, 3, 6])
 def test_angles_that_are_repeated_become_lines_and_their_holds_stay(rows: int) -> None:
-    """Yaw turns evenly, pitch is held, turns and is held again; both are refreshed at a lower rate."""
+    """Turn yaw evenly; hold pitch, turn it and hold it again. Both are refreshed at a lower rate."""
     number = np.arange(60 * rows + 1)
     t_ns = number * 33_000_000
     true = np.stack(
@@ -298,7 +298,7 @@ def test_angles_that_are_repeated_become_lines_and_their_holds_stay(rows: int) -
     seen = true[number // rows * rows]
     found = between_refreshed_angles(t_ns, seen)
     np.testing.assert_allclose(found[:, 0], true[:, 0], atol=1e-9)
-    # The first change ends a hold: the line to it may begin one row early, as rates do not keep step.
+    # The first change ends a hold. The line to it may begin one row early, because the rates differ.
     np.testing.assert_allclose(found[:, 1], true[:, 1], atol=40 / 10 / (rows + 1) + 1e-9)
     held = number < 31 * rows - (rows + 1)
     np.testing.assert_array_equal(found[held, 1], 0)
@@ -306,11 +306,11 @@ def test_angles_that_are_repeated_become_lines_and_their_holds_stay(rows: int) -
 
 
 def test_angles_whose_refresh_does_not_keep_step_with_the_pictures_become_lines() -> None:
-    """10 Hz in 29.97 pictures a second: three rows each, now and then two or four."""
+    """Use 10 Hz in 29.97 pictures a second: usually three rows each, sometimes two or four."""
     number = np.arange(600)
     t_ns = np.round(number * 1e9 / 29.97).astype(np.int64)
     at_s = np.floor(t_ns / 1e8) / 10
     found = between_refreshed_angles(t_ns, (20 * at_s)[:, None])[:, 0]
     behind = 20 * (t_ns / 1e9) - found
-    # Each measurement is shown up to a picture late, and at the end none comes after the last.
+    # Each measurement is shown up to a picture late, and none follows the last one.
     assert np.ptp(behind[:-4]) < 20 / 29.97 + 1e-6

@@ -1,4 +1,4 @@
-"""PX4's logs: real ones by facts.json, and written ones whose truth is known."""
+"""PX4's logs: real ones against facts.json, and written ones with known truth."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_axes_and_times(tmp_path: Path, truth: DroneTruth) -> None:
     assert telemetry.body is not None
     assert telemetry.gimbal is not None
     assert np.abs(multiply(conjugate(truth.body), telemetry.body.quaternion_xyzw)[:, :3]).max() < 1e-6
-    # The moment of the sample counts, not that of publication 2 ms later; both clocks in whole microseconds.
+    # The time of sampling is used, not that of publication 2 ms later; both clocks in whole microseconds.
     assert np.abs(telemetry.position.t_ns - truth.t_ns).max() <= 1001
     assert telemetry.clock == "UTC by GPS"
     assert telemetry.fit is not None
@@ -114,7 +114,7 @@ def test_a_gimbal_that_counts_from_the_nose(tmp_path: Path, truth: DroneTruth) -
     assert by_north is not None
     assert by_nose is not None
     off = multiply(conjugate(by_north.quaternion_xyzw), by_nose.quaternion_xyzw)
-    # Yaw of the nose from a body that leans by 5 deg, from floats of 32 bits.
+    # Yaw from the nose, for a body with a lean of 5 deg, from 32-bit floats.
     assert np.abs(off[:, :3]).max() < 1e-6
 
 
@@ -131,7 +131,7 @@ def test_an_estimator_that_moves_its_origin_is_followed(tmp_path: Path, truth: D
         else:
             later.append((name, instance, fields))
     telemetry = read(write_ulog(tmp_path / "a.ulg", rows[:half] + later))
-    # The vertical 40 m away is turned by 6e-6: 0.1 mm; heights of 280 m fit floats of 32 bits to 3e-5.
+    # The vertical 40 m away is turned by 6e-6: 0.1 mm. Heights of 280 m fit 32-bit floats to 3e-5.
     np.testing.assert_allclose(telemetry.position.values, truth.enu, atol=5e-4)
     assert any("moved its origin 1 times" in note for note in telemetry.notes)
 
@@ -161,7 +161,7 @@ def test_what_is_not_there(tmp_path: Path, truth: DroneTruth) -> None:
 
 
 def test_an_instance_is_taken_or_refused(tmp_path: Path, truth: DroneTruth) -> None:
-    """A second receiver with heights 7 m above the first one's, and a second gimbal that looks elsewhere."""
+    """Use a second receiver with heights 7 m above the first one's, and a second, turned gimbal."""
     rows = ulog_rows(truth)
     for name, _, fields in ulog_rows(truth):
         if name == "vehicle_gps_position":

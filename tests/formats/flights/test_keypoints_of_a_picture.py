@@ -1,4 +1,4 @@
-"""Keypoints against the size of their picture: kept, left out, or of another picture altogether."""
+"""Keypoints against the size of their picture: kept, dropped, or of a picture of another size."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CAMERA = Camera.model_validate({"pose": {"tum": "a.tum"}, "intrinsics": LENS_OF,
 
 
 def check(xy: Float, confidence: Float) -> None:
-    """Ask for the intrinsics of a camera with these keypoints [N, 2]."""
+    """Request the intrinsics of a camera with these keypoints [N, 2]."""
     flight = Flight.model_validate({"schema": 1, "cameras": {"drone1": CAMERA}})
     sources = CalibrationSources(Path("flight.yaml"), FlightLogs(flight, Path(), print), print)
     number = np.arange(len(xy))
@@ -39,7 +39,7 @@ def check(xy: Float, confidence: Float) -> None:
 
 @st.composite
 def entering(draw: st.DrawFn) -> tuple[Float, Float]:
-    """People inside, of whom a detector extrapolates up to a fifth of the keypoints beyond each border."""
+    """Draw people inside; the detector extrapolates up to a tenth of the keypoints beyond each border."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     inside = rng.uniform(0, [WIDTH - 1, HEIGHT - 1], (draw(st.integers(20, 100)), 2))
     for axis, size in enumerate((WIDTH, HEIGHT)):
@@ -59,7 +59,7 @@ def test_keypoints_of_larger_pictures_are_refused_with_numbers_outside(
     seed: int, times: float, all_alike: bool
 ) -> None:
     rng = np.random.default_rng(seed)
-    xy = rng.uniform(0, [times * WIDTH, times * HEIGHT], (500, 2))  # 1 - 1 / times^2 of them lie outside
+    xy = rng.uniform(0, [times * WIDTH, times * HEIGHT], (500, 2))  # a share 1 - 1 / times^2 lies outside
     confidence = np.full(500, 0.9 if all_alike else 0.0)
     with pytest.raises(DataError) as told:
         check(xy, confidence)
@@ -71,7 +71,7 @@ def test_keypoints_of_larger_pictures_are_refused_with_numbers_outside(
 
 @given(st.integers(0, 2**32))
 def test_keypoints_that_count_from_elsewhere_are_refused_with_numbers_outside(seed: int) -> None:
-    """From the middle of the picture: three quarters are negative, one is not."""
+    """Count pixels from the middle of the picture: in three quarters of it a coordinate is negative."""
     xy = np.random.default_rng(seed).uniform(-0.5, 0.5, (500, 2)) * [WIDTH, HEIGHT]
     with pytest.raises(DataError) as told:
         check(xy, np.ones(500))
@@ -81,7 +81,7 @@ def test_keypoints_that_count_from_elsewhere_are_refused_with_numbers_outside(se
 
 
 def test_what_a_detector_makes_up_of_legs_below_the_picture_refuses_no_flight() -> None:
-    """Half of every person lies below the border, found with a tenth of the confidence of the rest."""
+    """Put half of every person below the border, with a tenth of the confidence of the rest."""
     below = np.arange(1000) % 2 == 0
     xy = np.stack([np.full(1000, 600.0), np.where(below, HEIGHT + 40.0, 500.0)], axis=1)
     check(xy, np.where(below, 0.08, 0.8))
@@ -104,7 +104,7 @@ def test_keypoints_slightly_outside_are_kept_and_far_ones_left_out(tmp_path: Pat
     flight = write_flight(tmp_path, cameras=2, seconds=0.5, clean=True)
     succeeds("ingest", flight.manifest)
     before = len(keypoints_of(flight))
-    # A detector extrapolates in frame 2, puts one joint where no box reached in 3, and a person in 4.
+    # The detector extrapolates in frame 2; in 3 a joint lies beyond any box, in 4 a whole person.
     moved(flight, {2: [slightly] * 5, 3: [-300.0], 4: [3000.0] * 17})
     succeeds("ingest", flight.manifest)
     kept = keypoints_of(flight)

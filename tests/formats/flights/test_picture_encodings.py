@@ -1,4 +1,4 @@
-"""Pictures of logs in every layout that ROS names: colours come out as they went in."""
+"""Pictures of logs in every layout that ROS names: decoded colours equal the encoded ones."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ GREY = 0.114 * BLUE + 0.587 * GREEN + 0.299 * RED
 
 
 def mosaic(pattern: str) -> Picture:
-    """What a sensor sees of one colour, its first two rows of filters named by their first letters."""
+    """Make the mosaic of a sensor for one colour; `pattern` names the filters of its first two rows."""
     level = {"r": RED, "g": GREEN, "b": BLUE}
     tile = np.array([level[letter] for letter in pattern], np.uint8).reshape(2, 2)
     return np.tile(tile, (HEIGHT // 2, WIDTH // 2))
 
 
 def chroma() -> tuple[float, float, float]:
-    """Y, U and V of the colour, as in video: 16 to 235 and 16 to 240 (ITU-R BT.601)."""
+    """Compute Y, U and V of the colour, as in video: 16 to 235 and 16 to 240 (ITU-R BT.601)."""
     y = 16 + GREY * 219 / 255
     return y, 128 + (BLUE - GREY) / 1.772 * 224 / 255, 128 + (RED - GREY) / 1.402 * 224 / 255
 
 
 def in_pairs(*order: int) -> Picture:
-    """Two pixels in four bytes, in which Y, U and V have this order."""
+    """Encode two pixels in four bytes, with Y, U and V in this order."""
     values = [round(chroma()[k]) for k in order]
     return np.tile(np.array(values, np.uint8), (HEIGHT, WIDTH // 2))
 
@@ -62,7 +62,7 @@ ENCODED: dict[str, Picture] = {
     "yuv422_yuy2": in_pairs(0, 1, 0, 2),
     "yuyv": in_pairs(0, 1, 0, 2),
 }
-# Y, U and V were rounded: half a step of each, times the factors of the way back, and the result's own.
+# Y, U and V were rounded: half a step of each, times the factors of the inverse, and the result's rounding.
 ROUNDED = 0.5 * (255 / 219 + 1.772 * 255 / 224) + 1
 
 
@@ -96,7 +96,7 @@ def test_pictures_that_are_cut_short_are_missing(encoding: str) -> None:
 
 
 def test_what_opencv_refuses_is_missing() -> None:
-    # Two pixels share their colours: there is no such picture with a single column.
+    # Two pixels share their colours, so there is no such picture with a single column.
     assert decode(PictureSample(1, 1, "yuyv", 1, 4, 2, np.zeros(8, np.uint8))) is None
     assert decode(PictureSample(1, 1, "jpeg", None, None, None, np.zeros(8, np.uint8))) is None
     assert decode(PictureSample(1, 1, "jpeg", None, None, None, np.zeros(0, np.uint8))) is None
