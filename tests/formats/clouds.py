@@ -1,4 +1,4 @@
-"""The cloud that the tests of PCD and PLY write in every way these formats know."""
+"""Cloud that the tests of PCD and PLY write in every encoding of these formats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Damage as disks, networks and hostile people do it: a reader may refuse a file or read it, nothing else."""
+"""Damage as from disks, networks and attackers: a reader may refuse such a file or read it, nothing else."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pipelines.session.registries import MapFormat
 
 
 def damaged(content: bytes, seed: int) -> bytes:
-    """A copy with a few bytes changed, cut out, doubled, or cut off at the end."""
-    choice = random.Random(seed)  # noqa: S311 - damage needs no secrecy, but must be the same every time
+    """Return a copy with a few bytes changed, cut out, doubled, or cut off at the end."""
+    choice = random.Random(seed)  # noqa: S311 - damage needs no secrecy, but must be reproducible
     changed = bytearray(content)
     for _ in range(choice.randint(1, 4)):
         at = choice.randrange(len(changed)) if changed else 0
-        # Headers are a small part of a file and the better target: every other hit goes there.
+        # Headers are a small part of a file but the better target, so every other change is there.
         at = min(at, choice.randrange(200)) if choice.random() < 0.5 else at
         match choice.randrange(4):
             case 0:
@@ -32,7 +32,7 @@ def damaged(content: bytes, seed: int) -> bytes:
 
 
 def refuse_or_read(reader: MapFormat, path: Path, content: bytes, *, tries: int) -> int:
-    """Read damaged copies of a file; how many were refused. Any error but a DataError escapes."""
+    """Read damaged copies of a file; return how many were refused. Only a DataError is accepted."""
     refused = 0
     for seed in range(tries):
         path.write_bytes(damaged(content, seed))

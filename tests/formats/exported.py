@@ -1,4 +1,4 @@
-"""A recording whose every number is known, for the tests of exports."""
+"""Recording with known numbers, for the tests of exports."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ VOXEL_M = 0.5
 
 
 class Listener:
-    """Progress that remembers what was said."""
+    """Progress that keeps its notes."""
 
     def __init__(self) -> None:
         self.notes: list[str] = []
 
     def start(self, _: str, __: int) -> None:
-        """Not looked at."""
+        """Ignore the call."""
 
     def advance(self, _: int = 1) -> None:
-        """Not looked at."""
+        """Ignore the call."""
 
     def note(self, message: str) -> None:
         self.notes.append(message)
@@ -39,7 +39,7 @@ def stamps(count: int) -> NDArray[np.int64]:
 
 
 def walking(count: int = 60) -> JointMotion:
-    """One person who walks; bones are rigid, nothing is missing."""
+    """Make one person who walks; bones are rigid, nothing is missing."""
     position = walk(np.arange(count) / FPS, radius_m=4.0)[:, None]
     covariance = np.zeros((*position.shape[:3], 6))
     covariance[..., [0, 3, 5]] = np.square(SIGMA_M)
@@ -55,20 +55,20 @@ def walking(count: int = 60) -> JointMotion:
 
 
 def without(motion: JointMotion, joint: str, rows: slice | list[int]) -> JointMotion:
-    """The motion without a joint at some times."""
+    """Remove a joint from the motion at some times, in place; return the motion."""
     motion.position[rows, :, motion.joints.index(joint)] = np.nan
     return motion
 
 
 def flown(count: int = 60) -> Trajectory:
-    """A camera that looks north and goes east by 1 m/s, 4 m above the origin."""
+    """Make a camera that looks north and moves east at 1 m/s, 4 m above the origin."""
     t_ns = stamps(count)
     position = np.stack([(t_ns - START_NS) / 1e9, np.full(count, -8.0), np.full(count, 4.0)], axis=1)
     return Trajectory(t_ns, position, np.tile(LOOKING_NORTH, (count, 1)))
 
 
 def block() -> Occupancy:
-    """A solid block of 3 x 3 x 3 voxels: all but the innermost are its surface."""
+    """Make a solid block of 3 x 3 x 3 voxels: all but the innermost are its surface."""
     probability = np.full((5, 5, 5), 0.1, np.float32)
     probability[1:4, 1:4, 1:4] = 0.9
     return Occupancy(probability, np.array([10.0, 20.0, 0.0]), VOXEL_M)
@@ -79,7 +79,7 @@ def picture(level: int) -> NDArray[np.uint8]:
 
 
 def recording(count: int = 60, progress: Listener | None = None) -> Recording:
-    """One camera (with a hyphen), its pictures every half second, a map, and a wrist missing at frame 7."""
+    """Make one camera (with a hyphen), pictures every half second, a map, and no left wrist in frame 7."""
     t_ns = stamps(count)
     stills = [(int(t_ns[row]), picture(40 + row)) for row in range(0, count, FPS // 2)]
     return Recording(

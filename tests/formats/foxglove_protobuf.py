@@ -1,4 +1,4 @@
-"""Foxglove's schemas as dynamic protobuf messages, the way a reader of MCAP builds them."""
+"""Foxglove's schemas as dynamic protobuf messages, built as in a reader of MCAP."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from google.protobuf import (
     timestamp_pb2,
 )
 
-# A star is a repeated field, a capital a message; the rest are protobuf's own words.
+# A star means a repeated field, a capital a message; the rest are protobuf's own words.
 _MESSAGES = {
     "Vector3": {"x": "double", "y": "double", "z": "double"},
     "Quaternion": {"x": "double", "y": "double", "z": "double", "w": "double"},
@@ -84,6 +84,6 @@ _POOL = _pool()
 
 
 def protobuf(name: str, **fields: Any) -> Any:
-    """A message, serialised and parsed again; nested ones are given as dicts."""
+    """Make a message by serialising and parsing it; nested ones are given as dicts."""
     kind = message_factory.GetMessageClass(_POOL.FindMessageTypeByName(f"foxglove.{name}"))
     return kind.FromString(kind(**fields).SerializeToString())

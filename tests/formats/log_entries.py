@@ -1,4 +1,4 @@
-"""A short flight as log entries: odometry, pictures and a topic that nobody asks for."""
+"""Short flight as log entries: odometry, pictures and a topic that is not requested."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ POSE, PICTURE, OTHER = "/drone1/odometry", "/drone1/camera/image/compressed", "/
 
 
 def entries(seconds: float = 1.0, start_ns: int = START_NS) -> list[Entry]:
-    """Odometry at 100 Hz and pictures at 10 Hz; received 3 ms after their header stamps.
+    """Make odometry at 100 Hz and pictures at 10 Hz, received 3 ms after their header stamps.
 
-    Messages of a topic hold their number: x of the position, every byte of the picture.
+    Messages of a topic contain their number: as x of the position, or as the first byte of the picture.
     """
     rng = np.random.default_rng(0)
     rows = []
@@ -34,30 +34,30 @@ def entries(seconds: float = 1.0, start_ns: int = START_NS) -> list[Entry]:
 
 
 def _picture(number: int, rng: np.random.Generator) -> bytes:
-    """Bytes that do not compress, as of a JPEG; the number first."""
+    """Make bytes that do not compress, as in a JPEG; the number is the first byte."""
     return bytes([number % 256]) + rng.integers(0, 256, 1999, dtype=np.uint8).tobytes()
 
 
 def log_format(path: Path) -> LogFormat:
-    """The format of a log, as the program finds it."""
+    """Find the format of a log, as the program does."""
     return recognise(path, LogFormat, "log")
 
 
 def positions(path: Path) -> tuple[list[float], dict[str, int]]:
-    """x of every pose that can be read, and what was lost."""
+    """Return x of every readable pose, and the losses."""
     with log_format(path).open_log([path]) as log:
         return [m.value.pose.pose.position.x for m in log.messages([POSE])], dict(log.dropped)
 
 
 def everything(path: Path) -> tuple[list[tuple[str, int]], dict[str, int]]:
-    """Topic and stamp of every message that can be read, and what was lost."""
+    """Return topic and stamp of every readable message, and the losses."""
     with log_format(path).open_log([path]) as log:
         found = [(m.topic.name, m.receive_ns) for m in log.messages([t.name for t in log.topics])]
         return found, dict(log.dropped)
 
 
 def everything_or_one_line(path: Path) -> tuple[list[tuple[str, int]], dict[str, int]]:
-    """The same of a log that may be damaged beyond use: nothing, and the one line that says so."""
+    """Return the same of a log that may be unusable; then no messages and the line count of the error."""
     try:
         log_format(path).describe(path)
         return everything(path)
@@ -66,5 +66,5 @@ def everything_or_one_line(path: Path) -> tuple[list[tuple[str, int]], dict[str,
 
 
 def recognised_by(path: Path) -> list[str]:
-    """The names of the formats that know a path."""
+    """Return the names of the formats that recognise a path."""
     return [f.name for f in FORMATS.all() if f.recognises(path)]

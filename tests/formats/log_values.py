@@ -1,4 +1,4 @@
-"""Decoded messages as the readers of logs hand them over: ROS 1, ROS 2, Foxglove's JSON and protobuf."""
+"""Decoded messages in the form of the log readers: ROS 1, ROS 2, Foxglove's JSON and protobuf."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def message(
 
 
 def ros(ros_version: str, type_name: str, **fields: Any) -> Any:
-    """A message of rosbags, as it comes back from being serialised."""
+    """Make a rosbags message by serialising and deserialising it."""
     store = STORES[ros_version]
     value = store.types[type_name](**fields)
     if ros_version == "ros1":
@@ -41,7 +41,7 @@ def header(ros_version: str, stamp_ns: int, frame: str = "world") -> Any:
 
 
 def part(ros_version: str, type_name: str, *values: float) -> Any:
-    """geometry_msgs: a Point, Vector3 or Quaternion."""
+    """Make a Point, Vector3 or Quaternion of geometry_msgs."""
     fields = dict(zip("xyzw", values, strict=False))
     return STORES[ros_version].types[f"geometry_msgs/msg/{type_name}"](**fields)
 
@@ -95,7 +95,7 @@ def odometry(
 
 
 def camera_info(ros_version: str, stamp_ns: int = 0, **changed: Any) -> Any:
-    """640 x 480, f = 800, centre (320, 240), and what is to differ from it (lower-case keys)."""
+    """Make a camera of 640 x 480, f = 800, centre (320, 240), with some (lower-case) keys changed."""
     types = STORES[ros_version].types
     region = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
     fields: dict[str, Any] = {
@@ -117,7 +117,7 @@ def camera_info(ros_version: str, stamp_ns: int = 0, **changed: Any) -> Any:
 
 
 def from_json(**fields: Any) -> Any:
-    """JSON as attribute objects."""
+    """Convert fields through JSON to attribute objects."""
     return json.loads(json.dumps(fields), object_hook=lambda mapping: SimpleNamespace(**mapping))
 
 

@@ -1,4 +1,4 @@
-"""Joint motions that hypothesis draws for round trips."""
+"""Joint motions drawn by hypothesis for round trips."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NAMES = sorted({joint for skeleton in SKELETONS.values() for joint in skeleton.j
 
 @st.composite
 def motions(draw: st.DrawFn, *, people: int | None = None) -> JointMotion:
-    """A few times, people and joints, about a third of them missing, with status and reprojection errors."""
+    """Draw a few times, people and joints, some 30 % of them missing, with status and reprojection errors."""
     stamps = draw(st.lists(st.integers(-(10**15), 2 * 10**18), min_size=1, max_size=8, unique=True))
     joints = draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=5, unique=True))
     count = people or draw(st.integers(1, 3))

@@ -1,4 +1,4 @@
-"""What the simulator writes is read by the readers of the house and by those that others use."""
+"""Files of the simulator, read by our own readers and by those of other projects."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_stamps_and_pictures_of_a_video_in_parts(tmp_path: Path, parts: list[int
 
     index = video.FORMAT.index(whole)
     assert (index.count, index.start_ns, index.width, index.height) == (40, 0, *SIZE)
-    assert np.abs(index.pts_ns - pts_ns).max() <= HALF_TICK_NS + 1  # and a nanosecond of rounding
+    assert np.abs(index.pts_ns - pts_ns).max() <= HALF_TICK_NS + 1  # with a nanosecond of rounding
     with av.open(str(whole)) as container:
         shown = [
             read_bar_code(np.asarray(frame.to_ndarray(format="bgr24"), np.uint8))

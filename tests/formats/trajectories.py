@@ -1,4 +1,4 @@
-"""Trajectories that hypothesis draws for round trips."""
+"""Trajectories drawn by hypothesis for round trips."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pipelines.session.records import Trajectory
 
 @st.composite
 def trajectories(draw: st.DrawFn, *, with_covariance: bool = False) -> Trajectory:
-    """Rows with increasing stamps, positions over a wide range and unit quaternions."""
+    """Draw rows with increasing stamps, positions over a wide range and unit quaternions."""
     stamps = draw(st.lists(st.integers(-(10**17), 2 * 10**18), min_size=1, max_size=20, unique=True))
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     count = len(stamps)

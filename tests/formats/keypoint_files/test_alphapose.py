@@ -1,4 +1,4 @@
-"""AlphaPose results: the real file, and small ones with every oddity of the format."""
+"""AlphaPose results: the real file, and small ones with every special case of the format."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def test_the_real_file_holds_what_is_known_of_it() -> None:
     np.testing.assert_allclose(np.nanmax(found.xy, axis=(0, 1)), facts["xy_bbox"]["max"], atol=0.005)
     confidence = np.concatenate([entry["keypoints"][2::3] for entry in json.loads(path.read_text())])
     assert confidence.max() == pytest.approx(facts["conf_range"][1], abs=5e-4)
-    assert facts["conf_range"][1] > 1  # AlphaPose's heatmaps exceed 1 a little
+    assert facts["conf_range"][1] > 1  # AlphaPose's heatmaps slightly exceed 1
     assert found.confidence.max() == 1
     assert found.adjusted == {"confidence above 1, set to 1": np.count_nonzero(confidence > 1)}
-    # Everybody's idx is 0 (no tracker), so the second person of one frame must not be taken for the first.
+    # Everybody's idx is 0 (no tracker). The second person of a frame must not count as a repeat of the first.
     assert found.dropped == {}
     assert sorted(set(found.person.tolist())) == [0, 1]
 

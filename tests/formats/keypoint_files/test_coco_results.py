@@ -82,7 +82,7 @@ def test_results_by_number_or_name(tmp_path: Path) -> None:
 
 
 def test_a_joint_of_confidence_zero_was_not_found(tmp_path: Path) -> None:
-    # pycocotools counts the joints with a third value above 0; where the others stand means nothing.
+    # pycocotools counts the joints with a third value above 0; the positions of the others have no meaning.
     entry = result(1)
     keypoints = entry["keypoints"]
     assert isinstance(keypoints, list)

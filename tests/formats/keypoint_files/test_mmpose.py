@@ -1,4 +1,4 @@
-"""MMPose predictions in each of the shapes that its inferencer and demos save."""
+"""MMPose predictions in each form that its inferencer and demos save."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_missing_joints(tmp_path: Path) -> None:
     path = written(tmp_path / "walk.json", video([one]))
     found = FORMAT.read_keypoints(path, skeleton=None, first_frame=0)
     assert np.isnan(found.xy[0, :2]).all()
-    assert found.xy[0, 2].tolist() == [0, 0]  # a score says that the corner is meant
+    assert found.xy[0, 2].tolist() == [0, 0]  # its score shows that the corner is a real position
     assert found.confidence[0, :3].tolist() == [0, 0, 0.25]
     assert found.dropped == {"joint not finite": 1}
 

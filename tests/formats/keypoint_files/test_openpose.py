@@ -1,4 +1,4 @@
-"""OpenPose folders: the real recordings, and small ones with every oddity of the format."""
+"""OpenPose folders: the real recordings, and small ones with every special case of the format."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def test_bad_folders_are_one_clear_line(tmp_path: Path) -> None:
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(st.lists(st.lists(st.booleans(), max_size=3), min_size=1, max_size=6))
 def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, seen: list[list[bool]]) -> None:
-    """Each frame is a list of places, each filled by a person or by {}."""
+    """Write each frame as a list of places, each filled by a person or by {}."""
     seen = [*seen, [True]]
     folder = tmp_path_factory.mktemp("frames")
     for frame, places in enumerate(seen):

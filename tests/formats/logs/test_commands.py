@@ -1,4 +1,4 @@
-"""Setpoints and plans as the planner on board published them: which point holds at which time."""
+"""Setpoints and plans as the on-board planner published them: the valid point at each time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LATE = SECOND // 20  # from stamp to receipt
 
 @dataclass
 class Told:
-    """A log of one topic."""
+    """Log of one topic."""
 
     type: str
     values: Sequence[tuple[int, Any]]
@@ -37,7 +37,7 @@ class Told:
 
 
 def plan(k: int, shift_m: float) -> list[tuple[int, float]]:
-    """A second of flight along x, 1 m/s, in steps of 0.25 s from second k on; its later half is off."""
+    """Make two seconds of flight along x from second k, 1 m/s, steps of 0.25 s; shift the later one."""
     return [
         (START + k * SECOND + j * SECOND // 4, k + j / 4 + (shift_m if j >= 4 else 0.0)) for j in range(9)
     ]
@@ -76,7 +76,7 @@ def read(path: Path, stamps: Any = "header") -> Trajectory:
 @pytest.mark.parametrize("container", ["ros1", "ros2-mcap"])
 @pytest.mark.parametrize("entry", [path_entry, trajectory_entry])
 def test_a_plan_holds_until_the_next_one_begins(tmp_path: Path, container: Container, entry: Any) -> None:
-    """What plans say of the time after their successor's first point, 7 m aside, was never flown."""
+    """Give plans wrong points, 7 m aside, after the start of the next plan: they were never flown."""
     assert container in CONTAINERS
     entries = [entry(plan(k, 7.0 if k < 3 else 0.0)) for k in range(4)]
     found = read(write_log(tmp_path, "d1", container, entries))
@@ -112,7 +112,7 @@ def test_position_targets_say_where_to_unless_they_do_not() -> None:
 
 
 def test_what_is_no_plan_is_refused(tmp_path: Path) -> None:
-    route = path_entry([(START, 0.0), (START, 1.0)])  # as route planners stamp them: all alike
+    route = path_entry([(START, 0.0), (START, 1.0)])  # route planners give all points one stamp
     with pytest.raises(DataError, match="no times of their own"):
         read(write_log(tmp_path, "route", "ros2-mcap", [route]))
     entry = trajectory_entry(plan(0, 0.0))

@@ -1,4 +1,4 @@
-"""Poses read at once are those read one by one; where messages differ, nothing is read at once."""
+"""Poses read at once equal those read one by one; if messages differ, nothing is read at once."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ START_NS = 1_700_000_000_000_000_000
 
 
 def entry(type_: str, k: int, rng: np.random.Generator, *, frame: str = "odom", child: str = "base") -> Entry:
-    """A message of random numbers, whose stamp of receipt is not that of its header."""
+    """Make a message of random numbers, with different stamps of header and receipt."""
     x, y, z = rng.standard_normal(3).tolist()
     turned = rng.standard_normal(4)
-    # Some rows cannot be used, which both ways must say alike.
+    # Some rows cannot be used, and both ways must report them alike.
     qx, qy, qz, qw = (turned / np.linalg.norm(turned) * (k % 7 != 3)).tolist()
     place, turn = {"x": x, "y": y, "z": z}, {"x": qx, "y": qy, "z": qz, "w": qw}
     pose: Any = {"position": place, "orientation": turn}
@@ -101,7 +101,7 @@ def test_many_more_than_one_batch(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("container", CONTAINERS)
 def test_the_order_of_receipt_over_several_files(tmp_path: Path, container: Container) -> None:
-    """Messages of two files interleave, some were received at the same time, some are not in order."""
+    """Interleave the messages of two files; some have equal stamps of receipt, some are not in order."""
     rng = np.random.default_rng(8)
     entries = [entry("geometry_msgs/msg/PoseStamped", k, rng) for k in range(40)]
     received = rng.integers(0, 15, len(entries)).tolist()
@@ -118,7 +118,7 @@ def test_the_order_of_receipt_over_several_files(tmp_path: Path, container: Cont
 
 
 def test_a_long_log_is_not_copied_over_and_over() -> None:
-    """Covariances are what is large: those of the result, and little else, come to what was read."""
+    """Limit the memory: only the result's covariances, the largest part, may be added to the input."""
     count, rng = 40_000, np.random.default_rng(6)
     t_ns = START_NS + 10_000_000 * np.arange(count)
     turned = rng.standard_normal((count, 4))
@@ -130,6 +130,6 @@ def test_a_long_log_is_not_copied_over_and_over() -> None:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert found.covariance is not None
-    # Beside the covariances stamps, positions, rotations and a few numbers and flags a pose, and one block
-    # of 4096 poses with the steps in between: together less than another copy.
+    # Besides the covariances: stamps, positions, rotations, a few numbers and flags for each pose, and one
+    # block of 4096 poses with intermediate results. Together they are less than another copy.
     assert peak < 2 * found.covariance.nbytes

@@ -1,4 +1,4 @@
-"""Maps in logs: the same map as in a file, in every container, and in the world where the log says it is."""
+"""Maps in logs: the same map as in a file, in every container, and at its place in the world."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ Cells = NDArray[np.int8]
 
 
 class Read:
-    """What a log's topic of maps gives."""
+    """Maps and notes of a log's topic of maps."""
 
     def __init__(
         self,
@@ -98,7 +98,7 @@ def same(a: Occupancy, b: Occupancy) -> None:
 
 
 def box(changed: float = 0.971) -> Occupancy:
-    """Nothing symmetric: an L of obstacles, free air beside it."""
+    """Make a map without symmetry: an L of obstacles with free space beside it."""
     grid = np.full((6, 5, 4), np.nan, dtype=np.float32)
     grid[1:5, 3, 0:2], grid[1, 1:4, 2] = 0.971, 0.971
     grid[0, :, 3] = 0.1192
@@ -118,7 +118,7 @@ def test_octomap_is_that_of_its_file(tmp_path: Path, container: Container) -> No
 
 
 def test_octomap_of_a_log_without_definitions(tmp_path: Path) -> None:
-    """ROS 2 up to Humble recorded none, and octomap_msgs is no part of ROS itself."""
+    """Omit the definitions, as ROS 2 up to Humble does; octomap_msgs is not part of ROS itself."""
     file = as_bt(box(), tmp_path / "site")
     path = write_ros2(tmp_path / "bag", [octomap_entry(file, T0)], definitions=False)
     camera = {"pose": {"tum": "x"}, "intrinsics": "x", "keypoints": "y"}
@@ -138,7 +138,7 @@ def test_full_octomap_keeps_its_probabilities(tmp_path: Path, tree: str, colour:
 
 @pytest.mark.parametrize("binary", [True, False])
 def test_octomap_of_octomap_itself(tmp_path: Path, binary: bool) -> None:
-    """Trees that OctoMap's own library made and wrote."""
+    """Read trees that OctoMap's own library made and wrote."""
     pyoctomap = pytest.importorskip("pyoctomap")
     tree = pyoctomap.OcTree(0.25)
     hits = np.array([[1.1, -2.3, 0.6], [1.4, -2.3, 0.6], [-3.0, 4.0, 1.1]])
@@ -173,7 +173,7 @@ def test_no_more_maps_than_a_replay_can_use(tmp_path: Path, monkeypatch: pytest.
     entries = [octomap_entry(files[k % 2], T0 + k * SECOND) for k in range(10)]
     monkeypatch.setattr(log_maps, "MOST_MAPS", 4)
     found = Read(tmp_path, entries)
-    # Of rows 0 to 9 four, evenly.
+    # Of rows 0 to 9 four, evenly spaced.
     assert [(one.from_ns - T0) // SECOND for one in found.maps] == [0, 3, 6, 9]
     assert found.dropped == {"maps between those that are kept": 6}
     assert any("4 of 10 changes of the map are kept" in note for note in found.notes)
@@ -248,7 +248,7 @@ def test_coarser_octomap(tmp_path: Path) -> None:
         Read(tmp_path, [octomap_entry(file, T0)], resolution_m=0.3)
 
 
-# --- where the log's world is --------------------------------------------------------------------------
+# --- the log's world -----------------------------------------------------------------------------------
 
 
 def occupied_centres(one: Occupancy) -> NDArray[np.float64]:
@@ -290,7 +290,7 @@ def test_other_turns_lose_no_obstacle_and_grow_by_a_voxel_at_most(tmp_path: Path
     apart = np.linalg.norm(true[:, None, :2] - found[None, :, :2], axis=2)
     level = np.abs(true[:, None, 2] - found[None, :, 2]) < 1e-6
     apart = np.where(level, apart, np.inf)
-    # A sample within both voxels: centres are at most two half diagonals apart.
+    # A sample is within both voxels, so centres are at most two half diagonals apart.
     limit = 0.2 * math.sqrt(2) + 1e-9
     assert apart.min(axis=1).max() <= limit
     assert apart.min(axis=0).max() <= limit
@@ -308,7 +308,7 @@ def test_tilted_grids_are_refused(tmp_path: Path) -> None:
 
 
 def test_transforms_of_the_log_place_a_map(tmp_path: Path) -> None:
-    """map <- odom, yawed by a right angle; poses are in map."""
+    """Yaw odom against map by a right angle; poses are in map."""
     file = as_bt(box(), tmp_path / "site")
     turned: Pose = ((2.0, 0.0, 0.0), (0.0, 0.0, ROOT_HALF, ROOT_HALF))
     pose = {"header": {"stamp": T0, "frame_id": "/map"}, "pose": {"orientation": {"w": 1.0}}}
@@ -347,11 +347,11 @@ def plan() -> Cells:
 
 @pytest.mark.parametrize("container", CONTAINERS)
 def test_plan_is_raised_from_its_origin(tmp_path: Path, container: Container) -> None:
-    origin: Pose = ((-3.0, 7.0, 1.25), (0.0, 0.0, 0.0, 0.0))  # many leave the quaternion zero
+    origin: Pose = ((-3.0, 7.0, 1.25), (0.0, 0.0, 0.0, 0.0))  # a quaternion of zeros is common
     one = Read(tmp_path, [grid_entry(plan(), T0, origin=origin)], container=container, height_m=1.6).only
     cells = plan().astype(float)
     cells[cells < 0] = np.nan
-    # 1.6 m are 3.2 layers of 0.5 m: four.
+    # 1.6 m are 3.2 layers of 0.5 m, so there are four.
     np.testing.assert_array_equal(
         one.probability, np.repeat((cells / 100)[:, :, None], 4, axis=2).astype("f4")
     )
@@ -359,7 +359,7 @@ def test_plan_is_raised_from_its_origin(tmp_path: Path, container: Container) ->
 
 
 def test_cells_are_as_wide_as_was_meant(tmp_path: Path) -> None:
-    """The message's float32 is 0.0500000007; it was written as 0.05."""
+    """Write 0.05, which the message's float32 turns into 0.0500000007."""
     one = Read(tmp_path, [grid_entry(plan(), T0, cell_m=0.05)]).only
     assert one.resolution_m == 0.05
     assert one.probability.shape == (4, 3, 50)  # 2.5 m
@@ -372,7 +372,7 @@ def test_cells_are_as_wide_as_was_meant(tmp_path: Path) -> None:
     ned=st.booleans(),
 )
 def test_turned_plans(tmp_path_factory: pytest.TempPathFactory, cells: Cells, turns: int, ned: bool) -> None:
-    """Every known cell is where its corner, its turn and the axes put it, and stands upward."""
+    """Check that every known cell is where its corner, its turn and the axes put it, extruded upwards."""
     cells[0, 0] = 100
     angle = turns * math.pi / 2
     origin: Pose = ((4.0, -2.0, 1.5), (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2)))
@@ -409,7 +409,7 @@ def test_yawed_plan_loses_no_wall(tmp_path: Path) -> None:
             axis=1,
         )
         index = np.floor((points - one.origin[:2]) / one.resolution_m).astype(int)
-        # The voxel at the middle of the wall, of half a metre, or one that it touches.
+        # The half-metre voxel at the middle of the wall, or a neighbour of it.
         padded = np.pad(one.probability[:, :, 0], 1, constant_values=np.nan) >= 0.5
         near = [padded[index[:, 0] + i, index[:, 1] + j] for i in range(3) for j in range(3)]
         assert np.any(near, axis=0).all()
@@ -504,7 +504,7 @@ def test_clouds_that_show_nothing_new_make_no_map(tmp_path: Path) -> None:
 
 
 def test_cloud_of_a_moving_sensor_is_placed_by_transforms(tmp_path: Path) -> None:
-    """One point, seen from a sensor that flies along x and turns round from cloud to cloud."""
+    """Observe one point from a sensor that moves along x and turns round between clouds."""
     wall = np.array([5.05, 1.05, 2.05])
     entries: list[Entry] = [
         transform_entry("base", "lidar", ((0.0, 0.0, -0.5), (0.0, 0.0, 0.0, 1.0)), T0, topic="/tf_static")

@@ -1,4 +1,4 @@
-"""The checksum of the data section, as the mcap library writes it."""
+"""Checksum of the data section, as written by the mcap library."""
 
 from __future__ import annotations
 

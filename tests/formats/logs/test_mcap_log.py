@@ -1,4 +1,4 @@
-"""MCAP in every encoding and layout: whole, without its end or index, cut, hurt, and with absurd lengths."""
+"""MCAP in every encoding and layout: whole, without end or index, cut, damaged, and with absurd lengths."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def test_a_cut_file_gives_its_beginning(tmp_path: Path, compression: McapCompres
     path = cut(Path(shutil.copy(whole, tmp_path / "cut.mcap")), share)
     found, dropped = everything_or_one_line(path)
     if not found:
-        # Before the first message stand the definitions, some 5 kB.
+        # The definitions, some 5 kB, come before the first message.
         assert path.stat().st_size < 5_000 + 10_000
         return
     assert found == ALL[: len(found)]
@@ -185,14 +185,14 @@ def test_a_cut_file_gives_its_beginning(tmp_path: Path, compression: McapCompres
     }
     assert ("file truncated" in dropped) != ("recording not closed" in dropped)
     if compression == "none":
-        # Before the first message 5 kB, behind the last one 5 kB of summary; at the cut at most 3 messages.
+        # 5 kB come before the first message, 5 kB of summary after the last; the cut costs up to 3 messages.
         assert len(found) >= len(ALL) * share * (1 - 10_000 / whole.stat().st_size) - 10
 
 
 def test_a_file_without_its_end_is_read_whole(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", FLIGHT)
     content = path.read_bytes()
-    path.write_bytes(content[: records(content)[0x0F][0]])  # up to the end of the data section
+    path.write_bytes(content[: records(content)[0x0F][0]])  # until the end of the data section
     assert everything(path) == (ALL, {"recording not closed": 1})
 
 
@@ -207,17 +207,17 @@ def test_a_wrong_checksum_costs_its_chunk(tmp_path: Path) -> None:
     assert 0 < lost < 20
     assert not dropped
     assert len(found) == len(ALL) - lost
-    # Of the topic asked for alone.
+    # Losses of the requested topic alone.
     pose, dropped = positions(path)
     assert dropped == {"messages in damaged blocks": 100 - len(pose)}
 
 
 def test_checksums_count_without_an_index_too(tmp_path: Path) -> None:
-    """The library's reader for files without an index would hand out the damaged chunk as it is."""
+    """Damage a chunk in a file without an index; the library's reader would return it as it is."""
     path = write_mcap(tmp_path / "a.mcap", FLIGHT, compression="none", chunk_size=9_000)
     content = path.read_bytes()
     found = records(content)
-    # The chunks alone, the third of them damaged, behind the schemas and channels.
+    # The chunks alone, the third of them damaged, after the schemas and channels.
     begins = sorted(at for places in found.values() for at in places)
     ends = dict(zip(begins, [*begins[1:], len(content)], strict=True))
     kept = [at for kind in (0x01, 0x03, 0x04, _CHUNK) for at in found.get(kind, [])]
@@ -246,7 +246,7 @@ def test_an_index_that_points_nowhere_costs_its_messages(tmp_path: Path) -> None
 
 
 def records(content: bytes) -> dict[int, list[int]]:
-    """Where the records of each kind begin, outside chunks."""
+    """Return the positions of the records of each kind, outside chunks."""
     found: dict[int, list[int]] = {}
     position = 8
     while position < len(content) - 8:
@@ -272,7 +272,7 @@ def test_a_record_of_terabytes_does_not_exhaust_memory(tmp_path: Path, kind: int
 
 @pytest.mark.parametrize("offset", [16, 16 + 8 + 4 + 4 + 4])
 def test_a_chunk_that_claims_terabytes_is_damage(tmp_path: Path, offset: int) -> None:
-    # Its size once decompressed, and the length of the compressed bytes behind the word zstd.
+    # The chunk's decompressed size, and the length of the compressed bytes after the word zstd.
     path = write_mcap(tmp_path / "a.mcap", FLIGHT, chunk_size=9_000)
     content = bytearray(path.read_bytes())
     at = records(bytes(content))[_CHUNK][1] + 9 + offset

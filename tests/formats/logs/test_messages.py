@@ -1,4 +1,4 @@
-"""Messages of every spelling to samples: the same content gives the same samples."""
+"""Conversion of messages of every schema to samples: the same content gives the same samples."""
 
 from __future__ import annotations
 
@@ -247,7 +247,7 @@ def test_foxglove_calibration(encoding: str) -> None:
 
 
 def test_a_region_of_interest_and_binning_are_applied() -> None:
-    """A pixel (u, v) of the sensor is at ((u - 100) / 2, (v - 40) / 4) of the picture."""
+    """Map the sensor's pixel (u, v) to ((u - 100) / 2, (v - 40) / 4) of the picture."""
     region = {"x_offset": 100, "y_offset": 40, "width": 400, "height": 200}
     found = lens(camera_info("ros1", roi=region, binning_x=2, binning_y=4))
     assert (found.width, found.height) == (200, 50)

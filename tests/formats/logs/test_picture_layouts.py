@@ -1,4 +1,4 @@
-"""Pictures read from their bytes are those that are decoded, and are left to the decoder where unusual."""
+"""Pictures read from their bytes equal decoded ones; unusual ones are left to the decoder."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def serialized(encoding: str, type_: str, stated: dict[str, Any]) -> bytes:
 @pytest.mark.parametrize("type_", [COMPRESSED, RAW])
 @pytest.mark.parametrize("container", CONTAINERS)
 def test_the_same_as_decoded(tmp_path: Path, container: Container, type_: str) -> None:
-    # Lengths of names and data go through all remainders of the alignment; the last pictures differ.
+    # Lengths of names and data take all remainders of the alignment; the last pictures differ.
     stated = [
         fields(k, header={"stamp": START_NS + k, "frame_id": "c" * (k // 2)}, format="x" * (k // 3))
         for k in range(16)
@@ -85,7 +85,7 @@ def test_the_same_as_decoded(tmp_path: Path, container: Container, type_: str) -
 
 
 def alike(k: int, received_ns: int) -> Entry:
-    """A picture that differs from the others in its stamp and its pixels alone, as those of a camera do."""
+    """Make a picture that differs from the others only in stamp and pixels, as those of a camera do."""
     stated = fields(0, header={"stamp": START_NS + k, "frame_id": "camera"})
     return Entry(TOPIC, COMPRESSED, received_ns, stated)
 
@@ -101,7 +101,7 @@ def stamps_of(arrays: tuple[Int64, Int64]) -> list[tuple[int, int]]:
     st.sampled_from(["header", "receive"]),
 )
 def test_later_times_are_those_of_the_later_pictures(rows: list[tuple[int, int]], stamps: str) -> None:
-    """Seconds that repeat, go back, leap and are missing (0), or go on as those of a camera do."""
+    """Draw seconds that repeat, go back, leap or are missing (0), or increase as those of a camera do."""
     rows = rows if len(rows) > 3 else [(k + 1, k + 1) for k in range(len(rows))]
     header_ns, receive_ns = (np.array([r[i] for r in rows], np.int64) * 10**9 for i in range(2))
     samples = [
@@ -114,7 +114,7 @@ def test_later_times_are_those_of_the_later_pictures(rows: list[tuple[int, int]]
 
 @pytest.mark.parametrize("container", CONTAINERS)
 def test_stamps_at_once_are_those_of_the_pictures(tmp_path: Path, container: Container) -> None:
-    """Of two files that interleave, with equal stamps of receipt and some out of order."""
+    """Interleave two files, with equal stamps of receipt and some out of order."""
     received = np.random.default_rng(3).integers(0, 30, 60).tolist()
     entries = [alike(k, START_NS + r) for k, r in enumerate(received)]
     paths = [
@@ -140,7 +140,7 @@ def test_damage_costs_both_ways_the_same(tmp_path: Path, name: str, data: st.Dat
     container: Container = "ros2-sqlite3" if name == "bag" else "ros1" if name == "log.bag" else "mcap-cdr"
     whole = tmp_path / name
     if not whole.exists():
-        # Of 9 kB each, so that a database needs several pages for one.
+        # Pictures of 9 kB each, so that a database needs several pages for one.
         wide = np.arange(9000, dtype=np.uint8)
         write_log(
             tmp_path,
@@ -176,7 +176,7 @@ def test_damage_costs_both_ways_the_same(tmp_path: Path, name: str, data: st.Dat
 @pytest.mark.parametrize("type_", [COMPRESSED, RAW])
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
 def test_bytes_that_do_not_fit_are_refused_as_by_the_decoder(encoding: str, type_: str) -> None:
-    """Cut anywhere, or with any byte of the first 60 changed: both refuse, or both say the same."""
+    """Cut anywhere, or change any of the first 60 bytes: both must refuse, or both give the same result."""
     schema = Schema(type_, encoding)
     whole = serialized(encoding, type_, fields(1))
     damaged = [whole[:end] for end in range(len(whole))]

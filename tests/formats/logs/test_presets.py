@@ -1,4 +1,4 @@
-"""The usual topics of drivers: which are read, in which axes, units and order."""
+"""Usual topics of drivers: the choice of topics, with their axes, units and order."""
 
 from __future__ import annotations
 
@@ -95,8 +95,8 @@ def read(
 @pytest.mark.parametrize(
     ("frame", "vector"),
     [
-        ("", (-30.0, 0.0, 90.0)),  # pitch, roll, yaw: a subscription, as of an M210
-        ("ground_ENU", (0.0, -30.0, 90.0)),  # roll, pitch, yaw: a broadcast, as of an M100
+        ("", (-30.0, 0.0, 90.0)),  # pitch, roll, yaw: a subscription, as on an M210
+        ("ground_ENU", (0.0, -30.0, 90.0)),  # roll, pitch, yaw: a broadcast, as on an M100
     ],
 )
 def test_gimbals_of_the_onboard_sdk(tmp_path: Path, frame: str, vector: tuple[float, float, float]) -> None:
@@ -110,7 +110,7 @@ def test_gimbals_of_the_onboard_sdk(tmp_path: Path, frame: str, vector: tuple[fl
     assert telemetry.gimbal is not None
     assert telemetry.gimbal.relative_to == "world"
     ahead = rotate(telemetry.gimbal.quaternion_xyzw[0], np.array([1.0, 0, 0]))
-    # Yaw 90 from north is east, 30 degrees down, whatever the frame is called.
+    # Yaw 90 from north is east; pitch is 30 degrees down. The frame's name has no effect.
     np.testing.assert_allclose(ahead, [0.75**0.5, 0, -0.5], atol=1e-12)
     assert telemetry.body is not None
     nose = rotate(telemetry.body.quaternion_xyzw[0], np.array([1.0, 0, 0]))
@@ -232,7 +232,7 @@ def test_topics_of_other_types_are_refused_by_name(
     assert fault in refused.value.problem
     assert type_ in refused.value.problem
     assert "attribute" not in str(refused.value)
-    # What can be read instead: the only topics of the bag with positions or attitudes.
+    # The remedy: the only topics of the bag with positions or attitudes.
     assert "/novatel/oem7/odom" in refused.value.remedy
     assert ("/gps/fix" in refused.value.remedy) == (fault == position)
 

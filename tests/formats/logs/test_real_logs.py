@@ -1,4 +1,4 @@
-"""Real logs: `describe` and `messages` say what the ordinary readers said of the same files."""
+"""Real logs: `describe` and `messages` agree with the reference readers of the same files."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ LOGS = {
     "logs/mcap/edge_publish_vs_log_time.mcap": "mcap",
     "logs/mcap/edge_unsupported_encoding.mcap": "mcap",
 }
-# Written so that they cannot be decoded: encoding "a", a definition that is none, protobuf as text.
+# Messages that cannot be decoded: encoding "a", an invalid definition, protobuf as text.
 UNDEFINED = {
     "logs/mcap/conformance_TenMessages.mcap": {"example"},
     "logs/mcap/edge_bad_schema.mcap": {"/bad/data"},
     "logs/mcap/edge_unsupported_encoding.mcap": {"/proto/data"},
 }
-# Their metadata.yaml states another time than their messages have; the ordinary reader repeats it.
+# Their metadata.yaml states another time than their messages; the reference reader repeats it.
 WRONG_METADATA = {"logs/ros2/rosbag2_wbag_sqlite3", "logs/ros2/rosbag2_wbag_mcap"}
 
 
@@ -111,7 +111,7 @@ def test_pictures_in_json_are_bytes() -> None:
     with recognise(path, LogFormat, "log").open_log([path]) as log:
         picture = next(log.messages(["/image/compressed"])).value
         lens = next(log.messages(["/camera_calibration"])).value
-    assert picture.data[:3] == b"\xff\xd8\xff"  # a JPEG begins so
+    assert picture.data[:3] == b"\xff\xd8\xff"  # the first bytes of a JPEG
     assert (lens.width, lens.K[:3]) == (640, [800, 0, 320])
 
 

@@ -1,4 +1,4 @@
-"""ROS 1 and ROS 2 bags: every way to store one gives the same; a damaged one gives what is left."""
+"""ROS 1 and ROS 2 bags: every storage gives the same messages; a damaged bag gives its readable ones."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_describe_says_what_is_inside(tmp_path: Path) -> None:
     assert pose["rate_hz"] == pytest.approx(69 / 0.99, abs=1e-3)
     assert pose["longest_gap_s"] == pytest.approx(0.31)
     # A ROS 1 Odometry: header of 12 + 4 + 4 bytes with "odom", 4 of child, 56 + 288 of pose, 48 + 288 of
-    # twist. The connection of the next topic lies behind a message and counts to it.
+    # twist. The connection of the next topic follows a message and counts to it.
     assert pose["size_bytes"] >= 70 * 704
     assert pose["size_bytes"] < 70 * 704 + 10_000
 
@@ -116,7 +116,7 @@ def test_topics_that_are_not_asked_for_are_not_decoded(tmp_path: Path) -> None:
         assert not log.dropped
         assert not list(log.messages([OTHER]))
         assert log.dropped == {"messages that cannot be decoded": 10}
-        list(log.messages([OTHER]))  # a second reading loses the same ones
+        list(log.messages([OTHER]))  # a second reading has the same losses
         assert log.dropped == {"messages that cannot be decoded": 10}
         assert not list(log.messages(["/nothing"]))
 
@@ -234,7 +234,7 @@ def test_a_cut_ros1_bag_gives_its_beginning(
     }
     assert ("file truncated" in dropped) != ("recording not closed" in dropped)
     if compression == "none":
-        # A message of at most 2.1 kB, an index and a connection can be lost at the cut, not more.
+        # At the cut at most a message of 2.1 kB, an index and a connection can be lost.
         assert len(found) >= len(ALL) * (share - 4117 / whole.stat().st_size) - 10
 
 
@@ -256,7 +256,7 @@ def test_most_of_a_cut_database_is_read(tmp_path: Path) -> None:
     found, dropped = everything(path)
     assert len(found) > 0.55 * 1200
     assert dropped["file truncated"] == 1
-    # Listed or not: every message is either read, or counted with a reason.
+    # Every message, listed or not, is either read or counted with a reason.
     listed = dropped["messages that metadata.yaml counts and the files lack"]
     assert len(found) + listed + dropped.get("messages in damaged blocks", 0) == 1200
 
@@ -280,7 +280,7 @@ def test_flipped_bytes_are_a_loss_or_one_line(tmp_path: Path, name: str, data: s
 def test_a_length_of_gigabytes_is_damage(tmp_path: Path) -> None:
     path = write_ros1(tmp_path / "a.bag", FLIGHT, chunk_size=8_000)
     content = path.read_bytes()
-    # The size that the third chunk states for its content, before compression.
+    # The size of the third chunk's content before compression.
     at = -1
     for _ in range(3):
         at = content.index(b"size=", at + 1)

@@ -1,4 +1,4 @@
-"""Samples gathered into trajectories: stamps compared, losses counted, transforms chained."""
+"""Trajectories built from samples: stamps compared, losses counted, transforms chained."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 def flown(
     count: int = 10, *, rate_hz: int = 10, lag_ns: int = 2_000_000, frames: tuple[str, str] = ("odom", "base")
 ) -> list[PoseSample]:
-    """1 m/s to the east, received a little after it was stamped."""
+    """Make poses that move east at 1 m/s, received a little after their header stamps."""
     stamps = [EPOCH + k * S // rate_hz for k in range(count)]
     return [
         PoseSample(t, t + lag_ns, frames[0], frames[1], ((t - EPOCH) / S, 0.0, 0.0), LEVEL) for t in stamps
@@ -74,7 +74,7 @@ def test_a_clock_jump_is_told_with_its_place_and_size(jump_s: float) -> None:
     assert found.stamps.jumps == (ClockJump(12, stated[12].stamp_ns, jump_s),)
     assert found.stamps.disagreeing == 8
     assert found.stamps.largest_disagreement_s == pytest.approx(jump_s - 0.002)
-    if jump_s < 0:  # nothing after the jump comes later than what came before it
+    if jump_s < 0:  # no stamp after the jump is later than those before it
         assert found.trajectory.dropped == {"stamp out of order": 8}
     else:
         assert found.trajectory.dropped == {}
@@ -105,7 +105,7 @@ def test_losses_are_counted_by_the_rules_of_every_pose_file() -> None:
 
 
 def test_covariances_turn_with_the_body() -> None:
-    """Heading north, what varies about the world's x (east) varies about the body's y, to the right."""
+    """Head north: a variance about the world's x (east) is then one about the body's y, to the right."""
     north = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
     covariance = np.diag([1.0, 2, 3, 4, 5, 6])
     stated = [replace(s, quaternion_xyzw=north, covariance=covariance) for s in flown()]
@@ -174,7 +174,7 @@ def test_chains_of_moving_and_static_transforms() -> None:
         static=[static(("base", "camera"), (0.5, 0.0, 0.0))],
     )
     found = chained(transforms, "d1", parent="map", child="/camera", stamps="header", max_gap_ns=S)
-    # 5 Hz ends at 0.8 s: of 0.00 to 0.98 s at 50 Hz the last nine have no correction.
+    # 5 Hz ends at 0.8 s, so the last nine stamps of 0.00 to 0.98 s at 50 Hz have no correction.
     assert found.trajectory.dropped == {"no transform": 9}
     np.testing.assert_allclose(
         found.trajectory.position, [[k / 50 + 0.5, 100, 0] for k in range(41)], rtol=0, atol=1e-12
@@ -230,12 +230,12 @@ def test_the_odometry_of_a_real_robot() -> None:
     assert abs(found.stamps.largest_disagreement_s) < 0.01
     covariance = found.trajectory.covariance
     assert covariance is not None
-    # The robot turns about the vertical alone: what it states in the world holds in the body too.
+    # The robot turns about the vertical alone, so its covariance is the same in world and body.
     np.testing.assert_allclose(covariance[0], np.diag([1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 0.03]), atol=1e-12)
 
 
 def test_the_transforms_of_two_real_turtles() -> None:
-    """One turtle is followed by the other, which steers for a carrot 1 m before the first one's nose."""
+    """Read a turtle that follows another one by steering for a carrot 1 m before the other's nose."""
     path = real_data("logs/ros1/foxglove_example.bag")
     transforms = transforms_of(
         all_samples(real_messages(path, ["/tf"]), path),
