@@ -1,4 +1,4 @@
-"""Voxel maps as npz, as a script of the user's own would write them."""
+"""Voxel maps as npz, as written by a user's own script."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""OctoMap: trees written here by another rule than they are read, and real maps with known contents."""
+"""OctoMap: trees written here by another algorithm than the reader's, and real maps with known contents."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from tests.real_data import real_data
 READER: MapFormat = octomap.FORMAT
 FREE, OCCUPIED = np.float32(0.1192), np.float32(0.971)
 
-Leaf = float | None  # log odds; None where nothing is known
+Leaf = float | None  # log odds; None if unknown
 Node = Leaf | list["Node"]
 
-# Below 13 fixed levels: at most 8 x 8 x 8 finest voxels.
+# Below 13 fixed levels, so that there are at most 8 x 8 x 8 finest voxels.
 leaf_values = st.sampled_from([None, -2.0, 3.5])
 
 
 def eight(children: st.SearchStrategy[Node]) -> st.SearchStrategy[list[Node]]:
-    """An inner node: it has a child."""
+    """Draw an inner node, which has at least one child."""
     return st.lists(children, min_size=8, max_size=8).filter(lambda node: node != [None] * 8)
 
 
@@ -39,7 +39,7 @@ paths = st.lists(st.integers(0, 7), min_size=13, max_size=13)
 
 
 def at(path: list[int], node: Node) -> Node:
-    """The tree whose only branch is a path of child numbers, with a node at its end."""
+    """Return the tree whose only branch is a path of child numbers, with a node at its end."""
     for child in reversed(path):
         parent: list[Node] = [None] * 8
         parent[child] = node
@@ -87,7 +87,7 @@ def file_of(
 
 
 def painted(path: list[int], node: Node, finest: float) -> dict[tuple[int, int, int], float]:
-    """Every known finest voxel by its index from the world's origin, found by halving cubes."""
+    """Return every known finest voxel by its index from the world's origin, by halving cubes."""
     voxels: dict[tuple[int, int, int], float] = {}
 
     def visit(node: Node, low: tuple[int, int, int], side: int) -> None:
@@ -127,7 +127,7 @@ def test_every_voxel_is_where_halving_the_cube_puts_it(
     np.testing.assert_allclose(occupancy.origin, index.min(axis=0) * 0.2, rtol=0, atol=1e-9)
     grid = np.full(np.ptp(index, axis=0) + 1, np.nan)
     log_odds = np.array(list(expected.values()))
-    # Limits of a .bt are OctoMap's; a .ot says its own: p = 1 - 1 / (1 + exp(log odds)).
+    # Limits of a .bt are OctoMap's; a .ot has its own: p = 1 - 1 / (1 + exp(log odds)).
     limits = np.where(log_odds > 0, OCCUPIED, FREE)
     grid[*(index - index.min(axis=0)).T] = limits if kind == "bt" else 1 - 1 / (1 + np.exp(log_odds))
     np.testing.assert_allclose(occupancy.probability, grid, rtol=0, atol=2e-7)  # float32

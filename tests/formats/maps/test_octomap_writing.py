@@ -1,4 +1,4 @@
-"""What we write as .bt, read by ourselves and by OctoMap."""
+"""Our .bt files, read by our own reader and by OctoMap."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FREE, OCCUPIED = np.float32(octomap.FREE_PROBABILITY), np.float32(octomap.OCCUPI
 
 Voxels = dict[tuple[int, int, int], bool]
 
-# Blocks of one value beside single voxels, so that pruning has something to do on several levels.
+# Blocks of one value beside single voxels, so that several levels are pruned.
 fine = hnp.arrays(
     np.float32, st.tuples(*[st.integers(1, 5)] * 3), elements=st.sampled_from([0.0, 1.0, np.nan])
 )
@@ -33,7 +33,7 @@ corners = st.tuples(*[st.integers(-9, 9)] * 3)
 
 
 def voxels_of(occupancy: Occupancy) -> Voxels:
-    """Whether it is occupied, for every known voxel by its index from the world's origin."""
+    """Return True if occupied, for every known voxel by its index from the world's origin."""
     first = np.rint(occupancy.origin / occupancy.resolution_m).astype(int)
     known = np.argwhere(~np.isnan(occupancy.probability))
     states = (occupancy.probability[tuple(known.T)] >= 0.5).tolist()
@@ -51,7 +51,7 @@ def test_our_reader_gets_every_voxel_back(
     read = octomap.FORMAT.read_map(file)
     assert voxels_of(read) == voxels_of(written)
     known = read.probability[~np.isnan(read.probability)]
-    # The reader's log odds are float32 of at most 3.5: a rounding of 2e-7 on the way to probabilities.
+    # The reader's log odds are float32 of at most 3.5, which round probabilities by 2e-7.
     np.testing.assert_allclose(known, np.where(known >= 0.5, OCCUPIED, FREE), rtol=0, atol=2e-7)
 
 
@@ -60,7 +60,7 @@ def test_our_reader_gets_every_voxel_back(
 def test_octomap_itself_would_write_the_same_tree(
     tmp_path_factory: pytest.TempPathFactory, grid: NDArray[np.float32], corner: tuple[int, int, int]
 ) -> None:
-    """The same nodes in the same order, byte for byte, as from a tree filled voxel by voxel and pruned."""
+    """Compare byte by byte with a tree that OctoMap filled voxel by voxel and pruned."""
     pyoctomap = pytest.importorskip("pyoctomap")
     folder = tmp_path_factory.mktemp("map")
     occupancy = Occupancy(grid, np.array(corner) * 0.25, 0.25)
@@ -99,7 +99,7 @@ def test_octomap_reads_the_same_leaves(tmp_path: Path) -> None:
 
 
 def test_a_large_map_takes_seconds_at_most(tmp_path: Path) -> None:
-    """2 million voxels of which half are noise, the worst case for pruning; about 0.2 s on an idle core."""
+    """Write 2 million voxels, half of them noise, the worst case for pruning; some 0.2 s on an idle core."""
     rng = np.random.default_rng(3)
     grid = np.zeros((200, 200, 50), dtype=np.float32)
     grid[..., :25] = rng.integers(0, 2, (200, 200, 25))

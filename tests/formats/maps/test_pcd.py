@@ -21,7 +21,7 @@ from tests.real_data import real_data
 
 READER: MapFormat = pcd.FORMAT
 
-# liblzf packed this: x, intensity, y, z of 36 points, each field after the other.
+# Packed by liblzf: x, intensity, y, z of 36 points, one field after the other.
 PACKED_BY_LIBLZF = bytes.fromhex(
     "070000803f00008040200340074003e0760b400000016001000260010003600100046001000560010006600100076001"
     "0008600100096001000a6001000b6001200020c700a0200340074003e0030b0114c18013e00717e00323e0470b004020"
@@ -30,13 +30,13 @@ PACKED_BY_LIBLZF = bytes.fromhex(
 
 
 def literals(content: bytes) -> bytes:
-    """LZF without any repetition: runs of up to 32 bytes."""
+    """Pack as LZF without any repetition: runs of up to 32 bytes."""
     runs = [content[k : k + 32] for k in range(0, len(content), 32)]
     return b"".join(bytes([len(run) - 1]) + run for run in runs)
 
 
 def squeezed(content: bytes) -> bytes:
-    """LZF that repeats the longest earlier match in reach, found by trying them all."""
+    """Pack as LZF that repeats the longest earlier match in reach, found by brute force."""
     packed, at = bytearray(), 0
     while at < len(content):
         best, back = 0, 0
@@ -75,7 +75,7 @@ def header(fields: str, sizes: str, types: str, counts: str, points: int, data: 
 
 
 def mixed(points: Float) -> tuple[tuple[str, str, str, str], np.ndarray]:
-    """Records with z first, x as a double, padding, and a field of three values between."""
+    """Make records with z first, x as a double, padding, and a field of three values in between."""
     kind = np.dtype([("z", "<f4"), ("pad", "u1", (2,)), ("x", "<f8"), ("hist", "<u2", (3,)), ("y", "<f4")])
     records = np.zeros(len(points), kind)
     records["x"], records["y"], records["z"] = points.T

@@ -24,7 +24,7 @@ def head(encoding: str, elements: str) -> bytes:
 
 
 def write(path: Path, encoding: str) -> Path:
-    """A mesh: two sensors before its vertices, whose x comes last, and a face after them."""
+    """Write a mesh: two sensors before its vertices, with x last, and a face after them."""
     points = clouds.POINTS
     header = head(
         encoding,

@@ -24,7 +24,7 @@ from tests.real_data import real_data
 READER: MapFormat = ros_map.FORMAT
 
 PICTURE = np.array([[0, 254, 205], [254, 254, 254]], dtype=np.uint8)
-"""Two rows, the upper one is the higher y: occupied, free, and (at free_thresh 0.19) unknown."""
+"""Two rows; the upper one has the higher y: occupied, free, and (at free_thresh 0.19) unknown."""
 
 
 def pgm(values: NDArray[np.integer[Any]], most: int = 255, comment: str = "") -> bytes:
@@ -34,7 +34,7 @@ def pgm(values: NDArray[np.integer[Any]], most: int = 255, comment: str = "") ->
 
 
 def write(folder: Path, picture: bytes = pgm(PICTURE), *, name: str = "plan.pgm", **keys: object) -> Path:
-    """A plan and its picture; a key that is None is left out."""
+    """Write a plan and its picture; a key that is None is left out."""
     values: dict[str, object] = {
         "image": name,
         "mode": "trinary",
@@ -52,7 +52,7 @@ def write(folder: Path, picture: bytes = pgm(PICTURE), *, name: str = "plan.pgm"
 
 
 def floor(path: Path, resolution_m: float | None = None) -> NDArray[np.float32]:
-    """One level of the map, [x][y], after a look that all are alike."""
+    """Return one level of the map, [x][y], after a check that all levels are equal."""
     probability = READER.read_map(path, resolution_m=resolution_m).probability
     np.testing.assert_array_equal(probability, probability[:, :, :1].repeat(probability.shape[2], axis=2))
     return probability[:, :, 0]
@@ -141,7 +141,7 @@ def test_turned_walls_are_neither_lost_nor_moved(
     voxels = np.argwhere(occupancy.probability[:, :, 0] >= 0.5) + 0.5
     voxels = voxels * side + occupancy.origin[:2]
     gaps = np.linalg.norm(pixels[:, None] - voxels[None], axis=2)
-    # Each pixel shares a point with one of the voxels and the other way round: centres are at most half of
+    # Each pixel shares a point with a voxel and vice versa, so centres are at most half of
     # both diagonals apart.
     reach = (0.5 + side) * math.sqrt(0.5) + 1e-9
     assert gaps.min(axis=1).max() <= reach

@@ -36,7 +36,7 @@ def test_euroc_ground_truth(tmp_path: Path) -> None:
     assert not tum.FORMAT.recognises(path), "its order is w first: as TUM it would be another rotation"
     poses = READER.read_trajectory(path)
     assert poses.t_ns.tolist() == [1403636580838555648, 1403636580843555328]
-    # Six decimals per number leave the norm within 4 * 0.5e-6 of one.
+    # With six decimals per number the norm is within 4 * 0.5e-6 of one.
     np.testing.assert_allclose(
         poses.quaternion_xyzw[0], [-0.153029, -0.827383, -0.082152, 0.534108], rtol=0, atol=2e-6
     )

@@ -1,4 +1,4 @@
-"""TUM trajectories: what is read, what is dropped and counted, what is refused."""
+"""TUM trajectories: rows that are read, dropped and counted, and files that are refused."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_separators_comments_blank_lines_and_line_ends(tmp_path: Path, separator
     ],
 )
 def test_a_header_states_the_order_of_the_quaternion(tmp_path: Path, header: str) -> None:
-    # 90 deg about x: w = x = sqrt(1/2). Read as x y z w it would be another axis and angle.
+    # 90 deg about x: w = x = sqrt(1/2). In the order x y z w it would have another axis and angle.
     half = "0.7071067811865476"
     text = rows(header, f"1 10 20 30 {half} {half} 0 0", f"2 10 20 30 {half} {half} 0 0")
     poses = READER.read_trajectory(write(tmp_path, text))
@@ -78,7 +78,7 @@ def test_a_header_states_the_order_of_the_quaternion(tmp_path: Path, header: str
     assert poses.position.tolist() == [[10, 20, 30]] * 2
     np.testing.assert_allclose(poses.quaternion_xyzw, [[0.5**0.5, 0, 0, 0.5**0.5]] * 2, atol=1e-16)
     assert poses.dropped == {}
-    assert READER.recognises(tmp_path / "poses.tum") == ("," not in header)  # a CSV with a header is `csv`'s
+    assert READER.recognises(tmp_path / "poses.tum") == ("," not in header)  # `csv` reads a CSV with a header
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_rows_are_dropped_by_cause(tmp_path: Path) -> None:
             f"1 0 0 0 {IDENTITY}",
             f"nan 0 0 0 {IDENTITY}",
             f"2 nan 0 0 {IDENTITY}",
-            "99 0 0 inf 0 0 0 1",  # its stamp must not make those below look backward
+            "99 0 0 inf 0 0 0 1",  # its stamp must not put the rows below out of order
             "3 0 0 0 0 0 0 0",
             "4 0 0 0 0 0 0 1.2",
             "4 0 0 0 0 0 0 1e200",
@@ -257,7 +257,7 @@ def test_export_writes_each_camera(tmp_path: Path) -> None:
 
 
 def test_cameras_and_joints_as_evo_reads_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))  # evo writes its settings there when it is imported
+    monkeypatch.setenv("HOME", str(tmp_path))  # evo writes its settings there on import
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         file_interface = pytest.importorskip("evo.tools.file_interface")
@@ -275,7 +275,7 @@ def test_cameras_and_joints_as_evo_reads_them(tmp_path: Path, monkeypatch: pytes
         read = file_interface.read_tum_trajectory_file(str(paths[name]))
         np.testing.assert_array_equal(read.positions_xyz, track.position)
         np.testing.assert_array_equal(read.orientations_quat_wxyz[:, [1, 2, 3, 0]], track.quaternion_xyzw)
-        # evo keeps seconds as float64: a quarter of a microsecond so far from 1970.
+        # evo keeps seconds as float64: steps of a quarter of a microsecond so far from 1970.
         np.testing.assert_allclose(read.timestamps, track.t_ns / 1e9, rtol=0, atol=2.5e-7)
     wrist = motion.position[:, 0, motion.joints.index("left_wrist")]
     read = file_interface.read_tum_trajectory_file(str(paths["left_wrist"]))

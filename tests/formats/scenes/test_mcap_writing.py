@@ -1,4 +1,4 @@
-"""The MCAP export: the mcap library finds valid schemas, rosbags decodes what was written."""
+"""Export to MCAP: the mcap library finds valid schemas, and rosbags decodes the messages."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_the_skeleton_is_there_at_its_own_times(log: Path) -> None:
         assert len(joints.colors) == len(points)
         assert len(bones.colors) == len(bones.points)
         assert len(joints.points) == 19 - (row == 7)
-    # One bone ends in the wrist that is missing in frame 7.
+    # One bone ends in the wrist, which is missing in frame 7.
     assert len(read[6][1].markers[1].points) - len(read[7][1].markers[1].points) == 2
 
 
@@ -117,7 +117,7 @@ def test_cameras_fly_and_look_where_they_do(log: Path) -> None:
     assert [pose.pose.position.x for pose in path.poses] == track.position[::3, 0].tolist()
     _, frustums = messages(log, "/frustums")[0]
     corner = frustums.markers[0].points[1]
-    # The picture's corner, half a pixel outside the middle of the first one.
+    # The picture's corner, half a pixel outside the centre of the first pixel.
     np.testing.assert_allclose(
         [corner.x, corner.y, corner.z],
         [(-0.5 - LENS.cx) / LENS.fx, (-0.5 - LENS.cy) / LENS.fy, 1.0],

@@ -1,4 +1,4 @@
-"""The Rerun export, read back by Rerun's own reader."""
+"""Export to Rerun, read back by Rerun's own reader."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FLOAT32 = 2.0**-24
 
 @pytest.fixture(scope="module")
 def chunks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
-    """Record batches by entity."""
+    """Return record batches by entity."""
     (path,) = WRITER.write(recording(), tmp_path_factory.mktemp("rerun"))
     assert path.name == "Mound_walk.rrd"
     found: dict[str, list[Any]] = {}
@@ -31,7 +31,7 @@ def chunks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
 
 
 def column(chunks: dict[str, list[Any]], entity: str, name: str) -> list[Any]:
-    """A column of an entity, row after row."""
+    """Return a column of an entity, row by row."""
     batches = [batch for batch in chunks[entity] if name in batch.schema.names]
     return [row for batch in batches for row in batch.column(name).to_pylist()]
 

@@ -1,4 +1,4 @@
-"""BVH: hand-made files whose joints can be worked out on paper, and real ones that others read before."""
+"""BVH: small files whose joints can be computed on paper, and real ones with reference values."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def write(folder: Path, text: str) -> Path:
 
 
 def joint_places(motion: SkeletalMotion) -> tuple[Float, dict[int, Float]]:
-    """World positions of joints [T, B, 3] and of end sites, as the record's docstring defines them."""
+    """Compute world positions of joints [T, B, 3] and of end sites, as in the record's docstring."""
     place, turn = np.empty((len(motion.t_s), len(motion.bones), 3)), motion.rotation.copy()
     for bone, parent in enumerate(motion.parent):
         if parent < 0:
@@ -89,9 +89,9 @@ def test_joints_are_where_they_are_on_paper(tmp_path: Path) -> None:
     expected = [[0.03, 0.01, 1.0], [0.03, 0.11, 0.95], [0.03, 0.01, 1.2]]
     np.testing.assert_allclose(place[0], expected, rtol=0, atol=1e-12)
     np.testing.assert_allclose(ends[1][0], [0.05, 0.11, 0.55], rtol=0, atol=1e-12)
-    # Then the hips are turned by 90 about z: file x becomes y, y becomes -x. The leg sits at
-    # (-1.5, 100, 30) + (5, 10, 0). Its own -90 about x takes its end (0, -40, 2) to (0, 2, 40), the hips
-    # that to (-2, 0, 40).
+    # Then the hips are turned by 90 about z: file x becomes y, y becomes -x. The leg is at
+    # (-1.5, 100, 30) + (5, 10, 0). Its own turn of -90 about x moves its end (0, -40, 2) to (0, 2, 40). The
+    # hips' turn moves that to (-2, 0, 40).
     np.testing.assert_allclose(place[1, 1], [0.30, 0.035, 1.10], rtol=0, atol=1e-12)
     np.testing.assert_allclose(ends[1][1], [0.70, 0.015, 1.10], rtol=0, atol=1e-12)
     np.testing.assert_allclose(ends[2][1], [0.30, -0.515, 1.0], rtol=0, atol=1e-12)
@@ -106,13 +106,13 @@ def test_units_and_axes(tmp_path: Path) -> None:
         np.testing.assert_allclose(
             read_motion(path, unit=unit, axes="z-up").end[1], metres.end[1] * scale, rtol=1e-15
         )
-    # A turn of the axes turns every joint alike.
+    # A turn of the axes turns every joint in the same way.
     upright, _ = joint_places(read_motion(path, unit="m", axes="y-up"))
     np.testing.assert_allclose(upright, joint_places(metres)[0][..., [2, 0, 1]], rtol=0, atol=1e-12)
 
 
 def turn_about(axis: str, deg: float) -> Float:
-    """The textbook matrices."""
+    """Return the textbook rotation matrix about an axis."""
     c, s = np.cos(np.radians(deg)), np.sin(np.radians(deg))
     return np.array(
         {
@@ -144,7 +144,7 @@ def test_channels_turn_in_the_order_in_which_they_stand(
     for axis, angle in zip(order, used, strict=True):
         expected = expected @ turn_about(axis, angle)
     found = matrix_from_quaternion(read_motion(path, unit="m", axes="z-up").rotation[0, 0])
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)  # of 720 deg, 1e-13 rad are one rounding
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)  # a rounding of 720 deg is 1e-13 rad
 
 
 @pytest.mark.parametrize(
@@ -174,7 +174,7 @@ SIX = "CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation"
 
 
 def carried(rows: str) -> str:
-    """A scene's root that carries hips with a leg; all have position channels."""
+    """Write a scene's root that carries hips with a leg; all have position channels."""
     return (
         f"HIERARCHY\nROOT Scene\n{{\nOFFSET 0 0 0\n{SIX}\nJOINT Hips\n{{\nOFFSET 0 9 0\n{SIX}\n"
         f"JOINT Leg\n{{\nOFFSET 1 2 3\n{SIX}\nEnd Site\n{{\nOFFSET 0 -4 0\n}}\n}}\n}}\n}}\n"
@@ -183,7 +183,7 @@ def carried(rows: str) -> str:
 
 
 def test_what_only_carries_the_body_is_merged_into_its_root(tmp_path: Path) -> None:
-    """The scene stands at (100, 0, 0), turned by 90 about y: its x is -z, its z is x."""
+    """Put the scene at (100, 0, 0), turned by 90 about y: its x is -z, its z is x."""
     scene = "100 0 0 0 90 0"
     path = write(tmp_path, carried(f"{scene} 10 90 0 0 0 0 1 2 3 0 0 0\n{scene} 20 90 5 0 -90 0 1 2 3 0 0 0"))
     motion = read_motion(path, unit="m", axes="z-up")
@@ -293,11 +293,11 @@ def test_real_files_hold_what_others_read(name: str) -> None:
     for joint, frames in facts["fk_positions"].items():
         for frame, expected in frames.items():
             found = in_file[int(frame.removeprefix("frame_")), motion.bones.index(joint)]
-            np.testing.assert_allclose(found, expected, rtol=0, atol=6e-5)  # the facts have four decimals
+            np.testing.assert_allclose(found, expected, rtol=0, atol=6e-5)  # references have 4 decimals
 
 
 def test_a_real_person_walks_towards_the_file_s_z() -> None:
-    """CMU 10_04 walks along +z: east in the world, with the left hip towards north, as documented."""
+    """Read CMU 10_04, who walks along +z: east in the world, with the left hip towards north."""
     motion = read_motion(real_data("motion/cmu_10_04_walk.bvh"), unit="cm", axes="y-up")
     way = motion.root[-1] - motion.root[1]
     assert way[0] > 20 * abs(way[1])
@@ -307,7 +307,7 @@ def test_a_real_person_walks_towards_the_file_s_z() -> None:
 
 
 def test_long_files_are_read_at_numpy_s_speed(tmp_path: Path) -> None:
-    """Ten minutes at 120 Hz of 3 bones; about 0.15 s on an idle core."""
+    """Read ten minutes at 120 Hz of 3 bones; this takes about 0.15 s on an idle core."""
     row = "-1.123456 100.123456 3.123456 12.123456 -0.123456 3.123456 1.5 2.5 3.5 4.5"
     path = write(tmp_path, HIERARCHY + "MOTION\nFrames: 72000\nFrame Time: 0.0083333\n" + f"{row}\n" * 72_000)
     began = time.process_time()

@@ -1,4 +1,4 @@
-"""BVH out: rigs of motions whose bones are known, read by bvhtoolbox and by ourselves."""
+"""Writer of BVH: rigs of motions with known bones, read by bvhtoolbox and by our own reader."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ WRITTEN_M = 1e-6  # six decimals of a degree over 2 m of bones, and of a centime
 
 
 def measured(motion: JointMotion, joints: tuple[str, ...]) -> Float:
-    """Positions [T, B, 3] of a rig's joints as they were measured; the hip is the hips' middle."""
+    """Return the measured positions [T, B, 3] of a rig's joints; the hip is the middle of the hips."""
     return take_joints(*with_derived(motion.joints, motion.position[:, 0])[::-1], joints)
 
 
 def seen_by_bvhtoolbox(path: Path, folder: Path) -> tuple[list[str], Float]:
-    """Joints and world positions [T, B, 3] as bvhtoolbox has them, in the file's unit and axes."""
+    """Return joints and world positions [T, B, 3] by bvhtoolbox, in the file's unit and axes."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it still asks for pkg_resources
+        warnings.simplefilter("ignore")  # bvhtoolbox still imports pkg_resources
         bvhtoolbox = pytest.importorskip("bvhtoolbox")
         converter = pytest.importorskip("bvhtoolbox.convert.bvh2csv")
     tree = bvhtoolbox.BvhTree(path.read_text())
@@ -66,7 +66,7 @@ def test_another_reader_sees_the_joints_where_the_rig_has_them(
     names, positions = seen_by_bvhtoolbox(path, tmp_path)
     assert names == list(rigged.motion.bones)
     ours = joint_positions(rigged.motion)
-    # It writes five decimals of the unit; the world's (y, z, x) are the file's.
+    # It writes five decimals of the unit; the file's axes are the world's (y, z, x).
     np.testing.assert_allclose(
         positions / scale, ours[..., [1, 2, 0]], rtol=0, atol=WRITTEN_M + 5.1e-6 / scale
     )
@@ -99,14 +99,14 @@ def test_what_is_missing_is_held_left_out_and_counted(tmp_path: Path) -> None:
     back = read_motion(path, unit="cm", axes="y-up")
     assert len(back.t_s) == 27
     place = joint_positions(back)
-    np.testing.assert_allclose(place[8, 0], place[7, 0], atol=WRITTEN_M)  # frame 10 stays where 9 was
+    np.testing.assert_allclose(place[8, 0], place[7, 0], atol=WRITTEN_M)  # frame 10 keeps the place of 9
     forearm = back.bones.index("RightForeArm")
     np.testing.assert_allclose(back.rotation[13, forearm], back.rotation[12, forearm], atol=1e-7)
     np.testing.assert_allclose(back.rotation[14, forearm], back.rotation[12, forearm], atol=1e-7)
     (note,) = listener.notes
     assert "3 of 30 frames before and after the hips are seen were left out" in note
     assert "the hips stay where they were in 1 of 27 frames" in note
-    # Frame 10: the turns of hips, spine and left thigh; 15 and 16: the forearm. 13 bones point somewhere.
+    # Frame 10: the turns of hips, spine and left thigh; 15 and 16: the forearm. 13 bones have a direction.
     assert "5 of 351 turns of bones are held" in note
 
 
@@ -128,7 +128,7 @@ def test_angles_are_the_rotation_locked_or_not(seed: int, x_deg: float | None) -
         turns = Rotation.from_euler("ZXY", np.stack([z, np.full(5, x_deg), y], axis=1), degrees=True)
     angles = bvh_writing.euler_zxy_deg(turns.as_quat()[:, None])[:, 0]
     back = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
-    # Locked within 1e-7: what is left out of y turns by as much.
+    # Locked within 1e-7: the turn that is left out of y is as small.
     np.testing.assert_allclose(back, matrix_from_quaternion(turns.as_quat()), atol=3e-7)
 
 

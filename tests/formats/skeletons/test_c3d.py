@@ -1,4 +1,4 @@
-"""C3D: what we write is read by ezc3d and by us; files of others; what is damaged."""
+"""C3D: our files read by ezc3d and by our reader; files of other programs; damaged files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def write(path: Path, motion: JointMotion, unit: str = "mm", axes: str = "z-up")
 
 
 def foreign(path: Path, points: Any, labels: list[str], unit: str = "mm", first: int = 0) -> Path:
-    """A file as another program writes it with ezc3d: points [3, N, T]."""
+    """Write points [3, N, T] with ezc3d, as another program does."""
     file = need("ezc3d", "c3d").c3d()
     file["data"]["points"] = np.concatenate([points, np.ones((1, *points.shape[1:]))])
     file["parameters"]["POINT"]["RATE"]["value"] = [100.0]
@@ -73,7 +73,7 @@ def test_ezc3d_reads_unit_axes_rate_labels_and_residuals(tmp_path: Path) -> None
     expected = np.full(residual.shape, 0.001 * round(1000 * np.sqrt(np.square(SIGMA_M).sum() / 3)))
     expected[wrist, 7] = -1
     np.testing.assert_allclose(residual, expected, rtol=1e-6)
-    # Y up: the nose's second coordinate is its height.
+    # With y up, the nose's second coordinate is its height.
     assert asked.motion is not None
     np.testing.assert_allclose(file["data"]["points"][1, 0], asked.motion.position[:, 0, 0, 2], rtol=FLOAT32)
 
@@ -142,9 +142,9 @@ def test_what_is_wrong_is_said(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", [b"POINT", b"LABELS", b"RATE", b"FIRST_T_NS"])
 def test_damaged_parameters_are_refused_before_ezc3d_sees_them(tmp_path: Path, name: bytes) -> None:
-    """It searches minutes for what they promise, or takes the process along."""
+    """Damage the parameters; ezc3d would search for minutes for missing content, or crash the process."""
     damaged = bytearray(write(tmp_path / "a.c3d", walking(30)).read_bytes())
-    behind = damaged.index(name) + len(name)  # how far it is to the next, then type and dimensions
+    behind = damaged.index(name) + len(name)  # the distance to the next one, then type and dimensions
     damaged[behind : behind + 4] = bytes([0x77]) * 4
     (tmp_path / "a.c3d").write_bytes(damaged)
     with pytest.raises(DataError, match="its parameters are damaged"):

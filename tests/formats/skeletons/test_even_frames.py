@@ -1,4 +1,4 @@
-"""Times to frames: what is kept, what is interpolated, what is refused."""
+"""Resampling of times to frames: values that are kept, interpolated or refused."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.formats.exported import START_NS, Listener
 
 
 def moving(t_ns: np.ndarray) -> JointMotion:
-    """A point that goes by 1 m/s along x."""
+    """Make a point that moves at 1 m/s along x."""
     position = np.zeros((len(t_ns), 1, 1, 3))
     position[:, 0, 0, 0] = (t_ns - START_NS) / 1e9
     return JointMotion(t_ns, ("nose",), position)
@@ -38,7 +38,7 @@ def test_uneven_stamps_are_interpolated_never_beside_a_missing_one() -> None:
     even = at_even_times("x", motion, listener)
     assert even.rate_hz == pytest.approx(30)
     x = even.motion.position[:, 0, 0, 0]
-    missing = [3]  # at 100 ms exactly; 67 and 133 ms lie between samples that are there, or not
+    missing = [3]  # at 100 ms exactly; `beside` finds the frames between two samples, one of them missing
     expected = np.arange(7) / 30
     known = np.isfinite(x)
     np.testing.assert_allclose(x[known], expected[known], atol=1e-9)
@@ -47,7 +47,7 @@ def test_uneven_stamps_are_interpolated_never_beside_a_missing_one() -> None:
 
 
 def beside(t_ns: np.ndarray, frame: int) -> bool:
-    """Whether the sample that is missing is one of the two around a frame."""
+    """Return True if the missing sample is one of the two around a frame."""
     at = (t_ns[0] + t_ns[-1] * 0) + round(frame * 200_000_000 / 6)
     after = int(np.searchsorted(t_ns, at))
     return bool(t_ns[after] != at) and 3 in (after - 1, after)

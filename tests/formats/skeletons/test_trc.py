@@ -1,4 +1,4 @@
-"""TRC: real files of Pose2Sim, hand-made ones, and what we write."""
+"""TRC: real files of Pose2Sim, small ones, and our own."""
 
 from __future__ import annotations
 
@@ -79,12 +79,12 @@ def test_real_files(relative: str) -> None:
 
 def test_a_real_first_row_to_the_digit() -> None:
     motion = read(real_data("motion/pose2sim_markers.trc"))
-    # As noted by an independent reader in the file's own axes: RHip -0.065, 0.90151, -1.40057.
+    # Values of an independent reader in the file's own axes: RHip -0.065, 0.90151, -1.40057.
     np.testing.assert_allclose(motion.position[0, 0, 0], [-1.40057, -0.065, 0.90151], atol=1e-5)
 
 
 def test_the_header_of_a_real_file_may_count_wrong() -> None:
-    """Pose2Sim's filter writes one row less than it states: rows are counted, not believed."""
+    """Read a file of Pose2Sim's filter, which states one row too many: the rows themselves are counted."""
     path = real_data("pose2sim_single/pose-3d/single_0-99_filt_butterworth.trc")
     summary = READER.describe(path)
     assert summary["header: NumFrames"] == "100"
@@ -168,9 +168,9 @@ def test_export_is_what_opensim_expects(tmp_path: Path) -> None:
 
 
 def opensim() -> Any:
-    """OpenSim itself, told not to write opensim.log into the working folder."""
+    """Import OpenSim, and keep it from writing opensim.log into the working folder."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # SWIG's wrappers deprecate themselves
+        warnings.simplefilter("ignore", DeprecationWarning)  # SWIG's wrappers are deprecated
         library = pytest.importorskip("opensim", reason="opensim, the reader of TRC files, is not installed")
     library.Logger.removeFileSink()
     return library
@@ -216,7 +216,7 @@ def test_opensim_and_we_read_every_pattern_of_gaps(tmp_path: Path, gaps: list[An
     # OpenSim's x, y (up), z are the world's y, z (up), x. Seven decimals of a metre are written.
     turned = position[..., [1, 2, 0]]
     np.testing.assert_allclose(cells / {"m": 1, "mm": 1000}[unit], turned, rtol=0, atol=0.5001e-7)
-    # The older reader, which scaling and inverse kinematics use for marker files.
+    # The older reader, which OpenSim's scaling and inverse kinematics use for marker files.
     frames = library.MarkerData(str(path))
     assert (frames.getNumFrames(), frames.getNumMarkers()) == (5, 3)
     older = [
@@ -241,7 +241,7 @@ def test_one_person_keeps_the_plain_name(tmp_path: Path) -> None:
 
 
 def as_pose2sim_reads(path: Path) -> tuple[list[str], pd.DataFrame]:
-    """Marker names of the fourth line, numbers below the fifth: what Pose2Sim's own tools do."""
+    """Read marker names in line four and numbers below line five, as Pose2Sim's own tools do."""
     names = pd.read_csv(path, sep="\t", skiprows=3, nrows=0).columns[2:].tolist()
     return names[::3], pd.read_csv(path, sep="\t", skiprows=4)
 
@@ -260,7 +260,7 @@ def test_another_reader_finds_the_same(tmp_path: Path) -> None:
     assert np.isnan(values[7, names.index("LWrist")]).all()
     back = read(path, axes="z-up")
     np.testing.assert_allclose(back.position, motion.position, rtol=0, atol=0.5001e-7)
-    # The same on a file of theirs: the reader above is theirs, not ours.
+    # The same for a file of Pose2Sim's: the reader above is Pose2Sim's, not ours.
     names, table = as_pose2sim_reads(real_data("motion/pose2sim_markers.trc"))
     assert names[0] == "RHip"
     assert table.iloc[0, 2:5].tolist() == pytest.approx([-0.065, 0.90151, -1.40057], abs=1e-5)

@@ -28,7 +28,7 @@ def utc_ns(text: str, microseconds: int = 0) -> int:
 
 
 def subtitles(clocks: list[str], step_ms: int = 40) -> str:
-    """Blocks as DJI drones write them."""
+    """Write blocks as DJI drones do."""
     blocks = []
     for k, clock in enumerate(clocks):
         start, stop = (f"00:00:{t // 1000:02d},{t % 1000:03d}" for t in (k * step_ms, (k + 1) * step_ms))
@@ -148,7 +148,7 @@ def test_real_subtitles(name: str, rows: int, last_frame: int, first_ns: int, la
 @pytest.mark.parametrize(
     ("name", "problem"),
     [
-        # The first subtitle of two of them stands at 1 s, so that frame 0 is a second earlier.
+        # The first subtitle of two of them is at 1 s, so that frame 0 is a second earlier.
         (
             "matrice_300.srt",
             f"every 1 s, not for each frame.*start: {utc_ns('2022-06-21 16:06:17') // 10**9}}}",
@@ -205,7 +205,7 @@ def test_times_by_frame_number() -> None:
 
 
 def test_times_by_place_in_the_video() -> None:
-    # The recorder skipped what would have been frame 2: the video's frame 2 is shown at 120 ms.
+    # The recorder skipped what would have been frame 2, so the video's frame 2 is shown at 120 ms.
     media_ns = np.array([0, 40, 120, 160]) * 1_000_000
     stamps = FrameStamps(np.array([0, 1, 3, 4]), np.array([5, 45, 125, 165]), media_ns)
     pts_ns = np.array([0, 40_000_123, 119_999_000, 160_000_000, 200_000_000])

@@ -1,4 +1,4 @@
-"""Points followed through a video whose camera turned as it is known, and when that says the video began."""
+"""Points tracked through a video of a camera with known rotation, and the video's start estimated by them."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from tests.keypoints.spotted_flights import FPS, write_pictures
 Float = NDArray[np.float64]
 
 START_S = 1_700_000_000
-BEGINS_S = 7.2345  # the video, after the log
+BEGINS_S = 7.2345  # start of the video after that of the log
 LENS = Intrinsics(320, 240, 300.0, 300.0, 159.5, 119.5, "none", ())
 SECONDS, LOG_SECONDS, LOG_HZ = 4, 20, 100
 SAMPLE_FRAMES = 180
 
 
 def turning(t_s: Float) -> Rotation:
-    """The camera's attitude against the wall that it looks at: up to 12 deg, never twice alike."""
+    """Compute the camera's attitude against the wall it looks at: up to 12 deg, without repetition."""
     yaw = 8 * np.sin(1.3 * t_s) + 4 * np.sin(3.1 * t_s + 1)
     pitch = 3 * np.sin(1.9 * t_s)
     return Rotation.from_euler("YX", np.stack([yaw, pitch], axis=-1), degrees=True)
 
 
 def pictures(attitudes: Rotation) -> Iterator[NDArray[np.uint8]]:
-    """What a camera sees of something very far away: noise, blurred to some pixels."""
+    """Render a wall at a great distance: noise, blurred to some pixels."""
     noise = np.random.default_rng(1).integers(0, 256, (800, 1000), dtype=np.uint8)
     wall = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.5), None, 0, 255, cv2.NORM_MINMAX)
     wall_camera = np.array([[300.0, 0, 500], [0, 300.0, 400], [0, 0, 1]])
@@ -52,7 +52,7 @@ def pictures(attitudes: Rotation) -> Iterator[NDArray[np.uint8]]:
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A flight of one camera whose video says nothing of when it began."""
+    """Write a flight of one camera whose video does not state its start."""
     folder = tmp_path_factory.mktemp("panning")
     write_pictures(folder / "drone1.mp4", pictures(turning(np.arange(SECONDS * FPS) / FPS + BEGINS_S)))
     log_s = np.arange(LOG_SECONDS * LOG_HZ) / LOG_HZ
@@ -88,7 +88,7 @@ def test_points_are_followed_to_where_they_are(filmed: Path) -> None:
     turn = (turning(end_s).inv() * turning(begin_s)).as_matrix()[followed.stretch]
     ray = np.einsum("pij,pj->pi", turn, np.column_stack([followed.begin, np.ones(len(followed.begin))]))
     error_px = 300 * np.linalg.norm(followed.end - ray[:, :2] / ray[:, 2:], axis=1)
-    # Following errs by a tenth of a pixel from picture to picture, and there are six or seven of them.
+    # Tracking has an error of a tenth of a pixel from picture to picture, and there are six or seven of them.
     assert np.median(error_px) < 0.1 * np.sqrt(7)
 
 
@@ -98,10 +98,10 @@ def test_a_video_begins_when_its_pictures_turn_as_the_poses_do(filmed: Path) -> 
     camera = described["cameras"]["drone1"]
     error_s = camera["frames"]["first_t_ns"] / 1e9 - START_S - BEGINS_S
     sigma_s = camera["clock"]["sigma_s"]
-    # 1 mrad a point against motion that changes by some 0.5 rad/s^2 in a fifth of a second, 0.1 rad/s: 10 ms;
-    # of 100 points in each of 19 stretches, a quarter of a millisecond, were all their errors their own.
+    # 1 mrad a point against motion that changes by some 0.5 rad/s^2 in a fifth of a second, 0.1 rad/s: 10 ms.
+    # With independent errors, 100 points in each of 19 stretches give a quarter of a millisecond.
     assert 1e-5 < sigma_s < 2e-3
-    assert abs(error_s) < 4 * sigma_s + 1e-3  # the same test of formulas alone allows 1 ms
+    assert abs(error_s) < 4 * sigma_s + 1e-3  # the same test with formulas alone allows 1 ms
     assert any("by the motion in its pictures" in line for line in described["warnings"])
 
 
@@ -136,7 +136,7 @@ def test_a_start_that_is_known_roughly_is_refined(filmed: Path, tmp_path: Path) 
 
 
 def test_the_offset_of_a_clock_counts_once(filmed: Path, tmp_path: Path) -> None:
-    """Start and offset together say where to look; what the motion says is world time."""
+    """Check that start and offset together say where to search; the estimate by motion is world time."""
     manifest = (filmed / "flight.yaml").read_text(encoding="utf-8").replace("drone1.", f"{filmed}/drone1.")
     path = tmp_path / "flight.yaml"
     stated = f"{{start: {START_S + BEGINS_S - 5.4}, start_from: motion}}\n    clock: {{offset_s: 5.5}}"
@@ -145,14 +145,14 @@ def test_the_offset_of_a_clock_counts_once(filmed: Path, tmp_path: Path) -> None
     described = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
     camera = described["cameras"]["drone1"]
     assert camera["frames"]["first_t_ns"] / 1e9 == pytest.approx(START_S + BEGINS_S, abs=0.01)
-    assert camera["clock"]["sigma_s"] < 2e-3  # what was found, not the default of a clock that states none
+    assert camera["clock"]["sigma_s"] < 2e-3  # the estimate, not the default of a clock without a sigma
     alone = "{start_from: motion}\n    clock: {offset_s: 5.5}"
     path.write_text(manifest.replace("{start_from: motion}", alone), encoding="utf-8")
     assert "cameras.drone1: clock.offset_s: start_from: motion finds the start" in refused("ingest", path)
 
 
 def test_a_camera_that_flies_beside_a_person_is_timed_by_what_it_passes(tmp_path: Path) -> None:
-    """The sample flight (simulated): it flies a bow, over ground 10 m away, and the gimbal turns with it."""
+    """Use the sample flight (simulated): an arc over ground 10 m away, and the gimbal turns with it."""
     sample = Path(__file__).parents[3] / "sample_data" / "mound_walk"
     folder = ingest(sample / "flight.yaml", tmp_path / "a.session").folder / "cameras" / "drone1"
     poses = pd.read_parquet(folder / "poses.parquet")
@@ -169,7 +169,7 @@ def test_a_camera_that_flies_beside_a_person_is_timed_by_what_it_passes(tmp_path
         max_gap_ns=500_000_000,
         near_ns=true_ns - 500_000_000,
     )
-    # The poses err by 0.2 deg from row to row, 3.5 mrad: over a window of 0.1 s 1 mrad, against motion of
-    # some 20 mrad that changes within a second: 50 ms a stretch, 10 ms of thirty.
+    # The poses have errors of 0.2 deg from row to row, 3.5 mrad: over a window of 0.1 s 1 mrad, against
+    # motion of some 20 mrad that changes within a second. So sigma is 50 ms for a stretch, 10 ms for thirty.
     assert found.sigma_s < 0.03
     assert abs(found.start_ns - true_ns) / 1e9 < 4 * found.sigma_s

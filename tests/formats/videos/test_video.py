@@ -1,4 +1,4 @@
-"""Videos written with known stamps; FFmpeg's plain decoding and OpenCV are the oracles."""
+"""Videos with known stamps; FFmpeg's plain decoding and OpenCV give the expected values."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def relative_ns(ticks: list[int], tick_s: Fraction = TICK_S) -> list[int]:
 
 
 def packets(path: Path) -> list[tuple[int, int]]:
-    """Where each coded frame lies: position and size, in the order of decoding."""
+    """Return position and size of each coded frame in the file, in the order of decoding."""
     with av.open(str(path)) as container:
         return [(p.pos, p.size) for p in container.demux(video=0) if p.size and p.pos is not None]
 
@@ -119,7 +119,7 @@ def test_one_frame(tmp_path: Path) -> None:
 def test_frames_that_an_edit_list_hides_are_none(tmp_path: Path) -> None:
     path = write_video(tmp_path / "v.mp4", even_ticks(40), b_frames=0)
     content = bytearray(path.read_bytes())
-    place = content.find(b"elst") + 4 + 8 + 4  # version and flags, count; the duration stands first
+    place = content.find(b"elst") + 4 + 8 + 4  # version and flags, count; the duration comes first
     content[place : place + 4] = (10 * 3000).to_bytes(4, "big")
     path.write_bytes(content)
     pictures, _ = decoded_by_opencv(path)
@@ -139,7 +139,7 @@ def test_frames_that_vp9_never_shows_are_none() -> None:
         assert not reader.index.variable
         mine = dict(reader.frames())
         assert (sorted(mine), reader.missing) == (list(range(72)), set())
-    # The two conversions of ten bits to eight differ by levels at edges; another frame differs by far more.
+    # The two conversions of ten bits to eight differ by levels at edges; another frame differs far more.
     mean = [[np.abs(mine[k].astype(int) - pictures[j]).mean() for j in range(72)] for k in (0, 30, 50, 71)]
     assert np.argmin(mean, axis=1).tolist() == [0, 30, 50, 71]
 
@@ -214,7 +214,7 @@ def test_pictures_are_opencvs(tmp_path: Path, turned_deg: int) -> None:
     index = index_video(path)
     assert index.rotation_deg == turned_deg
     assert (index.width, index.height) == (SIZE if turned_deg % 180 == 0 else SIZE[::-1])
-    # OpenCV says milliseconds as a float64 of seconds.
+    # OpenCV gives milliseconds as a float64 of seconds.
     np.testing.assert_allclose(index.pts_ns / 1e6, milliseconds, rtol=0, atol=1e-6)
     mine = [picture for _, picture in frames(path)]
     assert len(mine) == len(pictures)
@@ -254,7 +254,7 @@ def test_pictures_are_not_kept(tmp_path: Path) -> None:
     alive: list[weakref.ref[Picture]] = []
     for _, picture in frames(path):
         alive = [kept for kept in alive if kept() is not None] + [weakref.ref(picture)]
-        assert len(alive) <= 2  # this one, and the one before that the loop's variable held
+        assert len(alive) <= 2  # this one, and the one before, which the loop's variable held
 
 
 # --- damage --------------------------------------------------------------------------------------------
@@ -314,7 +314,7 @@ def test_a_cut_mp4_is_salvaged_and_says_what_it_lost(tmp_path: Path, share: floa
     with VideoReader(path) as reader:
         count = reader.index.count
         assert reader.index.dropped == {"cut off": 60 - count}
-        # Two frames in a row refer to later ones: decoding is that and one more ahead of showing.
+        # Two frames in a row refer to later ones: decoding is ahead of showing by that and one more.
         assert held - 3 <= count <= held
         assert reader.index.pts_ns.tolist() == relative_ns(uneven_ticks(60))[:count]
         assert [read_bar_code(picture) for _, picture in reader.frames()] == list(range(count))
@@ -472,7 +472,7 @@ def test_real_recordings_decode_as_ffmpeg_does(name: str) -> None:
     ("stated", "made_ns"),
     [
         ("2024-05-01T10:00:03.000000Z", 1_714_557_603_000_000_000),
-        ("1904-01-01T00:00:00.000000Z", None),  # the zero of MP4: its clock was never set
+        ("1904-01-01T00:00:00.000000Z", None),  # MP4's zero: its clock was never set
         (None, None),
     ],
 )
