@@ -1,1 +1,1 @@
-"""What a session is: manifest, tables, storage, stages, skeletons, errors and registries."""
+"""Data model of a session: manifest, tables, storage, stages, skeletons, errors and registries."""

@@ -1,4 +1,4 @@
-"""Where a session's cameras were at given times, as far as its logs are trusted between their stamps."""
+"""Poses of a session's cameras at given times, interpolated as far as the manifest trusts the logs."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from pipelines.session.records import Float, Int64, Trajectory
 def poses_at(
     track: Trajectory, t_ns: Int64, between: Interpolation, *, static: bool = False
 ) -> tuple[Float, Float]:
-    """world_from_camera at given times.
+    """Interpolate world_from_camera at given times.
 
     Args:
         track: the logged or refined poses.
         t_ns: [T].
-        between: how far they are trusted.
-        static: the first pose holds all the time.
+        between: the longest gap to bridge and the longest extrapolation.
+        static: True for a camera that stands still; its first pose holds all the time.
 
     Returns:
         Positions [T, 3] m and quaternions [T, 4] xyzw; NaN where there is no pose.

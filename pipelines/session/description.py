@@ -1,6 +1,6 @@
-"""`session.json`: what a session holds and what was doubted when it was ingested.
+"""`session.json`: the contents of a session and the warnings of its ingest.
 
-Ingest alone writes it; every later stage reads it through here instead of opening the manifest again.
+Only ingest writes it. Every later stage reads it through this module and does not open the manifest again.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SCHEMA = 1
 
 
 class Entry(BaseModel):
-    """A mapping of session.json; keys that a later version added are kept out of the way."""
+    """A mapping of session.json; unknown keys, which a later version added, are ignored."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, populate_by_name=True)
 
@@ -41,11 +41,11 @@ class IntrinsicsEntry(Entry):
 
     @classmethod
     def of(cls, intrinsics: Intrinsics) -> IntrinsicsEntry:
-        """The entry of given intrinsics."""
+        """Return the entry of given intrinsics."""
         return cls(**asdict(intrinsics))
 
     def intrinsics(self) -> Intrinsics:
-        """The intrinsics of this entry."""
+        """Return the intrinsics of this entry."""
         return Intrinsics(**self.model_dump())
 
 
@@ -60,7 +60,7 @@ class FramesEntry(Entry):
 
 
 class PosesEntry(Entry):
-    """The poses of a camera, and the frames that none of them covers."""
+    """The poses of a camera, and the number of frames without a pose."""
 
     source: str
     static: bool
@@ -93,7 +93,7 @@ class ClockEntry(Entry):
 
 
 class MediaEntry(Entry):
-    """Where the pictures of a camera lie; without them only overlays are lost."""
+    """Files that hold the pictures of a camera; overlays and keypoint detection need them."""
 
     paths: list[str]  # relative to the session's folder: a video file, or the files of a log
     sources: list[str]  # the same files as `Description.sources` names them
@@ -102,10 +102,10 @@ class MediaEntry(Entry):
 
 
 class LogClockEntry(Entry):
-    """How the clock of a drone's own log was taken to UTC, by the time of its GPS; applied to the tables."""
+    """Fit of a drone log's clock to UTC, from its GPS times; already applied to the tables."""
 
     at_ns: int  # the log's own clock, in the middle of the fixes
-    offset_ns: int  # UTC less that, there
+    offset_ns: int  # UTC minus the log's clock, at `at_ns`
     drift_ppm: float
     drift_sigma_ppm: float
     residual_s: float  # scatter of the fixes
@@ -114,12 +114,12 @@ class LogClockEntry(Entry):
 
 
 class OriginEntry(Entry):
-    """Where on Earth the world's origin lies; all cameras with positions on Earth share it."""
+    """Place on Earth of the world's origin; all cameras with positions on Earth share it."""
 
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
-    source: str  # "world.origin", or the log whose first position it is
+    source: str  # "world.origin", or the log whose first position is the origin
 
 
 class CameraEntry(Entry):
@@ -135,11 +135,11 @@ class CameraEntry(Entry):
     media: MediaEntry | None
 
 
-_HIP_ABOVE_M = {"hip": 0.0, "centre": 0.0, "feet": 0.95, "head": -0.70}  # of 1.75 m, standing
+_HIP_ABOVE_M = {"hip": 0.0, "centre": 0.0, "feet": 0.95, "head": -0.70}  # of a standing person of 1.75 m
 
 
 class ActorEntry(Entry):
-    """Where the actor was, as logged."""
+    """The logged positions of the actor."""
 
     source: str
     sources: list[str] = []  # the files of that log as `Description.sources` names them
@@ -150,12 +150,12 @@ class ActorEntry(Entry):
 
     @property
     def hip_above_m(self) -> float:
-        """How far the hips are above the point that was logged, for a person of 1.75 m who stands."""
+        """Height of the hips above the logged point, m, for a standing person of 1.75 m."""
         return _HIP_ABOVE_M[self.point]
 
 
 class HeldMap(Entry):
-    """One map, voxel counts included; unknown voxels count neither as occupied nor as free."""
+    """One map with its voxel counts; unknown voxels count neither as occupied nor as free."""
 
     from_ns: int  # it holds from then on, until the next one does
     resolution_m: float
@@ -165,7 +165,7 @@ class HeldMap(Entry):
 
     @classmethod
     def of(cls, occupancy: Occupancy) -> HeldMap:
-        """The entry of a map."""
+        """Return the entry of a map."""
         occupied, free = occupancy.probability >= 0.5, occupancy.probability < 0.5  # NaN is neither
         return cls(
             from_ns=occupancy.from_ns,
@@ -177,20 +177,20 @@ class HeldMap(Entry):
 
 
 class MapEntry(Entry):
-    """What stands around; where maps replaced each other, the figures beside `maps` are the last one's."""
+    """The maps of the surroundings; the figures beside `maps` are those of the last map."""
 
     source: str
-    unknown: str  # what the planner takes unknown voxels for
+    unknown: str  # state that the planner assumes for unknown voxels
     resolution_m: float
     shape: list[int]
     occupied: int
     free: int
     dropped: dict[str, int]
-    maps: list[HeldMap] = []  # every one, as in map/index.json; sessions of before do not say
+    maps: list[HeldMap] = []  # all maps, as in map/index.json; empty in sessions of older versions
 
 
 class PlannedEntry(Entry):
-    """Where one drone was sent, as logged."""
+    """The logged setpoints of one drone."""
 
     source: str
     count: int
@@ -198,32 +198,32 @@ class PlannedEntry(Entry):
 
 
 class TruthEntry(Entry):
-    """What is known to be true."""
+    """The ground truth of a session: joints and camera poses."""
 
     joints: list[str]
     people: int
     first_t_ns: int
     last_t_ns: int
     cameras: list[str]
-    missing: int = 0  # of all times, people and joints: how many have no position
-    dropped: dict[str, int] = {}  # of these, positions that the file has and that cannot be used
+    missing: int = 0  # positions that are absent, counted over all times, people and joints
+    dropped: dict[str, int] = {}  # those of them that the file has but that cannot be used, by cause
     poses_dropped: dict[str, dict[str, int]] = {}  # of the true poses, by camera
 
 
 class Interpolation(Entry):
-    """How far poses are trusted between and beyond the stamps of their log."""
+    """Limits of interpolation between, and extrapolation beyond, the stamps of a pose log."""
 
     max_gap_s: float
     max_extrapolation_s: float
 
     @property
     def max_gap_ns(self) -> int:
-        """The longest stretch between two logged poses that is bridged."""
+        """The longest time between two logged poses that is bridged."""
         return round(self.max_gap_s * 1e9)
 
     @property
     def max_extrapolation_ns(self) -> int:
-        """How far before its log begins, and after it ends, a pose is held."""
+        """The longest time for which a pose is held before its log begins or after it ends."""
         return round(self.max_extrapolation_s * 1e9)
 
 
@@ -247,7 +247,7 @@ class Description(Entry):
 
     @model_validator(mode="after")
     def _names_are_of_cameras(self) -> Description:
-        """Names lead to folders: those of a session from elsewhere must not lead out of it."""
+        """Refuse names that are unsafe as folders: those of a foreign session must not lead out of it."""
         refuse_camera_names(self.cameras)
         named = [self.clock_reference, *(self.plan or {}), *(self.truth.cameras if self.truth else [])]
         strange = [name for name in named if name not in self.cameras]
@@ -257,7 +257,7 @@ class Description(Entry):
 
     @property
     def has_true_joints(self) -> bool:
-        """Whether it is known where the joints really were."""
+        """True if the session holds ground truth for joints."""
         return self.truth is not None and bool(self.truth.joints)
 
     @property
@@ -284,7 +284,7 @@ class Description(Entry):
 
     @property
     def start_ns(self) -> int:
-        """The first frame of the flight's cameras: what users' seconds count from."""
+        """Time of the flight's first frame of any camera; seconds that users give count from it."""
         return min(entry.frames.first_t_ns for entry in self.cameras.values())
 
 

@@ -1,6 +1,6 @@
-"""The errors a user can cause or mend. Each is one line: which file, what is wrong, what to do.
+"""The errors that a user can cause or correct. Each is one line: which file, what is wrong, what to do.
 
-The command line prints the line and exits 1. Anything else that escapes is our own bug.
+The command line prints the line and exits 1. Any other exception that escapes is a bug of this program.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class DataError(MocapError):
     Args:
         source: the file, folder or setting at fault.
         problem: what is wrong with it, with the numbers involved.
-        remedy: what the user can do about it; empty only when the problem says it already.
+        remedy: what the user can do about it; empty only where the problem already says it.
     """
 
     def __init__(self, source: Path | str, problem: str, remedy: str = "") -> None:

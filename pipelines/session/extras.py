@@ -1,4 +1,4 @@
-"""Optional libraries: imported where they are needed, or a line with the command that installs them."""
+"""Import of optional libraries; where one is missing, the error gives the command that installs it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def need(module: str, extra: str) -> Any:
     """Import an optional library.
 
     Args:
-        module: what is imported.
+        module: the name of the module.
         extra: the extra of this package that lists it.
 
     Raises:
@@ -34,7 +34,7 @@ def need(module: str, extra: str) -> Any:
 def install_command(extra: str) -> str:
     """Write the command that installs the libraries of an extra, by their own names.
 
-    This package is on no index: a hint to install it with the extra would name what pip does not find.
+    This package is on no package index, so pip would not find `mocap-pipeline[extra]`.
     """
     listed = [_OF_EXTRA.fullmatch(line) for line in requires("mocap-pipeline") or ()]
     names = [found["requirement"] for found in listed if found and found["extra"] == extra]

@@ -1,4 +1,4 @@
-"""Where the logs of a session say that the actor was."""
+"""The actor's logged positions in a session."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from pipelines.session.description import Description
 from pipelines.session.records import Float, Int64
 from pipelines.session.tables import ACTOR, read_table
 
-_GAP_NS = 2_000_000_000  # between two stamps further apart nobody knows
+_GAP_NS = 2_000_000_000  # no interpolation between two stamps that are further apart
 
 
 @dataclass(frozen=True)
 class LoggedActor:
-    """The actor's way. Of one whose head or feet were logged, the hips of somebody 1.75 m tall who stands."""
+    """The actor's hips over time; from a logged head or feet, those of a standing person of 1.75 m."""
 
     t_ns: Int64  # [A] ascending
     hips: Float  # [A, 3] m, world
 
     def hips_at(self, t_ns: Int64) -> Float:
-        """The hips [T, 3] at given times, NaN where the log says nothing."""
+        """Interpolate the hips [T, 3] at given times; NaN where no logged position is near enough."""
         return interpolate_points(self.t_ns, self.hips, t_ns, max_gap_ns=_GAP_NS)
 
 
 def logged_actor(folder: Path, description: Description) -> LoggedActor | None:
-    """The actor of a session; None where none was logged.
+    """Load the actor of a session; None where none was logged.
 
     Raises:
         DataError: the table is damaged.

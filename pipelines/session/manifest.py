@@ -1,8 +1,8 @@
-"""`flight.yaml`: where everything of one flight lies and how it hangs together (DESIGN, section 4).
+"""`flight.yaml`: the files of one flight and how they belong together (DESIGN, section 4).
 
-The whole schema stands here, also the parts whose readers come later: those are valid, and refused by
-the stage that would need them. Every problem of a manifest is told in one message, an unknown key with
-the nearest known one.
+The whole schema is defined here, including the parts that have no reader yet. Those are valid, but the
+stage that needs them refuses them. All problems of a manifest are reported in one message, an unknown key
+with the nearest known one.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ Seconds = Annotated[float, AfterValidator(_seconds)]
 
 
 class Origin(Part):
-    """Where on Earth the world's origin lies."""
+    """Place on Earth of the world's origin."""
 
     latitude_deg: float = Field(ge=-90, le=90)
     longitude_deg: float = Field(ge=-180, le=180)
@@ -86,21 +86,21 @@ class Origin(Part):
 
 
 class World(Part):
-    """The axes that sources use unless they say otherwise."""
+    """The axes of all sources that do not state their own, and the world's origin."""
 
     frame: Axes = "enu"
     origin: Origin | None = None
 
 
 class LogClock(Part):
-    """How a recorder's clock relates to the world's: the offset at the first message, and the drift since."""
+    """Relation of a recorder's clock to the world's: the offset at the first message, and the drift since."""
 
     offset_s: Seconds = 0.0
     drift_ppm: float = Field(0.0, ge=-100_000, le=100_000)
 
 
 class WorldFromLog(Part):
-    """Where a drone's estimator has its origin."""
+    """Pose in the world of the origin of a drone's estimator."""
 
     translation: Vector = [0.0, 0.0, 0.0]
     yaw_deg: float = 0.0
@@ -129,14 +129,15 @@ class Video(Part):
     topic: str | None = None
 
 
-_COUNTED = (("start", "start_ns"), ("start_from", "start_from"), ("fps", "fps"))  # go with each other only
+_COUNTED = (("start", "start_ns"), ("start_from", "start_from"), ("fps", "fps"))  # not with other keys
 
 
 class FrameTimes(Part):
-    """When each frame was taken; container stamps from `start` on where nothing else is said."""
+    """Source of the frames' times; by default the container's stamps, counted from `start`."""
 
     start_ns: SecondsAsNs = Field(0, alias="start")
-    # The time of its creation that a video states, or that at which its pictures turn as the poses do.
+    # container: the creation time that the video states; motion: the start at which the pictures turn as
+    # the poses do.
     start_from: Literal["container", "motion"] | None = None
     fps: Fps | None = None
     csv: str | None = None
@@ -160,7 +161,7 @@ class FrameTimes(Part):
 
     @property
     def has_start(self) -> bool:
-        """Whether a start is stated, be it 0."""
+        """True if a start is stated, even 0."""
         return "start_ns" in self.model_fields_set
 
 
@@ -172,7 +173,7 @@ class Clock(Part):
 
 
 class StaticPose(Part):
-    """A calibration that holds the pose of a camera that stands still."""
+    """A calibration file with the pose of a camera that stands still."""
 
     shorthand = "path"
     path: str
@@ -180,7 +181,7 @@ class StaticPose(Part):
 
 
 class PoseSource(Part):
-    """Where a camera's poses come from."""
+    """Source of a camera's poses."""
 
     one_of = ("log", "tum", "csv", "static", "dji", "ulog", "ardupilot")
     log: str | None = None
@@ -188,8 +189,8 @@ class PoseSource(Part):
     parent: str | None = None
     child: str | None = None
     preset: Literal["dji_osdk", "mavros"] | None = None  # the usual topics of a driver, in a log
-    namespace: str | None = None  # of these topics, where a log holds several drones: /uav1
-    attitude: str | None = None  # a topic beside one of positions alone (NavSatFix, PointStamped)
+    namespace: str | None = None  # of the preset's topics, where a log holds several drones: /uav1
+    attitude: str | None = None  # topic of attitudes, if `topic` has only positions (NavSatFix, PointStamped)
     tum: str | None = None
     csv: str | None = None
     static: StaticPose | None = None
@@ -233,7 +234,7 @@ class PoseSource(Part):
 
     @property
     def is_telemetry(self) -> bool:
-        """Whether a drone's own log, or its driver's topics, say position and attitude apart."""
+        """True if position and attitude come separately, from a drone's own log or its driver's topics."""
         parts = (self.dji, self.ulog, self.ardupilot, self.preset, self.attitude)
         return any(part is not None for part in parts)
 
@@ -246,7 +247,7 @@ class RigidTransform(Part):
 
 
 class Mount(Part):
-    """How the camera sits on the body."""
+    """Pose of the camera on the body."""
 
     looks: Literal["forward", "backward", "left", "right", "down", "up"] | None = None
     down_deg: float = 0.0
@@ -256,7 +257,7 @@ class Mount(Part):
 
 
 class FixedAngles(Part):
-    """Where a camera looked throughout, as DJI states it: yaw from north to east, pitch up, roll right."""
+    """Constant direction of a camera in DJI's angles: yaw from north to east, pitch up, roll right."""
 
     yaw_deg: float = Field(ge=-360, le=360)
     pitch_deg: float = Field(ge=-180, le=180)
@@ -264,7 +265,7 @@ class FixedAngles(Part):
 
 
 class Gimbal(Part):
-    """Angles of the gimbal over time: of a topic, fixed, or of the drone's own log that states the pose."""
+    """Source of the gimbal's angles: a topic, fixed angles, or the drone's own log that gives the pose."""
 
     log: str | None = None
     topic: str | None = None
@@ -367,7 +368,7 @@ class Camera(Part):
 
 
 class Actor(Part):
-    """Where the actor was, as logged in flight."""
+    """Source of the actor's positions, logged in flight."""
 
     log: str
     topic: str | None = None
@@ -375,7 +376,7 @@ class Actor(Part):
 
 
 class Map(Part):
-    """What stands around."""
+    """Source of the map of the surroundings."""
 
     shorthand = "path"
     one_of = ("path", "log")
@@ -385,7 +386,7 @@ class Map(Part):
     parent: str | None = None  # the frame that is the log's world
     unknown: Literal["free", "occupied"] = "free"
     resolution_m: float | None = Field(None, gt=0)
-    height_m: float | None = Field(None, gt=0, le=1000)  # of what stands on a logged floor plan
+    height_m: float | None = Field(None, gt=0, le=1000)  # of obstacles on a logged floor plan
 
     @model_validator(mode="after")
     def _only_of_logs(self) -> Map:
@@ -407,7 +408,7 @@ class TruthJoints(Part):
 
 
 class Truth(Part):
-    """What is known to be true."""
+    """Sources of ground truth: joints, and camera poses by camera."""
 
     shorthand = "joints"
     joints: TruthJoints | None = None
@@ -415,7 +416,7 @@ class Truth(Part):
 
 
 class PlannedTopic(Part):
-    """A topic of commanded positions, and the log that holds it where that is not the plan's."""
+    """A topic of commanded positions, and its log where that is not the plan's `log`."""
 
     shorthand = "topic"
     topic: str
@@ -423,7 +424,7 @@ class PlannedTopic(Part):
 
 
 class Plan(Part):
-    """Where the on-board planner sent the drones, by camera: topics of a log, or files of poses."""
+    """Setpoints of the on-board planner by camera: topics of a log, or files of poses."""
 
     log: str | None = None
     topics: dict[str, PlannedTopic] = {}
@@ -443,19 +444,19 @@ class Plan(Part):
 
     @property
     def cameras(self) -> list[str]:
-        """Of whom it says something."""
+        """The cameras that have a topic or a file."""
         return [*self.topics, *self.files]
 
     def log_of(self, camera: str) -> str:
-        """The log of a camera's topic."""
+        """Return the log of a camera's topic."""
         return self.topics[camera].log or self.log or ""
 
 
 def refuse_camera_names(names: Collection[str]) -> None:
-    """Refuse names of cameras that cannot each name a folder of its own.
+    """Refuse camera names that cannot each name their own folder.
 
     Raises:
-        ValueError: which, and what names may be.
+        ValueError: a name is not allowed, or two names differ in case only.
     """
     bad = [name for name in names if not CAMERA_NAME.fullmatch(name)]
     if bad:
@@ -496,7 +497,7 @@ class Flight(Part):
 
     @property
     def reference_camera(self) -> str:
-        """The camera whose clock is held."""
+        """The camera whose clock offset is held at its given value when clocks are estimated."""
         return self.clock_reference or next(iter(self.cameras))
 
 

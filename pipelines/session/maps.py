@@ -1,13 +1,13 @@
 """Occupancy maps of a session: `map/0.npz`, `map/1.npz`, ... and `map/index.json`.
 
-One npz (a zip of .npy files) holds one grid; what stands there may come from anybody, so these are the rules:
+One npz (a zip of .npy files) holds one grid. Any program may write one, so these are the rules:
 
 - `probability`: float [X, Y, Z], 0..1, NaN where nothing is known. Instead of it `occupancy`: bool, or
   integers as in nav_msgs/OccupancyGrid (0 to 100 percent, -1 unknown).
 - `origin`: [3], metres, the corner of voxel (0, 0, 0); `resolution_m`: the side of a voxel.
 - `from_ns`: the time from which the map holds; optional, 0.
 
-The same map gives the same bytes, and nothing in a file is unpickled or believed before it was checked.
+The same map gives the same bytes. Nothing in a file is unpickled, and nothing is used before it is checked.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from pipelines.session.records import Float, Occupancy
 from pipelines.session.storage import as_data_error, jsonable, read_json, write_json
 
 MOST_VOXELS = 500_000_000
-"""A larger grid (2 GB as float32) is refused."""
+"""The most voxels of a grid (2 GB as float32); a larger one is refused."""
 
 FINEST_M, COARSEST_M = 1e-4, 1e4
-"""Voxels smaller or larger than these are a mistake in a file, not a map of a site."""
+"""The smallest and the largest side of a voxel; anything else is a mistake in the file."""
 
 _SLAB_BYTES = 16 << 20  # how much of a stored grid is decoded at a time
 _SMALL_MEMBER = 4096  # bytes; origin, resolution and time are far smaller
 _WRITE_AGAIN = "write it again: probability [X, Y, Z], origin [3], resolution_m"
 
-# What zipfile, zlib and numpy's header parser raise on damaged files.
+# Exceptions that zipfile, zlib and numpy's header parser raise on damaged files.
 _DAMAGED = (
     zipfile.BadZipFile,
     zlib.error,
@@ -59,7 +59,7 @@ _DAMAGED = (
 
 
 def check_resolution(source: Path | str, resolution_m: float) -> float:
-    """The side of a voxel, if it is one.
+    """Return the side of a voxel, or refuse one that cannot be right.
 
     Raises:
         DataError: not a number, or not within 0.1 mm and 10 km.
@@ -99,7 +99,7 @@ def check_size(source: Path | str, shape: Sequence[float], resolution_m: float, 
 def describe_grid(
     resolution_m: float, origin: Float, shape: Sequence[int], *, occupied: int, free: int
 ) -> dict[str, object]:
-    """What `mocap info` says of every voxel map: its box and how many voxels are in which state."""
+    """Describe a voxel map for `mocap info`: its box, and the number of voxels in each state."""
     corner = origin + np.asarray(shape) * resolution_m
     return {
         "resolution_m": resolution_m,
@@ -122,7 +122,7 @@ def store_map(folder: Path, occupancies: Iterable[Occupancy]) -> list[HeldMap]:
         occupancies: at least one, in the order of the times from which they hold.
 
     Returns:
-        What each of them holds.
+        The entry of each map, in the same order.
     """
     place = folder / "map"
     place.mkdir()
@@ -144,7 +144,7 @@ def store_map(folder: Path, occupancies: Iterable[Occupancy]) -> list[HeldMap]:
 
 
 def load_maps(session: Path) -> list[Occupancy]:
-    """The maps of a session in the order they were stored; none without `map/`.
+    """Load the maps of a session in the order they were stored; an empty list without `map/`.
 
     Raises:
         DataError: the index or a map is missing or damaged.
@@ -153,7 +153,7 @@ def load_maps(session: Path) -> list[Occupancy]:
 
 
 def each_map(session: Path) -> Iterator[Occupancy]:
-    """The same, one in memory at a time.
+    """Yield the maps of a session in the order they were stored, one in memory at a time.
 
     Raises:
         DataError: the index or a map is missing or damaged.
@@ -187,7 +187,7 @@ def write_grid(path: Path, occupancy: Occupancy) -> None:
 
 
 def read_grid(path: Path) -> Occupancy:
-    """Read one map, whoever wrote it, in the layout above.
+    """Read one map in the layout of the module's docstring, whichever program wrote it.
 
     Raises:
         DataError: no zip, damaged, arrays missing or of another shape or kind, a probability outside 0..1,
@@ -201,7 +201,7 @@ def read_grid(path: Path) -> Occupancy:
 
 
 def describe_stored(path: Path) -> dict[str, object]:
-    """Box, voxels and states of a stored map, a slab at a time.
+    """Describe a stored map (box, voxels, states), one slab in memory at a time.
 
     Raises:
         DataError: as `read_grid`.
@@ -315,7 +315,7 @@ class _StoredGrid:
         return _Header(name, shape, fortran_order, dtype, offset)
 
     def slabs(self) -> Iterator[tuple[tuple[slice, ...], NDArray[np.float32]]]:
-        """Probabilities, part after part, and the place of each part in the grid."""
+        """Yield the place of each part in the grid and its probabilities, part after part."""
         header = self.header
         stored_shape = header.shape[::-1] if header.fortran_order else header.shape
         layer_bytes = stored_shape[1] * stored_shape[2] * header.dtype.itemsize

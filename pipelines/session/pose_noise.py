@@ -1,6 +1,6 @@
-"""How far the poses of a camera err, as somebody says: the command line, flight.yaml, or the log itself.
+"""Uncertainty of a camera's poses, from the command line, flight.yaml, or the log itself.
 
-The first of these that says anything is believed; nobody may, too.
+The first of these that states one is used. All three may be silent.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ _ROUNDED = 1e-6  # of an eigenvalue of correlations that logs have rounded
 
 
 class StatedNoise(NamedTuple):
-    """The errors of N logged poses, None where nobody states them."""
+    """The standard deviations of N logged poses; None where no source states them."""
 
     sigma: Float | None  # [N, 2] standard deviation per axis of position (m) and rotation (rad)
-    covariance: Float | None  # [N, 6, 6] the log's own, where `sigma` is its level
+    covariance: Float | None  # [N, 6, 6] the log's own, where `sigma` is computed from it
 
 
 def stated_models(name: str, entry: CameraEntry, pose_noise: str | None) -> list[NoiseModel] | None:
-    """The models of a camera's pose errors; None where neither command line nor flight.yaml names any.
+    """Return the models of a camera's pose errors; None if neither command line nor flight.yaml names any.
 
     Args:
         name: of the camera.
-        entry: what session.json says of it.
-        pose_noise: what the command line says.
+        entry: its entry in session.json.
+        pose_noise: the value of `--pose-noise`, if any.
 
     Raises:
-        DataError: the models are none that are known.
+        DataError: a model is not known.
     """
     if pose_noise:
         return parsed_noise_models(COMMAND_LINE, pose_noise)
@@ -49,16 +49,16 @@ def stated_models(name: str, entry: CameraEntry, pose_noise: str | None) -> list
 def stated_noise(
     name: str, entry: CameraEntry, trajectory: Trajectory, pose_noise: str | None = None
 ) -> StatedNoise:
-    """How far each pose of a camera's log errs, by its models or else by its covariances.
+    """Compute the uncertainty of each pose of a camera's log, from models or else from its covariances.
 
     Args:
         name: of the camera.
-        entry: what session.json says of it.
+        entry: its entry in session.json.
         trajectory: its N logged poses.
-        pose_noise: what the command line says.
+        pose_noise: the value of `--pose-noise`, if any.
 
     Raises:
-        DataError: the models are none that are known.
+        DataError: a model is not known.
     """
     models = stated_models(name, entry, pose_noise)
     if models is None:
@@ -70,11 +70,12 @@ def stated_noise(
 
 
 def logged_covariance(trajectory: Trajectory) -> Float | None:
-    """The logged covariances [N, 6, 6] as they are, where they say something of positions and of rotations.
+    """Return the logged covariances [N, 6, 6] with unknown variances filled in.
 
-    An axis that is unknown (`known_variances`) has the mean of the known ones of its kind, and goes with no
-    other; a pose with none known has the median of the other poses. None where there is no other. A matrix
-    that is none of a covariance (its correlations contradict each other) keeps its variances alone.
+    An axis with an unknown variance (`known_variances`) gets the mean of the pose's known variances of its
+    kind (position or rotation), and no correlation with other axes. A pose without a known variance of a kind
+    gets the median of the other poses. The result is None if no pose has one. A matrix that is not a valid
+    covariance (an eigenvalue of its correlations is negative) keeps its variances only.
     """
     if trajectory.covariance is None:
         return None
@@ -99,16 +100,16 @@ def logged_covariance(trajectory: Trajectory) -> Float | None:
 
 
 def known_variances(covariance: Float) -> tuple[Float, NDArray[np.bool_]]:
-    """Variances [N, 2, 3] of position (m^2) and rotation (rad^2) in covariances [N, 6, 6], and whether known.
+    """Extract variances [N, 2, 3] of position (m^2) and rotation (rad^2), and a mask of those that are known.
 
-    Zero, negative, NaN and absurdly large variances are what logs write for "unknown".
+    `covariance` is [N, 6, 6]. Logs write zero, negative, NaN and absurdly large variances for "unknown".
     """
     variances = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
     return variances, (variances > 0) & (variances < np.array(_SANE_VARIANCE)[:, None])
 
 
 def _level(covariance: Float) -> Float:
-    """Standard deviation per axis [N, 2] of position and rotation: the root of the mean variance."""
+    """Compute the standard deviation per axis [N, 2] of position and rotation: root of the mean variance."""
     variances = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
     sigma: Float = np.sqrt(variances.mean(axis=2))
     return sigma

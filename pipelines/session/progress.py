@@ -1,4 +1,4 @@
-"""How long work says where it is. The terminal's bar is one implementation, silence another."""
+"""Progress of long work. The terminal's bar is one implementation, silence another."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """What a stage needs of whoever watches it."""
+    """The interface by which a stage reports its progress."""
 
     def start(self, task: str, total: int) -> None:
-        """Begin a task of `total` steps; the one before it is finished."""
+        """Begin a task of `total` steps; this ends the previous task."""
 
     def advance(self, steps: int = 1) -> None:
-        """Say that `steps` more are done."""
+        """Report that `steps` more steps are done."""
 
     def note(self, message: str) -> None:
-        """Say something worth knowing: what was chosen, found or doubted."""
+        """Report a choice, a finding or a doubt to the user."""
 
 
 class Silent:

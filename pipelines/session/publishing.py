@@ -1,8 +1,8 @@
-"""How a stage's files take the place of earlier ones, in one piece whatever is killed when.
+"""Replacement of a stage's files by new ones, complete or not at all, even if the process is killed.
 
-A stage writes into `<stage>.new/`. Its `stage.json`, written last and synced, is the point of no return:
-without it the folder is thrown away, with it publication is carried to its end, by whoever opens the
-session next.
+A stage writes into `<stage>.new/`. Its `stage.json`, written last and synced, is the point of no return.
+Without it, the folder is removed. With it, publication is completed by the next process that opens the
+session.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ AT_ROOT = {
         "session.json",
     )
 }
-"""What a stage publishes beside its own folder instead of inside it; these names are its own."""
+"""Names that a stage publishes beside its own folder instead of inside it; only that stage writes them."""
 
 _SHOWN_BY = {"reconstruct": ("overlay",)}
-"""Stages that show a stage's result and nothing else: they go with the result that they show."""
+"""Stages that only show another stage's result; they are removed when that result is replaced."""
 
 
 def new_folder(folder: Path, stage: str) -> Path:
-    """Where a stage writes until it is published."""
+    """Return the folder in which a stage writes until it is published."""
     return folder / f"{stage}.new"
 
 
 def _old(folder: Path, stage: str) -> Path:
-    # Hidden: a user may well keep a copy of a result as `reconstruct.old`, and that is not ours to remove.
+    # Hidden, because a user may keep a copy of a result as `reconstruct.old`, which must not be removed.
     return folder / f".{stage}.old"
 
 
 def is_interrupted(folder: Path) -> bool:
-    """Whether something in a session is published halfway."""
+    """Return True if the publication of a stage was interrupted."""
     return any(
         (new_folder(folder, stage) / "stage.json").exists() or _old(folder, stage).exists()
         for stage in STAGES
@@ -49,7 +49,7 @@ def is_interrupted(folder: Path) -> bool:
 
 
 def repair(folder: Path) -> None:
-    """Finish what was published halfway, remove what was not."""
+    """Complete interrupted publications, and remove the folders of stages that did not reach theirs."""
     for stage in STAGES:
         if usable_record(new_folder(folder, stage) / "stage.json") is not None:
             roll_forward(folder, stage)
@@ -61,8 +61,8 @@ def repair(folder: Path) -> None:
 def roll_forward(folder: Path, stage: str) -> None:
     """Publish a complete `<stage>.new`.
 
-    Every step can be taken again, and the renaming of the stage's folder, with its record, comes last: a kill
-    between any two steps is mended by doing it all once more.
+    Every step can be repeated, and the stage's folder, with its record, is renamed last. After a kill between
+    any two steps, doing all of them again completes the publication.
     """
     new, old = new_folder(folder, stage), _old(folder, stage)
     record = read_record(new / "stage.json")
@@ -84,7 +84,7 @@ def roll_forward(folder: Path, stage: str) -> None:
 
 
 def outdated(folder: Path, record: StageRecord) -> list[str]:
-    """The stages that show another result than this one; those of a later version are not ours to judge."""
+    """List the stages that show a result other than this one; those of a later version are left alone."""
     gone = []
     for name in _SHOWN_BY.get(record.stage, ()):
         with suppress(NewerSchemaError):
@@ -95,7 +95,7 @@ def outdated(folder: Path, record: StageRecord) -> list[str]:
 
 
 def _settle_old(folder: Path, stage: str) -> None:
-    """Remove what was replaced, or put it back where its successor has been removed by hand meanwhile."""
+    """Remove replaced files, or put them back if the user has removed their successor since."""
     old = _old(folder, stage)
     if old.exists() and not (folder / stage).exists():
         for entry in sorted(old.iterdir()):
@@ -110,7 +110,7 @@ def _move(source: Path, target: Path) -> None:
 
 
 def remove_partials(folder: Path, stage: str) -> None:
-    """Remove the finished parts of a stage that no run will ask for."""
+    """Remove the stored finished parts of a stage, which no run needs any more."""
     partial = folder / ".partial"
     for chunks in sorted(partial.glob(f"{stage}-*")):
         remove_tree(chunks)

@@ -1,4 +1,4 @@
-"""What readers hand over and writers take: plain frozen records of numpy arrays.
+"""Records that readers return and writers take: plain frozen dataclasses of numpy arrays.
 
 Conventions (DESIGN): world ENU in metres, camera x right, y down, z forward, stamps int64 ns,
 quaternions xyzw, transforms named target_from_source, missing is NaN and never 0.
@@ -25,9 +25,9 @@ Int64 = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses of one moving thing, as a log states them.
+    """Logged poses of one moving object.
 
-    Rows are sorted by time, stamps strictly increase and every number is finite: readers leave bad
+    Rows are sorted by time, stamps strictly increase and every number is finite. Readers leave bad
     rows out and count them by cause in `dropped` (for example {"not finite": 3, "duplicate stamp": 1}).
     """
 
@@ -52,15 +52,15 @@ class Detections:
     """People that a keypoint detector found in one camera's frames, sorted by frame, then person.
 
     A joint that was not found has NaN in `xy` and 0 confidence. `person` is the detector's own id, or
-    the rank within the frame where it has none. `image_size` is what the file itself states, if it does.
+    the rank within the frame where it has none. `image_size` is None if the file does not state it.
     """
 
     joints: tuple[str, ...]
     frame: Int64  # [M]
     person: Int64  # [M]
     xy: Float  # [M, J, 2] px, the centre of the top left pixel is (0, 0)
-    confidence: Float  # [M, J] 0..1 where the detector says so
-    frames_listed: Int64  # [F] sorted: every frame the files speak of, people in it or not
+    confidence: Float  # [M, J] 0..1 if the detector keeps to that range
+    frames_listed: Int64  # [F] sorted: every frame that the files list, with or without people
     image_size: tuple[int, int] | None = None  # width, height
     dropped: dict[str, int] = field(default_factory=dict)
     adjusted: dict[str, int] = field(
@@ -78,16 +78,16 @@ class JointMotion:
     t_ns: Int64  # [T]
     joints: tuple[str, ...]
     position: Float  # [T, P, J, 3] m, world
-    status: NDArray[np.str_] | None = None  # [T, P, J] words of triangulation.STATUS, where they are known
+    status: NDArray[np.str_] | None = None  # [T, P, J] words of triangulation.STATUS, if known
     reprojection_px: Float | None = None  # [T, P, J]
     views: Int64 | None = None  # [T, P, J] cameras that measured the joint
     covariance: Float | None = None  # [T, P, J, 6] m^2: xx, xy, xz, yy, yz, zz
-    dropped: dict[str, int] = field(default_factory=dict)  # positions that were there, by cause
+    dropped: dict[str, int] = field(default_factory=dict)  # positions in the file that are left out, by cause
 
 
 @dataclass(frozen=True)
 class SkeletalMotion:
-    """A chain of bones and how its joints turn: what BVH files hold. Parents stand before children.
+    """A chain of bones with the rotations of its joints, as in BVH files. Parents come before children.
 
     A bone's world rotation is its parent's times its own; in the rest pose all are the identity.
     """
@@ -96,16 +96,16 @@ class SkeletalMotion:
     bones: tuple[str, ...]  # as the file calls them
     parent: tuple[int, ...]  # -1 for the root
     offset: Float  # [B, 3] m, from the parent's joint in the rest pose, z up
-    end: dict[int, Float]  # bone to where its end site lies, [3] m
-    root: Float  # [T, 3] m, where the root's joint is
+    end: dict[int, Float]  # bone to the position of its end site, [3] m
+    root: Float  # [T, 3] m, position of the root's joint
     rotation: Float  # [T, B, 4] unit quaternions xyzw, parent_from_bone
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Everything an export may need: the skeleton, the cameras that it was made with, and what stood around.
+    """Everything that an export may need: the skeleton, the cameras that it was made with, and the maps.
 
-    Maps and pictures are many: they are handed out one at a time, each call from the start.
+    Maps and pictures are large, so they are yielded one at a time. Each call starts from the beginning.
     """
 
     name: str
@@ -115,16 +115,16 @@ class Recording:
     lenses: dict[str, Intrinsics] = field(default_factory=dict)
     maps: Callable[[], Iterable[Occupancy]] = tuple
     pictures: Callable[[str], Iterable[tuple[int, NDArray[np.uint8]]]] = field(default=lambda _: ())
-    """Of a camera: world time and [height, width, 3] BGR, in order, as often as was asked for."""
+    """Pictures of a camera in order, at the rate that was asked for: world time, [height, width, 3] BGR."""
     overlays: Callable[[str], Iterable[tuple[int, NDArray[np.uint8]]]] = field(default=lambda _: ())
     """The same pictures with the skeleton drawn into them."""
     unit: str | None = None  # of lengths, where the user asks for one that the export has
     axes: str | None = None  # z-up or y-up, likewise
-    progress: Progress = field(default_factory=Silent)  # who is told what was held, moved or thinned out
+    progress: Progress = field(default_factory=Silent)  # receives notes on held, moved and thinned samples
 
     @property
     def tracks(self) -> dict[str, Trajectory]:
-        """The best known poses of every camera that has any: refined ones, else those of the log."""
+        """The refined poses of every camera, else its logged ones; cameras without poses are left out."""
         best = {name: self.refined.get(name, logged) for name, logged in self.cameras.items()}
         return {name: track for name, track in best.items() if len(track.t_ns)}
 
@@ -143,7 +143,7 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One decoded message: `value` has the schema's fields as attributes, whatever the encoding was."""
+    """One decoded message: `value` has the schema's fields as attributes, for every encoding."""
 
     topic: Topic
     receive_ns: int
@@ -175,7 +175,7 @@ class AngleSample:
 
 @dataclass(frozen=True, slots=True)
 class IntrinsicsSample:
-    """What a CameraInfo says."""
+    """The intrinsics of a CameraInfo message."""
 
     stamp_ns: int
     receive_ns: int
@@ -200,11 +200,11 @@ Sample = PoseSample | AngleSample | IntrinsicsSample | PictureSample
 
 @dataclass(frozen=True)
 class VideoIndex:
-    """When the frames of a video are shown. Frame k is the k-th in the order of showing, from 0.
+    """Presentation times of the frames of a video. Frame k is the k-th in presentation order, from 0.
 
-    Every frame that the container lists has its row, whether or not a decoder can make a picture of it:
-    a frame that turns out damaged is missing, the others keep their numbers. What the container lists
-    but the file no longer holds is counted in `dropped`.
+    Every frame that the container lists has a row, even if it cannot be decoded. A damaged frame is
+    then missing and the others keep their numbers. Frames that the container lists but the file no longer
+    holds are counted in `dropped`.
     """
 
     pts_ns: Int64  # [N] strictly increasing, since the first frame: pts_ns[0] is 0
@@ -213,17 +213,17 @@ class VideoIndex:
     height: int
     rotation_deg: int  # 0, 90, 180 or 270: how far the coded picture is turned counter-clockwise to show it
     codec: str
-    variable: bool  # whether k / rate_hz is further from pts_ns[k] than the container's clock explains
+    variable: bool  # True if k / rate_hz is further from pts_ns[k] than the container's clock explains
     dropped: dict[str, int] = field(default_factory=dict)
 
     @property
     def count(self) -> int:
-        """How many frames."""
+        """The number of frames."""
         return len(self.pts_ns)
 
     @property
     def span_s(self) -> float:
-        """From the first frame's stamp to the last one's."""
+        """The time from the first frame's stamp to the last one's."""
         return int(self.pts_ns[-1]) / 1e9
 
     @property
@@ -236,8 +236,7 @@ class VideoIndex:
 class Occupancy:
     """A voxel map: probability of being occupied, 0.5 and above is occupied, NaN where nothing is known.
 
-    What a reader left out of the file is counted by cause in `dropped`; it is not part of the map and not
-    stored with it.
+    `dropped` counts by cause what a reader left out of the file. It is not stored with the map.
     """
 
     probability: NDArray[np.float32]  # [X, Y, Z]

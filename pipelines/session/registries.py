@@ -1,7 +1,7 @@
-"""What others can add: formats, exports, detectors, noise models and planner arms.
+"""Registries of extensions: formats, exports, detectors, noise models and planner arms.
 
-Each is found through an entry point, so adding one is one module and one line in a pyproject.toml,
-in this package or in a package of the user's own. An entry point names an object of the protocol here.
+Each is found through an entry point, so adding one takes one module and one line in a pyproject.toml,
+in this package or in the user's own. An entry point names an object that has the protocol defined here.
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ T = TypeVar("T")
 
 
 class Format(Protocol):
-    """A foreign file format. The reading method depends on what the format holds (below)."""
+    """A foreign file format. Its reading method depends on its kind (the protocols below)."""
 
     @property
     def name(self) -> str:
-        """What the user writes after `format:`."""
+        """The name that the user writes after `format:`."""
 
     @property
     def title(self) -> str:
-        """What `mocap info` calls it."""
+        """The name that `mocap info` prints."""
 
     @property
     def suffixes(self) -> tuple[str, ...]:
-        """Endings of file names, lower case, to be quick; `recognises` decides by content."""
+        """Endings of file names, lower case, for a quick choice; `recognises` decides by content."""
 
     def recognises(self, path: Path) -> bool:
-        """Whether this file or folder is of this format, by its content. Never raises on bad content."""
+        """Test by content if a file or folder is of this format. Never raise on bad content."""
 
     def describe(self, path: Path) -> dict[str, object]:
-        """What is inside, for `mocap info`: names to numbers, text or lists, JSON-able, in reading order."""
+        """Describe the content for `mocap info`: names to numbers, text or lists, JSON-able, in order."""
 
 
 @runtime_checkable
@@ -63,7 +63,7 @@ class KeypointFormat(Format, Protocol):
     """2D keypoints of one camera."""
 
     def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
-        """Read them all; `skeleton` where the user states it; file frame k becomes k - first_frame."""
+        """Read all keypoints; `skeleton` if the user states it; file frame k becomes k - first_frame."""
 
 
 @runtime_checkable
@@ -71,7 +71,7 @@ class TrajectoryFormat(Format, Protocol):
     """Poses over time."""
 
     def read_trajectory(self, path: Path) -> Trajectory:
-        """Read them in the axes of the file; rows that cannot be used are dropped and counted."""
+        """Read the poses in the axes of the file; unusable rows are dropped and counted."""
 
 
 @runtime_checkable
@@ -87,7 +87,7 @@ class JointFormat(Format, Protocol):
     """3D joints over time."""
 
     def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
-        """Read them as metres, z up; `unit` (m, cm, mm), `axes` (z-up, y-up) where the user states them."""
+        """Read the joints as metres, z up; `unit` (m, cm, mm), `axes` (z-up, y-up) if the user gives them."""
 
 
 class Log(Protocol):
@@ -99,13 +99,13 @@ class Log(Protocol):
 
     @property
     def dropped(self) -> Mapping[str, int]:
-        """What could not be read so far, counted by cause."""
+        """Counts by cause of what could not be read so far."""
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
-        """The messages of some channels in the order of receipt, one at a time; others are not decoded."""
+        """Yield the messages of some channels in the order of receipt; others are not decoded."""
 
     def __enter__(self) -> Log:
-        """The log itself."""
+        """Return the log itself."""
 
     def __exit__(self, *exception: object) -> None:
         """Close the files."""
@@ -124,26 +124,24 @@ class VideoFormat(Format, Protocol):
     """Pictures over time."""
 
     def index(self, path: Path) -> VideoIndex:
-        """When its frames are shown, from the container alone: no picture but the first is decoded."""
+        """Read the presentation times of the frames from the container; only the first frame is decoded."""
 
 
 @runtime_checkable
 class MapFormat(Format, Protocol):
-    """What stands around."""
+    """Maps of the surroundings."""
 
     def read_map(self, path: Path, *, resolution_m: float | None = None) -> Occupancy:
-        """Read it as voxels, in the axes of the file; `resolution_m` where the user states their size."""
+        """Read the map as voxels, in the axes of the file; `resolution_m` if the user states their size."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """A square of a picture in which one person is looked for; it may reach beyond the picture."""
+    """A square of a picture in which a detector searches one person; it may reach beyond the picture."""
 
     centre: tuple[float, float]  # px
     side: float  # px
-    angle_rad: float = (
-        0.0  # clockwise in the picture: how far the person's up is turned from the picture's up
-    )
+    angle_rad: float = 0.0  # clockwise in the picture, from the picture's up to the person's up
 
 
 @dataclass(frozen=True)
@@ -152,22 +150,22 @@ class Person:
 
     xy: Float  # [J, 2] px in the whole picture, NaN where a joint was not found
     confidence: Float  # [J] 0..1
-    presence: float  # 0..1, whether there is a person at all
-    region: Region  # where the same person is to be looked for in the next frame
+    presence: float  # 0..1, confidence that there is a person at all
+    region: Region  # in which to search the same person in the next frame
 
 
 class KeypointNetworks(Protocol):
-    """The loaded networks of a detector; a context manager is not needed: they hold no files open."""
+    """The loaded networks of a detector. They hold no files open, so no context manager is needed."""
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """What the J joints are called."""
+        """The names of the J joints."""
 
     def find_people(self, picture: NDArray[np.uint8]) -> list[tuple[Region, float]]:
-        """People in a picture [H, W, 3] BGR looked at as a whole, and how sure it is; best first."""
+        """Find people in a whole picture [H, W, 3] BGR; return regions with confidences, best first."""
 
     def locate(self, picture: NDArray[np.uint8], regions: Sequence[Region]) -> list[Person]:
-        """The joints of the person in each region, whether or not there is one (see `presence`)."""
+        """Locate the joints of one person in each region; `presence` says if there is one at all."""
 
 
 class Detector(Protocol):
@@ -175,25 +173,25 @@ class Detector(Protocol):
 
     @property
     def name(self) -> str:
-        """What the user writes after `--detector`, without paths: with the models, it decides the results."""
+        """The text after `--detector`, without paths. Name and model files together determine the results."""
 
     @property
     def title(self) -> str:
-        """What `mocap models` calls it."""
+        """The name that `mocap models` prints."""
 
     def models(self) -> dict[str, Path | None]:
-        """The files it needs: name to where they are, None for those that are missing."""
+        """List the files that it needs: name to path, None for those that are missing."""
 
     def fetch(self, source: Path | None = None) -> None:
-        """Get the missing files, from `source` where they are here already. DataError says what to do."""
+        """Get the missing files, from `source` if that holds them. A DataError says what to do."""
 
     def load(self, *, threads: int) -> KeypointNetworks:
-        """Load the networks. DataError where a file is missing or is not the one that was expected."""
+        """Load the networks. Raise DataError if a file is missing or is not the expected one."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Accuracy and time of a detector, as docs/detector.md says they are measured."""
+    """Accuracy and time of a detector, measured as docs/detector.md describes."""
 
     sample_mpjpe_mm: float  # of the sample flight with true poses
     person_ms: float  # its networks' time for each person in each picture, on one thread
@@ -205,85 +203,88 @@ class MeasuredDetector(Detector, Protocol):
 
     @property
     def measured(self) -> Measured:
-        """Its accuracy and its time."""
+        """The accuracy and the time of the detector."""
 
     @property
     def advice(self) -> str | None:
-        """One line on a detector that is more accurate, said where this one runs."""
+        """One line on a more accurate detector, printed when this one runs; None without one."""
 
 
 @runtime_checkable
 class DetectorFamily(Protocol):
-    """Detectors that are told what to run, behind a colon: `--detector NAME:ARGUMENT`."""
+    """Detectors with an argument after a colon that says which model to run: `--detector NAME:ARGUMENT`."""
 
     @property
     def name(self) -> str:
-        """What the user writes before the colon."""
+        """The name that the user writes before the colon."""
 
     @property
     def title(self) -> str:
-        """What `mocap models` calls it."""
+        """The name that `mocap models` prints."""
 
     @property
     def usage(self) -> str:
-        """What the user writes after `--detector`, and what it means; one line each."""
+        """The text that the user writes after `--detector`, and its meaning; one line each."""
 
     def configured(self, argument: str) -> Detector:
-        """The detector of that argument. DataError says what is wrong with it."""
+        """Return the detector for an argument. A DataError says what is wrong with the argument."""
 
 
 class Export(Protocol):
-    """A way out of a session."""
+    """A format in which sessions are exported."""
 
     @property
     def name(self) -> str:
-        """What the user writes after `--to`."""
+        """The name that the user writes after `--to`."""
 
     @property
     def title(self) -> str:
-        """What the help text says of it, on one line."""
+        """The line for the help text."""
 
     def write(self, recording: Recording, folder: Path) -> list[Path]:
-        """Write into an existing empty folder; the paths written, sorted. DataError without content.
+        """Write into an existing empty folder and return the paths written, sorted.
 
-        What is held, moved or thinned out is counted in a note to `recording.progress`.
+        Samples that are held, moved or thinned out are counted in a note to `recording.progress`.
+
+        Raises:
+            DataError: there is no content to write.
         """
 
 
 @runtime_checkable
 class ChoiceOfAxes(Export, Protocol):
-    """An export that heeds `recording.unit` and `recording.axes`; others write metres with z up."""
+    """An export that obeys `recording.unit` and `recording.axes`; others write metres with z up."""
 
     @property
     def units(self) -> tuple[str, ...]:
-        """The units of length that it can be written in, the usual one first."""
+        """The units of length that the export can write, the default first."""
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """The axes (z-up, y-up) that it can be written in, the usual ones first."""
+        """The axes (z-up, y-up) that the export can write, the default first."""
 
 
 class Arm(Protocol):
     """A way to plan formations.
 
-    What it is handed and what it makes are types of the planning room, above this one: there
-    `pipelines.planning.arms` states the same protocol with them.
+    Its arguments and results are types of `pipelines.planning`, which this layer cannot import.
+    `pipelines.planning.arms` defines the same protocol with these types.
     """
 
     @property
     def name(self) -> str:
-        """What the user writes after `--arms`."""
+        """The name that the user writes after `--arms`."""
 
     @property
     def title(self) -> str:
-        """What reports call it."""
+        """The name that reports print."""
 
     def start(self, config: Any, *, drones: int, yaw_rad: float) -> Any:
-        """The `FormationPlanner` of a `PlannerConfig` for a flight whose first camera starts at that yaw."""
+        """Make the `FormationPlanner` of a `PlannerConfig`; the first camera starts at the given yaw."""
 
 
 class Registry(Generic[T]):
-    """The objects that one group of entry points names, loaded when they are asked for."""
+    """The objects that one group of entry points names, loaded on request."""
 
     def __init__(self, group: str, noun: str) -> None:
         self.group = group
@@ -294,14 +295,14 @@ class Registry(Generic[T]):
         return {entry.name: entry for entry in sorted(entry_points(group=self.group), key=lambda e: e.name)}
 
     def names(self) -> list[str]:
-        """Every registered name, sorted."""
+        """List every registered name, sorted."""
         return list(self._entries)
 
     def get(self, name: str) -> T:
-        """The object of that name.
+        """Load the object of a name.
 
         Raises:
-            DataError: no such name; the message lists those there are.
+            DataError: no such name; the message lists the existing ones.
         """
         if name not in self._entries:
             raise DataError(name, f"no such {self.noun}", f"there are {', '.join(self.names()) or 'none'}")
@@ -309,7 +310,7 @@ class Registry(Generic[T]):
         return loaded
 
     def all(self) -> list[T]:
-        """Every registered object, in the order of their names."""
+        """Load every registered object, in the order of their names."""
         return [self.get(name) for name in self.names()]
 
 
@@ -323,7 +324,7 @@ F = TypeVar("F")
 
 
 def find_detector(text: str) -> Detector:
-    """The detector that a user asks for: a registered name, or that of a family, a colon and its argument.
+    """Find the detector of a user's text: a registered name, or a family's name, a colon and its argument.
 
     Raises:
         DataError: no such name, an argument where none is taken, none where one is needed, or a bad one.
@@ -340,23 +341,23 @@ def find_detector(text: str) -> Detector:
 
 
 def advice_on(detector: Detector) -> list[str]:
-    """What is said where a detector runs: a line on a more accurate one, where it knows one."""
+    """Return the detector's line on a more accurate detector, or an empty list."""
     known = isinstance(detector, MeasuredDetector) and detector.advice
     return [known] if known else []
 
 
 def hashes_of_models(detector: Detector) -> dict[str, str]:
-    """The sha256 of the files of a detector that are there, by their names."""
+    """Hash the existing files of a detector; return their SHA-256 by name."""
     return {name: sha256_of(path) for name, path in detector.models().items() if path is not None}
 
 
 def recognise(path: Path, protocol: type[F], noun: str, formats: Sequence[Format] | None = None) -> F:
-    """The one registered format of a kind that recognises a file.
+    """Find the one registered format of a kind that recognises a file.
 
     Args:
         path: an existing file or folder.
         protocol: the kind, one of the runtime-checkable protocols above.
-        noun: what the kind is called in messages ("keypoint file", "camera trajectory").
+        noun: the kind's name in messages ("keypoint file", "camera trajectory").
         formats: the candidates; every registered format by default.
 
     Raises:
@@ -382,7 +383,7 @@ def recognise(path: Path, protocol: type[F], noun: str, formats: Sequence[Format
 
 
 def why_not(path: Path) -> str:
-    """What may have kept a file from being recognised, to be put behind that; empty where nothing is seen."""
+    """Explain why a file may not be recognised, as the end of a message; empty if no reason is found."""
     if not path.is_file():
         return ": it is a pipe, a socket or a device" if is_special(path) else ""
     try:
@@ -398,7 +399,7 @@ def why_not(path: Path) -> str:
 
 
 def noise_models(place: str, parts: Mapping[str, Mapping[str, object]]) -> list[NoiseModel]:
-    """The pose noise models that a manifest names; `place` is said where they cannot be built.
+    """Build the pose noise models that a manifest names; `place` names the setting in error messages.
 
     Raises:
         DataError: an unknown model or parameter, or a value out of range.
@@ -407,10 +408,10 @@ def noise_models(place: str, parts: Mapping[str, Mapping[str, object]]) -> list[
 
 
 def parsed_noise_models(place: str, text: str) -> list[NoiseModel]:
-    """The pose noise models of a text like `white:position_m=0.3,rotation_deg=1 + bias:position_m=0.1`.
+    """Build the pose noise models of a text like `white:position_m=0.3,rotation_deg=1 + bias:position_m=0.1`.
 
     Raises:
-        DataError: the text does not read so, or names what there is not.
+        DataError: the text has another form, or names an unknown model or parameter.
     """
     try:
         parts = parse(text)

@@ -1,6 +1,6 @@
-"""When stages ran, for how long, with what, and when sources were last changed.
+"""Run times of stages, the library versions they ran with, and the stamps of sources.
 
-All of it stands in `run.json`, the one file that differs from run to run.
+All of it is in `run.json`, the only file that differs from run to run.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ _LIBRARIES = (
     *("numpy", "scipy", "numba", "pandas", "pyarrow", "matplotlib"),
     *("opencv-python-headless", "av", "ai-edge-litert", "onnxruntime", "pycolmap", "mcap", "rosbags"),
 )
-"""What results rest on, as far as it is installed."""
+"""The libraries on which results depend; those that are installed are noted."""
 
 
 @dataclass(frozen=True)
 class Stopwatch:
-    """Started when a run begins."""
+    """A clock that starts when a run begins."""
 
     started: datetime = field(default_factory=lambda: datetime.now(UTC))
     started_s: float = field(default_factory=time.monotonic)
 
     def note(self, session: Path, stage: str) -> None:
-        """Add the run that ends now to the session's run.json."""
+        """Add the run, which ends now, to the session's run.json."""
         entry = {
             "stage": stage,
             "started": self.started.isoformat(timespec="seconds"),
@@ -48,7 +48,7 @@ class Stopwatch:
 
 
 def versions_of(folder: Path) -> dict[str, dict[str, str]]:
-    """With which mocap, Python and libraries each stage of a session last ran, as far as run.json says."""
+    """Return the versions of mocap, Python and libraries with which each stage last ran, from run.json."""
     told: dict[str, dict[str, str]] = {}
     for run in _runs(folder):
         told[str(run.get("stage"))] = {"mocap": str(run.get("version")), **run.get("libraries", {})}
@@ -56,14 +56,14 @@ def versions_of(folder: Path) -> dict[str, dict[str, str]]:
 
 
 def note_sources(session: Path, hashes: Mapping[str, str], stamps: Mapping[str, str]) -> None:
-    """Note the stamp that every source had when its content had this hash; both by the source's name."""
+    """Note in run.json each source's content hash with its stamp; both mappings are by the source's name."""
     noted = {name: {"sha256": digest, "stamp": stamps[name]} for name, digest in hashes.items()}
     if noted != _read(session).get("sources"):
         _write(session, {"sources": noted})
 
 
 def noted_stamps(session: Path, hashes: Mapping[str, str]) -> dict[str, str]:
-    """The stamps of the sources that were noted with these hashes; none without a usable run.json."""
+    """Return the noted stamps of the sources whose hashes are unchanged; empty without a usable run.json."""
     try:
         noted = _read(session).get("sources")
     except DataError:

@@ -1,4 +1,4 @@
-"""Several flights at once: what their sessions are called when they share a folder."""
+"""Names for the sessions of several flights that share a folder."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ _USUAL = "flight"
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:
-    """A name for each flight or session, which does not depend on the others.
+    """Return a name for each flight or session, which does not depend on the others.
 
-    It is that of the file without its ending. Where that is `flight`, as most manifests are called, it is
-    that of the folder around it.
+    The name is that of the file without its ending. Most manifests are called `flight`; these get the name
+    of the folder around them.
 
     Raises:
-        DataError: two are called alike.
+        DataError: two have the same name.
     """
     named: dict[str, Path] = {}
     for path in paths:

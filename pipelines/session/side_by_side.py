@@ -1,4 +1,4 @@
-"""Parts of a stage worked on at once, so that an error or Ctrl-C ends all of them soon."""
+"""Parallel work on the parts of a stage; an error or Ctrl-C soon ends all of them."""
 
 from __future__ import annotations
 
@@ -12,33 +12,35 @@ R = TypeVar("R")
 
 
 class Halt:
-    """What everybody who works on a part looks at now and then."""
+    """A request to stop, which every worker checks from time to time."""
 
     def __init__(self) -> None:
         self._asked = Event()
 
     def ask(self) -> None:
-        """Have everybody stop."""
+        """Ask all workers to stop."""
         self._asked.set()
 
     def check(self) -> None:
-        """Go on, unless everybody is to stop.
+        """Raise an error if all workers are asked to stop.
 
         Raises:
-            InterruptedError: they are.
+            InterruptedError: they are asked to stop.
         """
         if self._asked.is_set():
             raise InterruptedError("another part failed, or the user stopped it")
 
 
 def side_by_side(work: Callable[[T], R], parts: Iterable[T], *, workers: int, halt: Halt) -> list[R]:
-    """What `work` makes of every part, in their order; threads, since what takes long leaves the interpreter.
+    """Call `work` on every part in parallel and return the results in the order of the parts.
+
+    Threads are enough, because the long calculations release the interpreter lock.
 
     Args:
-        work: looks at `halt` now and then.
-        parts: handed to it.
-        workers: how many at once.
-        halt: asked for when one fails or the user interrupts; the exception is raised when all have stopped.
+        work: called with one part; it checks `halt` from time to time.
+        parts: the arguments of `work`.
+        workers: the number of threads.
+        halt: set when one part fails or the user interrupts; the exception is raised when all have stopped.
     """
     with ThreadPoolExecutor(workers) as pool:
         try:

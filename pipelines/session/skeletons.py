@@ -1,7 +1,7 @@
-"""Which joints a keypoint detector reports, in which order, and what joins them.
+"""Skeletons: the joints that a keypoint detector reports, their order, and the bones between them.
 
-Joint names are shared by every skeleton, so that moving from one to another is a matter of names. Detectors
-mean slightly different points by some of them; the differences stay the same over time:
+All skeletons share joint names, so that converting one into another only needs the names. Detectors
+place some of these joints at slightly different points; the differences are constant over time:
 
 * `neck` is the midpoint of the shoulders in body25; body25b's lies above it by 3 % of the body's height.
 * `hip` is the midpoint of the hips; in body25 it is what OpenPose calls MidHip.
@@ -35,11 +35,11 @@ DERIVED: tuple[tuple[str, tuple[str, str]], ...] = (
     ("neck", ("left_shoulder", "right_shoulder")),
     ("hip", ("left_hip", "right_hip")),
 )
-"""Joints that are computed where a skeleton lacks them: each is the midpoint of its two parents."""
+"""Joints that are computed if a skeleton lacks them: each is the midpoint of its two parents."""
 
 
 def mirrored(joint: str) -> str:
-    """The joint on the other side of the body; a joint of the middle is its own mirror."""
+    """Return the joint on the other side of the body; a joint of the middle is its own mirror."""
     if joint.startswith("left_"):
         return "right_" + joint.removeprefix("left_")
     if joint.startswith("right_"):
@@ -76,13 +76,13 @@ _ALL_BONES = (*_MIDDLE_BONES, *_LEFT_BONES, *((mirrored(a), mirrored(b)) for a, 
 
 
 def bones_of(joints: tuple[str, ...]) -> tuple[Bone, ...]:
-    """The bones whose two ends are among `joints`: for drawing, and for bone lengths."""
+    """Return the bones whose two ends are among `joints`, for drawing and for bone lengths."""
     there = set(joints)
     return tuple(bone for bone in _ALL_BONES if there.issuperset(bone))
 
 
 def _both(*parts: str) -> tuple[str, ...]:
-    """Left and right of each part, side by side."""
+    """List the left and the right joint of each part, side by side."""
     return tuple(f"{side}_{part}" for part in parts for side in ("left", "right"))
 
 
@@ -123,14 +123,14 @@ _JOINTS: dict[str, tuple[str, ...]] = {
 SKELETONS: dict[str, Skeleton] = {
     name: Skeleton(name, joints, bones_of(joints)) for name, joints in _JOINTS.items()
 }
-"""Every skeleton by the name that `flight.yaml` uses; of equal counts the likelier stands first."""
+"""Every skeleton by the name that `flight.yaml` uses; of two with equal counts the likelier comes first."""
 
 
 def get_skeleton(name: str) -> Skeleton:
-    """The skeleton of that name.
+    """Return the skeleton of a name.
 
     Raises:
-        DataError: no such name; the message lists those there are.
+        DataError: no such name; the message lists the existing ones.
     """
     if name not in SKELETONS:
         raise DataError(name, "no such skeleton", f"there are {', '.join(SKELETONS)}")
@@ -138,18 +138,18 @@ def get_skeleton(name: str) -> Skeleton:
 
 
 def skeleton_with(count: int) -> tuple[Skeleton, ...]:
-    """The skeletons of `count` keypoints, the likelier first: 25 is body25, unless it is body25b."""
+    """Return the skeletons of `count` keypoints, the likelier first: for 25, body25 before body25b."""
     return tuple(skeleton for skeleton in SKELETONS.values() if len(skeleton.joints) == count)
 
 
 def take_joints(values: Float, joints: tuple[str, ...], wanted: tuple[str, ...], axis: int = -2) -> Float:
-    """The columns of `wanted` joints, in their order.
+    """Select the entries of the `wanted` joints, in their order.
 
     Args:
         values: any floats with one entry per joint along `axis` (positions [..., J, 3] by default).
         joints: the J joints of `values`.
         wanted: the joints to return; one that is absent from `joints` is NaN.
-        axis: where the joints lie.
+        axis: the axis of the joints.
     """
     column = {joint: index for index, joint in enumerate(joints)}
     source = np.array([column.get(joint, -1) for joint in wanted], dtype=np.int64)
@@ -167,7 +167,8 @@ def with_derived(joints: tuple[str, ...], position: Float) -> tuple[tuple[str, .
         position: [..., J, D] in any unit; NaN is missing.
 
     Returns:
-        The joints, longer by those derived, and their positions. A derived joint is NaN where a parent is.
+        The joints with the derived ones at the end, and their positions. A derived joint is NaN where a
+        parent is.
     """
     for joint, parents in DERIVED:
         if joint in joints or not set(parents).issubset(joints):

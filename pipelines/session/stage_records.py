@@ -1,4 +1,4 @@
-"""What a stage is, and what its `stage.json` says of a finished one."""
+"""Stages of a session, and their records in `stage.json`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SCHEMA = 1
 """Version of session.json and stage.json. Older ones are read, newer ones refused."""
 
 STAGES = ("ingest", "detect", "reconstruct", "overlay", "replan", "film", "report")
-"""In the order in which they may run."""
+"""The stages in the order in which they may run."""
 
 COMMANDS = {
     "ingest": "mocap ingest",
@@ -29,7 +29,7 @@ COMMANDS = {
 
 
 class NewerSchemaError(DataError):
-    """A file of a later version of this program."""
+    """Error for a file that a later version of this program wrote."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Stage:
 
     Args:
         name: its folder in the session.
-        revision: raised when the same input and settings give other results than before.
+        revision: a number that is increased when the same inputs and settings give other results than before.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class StageRecord:
-    """What `stage.json` says of a finished stage."""
+    """The content of a finished stage's `stage.json`."""
 
     stage: str
     revision: int
@@ -64,7 +64,7 @@ class StageRecord:
 
 
 def key_of(stage: Stage, settings: Mapping[str, object], inputs: Mapping[str, str]) -> str:
-    """Sha256 of all that decides a stage's result: equal keys, equal bytes."""
+    """Compute the SHA-256 of everything that determines a stage's result: equal keys, equal bytes."""
     ingredients = {
         "stage": stage.name,
         "revision": stage.revision,
@@ -93,7 +93,7 @@ def outdated(records: Mapping[str, StageRecord], recorded: Mapping[str, str]) ->
 
 
 def read_record(path: Path) -> StageRecord:
-    """What a `stage.json` says.
+    """Read a `stage.json`.
 
     Raises:
         DataError: it is damaged or of a later version.
@@ -118,7 +118,7 @@ def read_record(path: Path) -> StageRecord:
 
 
 def usable_record(path: Path) -> StageRecord | None:
-    """What a `stage.json` says; None where it is missing or damaged.
+    """Read a `stage.json`; return None if it is missing or damaged.
 
     Raises:
         NewerSchemaError: it is of a later version.
@@ -132,7 +132,7 @@ def usable_record(path: Path) -> StageRecord | None:
 
 
 def refuse_newer(path: Path, document: Mapping[str, Any], remedy: str) -> None:
-    """Raise DataError for a file of a later version, or of none."""
+    """Refuse, with a DataError, a file of a later version or without a version."""
     schema = document.get("schema")
     if not isinstance(schema, int):
         raise DataError(path, f"states no schema number (schema: {schema!r})", remedy)

@@ -1,6 +1,6 @@
-"""The life of a stage: begun under a lock, resumed, published in one piece.
+"""Running a stage: begin under a lock, resume after an interrupt, publish completely or not at all.
 
-Stages read like this:
+The code of a stage looks like this:
 
 with locked(folder) as session:
     run = session.begin(RECONSTRUCT, settings=settings, inputs=hashes)
@@ -65,19 +65,19 @@ class Session:
         self.folder = folder
 
     def record(self, stage: str) -> StageRecord | None:
-        """What a stage says of itself, None if it was never finished.
+        """Read the record of a stage; None if it was never finished.
 
         Raises:
-            DataError: its record is damaged or of a later version.
+            DataError: the record is damaged or of a later version.
         """
         path = self.folder / stage / "stage.json"
         return read_record(path) if path.exists() else None
 
     def intact_record(self, stage: str) -> StageRecord | None:
-        """Return what a stage says of itself once all of its files are found to be as it wrote them.
+        """Return the record of a stage after checking that all of its files are as the stage wrote them.
 
-        Stages that read another one's files ask here: what was edited, truncated or replaced since must not
-        be taken for what the record says. None if the stage was never finished.
+        Stages that read the files of another stage use this: a file that was edited, truncated or replaced
+        since does not match the record. None if the stage was never finished.
 
         Raises:
             DataError: a file is gone or has another content; the record is damaged or of a later version.
@@ -100,7 +100,7 @@ class Session:
 
 
 class WritableSession(Session):
-    """A session that nobody else writes; `locked` hands it out."""
+    """A session that no other process writes; `locked` makes it."""
 
     def begin(
         self,
@@ -110,13 +110,14 @@ class WritableSession(Session):
         inputs: Mapping[str, str],
         force: bool = False,
     ) -> Run:
-        """Begin a stage, or find that it is finished with these settings and inputs and undamaged.
+        """Begin a stage, or find it finished with the same settings and inputs, and undamaged.
 
         Args:
-            stage: what runs.
-            settings: all that decides the result, resolved, of what `jsonable` knows; no paths, no threads.
-            inputs: the sha256 of everything read, by a name that is the same on every machine.
-            force: do it again, from the start.
+            stage: the stage to run.
+            settings: everything that determines the result, with defaults filled in, of types that
+                `jsonable` accepts; no paths, no thread counts.
+            inputs: the SHA-256 of everything read, by a name that is the same on every machine.
+            force: run it again, from the start.
 
         Raises:
             DataError: the stage was written by a later version.
@@ -155,12 +156,12 @@ class Run:
     """One run of a stage.
 
     Attributes:
-        folder: where the stage writes; it becomes the stage when published. What ingest writes there becomes
-            the session's own files (session.json, cameras/, ...).
-        finished: nothing is to be done, `record` says what there is.
-        replaces: settings of the stage as it stands that differ from these: name to (before, now). None is
-            what a setting is that was or is not there.
-        outdated: stages that showed what was replaced, and went with it.
+        folder: the folder in which the stage writes; it becomes the stage when published. The files that
+            ingest writes there become the session's own (session.json, cameras/, ...).
+        finished: True if nothing is to be done; `record` then describes the existing result.
+        replaces: settings that differ from those of the stage's earlier run: name to (before, now). A setting
+            that was or is absent is None.
+        outdated: stages that showed the replaced result and were removed with it.
     """
 
     def __init__(
@@ -194,17 +195,17 @@ class Run:
 
     @property
     def record(self) -> StageRecord:
-        """What the finished or published stage says of itself."""
+        """The record of the finished or published stage."""
         if self._record is None:
             raise RuntimeError(f"{self._stage.name} is not published yet")
         return self._record
 
     def chunk(self, name: str, produce: Callable[[Path], None]) -> Path:
-        """The folder of a finished part of a long stage, made by `produce` unless an earlier run finished it.
+        """Return the folder of a finished part of a long stage; call `produce` if no earlier run finished it.
 
         Args:
-            name: of the part; the key of the stage is added to it.
-            produce: writes the part into the empty folder it is given.
+            name: of the part; the parts of a stage are stored by the stage's key.
+            produce: writes the part into the empty folder that it gets.
         """
         finished = self._session / ".partial" / f"{self._stage.name}-{self._key}" / name
         if finished.is_dir():
@@ -219,11 +220,11 @@ class Run:
         return finished
 
     def publish(self, *, counts: Mapping[str, object], warnings: Sequence[str] = ()) -> StageRecord:
-        """End the stage: what lies in `folder` replaces what the stage wrote before, in one piece.
+        """End the stage: the content of `folder` replaces its earlier files, completely or not at all.
 
         Args:
-            counts: what was found, used and dropped, of what `jsonable` knows.
-            warnings: what the user should know, one line each.
+            counts: numbers of things found, used and dropped, of types that `jsonable` accepts.
+            warnings: warnings for the user, one line each.
         """
         sync_tree(self.folder)
         self._record = StageRecord(
@@ -257,12 +258,12 @@ class Run:
 
 
 def session_name(folder: Path) -> str:
-    """What a session is called: its folder's name, whatever way it was written, without `.session`."""
+    """Return the name of a session: the name of its resolved folder without `.session`."""
     return folder.resolve().name.removesuffix(".session")
 
 
 def open_session(folder: Path) -> Session:
-    """Open a session to read it; what a killed writer left half published is finished first.
+    """Open a session for reading; an interrupted publication is completed first.
 
     Raises:
         DataError: not a session, damaged, of a later version, or unreadable.
@@ -280,15 +281,15 @@ def open_session(folder: Path) -> Session:
 
 @contextmanager
 def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> Iterator[WritableSession]:
-    """Hold a session for writing; what an earlier writer left behind is finished or removed first.
+    """Lock a session for writing; leftovers of a killed writer are completed or removed first.
 
     An exception inside leaves every stage as it was. Errors of the operating system become DataError.
 
     Args:
         folder: the session's.
-        create: it need not be there yet (ingest); a new folder of an ingest that fails is removed again.
-        overwrite: with `create`, write also into a folder with other things in it. Those stay, except
-            where they bear the name of one of the session's own files.
+        create: allow a folder that does not exist yet (ingest); if the ingest fails, a new folder is removed.
+        overwrite: with `create`, write also into a folder with other files in it. Those stay, unless they
+            have the name of one of the session's own files.
 
     Raises:
         DataError: not a session, or with `create` something else; of a later version; cannot be written.
@@ -309,12 +310,12 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
                     _check_session(folder)
                 yield WritableSession(folder)
             except BaseException as error:
-                # What cannot be tidied now is tidied by whoever opens the session next.
+                # What cannot be repaired now is repaired when the session is opened next.
                 with suppress(OSError):
                     repair(folder)
                     if is_new and isinstance(error, MocapError):
-                        # The user will change something, and then nothing of this is of use; after an
-                        # interrupt it is.
+                        # The user will change an input, so finished parts are useless; after an interrupt
+                        # they are useful.
                         remove_tree(folder / ".partial")
                 raise
             finally:
@@ -355,13 +356,13 @@ def _refuse_newer_session(folder: Path) -> None:
     except NewerSchemaError:
         raise
     except DataError:
-        pass  # missing or damaged: whoever needs it says so, and ingest writes it anew
+        pass  # missing or damaged: its readers report this, and ingest writes it again
 
 
 @contextmanager
 def _lock(folder: Path) -> Iterator[None]:
-    """The kernel's lock, which ends with the process, however that ends."""
-    # The holder's number stands beside the lock: some versions of filelock empty the file when they try it.
+    """Hold a lock of the kernel, which ends with the process, however that ends."""
+    # The holder's process id is in a file of its own: some versions of filelock empty the lock file.
     holder = folder / ".lock.pid"
     try:
         lock = FileLock(folder / ".lock").acquire(timeout=0)

@@ -1,4 +1,4 @@
-"""Files that survive a kill, JSON that is always the same, and hashes of what was read or written."""
+"""Files that survive a kill, reproducible JSON, and hashes of files that were read or written."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ _REMEDIES = {
 
 
 def as_data_error(error: OSError, path: Path) -> DataError:
-    """What the operating system refused, as one line; `path` where the error itself names no file."""
+    """Make a one-line error of an operating system's error; `path` is used if the error names no file."""
     remedy = _REMEDIES.get(error.errno or 0, "mend that and run the command again")
     return DataError(error.filename or path, error.strerror or str(error), remedy)
 
 
 def is_special(path: Path) -> bool:
-    """Whether it is a pipe, a socket or a device: reading one may never end. Never raises."""
+    """Return True for a pipe, a socket or a device, of which reading may never end. Never raise."""
     try:
         mode = path.stat().st_mode
-    except (OSError, ValueError):  # missing, or a name that no file can have: for whoever opens it to say
+    except (OSError, ValueError):  # missing, or an impossible name: the function that opens it reports this
         return False
     return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
 
 
 def refuse_special(path: Path) -> None:
-    """Refuse what is neither a file nor a folder.
+    """Refuse a path that exists but is neither a file nor a folder.
 
     Raises:
         DataError: it is a pipe, a socket or a device.
@@ -55,13 +55,13 @@ def refuse_special(path: Path) -> None:
 
 
 def sha256_of(path: Path, hash_for: Callable[[Path], Any] = lambda _: hashlib.sha256()) -> str:
-    """Hash of a file's content, or of a folder's: the relative names and contents of all its files, sorted.
+    """Hash the content of a file, or of a folder: the relative names and contents of its files, sorted.
 
-    Empty folders do not count, nor does what lies behind links to folders.
+    Empty folders and the content of linked folders are ignored.
 
     Args:
         path: the file or folder.
-        hash_for: makes what is given the bytes of a file and has their SHA-256 as its digest.
+        hash_for: makes the object that receives the bytes of a file and has their SHA-256 as its digest.
 
     Raises:
         DataError: the path is missing, cannot be read, or is no file or folder.
@@ -82,7 +82,7 @@ def sha256_of(path: Path, hash_for: Callable[[Path], Any] = lambda _: hashlib.sh
 def file_stamp(path: Path) -> str:
     """Hash a file's size and time of change, or those of all files of a folder with their names.
 
-    Equal stamps mean that nothing was written, so that the content need not be read again.
+    If the stamp is unchanged, nothing was written, and the content need not be read again.
 
     Raises:
         DataError: the path is missing or cannot be read.
@@ -111,7 +111,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def jsonable(value: object) -> Any:
-    """The same value in what JSON knows: NaN becomes null, numpy numbers and arrays plain ones, tuples lists.
+    """Convert a value to JSON types: NaN to null, numpy numbers and arrays to plain ones, tuples to lists.
 
     Raises:
         TypeError: anything else (a path, an object, a key that is no string).
@@ -139,17 +139,17 @@ def jsonable(value: object) -> Any:
 
 
 def canonical_json(value: object) -> str:
-    """One text for equal values, whatever the order of their keys: what keys are made of."""
+    """Write a value as one JSON text, the same for any order of keys; the keys of stages are its hashes."""
     return json.dumps(jsonable(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
 def hash_of(value: object) -> str:
-    """Sha256 of what `jsonable` knows: equal for equal values."""
+    """Compute the SHA-256 of a value of types that `jsonable` accepts: equal for equal values."""
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a JSON object in its own order; a kill leaves the old file or the new one, whole.
+    """Write a JSON object with its keys in their order; a kill leaves the old file or the new one, complete.
 
     Raises:
         ValueError: it holds NaN or an infinite number (`jsonable` turns NaN into null).
@@ -184,13 +184,13 @@ def _refuse_constant(name: str) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Make the files of a folder, its folders and itself outlast a loss of power."""
+    """Sync a folder and everything in it to disk, so that it survives a loss of power."""
     for path in [*folder.rglob("*"), folder]:
         _sync(path)
 
 
 def sync_folder(folder: Path) -> None:
-    """Make what was last renamed in a folder outlast a loss of power."""
+    """Sync a folder to disk, so that renames in it survive a loss of power."""
     _sync(folder)
 
 
@@ -203,7 +203,7 @@ def _sync(path: Path) -> None:
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a file, a link or a folder with all it holds; nothing there is fine."""
+    """Remove a file, a link or a folder with its content; a missing path is no error."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:

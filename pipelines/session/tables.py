@@ -1,4 +1,4 @@
-"""The columns of every table of a session, and how they are read and written.
+"""The columns of every table of a session, with functions to read and write tables.
 
 The files are plain Parquet that pandas reads without this program. The same frame gives the same
 bytes: no index, no pandas metadata, fixed writer settings.
@@ -66,7 +66,7 @@ PLAN = pa.schema(
         ("z", pa.float64()),
     ]
 )
-"""plan.parquet: where the on-board planner sent every drone."""
+"""plan.parquet: the setpoints of the on-board planner for every drone."""
 
 SKELETON = pa.schema(
     [
@@ -97,9 +97,9 @@ REPLAN = pa.schema(
         ("predicted_error_m", pa.float64()),
     ]
 )
-"""replan/<arm>/trajectories.parquet, sorted by time, then camera: the pose (world_from_camera), what
-was commanded (yaw continuous, NaN for what was flown), the tilt above the actor, whether nothing stands in
-the sight line, and what all cameras together are expected to err by (NaN where they determine nothing)."""
+"""replan/<arm>/trajectories.parquet, sorted by time, then camera: the pose (world_from_camera), the commanded
+slot (yaw continuous, NaN for the flown trajectories), the tilt above the actor, `visible` (True if nothing
+blocks the sight line), and the predicted error of all cameras together (NaN where not determined)."""
 SEEN = pa.schema(
     [
         ("t_ns", pa.int64()),
@@ -110,10 +110,10 @@ SEEN = pa.schema(
         ("status", pa.string()),
     ]
 )
-"""replan/<arm>/seen.parquet, once a second: where each known joint is in the arm's pictures (exact px, NaN
-outside) and whether it is `seen`, `hidden` by what stands around, or `outside` the picture."""
+"""replan/<arm>/seen.parquet, once a second: the position of each known joint in the arm's pictures (exact px,
+NaN outside) and its status: `seen`, `hidden` by the surroundings, or `outside` the picture."""
 COST_MAP = pa.schema([("t_ns", pa.int64()), ("yaw_rad", pa.float64()), ("cost", pa.float64())])
-"""replan/cost_map.parquet: what a formation whose first camera has that yaw would cost at that time."""
+"""replan/cost_map.parquet: the cost of a formation at a time, by the yaw of its first camera."""
 
 
 def write_table(path: Path, frame: pd.DataFrame, schema: pa.Schema) -> None:

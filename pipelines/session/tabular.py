@@ -1,7 +1,6 @@
-"""Records as rows of a session's tables, and back.
+"""Conversion of records to rows of a session's tables, and back.
 
-A table has one row per thing that was measured: a joint that was not found has no row, and comes back
-as NaN.
+A table has one row per measurement. A joint that was not found has no row, and is read back as NaN.
 """
 
 from __future__ import annotations
@@ -24,21 +23,21 @@ _QUATERNION = ["qx", "qy", "qz", "qw"]
 
 
 def frames_table(frame: Int64, t_ns: Int64, pts_ns: Int64) -> pd.DataFrame:
-    """Frames with their world times and their place in the video, as rows of `tables.FRAMES`."""
+    """Make rows of `tables.FRAMES` from frames, their world times and their presentation times."""
     import pandas as pd
 
     return pd.DataFrame({"frame": frame, "t_ns": t_ns, "pts_ns": pts_ns})
 
 
 def rows_between(since_ns: Int64, start_s: float | None, end_s: float | None) -> range:
-    """The rows of sorted times [F] at or after `start_s` and before `end_s`; None is no bound."""
+    """Find the rows of sorted times [F] at or after `start_s` and before `end_s`; None is no bound."""
     first = 0 if start_s is None else int(np.searchsorted(since_ns, round(start_s * 1e9), side="left"))
     stop = len(since_ns) if end_s is None else int(np.searchsorted(since_ns, round(end_s * 1e9), side="left"))
     return range(first, max(first, stop))
 
 
 def actor_table(trajectory: Trajectory) -> pd.DataFrame:
-    """Where the actor was, as rows of `tables.ACTOR`; person 0."""
+    """Make rows of `tables.ACTOR` from the actor's trajectory; the person is 0."""
     import pandas as pd
 
     table = pd.DataFrame({"t_ns": trajectory.t_ns, "person": 0})
@@ -47,7 +46,7 @@ def actor_table(trajectory: Trajectory) -> pd.DataFrame:
 
 
 def pose_table(trajectory: Trajectory) -> pd.DataFrame:
-    """A trajectory as rows of `tables.POSES`, with its covariance where it has one."""
+    """Make rows of `tables.POSES` from a trajectory, with its covariance if it has one."""
     import pandas as pd
 
     table = pd.DataFrame({"t_ns": trajectory.t_ns})
@@ -59,7 +58,7 @@ def pose_table(trajectory: Trajectory) -> pd.DataFrame:
 
 
 def trajectory_from(table: pd.DataFrame) -> Trajectory:
-    """The trajectory that `pose_table` stored."""
+    """Rebuild the trajectory that `pose_table` stored."""
     covariance = None
     if set(COVARIANCE_COLUMNS) <= set(table.columns):
         covariance = np.zeros((len(table), 6, 6))
@@ -75,7 +74,7 @@ def trajectory_from(table: pd.DataFrame) -> Trajectory:
 
 
 def keypoints_table(detections: Detections, known_frame: Int64, t_ns: Int64) -> pd.DataFrame:
-    """The joints that were found, as rows of `tables.KEYPOINTS`.
+    """Make rows of `tables.KEYPOINTS` from the joints that were found.
 
     Args:
         detections: in known frames only.
@@ -100,7 +99,7 @@ def keypoints_table(detections: Detections, known_frame: Int64, t_ns: Int64) -> 
 
 
 def detections_from(table: pd.DataFrame, joints: tuple[str, ...]) -> Detections:
-    """The detections that `keypoints_table` stored, with these joints in this order; others are left out."""
+    """Rebuild the detections that `keypoints_table` stored, with only these joints, in this order."""
     joint = _index_of(table["joint"], joints)
     table, joint = table[joint >= 0], joint[joint >= 0]
     keys = table[["frame", "person"]].to_numpy(np.int64)
@@ -120,7 +119,7 @@ def detections_from(table: pd.DataFrame, joints: tuple[str, ...]) -> Detections:
 
 
 def most_confident(detections: Detections, most: int) -> tuple[Detections, int]:
-    """At most so many people of each frame, by confidence, and how many are left out."""
+    """Keep the `most` most confident people of each frame; return also the number left out."""
     frame = detections.frame
     order = np.lexsort((detections.person, -detections.confidence.sum(axis=1), frame))
     rank = np.arange(len(frame)) - np.searchsorted(frame[order], frame[order], side="left")
@@ -138,7 +137,7 @@ def most_confident(detections: Detections, most: int) -> tuple[Detections, int]:
 
 
 def motion_table(motion: JointMotion) -> pd.DataFrame:
-    """The joints that are there, as rows of `tables.TRUTH`."""
+    """Make rows of `tables.TRUTH` from the joints that are not NaN."""
     import pandas as pd
 
     t, person, joint = np.nonzero(~np.isnan(motion.position[..., 0]))
@@ -154,9 +153,9 @@ def motion_table(motion: JointMotion) -> pd.DataFrame:
 
 
 def motion_from(table: pd.DataFrame, joints: tuple[str, ...]) -> JointMotion:
-    """The motion of these joints in a table of `tables.TRUTH` or `tables.SKELETON`; the rest is left out."""
+    """Rebuild the motion of these joints from a table of `tables.TRUTH` or `tables.SKELETON`."""
     joint = _index_of(table["joint"], joints)
-    # Times at which none of these joints is there are times all the same.
+    # Times without any of these joints are kept.
     t_ns, row = np.unique(table["t_ns"].to_numpy(np.int64), return_inverse=True)
     table, row, joint = table[joint >= 0], row[joint >= 0], joint[joint >= 0]
     person = table["person"].to_numpy(np.int64)
@@ -177,7 +176,7 @@ def motion_from(table: pd.DataFrame, joints: tuple[str, ...]) -> JointMotion:
 
 
 def _index_of(names: pd.Series[str], wanted: Sequence[str]) -> NDArray[np.intp]:
-    """The place of every name among the wanted ones, -1 for those that are not."""
+    """Find the index of every name among the wanted ones, -1 for names that are not wanted."""
     import pandas as pd
 
     return pd.Index(wanted).get_indexer(pd.Index(names))

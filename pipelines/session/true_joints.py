@@ -1,4 +1,4 @@
-"""The true joints of a session, at the times at which others are compared with them."""
+"""Interpolation of true joints to the times at which results are compared with them."""
 
 from __future__ import annotations
 
@@ -9,31 +9,32 @@ from pipelines.geometry.poses import interpolate_points
 from pipelines.session.records import Float, Int64, JointMotion
 
 _MOST_STREAMS = 8  # cameras or trackers whose samples take turns
-_LEAST_TURNS = 4  # before it can be said that they repeat
-_ALIKE = 0.2  # of a step on the average: what times that are the same may differ by
-_MOST = 0.6  # of all times: so many must be alike
-_HARDLY_MORE = 0.1  # of all times: more streams must make so many more of them alike
-_LONGER = 1.2  # times the usual longest step, at least, may lie between two samples
-_OF_NO_ORDER = 1.5  # times the 90th percentile of steps that do not repeat
+_LEAST_TURNS = 4  # fewest repetitions to call a pattern periodic
+_ALIKE = 0.2  # of the mean step: largest difference between times that count as equal
+_MOST = 0.6  # smallest share of times that must be equal
+_HARDLY_MORE = 0.1  # a larger number of streams must raise the share of equal times by more than this
+_LONGER = 1.2  # smallest limit, as a multiple of the usual longest step
+_OF_NO_ORDER = 1.5  # limit for steps that do not repeat, as a multiple of their 90th percentile
 
 
 def true_joints_at(truth: JointMotion, t_ns: Int64) -> Float:
     """Interpolate true positions [T, P, J, 3] at given times, linearly.
 
-    NaN outside the stamps of the truth, beside a sample that misses the joint, and across a hole
-    (`longest_step_ns`).
+    The result is NaN outside the stamps of the truth, next to a sample without the joint, and across a gap
+    longer than `longest_step_ns`.
     """
     return interpolate_points(truth.t_ns, truth.position, t_ns, max_gap_ns=longest_step_ns(truth.t_ns))
 
 
 def longest_step_ns(t_ns: Int64) -> int:
-    """Return the longest step between samples that is no hole.
+    """Return the longest step between samples that is not a gap.
 
-    Truth may be sampled when any of several cameras takes its picture. Cameras of 25 Hz with shutters of
-    their own give steps of 8 and 32 ms by turns: neither is a hole, and the usual step is no measure. So the
-    number of steps is looked for after which they repeat. A missing sample joins two steps, and the limit
-    lies half way between the longest usual step and the shortest such sum above it: 1.5 steps where all are
-    alike. Streams of different rates never repeat; of their steps the 90th percentile counts.
+    Truth may be sampled whenever one of several cameras takes a picture. Two cameras of 25 Hz that are not
+    synchronised give alternating steps of 8 and 32 ms. Neither is a gap, and the median step is no measure.
+    So the function finds the number of steps after which they repeat. A missing sample joins two steps. The
+    limit lies half way between the longest usual step and the shortest such sum above it, which is 1.5 steps
+    if all are equal. Streams of different rates never repeat; for them the limit is 1.5 times the 90th
+    percentile of the steps.
 
     Args:
         t_ns: [N] strictly increasing.
@@ -62,6 +63,6 @@ def longest_step_ns(t_ns: Int64) -> int:
 
 
 def _alike(times: Float, share: float) -> NDArray[np.bool_]:
-    """Tell which times differ from their median by no more than a share of it."""
+    """Mark the times that differ from their median by no more than a share of it."""
     usual = np.median(times)
     return np.asarray(np.abs(times - usual) <= share * usual)

@@ -1,4 +1,4 @@
-"""A folder of results that appears in one piece, made of parts that outlive an interrupt.
+"""A folder of results that appears complete or not at all; its finished parts survive an interrupt.
 
     with whole_folder(target, key, overwrite=overwrite) as making:
         video = making.part("drone1-0", encode)
@@ -6,8 +6,8 @@
         (making.folder / "flight.yaml").write_text(...)
         making.publish()
 
-Everything is made in a hidden folder beside the target and renamed to it at the end. Parts lie there by
-key: other settings do not find them.
+Everything is written in a hidden folder beside the target, which is renamed to the target at the end.
+Parts are stored by key, so a run with other settings does not use them.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from pipelines.session.errors import BusyError, DataError
 from pipelines.session.storage import as_data_error, read_json, remove_tree, sync_folder, sync_tree
 
 SIMULATION_MARK = "simulation.json"
-"""The file that every folder of `mocap simulate` has."""
+"""The file that is in every folder of `mocap simulate`."""
 
 STUDY_MARK = "summary.json"
-"""The file that every folder of `mocap ablate` has."""
+"""The file that is in every folder of `mocap ablate`."""
 
 _OF_SESSIONS = {"session.json": "a session", "stage.json": "a stage of a session"}
 
 
 class Making:
-    """A folder in the making.
+    """A folder that is being made.
 
     Attributes:
-        folder: what is written here appears as the target when published.
+        folder: the folder to write into; it becomes the target when published.
     """
 
     def __init__(self, work: Path, target: Path, key: str) -> None:
@@ -45,7 +45,7 @@ class Making:
         self._parts = work / key
 
     def part(self, name: str, produce: Callable[[Path], None]) -> Path:
-        """The folder of a finished part, made by `produce` unless an interrupted run finished it."""
+        """Return the folder of a finished part; call `produce` if no interrupted run finished it."""
         finished = self._parts / name
         if not finished.is_dir():
             temporary = self._parts / f"{name}.new"
@@ -57,7 +57,7 @@ class Making:
         return finished
 
     def publish(self) -> None:
-        """Put the folder in the target's place, and what lay there away."""
+        """Replace the target by the folder, and move the old target away."""
         sync_tree(self.folder)
         old = self._work / "old"
         remove_tree(old)
@@ -69,13 +69,13 @@ class Making:
 
 @contextmanager
 def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Iterator[Making]:
-    """Make a folder; parts stay when the work is interrupted, and go when it ends or cannot succeed.
+    """Make a folder. Parts are kept after an interrupt, and removed after success or a DataError.
 
     Args:
         target: the folder.
         key: equal for equal results.
-        mark: a file that every such folder has; a target without it is somebody else's.
-        overwrite: replace what is somebody else's, too.
+        mark: a file that every such folder has; a target without it holds something else.
+        overwrite: replace also a target that holds something else.
 
     Raises:
         DataError: the target is something else, or cannot be written.
@@ -95,7 +95,7 @@ def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Itera
             try:
                 yield making
             except DataError:
-                remove_tree(work / key)  # the user will change something
+                remove_tree(work / key)  # the user will change an input
                 raise
             else:
                 remove_tree(work / key)
@@ -110,12 +110,12 @@ def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Itera
 
 
 def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
-    """What is of a session is not replaced, whatever was asked for.
+    """Refuse to replace a session or a part of one, even with `overwrite`.
 
     Args:
         target: the folder that would be replaced.
         mark: as for `whole_folder`.
-        option: by which the user named it.
+        option: the option by which the user named the target.
 
     Raises:
         DataError: the target holds a session or a stage of one, at any depth, or lies in a session.
@@ -135,9 +135,9 @@ def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
 
 
 def is_made(target: Path, key: str, *, mark: str) -> bool:
-    """Whether the target is there already with this key, which its mark states.
+    """Return True if the target exists with this key, which its mark file states.
 
-    If so, what an attempt to make it once more left when it was killed is of no use, and goes.
+    In that case, leftovers of a later attempt that was killed are useless and are removed.
     """
     made = False
     with suppress(DataError):
@@ -152,7 +152,7 @@ def _work_of(target: Path) -> Path:
 
 
 def _clear(work: Path, target: Path) -> None:
-    """Remove a place of work in which nobody works."""
+    """Remove a working folder that no process uses."""
     with suppress(OSError, BusyError):
         if work.is_dir():
             with _held(work / "lock", target):
@@ -185,7 +185,7 @@ def _held(path: Path, target: Path) -> Iterator[None]:
 
 
 def _put_back(work: Path, target: Path) -> None:
-    """What a kill between two renames left without a successor goes back; else it goes."""
+    """Put the old target back if a kill between two renames left no new one; else remove it."""
     old = work / "old"
     if old.exists() and not target.exists():
         old.rename(target)
@@ -193,7 +193,7 @@ def _put_back(work: Path, target: Path) -> None:
 
 
 def _tidy(work: Path) -> None:
-    """Remove the place of work where nothing is left in it but the lock."""
+    """Remove the working folder if only the lock is left in it."""
     with suppress(OSError):
         if {path.name for path in work.iterdir()} <= {"lock"}:
             (work / "lock").unlink(missing_ok=True)

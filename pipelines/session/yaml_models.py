@@ -1,4 +1,4 @@
-"""YAML files that users write, read into models: every problem in one message, unknown keys with a hint."""
+"""Models of users' YAML files; all problems are in one message, unknown keys with a hint."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ M = TypeVar("M", bound=Part)
 
 
 def keys_of(model: type[Part]) -> set[str]:
-    """The keys that a mapping of this kind may have, as users write them."""
+    """Return the keys that a mapping of this kind may have, as users write them."""
     return {field.alias or name for name, field in model.model_fields.items()}
 
 
@@ -52,10 +52,10 @@ def read_yaml_model(path: Path, model: type[M], noun: str, *, newest: int, shape
 
     Args:
         path: the file.
-        model: what it must hold; its schema's version stands behind the key `schema`.
-        noun: what such a file is called ("flight manifest").
+        model: the model of its content; the schema's version is the value of the key `schema`.
+        noun: the name of such a file ("flight manifest").
         newest: the newest version of the schema.
-        shape: what the file must be, for a file that holds something else altogether.
+        shape: a description of the file's form, for the message if the file is no mapping.
 
     Raises:
         DataError: the file is missing, no YAML, or does not keep to the schema; the message holds
@@ -106,7 +106,7 @@ def _describe(problem: Any, model: type[Part]) -> str:  # ErrorDetails, whose ct
 
 
 def _keys_at(model: type[Part], place: tuple[str | int, ...]) -> list[str]:
-    """The keys that the schema knows at a place, found by walking the types of the fields."""
+    """List the keys that the schema allows at a place, by walking the types of the fields."""
     kind: Any = model
     for part in place:
         if isinstance(kind, type) and issubclass(kind, Part):
@@ -118,7 +118,7 @@ def _keys_at(model: type[Part], place: tuple[str | int, ...]) -> list[str]:
 
 
 def _plain(annotation: Any) -> Any:
-    """A type without what may be None, and without what is said of it."""
+    """Return a type without `None` and without its `Annotated` metadata."""
     if get_origin(annotation) is Annotated:
         return _plain(get_args(annotation)[0])
     if type(None) in get_args(annotation):

@@ -1,4 +1,4 @@
-"""Safe YAML as plain mappings, lists and numbers; what is none is told in one line."""
+"""Reading of safe YAML into plain mappings, lists and numbers; problems are one-line errors."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ _MOST_BITS = 1024  # a float holds integers of fewer
 
 
 def plain_yaml(path: Path, text: str) -> object:
-    """What a text says, built of plain types only.
+    """Parse YAML into plain types only.
 
     Args:
-        path: where the text is from.
+        path: the file of the text, for messages.
         text: of the whole file.
 
     Raises:
-        DataError: no valid YAML; the message names the line where there is one. Or a value that no program
+        DataError: no valid YAML; the message names the line if it is known. Or a value that no program
             can use: a text that cannot be written, an integer beyond any float.
     """
     from ruamel.yaml import YAML
@@ -39,11 +39,11 @@ def plain_yaml(path: Path, text: str) -> object:
 
 
 def _refuse_impossible_values(path: Path, value: object) -> None:
-    """Refuse integers beyond any float, and escapes for what no name of a file can hold.
+    """Refuse integers beyond any float, and texts with characters that no file name can hold.
 
-    That is zero bytes and halves of characters. Python refuses to print integers of thousands of digits.
+    Such characters are zero bytes and lone surrogates. Python cannot print integers of thousands of digits.
     """
-    seen: set[int] = set()  # aliases of aliases are one thing, however often they stand there
+    seen: set[int] = set()  # an aliased value is one object, however often it is used
     waiting: list[tuple[object, tuple[object, ...]]] = [(value, ())]
     while waiting:
         item, place = waiting.pop()
