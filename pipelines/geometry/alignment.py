@@ -27,19 +27,19 @@ class Alignment:
     translation: Float  # [..., 3]
 
     def apply(self, points: Float) -> Float:
-        """Points [..., J, 3] of the source, moved onto the target."""
+        """Move points [..., J, 3] of the source onto the target."""
         turned = points @ np.swapaxes(self.rotation, -1, -2)
         moved: Float = self.scale[..., None, None] * turned + self.translation[..., None, :]
         return moved
 
 
 def align(source: Float, target: Float, *, with_scale: bool) -> Alignment:
-    """The alignment of two point sets.
+    """Align two point sets.
 
     Args:
         source: [J, 3].
-        target: [J, 3], row by row the same points; rows with NaN on either side are left out.
-        with_scale: a similarity instead of a rigid motion.
+        target: [J, 3], the same points in the same order; rows with NaN on either side are left out.
+        with_scale: find a similarity instead of a rigid motion.
 
     Raises:
         ValueError: fewer than 3 common points, or points on a line: the rotation is not determined.
@@ -54,12 +54,12 @@ def align(source: Float, target: Float, *, with_scale: bool) -> Alignment:
 
 
 def align_each(source: Float, target: Float, *, with_scale: bool) -> Alignment:
-    """The alignments of many pairs of point sets, each on its own.
+    """Align many pairs of point sets, each pair separately.
 
     Args:
         source: [..., J, 3].
         target: [..., J, 3]; a point with NaN on either side is left out of its pair.
-        with_scale: similarities instead of rigid motions.
+        with_scale: find similarities instead of rigid motions.
 
     Returns:
         A batch [...]; NaN where fewer than 3 points are common or they lie on a line.

@@ -1,9 +1,9 @@
-"""How sure a mean over a flight is: a bootstrap of stretches, because neighbouring moments err alike.
+"""Confidence intervals of means over a flight, by a block bootstrap, because neighbouring errors correlate.
 
-The circular block bootstrap (Politis & Romano 1992): stretches of a fixed length, drawn with replacement from
-anywhere in the flight, whose end is followed by its beginning, are joined to a flight of the same length; the
-interval holds the middle 95 % of the means of many such flights. What is the same all through a flight, such
-as a constant pose error, does not show: the interval speaks of this flight, not of the next.
+This is the circular block bootstrap (Politis & Romano 1992). The flight is treated as a circle. Stretches of
+a fixed length are drawn from it with replacement and joined to a flight of the same length. The interval
+holds the middle 95 % of the means of many such flights. It does not include errors that are constant during
+the flight, such as a constant pose error. So it is valid for this flight, not for the next.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Series = tuple[Float, Float]
 
 LEVEL = 0.95
 STRETCH_S = 2.0
-"""Two steps of a walk; errors of a detector and of white poses are forgotten long before."""
+"""Length of a stretch: two steps of a walk. Errors of detectors and of white poses decorrelate sooner."""
 
 RESAMPLES = 1000
 _FEWEST_STRETCHES = 5
@@ -29,7 +29,7 @@ _FEWEST_SAMPLES = 10
 
 
 def stretch_samples(t_ns: Int64) -> int:
-    """How many samples a stretch has: `STRETCH_S`, in a short flight a fifth of it, and at least one."""
+    """Return the samples of a stretch: `STRETCH_S`, at most a fifth of the flight, and at least one."""
     step_s = float(np.median(np.diff(t_ns))) / 1e9
     return max(min(round(STRETCH_S / step_s), len(t_ns) // _FEWEST_STRETCHES), 1)
 
@@ -37,7 +37,7 @@ def stretch_samples(t_ns: Int64) -> int:
 def intervals(
     series: Mapping[str, Series], t_ns: Int64, *, seed: int = 0
 ) -> dict[str, tuple[float, float] | None]:
-    """The interval of every figure; the same draws for all of them.
+    """Compute the interval of every figure, with the same draws for all of them.
 
     Args:
         series: by name, [T] each; nothing may be NaN.
@@ -45,16 +45,16 @@ def intervals(
         seed: of the draws.
 
     Returns:
-        By name; None where there are fewer than ten samples, or a resampled flight holds nothing of it.
+        By name; None with fewer than ten samples, or if a resampled flight has no data for the figure.
     """
     return {name: interval_of(values) for name, values in resampled(series, t_ns, seed=seed).items()}
 
 
 def resampled(series: Mapping[str, Series], t_ns: Int64, *, seed: int = 0) -> dict[str, Float]:
-    """Every figure of every resampled flight, [RESAMPLES]; the same draws for all figures.
+    """Compute every figure of every resampled flight, [RESAMPLES], with the same draws for all figures.
 
-    Arguments as of `intervals`. NaN where a resampled flight holds nothing of a figure, and all of them
-    where there are fewer than ten samples.
+    The arguments are those of `intervals`. A value is NaN if a resampled flight has no data for the figure.
+    All values are NaN with fewer than ten samples.
     """
     times = len(t_ns)
     if times < _FEWEST_SAMPLES:
@@ -70,7 +70,7 @@ def resampled(series: Mapping[str, Series], t_ns: Int64, *, seed: int = 0) -> di
 
 
 def interval_of(values: Float) -> tuple[float, float] | None:
-    """The middle 95 % of a figure of resampled flights; None where one of them holds nothing of it."""
+    """Return the middle 95 % of a figure of resampled flights; None if any of them has no data for it."""
     if not np.isfinite(values).all():
         return None
     tail = 50 * (1 - LEVEL)
@@ -79,6 +79,6 @@ def interval_of(values: Float) -> tuple[float, float] | None:
 
 
 def _of_stretches(values: Float, length: int) -> Float:
-    """The sum [T] of the stretch that begins at each moment, around the end."""
+    """Sum [T] the stretch that begins at each sample; stretches wrap around the end."""
     total = np.concatenate([[0.0], np.cumsum(np.concatenate([values, values[: length - 1]]))])
     return np.asarray(total[length:] - total[:-length], dtype=np.float64)

@@ -16,15 +16,15 @@ Bool = NDArray[np.bool_]
 DistortionModel = Literal["none", "radtan", "fisheye"]
 
 COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {"none": (0,), "radtan": (4, 5, 8), "fisheye": (4,)}
-"""How many distortion coefficients each model takes."""
+"""The allowed numbers of distortion coefficients of each model."""
 
-# Beyond 89.94 degrees off the axis, x/z says nothing any more.
+# Beyond 89.94 degrees off the axis, x/z is no longer useful.
 _WIDEST = 1e3
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A camera's inner geometry, in pixels of a `width` x `height` picture.
+    """The intrinsic parameters of a camera, in pixels of a `width` x `height` picture.
 
     `radtan` is OpenCV's order k1 k2 p1 p2 [k3 [k4 k5 k6]], `fisheye` is OpenCV's k1 k2 k3 k4
     (equidistant). The centre of the top left pixel is (0, 0). `readout_s` is the time a rolling
@@ -68,17 +68,17 @@ class Intrinsics:
 
 
 def camera_matrix(intrinsics: Intrinsics) -> Float:
-    """K, [3, 3] in pixels, without skew."""
+    """Return the camera matrix K, [3, 3] in pixels, without skew."""
     return np.array(
         [[intrinsics.fx, 0.0, intrinsics.cx], [0.0, intrinsics.fy, intrinsics.cy], [0.0, 0.0, 1.0]]
     )
 
 
 def project(points_camera: Float, intrinsics: Intrinsics) -> Float:
-    """Where points in the camera's frame appear in the picture.
+    """Project points in the camera's frame to pixels.
 
-    The picture's border is not applied. Where the distortion polynomial has folded back on itself,
-    OpenCV returns the pixel of the fold's other branch; here such points have no pixel, so that
+    Pixels outside the picture are returned as well. Where the distortion polynomial has folded back on
+    itself, OpenCV returns the pixel of the fold's other branch. Here such points have no pixel, so that
     `undistort` is the exact inverse.
 
     Args:
@@ -99,7 +99,7 @@ def project(points_camera: Float, intrinsics: Intrinsics) -> Float:
 
 
 def undistort(pixels: Float, intrinsics: Intrinsics) -> Float:
-    """The viewing ray of each pixel, as x/z and y/z.
+    """Compute the viewing ray of each pixel, as x/z and y/z.
 
     Args:
         pixels: [..., 2] px.
@@ -119,10 +119,10 @@ def undistort(pixels: Float, intrinsics: Intrinsics) -> Float:
 
 
 def rescaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
-    """The same camera with its pictures resized to `width` x `height`.
+    """Return the intrinsics for pictures resized to `width` x `height`.
 
-    The corners of the picture stay corners. They lie half a pixel outside of the centres of pixels, so the
-    principal point moves by more than the factor, as in OpenCV's resize.
+    The corners of the picture stay corners. They lie half a pixel outside the centres of the corner pixels,
+    so the principal point is not just multiplied by the factor (as in OpenCV's resize).
     """
     sx, sy = width / intrinsics.width, height / intrinsics.height
     return replace(
@@ -137,13 +137,14 @@ def rescaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
 
 
 def fit_to_size(intrinsics: Intrinsics, width: int, height: int) -> tuple[Intrinsics, str | None]:
-    """Intrinsics for pictures of a size that the calibration may not have been made for.
+    """Adapt intrinsics to the size of the pictures, which may differ from that of the calibration.
 
-    The same shape (aspect ratio within 0.5 %) at another size is a resized picture: rescaled. Another
-    shape, both sides within 2 %, is a picture cropped or padded by its codec: kept.
+    The same shape (aspect ratio within 0.5 %) at another size means a resized picture: the intrinsics are
+    rescaled. Another shape, with both sides within 2 %, means a picture that its codec cropped or padded: the
+    intrinsics are kept.
 
     Returns:
-        The intrinsics to use, and a note where the sizes differ.
+        The intrinsics to use, and a note if the sizes differ.
 
     Raises:
         ValueError: the sizes differ by more than that.
@@ -183,7 +184,7 @@ def _distort_fisheye(normalised: Float, coefficients: tuple[float, ...]) -> Floa
 
 
 def _undistort_radtan(distorted: Float, coefficients: tuple[float, ...]) -> Float:
-    """Newton on both coordinates, from the exact solution without the tangential part."""
+    """Invert the model by Newton's method, from the exact solution without the tangential part."""
     target = np.hypot(distorted[:, 0], distorted[:, 1])
     radius = _invert(lambda r: _radtan_radius(r, coefficients), target, _radtan_limit(coefficients))
     normalised = distorted * np.where(target > 0, radius / target, 1.0)[:, None]
@@ -192,7 +193,7 @@ def _undistort_radtan(distorted: Float, coefficients: tuple[float, ...]) -> Floa
         step = _solve_symmetric(jacobian, distorted - value)
         normalised = normalised + step
         small = np.abs(step) <= 1e-10 * np.maximum(1.0, np.abs(normalised))
-        # NaN steps (a singular Jacobian) will never get small.
+        # NaN steps (a singular Jacobian) never become small.
         if (small | np.isnan(step)).all():
             break
     _, jacobian = _radtan(normalised, coefficients)
@@ -215,7 +216,7 @@ _UNDISTORT = {"none": _distort_none, "radtan": _undistort_radtan, "fisheye": _un
 
 
 def _radtan(normalised: Float, coefficients: tuple[float, ...]) -> tuple[Float, tuple[Float, Float, Float]]:
-    """Brown's model in OpenCV's form, and its symmetric Jacobian as (xx, xy, yy)."""
+    """Evaluate Brown's model in OpenCV's form, and its symmetric Jacobian as (xx, xy, yy)."""
     x, y = normalised[..., 0], normalised[..., 1]
     p1, p2 = coefficients[2:4]
     square = x * x + y * y
@@ -236,7 +237,7 @@ def _radtan(normalised: Float, coefficients: tuple[float, ...]) -> tuple[Float, 
 def _radtan_holds(
     normalised: Float, jacobian: tuple[Float, Float, Float], coefficients: tuple[float, ...]
 ) -> Bool:
-    """Whether points lie where the model has not folded: a positive definite Jacobian from the centre on."""
+    """Test if the model has not folded at points: inside its limit, with a positive definite Jacobian."""
     xx, xy, yy = jacobian
     inside = np.hypot(normalised[..., 0], normalised[..., 1]) < _radtan_limit(coefficients)
     holds: Bool = inside & (xx * yy - xy * xy > 0) & (xx + yy > 0)
@@ -244,7 +245,7 @@ def _radtan_holds(
 
 
 def _radtan_gain(square: Float, coefficients: tuple[float, ...]) -> tuple[Float, Float]:
-    """The radial factor at a squared radius, and its derivative by the squared radius."""
+    """Compute the radial factor at a squared radius, and its derivative by the squared radius."""
     numerator, denominator = _radtan_polynomials(coefficients)
     above, below = numerator(square), denominator(square)
     gain = above / below
@@ -253,7 +254,7 @@ def _radtan_gain(square: Float, coefficients: tuple[float, ...]) -> tuple[Float,
 
 
 def _radtan_radius(radius: Float, coefficients: tuple[float, ...]) -> tuple[Float, Float]:
-    """The distorted radius without the tangential part, and its derivative."""
+    """Compute the distorted radius without the tangential part, and its derivative."""
     square = radius * radius
     gain, slope = _radtan_gain(square, coefficients)
     return radius * gain, gain + 2 * square * slope
@@ -269,7 +270,7 @@ def _radtan_polynomials(
 
 @lru_cache(maxsize=256)
 def _radtan_limit(coefficients: tuple[float, ...]) -> float:
-    """The radius below which the distorted radius grows: to its first turn, or the first pole."""
+    """Find the radius up to which the distorted radius grows: its first maximum, or the first pole."""
     above, below = _radtan_polynomials(coefficients)
     square = np.polynomial.Polynomial([0, 1])
     slope = above * below + 2 * square * (above.deriv() * below - above * below.deriv())
@@ -277,7 +278,7 @@ def _radtan_limit(coefficients: tuple[float, ...]) -> float:
 
 
 def _fisheye_angle(theta: Float, coefficients: tuple[float, ...]) -> tuple[Float, Float]:
-    """The distorted angle (Kannala & Brandt 2006, Eq. 6, in OpenCV's scaling), and its derivative."""
+    """Compute the distorted angle (Kannala & Brandt 2006, Eq. 6, in OpenCV's scaling) and its derivative."""
     k1, k2, k3, k4 = coefficients
     square = theta * theta
     gain = 1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))
@@ -287,14 +288,14 @@ def _fisheye_angle(theta: Float, coefficients: tuple[float, ...]) -> tuple[Float
 
 @lru_cache(maxsize=256)
 def _fisheye_limit(coefficients: tuple[float, ...]) -> float:
-    """The angle below which the distorted angle grows, and the point is in front of the camera."""
+    """Find the angle up to which the distorted angle grows and the point is in front of the camera."""
     k1, k2, k3, k4 = coefficients
     slope = np.polynomial.Polynomial([1, 3 * k1, 5 * k2, 7 * k3, 9 * k4])
     return min(math.sqrt(_first_positive_root(slope)), math.atan(_WIDEST))
 
 
 def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
-    """The smallest positive root of a polynomial that is 1 at 0; infinity without one."""
+    """Find the smallest positive root of a polynomial that is 1 at 0; infinity without one."""
     # Roots of the reversed polynomial are the reciprocals. Its leading coefficient is 1, so it stays
     # well conditioned when the highest coefficients are tiny or zero.
     reciprocals = np.asarray(np.polynomial.Polynomial(polynomial.coef[::-1]).roots(), dtype=np.complex128)
@@ -305,7 +306,7 @@ def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
 def _invert(function: Callable[[Float], tuple[Float, Float]], target: Float, limit: float) -> Float:
     """Solve f(u) = target on [0, limit] for an f that grows there; the limit where f stays below.
 
-    Newton, replaced by bisection wherever it would leave the bracket. `function` gives f and f'.
+    Newton's method, with bisection where a step would leave the bracket. `function` returns f and f'.
     """
     low, high = np.zeros_like(target), np.full_like(target, limit)
     solution = np.minimum(target, limit)

@@ -1,7 +1,8 @@
-"""Compiling numerical functions with numba, with a cache on disk that can be lost but never in the way.
+"""Compilation of numerical functions with numba, with a cache on disk; a lost or bad cache is no error.
 
-numba puts its cache beside the source, else in the user's cache folder, or where NUMBA_CACHE_DIR says. It
-compiles again where the file of the outermost function changed; here, where a helper's file did, too.
+numba puts its cache beside the source, else in the user's cache folder, or in NUMBA_CACHE_DIR. It compiles
+again if the file of the outermost function changed. With this module, it does so also if the file of a
+helper changed.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ Result = TypeVar("Result")
 
 
 _OPTIONS = {
-    "error_model": "numpy",  # a division by zero gives inf, as everywhere in arrays
-    "no_cfunc_wrapper": True,  # nothing here is called by way of C
+    "error_model": "numpy",  # a division by zero gives inf, as in arrays
+    "no_cfunc_wrapper": True,  # nothing here is called from C
 }
 
 
 def helper(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Compile a function that compiled functions call, and they alone; it becomes part of them.
+    """Compile a function that only compiled functions call; it becomes part of them.
 
-    Without what Python would need to call it, it compiles in three quarters of the time.
+    Without the wrapper for calls from Python, it compiles in three quarters of the time.
     """
     compiled: Callable[Arguments, Result] = numba.njit(function, no_cpython_wrapper=True, **_OPTIONS)
     return compiled
@@ -37,9 +38,9 @@ def helper(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
 def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Compile at the first call, release the interpreter while running, keep the code for the next process.
 
-    numba's cache raises where it cannot be written (`RuntimeError` when decorating) or read (a file cut
-    short by a full disk, or of an earlier version, whose types stood in other modules). Here the function is
-    compiled for this process alone instead, and such a cache is emptied for the next one.
+    numba's cache raises an error if it cannot be written (`RuntimeError` when decorating) or read (a file cut
+    short by a full disk, or of an earlier version with types in other modules). In these cases the function
+    is compiled for this process only, and an unreadable cache is emptied for the next process.
     """
     options = {"nogil": True, **_OPTIONS}
     try:
@@ -64,9 +65,9 @@ def cached(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]
 
 
 def _watch_helpers(compiled: Any, function: Callable[..., object]) -> None:
-    """Make the age and size of the files that hold helpers part of what the cache is compared by.
+    """Add the age and size of the helpers' files to the stamp that validates the cache.
 
-    numba has no way to say so: where its inside is another, its cache watches the outermost file, as always.
+    numba has no public interface for this. If its internals differ, the cache checks only the outermost file.
     """
     files = {function.__code__.co_filename}
     waiting = [function]

@@ -1,9 +1,9 @@
-"""When a video began, from how points move through its pictures and how a log says that its camera moved.
+"""Start time of a video, from the motion of points in its pictures and the logged motion of its camera.
 
-Between two pictures a point moves along a line of which the camera's motion says everything but how far: its
-depth (epipolar geometry, Hartley and Zisserman 2004, section 9.1). So a start is judged without knowing the
-scene, by how far points end beside the stretch of that line from infinity to the nearest that anything is.
-Where the camera only turns, the stretch is a point.
+Between two pictures, a point moves along a line that the camera's motion determines (epipolar geometry,
+Hartley and Zisserman 2004, section 9.1). Only its place on the line depends on its depth. So a start can be
+judged without knowing the scene: by the distance of points from the segment of that line between infinite
+depth and the nearest possible depth. If the camera only rotates, the segment is a point.
 """
 
 from __future__ import annotations
@@ -21,41 +21,41 @@ Bool = NDArray[np.bool_]
 
 _STEP_S = 0.02
 _SMOOTHED_S = 0.1  # standard deviation of the window: a log's poses are noisy from row to row
-_LEAST_WEIGHT = 0.9  # of a window: beside gaps and ends its mean is not that of its middle
-_NEAREST_M = 2.0  # what a drone films is no nearer
-_LEAST_DEPTH = 0.1  # of a direction, per its length: no picture shows what lies beside the camera
-_SCATTER = 2e-3  # rad: 0.4 px of pictures 320 px wide; what following errs by, and the poses between pictures
-_SEARCHED_S = 0.08  # a step from start to start
-_SEARCHED_SHARE = 0.25  # of how far points move: what a step may be off by
-_MOST_SEARCHED = 500  # points, while all starts are tried
-_LEAST_COVERED = 0.5  # of the stretches, that the log must cover
-_ELSEWHERE_S = 0.5  # a start this far from the best is another one
+_LEAST_WEIGHT = 0.9  # known share of a window: next to gaps and ends its mean is biased
+_NEAREST_M = 2.0  # smallest distance from the drone to anything that it films
+_LEAST_DEPTH = 0.1  # of a direction, as a share of its length: no picture shows points beside the camera
+_SCATTER = 2e-3  # rad: 0.4 px of pictures 320 px wide; error of tracking and of the poses between pictures
+_SEARCHED_S = 0.08  # step between the starts that are tried
+_SEARCHED_SHARE = 0.25  # scatter during the search, as a share of the motion of points
+_MOST_SEARCHED = 500  # points that are used while all starts are tried
+_LEAST_COVERED = 0.5  # share of the stretches that the log must cover
+_ELSEWHERE_S = 0.5  # a start this far from the best counts as another one
 _CLEAR = 4.0  # standard deviations of a difference of log-likelihoods
-_MOST_STEPS = 30  # of Newton's method: halved every other time, they are shorter than 1e-5 s by then
-_REFINED_S = 0.01  # a step of the differences that refine a start
-_BLOCK_S = 1.0  # errors within a second resemble each other
+_MOST_STEPS = 30  # of Newton's method: if every other one is halved, they end shorter than 1e-5 s
+_REFINED_S = 0.01  # step of the finite differences that refine a start
+_BLOCK_S = 1.0  # errors within a second may correlate
 _LARGEST_SIGMA_S = 0.1
 
 
 @dataclass(frozen=True)
 class Followed:
-    """Points that were followed through stretches of a video, in normalised coordinates (x/z, y/z)."""
+    """Points tracked through stretches of a video, in normalised coordinates (x/z, y/z)."""
 
     begin_ns: Int64  # [S] of the video's own stamps, rising
     end_ns: Int64  # [S]
-    stretch: Int64  # [P] which one a point belongs to, rising
+    stretch: Int64  # [P] index of a point's stretch, rising
     begin: Float  # [P, 2]
     end: Float  # [P, 2]
 
 
 @dataclass(frozen=True)
 class StartFit:
-    """When the video's stamps begin to count."""
+    """The start time of a video: the time at which its stamps are 0."""
 
     start_ns: int
     sigma_s: float
-    moved: float  # how far points move in a stretch, median; rad
-    beside: float  # how far from where the poses may put them they end, median; rad
+    moved: float  # median motion of points in a stretch, rad
+    beside: float  # median distance of points from where the poses allow them, rad
 
 
 @dataclass(frozen=True)
@@ -69,22 +69,22 @@ class _Path:
 
 @dataclass(frozen=True)
 class _Search:
-    """Starts on a grid, and how much better than a camera that stands still each explains the points."""
+    """Starts on a grid, and the log-likelihood gain of each over a camera that stands still."""
 
     path: _Path
     followed: Followed
-    moved: float  # how far points move in a stretch, median; rad
-    scatter: float  # rad: about what the best start of the grid leaves of it
+    moved: float  # median motion of points in a stretch, rad
+    scatter: float  # rad: expected residual of the best start of the grid
     starts_s: Float  # [K] after the first pose
     gain: Float  # [K]; -inf where the log covers too little
 
     def likeliest(self, among: Bool) -> tuple[float, float]:
-        """The likeliest start of some [K], with its standard deviation."""
+        """Find the likeliest start among those marked [K]; return it and its standard deviation, in s."""
         best = np.argmax(np.where(among, self.gain, -np.inf))
         return _refined(self.path, self.followed, float(self.starts_s[best]), self.scatter)
 
     def explained(self, start_s: float) -> Float:
-        """[S] what a start explains; nothing of what the log does not cover."""
+        """Compute the log-likelihood gain of a start for each stretch [S]; 0 where the log has no poses."""
         still = _still(self.followed, _SCATTER)
         return np.nan_to_num(still - _misfits(self.path, self.followed, start_s, _SCATTER))
 
@@ -99,25 +99,25 @@ def fit_start(
     near_ns: int | None = None,
     within_s: float = 1.0,
 ) -> StartFit:
-    """The time at which the video's stamps are 0, such that points move as the poses let them.
+    """Find the time at which the video's stamps are 0, such that the points move as the poses predict.
 
-    All starts on a grid are compared by the likelihood of the points' distances (Cauchy's: the filmed
-    person and lost points count little) against a camera that stands still. The best must be better than
-    that, and than the best start elsewhere, by four standard deviations of the difference (Vuong 1989,
-    stretches being independent). It is refined by Newton's method; its standard deviation lets errors within
-    a second be of any correlation (sums over blocks: Liang and Zeger 1986).
+    All starts on a grid are compared with a camera that stands still, by the likelihood of the points'
+    distances (Cauchy's, so that the filmed person and lost points have little weight). The best start must be
+    better than a still camera, and than the best start elsewhere, by four standard deviations of the
+    difference (Vuong 1989, with independent stretches). It is refined by Newton's method. Its standard
+    deviation allows any correlation of errors within a second (sums over blocks: Liang and Zeger 1986).
 
     Args:
         t_ns: [N] strictly increasing stamps of the poses.
         position: [N, 3] m, of the camera in the world.
         quaternion_xyzw: [N, 4] world_from_camera.
         followed: the points.
-        max_gap_ns: poses further apart than this say nothing in between.
-        near_ns: about when it was; None for any time that the poses cover.
-        within_s: how far from there at most.
+        max_gap_ns: there is no interpolation between poses further apart than this.
+        near_ns: the approximate start; None for any time that the poses cover.
+        within_s: the largest distance of the start from `near_ns`.
 
     Raises:
-        ValueError: they agree nowhere, or at several times; what the matter is, in words.
+        ValueError: points and poses agree at no time or at several times; the message explains the reason.
     """
     if not len(followed.stretch):
         raise ValueError("nothing in them can be followed")
@@ -198,7 +198,7 @@ def _search(path: _Path, followed: Followed) -> _Search:
 
 
 def _thinned(followed: Followed) -> Followed:
-    """Every n-th point, so that many starts can be tried."""
+    """Keep every n-th point, so that many starts can be tried."""
     every = slice(None, None, max(1, len(followed.stretch) // _MOST_SEARCHED))
     return Followed(
         followed.begin_ns,
@@ -210,7 +210,7 @@ def _thinned(followed: Followed) -> Followed:
 
 
 def _gains(path: _Path, followed: Followed, starts_s: Float, scatter: float) -> Float:
-    """What each start explains more than a camera that stands still; -inf where the log covers too little."""
+    """Compute each start's log-likelihood gain over a still camera; -inf where the log covers too little."""
     still = _still(followed, scatter)
     gain = np.full(len(starts_s), -np.inf)
     for k, start_s in enumerate(starts_s.tolist()):
@@ -222,23 +222,23 @@ def _gains(path: _Path, followed: Followed, starts_s: Float, scatter: float) -> 
 
 
 def _still(followed: Followed, scatter: float) -> Float:
-    """[S] misfits where the camera stands still."""
+    """Compute the misfits [S] of a camera that stands still."""
     return _summed(followed, np.linalg.norm(followed.end - followed.begin, axis=1), scatter)
 
 
 def _misfits(path: _Path, followed: Followed, start_s: float, scatter: float) -> Float:
-    """[S] misfits of a start, in s after the first pose; NaN where the log says nothing."""
+    """Compute the misfits [S] of a start, in s after the first pose; NaN where the log has no poses."""
     return _summed(followed, _distances(path, followed, start_s), scatter)
 
 
 def _summed(followed: Followed, distance: Float, scatter: float) -> Float:
-    """Negative log-likelihoods of points, but for a constant, summed for each stretch."""
+    """Sum the negative log-likelihoods of the points of each stretch, up to a constant."""
     each = np.log1p((distance / scatter) ** 2)
     return np.bincount(followed.stretch, each, len(followed.begin_ns)).astype(np.float64)
 
 
 def _distances(path: _Path, followed: Followed, start_s: float) -> Float:
-    """[P] how far points end beside where a start lets them; NaN where the log says nothing."""
+    """Compute the distances [P] of points from where a start allows them; NaN where the log has no poses."""
     from_position, from_quaternion = _at(path, start_s + followed.begin_ns / 1e9)
     to_position, to_quaternion = _at(path, start_s + followed.end_ns / 1e9)
     turn = matrix_from_quaternion(multiply(conjugate(to_quaternion), from_quaternion))
@@ -258,7 +258,7 @@ def _in_picture(ray: Float) -> Float:
 
 
 def _at(path: _Path, at_s: Float) -> tuple[Float, Float]:
-    """Positions [S, 3] and quaternions [S, 4] at times after the first pose; NaN where they are not known."""
+    """Interpolate positions [S, 3] and quaternions [S, 4] at times after the first pose; NaN if not known."""
     place = at_s / _STEP_S
     before = np.clip(np.floor(place).astype(np.int64), 0, max(len(path.known) - 2, 0))
     after = np.minimum(before + 1, len(path.known) - 1)
@@ -271,19 +271,19 @@ def _at(path: _Path, at_s: Float) -> tuple[Float, Float]:
 
 
 def _is_clear(differences: Float) -> bool:
-    """Whether a sum of differences of log-likelihoods is beyond what scatter makes of nothing."""
+    """Test if a sum of differences of log-likelihoods is significantly above zero."""
     known = differences[np.isfinite(differences)]
     sigma = float(np.std(known, ddof=1)) * np.sqrt(len(known)) if len(known) > 1 else np.inf
     return float(known.sum()) > max(_CLEAR * sigma, _CLEAR**2 / 2)
 
 
 def _refined(path: _Path, followed: Followed, start_s: float, scatter: float) -> tuple[float, float]:
-    """The start to a fraction of a step, and its standard deviation in s; with ever less scatter.
+    """Refine a start to a fraction of a step, with smaller and smaller scatter; return also its sigma in s.
 
-    Newton's method, held to ever shorter steps once it steps over the likeliest: where points scatter little,
-    their likelihood is as sharp as a tip, and whole steps would leap from side to side of it. Beside the tip
-    it bends the other way; there a step goes downhill. The standard deviation is infinite where no start near
-    is likelier than those beside it.
+    The limit on Newton's steps is halved each time they change direction. If points scatter little, their
+    likelihood has a sharp peak, and full steps would jump from side to side of it. Beside the peak its
+    curvature has the other sign; there a step goes downhill in misfit. The standard deviation is infinite if
+    the likelihood has no peak near the start.
     """
     block = (followed.begin_ns / 1e9 / _BLOCK_S).astype(np.int64)
     sigma_s = np.inf
@@ -299,7 +299,7 @@ def _refined(path: _Path, followed: Followed, start_s: float, scatter: float) ->
             sigma_s = spread / bend if bend > 0 else np.inf
             downhill = -float(slope.sum())
             if bend <= 0 and not downhill:
-                break  # the log says nothing here
+                break  # the log has no poses here
             step_s = downhill / bend if bend > 0 else float(np.copysign(longest_s, downhill))
             if step_s * before_s < 0:
                 longest_s /= 2

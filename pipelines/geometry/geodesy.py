@@ -1,4 +1,4 @@
-"""From latitude, longitude and height to metres east, north and up of a place (WGS84).
+"""Conversion of latitude, longitude and height to metres east, north and up of a place (WGS84).
 
 By way of earth-centred, earth-fixed coordinates (ECEF: x to the meridian of Greenwich, z to the north
 pole), in closed form: exact at any distance, where "metres per degree" is off by 0.1 % within some
@@ -33,7 +33,7 @@ class Place:
 
 
 def ecef_from_geodetic(latitude_deg: Float, longitude_deg: Float, altitude_m: Float) -> Float:
-    """Earth-centred coordinates [..., 3] m of points on Earth; arguments broadcast."""
+    """Compute earth-centred coordinates [..., 3] m of points on Earth; arguments broadcast."""
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     # The radius of curvature in the prime vertical.
     normal_m = _SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)
@@ -45,7 +45,7 @@ def ecef_from_geodetic(latitude_deg: Float, longitude_deg: Float, altitude_m: Fl
 
 
 def geodetic_from_ecef(from_centre: Float) -> tuple[Float, Float, Float]:
-    """Latitude and longitude in degrees and height in metres of earth-centred points [..., 3].
+    """Compute latitude and longitude in degrees and height in metres of earth-centred points [..., 3].
 
     Bowring 1976, one step: below 10 km of height its error is less than a micrometre. At the poles
     themselves the height is that along the axis.
@@ -66,20 +66,20 @@ def geodetic_from_ecef(from_centre: Float) -> tuple[Float, Float, Float]:
 
 
 def place_at(enu: Float, origin: Place) -> Place:
-    """The place that lies at metres [3] east, north and up of another."""
+    """Find the place that lies at metres [3] east, north and up of another."""
     latitude, longitude, altitude = geodetic_from_ecef(enu @ _enu_axes(origin) + _ecef_of(origin))
     return Place(float(latitude), float(longitude), float(altitude))
 
 
 def enu_from_geodetic(latitude_deg: Float, longitude_deg: Float, altitude_m: Float, origin: Place) -> Float:
-    """Metres [..., 3] east, north and up of a place, of points on Earth; arguments broadcast."""
+    """Compute metres [..., 3] east, north and up of a place for points on Earth; arguments broadcast."""
     from_centre = ecef_from_geodetic(latitude_deg, longitude_deg, altitude_m) - _ecef_of(origin)
     turned: Float = from_centre @ _enu_axes(origin).T
     return turned
 
 
 def enu_from_enu(of: Place, origin: Place) -> tuple[Float, Float]:
-    """What takes metres east, north and up of one place to those of another.
+    """Compute the transform of metres east, north and up of one place to those of another.
 
     Returns:
         The rotation [3, 3] (north is not the same direction at both, nor is up) and the position [3] m of
@@ -96,7 +96,7 @@ def _ecef_of(place: Place) -> Float:
 
 
 def _enu_axes(place: Place) -> Float:
-    """East, north and up [3, 3] at a place, a row each, in earth-centred coordinates."""
+    """Compute the directions east, north and up [3, 3] at a place, one row each, in earth-centred axes."""
     latitude, longitude = np.radians(place.latitude_deg), np.radians(place.longitude_deg)
     sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
     sin_lon, cos_lon = np.sin(longitude), np.cos(longitude)

@@ -1,4 +1,4 @@
-"""How far a skeleton is from the truth, and how plausible it is without one.
+"""Errors of a skeleton against the truth, and measures of its plausibility without truth.
 
 Positions are [T, P, J, 3] in metres: time, person, joint; NaN is missing. A joint-frame is one joint of one
 person at one time, a person-frame one person at one time. Means run over joint-frames, each with the
@@ -34,7 +34,7 @@ class JointErrors:
 
     Attributes:
         joint_frames: joint-frames that have truth.
-        reconstructed_share: share of these that were reconstructed at all, 0..1.
+        reconstructed_share: share of these that were reconstructed, 0..1.
         mpjpe_mm: mean distance, absolute.
         root_mpjpe_mm: mean distance after both skeletons are moved to their root; the joint that is the
             root itself is left out, because its distance is 0 by construction.
@@ -45,7 +45,7 @@ class JointErrors:
         pck150: share of the joint-frames with truth that are within 150 mm, 0..1; missing joints are wrong.
         pck150_auc: mean of that share over every threshold from 0 to 150 mm.
         acceleration_error_mm_s2: mean length of the difference between the accelerations, over three
-            consecutive samples that are all there.
+            consecutive samples that are all present.
     """
 
     joint_frames: int
@@ -62,7 +62,7 @@ class JointErrors:
 
 
 def measure(estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64) -> dict[str, object]:
-    """Every error of an estimate against the truth, over all joints and per joint.
+    """Compute every error of an estimate against the truth, over all joints and per joint.
 
     Args:
         estimate: [T, P, J, 3] m.
@@ -94,10 +94,10 @@ def measure(estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64) -
 def error_series(
     estimate: Float, truth: Float, joints: Sequence[str], t_ns: Int64
 ) -> tuple[dict[str, Series], dict[str, dict[str, Series]]]:
-    """The errors of `measure` moment by moment, for their intervals (`bootstrap.intervals`).
+    """Compute the errors of `measure` at each time, for their intervals (`bootstrap.intervals`).
 
     Returns:
-        By the names of `JointErrors`, over all joints; and the same per joint.
+        The series over all joints, by the names of `JointErrors`; and the same per joint.
 
     Raises:
         ValueError: as `measure`.
@@ -108,7 +108,7 @@ def error_series(
 
 
 def root_relative_distances(estimate: Float, truth: Float, joints: Sequence[str]) -> Float:
-    """Distances [T, P, J] in m of joints relative to their root; NaN without one, and for `hip` itself."""
+    """Compute root-relative distances [T, P, J] of joints in m; NaN without a root, and for `hip` itself."""
     root_error = _root(estimate, joints) - _root(truth, joints)
     distances = _length(estimate - truth - root_error[:, :, None])
     if "hip" in joints:
@@ -117,12 +117,12 @@ def root_relative_distances(estimate: Float, truth: Float, joints: Sequence[str]
 
 
 def aligned_distances(estimate: Float, truth: Float) -> Float:
-    """Distances [T, P, J] in m after a similarity per person-frame; NaN where none is determined."""
+    """Compute distances [T, P, J] in m after a similarity per person-frame; NaN where it is undetermined."""
     return _length(align_each(estimate, truth, with_scale=True).apply(estimate) - truth)
 
 
 def common(*estimates: Float) -> Bool:
-    """The joint-frames [T, P, J] that every estimate [T, P, J, 3] has: where methods may be compared."""
+    """Mark the joint-frames [T, P, J] that every estimate [T, P, J, 3] has, where methods may be compared."""
     return np.asarray(np.isfinite(np.stack(estimates)).all(axis=(0, -1)))
 
 
@@ -130,10 +130,10 @@ def common(*estimates: Float) -> Bool:
 
 
 def bone_lengths(position: Float, joints: Sequence[str], bones: Sequence[tuple[str, str]]) -> Float:
-    """Lengths [T, P, B] in m of bones between named joints; NaN where either end is missing.
+    """Compute lengths [T, P, B] in m of bones between named joints; NaN where either end is missing.
 
     Raises:
-        ValueError: a bone ends at a joint that is not there.
+        ValueError: a bone ends at a joint that is not in `joints`.
     """
     unknown = sorted({end for bone in bones for end in bone} - set(joints))
     if unknown:
@@ -145,7 +145,7 @@ def bone_lengths(position: Float, joints: Sequence[str], bones: Sequence[tuple[s
 def measure_shape(
     position: Float, joints: Sequence[str], bones: Sequence[tuple[str, str]], t_ns: Int64
 ) -> dict[str, object]:
-    """How plausible a skeleton is in itself: bones that keep their length, symmetry, smoothness.
+    """Measure the plausibility of a skeleton without truth: constant bone lengths, symmetry, smoothness.
 
     Args:
         position: [T, P, J, 3] m.
@@ -190,7 +190,7 @@ def measure_shape(
 
 
 def _mirrored(bones: Sequence[tuple[str, str]]) -> list[tuple[int, int]]:
-    """Indices of the left and the right bone of every pair; bones that cross the middle have none."""
+    """Find the indices of the left and right bone of every pair; bones that cross the middle have none."""
     index_of = {frozenset(bone): index for index, bone in enumerate(bones)}
     pairs = []
     for index, bone in enumerate(bones):
@@ -247,7 +247,7 @@ class _Distances:
         )
 
     def series(self, joints: slice) -> dict[str, Series]:
-        """The same moment by moment; an acceleration stands at the middle of its three samples."""
+        """Compute the same errors at each time; an acceleration is at the middle of its three samples."""
         absolute = self.absolute[:, :, joints]
         present = np.isfinite(absolute)
         judged = self.has_truth[:, :, joints].sum(axis=(1, 2), dtype=np.float64)
@@ -272,13 +272,13 @@ class _Distances:
 
 
 def _summed(distance_m: Float) -> Series:
-    """Sums [T] in mm and counts [T] of what is there."""
+    """Compute sums [T] in mm and counts [T] of the finite distances."""
     there = np.isfinite(distance_m)
     return 1e3 * np.where(there, distance_m, 0.0).sum(axis=(1, 2)), there.sum(axis=(1, 2), dtype=np.float64)
 
 
 def _root(position: Float, joints: Sequence[str]) -> Float:
-    """The root [T, P, 3] of every skeleton; NaN where it is missing or has no joint."""
+    """Compute the root [T, P, 3] of every skeleton; NaN where it is missing or there is no hip joint."""
     if "hip" in joints:
         return position[:, :, joints.index("hip")]
     if "left_hip" in joints and "right_hip" in joints:
@@ -287,10 +287,10 @@ def _root(position: Float, joints: Sequence[str]) -> Float:
 
 
 def _derivative(position: Float, t_ns: Int64, order: int) -> Float:
-    """The derivative [T - order, ...] from neighbouring samples, by divided differences.
+    """Compute the derivative [T - order, ...] from neighbouring samples, by divided differences.
 
-    Exact for polynomials of that order whatever the steps; NaN where a sample is missing or the stretch
-    holds a gap in time.
+    It is exact for polynomials of that order with any steps. It is NaN where a sample is missing or the
+    samples span a gap in time.
     """
     samples = len(t_ns)
     if samples <= order:
@@ -323,7 +323,7 @@ def _length(vectors: Float) -> Float:
 
 
 def _mean(values: Float) -> float:
-    """The mean of what is there; NaN of nothing, without a warning."""
+    """Compute the mean of the finite values; NaN if there are none, without a warning."""
     present = values[np.isfinite(values)]
     return float(present.mean()) if present.size else math.nan
 

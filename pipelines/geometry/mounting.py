@@ -1,7 +1,7 @@
-"""How a camera sits on the drone: fixed mounts, gimbals and lever arms (docs/frames.md works one out).
+"""Pose of a camera on the drone: fixed mounts, gimbals and lever arms (docs/frames.md has an example).
 
 The body is FLU (x forward, y left, z up), the camera OpenCV (x right, y down, z forward), the world ENU.
-A gimbal's frame is FLU too: level and at zero angles its x axis is where the camera looks.
+A gimbal's frame is FLU too: its x axis is the direction of the camera's view.
 Quaternions are xyzw and unit; NaN in gives NaN out.
 """
 
@@ -26,7 +26,7 @@ Looks = Literal["forward", "backward", "left", "right", "down", "up"]
 
 # The optical axis along x, the picture's right along -y, its bottom along -z.
 _FLU_FROM_OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])
-# A half turn about x: forward stays, left becomes right, up becomes down. Its own inverse.
+# A half turn about x: forward stays, left becomes right, up becomes down. It is its own inverse.
 _FLU_FROM_FRD = np.array([1.0, 0.0, 0.0, 0.0])
 
 _AZIMUTH_DEG = {"forward": 0.0, "left": 90.0, "backward": 180.0, "right": -90.0, "down": 0.0, "up": 0.0}
@@ -36,14 +36,14 @@ _STRAIGHT_DEG = {"down": 90.0, "up": -90.0}
 
 
 def body_from_camera(looks: Looks, down_deg: float = 0.0) -> Float:
-    """The rotation [4] of a camera that looks one way from the body, tilted down by an angle.
+    """Compute the rotation [4] of a camera that looks in a direction of the body, tilted down by an angle.
 
-    The picture is upright: its top is up. Straight down its top is forward, as of a camera that looks
-    forward and is tilted down by 90 degrees; straight up its top is backward.
+    The picture is upright: its top is up. For a camera that looks straight down, the top is forward, as for
+    a forward camera tilted down by 90 degrees. For one that looks straight up, the top is backward.
 
     Args:
-        looks: where the optical axis points before the tilt.
-        down_deg: how far the axis is turned below the horizon, -90 to 90.
+        looks: the direction of the optical axis before the tilt.
+        down_deg: the angle of the axis below the horizon, -90 to 90.
 
     Raises:
         ValueError: a tilt beyond 90 degrees, or one on top of down or up.
@@ -61,7 +61,7 @@ def body_from_camera(looks: Looks, down_deg: float = 0.0) -> Float:
 
 
 def compose_mount(world_from_body: Pose, body_from_camera: Pose) -> Pose:
-    """Poses of a camera fixed to the body: its lever arm turns with the body.
+    """Compute the poses of a camera fixed to the body; its lever arm turns with the body.
 
     Args:
         world_from_body: position [N, 3] m and quaternion [N, 4].
@@ -79,17 +79,18 @@ def compose_mount(world_from_body: Pose, body_from_camera: Pose) -> Pose:
 def attitude_from_angles(
     angles: Float, *, order: Literal["ypr", "rpy", "pry"], units: Literal["deg", "rad"]
 ) -> Float:
-    """Yaw about z, then pitch about the turned y, then roll about the twice turned x; right-handed.
+    """Compute attitudes from yaw about z, then pitch about the turned y, then roll about the twice turned x.
 
-    Whether that makes a positive pitch look down (FLU) or up (FRD) is for `attitude_in_enu` to say.
+    The angles are right-handed. The axes (see `attitude_in_enu`) determine if a positive pitch looks down
+    (FLU) or up (FRD).
 
     Args:
         angles: [..., 3].
-        order: how the log lists them; the rotation is the same for all.
+        order: the order in which the log lists them; the rotation is the same for all orders.
         units: degrees or radians.
 
     Returns:
-        [..., 4] reference_from_gimbal, in the axes that the angles are stated in.
+        [..., 4] reference_from_gimbal, in the axes of the angles.
     """
     in_rad = np.radians(angles) if units == "deg" else angles
     yaw, pitch, roll = np.moveaxis(in_rad[..., [order.index(letter) for letter in "ypr"]], -1, 0)
@@ -97,11 +98,11 @@ def attitude_from_angles(
 
 
 RelativeTo = Literal["world", "body", "heading"]
-"""What a gimbal's angles count from. Heading: yaw from the nose, pitch and roll from the horizon."""
+"""The reference of a gimbal's angles. Heading: yaw from the nose, pitch and roll from the horizon."""
 
 
 def attitude_in_enu(quaternion_xyzw: Float, *, relative_to: RelativeTo, axes: Literal["enu", "ned"]) -> Float:
-    """A gimbal's attitude in our axes, from those of its log.
+    """Convert a gimbal's attitude from the axes of its log to FLU and ENU.
 
     With `enu` the world is ENU, body and gimbal FLU: yaw is counted from east to north, or from forward to
     left, a positive pitch looks down, a positive roll lowers the right side. With `ned` the world is
@@ -111,11 +112,12 @@ def attitude_in_enu(quaternion_xyzw: Float, *, relative_to: RelativeTo, axes: Li
 
     Args:
         quaternion_xyzw: [..., 4] world_from_gimbal, body_from_gimbal or heading_from_gimbal.
-        relative_to: which of them.
+        relative_to: which of these three it is.
         axes: the axes of the log.
 
     Returns:
-        [..., 4] the same, of an FLU gimbal in an ENU world, an FLU body or a level one that heads as it does.
+        [..., 4] the attitude of an FLU gimbal in an ENU world, in an FLU body, or in a level frame with the
+        heading of the body.
     """
     if axes == "enu":
         return quaternion_xyzw
@@ -126,7 +128,7 @@ def attitude_in_enu(quaternion_xyzw: Float, *, relative_to: RelativeTo, axes: Li
 
 
 def level_heading(quaternion_xyzw: Float) -> Float:
-    """Attitudes [..., 4] in ENU of level things that head where x of others points: yaw alone."""
+    """Keep only the yaw of attitudes in ENU: level attitudes [..., 4] with the heading of the x axis."""
     ahead = rotate(quaternion_xyzw, np.array([1.0, 0.0, 0.0]))
     return _turn("z", np.arctan2(ahead[..., 1], ahead[..., 0]))
 
@@ -139,18 +141,18 @@ def compose_gimbal(
     *,
     relative_to: RelativeTo,
 ) -> Pose:
-    """Poses of a camera on a gimbal.
+    """Compute the poses of a camera on a gimbal.
 
-    An attitude in the world replaces the body's rotation, one relative to the body composes with it, one
-    relative to the heading with its yaw alone. The lever arm, from the body's origin to the camera, turns
-    with the body in any case: the arm of the gimbal's own joints is taken as part of it.
+    An attitude in the world replaces the body's rotation. One relative to the body is composed with it. One
+    relative to the heading is composed with its yaw only. The lever arm goes from the body's origin to the
+    camera and always turns with the body: the arm of the gimbal's own joints is assumed to be part of it.
 
     Args:
         world_from_body: position [N, 3] m and quaternion [N, 4], ENU from FLU.
         lever_arm: [3] m, in the body.
         attitude_xyzw: [N, 4] the gimbal's attitude at the stamps of the body's poses (`attitude_in_enu`).
         gimbal_from_camera_xyzw: [4]; `body_from_camera("forward")` unless the camera is tilted in its gimbal.
-        relative_to: what the attitude is relative to.
+        relative_to: the reference of the attitude.
 
     Returns:
         world_from_camera: position [N, 3] and quaternion [N, 4].
@@ -169,7 +171,7 @@ def compose_gimbal(
 
 
 def flu_body_from_frd(quaternion_xyzw: Float, covariance: Float | None = None) -> tuple[Float, Float | None]:
-    """Poses of a body logged as FRD (x forward, y right, z down), as of the same body in FLU.
+    """Convert poses of a body logged as FRD (x forward, y right, z down) to those of the same body in FLU.
 
     Args:
         quaternion_xyzw: [..., 4] world_from_frd.
@@ -184,6 +186,6 @@ def flu_body_from_frd(quaternion_xyzw: Float, covariance: Float | None = None) -
 
 
 def _turn(axis: Literal["x", "y", "z"], angle: Float | np.float64) -> Float:
-    """Quaternions [..., 4] of turns about one axis by angles [...] in rad."""
+    """Make quaternions [..., 4] of rotations about one axis by angles [...] in rad."""
     direction = np.eye(3)["xyz".index(axis)]
     return quaternion_from_rotation_vector(np.asarray(angle)[..., None] * direction)

@@ -1,4 +1,4 @@
-"""What is wrong with the poses of a log: the vocabulary of errors, as priors and to disturb with.
+"""Models of the errors of logged poses, used as priors and to simulate noisy logs.
 
 The error of a pose is a translation in m and a rotation vector in rad. The translation is along the
 world's axes, or along the camera's with `frame: body`; the rotation is about the camera's axes, applied
@@ -29,7 +29,7 @@ from pipelines.geometry.poses import (
     rotation_vector_from_quaternion,
 )
 
-_LARGEST = 1e6  # of any parameter: squares of larger ones overflow long before they mean anything
+_LARGEST = 1e6  # of any parameter: larger ones make no sense, and their squares may overflow
 
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -50,12 +50,12 @@ class NoiseModel(ABC):
 
     @abstractmethod
     def marginal_sigma(self, elapsed_s: Float, speed_mps: Float, turn_rate_radps: Float) -> Float:
-        """Standard deviation of the error at each moment by itself.
+        """Compute the marginal standard deviation of the error at each time.
 
         Args:
             elapsed_s: [T] time since the first pose.
             speed_mps: [T] speed of the camera.
-            turn_rate_radps: [T] how fast the camera turns.
+            turn_rate_radps: [T] angular speed of the camera.
 
         Returns:
             [T, 2] per axis of the position (m) and of the rotation (rad).
@@ -63,13 +63,13 @@ class NoiseModel(ABC):
 
     @abstractmethod
     def errors(self, t_ns: Int64, position: Float, quaternion_xyzw: Float, rng: np.random.Generator) -> Float:
-        """One draw of the errors of a whole log.
+        """Draw the errors of a whole log once.
 
         Args:
             t_ns: [T] strictly increasing stamps.
             position: [T, 3] m, the true world_from_camera.
             quaternion_xyzw: [T, 4] unit, the same.
-            rng: where chance comes from.
+            rng: the random generator.
 
         Returns:
             [T, 6]: translation in the world (m), rotation vector in the camera (rad).
@@ -78,21 +78,21 @@ class NoiseModel(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class _Process(NoiseModel):
-    """Six independent axes of one random process in time, whatever the camera does."""
+    """One random process in time for six independent axes; the camera's motion has no influence."""
 
     frame: Frame = "world"
 
     @abstractmethod
     def _scale(self) -> tuple[float, float]:
-        """What the process of unit scale is multiplied by: m for the position, rad for the rotation."""
+        """Return the factors on the process of unit scale: m for the position, rad for the rotation."""
 
     @abstractmethod
     def _unit_sigma(self, elapsed_s: Float) -> Float:
-        """Standard deviation [T] of the process of unit scale."""
+        """Compute the standard deviation [T] of the process of unit scale."""
 
     @abstractmethod
     def _unit_draw(self, elapsed_s: Float, rng: np.random.Generator) -> Float:
-        """One draw [T, 6] of the process of unit scale."""
+        """Draw the process of unit scale once, [T, 6]."""
 
     def marginal_sigma(
         self,
@@ -100,7 +100,7 @@ class _Process(NoiseModel):
         speed_mps: Float,  # noqa: ARG002  # the base class's signature
         turn_rate_radps: Float,  # noqa: ARG002
     ) -> Float:
-        """See `NoiseModel.marginal_sigma`; motion makes no difference."""
+        """Compute `NoiseModel.marginal_sigma`; motion has no influence."""
         sigma: Float = self._unit_sigma(elapsed_s)[:, None] * self._scale()
         return sigma
 
@@ -111,7 +111,7 @@ class _Process(NoiseModel):
         quaternion_xyzw: Float,
         rng: np.random.Generator,
     ) -> Float:
-        """See `NoiseModel.errors`."""
+        """Draw `NoiseModel.errors`."""
         draw: Float = self._unit_draw((t_ns - t_ns[:1]) / 1e9, rng) * np.repeat(self._scale(), 3)
         if self.frame == "body":
             draw[:, :3] = rotate(quaternion_xyzw, draw[:, :3])
@@ -120,7 +120,7 @@ class _Process(NoiseModel):
 
 @dataclass(frozen=True, kw_only=True)
 class _Stationary(_Process):
-    """A process whose scatter is the same at any time."""
+    """A process whose standard deviation is the same at any time."""
 
     position_m: float = 0.0
     rotation_deg: float = 0.0
@@ -134,7 +134,7 @@ class _Stationary(_Process):
 
 @dataclass(frozen=True, kw_only=True)
 class White(_Stationary):
-    """An error of its own for every pose."""
+    """White noise: an independent error for every pose."""
 
     def _unit_draw(self, elapsed_s: Float, rng: np.random.Generator) -> Float:
         return rng.standard_normal((len(elapsed_s), 6))
@@ -142,7 +142,7 @@ class White(_Stationary):
 
 @dataclass(frozen=True, kw_only=True)
 class Bias(_Stationary):
-    """One error for the whole flight."""
+    """A constant bias: one error for the whole flight."""
 
     def _unit_draw(self, elapsed_s: Float, rng: np.random.Generator) -> Float:
         return np.tile(rng.standard_normal(6), (len(elapsed_s), 1))
@@ -150,7 +150,7 @@ class Bias(_Stationary):
 
 @dataclass(frozen=True, kw_only=True)
 class GaussMarkov(_Stationary):
-    """An error that is forgotten with a correlation time, as that of satellite positioning.
+    """An error that decorrelates with a correlation time, like that of satellite positioning.
 
     The autocorrelation is exp(-lag / correlation_s) (Gelb 1974, Applied Optimal Estimation, 3.8).
     """
@@ -191,7 +191,7 @@ class Drift(_Process):
 
 @dataclass(frozen=True, kw_only=True)
 class Latency(NoiseModel):
-    """A log that lags behind: the pose stamped t is where the camera was `latency_ms` before t."""
+    """A delayed log: the pose stamped t is the pose of the camera at `latency_ms` before t."""
 
     latency_ms: float
 
@@ -201,7 +201,7 @@ class Latency(NoiseModel):
         speed_mps: Float,
         turn_rate_radps: Float,
     ) -> Float:
-        """See `NoiseModel.marginal_sigma`: the full error, which lies along the motion, for every axis."""
+        """Compute `NoiseModel.marginal_sigma`: the full error, which is along the motion, for every axis."""
         return np.stack([speed_mps, turn_rate_radps], axis=-1) * (self.latency_ms / 1e3)
 
     def errors(
@@ -211,7 +211,7 @@ class Latency(NoiseModel):
         quaternion_xyzw: Float,
         rng: np.random.Generator,  # noqa: ARG002  # the base class's signature
     ) -> Float:
-        """See `NoiseModel.errors`; before the log's beginning the camera is taken to stand still."""
+        """Compute `NoiseModel.errors`; before the log begins, the camera is assumed to stand still."""
         delay_ns = round(self.latency_ms * 1e6)
         late_position, late_quaternion = interpolate_poses(
             t_ns,
@@ -228,7 +228,10 @@ class Latency(NoiseModel):
 def sum_sigma(
     models: Sequence[NoiseModel], elapsed_s: Float, speed_mps: Float, turn_rate_radps: Float
 ) -> Float:
-    """Standard deviation [T, 2] per axis (m, rad) of the sum of independent models; 0 without any."""
+    """Compute the standard deviation [T, 2] per axis (m, rad) of the sum of models; 0 without any.
+
+    The models are independent.
+    """
     variance = np.zeros((len(elapsed_s), 2))
     for model in models:
         variance += model.marginal_sigma(elapsed_s, speed_mps, turn_rate_radps) ** 2
@@ -242,14 +245,14 @@ def disturb(
     quaternion_xyzw: Float,
     rng: np.random.Generator,
 ) -> tuple[Float, Float]:
-    """A log as it would be with the models' errors, which add up before they are applied.
+    """Apply the models' errors to a log; the errors are added up before they are applied.
 
     Args:
         models: the errors, drawn in this order.
         t_ns: [T] strictly increasing stamps.
         position: [T, 3] m, the true world_from_camera.
         quaternion_xyzw: [T, 4] unit, the same.
-        rng: where chance comes from; the same state gives the same log.
+        rng: the random generator; the same state gives the same log.
 
     Returns:
         Position [T, 3] and quaternion [T, 4].
@@ -264,26 +267,26 @@ def disturb(
 def build(
     parts: Iterable[tuple[str, Mapping[str, object]]], classes: Mapping[str, type[NoiseModel]]
 ) -> list[NoiseModel]:
-    """The models that names and parameters ask for.
+    """Build noise models from names and parameters.
 
     Args:
         parts: (name, parameters) of each model: `pose_noise.items()` of a flight, or `parse(text)`.
         classes: every known model by its registered name.
 
     Raises:
-        ValueError: an unknown model or parameter (the message names those there are), one that is
-            missing, or a value that is out of range.
+        ValueError: an unknown model or parameter (the message lists the known ones), a missing
+            parameter, or a value that is out of range.
     """
     return [_build_one(name, parameters, classes) for name, parameters in parts]
 
 
 def parse(text: str) -> list[tuple[str, dict[str, object]]]:
-    """Names and parameters out of a text like `white:position_m=0.3,rotation_deg=1 + bias:position_m=0.1`.
+    """Parse names and parameters of a text like `white:position_m=0.3,rotation_deg=1 + bias:position_m=0.1`.
 
     Raises:
         ValueError: the text does not have that form.
     """
-    # The sign of an exponent (1e+3) does not start another model: its digits follow at once.
+    # The sign of an exponent (1e+3) does not start another model: a digit follows directly.
     return [_parse_one(part.strip()) for part in re.split(r"\+(?!\d)", text)]
 
 

@@ -1,11 +1,12 @@
-"""Gross keypoint errors that pose noise would hide: a pose error moves all joints of a picture, they do not.
+"""Detection of gross keypoint errors that pose noise would hide.
 
-The gate of `robust` must be as wide as poses err: 0.3 m and 1 deg move a keypoint by 50 px, and one that
-is 100 px off for its own sake passes as a good one. But all joints of a person in a picture share its pose,
-so what they share is the pose's error and says nothing about a joint. Each picture is therefore moved by the
-median of its joints' residuals, and `robust` with exact poses says which views err grossly beside that.
+The gate of `robust` must be as wide as the pose errors: 0.3 m and 1 deg move a keypoint by 50 px, so a
+keypoint that is itself wrong by 100 px passes the gate. But a pose error moves all joints of a person in a
+picture together, and a gross error of one joint does not. Each picture is therefore moved by the median of
+its joints' residuals, which removes the pose error. Then `robust` with exact poses finds the views with gross
+errors.
 
-They are left out, all others are triangulated with the pose noise that is stated. What it gains:
+These are left out; all others are triangulated with the stated pose noise. The benefit is measured in
 docs/decisions/0007-gross-errors.md.
 """
 
@@ -30,11 +31,12 @@ from pipelines.geometry.triangulation import (
 )
 
 _GROSS = 2 * GATE
-"""In standard deviations of what a picture's joints do beside each other. A camera that is turned about its
-axis, or further away, moves them by different amounts, which are no gross errors."""
+"""Gate for gross errors, in standard deviations of the joints' residuals after their picture is moved. A
+rotation of the camera about its axis, or an error of its distance, moves joints by different amounts; these
+are not gross errors."""
 
 _FEWEST = 5
-"""Joints that a picture must show: the median of fewer may follow the bad ones."""
+"""Joints that a picture must have: the median of fewer may follow the bad ones."""
 
 _ROUNDS = 2  # the second has residuals of points without gross errors
 
@@ -42,21 +44,21 @@ _ROUNDS = 2  # the second has residuals of points without gross errors
 def triangulate_pictures(
     views: Views, *, picture: Int64, pixel_sigma: Float, threads: int = 1
 ) -> Triangulation:
-    """`robust` without the views that err grossly beside the other joints of their picture.
+    """Triangulate with `robust`, without views that have gross errors relative to the rest of their picture.
 
-    Where nothing errs grossly this is `triangulate`, byte for byte. A clock that is off moves limbs apart,
-    too, and fast ones are left out where it is off by tenths of a second.
+    Without gross errors, the result is that of `triangulate`, byte for byte. A wrong clock offset moves
+    joints of a picture apart as well: with some tenths of a second, fast limbs are left out.
 
     Args:
-        views: what was seen; `views.pixel_sigma` as `estimate_noise` found it.
-        picture: [N] rows of one number, not negative, are the joints of one person in one picture of every
-            camera. Where a camera shows fewer than five of them its views are not judged.
-        pixel_sigma: [C] px, the detector's own, where `views` also holds what poses leave unexplained.
+        views: the observations; `views.pixel_sigma` as `estimate_noise` found it.
+        picture: [N] rows with the same number (not negative) are the joints of one person in one picture of
+            every camera. If a camera shows fewer than five of them, its views are not judged.
+        pixel_sigma: [C] px, that of the detector alone; `views.pixel_sigma` includes unexplained pose errors.
         threads: see `triangulate`.
 
     Returns:
-        As `triangulate`: views left out are no inliers and have their residuals; a joint-frame that lacks
-        views because of them is `rejected`.
+        As `triangulate`. Views that are left out are not inliers but have their residuals. A joint-frame with
+        too few views because of them is `rejected`.
     """
     first = triangulate(views, method="robust", threads=threads)
     gross = _gross(views, picture, first.points, pixel_sigma, threads)
@@ -73,7 +75,7 @@ def triangulate_pictures(
 
 
 def _gross(views: Views, picture: Int64, points: Float, pixel_sigma: Float, threads: int) -> Bool:
-    """Views [N, C] that err grossly, where `points` is about what they see."""
+    """Find views [N, C] with gross errors; `points` are approximate positions of the joint-frames."""
     gross = np.zeros(views.weight.shape, dtype=np.bool_)
     for _ in range(_ROUNDS):
         moved, judged = _moved(replace(views, pixel_sigma=pixel_sigma), picture, points)
@@ -88,9 +90,9 @@ def _gross(views: Views, picture: Int64, points: Float, pixel_sigma: Float, thre
 
 
 def _moved(views: Views, picture: Int64, points: Float) -> tuple[Views, Bool]:
-    """The views, each moved by what its picture's joints share, as of exact poses; and which [N, C] could be.
+    """Move each view by the median residual of its picture; return also which views [N, C] could be moved.
 
-    The others count as not seen.
+    The moved views have exact poses. The others count as not seen.
     """
     from pipelines.geometry.picture_kernels import move_pictures
 

@@ -1,4 +1,4 @@
-"""Compiled inside of `picture_gate`: what the joints of a picture do together."""
+"""Compiled kernels of `picture_gate`: the common motion of a picture's joints."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Bool = NDArray[np.bool_]
 
 @helper
 def _median(values: Float, count: int) -> float:
-    """Median of the first of them, which it sorts."""
+    """Compute the median of the first `count` values, which are sorted in place."""
     for i in range(1, count):
         value = values[i]
         k = i
@@ -54,8 +54,8 @@ def move_pictures(
     """Move the views of each picture by the median residual of its joints, and mark those that were.
 
     Rows order[starts[p]] ... of `points` are those of picture p in every camera. A view without a point in
-    front of its camera has no residual and is moved with the others; pictures of less than `fewest` residuals
-    stay as they are.
+    front of its camera has no residual and is moved with the others. Pictures with fewer than `fewest`
+    residuals stay as they are.
 
     `order` [N], `starts` [P + 1]; `points` [N, 3] m in the world, NaN where there is none; `xy` [N, C, 2]
     normalised, NaN or of weight 0 where unseen; `weight` [N, C]; `pose_index` [N] into `position` [F, C, 3] m

@@ -1,8 +1,8 @@
-"""Pose covariances carried from one frame to another, to first order.
+"""Transformation of pose covariances from one frame to another, to first order.
 
-A pose covariance [..., 6, 6] is that of a position (m) and of a small rotation (rad). Which axes the
-rotation is about is what differs: logs of ROS use the fixed axes of the world, a session the moving
-thing's own: R_true = R exp(rotation). NaN in gives NaN out; all zero (unknown) stays all zero.
+A pose covariance [..., 6, 6] is that of a position (m) and of a small rotation (rad). The axes of the
+rotation differ: logs of ROS use the fixed axes of the world. A session uses the axes of the moving
+object: R_true = R exp(rotation). NaN in gives NaN out; all zero (unknown) stays all zero.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from pipelines.geometry.poses import matrix_from_quaternion, rotate
 
 Float = NDArray[np.float64]
 
-_BLOCK = 4096  # poses at a time: what lies between stays small, however long the log
+_BLOCK = 4096  # poses at a time, so that intermediate arrays stay small for any length of log
 
 
 def pose_covariance_in_body(covariance: Float, world_from_body_xyzw: Float) -> Float:
-    """A covariance as ROS states it, with its rotation part about the body's axes.
+    """Convert a covariance in ROS's convention to one with its rotation part about the body's axes.
 
     geometry_msgs/PoseWithCovariance turns about fixed axes: R_true = exp(w) R. As exp(w) R = R exp(R' w),
     the rotation vector in the body is R' w; the position stays in the world.
@@ -43,11 +43,11 @@ def pose_covariance_in_body(covariance: Float, world_from_body_xyzw: Float) -> F
 def mounted_covariance(
     covariance: Float, world_from_body_xyzw: Float, lever_arm: Float, world_from_camera_xyzw: Float
 ) -> Float:
-    """The covariance of a camera's pose, given that of the body that carries it.
+    """Compute the covariance of a camera's pose from that of the body that carries it.
 
     A rotation error w of the body (about world axes) moves the camera by w x (R lever_arm) and turns it
-    by the same w. So it does with a gimbal that holds its attitude in the world: that attitude comes from
-    the body's own estimate of where north and down are, and logs say nothing better of its error.
+    by the same w. The same is assumed for a gimbal that holds its attitude in the world: that attitude comes
+    from the body's own estimate of north and down, and logs have no better value for its error.
 
     Args:
         covariance: [..., 6, 6] position in world, rotation vector in the body.
@@ -72,12 +72,12 @@ def mounted_covariance(
 
 
 def carried_covariance(jacobian: Float, covariance: Float) -> Float:
-    """Covariances [..., 6, 6] under one linear map [6, 6] for all of them."""
+    """Transform covariances [..., 6, 6] by one linear map [6, 6]."""
     return _by_blocks(lambda block: _propagated(jacobian, block), covariance)
 
 
 def _by_blocks(carry: Callable[..., Float], covariance: Float, *vectors: Float) -> Float:
-    """`carry` of covariances and vectors, each one for all poses or one for each, of so many at a time."""
+    """Apply `carry` to covariances and vectors block by block; a vector may be one for all poses."""
     if covariance.ndim != 3 or len(covariance) <= _BLOCK:
         return carry(covariance, *vectors)
     of_each = [np.broadcast_to(vector, (len(covariance), np.shape(vector)[-1])) for vector in vectors]
@@ -89,7 +89,7 @@ def _by_blocks(carry: Callable[..., Float], covariance: Float, *vectors: Float) 
 
 
 def _block_diagonal(rotation: Float) -> Float:
-    """The identity for the position, `rotation` [..., 3, 3] for the rotation vector."""
+    """Build a map with the identity for the position and `rotation` [..., 3, 3] for the rotation vector."""
     jacobian = np.zeros((*rotation.shape[:-2], 6, 6))
     jacobian[..., :3, :3] = np.eye(3)
     jacobian[..., 3:, 3:] = rotation
@@ -97,7 +97,7 @@ def _block_diagonal(rotation: Float) -> Float:
 
 
 def _cross_matrix(vector: Float) -> Float:
-    """[..., 3, 3] with which a product is the cross product: (v x) u."""
+    """Build the matrix [..., 3, 3] whose product with a vector u is the cross product v x u."""
     x, y, z = np.moveaxis(vector, -1, 0)
     o = np.zeros_like(x)
     rows = [[o, -z, y], [z, o, -x], [-y, x, o]]

@@ -1,4 +1,4 @@
-"""Poses over time: rotations, chains of transforms, and what a log says between its stamps.
+"""Poses over time: rotations, chains of transforms, and interpolation between the stamps of a log.
 
 Quaternions are xyzw and unit; NaN in gives NaN out. A pose `target_from_source` is a position [..., 3]
 (the source's origin in the target) and a quaternion [..., 4].
@@ -21,7 +21,7 @@ _ENU_FROM_NED = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 
 
 def matrix_from_quaternion(quaternion_xyzw: Float) -> Float:
-    """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
+    """Convert unit quaternions [..., 4] to rotation matrices [..., 3, 3]."""
     x, y, z, w = np.moveaxis(quaternion_xyzw, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -32,9 +32,9 @@ def matrix_from_quaternion(quaternion_xyzw: Float) -> Float:
 
 
 def quaternion_from_matrix(matrix: Float) -> Float:
-    """Unit quaternions [..., 4] of rotation matrices [..., 3, 3], with w >= 0.
+    """Convert rotation matrices [..., 3, 3] to unit quaternions [..., 4], with w >= 0.
 
-    Shepperd 1978: of the four ways to divide, the one by the largest component.
+    Shepperd 1978: of the four possible divisions, the one by the largest component is used.
     """
     m = matrix
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
@@ -58,7 +58,7 @@ def quaternion_from_matrix(matrix: Float) -> Float:
 
 
 def multiply(left_xyzw: Float, right_xyzw: Float) -> Float:
-    """The rotation that applies `right` first, then `left`; [..., 4], broadcast."""
+    """Multiply quaternions: the rotation that applies `right` first, then `left`; [..., 4], broadcast."""
     ax, ay, az, aw = np.moveaxis(left_xyzw, -1, 0)
     bx, by, bz, bw = np.moveaxis(right_xyzw, -1, 0)
     return np.stack(
@@ -73,12 +73,12 @@ def multiply(left_xyzw: Float, right_xyzw: Float) -> Float:
 
 
 def conjugate(quaternion_xyzw: Float) -> Float:
-    """The opposite rotation."""
+    """Return the inverse rotation."""
     return quaternion_xyzw * [-1.0, -1.0, -1.0, 1.0]
 
 
 def rotate(quaternion_xyzw: Float, vectors: Float) -> Float:
-    """Vectors [..., 3] turned by quaternions [..., 4], broadcast."""
+    """Rotate vectors [..., 3] by quaternions [..., 4], broadcast."""
     axis, w = quaternion_xyzw[..., :3], quaternion_xyzw[..., 3:]
     twice = 2 * np.cross(axis, vectors)
     rotated: Float = vectors + w * twice + np.cross(axis, twice)
@@ -86,14 +86,14 @@ def rotate(quaternion_xyzw: Float, vectors: Float) -> Float:
 
 
 def quaternion_from_rotation_vector(rotation_vector: Float) -> Float:
-    """Unit quaternions [..., 4] of rotation vectors [..., 3] (axis times angle in rad)."""
+    """Convert rotation vectors [..., 3] (axis times angle in rad) to unit quaternions [..., 4]."""
     half = np.linalg.norm(rotation_vector, axis=-1, keepdims=True) / 2
     # np.sinc(u) is sin(pi u)/(pi u): sin(half)/half without a division by zero.
     return np.concatenate([rotation_vector / 2 * np.sinc(half / np.pi), np.cos(half)], axis=-1)
 
 
 def rotation_vector_from_quaternion(quaternion_xyzw: Float) -> Float:
-    """Rotation vectors [..., 3] in rad of unit quaternions [..., 4], at most half a turn long."""
+    """Convert unit quaternions [..., 4] to rotation vectors [..., 3] in rad, at most half a turn long."""
     quaternion = quaternion_xyzw * np.where(quaternion_xyzw[..., 3:] < 0, -1.0, 1.0)
     sine = np.linalg.norm(quaternion[..., :3], axis=-1, keepdims=True)
     half = np.arctan2(sine, quaternion[..., 3:])
@@ -105,30 +105,30 @@ def rotation_vector_from_quaternion(quaternion_xyzw: Float) -> Float:
 
 
 def invert(position: Float, quaternion_xyzw: Float) -> tuple[Float, Float]:
-    """b_from_a of an a_from_b."""
+    """Invert a pose: return b_from_a of an a_from_b."""
     inverse = conjugate(quaternion_xyzw)
     return -rotate(inverse, position), inverse
 
 
 def compose(world_from_a: tuple[Float, Float], a_from_b: tuple[Float, Float]) -> tuple[Float, Float]:
-    """world_from_b = world_from_a . a_from_b; each is (position [..., 3], quaternion [..., 4]), broadcast."""
+    """Compute world_from_b = world_from_a . a_from_b; poses are ([..., 3], [..., 4]), broadcast."""
     position_a, quaternion_a = world_from_a
     position_b, quaternion_b = a_from_b
     return position_a + rotate(quaternion_a, position_b), multiply(quaternion_a, quaternion_b)
 
 
 def transform(target_from_source: tuple[Float, Float], points: Float) -> Float:
-    """Points [..., 3] of the source frame in the target frame, broadcast."""
+    """Transform points [..., 3] of the source frame to the target frame, broadcast."""
     position, quaternion = target_from_source
     return position + rotate(quaternion, points)
 
 
 def look_at(position: Float, target: Float) -> Float:
-    """Orientation of upright cameras that look at a point.
+    """Compute the orientation of upright cameras that look at a point.
 
     Args:
         position: [..., 3] metres, world.
-        target: [..., 3] metres, world; a camera straight above it has north up in its picture.
+        target: [..., 3] metres, world; a camera exactly above it has north up in its picture.
 
     Returns:
         [..., 4] unit quaternions xyzw, world_from_camera (x right, y down, z forward),
@@ -144,7 +144,7 @@ def look_at(position: Float, target: Float) -> Float:
 
 
 def enu_from_ned(position: Float, quaternion_xyzw: Float) -> tuple[Float, Float]:
-    """Poses logged in a north-east-down world, in an east-north-up world of the same origin.
+    """Convert poses in a north-east-down world to an east-north-up world of the same origin.
 
     Only the world's axes change; the body keeps its own.
     """
@@ -163,10 +163,10 @@ def interpolate_poses(
     max_gap_ns: int,
     max_extrapolation_ns: int,
 ) -> tuple[Float, Float]:
-    """Poses between the stamps of a log: linear in position, slerp in rotation.
+    """Interpolate poses between the stamps of a log: linear in position, slerp in rotation.
 
-    At a stamp the result is that row itself. Just outside the log the nearest pose is held: its error is
-    bounded by speed times tolerance, where a line through the last two rows would multiply their noise.
+    At a stamp, the result is that row itself. Just outside the log, the nearest pose is held. The error of
+    this is bounded by speed times tolerance; a line through the last two rows would amplify their noise.
 
     Args:
         t_ns: [N] strictly increasing stamps.
@@ -174,10 +174,11 @@ def interpolate_poses(
         quaternion_xyzw: [N, 4] unit; rows may differ in sign.
         at_ns: [M] times to interpolate to, in any order.
         max_gap_ns: stamps further apart than this have no pose between them.
-        max_extrapolation_ns: how far before the first and after the last stamp a pose is held.
+        max_extrapolation_ns: the longest time before the first and after the last stamp for which a pose is
+            held.
 
     Returns:
-        Position [M, 3] and quaternion [M, 4], NaN where the log says nothing. Signs follow the log's, made
+        Position [M, 3] and quaternion [M, 4], NaN where the log has no pose. Signs are those of the log, made
         continuous from its first row on.
 
     Raises:
@@ -195,16 +196,16 @@ def interpolate_poses(
 
 
 def interpolate_points(t_ns: Int64, values: Float, at_ns: Int64, *, max_gap_ns: int) -> Float:
-    """Values between stamps, linearly; never outside them, never across a gap or a missing sample.
+    """Interpolate values between stamps linearly; never outside them or across a gap or a missing sample.
 
     Args:
         t_ns: [N] strictly increasing stamps.
         values: [N, ...]; NaN is missing.
         at_ns: [M] times to interpolate to, in any order.
-        max_gap_ns: stamps further apart than this have nothing between them.
+        max_gap_ns: there is no interpolation between stamps further apart than this.
 
     Returns:
-        [M, ...]; NaN where a neighbour is missing. Exactly at a stamp only that sample counts.
+        [M, ...]; NaN where a neighbour is missing. Exactly at a stamp, the result is that sample.
 
     Raises:
         ValueError: the stamps do not increase strictly.
@@ -220,7 +221,10 @@ def interpolate_points(t_ns: Int64, values: Float, at_ns: Int64, *, max_gap_ns: 
 
 
 def rates(t_ns: Int64, position: Float, quaternion_xyzw: Float) -> tuple[Float, Float]:
-    """Speed [N] in m/s and turn rate [N] in rad/s at each stamp, from its neighbours; 0 for a lone pose."""
+    """Compute speed [N] in m/s and turn rate [N] in rad/s at each stamp, from its neighbours.
+
+    Both are 0 for a single pose.
+    """
     if len(t_ns) < 2:
         return np.zeros(len(t_ns)), np.zeros(len(t_ns))
     step_s = np.diff(t_ns) / 1e9
@@ -231,20 +235,20 @@ def rates(t_ns: Int64, position: Float, quaternion_xyzw: Float) -> tuple[Float, 
 
 
 def gaps(t_ns: Int64, longer_than_ns: int) -> list[tuple[int, int]]:
-    """Start and end of every stretch longer than `longer_than_ns` between neighbouring stamps."""
+    """Find start and end of every gap longer than `longer_than_ns` between neighbouring stamps."""
     (before,) = np.nonzero(np.diff(t_ns) > longer_than_ns)
     return [(int(t_ns[i]), int(t_ns[i + 1])) for i in before]
 
 
 def _at_stamps(of_steps: Float) -> Float:
-    """What holds between stamps [N - 1], as the mean of both sides at each stamp [N]."""
+    """Convert values between stamps [N - 1] to values at stamps [N]: the mean of both sides."""
     sides = np.concatenate([of_steps[:1], of_steps, of_steps[-1:]])
     mean: Float = (sides[:-1] + sides[1:]) / 2
     return mean
 
 
 class _Bracket(NamedTuple):
-    """For every asked time, the rows around it."""
+    """The rows before and after every requested time."""
 
     before: NDArray[np.intp]
     after: NDArray[np.intp]
@@ -269,14 +273,14 @@ def _bracket(t_ns: Int64, at_ns: Int64, max_gap_ns: int, max_extrapolation_ns: i
 
 
 def _continuous_signs(quaternion_xyzw: Float) -> Float:
-    """The same rotations, with the sign that keeps every row on the side of the one before it."""
+    """Choose the signs of quaternions such that every row is on the same side as the row before it."""
     same_side = np.sum(quaternion_xyzw[1:] * quaternion_xyzw[:-1], axis=-1) >= 0
     flips = np.concatenate([[1.0], np.where(same_side, 1.0, -1.0)])
     return quaternion_xyzw * np.cumprod(flips)[:, None]
 
 
 def _slerp(start: Float, end: Float, fraction: Float) -> Float:
-    """Shoemake 1985, between quaternions on the same side; exactly `start` at fraction 0."""
+    """Interpolate (slerp, Shoemake 1985) quaternions on the same side; exactly `start` at fraction 0."""
     # Half-angle form: accurate for the small angles between neighbours, where arccos is not.
     angle = 2 * np.arctan2(
         np.linalg.norm(end - start, axis=-1, keepdims=True),

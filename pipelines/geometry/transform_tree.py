@@ -1,6 +1,6 @@
-"""The pose of one frame in another, along a log's tree of transforms.
+"""Pose of one frame in another, along a log's tree of transforms.
 
-Every link states target_from_source over time; it may be followed both ways.
+Every link is target_from_source over time; it can be used in both directions.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ class Link(NamedTuple):
     t_ns: Int64  # [N] strictly increasing
     position: Float  # [N, 3] m
     quaternion_xyzw: Float  # [N, 4] unit
-    static: bool = False  # holds always, as its last row states it
+    static: bool = False  # if True, the last row is valid at all times
 
 
 class Chain(NamedTuple):
-    """parent_from_child at some times; NaN where a link on the way says nothing."""
+    """parent_from_child at some times; NaN where a link on the way has no pose."""
 
     t_ns: Int64  # [M]
     position: Float  # [M, 3] m
@@ -38,10 +38,10 @@ class Chain(NamedTuple):
 
 
 class Route(NamedTuple):
-    """A way through the tree."""
+    """A path through the tree."""
 
     frames: tuple[str, ...]  # parent first, child last
-    edges: tuple[tuple[str, str], ...]  # (target, source) as the tree has them, one between two frames each
+    edges: tuple[tuple[str, str], ...]  # (target, source) as in the tree, one for each step of the path
 
 
 def chain(
@@ -53,21 +53,22 @@ def chain(
     max_gap_ns: int,
     max_extrapolation_ns: int = 0,
 ) -> Chain:
-    """The pose of `child` in `parent`: every link on the shortest way interpolated, then composed.
+    """Compute the pose of `child` in `parent`: interpolate every link on the shortest path and compose them.
 
     Args:
         links: (target, source) to target_from_source.
         parent: the frame in which the pose is wanted.
         child: the frame whose pose is wanted.
-        at_ns: [M] times; by default the stamps of the link on the way that has the most of them (the one
-            nearest to the child among equals), so that nothing of the fastest motion is lost. A way of
-            static links alone has one row, at its latest stamp.
-        max_gap_ns: a link whose stamps are further apart than this says nothing between them.
-        max_extrapolation_ns: how far before its first and after its last stamp a link is held.
+        at_ns: [M] times. The default is the stamps of the link on the path that has the most (the one
+            nearest to the child among equals), so that no detail of the fastest motion is lost. A path of
+            static links only has one row, at its latest stamp.
+        max_gap_ns: a link has no pose between stamps that are further apart than this.
+        max_extrapolation_ns: the longest time before its first and after its last stamp for which a link is
+            held.
 
     Raises:
-        ValueError: an unknown frame (the nearest known names are told), no way between the two, or the
-            same frame twice.
+        ValueError: an unknown frame (the message gives the nearest known names), no path between the two,
+            or the same frame twice.
     """
     route = find_route(links, parent, child)
     on_the_way = [links[edge] for edge in route.edges]
@@ -80,10 +81,10 @@ def chain(
 
 
 def find_route(edges: Collection[tuple[str, str]], parent: str, child: str) -> Route:
-    """The shortest way from one frame to another, breadth first; alphabetical among equally short ones.
+    """Find the shortest path from one frame to another, breadth first; alphabetical among equal lengths.
 
     Raises:
-        ValueError: as `chain` does.
+        ValueError: as in `chain`.
     """
     neighbours: dict[str, set[str]] = {}
     for target, source in edges:

@@ -1,23 +1,25 @@
-"""From image points and camera poses to 3D points, over all frames, people and joints in one call.
+"""Triangulation of image points to 3D points, over all frames, people and joints in one call.
 
-Three methods, all weighted by the square of the detector's confidence w: a view of confidence w counts as
-one whose standard deviation is pixel_sigma / w (which is what multiplying its rows by w means).
+There are three methods, all weighted by the square of the detector's confidence w. A view of confidence w
+has the standard deviation pixel_sigma / w, which is the same as multiplying its rows by w.
 
 - `dlt`: homogeneous linear triangulation (Hartley & Zisserman, Multiple View Geometry, 12.2) with rows in
-  pixels. The world is moved to the mean centre of the cameras that see the point and its unit is their RMS
-  distance from it; without that the result depends on the origin and collapses under pose noise.
+  pixels. The world is moved to the mean centre of the cameras that see the point, and its unit is their RMS
+  distance from it. Without that, the result depends on the origin and fails under pose noise.
 - `midpoint`: the point closest to the viewing lines, sum w^2 (I - d d')(X - c) = 0.
-- `robust`: least squares of the reprojection errors whitened by pixel and pose noise together. Where every
-  view stays within `gate` standard deviations, that is all. Otherwise every pair of views (above 8 cameras
-  a fixed 28 of them) proposes a point, the lowest truncated cost over all views wins (MSAC: Torr &
-  Zisserman 2000), its inliers are refined by Gauss-Newton and chosen again until they stay the same.
+- `robust`: least squares of the reprojection errors, whitened by pixel and pose noise together. If every
+  view is within `gate` standard deviations, this is the result. Otherwise every pair of views (above 8
+  cameras a fixed set of 28) proposes a point. The point with the lowest truncated cost over all views wins
+  (MSAC: Torr & Zisserman 2000). It is refined by Gauss-Newton on its inliers, which are chosen again until
+  they stay the same.
 
 Two views agree by their epipolar distance alone. If only two of three or more views agree and another
-pair agrees on a different place, chance cannot be told from truth and the joint is `rejected`: on the walk
-of docs/benchmarks.md this costs 0.1 % of the joint-frames and takes the mean error from 13.6 to 13.0 mm.
+pair agrees on a different place, it is not possible to know which pair is right, and the joint is
+`rejected`. On the walk of docs/benchmarks.md this costs 0.1 % of the joint-frames and reduces the mean error
+from 13.6 to 13.0 mm.
 
-A gate in pixels would throw out good views as soon as poses are noisy: 1 deg is 26 px at f = 1500. State
-the pose noise in `Views.pose_sigma`, and let `estimate_noise` raise the pixel noise to what the views show.
+A gate in pixels would reject good views as soon as poses are noisy: 1 deg is 26 px at f = 1500. State
+the pose noise in `Views.pose_sigma`, and let `estimate_noise` raise the pixel noise to what the views need.
 """
 
 from __future__ import annotations
@@ -42,17 +44,17 @@ Bool = NDArray[np.bool_]
 Method = Literal["dlt", "midpoint", "robust"]
 
 MIN_PARALLAX_DEG = 2.0
-"""Below it depth is some thirty times as uncertain as the rest."""
+"""The least parallax. Below it, depth is about thirty times as uncertain as the other directions."""
 
 GATE = 4.0
-"""In standard deviations of a view's image point: one good view in 3000 falls outside."""
+"""The gate in standard deviations of a view's image point: one good view in 3000 falls outside."""
 
 STATUS = ("ok", "filled", "few_views", "low_parallax", "rejected", "not_detected", "no_pose")
-"""Meaning of `Triangulation.status`; the words of a session's skeleton."""
+"""Meanings of `Triangulation.status`; the words of a session's skeleton."""
 
 _MAX_PAIRS = 28  # all of 8 views; above, enough that with half the views bad one pair in 1000 cases is clean
 _BLOCK = 4096  # joint-frames that a thread takes at once
-_NOISE_SAMPLE = 20_000  # joint-frames; a median over them is good to one per cent
+_NOISE_SAMPLE = 20_000  # joint-frames; a median over them is accurate to one per cent
 _NOISE_ROUNDS = 2
 _START_WIDTH = (
     2.0  # a constant pose error gives few different pairs: undoubled, 2 % of draws at n = 3 lost all
@@ -61,11 +63,11 @@ _START_WIDTH = (
 
 @dataclass(frozen=True)
 class Views:
-    """What C cameras saw of N joint-frames, and where they were at F instants.
+    """Observations of N joint-frames by C cameras, and the cameras' poses at F instants.
 
     A view is absent where `xy` or the pose is NaN or `weight` is 0. Image points are normalised and free of
-    distortion, (x/z, y/z) in the camera's frame. Joints of one instant share its row of poses; N is fastest
-    when they stand together.
+    distortion, (x/z, y/z) in the camera's frame. Joints of one instant share its row of poses. Triangulation
+    is fastest if joints of one instant are neighbours in N.
     """
 
     xy: Float  # [N, C, 2]
@@ -100,7 +102,7 @@ class Views:
 
 @dataclass(frozen=True)
 class Points:
-    """Points alone; NaN, and no inliers, wherever `status` is not "ok"."""
+    """Points without uncertainty; NaN, and no inliers, wherever `status` is not "ok"."""
 
     points: Float  # [N, 3] m, world
     inlier: Bool  # [N, C]
@@ -111,13 +113,13 @@ class Points:
 class Triangulation(Points):
     """Points with their uncertainty and residuals, NaN wherever `status` is not "ok".
 
-    `covariance` is first order: pixel and pose noise of the inlier views, independent between cameras. It
-    holds the part of a pose error that all joints share, so it speaks for the absolute position.
+    `covariance` is of first order: pixel and pose noise of the inlier views, independent between cameras. It
+    includes the part of a pose error that all joints share, so it is that of the absolute position.
     """
 
     covariance: Float  # [N, 3, 3] m^2
     views: Int64  # [N] inlier views
-    residual_px: Float  # [N, C] reprojection distance of every view, rejected ones too; inf behind a camera
+    residual_px: Float  # [N, C] reprojection distance of every view, also rejected ones; inf behind a camera
 
 
 def triangulate(
@@ -129,16 +131,20 @@ def triangulate(
     gate: float = GATE,
     threads: int = 1,
 ) -> Triangulation:
-    """Triangulate every joint-frame; the same bytes for any number of threads.
+    """Triangulate every joint-frame; the result has the same bytes for any number of threads.
 
-    Statuses besides "ok": `not_detected` by any camera; `few_views` detect it; `no_pose` leaves fewer than
-    `min_views` of the detections; `low_parallax`: no two viewing lines differ by `min_parallax_deg` (facing
-    each other counts as none); `rejected`: fewer than `min_views` views agree within `gate` (`robust`), or
-    the point lies behind one of its cameras (`dlt` and `midpoint`, which reject no view).
+    Statuses besides "ok":
+
+    * `not_detected`: by no camera.
+    * `few_views`: detected by fewer than `min_views` cameras.
+    * `no_pose`: fewer than `min_views` of the detections have a camera pose.
+    * `low_parallax`: no two viewing lines differ by `min_parallax_deg` (opposite directions do not count).
+    * `rejected`: fewer than `min_views` views agree within `gate` (`robust`), or the point is behind one of
+      its cameras (`dlt` and `midpoint`, which reject no view).
 
     Args:
-        views: what was seen.
-        method: see the module; `min_views` and the parallax hold for all three, `gate` for `robust`.
+        views: the observations.
+        method: see the module; `min_views` and the parallax apply to all three, `gate` to `robust`.
         min_views: views needed, and inliers needed; at least 2.
         min_parallax_deg: least angle between two viewing lines.
         gate: in standard deviations of a view's image point, pixel and pose noise together.
@@ -162,7 +168,7 @@ def locate(
     gate: float = GATE,
     threads: int = 1,
 ) -> Points:
-    """What `triangulate` does without covariances and residuals: for studies over many draws of noise."""
+    """Triangulate without covariances and residuals, for studies over many draws of noise."""
     nothing = np.empty((0, 3, 3)), np.empty(0, np.int64), np.empty((0, 0))
     return _run(views, method, min_views, min_parallax_deg, gate, threads, *nothing)
 
@@ -178,7 +184,7 @@ def _run(
     count: Int64,
     residual_px: Float,
 ) -> Points:
-    """Run the kernel over blocks of joint-frames; fills the last three arrays unless they are empty."""
+    """Run the kernel over blocks of joint-frames; fill the last three arrays unless they are empty."""
     if min_views < 2 or not 0 < min_parallax_deg < 90 or not gate > 0:
         raise ValueError(
             f"min_views={min_views}, min_parallax_deg={min_parallax_deg}, gate={gate}: out of range"
@@ -235,8 +241,8 @@ def _run(
     if workers <= 1:
         block(0, n)
         return found
-    # The kernel releases the interpreter and each block writes its own rows: plain threads do, and unlike
-    # numba's own they may be started from several threads at once.
+    # The kernel releases the interpreter lock and each block writes its own rows, so plain threads suffice.
+    # Unlike numba's own threads, they may be started from several threads at once.
     with ThreadPoolExecutor(workers) as pool:
         for done in [pool.submit(block, first, min(first + _BLOCK, n)) for first in starts]:
             done.result()
@@ -244,10 +250,10 @@ def _run(
 
 
 def reprojection_px(views: Views, points: Float) -> Float:
-    """Reprojection distance [N, C] in px of every view; NaN where nothing was seen, inf behind a camera.
+    """Compute the reprojection distance [N, C] in px of views; NaN for absent views, inf behind a camera.
 
     Args:
-        views: what was seen.
+        views: the observations.
         points: [N, 3] m; NaN gives NaN.
     """
     rotation, position = views.rotation[views.pose_index], views.position[views.pose_index]
@@ -266,21 +272,21 @@ def estimate_noise(
     gate: float = GATE,
     threads: int = 1,
 ) -> Float:
-    """Pixel noise per axis [C] that explains how far the views disagree; the stated one is the floor.
+    """Estimate the pixel noise per axis [C] that explains the views' residuals; at least the stated one.
 
-    Whatever the stated pixel and pose noise leave unexplained - poses worse than their log says, a detector
-    less sharp than assumed - is added as pixel noise by one factor k for all cameras: k^2 is the median over
-    joint-frames of the whitened squared residuals over the median of their chi-square distribution with
-    2m - 3 degrees of freedom. The first k comes from one pair of views per joint-frame, which holds up to
-    29 % bad views however many cameras there are; then from the inliers that `robust` finds with it.
+    Residuals may be larger than the stated pixel and pose noise explain, because poses are worse than their
+    log states or the detector is less accurate than assumed. The excess is added as pixel noise by one factor
+    k for all cameras. k^2 is the median over joint-frames of the whitened squared residuals divided by the
+    median of their chi-square distribution with 2m - 3 degrees of freedom. The first k comes from one pair of
+    views per joint-frame, which tolerates up to 29 % bad views for any number of cameras. Later values come
+    from the inliers that `robust` finds with it.
 
     One factor, not one per camera: under constant pose errors a camera's residuals are a single draw, and
     weighting by them costs 3 to 7 % (docs/benchmarks.md).
 
-    Use it as `replace(views, pixel_sigma=estimate_noise(views))` wherever poses come from a log, also one
-    that states its noise: where that was true, little changes. For still, calibrated cameras state the
-    detector's pixel noise instead: their disagreement is the detector's, and a gate widened by it would
-    keep its errors.
+    Use it as `replace(views, pixel_sigma=estimate_noise(views))` if poses come from a log, even one that
+    states its noise: if that is right, little changes. For still, calibrated cameras, state the detector's
+    pixel noise instead: their residuals are the detector's errors, and a wider gate would keep these errors.
     """
     n, cameras = views.weight.shape
     if cameras < 2:
@@ -312,7 +318,7 @@ def estimate_noise(
 
 
 def _explaining_sigma(views: Views, result: Triangulation) -> Float:
-    """Pixel noise per axis [C] under which the inliers' residuals have their median size."""
+    """Compute the pixel noise per axis [C] with which the inliers' residuals have their expected median."""
     seen = np.where(result.inlier, views.weight, np.nan)
     variance = views.pixel_sigma**2 + seen**2 * _pose_variance_px(views, result.points)  # of confidence 1
     whitened = np.nansum((seen * result.residual_px) ** 2 / variance, axis=1)
@@ -330,7 +336,7 @@ def _explaining_sigma(views: Views, result: Triangulation) -> Float:
 
 
 def _pose_variance_px(views: Views, points: Float) -> Float:
-    """What pose noise adds to the variance of every image point [N, C], px^2 per axis near the axis."""
+    """Compute the variance of every image point [N, C] from pose noise, px^2, near the optical axis."""
     position, rotation = views.position[views.pose_index], views.rotation[views.pose_index]
     depth = np.einsum("nci,nci->nc", rotation[..., 2], points[:, None] - position)
     shift, turn = np.moveaxis(views.pose_sigma[views.pose_index], -1, 0)
@@ -340,7 +346,7 @@ def _pose_variance_px(views: Views, points: Float) -> Float:
 
 @cache
 def _pair_table(cameras: int) -> tuple[Int64, Int64]:
-    """Pairs of views that propose a point: [m, k] for m views in order of trial, and how many [m]."""
+    """List the pairs of views that propose a point: [m, k] for m views in order of trial; and counts [m]."""
     table = np.zeros((cameras + 1, _MAX_PAIRS, 2), np.int64)
     count = np.zeros(cameras + 1, np.int64)
     for m in range(2, cameras + 1):
@@ -356,7 +362,7 @@ def _pair_table(cameras: int) -> tuple[Int64, Int64]:
 
 
 def _spread_pairs(m: int) -> Iterator[tuple[int, int]]:
-    """Distinct pairs of m views, spread over views and distances by golden section steps."""
+    """Yield distinct pairs of m views, spread over views and distances by golden section steps."""
     seen = set()
     for trial in count_up():
         i = trial * _golden_step(m) % m
@@ -368,5 +374,5 @@ def _spread_pairs(m: int) -> Iterator[tuple[int, int]]:
 
 
 def _golden_step(n: int) -> int:
-    """The first step from 0.618 n on that visits all of 0..n-1."""
+    """Find the first step, from 0.618 n upwards, that visits all of 0..n-1."""
     return next(step for step in count_up(max(round(0.618 * n), 1)) if gcd(step, n) == 1)

@@ -1,12 +1,12 @@
-"""The compiled arithmetic of triangulation; `triangulation` is its only user and explains the methods.
+"""Compiled kernels of triangulation; `triangulation` is their only user and explains the methods.
 
-All kernels stand in this one module: numba's cache watches the file of the outermost function only, so a
+All kernels are in this one module: numba's cache watches the file of the outermost function only, so a
 helper in another file could change without the cached code noticing. For the same reason only
-`triangulate_range` is cached; its helpers are compiled into it. No fastmath and no threads in here: a
-joint-frame's result depends on its own numbers alone, so any division of the work gives the same bytes.
+`triangulate_range` is cached; its helpers are compiled into it. There is no fastmath and no thread here:
+a joint-frame's result depends only on its own numbers, so any division of the work gives the same bytes.
 
-Symmetric 3x3 matrices are passed as the six numbers xx, xy, xz, yy, yz, zz. Everything happens in a world
-moved to the mean camera centre, so that an origin kilometres away costs no digits.
+Symmetric 3x3 matrices are passed as the six numbers xx, xy, xz, yy, yz, zz. All calculations use a world
+moved to the mean camera centre, so that an origin kilometres away costs no precision.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ Symmetric = tuple[float, float, float, float, float, float]
 DLT, MIDPOINT, ROBUST = 0, 1, 2
 OK, FILLED, FEW_VIEWS, LOW_PARALLAX, REJECTED, NOT_DETECTED, NO_POSE = range(7)  # by STATUS
 
-# Squared length, in standard deviations of the point, of the Gauss-Newton step that is taken as the last.
-# Measured on the walk at 5 views, what is left after it is at most 3e-4 standard deviations for pixel noise
-# and 0.1 for 0.5 m / 2 deg (whose covariance moves with the depth); one step more would cost 40 %.
+# Squared length, in standard deviations of the point, below which a Gauss-Newton step is the last one.
+# Measured on the walk at 5 views, the remaining error is at most 3e-4 standard deviations for pixel noise
+# and 0.1 for 0.5 m / 2 deg (where the covariance changes with the depth); one step more would cost 40 %.
 CONVERGED = 1e-2
 MAX_STEPS = 10
 
 
 @helper
 def _inverse(a: Symmetric) -> Symmetric:
-    """Inverse of a symmetric 3x3 matrix by cofactors."""
+    """Invert a symmetric 3x3 matrix by cofactors."""
     xx, xy, xz, yy, yz, zz = a
     c0 = yy * zz - yz * yz
     c1 = xz * yz - xy * zz
@@ -55,7 +55,7 @@ def _inverse(a: Symmetric) -> Symmetric:
 
 @helper
 def _times(a: Symmetric, b: Vector) -> Vector:
-    """Product of a symmetric 3x3 matrix and a vector."""
+    """Multiply a symmetric 3x3 matrix and a vector."""
     return (
         a[0] * b[0] + a[1] * b[1] + a[2] * b[2],
         a[1] * b[0] + a[3] * b[1] + a[4] * b[2],
@@ -67,7 +67,7 @@ def _times(a: Symmetric, b: Vector) -> Vector:
 def _load_cameras(
     position: Float, rotation: Float, pose_sigma: Float, pose: int, camera: Float, posed: Bool
 ) -> Vector:
-    """Copy the poses of one instant, moved to their mean centre; returns that centre.
+    """Copy the poses of one instant, moved to their mean centre; return that centre.
 
     Columns of `camera`: 0-8 world_from_camera rotation by rows, 9-11 centre, 12 and 13 variances of
     position and rotation.
@@ -104,10 +104,10 @@ def _load_cameras(
 def _load_views(
     xy: Float, weight: Float, n: int, camera: Float, posed: Bool, ids: Int64, ray: Float
 ) -> tuple[int, int]:
-    """Collect the usable views of one joint-frame; returns how many, and how many are detected at all.
+    """Collect the usable views of one joint-frame; return their number and the number of detections.
 
     Columns of `ray`: 0-1 image point, 2 squared confidence, 3-5 direction in the world (depth 1), 6 its
-    squared length; the rest is `_load_noise`'s.
+    squared length; `_load_noise` writes the rest.
     """
     views = detected = 0
     for c in range(weight.shape[1]):
@@ -133,7 +133,7 @@ def _load_views(
 
 @helper
 def _load_noise(ids: Int64, ray: Float, views: int, camera: Float, pixel_variance: Float) -> None:
-    """Covariances of the image points: columns 7-9 from pixels and rotation, 10-12 from position at depth 1.
+    """Compute covariances of image points: columns 7-9 pixels and rotation, 10-12 position at depth 1.
 
     The image moves by J t under a shift t and by L w under a turn w of the camera, with the interaction
     matrices J = [1 0 -x; 0 1 -y]/z and L = [xy, -1-x^2, y; 1+y^2, -xy, -x] (Chaumette and Hutchinson
@@ -159,7 +159,7 @@ def _load_noise(ids: Int64, ray: Float, views: int, camera: Float, pixel_varianc
 
 @helper
 def _pair_parallax(ray: Float, i: int, j: int, cos2_min: float) -> bool:
-    """Whether two viewing lines differ by more than the least parallax (facing each other is none)."""
+    """Test if two viewing lines differ by more than the least parallax (opposite directions do not)."""
     dot = ray[i, 3] * ray[j, 3] + ray[i, 4] * ray[j, 4] + ray[i, 5] * ray[j, 5]
     differ: bool = dot * dot < cos2_min * ray[i, 6] * ray[j, 6]
     return differ
@@ -167,7 +167,7 @@ def _pair_parallax(ray: Float, i: int, j: int, cos2_min: float) -> bool:
 
 @helper
 def _parallax(ray: Float, used: Bool, views: int, cos2_min: float) -> bool:
-    """Whether any two used viewing lines differ enough; nearly always the first pair decides."""
+    """Test if any two used viewing lines have enough parallax; nearly always the first pair decides."""
     for i in range(views):
         if used[i]:
             for j in range(i + 1, views):
@@ -178,7 +178,7 @@ def _parallax(ray: Float, used: Bool, views: int, cos2_min: float) -> bool:
 
 @helper
 def _midpoint(ids: Int64, ray: Float, views: int, camera: Float) -> Vector:
-    """Point closest to the viewing lines: sum w^2 (I - d d') (X - c) = 0."""
+    """Compute the point closest to the viewing lines: sum w^2 (I - d d') (X - c) = 0."""
     xx = xy = xz = yy = yz = zz = 0.0
     bx = by = bz = 0.0
     for k in range(views):
@@ -209,12 +209,12 @@ def _midpoint(ids: Int64, ray: Float, views: int, camera: Float) -> Vector:
 
 @helper
 def _dlt(ids: Int64, ray: Float, views: int, camera: Float, focal: Float) -> Vector:
-    """Homogeneous linear solution (Hartley and Zisserman 12.2) in a normalised world.
+    """Compute the homogeneous linear solution (Hartley and Zisserman 12.2) in a normalised world.
 
-    The smallest eigenvector of A'A = [B b; b' c] is (y, 1) with y = -(B - l)^-1 b where l is the smallest
-    root of c - l + b'y = 0. Newton on that equation takes the inhomogeneous solution (l = 0) as its first
-    guess and needs only 3x3 systems. An eigenvalue of B bounds the root from above (interlacing), so a
-    bracket keeps the iteration left of it.
+    The smallest eigenvector of A'A = [B b; b' c] is (y, 1) with y = -(B - l)^-1 b, where l is the smallest
+    root of c - l + b'y = 0. Newton's method on that equation starts with the inhomogeneous solution (l = 0)
+    and needs only 3x3 systems. An eigenvalue of B bounds the root from above (interlacing), so a bracket
+    keeps the iteration left of it.
     """
     # The world's unit is the RMS distance of the cameras from the mean of the ones that see the point.
     mx = my = mz = 0.0
@@ -286,7 +286,7 @@ def _dlt(ids: Int64, ray: Float, views: int, camera: Float, focal: Float) -> Vec
 
 @helper
 def _project(camera: Float, c: int, x: float, y: float, z: float) -> Vector:
-    """The point in the camera's frame."""
+    """Transform a point to the camera's frame."""
     dx = x - camera[c, 9]
     dy = y - camera[c, 10]
     dz = z - camera[c, 11]
@@ -299,7 +299,7 @@ def _project(camera: Float, c: int, x: float, y: float, z: float) -> Vector:
 
 @helper
 def _information(ray: Float, k: int, inverse_depth: float) -> Vector:
-    """Inverse of the image point's covariance when the point lies at that depth."""
+    """Compute the inverse of the image point's covariance for a point at that depth."""
     at = inverse_depth * inverse_depth
     a = ray[k, 7] + ray[k, 10] * at
     b = ray[k, 8] + ray[k, 11] * at
@@ -310,7 +310,7 @@ def _information(ray: Float, k: int, inverse_depth: float) -> Vector:
 
 @helper
 def _jacobian(camera: Float, c: int, u: float, v: float, inverse_depth: float) -> tuple[Vector, Vector]:
-    """Derivatives of the two image coordinates by the point."""
+    """Compute the derivatives of the two image coordinates by the point."""
     return (
         (
             (camera[c, 0] - u * camera[c, 2]) * inverse_depth,
@@ -346,7 +346,7 @@ def _add_quadratic(to: Symmetric, a: float, b: float, d: float, p: Vector, q: Ve
 
 @helper
 def _chi2(ids: Int64, ray: Float, k: int, camera: Float, x: float, y: float, z: float) -> float:
-    """Squared whitened reprojection error of view k, infinite behind its camera."""
+    """Compute the squared whitened reprojection error of view k, infinite behind its camera."""
     u, v, depth = _project(camera, ids[k], x, y, z)
     if not depth > 0.0:
         return math.inf
@@ -362,7 +362,7 @@ def _chi2(ids: Int64, ray: Float, k: int, camera: Float, x: float, y: float, z: 
 def _linearise(
     ids: Int64, ray: Float, views: int, used: Bool, camera: Float, x: float, y: float, z: float
 ) -> tuple[float, float, Symmetric, Vector]:
-    """Sum and largest of the squared whitened errors of the used views, their normal matrix and gradient."""
+    """Linearise the used views: sum and largest of the squared whitened errors, normal matrix, gradient."""
     normal = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     gx = gy = gz = 0.0
     total = worst = 0.0
@@ -403,10 +403,10 @@ def _refine(
     start: Vector,
     hopeless: float,
 ) -> tuple[float, float, float, float, float]:
-    """Gauss-Newton on the whitened reprojection errors of the used views.
+    """Refine a point by Gauss-Newton on the whitened reprojection errors of the used views.
 
-    A step that raises the cost is shortened, so the result is never worse than the start. Gives up where
-    the linear model foretells a cost above `hopeless`. Returns the point, the cost and the largest term.
+    A step that raises the cost is shortened, so the result is never worse than the start. The function stops
+    if the linear model predicts a cost above `hopeless`. It returns the point, the cost and the largest term.
     """
     x, y, z = start
     dx = dy = dz = 0.0
@@ -438,7 +438,7 @@ def _refine(
 
 @helper
 def _pair_point(ids: Int64, ray: Float, i: int, j: int, camera: Float) -> tuple[float, float, float, bool]:
-    """Middle of the shortest link between two viewing lines, and whether it lies in front of both."""
+    """Compute the middle of the shortest link between two viewing lines, and test if it is before both."""
     ci = ids[i]
     cj = ids[j]
     ox = camera[cj, 9] - camera[ci, 9]
@@ -460,7 +460,7 @@ def _pair_point(ids: Int64, ray: Float, i: int, j: int, camera: Float) -> tuple[
 
 @helper
 def _agreed(count: int, total: float, gate2: float) -> bool:
-    """Two views agree by their epipolar distance alone: one degree of freedom for both errors together."""
+    """Test agreement: two views have only their epipolar distance, one degree of freedom for both errors."""
     return count > 2 or (count == 2 and total <= gate2)
 
 
@@ -476,7 +476,7 @@ def _rivalled(
     gate2: float,
     cos2_min: float,
 ) -> bool:
-    """Whether another pair agrees on a place that the two used views cannot mean (twice the gate away)."""
+    """Test if another pair agrees on a place that is not that of the two used views (twice the gate away)."""
     for p in range(n_pairs):
         i = pairs[p, 0]
         j = pairs[p, 1]
@@ -506,7 +506,7 @@ def _consensus(
     cos2_min: float,
     min_views: int,
 ) -> tuple[float, float, float, int]:
-    """Best point that a pair of views proposes, by truncated cost over all views, refined on its inliers."""
+    """Find the best point of all pairs of views by truncated cost over all views; refine it on inliers."""
     best = math.inf
     bx = by = bz = 0.0
     wide = False
@@ -553,7 +553,7 @@ def _consensus(
             break
     if changed or count < min_views or not _agreed(count, total, gate2):
         return bx, by, bz, REJECTED
-    # Two views that agree by chance look like two that are right; only a lack of rivals tells them apart.
+    # Two views that agree by chance look like two that are right. They count only without a rival pair.
     if count == 2 and _rivalled(ids, ray, views, used, camera, pairs, n_pairs, gate2, cos2_min):
         return bx, by, bz, REJECTED
     return bx, by, bz, OK
@@ -572,7 +572,7 @@ def _robust(
     cos2_min: float,
     min_views: int,
 ) -> tuple[float, float, float, int]:
-    """Least squares over all views where all agree, else over the largest agreement of a pair."""
+    """Fit all views by least squares if all agree, else the inliers of the best pair's point."""
     if not _parallax(ray, used, views, cos2_min):
         return 0.0, 0.0, 0.0, LOW_PARALLAX
     start = _midpoint(ids, ray, views, camera)
@@ -584,7 +584,7 @@ def _robust(
 
 @helper
 def _in_front(ids: Int64, views: int, camera: Float, x: float, y: float, z: float) -> bool:
-    """Whether the point lies in front of every view's camera."""
+    """Test if the point lies in front of every view's camera."""
     behind = 0
     for k in range(views):
         behind += not _project(camera, ids[k], x, y, z)[2] > 0.0
@@ -593,7 +593,7 @@ def _in_front(ids: Int64, views: int, camera: Float, x: float, y: float, z: floa
 
 @helper
 def _sandwich(inverse: Symmetric, middle: Symmetric) -> Symmetric:
-    """The product H^-1 M H^-1 of symmetric matrices, given H^-1."""
+    """Compute the product H^-1 M H^-1 of symmetric matrices, given H^-1."""
     xx, xy, xz, yy, yz, zz = inverse
     # The product is symmetric, so its columns are those of H^-1 taken twice through the middle.
     c0 = _times(inverse, _times(middle, (xx, xy, xz)))
@@ -619,8 +619,8 @@ def _describe(
 ) -> Symmetric:
     """Write the residuals of one joint-frame and return its covariance H^-1 M H^-1.
 
-    To first order every method solves sum J'V(r + J dX) = 0 with its own weight V of a view's image
-    residual r, so with H = sum J'VJ the noise S of the views arrives as M = sum J'VSVJ.
+    To first order, every method solves sum J'V(r + J dX) = 0 with its own weight V of a view's image
+    residual r. So with H = sum J'VJ, the noise S of the views gives M = sum J'VSVJ.
     """
     h = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     m = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -696,7 +696,7 @@ def triangulate_range(
 ) -> None:
     """Triangulate the joint-frames first <= n < last into the arrays at the end.
 
-    Where `covariance` has no rows, `covariance`, `count` and `residual_px` are left alone.
+    If `covariance` has no rows, `covariance`, `count` and `residual_px` are not written.
     """
     n_cameras = weight.shape[1]
     describe = covariance.shape[0] > 0
