@@ -1,4 +1,4 @@
-"""From the logs and videos of a drone team to the measured 3D motion of the person it filmed.
+"""Measured 3D motion of a person, from the logs and videos of the drone team that filmed it.
 
 The modules directly in this package are the stages (ingest, reconstruct, report, ...): each loads
 tables from a session, makes one call into a room (`geometry`, `formats`, `reconstruction`, ...) and
@@ -11,7 +11,7 @@ stores what comes back. Everything here can be called from a notebook; nothing h
 import os as _os
 import zlib as _zlib  # noqa: F401
 
-# Sums over several threads depend on their number, and small matrices are faster on one: the work is spread
-# by its callers. Whoever set these before knows better.
+# Sums over several threads depend on the number of threads, and small matrices are faster on one. Callers
+# distribute the work themselves. Values that the user has set are kept.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     _os.environ.setdefault(_name, "1")

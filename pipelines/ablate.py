@@ -1,8 +1,8 @@
-"""Stage `ablate`: what the reconstruction error depends on - tilt, number of drones, noise of the poses.
+"""Stage `ablate`: study of the reconstruction error against tilt, number of drones and pose noise.
 
 Film a simulated walk from every formation, disturb poses and keypoints in several trials, triangulate by
-every method, measure on what all methods measured, and tell means with their intervals. Everything here
-is simulated.
+every method, compute errors on the joint-frames that all methods have, and report means with their
+intervals. Everything here is simulated.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from pipelines.simulation.world.scene import build_world
 
 _REVISION = 3
 _PER_JOINT = ("mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm")
-_HINT_SIGMA_M = 0.1  # of what the detector is told of the person's place: the camera looks straight there
+_HINT_SIGMA_M = 0.1  # of the detector's hint of the person's position: the camera looks exactly there
 
 
 # --- the study -----------------------------------------------------------------------------------------
@@ -57,11 +57,11 @@ _HINT_SIGMA_M = 0.1  # of what the detector is told of the person's place: the c
 
 @dataclass(frozen=True)
 class Ablated:
-    """What a study left behind."""
+    """Result of a study."""
 
     folder: Path
     summary: dict[str, Any]
-    skipped: bool  # it was there already
+    skipped: bool  # True if the study existed already
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Cell:
 
     @property
     def filmed(self) -> tuple[float, int]:
-        """What its keypoints depend on."""
+        """The settings on which its keypoints depend: tilt in deg and number of drones."""
         return self.tilt_deg, self.drones
 
 
@@ -91,14 +91,14 @@ def ablate(
 
     Args:
         settings: the study.
-        folder: where to; an earlier study there is replaced.
-        workers: conditions worked on at once; the results do not depend on them.
+        folder: the output folder; an earlier study there is replaced.
+        workers: the number of conditions in parallel; the results do not depend on it.
         overwrite: replace a folder that is no study.
-        force: do it again although nothing changed.
-        progress: who watches.
+        force: run it again even if nothing changed.
+        progress: receives the progress.
 
     Raises:
-        DataError: the folder cannot be written or is a session's, the detector is not there, nothing was
+        DataError: the folder cannot be written or is a session's, the detector is missing, or nothing was
             reconstructed.
         BusyError: another process makes the same folder.
     """
@@ -109,7 +109,7 @@ def ablate(
     if not force and is_made(folder, key, mark=STUDY_MARK):
         return Ablated(folder, read_json(folder / STUDY_MARK), skipped=True)
     if detector is not None:
-        detector.load(threads=1)  # says at once what is missing
+        detector.load(threads=1)  # raises an error at once if a file is missing
     with whole_folder(folder, key, mark=STUDY_MARK, overwrite=overwrite) as making:
         filmed = walk(settings.seconds, settings.rate_hz, settings.seed)
         cells = list(_cells(settings))
@@ -134,7 +134,7 @@ def ablate(
 
 
 def _key(settings: Settings, detector: Detector | None) -> str:
-    """Equal for equal results."""
+    """Compute the key of a study; it is equal for equal results."""
     ingredients: dict[str, object] = {"revision": _REVISION, "settings": asdict(settings)}
     if detector is None:
         ingredients["errors"] = sha256_of(errors_of(IMITATED))
@@ -157,12 +157,12 @@ Part = Callable[[str, Callable[[Path], None]], Path]
 def _parts(
     work: Sequence[tuple[str, Callable[[Path], None]]], part: Part, workers: int, halt: Halt
 ) -> list[Path]:
-    """The folders of the finished parts, in the order of the work."""
+    """Run the work in parallel and return the folders of the parts, in the order of the work."""
     return side_by_side(lambda each: part(*each), work, workers=workers, halt=halt)
 
 
 def _refuse_nothing(folder: Path, summary: Mapping[str, Any]) -> None:
-    """An empty study would look like success."""
+    """Refuse an empty study, which would look like success."""
     if not any(cell["metrics"]["mpjpe_mm"] for cell in summary["cells"]):
         raise DataError(folder, "nothing was reconstructed by all methods", "film longer, or at lower tilts")
 
@@ -216,10 +216,10 @@ def _condition(cell: Cell) -> Row:
 def reconstructed(
     method: StudyMethod, views: Views, filmed: Walk, models: Sequence[NoiseModel]
 ) -> tuple[Float, str | None]:
-    """The points [N, 3] m that a method makes of views, NaN for none, and why it fell back if it did.
+    """Triangulate views by a method: points [N, 3] m, NaN if rejected, and the reason for a fallback if any.
 
-    All are told how far poses err; `robust` and `refined` estimate what keypoints add, and `refined` is told
-    how long pose errors last.
+    All methods know the standard deviations of the poses. `robust` and `refined` also estimate the noise of
+    keypoints. `refined` also knows the noise models, and so the correlation of pose errors in time.
     """
     if method == "refined":
         elapsed_s = (filmed.t_ns - filmed.t_ns[0]) / 1e9
@@ -233,16 +233,16 @@ def reconstructed(
 
 
 def compared(points: Mapping[StudyMethod, Float], filmed: Walk) -> dict[StudyMethod, Row]:
-    """Errors of several methods on one walk.
+    """Compute the errors of several methods on one walk.
 
     Args:
         points: [T * J, 3] m of every method, joints fastest.
-        filmed: what is true.
+        filmed: the walk with its true joints.
 
     Returns:
-        By method what `measure` says of the joint-frames that all of them have, per joint only the three
-        MPJPEs. Of the method's own joint-frames `reconstructed_share`, `own_mpjpe_mm`, and `pck150` and
-        `pck150_auc`, which count missing joints as wrong.
+        By method the result of `measure` on the joint-frames that all methods have (per joint only the three
+        MPJPEs). These figures are for all joint-frames of the method itself: `reconstructed_share`,
+        `own_mpjpe_mm`, and `pck150` and `pck150_auc`, which count missing joints as wrong.
     """
     truth = filmed.joints[:, None]
     estimates = {method: own.reshape(truth.shape) for method, own in points.items()}
@@ -278,7 +278,7 @@ def _detect_all(
     part: Part,
     progress: Progress,
 ) -> dict[tuple[float, int], Sightings]:
-    """Film the walk from every formation and look for keypoints in the pictures."""
+    """Film the walk from every formation and detect keypoints in the pictures."""
     geometries = sorted({cell.filmed for cell in cells})
     cameras = [(tilt, drones, k) for tilt, drones in geometries for k in range(drones)]
     progress.start("Filming", len(cameras) * len(filmed.t_ns))
@@ -313,7 +313,7 @@ def _film(
     progress: Progress,
     folder: Path,
 ) -> None:
-    """Write what a detector finds in the pictures of one camera: xy [T, J, 2] and confidence [T, J]."""
+    """Write the keypoints of a detector in the pictures of one camera: xy [T, J, 2], confidence [T, J]."""
     names = filmed.person.joints
     follower = FollowedAlone(detector.load(threads=1), names)
     xy = np.empty((len(filmed.t_ns), len(names), 2))

@@ -1,7 +1,7 @@
-"""Stages over many flights, on Dask: the only thing above the stages.
+"""Stages over many flights, on Dask; this is the only module above the stages.
 
-A flight is one task, so that what a worker loses with its life is the flight it was at; whoever takes that up
-again continues where the stages left off. Sessions are those of single runs, byte for byte.
+A flight is one task. If a worker dies, only its current flight is interrupted; the next worker continues
+this flight where the stages stopped. Sessions are the same as those of single runs, byte for byte.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from pipelines.session.storage import as_data_error, read_json, write_json
 
 STAGES = ("ingest", "reconstruct", "replan-compare", "report")
 
-_FOLDER = "batch"  # of the summary, where sessions lie beside their flights
+_FOLDER = "batch"  # of the summary, if sessions lie beside their flights
 _TABLE, _PAGE, _TIMES = "summary.csv", "summary.html", "run.json"
 _OWNER_LEAVES_S = 30.0
 _ANSWER_S = 20.0
@@ -46,7 +46,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Settings:
-    """What is done with every flight."""
+    """Settings for every flight."""
 
     stages: tuple[str, ...] = STAGES
     method: Method | Literal["refined"] = "robust"
@@ -56,18 +56,18 @@ class Settings:
 
 @dataclass(frozen=True)
 class Job:
-    """One flight, for whichever worker takes it."""
+    """One flight, as a task for a worker."""
 
-    flight: Path  # absolute: workers stand elsewhere
+    flight: Path  # absolute, because workers have other working directories
     session: Path
     settings: Settings
     force: bool
-    threads: int = 1  # blocks of its pictures that are worked on side by side; results do not depend on them
+    threads: int = 1  # blocks of its pictures in parallel; results do not depend on it
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a flight."""
+    """Result of a flight."""
 
     failed_stage: str | None = None
     error: str | None = None  # one line
@@ -76,22 +76,22 @@ class Outcome:
     figures: dict[str, float] = field(default_factory=dict)  # by column of the summary
     warnings: tuple[str, ...] = ()
     seconds: dict[str, dict[str, float]] = field(default_factory=dict)  # of every stage: wall and cpu
-    peak_memory_mb: float | None = None  # of the worker, until then
-    worker: int | None = None  # the number of its process
+    peak_memory_mb: float | None = None  # of the worker, up to the end of this flight
+    worker: int | None = None  # its process id
 
 
 @dataclass(frozen=True)
 class Batch:
-    """What a batch left behind."""
+    """Result of a batch."""
 
     rows: tuple[FlightRow, ...]
-    unchanged: int  # flights of which no stage had anything to do
+    unchanged: int  # flights for which no stage had anything to do
     table: Path
     page: Path
 
     @property
     def failed(self) -> int:
-        """How many flights did not go through."""
+        """The number of flights that failed."""
         return sum(row.error is not None for row in self.rows)
 
 
@@ -106,25 +106,25 @@ def batch(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Batch:
-    """Run the stages over many flights, and sum up.
+    """Run the stages over many flights, and write a summary.
 
-    A flight that fails does not stop the others, and gets its report all the same if it was ingested.
+    A flight that fails does not stop the others. It still gets its report if it was ingested.
 
     Args:
         flights: manifests.
         output: the folder of the sessions and the summary. By default sessions lie beside their manifests,
-            and the summary in `batch/` where the command was given.
-        settings: what decides the results.
-        workers: how many work on this machine, by default one for each core; without `scheduler`. Processes,
-            a flight each; where there are fewer flights, those left over work on their pictures as well.
+            and the summary in `batch/` of the working directory.
+        settings: the settings that determine the results.
+        workers: the number of processes on this machine, one flight each; by default one for each core. Not
+            used with `scheduler`. If there are fewer flights than workers, a flight gets more threads.
         scheduler: the address of a Dask cluster, which reads and writes the same folders by the same paths.
-        force: do everything again although nothing changed.
-        overwrite: replace files that are called like the summary's and are not a batch's.
-        progress: who watches.
+        force: run everything again even if nothing changed.
+        overwrite: replace files that have the names of the summary's but are not of a batch.
+        progress: receives the progress.
 
     Raises:
-        DataError: Dask is not installed, no scheduler answers, sessions would be called alike, or the summary
-            cannot be written. What is wrong with a flight is told in its row.
+        DataError: Dask is not installed, no scheduler answers, sessions would have the same name, or the
+            summary cannot be written. Errors of a flight are in its row.
     """
     settings, progress = settings or Settings(), progress or Silent()
     unknown = [stage for stage in settings.stages if stage not in STAGES]
@@ -148,7 +148,7 @@ def batch(
 
 
 def run_flight(job: Job) -> Outcome:
-    """All stages of one flight; what goes wrong is part of the outcome."""
+    """Run all stages of one flight; errors are part of the outcome."""
     flight = _Flight(job)
     for stage in STAGES:
         if stage in job.settings.stages and flight.can(stage):
@@ -157,7 +157,7 @@ def run_flight(job: Job) -> Outcome:
 
 
 class _Flight:
-    """A flight on its way through the stages."""
+    """State of a flight between its stages."""
 
     def __init__(self, job: Job) -> None:
         self.job = job
@@ -172,7 +172,7 @@ class _Flight:
         return (self.job.session / "session.json").is_file() and self.failed_stage != "ingest"
 
     def can(self, stage: str) -> bool:
-        """Whether a stage is of use: what there is gets a report, even if it is not much."""
+        """Return True if a stage can run: after an error, only the report of an ingested flight."""
         return self.error is None or (stage == "report" and self.ingested)
 
     def run(self, stage: str) -> None:
@@ -182,7 +182,7 @@ class _Flight:
             self.finished.append(stage)
         except MocapError as error:
             self._fail(stage, str(error))
-        except Exception as error:  # our own bug in one flight must not stop the others
+        except Exception as error:  # a bug of mocap in one flight must not stop the others
             self._fail(
                 stage, f"{self.job.flight}: a bug of mocap stopped {stage} ({type(error).__name__}: {error})"
             )
@@ -192,7 +192,7 @@ class _Flight:
         }
 
     def _skipped(self, stage: str) -> bool:
-        """Run a stage; whether there was nothing to do."""
+        """Run a stage; return True if there was nothing to do."""
         job, force = self.job, self.job.force
         match stage:
             case "ingest":
@@ -234,7 +234,7 @@ class _Flight:
 
 
 def _patiently(call: Callable[[], T]) -> T:
-    """Make a call; wait a while for a session that is held, by a worker that was given up and still ends."""
+    """Call a function; if a session is locked, wait a while for an abandoned worker that is still ending."""
     until_s = time.monotonic() + _OWNER_LEAVES_S
     while True:
         try:
@@ -246,7 +246,7 @@ def _patiently(call: Callable[[], T]) -> T:
 
 
 def _told(session: Path, stages: Sequence[str]) -> tuple[str, dict[str, float], tuple[str, ...]]:
-    """The flight's name, and the figures and warnings of its finished stages."""
+    """Read the flight's name, and the figures and warnings of its finished stages."""
     description = read_description(session)
     found: dict[str, object] = {}
     warnings = list(description.warnings)
@@ -275,7 +275,7 @@ def _peak_memory_mb() -> float:
 def _outcomes(
     jobs: Sequence[Job], workers: int, scheduler: str | None, progress: Progress
 ) -> Iterator[tuple[int, Outcome]]:
-    """The outcome of every job, with its number, as they end."""
+    """Yield the number and outcome of every job, in the order in which they end."""
     distributed = need("distributed", "batch")
     progress.start("Flights", len(jobs))
     with _client(min(workers, len(jobs)), scheduler) as client:
@@ -300,14 +300,14 @@ def _result(future: Any, job: Job) -> Outcome:
         return result
     if isinstance(error, need("distributed", "batch").KilledWorker):
         return Outcome(error=f"{job.flight}: every worker that took it died, perhaps for lack of memory")
-    # The job itself raises nothing: a cluster that does not know this program, or another version of it.
+    # The job itself raises nothing, so the cluster has no mocap or another version of it.
     line = " ".join(f"{type(error).__name__}: {error}".split())
     return Outcome(error=f"{job.flight}: the Dask worker could not run it ({line})")
 
 
 @contextmanager
 def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
-    """A client of the cluster at an address, or of one made here for the time."""
+    """Connect to the cluster at an address, or to a temporary local one."""
     distributed = need("distributed", "batch")
     if scheduler is not None:
         try:
@@ -328,7 +328,7 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
         host="127.0.0.1",
         dashboard_address=None,
         scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # its usual port may be taken
-        memory_limit=0,  # Dask pauses workers near theirs for good, where memory is not given back
+        memory_limit=0,  # Dask pauses workers near a limit for ever if they do not free memory
         silence_logs=logging.CRITICAL,
         env={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
     )
@@ -344,14 +344,14 @@ def _absolute(path: Path) -> Path:
 
 
 def _sessions(flights: Sequence[Path], output: Path | None) -> list[Path]:
-    """Where the flights' sessions go."""
+    """List the folders of the flights' sessions."""
     if output is None:
         return [flight.with_suffix(".session") for flight in flights]
     return [output / f"{name}.session" for name in names_of(flights)]
 
 
 def _refuse_foreign(folder: Path, overwrite: bool) -> None:
-    """Refuse to replace a table of somebody else's."""
+    """Refuse to replace a table that is not the summary of a batch."""
     table = folder / _TABLE
     try:
         if overwrite or not table.exists():
@@ -367,7 +367,7 @@ def _refuse_foreign(folder: Path, overwrite: bool) -> None:
 
 
 def _row(folder: Path, job: Job, outcome: Outcome) -> FlightRow:
-    """A row of the summary, its paths relative to the summary's folder."""
+    """Make a row of the summary, with paths relative to the summary's folder."""
     page = job.session / "report" / "index.html"
     return FlightRow(
         flight=_from(folder, job.flight),
@@ -381,7 +381,7 @@ def _row(folder: Path, job: Job, outcome: Outcome) -> FlightRow:
 
 
 def _as_here(line: str) -> str:
-    """A line with its paths as a single run would name them."""
+    """Make the paths in a line relative, as in the messages of a single run."""
     return line.replace(f"{Path.cwd()}{os.sep}", "")
 
 
@@ -411,7 +411,7 @@ def _store(folder: Path, rows: Sequence[FlightRow], outcomes: Sequence[Outcome])
 
 
 def _write_text(path: Path, text: str) -> None:
-    """Replace a file in one piece; names that are not UTF-8 lose what cannot be written."""
+    """Replace a file completely or not at all; characters of names that UTF-8 cannot hold are replaced."""
     new = path.with_name(f"{path.name}.new")
     new.write_bytes(text.encode("utf-8", "replace"))
     new.replace(path)

@@ -1,1 +1,1 @@
-"""Drafting a flight.yaml: what belongs to which camera, and how to say it. Descriptions in, text out."""
+"""Draft of a flight.yaml: matches files and topics to cameras and writes them. Descriptions in, text out."""

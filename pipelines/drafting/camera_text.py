@@ -1,4 +1,4 @@
-"""One camera of a drafted manifest: what it has, the other candidates beside it, and what was assumed."""
+"""Text of one camera of a drafted manifest: chosen sources, other candidates, and assumptions."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from pipelines.drafting.matching import CameraDraft, Draft
 from pipelines.drafting.yaml_text import entry, flow, scalar
 
 ASSUMED_FPS = 30
-_BRIDGED_NS = 500_000_000  # between two poses, unless ingest is told otherwise
-_MOST_OTHERS = 8  # candidates that are named beside the one taken
+_BRIDGED_NS = 500_000_000  # ingest's default for the longest gap between two poses
+_MOST_OTHERS = 8  # candidates that are listed after the chosen one
 
 
 @dataclass
 class Remarks:
-    """What is to be said of the whole in short: each thing, and the cameras that it concerns."""
+    """Short remarks on the whole manifest: each with the cameras that it concerns."""
 
-    missing: dict[str, list[str]] = field(default_factory=dict)  # without it nothing can be ingested
+    missing: dict[str, list[str]] = field(default_factory=dict)  # ingest is not possible without it
     assumed: dict[str, list[str]] = field(default_factory=dict)  # the result depends on it
 
 
 class CameraText:
-    """Says one camera, key by key.
+    """Writer of one camera, key by key.
 
     Args:
-        camera: what belongs to it.
-        draft: the flight that it is of.
-        relative: a path as the manifest is to state it.
-        remarks: where what is missing and what is assumed is added.
+        camera: the camera with its candidates.
+        draft: the flight of the camera.
+        relative: converts a path to the form in the manifest.
+        remarks: missing and assumed things are added here.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class CameraText:
         self._remarks = remarks
 
     def lines(self) -> list[str]:
-        """The lines below its name, without indentation."""
+        """Write the lines below the camera's name, without indentation."""
         return [
             *self._video(),
             *self._keypoints(),
@@ -133,7 +133,7 @@ class CameraText:
         return [entry("frame_times", {"start": start, **fps}, remark)]
 
     def _coarse_start(self) -> list[str]:
-        """The video's start by subtitles that show whole seconds."""
+        """Write the video's start from subtitles that show whole seconds."""
         found = self._camera.poses.taken.found if self._camera.poses else None
         if not isinstance(found, DroneLog) or found.video_start_ns is None or not self._film:
             return []
@@ -143,13 +143,13 @@ class CameraText:
         return [entry("frame_times", {"start": start.normalize()}, remark)]
 
     def _start(self) -> tuple[Decimal | None, str]:
-        """When the first frame was taken, in seconds: as soon as poses and truth begin; None for 0."""
+        """Assume the first frame's time in seconds: when poses and truth have begun; None for 0."""
         poses = self._camera.poses.taken.span if self._camera.poses else None
         truth = next((joints.span for joints in self._draft.true_joints), None)
         known = {"its poses": poses, "the truth": truth}
         spans = {what: span for what, span in known.items() if span}
         if poses and truth and poses.overlap_ns(truth) < 0:
-            spans = {"its poses": poses}  # the truth counts from elsewhere
+            spans = {"its poses": poses}  # the truth has another zero of time
         filmed = Span(0, self._length_ns())
         if not spans or all(filmed.overlap_ns(span) >= 0 for span in spans.values()):
             return None, ""
@@ -204,7 +204,7 @@ class CameraText:
         return self._said("pose", choice.all, "; ".join(remarks), self._pose_settings)
 
     def _about_drone(self, found: DroneLog) -> list[str]:
-        """What a drone's own log leaves open."""
+        """List remarks on what a drone's own log does not determine."""
         remarks = []
         if found.height == "stated":
             self._miss("pose: altitude, for its log states no height")
@@ -287,7 +287,7 @@ class CameraText:
         return self._said("intrinsics", choice.all, remark, self._of_calibration)
 
     def _of_calibration(self, candidate: Candidate) -> object:
-        """The path alone where the camera goes without saying: its name, or the only one."""
+        """Write only the path if the camera is clear: it has the same name, or it is the only one."""
         if candidate.settings.get("camera") in {None, self._camera.name} and "path" in candidate.settings:
             return candidate.found.path
         return candidate.settings
@@ -301,7 +301,7 @@ class CameraText:
         remark: str,
         settings: Callable[[Candidate], object] = lambda candidate: candidate.settings,
     ) -> list[str]:
-        """The first candidate, and the others as comments below."""
+        """Write the first candidate, and the others as comments below."""
         line = entry(key, stated(settings(candidates[0]), self._relative), remark)
         return [line, *self._others(key, candidates[1:], settings)]
 
@@ -319,7 +319,7 @@ class CameraText:
         return [*lines, f"#   and {more} more"] if more else lines
 
     def _loose(self, *kinds: type[Found]) -> str:
-        """What lies around without a use."""
+        """List found things of some kinds that are not used."""
         paths = [self._relative(found.path) for found in self._draft.unused if isinstance(found, kinds)]
         return f"; there is {', '.join(map(scalar, paths[:_MOST_OTHERS]))}" if paths else ""
 
@@ -331,7 +331,7 @@ class CameraText:
 
 
 def stated(settings: object, relative: Callable[[Path], str]) -> object:
-    """Settings as the manifest states them: relative paths, nothing that is None, a bare path by itself."""
+    """Convert settings to the form in the manifest: relative paths, no None, a lone path without its key."""
     if isinstance(settings, Path):
         return relative(settings)
     if not isinstance(settings, dict):
@@ -341,7 +341,7 @@ def stated(settings: object, relative: Callable[[Path], str]) -> object:
 
 
 def told(candidate: Candidate) -> str:
-    """What it is, in a few words."""
+    """Describe a candidate in a few words."""
     found, topic = candidate.found, candidate.topic
     if topic:
         type_ = topic.type.rpartition("/")[2]
@@ -367,12 +367,12 @@ def told(candidate: Candidate) -> str:
 
 
 def spanned(span: Span) -> str:
-    """How long, and from when on."""
+    """Write the length and the start of a span."""
     return f"{(span.last_ns - span.first_ns) / 1e9:.6g} s from {span.first_ns / 1e9:.3f}"
 
 
 def _first_frame(found: Keypoints, video: Video | None) -> int:
-    """The number that the first frame bears, where the numbers cannot count from 0; else 0."""
+    """Return the first frame's number if the numbers cannot count from 0; else 0."""
     if video is None:
         return found.first_frame if found.first_frame > found.frames else 0
     fits = found.last_frame - found.first_frame < video.frames
@@ -380,5 +380,5 @@ def _first_frame(found: Keypoints, video: Video | None) -> int:
 
 
 def flowing(settings: object, relative: Callable[[Path], str]) -> str:
-    """Settings in one line of YAML."""
+    """Write settings in one line of YAML."""
     return flow(stated(settings, relative))

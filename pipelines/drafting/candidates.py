@@ -1,4 +1,4 @@
-"""What of everything found could be said of a camera: each with its name, its times and its rank."""
+"""Candidates for the keys of a camera, among all that was found: each with labels, times and rank."""
 
 from __future__ import annotations
 
@@ -38,45 +38,45 @@ from pipelines.drafting.recordings import (
 from pipelines.session.manifest import PoseSource
 
 _POSE_TYPES = ("Odometry", "PoseWithCovarianceStamped", "PoseStamped", "PoseInFrame", "TransformStamped")
-"""The likelier first: odometry says how sure it is. A Path comes last, it repeats what others say."""
+"""Types of pose messages, the preferred first: odometry states its uncertainty. All others come last."""
 _GIMBAL = frozenset({"gimbal", "mount", "pan", "tilt", "ptz", "camera", "cam"})
-_MANY_CAMERAS = 200  # of one calibration: more are the pictures of a moving camera
+_MANY_CAMERAS = 200  # of one calibration file: more are the pictures of one moving camera
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Something a manifest can say, whose it is, and how it is rated among its like."""
+    """Something that a manifest can state, with its labels and its rank among candidates of its kind."""
 
-    settings: dict[str, object]  # what the manifest says; paths are Path objects
-    labels: tuple[Label, ...]  # what it is called after, one or more
+    settings: dict[str, object]  # for the manifest; paths are Path objects
+    labels: tuple[Label, ...]  # the labels of its names, one or more
     found: Found
-    rank: tuple[object, ...] = ()  # the smaller the likelier, at equal names
+    rank: tuple[object, ...] = ()  # the smallest is the likeliest among those with equal names
     span: Span | None = None
     topic: TopicFound | None = None
     of_body: bool = False  # poses of the body; else of the camera
     by_gps: bool = False  # poses whose position is that of a satellite receiver
-    unturned: bool = False  # positions alone: nothing says how the drone was turned
-    is_true: bool = False  # called the truth
+    unturned: bool = False  # positions only, without attitudes of drone or gimbal
+    is_true: bool = False  # its name says that it is ground truth
     ned_hint: str = ""  # a name that sounds like north-east-down
 
     def affinity(self, label: Label) -> int:
-        """How well it goes with a camera's label."""
+        """Rate how well it matches a camera's label."""
         return max(affinity(own, label) for own in self.labels)
 
 
 def videos(findings: Findings) -> list[Candidate]:
-    """Video files."""
+    """List video files."""
     return [_of_file(video, {"path": video.path}) for video in findings.videos]
 
 
 def picture_topics(logs: Mapping[str, Recording]) -> list[Candidate]:
-    """Topics with what cameras see; depth and masks only where there is nothing else."""
+    """List topics with pictures; depth and masks only if there is nothing else."""
     found = list(_topics(logs, "pictures", _of_topic))
     return [c for c in found if c.topic and shows_colours(c.topic)] or found
 
 
 def keypoints(findings: Findings) -> list[Candidate]:
-    """Keypoint files; first those of a folder that holds them for most cameras."""
+    """List keypoint files; those of the folder with the most of them rank first."""
     together = Counter(found.path.parent for found in findings.keypoints)
     return [
         replace(_of_file(found, {"path": found.path}), rank=(-together[found.path.parent], found.place))
@@ -85,7 +85,7 @@ def keypoints(findings: Findings) -> list[Candidate]:
 
 
 def moving_poses(findings: Findings, logs: Mapping[str, Recording]) -> list[Candidate]:
-    """Trajectories, topics and chains of transforms that no name calls the truth, a command or the actor."""
+    """List trajectories, topics and chains of transforms; not those named after truth, commands or actor."""
     files = [_trajectory(found) for found in findings.poses if not _is_true(found)]
     topics = [
         candidate
@@ -98,24 +98,24 @@ def moving_poses(findings: Findings, logs: Mapping[str, Recording]) -> list[Cand
 
 
 def true_poses(findings: Findings) -> list[Candidate]:
-    """Trajectories that are called the truth."""
+    """List trajectories whose names say that they are ground truth."""
     files = (_trajectory(found) for found in findings.poses if _is_true(found))
     return [replace(candidate, is_true=True) for candidate in files if candidate]
 
 
 def true_topics(logs: Mapping[str, Recording]) -> list[Candidate]:
-    """Topics of poses that are called the truth."""
+    """List topics of poses whose names say that they are ground truth."""
     topics = _topics(logs, "poses", _of_pose_topic)
     return [replace(c, is_true=True) for c in topics if c.topic and is_truth(c.topic)]
 
 
 def actors(logs: Mapping[str, Recording]) -> list[Candidate]:
-    """Topics that say where the person was."""
+    """List topics of the person's position."""
     return [c for c in _topics(logs, "poses", _of_pose_topic) if c.topic and is_actor(c.topic)]
 
 
 def still_poses(findings: Findings) -> list[Candidate]:
-    """Poses of cameras in calibrations."""
+    """List poses of still cameras in calibrations."""
     return [
         _of_calibration(found, name)
         for found in findings.calibrations
@@ -126,7 +126,7 @@ def still_poses(findings: Findings) -> list[Candidate]:
 
 
 def lenses(findings: Findings, logs: Mapping[str, Recording]) -> list[Candidate]:
-    """Intrinsics in calibrations and topics."""
+    """List intrinsics in calibrations and topics."""
     files = [
         _of_calibration(found, name)
         for found in findings.calibrations
@@ -138,23 +138,23 @@ def lenses(findings: Findings, logs: Mapping[str, Recording]) -> list[Candidate]
 
 
 def gimbals(logs: Mapping[str, Recording]) -> list[Candidate]:
-    """Topics of angles that are called after a gimbal; others are magnetic fields, velocities, attitudes."""
+    """List topics of angles named after a gimbal; others are magnetic fields, velocities, attitudes."""
     return [c for c in _topics(logs, "angles", _of_topic) if c.topic and is_called(c.topic.name, _GIMBAL)]
 
 
 def joints(findings: Findings) -> list[Candidate]:
-    """3D joints, for when they were."""
+    """List 3D joints, for their times."""
     return [replace(_of_file(found, {"path": found.path}), span=found.span) for found in findings.joints]
 
 
 def frame_times(findings: Findings) -> list[Candidate]:
-    """Files with the times of frames."""
+    """List files with the times of frames."""
     stamps = findings.frame_times
     return [replace(_of_file(found, {found.key: found.path}), span=found.span) for found in stamps]
 
 
 def near(candidate: Candidate, pictures: str) -> int:
-    """How many parts of its name, from the left, a camera info shares with a topic of pictures; else 0."""
+    """Count the leading name parts that a camera info shares with a topic of pictures; 0 for other kinds."""
     if candidate.topic is None or candidate.topic.kind != "intrinsics":
         return 0
     ours, theirs = (name.strip("/").split("/") for name in (candidate.topic.name, pictures))
@@ -169,14 +169,14 @@ def _of_file(found: Found, settings: dict[str, object]) -> Candidate:
 
 
 def _trajectory(found: Poses) -> Candidate | None:
-    """A trajectory file, if manifests have a key for its format."""
+    """Make a candidate of a trajectory file, if manifests have a key for its format."""
     if found.format not in PoseSource.one_of:
         return None
     return replace(_of_file(found, {found.format: found.path}), rank=(0, 0, found.place), span=found.span)
 
 
 def _of_drone(found: DroneLog) -> Candidate:
-    """A drone's own log; the poses of its camera where it has gimbal angles."""
+    """Make a candidate of a drone's own log; with gimbal angles, it has the poses of the camera."""
     return replace(
         _of_file(found, {found.key: found.path}),
         rank=(0, int(not found.gimbal), found.place),
@@ -188,7 +188,7 @@ def _of_drone(found: DroneLog) -> Candidate:
 
 
 def _of_drivers(logs: Mapping[str, Recording]) -> Iterator[Candidate]:
-    """What a driver's usual topics say together, which is more than any of them says alone."""
+    """Yield candidates of drivers: the usual topics of a driver together hold more than each topic alone."""
     for log, recording in logs.items():
         for driver in recording.drivers:
             namespace = driver.namespace or ""
@@ -210,7 +210,7 @@ def _is_true(found: Found) -> bool:
 
 
 def _of_calibration(found: Calibration, camera: str) -> Candidate:
-    """One camera of a calibration; `camera` is left out of the settings where it goes without saying."""
+    """Make a candidate of one camera of a calibration; an only camera is not named in the settings."""
     of_file, own = label_of_place(found.place), label_of(camera)
     alone = len(found.cameras) == 1
     both = tuple({word.key: word for word in (*of_file, *own)}.values())

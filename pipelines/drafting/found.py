@@ -1,4 +1,4 @@
-"""What was found, as far as drafting a manifest needs it: names, kinds, times, topics - no arrays."""
+"""Records of found files, with what a draft needs: names, kinds, times, topics; no arrays."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 from pipelines.session.telemetry import Height
 
 Place = tuple[str, ...]
-"""Folders below the common one, then the name without its suffix: what a thing is called."""
+"""Names of a thing: folders below the common one, then the file's name without its suffix."""
 
 TopicKind = Literal["poses", "transforms", "angles", "intrinsics", "pictures"]
 
@@ -22,13 +22,13 @@ class Span:
     last_ns: int
 
     def overlap_ns(self, other: Span) -> int:
-        """How long both last; negative is the gap between them."""
+        """Compute the length of the overlap with another span; negative is the gap between them."""
         return min(self.last_ns, other.last_ns) - max(self.first_ns, other.first_ns)
 
 
 @dataclass(frozen=True)
 class Found:
-    """A file, or a folder that is one thing."""
+    """A file, or a folder that is one source."""
 
     path: Path
     place: Place
@@ -43,7 +43,7 @@ class Keypoints(Found):
     frames: int  # listed
     first_frame: int
     last_frame: int
-    ambiguous: bool = False  # other formats recognise it as well: its own must be stated
+    ambiguous: bool = False  # other formats recognise it as well: the manifest must state its format
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Poses(Found):
 
 @dataclass(frozen=True)
 class Lens:
-    """What a calibration holds of one camera."""
+    """Flags for what a calibration holds of one camera."""
 
     intrinsics: bool
     pose: bool
@@ -77,16 +77,16 @@ class Joints(Found):
 
 @dataclass(frozen=True)
 class FrameTimes(Found):
-    """When frames were taken."""
+    """A file with the times of frames."""
 
-    key: Literal["csv", "srt"]  # what it is called in a manifest
+    key: Literal["csv", "srt"]  # its key in a manifest
     rows: int
     span: Span
 
 
 @dataclass(frozen=True)
 class Video(Found):
-    """A video; its stamps count from wherever its container lets them begin."""
+    """A video; the zero of its stamps is that of its container."""
 
     frames: int
     length_ns: int
@@ -94,7 +94,7 @@ class Video(Found):
 
 @dataclass(frozen=True)
 class Map(Found):
-    """What stands around."""
+    """A map of the surroundings."""
 
 
 @dataclass(frozen=True)
@@ -112,17 +112,17 @@ class TopicFound:
 
 @dataclass(frozen=True)
 class DroneLog(Found):
-    """A log that a drone wrote itself: where it was, and perhaps how it and its gimbal were turned."""
+    """A drone's own log: positions, and perhaps attitudes of body and gimbal."""
 
-    key: Literal["dji", "ulog", "ardupilot"]  # what it is called in a manifest
+    key: Literal["dji", "ulog", "ardupilot"]  # its key in a manifest
     span: Span
     positions: int
-    step_ns: int  # between positions, usually
+    step_ns: int  # median step between positions
     by_gps: bool
     body: bool
     gimbal: bool
-    height: Height = "unknown"  # what its heights count from; "stated" where it has none
-    video_start_ns: int | None = None  # of the video beside it, where its own times are too coarse for frames
+    height: Height = "unknown"  # zero level of its heights; "stated" if it has no heights
+    video_start_ns: int | None = None  # of the video beside it, if its own times are too coarse for frames
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class Driver:
     """The topics of a drone's driver in a log, as a manifest's preset reads them."""
 
     preset: str
-    namespace: str | None  # None where it is the only one
+    namespace: str | None  # None if it is the only one
     span: Span
     count: int
     body: bool
@@ -140,7 +140,7 @@ class Driver:
 
 @dataclass(frozen=True)
 class Edge:
-    """A transform that a log states: the frame `child` in `parent`."""
+    """A logged transform: the frame `child` in `parent`."""
 
     topic: str
     parent: str
@@ -150,7 +150,7 @@ class Edge:
 
 @dataclass(frozen=True)
 class Recording(Found):
-    """A log; several paths where it was split."""
+    """A log; it has several paths if it was split."""
 
     parts: tuple[Path, ...]
     topics: tuple[TopicFound, ...]
@@ -160,7 +160,7 @@ class Recording(Found):
 
 @dataclass(frozen=True)
 class Findings:
-    """Everything, each kind in the order of its paths."""
+    """Everything that was found, each kind in the order of its paths."""
 
     keypoints: list[Keypoints] = field(default_factory=list)
     poses: list[Poses] = field(default_factory=list)
@@ -173,7 +173,7 @@ class Findings:
     drone_logs: list[DroneLog] = field(default_factory=list)
 
     def all(self) -> list[Found]:
-        """Every one of them, kind by kind."""
+        """List all of them, kind by kind."""
         return [
             *self.videos,
             *self.keypoints,

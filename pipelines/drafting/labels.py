@@ -1,8 +1,8 @@
-"""What files and topics are called, and whether two of them are called after the same camera.
+"""Labels of files and topics, to find those of the same camera.
 
-A name is cut into words with their numbers (drone_1_poses: drone 1, poses). Words that say what a thing
-is, not whose (poses, camera, json), do not count; the rest is its label. `drone1.mp4`, `drone1_poses.tum`,
-`/drone1/odometry` and `drone-01/calib.yaml` all bear the label drone 1.
+A name is split into words with their numbers (drone_1_poses: drone 1, poses). Words for the kind of a thing
+(poses, camera, json) are ignored; the rest is its label. `drone1.mp4`, `drone1_poses.tum`,
+`/drone1/odometry` and `drone-01/calib.yaml` all have the label drone 1.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from typing import NamedTuple
 from pipelines.drafting.found import Place
 
 EQUAL, PART, NUMBER, UNNAMED, OTHER = 4, 3, 2, 1, 0
-"""How two labels go together: the same; one within the other; only the numbers agree (d1, drone1); one of
-them says nothing; they speak of different things."""
+"""Ratings of two labels: they are the same; one is within the other; only the numbers agree (d1, drone1); one
+of them is empty; they differ."""
 
 TRUTH_WORDS = frozenset({"truth", "true", "gt", "groundtruth"})
 _GENERIC_TEXT = """
@@ -31,13 +31,13 @@ _GENERIC_TEXT = """
     timestamp timestamps stamps stamp static base link body optical imu vio slam the of and
 """
 _GENERIC = TRUTH_WORDS | frozenset(_GENERIC_TEXT.split())
-"""Words that say what a thing is, not whose. With a number (cam01) they do name a camera."""
+"""Words for the kind of a thing, which do not name its owner. With a number (cam01) they do name a camera."""
 _GENERIC_NUMBERED = re.compile(
     r"(?i)(?<![^\W_])(?:rosbag2|halpe26|coco17|coco133|body25b?|blazepose33|[hx]26[45]|[23]d|\d{3,4}p|\d+fps)"
     r"(?![^\W_])"
 )
 _WORD = re.compile(r"[^\W\d_]+[0-9]*|[0-9]+")
-_MOST_DIGITS = 18  # of a number that is compared as one
+_MOST_DIGITS = 18  # of a number; only the last ones are compared
 
 
 class Word(NamedTuple):
@@ -49,7 +49,7 @@ class Word(NamedTuple):
 
     @property
     def key(self) -> tuple[str, int | None]:
-        """What makes two words the same: drone_1, Drone01."""
+        """The key by which words are equal: drone_1, Drone01."""
         return self.word, self.number
 
 
@@ -57,7 +57,7 @@ Label = tuple[Word, ...]
 
 
 def words(text: str) -> list[Word]:
-    """The words of a name in their order; a number belongs to the word before it."""
+    """Split a name into its words in their order; a number belongs to the word before it."""
     found: list[Word] = []
     start = end = 0  # of the word found last
     for match in _WORD.finditer(_GENERIC_NUMBERED.sub(lambda generic: " " * len(generic[0]), text)):
@@ -73,15 +73,15 @@ def words(text: str) -> list[Word]:
 
 
 def label_of(text: str) -> Label:
-    """The words of a name that say whose it is."""
+    """Return the label of a name: its words without those for kinds of things."""
     kept = {word.key: word for word in words(text) if word.number is not None or word.word not in _GENERIC}
     return tuple(kept.values())
 
 
 def label_of_place(place: Place) -> Label:
-    """The label of a file: of its name, with numbered folders above it (drone1/DJI_0001.mp4).
+    """Return the label of a file: that of its name, with numbered folders above it (drone1/DJI_0001.mp4).
 
-    Where the name says nothing (drone1/video.mp4) it is the nearest folder's that does.
+    If the name has no label (drone1/video.mp4), it is the label of the nearest folder that has one.
     """
     *folders, name = place
     own = label_of(name)
@@ -93,12 +93,12 @@ def label_of_place(place: Place) -> Label:
 
 
 def is_called(text: str, wanted: frozenset[str]) -> bool:
-    """Whether a name holds one of some words."""
+    """Test if a name contains one of some words."""
     return any(word.word in wanted for word in words(text))
 
 
 def affinity(one: Label, other: Label) -> int:
-    """How two labels go together, from `OTHER` to `EQUAL`."""
+    """Rate how well two labels match, from `OTHER` to `EQUAL`."""
     if not one or not other:
         return UNNAMED
     ours, theirs = {word.key for word in one}, {word.key for word in other}
@@ -111,15 +111,15 @@ def affinity(one: Label, other: Label) -> int:
 
 
 def order(label: Label) -> list[tuple[str, int]]:
-    """Sorts drone2 before drone10."""
+    """Make a sort key that sorts drone2 before drone10."""
     return [(word.word, -1 if word.number is None else word.number) for word in label]
 
 
 def camera_names(labels: Sequence[Label]) -> list[str]:
-    """A name for each camera, [A-Za-z0-9_-]{1,64}, no two of them equal but for case.
+    """Make a name for each camera, [A-Za-z0-9_-]{1,64}, such that no two differ only in case.
 
-    Numbered words that all share (a date, a take) are left out; of the rest as many as it takes to tell
-    the cameras apart.
+    Numbered words that all labels share (a date, a take) are left out. Of the rest, a name has as many words
+    as are needed to distinguish the cameras.
     """
     if len(labels) > 1:
         shared = Counter(word.key for label in labels for word in label if word.number is not None)
@@ -141,14 +141,14 @@ def _keys(label: Label) -> tuple[tuple[str, int | None], ...]:
 
 
 def fitting(text: str, otherwise: str) -> str:
-    """A text made to fit [A-Za-z0-9_-]{1,64}; `otherwise` where no letter is left of it."""
+    """Convert a text to [A-Za-z0-9_-]{1,64}; return `otherwise` if no letter is left of it."""
     plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", plain).strip("_-")[:64]
     return name if re.search("[A-Za-z]", name) else otherwise
 
 
 def unique(name: str, taken: Sequence[str]) -> str:
-    """The name, with a number where it is taken."""
+    """Return the name, with a number if it is taken."""
     folded = {other.lower() for other in taken}
     candidate, number = name, 2
     while candidate.lower() in folded:

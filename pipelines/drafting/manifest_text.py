@@ -1,4 +1,4 @@
-"""A draft as the text of a flight.yaml: what was found, and in comments what only the user can know."""
+"""Text of a drafted flight.yaml: what was found, with comments on what only the user can know."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ _NAMES_TOLD = 5
 
 @dataclass(frozen=True)
 class ManifestText:
-    """The manifest, and in short what its comments say."""
+    """The manifest, with short versions of its comments."""
 
     text: str
-    missing: list[str]  # without it the flight cannot be ingested
-    assumed: list[str]  # it can, but the result depends on it
+    missing: list[str]  # the flight cannot be ingested without it
+    assumed: list[str]  # the flight can be ingested, but results depend on it
 
 
 def write_manifest(draft: Draft, name: str, relative: Callable[[Path], str]) -> ManifestText:
-    """Say it all.
+    """Write the whole manifest of a draft.
 
     Args:
-        draft: what belongs together.
+        draft: the flight with its cameras and sources.
         name: of the flight.
-        relative: a path as the manifest is to state it.
+        relative: converts a path to the form in the manifest.
     """
     remarks = Remarks()
     lines = [
@@ -62,7 +62,7 @@ def write_manifest(draft: Draft, name: str, relative: Callable[[Path], str]) -> 
 
 
 def _in_short(remarks: Mapping[str, list[str]]) -> list[str]:
-    """One line for each thing, with the cameras it concerns."""
+    """Write one line for each remark, with the cameras that it concerns."""
     lines = []
     for what, names in remarks.items():
         shown = ", ".join(names[:_NAMES_TOLD]) + (", ..." if len(names) > _NAMES_TOLD else "")
@@ -71,14 +71,14 @@ def _in_short(remarks: Mapping[str, list[str]]) -> list[str]:
 
 
 def _origin(draft: Draft) -> list[str]:
-    """Where the world's origin lies, for positions on Earth."""
+    """Write a comment on the world's origin, for positions on Earth."""
     if not any(camera.poses and camera.poses.taken.by_gps for camera in draft.cameras):
         return []
     return ["#   origin: {latitude_deg: 0, longitude_deg: 0, altitude_m: 0}  # else the first position's"]
 
 
 def _logs(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) -> list[str]:
-    """Every log that is named below."""
+    """Write every log that the rest of the manifest names."""
     if not draft.logs:
         return []
     lines = ["", "logs:"]
@@ -106,7 +106,7 @@ def _cameras(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) ->
 
 
 def _actor(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) -> list[str]:
-    """Where the person was, as a log says."""
+    """Write the source of the person's logged positions."""
     if not draft.actors:
         return []
     taken, *others = draft.actors
@@ -117,13 +117,13 @@ def _actor(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) -> l
 
 
 def _map(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
-    """What stands around."""
+    """Write the maps: the first one, and the others as comments."""
     lines = [entry("map", relative(found.path), found.title) for found in draft.maps]
     return ["", *lines[:1], *(f"# or {line}" for line in lines[1:])] if lines else []
 
 
 def _truth(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
-    """What is called the truth; joints only if they last while there are poses, for ingest refuses others."""
+    """Write the truth; joints only if they overlap with poses in time, because ingest refuses others."""
     known: dict[str, object] = {}
     lines: list[str] = []
     spans = [camera.poses.taken.span for camera in draft.cameras if camera.poses]
@@ -150,7 +150,7 @@ def _truth(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
 
 
 def _unused(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
-    """What was recognised but has no place."""
+    """Write comments on files that were recognised but are not used."""
     if not draft.unused:
         return []
     lines = ["", "# Recognised, but not used:"]
@@ -161,6 +161,6 @@ def _unused(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
 
 
 def _held(found: Found) -> str:
-    """The topics of a log that could be named all the same."""
+    """List the topics of an unused log, which the user could still name."""
     topics = [topic.name for topic in found.topics if topic.count] if isinstance(found, Recording) else []
     return f" with {one_line(', '.join(topics[:_NAMES_TOLD]))}" if topics else ""

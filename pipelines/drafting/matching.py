@@ -1,8 +1,8 @@
-"""Which pictures, poses, calibrations and truths belong to one camera.
+"""Matching of pictures, poses, calibrations and truth to cameras.
 
-Cameras are what has pictures: a video, keypoints, a topic with pictures. Everything else goes to the
-camera that it is called after; where several do, the one that lasts while the camera filmed is taken, then
-the likelier kind, and the others are kept to be named beside it.
+A camera is anything with pictures: a video, keypoints, a topic with pictures. Every other thing goes to the
+camera with the same name. If there are several for a camera, the one that overlaps in time with its film is
+taken, then the one of the likelier kind. The others are kept and listed as alternatives.
 """
 
 from __future__ import annotations
@@ -33,27 +33,27 @@ from pipelines.drafting.recordings import joined, label_of_recording
 
 @dataclass(frozen=True)
 class Choice:
-    """The candidate that was taken, and those that could stand in its place."""
+    """The candidate that was taken, and its alternatives."""
 
     taken: Candidate
     others: tuple[Candidate, ...] = ()
-    named: bool = True  # its name says so; else it is the only one there is
+    named: bool = True  # True if its name matches; else it is the only one there is
 
     @property
     def all(self) -> tuple[Candidate, ...]:
-        """Both."""
+        """The candidate that was taken, then its alternatives."""
         return (self.taken, *self.others)
 
 
 @dataclass
 class CameraDraft:
-    """What belongs to one camera."""
+    """One camera with the candidates that belong to it."""
 
     label: Label
     name: str = ""
     videos: list[Candidate] = field(default_factory=list)  # the first is taken
     keypoints: list[Candidate] = field(default_factory=list)
-    paired: bool = False  # video and keypoints go together only because nothing else is left
+    paired: bool = False  # video and keypoints are matched only because nothing else is left
     frame_times: Choice | None = None
     poses: Choice | None = None
     gimbal: Choice | None = None
@@ -62,20 +62,20 @@ class CameraDraft:
 
     @property
     def filmed(self) -> Span | None:
-        """When it filmed, where that is known from the stamps of a log."""
+        """The span of its film, if that is known from the stamps of a log."""
         return self.videos[0].span if self.videos else None
 
     def mentioned(self) -> list[Candidate]:
-        """Everything that the manifest says of it, in comments too."""
+        """List every candidate that the manifest mentions for it, also those in comments."""
         choices = (self.frame_times, self.poses, self.gimbal, self.intrinsics, self.true_poses)
         return [*self.videos, *self.keypoints, *(c for choice in choices if choice for c in choice.all)]
 
 
 @dataclass(frozen=True)
 class Draft:
-    """A flight as far as it can be told from what was found."""
+    """A flight as far as it is known from what was found."""
 
-    logs: dict[str, Recording]  # those that are named, by the name the manifest gives them
+    logs: dict[str, Recording]  # those that are used, by their name in the manifest
     cameras: list[CameraDraft]
     true_joints: list[Joints]  # the first is taken
     actors: list[Candidate]  # the first is taken
@@ -128,7 +128,7 @@ def _video(camera: CameraDraft) -> dict[str, object]:
 
 
 def _log_names(recordings: Sequence[Recording]) -> dict[str, Recording]:
-    """Short names, as `log:` refers to them."""
+    """Give recordings the short names that `log:` uses."""
     names: list[str] = []
     for recording in recordings:
         label = "_".join(word.text for word in label_of_recording(recording))
@@ -140,7 +140,7 @@ def _log_names(recordings: Sequence[Recording]) -> dict[str, Recording]:
 
 
 def _cameras(findings: Findings, logs: dict[str, Recording]) -> list[CameraDraft]:
-    """One for everything that has pictures; without any, one for each that has poses."""
+    """Make a camera for everything that has pictures; if nothing has, one for each source of poses."""
     cameras: list[CameraDraft] = []
     for video in sorted(of.videos(findings), key=_by_name):
         _home(cameras, video, lambda camera: camera.videos).videos.append(video)
@@ -172,7 +172,7 @@ def _same(label: Label, candidate: Candidate) -> bool:
 def _home(
     cameras: list[CameraDraft], candidate: Candidate, like: Callable[[CameraDraft], Sequence[Candidate]]
 ) -> CameraDraft:
-    """The camera of some pictures: of the same name, or of a like one that has none of their kind yet."""
+    """Find or add the camera of some pictures: one of the same name, or a similar one without pictures."""
     label = candidate.labels[0]
     for camera in cameras:
         if _same(camera.label, candidate):
@@ -187,7 +187,7 @@ def _home(
 
 
 def _pair_the_last(cameras: list[CameraDraft]) -> None:
-    """One video and one keypoint file that nothing else goes with belong together."""
+    """Join one video and one keypoint file if both are the only ones without a partner."""
     filmed = [camera for camera in cameras if not camera.keypoints]
     detected = [camera for camera in cameras if not camera.videos]
     if len(filmed) == len(detected) == 1 and not _are_two(filmed[0].label, detected[0].label):
@@ -197,7 +197,7 @@ def _pair_the_last(cameras: list[CameraDraft]) -> None:
 
 
 def _are_two(one: Label, other: Label) -> bool:
-    """Whether names count: drone 1, drone 2."""
+    """Test if labels share a word, as those of two drones do: drone 1, drone 2."""
     return bool({word.word for word in one} & {word.word for word in other})
 
 
@@ -205,7 +205,7 @@ def _are_two(one: Label, other: Label) -> bool:
 
 
 class _Chooser:
-    """Picks for one camera among candidates of one kind; `anchors` say when the flight was."""
+    """Chooser of candidates of one kind for one camera; `anchors` define the time of the flight."""
 
     def __init__(
         self, camera: CameraDraft, cameras: Sequence[CameraDraft], anchors: Sequence[Candidate]
@@ -216,11 +216,11 @@ class _Chooser:
         self._topic = str(_video(camera).get("topic", ""))
 
     def __call__(self, candidates: Sequence[Candidate], *, shared: bool = False) -> Choice | None:
-        """The best that is called after the camera; or the only one, for the only camera.
+        """Choose the best candidate with the camera's name; or the only one, for the only camera.
 
         Args:
             candidates: of one kind.
-            shared: whether one that no name speaks for may serve several cameras.
+            shared: True if one candidate without a matching name may serve several cameras.
         """
         least = UNNAMED if self._lone or shared else NUMBER
         rivals = [candidate for candidate in candidates if self._likeness(candidate) >= least]
@@ -228,13 +228,14 @@ class _Chooser:
             rivals = list(candidates)
         if not rivals:
             return None
-        # What is called after the camera excludes what is not; how fully it is spells out less than time.
+        # A candidate with the camera's name excludes those without. How exactly the name matches matters less
+        # than time.
         level = min(PART, max(map(self._likeness, rivals)))
         rivals = [candidate for candidate in rivals if self._likeness(candidate) >= level]
         times = self._times(rivals)
 
         def key(rival: Candidate) -> tuple[object, ...]:
-            # That one log began a second before another says nothing, that it is of another flight does.
+            # A log that began a second earlier is as good as another; one of another flight is not.
             elsewhere = 2 * times[id(rival)] < max(times.values())
             return elsewhere, -self._likeness(rival), -of.near(rival, self._topic), rival.rank
 
@@ -246,14 +247,14 @@ class _Chooser:
         return candidate.affinity(self._camera.label)
 
     def _times(self, rivals: Sequence[Candidate]) -> dict[int, float]:
-        """How long each lasts while the camera films, or else while others log."""
+        """Compute how long each overlaps in time with the camera's film, or else with the other logs."""
         others = [anchor for anchor in self._anchors if all(anchor is not rival for rival in rivals)]
         anchors = [self._camera.filmed] if self._camera.filmed else _spans(others)
         return {id(rival): _shared([rival.span] if rival.span else [], anchors) for rival in rivals}
 
 
 def _shared(spans: Sequence[Span], anchors: Iterable[Span]) -> float:
-    """For how long spans last while others do, added up; ns."""
+    """Sum the overlaps of spans with other spans, ns."""
     return float(sum(max(span.overlap_ns(anchor), 0) for anchor in anchors for span in spans))
 
 
@@ -262,7 +263,7 @@ def _spans(candidates: Iterable[Candidate]) -> list[Span]:
 
 
 def _beside(first: Choice | None, second: Choice | None) -> Choice | None:
-    """The first choice with the second as one more that could be taken."""
+    """Return the first choice with the candidates of the second as alternatives."""
     if first is None or second is None:
         return first or second
     return Choice(first.taken, (*first.others, *second.all), first.named)

@@ -1,4 +1,4 @@
-"""Logs: which files are one recording, what each topic is for, which frames are a drone's."""
+"""Analysis of logs: files that are one recording, purposes of topics, and frames of drones."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BODIES = frozenset({"base", "body", "imu", "fcu"})
 
 
 def joined(recordings: Sequence[Recording]) -> list[Recording]:
-    """Files called NAME_0, NAME_1, ... as one recording, if each begins when the one before has ended.
+    """Join files named NAME_0, NAME_1, ... to one recording, if each begins after the previous one ends.
 
     Two drones that log at the same time stay two recordings.
     """
@@ -72,51 +72,51 @@ def _extended(before: Recording, recording: Recording) -> Recording:
 
 
 def label_of_recording(recording: Recording) -> Label:
-    """What a log is called after; the _0 of its first part is none of it."""
+    """Return the label of a log, without the _0 of its first part."""
     *folders, name = recording.place
     match = _PART.fullmatch(name)
     return label_of_place((*folders, match[1] if match and label_of(match[1]) else name))
 
 
 def label_of_topic(recording: Recording, name: str) -> Label:
-    """Whose a topic or frame is: by its own name, or else by that of its log."""
+    """Return the label of a topic or frame: that of its own name, or else that of its log."""
     return label_of(name) or label_of_recording(recording)
 
 
 def is_truth(topic: TopicFound) -> bool:
-    """Whether it bears the name of the truth."""
+    """Test if a topic's name says that it is ground truth."""
     return is_called(topic.name, TRUTH_WORDS)
 
 
 def is_actor(topic: TopicFound) -> bool:
-    """Whether it tells of the person who was filmed."""
+    """Test if a topic's name says that it is about the filmed person."""
     return is_called(topic.name, _ACTOR)
 
 
 def is_commanded(topic: TopicFound) -> bool:
-    """Whether it tells where something was to go, not where it was."""
+    """Test if a topic's name says that it holds commands, not measurements."""
     return is_called(topic.name, _COMMANDED)
 
 
 def shows_colours(topic: TopicFound) -> bool:
-    """Whether its pictures are what a camera sees, and no depth or mask."""
+    """Test if a topic holds pictures of a camera, not depth or masks."""
     return not any(word.word in _NO_PICTURES for word in words(topic.name))
 
 
 def is_of_camera(name: str) -> bool:
-    """Whether a frame or topic is a camera's own, and not the body's."""
+    """Test if a frame or topic is that of a camera, not of the body."""
     return is_called(name, _OPTICAL)
 
 
 def hints_at_ned(*names: str) -> str:
-    """The first of some names that sounds like north-east-down; empty if none does."""
+    """Return the first of some names that suggests north-east-down; empty if none does."""
     return next((name for name in names if is_called(name, _NED)), "")
 
 
 def chains(recording: Recording) -> list[tuple[str, str]]:
-    """(parent, child) for every moving camera or body frame of a log's transforms; cameras first.
+    """List (parent, child) of every moving camera or body frame of a log's transforms; cameras first.
 
-    The parent is the root of the child's tree. Frames that are fixed to the root do not fly.
+    The parent is the root of the child's tree. Frames that are fixed to the root are left out.
     """
     above: dict[str, Edge] = {}
     for edge in recording.edges:

@@ -1,4 +1,4 @@
-"""What lies in files and folders that any format knows, each thing once, and what does not."""
+"""Search of files and folders for everything that a format recognises, each thing once."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _FILES_ASKED = 16  # of a folder of keypoints, for their format
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What was looked at in vain."""
+    """A path that was looked at but is not used."""
 
     path: Path
     reason: str
@@ -39,7 +39,7 @@ Thing = tuple[Path, list[Format]]
 
 
 class Search:
-    """Goes through files and folders, and notes what it had to leave out."""
+    """A search through files and folders, which notes what it had to leave out."""
 
     def __init__(self) -> None:
         self.left_out: list[LeftOut] = []
@@ -47,7 +47,7 @@ class Search:
         self._seen: set[Path] = set()
 
     def look(self, paths: Sequence[Path]) -> tuple[list[Thing], Path]:
-        """Everything that is recognised, each thing once, and the folder that all paths have in common.
+        """Find everything that is recognised, each thing once, and the folder that all paths share.
 
         Raises:
             DataError: a path does not exist.
@@ -64,7 +64,7 @@ class Search:
         return sorted(things, key=lambda thing: thing[0]), Path(os.path.commonpath(bases))
 
     def _under(self, path: Path) -> Iterator[Thing]:
-        """The things at a path and below it."""
+        """Yield the things at a path and below it."""
         if path.resolve() in self._seen:  # named twice, or a link that leads back
             return
         self._seen.add(path.resolve())
@@ -78,7 +78,7 @@ class Search:
             self.left_out.append(LeftOut(path, _why_left_out(path)))
 
     def _under_folder(self, folder: Path) -> Iterator[Thing]:
-        """The folder itself where it is one thing, and what lies in it but is no part of that."""
+        """Yield the folder itself if it is one thing, and things in it that are not part of that."""
         children = self._children(folder)
         formats = [f for f in self._recognising(folder) if self._is_whole(folder, children, f)]
         if not formats:
@@ -96,10 +96,10 @@ class Search:
                     yield child, others
 
     def _is_whole(self, folder: Path, children: Sequence[Path], format_: Format) -> bool:
-        """Whether a folder that a format recognises is one thing, and not a place where such things lie.
+        """Test if a folder that a format recognises is one thing, not a folder with several such things.
 
-        Files of keypoints, one for each camera, are recognised as a folder too, and so are a log that lies
-        alone in a folder and the files of a bag beside the videos of its flight.
+        A folder is also recognised if it holds keypoint files, one for each camera, or a single log, or the
+        files of a bag beside the videos of its flight.
         """
         if isinstance(format_, LogFormat):
             inside = [kind_of_format(f) for child in children for f in self._recognising(child)]
@@ -130,7 +130,7 @@ class Search:
 
 
 def kind_of_format(format_: Format) -> type | None:
-    """The protocol that a format keeps to."""
+    """Return the protocol of a format; None if it has none of these."""
     kinds = (
         KeypointFormat,
         TrajectoryFormat,
@@ -153,7 +153,7 @@ def _is_text(path: Path) -> bool:
 
 
 def _why_left_out(path: Path) -> str:
-    """What to say of a file that no format knows."""
+    """Explain why a file is left out that no format recognises."""
     if path.suffix.lower() in {".yaml", ".yml"}:
         try:
             read_flight(path)

@@ -1,7 +1,7 @@
-"""YAML by hand, so that comments stand where they belong: scalars, flow mappings, comments of one line.
+"""Writers of YAML text with comments in the right places: scalars, flow mappings, comments of one line.
 
-Names come from file systems and logs, and may be anything: whatever they hold, a scalar reads back as the
-same text, and a comment ends where its line ends.
+Names come from file systems and logs, and may hold any character. A scalar is always read back as the same
+text, and a comment always ends at the end of its line.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ import re
 from collections.abc import Mapping
 from decimal import Decimal
 
-# Plain where no reader of YAML, old or new, can take it for anything but text.
+# Texts that every reader of YAML, old or new, reads as text without quotes.
 _PLAIN = re.compile(r"(?:\.\.?/)*[A-Za-z_/][A-Za-z0-9_./-]*(?: [A-Za-z0-9_./-]+)*")
 _WORDS_OF_YAML = frozenset(["null", "true", "false", "yes", "no", "on", "off", "y", "n"])
 _ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r"}
 
 
 def scalar(value: object) -> str:
-    """A text, number or yes/no as one YAML scalar on one line."""
+    """Write a text, number or boolean as one YAML scalar on one line."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, int | float | Decimal):
@@ -38,7 +38,7 @@ def _escaped(character: str) -> str:
 
 
 def flow(value: object) -> str:
-    """Mappings and lists in one line, anything else as `scalar`."""
+    """Write mappings and lists in one line, anything else as `scalar`."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{scalar(key)}: {flow(item)}" for key, item in value.items()) + "}"
     if isinstance(value, list | tuple):
@@ -47,15 +47,15 @@ def flow(value: object) -> str:
 
 
 def entry(key: str, value: object, comment: str = "") -> str:
-    """A line `key: value  # comment`, without indentation."""
+    """Write a line `key: value  # comment`, without indentation."""
     return commented(f"{scalar(key)}: {flow(value)}", comment)
 
 
 def commented(line: str, comment: str) -> str:
-    """The line with a comment behind it, if there is one."""
+    """Append a comment to a line, if there is one."""
     return f"{line}  # {one_line(comment)}" if comment else line
 
 
 def one_line(text: str) -> str:
-    """The text with everything replaced that ends a line or steers a terminal."""
+    """Replace all characters that end a line or control a terminal."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
