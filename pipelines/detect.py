@@ -1,4 +1,4 @@
-"""Stage `detect`: run a keypoint detector over the pictures of every camera that came without keypoints.
+"""Stage `detect`: run a keypoint detector on the pictures of every camera that has no imported keypoints.
 
 Pictures are taken in blocks of fixed length, each followed from its own start, so that blocks can be worked
 on side by side and an interrupted run continues with those that are missing; the result does not depend on
@@ -57,12 +57,12 @@ if TYPE_CHECKING:
 
 DETECT = Stage("detect", revision=2)
 
-_BLOCK = 300  # pictures; ten seconds are worth little when lost, and a search at each start costs little
+_BLOCK = 300  # pictures: ten seconds of work are a small loss, and a search at each start costs little
 
 
 @dataclass(frozen=True)
 class Block:
-    """Rows of a camera's frames that are worked on in one go."""
+    """Rows of a camera's frames that are processed together."""
 
     camera: str
     first: int
@@ -70,12 +70,12 @@ class Block:
 
     @property
     def name(self) -> str:
-        """A name that sorts in time."""
+        """A name by which blocks sort in time."""
         return f"{self.camera}-{self.first:09d}"
 
 
 def cameras_to_detect(description: Description) -> dict[str, MediaEntry]:
-    """The cameras with pictures and without keypoints."""
+    """Find the cameras with pictures and without imported keypoints."""
     return {
         name: entry.media
         for name, entry in description.cameras.items()
@@ -94,21 +94,21 @@ def detect(
     force: bool = False,
     progress: Progress | None = None,
 ) -> StageRecord | None:
-    """Find keypoints where none were imported.
+    """Detect keypoints for cameras without imported ones.
 
     Args:
         session: locked by the caller.
-        detector: a registered name, or that of a family, a colon and its argument.
-        every: look at every k-th picture only.
-        start_s: look at pictures from then on only, in seconds since the first frame of the flight's cameras,
-            those with keypoints among them; from the first by default.
-        end_s: and at those before then; to the last by default.
-        workers: blocks worked on at once; the result does not depend on them.
-        force: do it again although nothing changed.
-        progress: who watches.
+        detector: a registered name, or a family's name, a colon and its argument.
+        every: use only every k-th picture.
+        start_s: use only pictures at or after this time, in seconds since the flight's first frame of any
+            camera, also of those with keypoints; by default from the first.
+        end_s: use only pictures before this time; by default to the last.
+        workers: the number of blocks in parallel; the result does not depend on it.
+        force: run it again even if nothing changed.
+        progress: receives the progress.
 
     Returns:
-        The record of the stage; None where every camera has keypoints already.
+        The record of the stage; None if every camera has imported keypoints.
 
     Raises:
         DataError: the detector's files are missing, pictures are gone or not those that were ingested, a
@@ -286,7 +286,7 @@ class _Hints:
 
 
 class _Work:
-    """What the blocks of a session need to know."""
+    """Data that all blocks of a session share."""
 
     def __init__(
         self,
@@ -310,22 +310,22 @@ class _Work:
         }
 
     def blocks(self, camera: str) -> list[Block]:
-        """The blocks of a camera; a single one of nothing where no picture is in the span."""
+        """List the blocks of a camera; a single empty one if no picture is in the span."""
         rows = self._spans[camera]
         firsts = rows[::_BLOCK] or [rows.start]
         return [Block(camera, first, min(first + _BLOCK, rows.stop)) for first in firsts]
 
     def span(self, camera: str) -> tuple[int, int]:
-        """First row of a camera's frame table that is looked at, and the one behind the last."""
+        """Return the first row of a camera's frame table that is used, and the row after the last."""
         rows = self._spans[camera]
         return -(-rows.start // self.every) * self.every, rows.stop
 
     def pictures(self, block: Block) -> int:
-        """How many pictures of a block are looked at."""
+        """Count the pictures of a block that are used."""
         return len(self.rows(block))
 
     def rows(self, block: Block) -> range:
-        """The rows of the frame table that are looked at: every k-th from the first of all on."""
+        """Return the rows of the frame table that are used: multiples of `every` within the block."""
         first = -(-block.first // self.every) * self.every
         return range(first, block.stop, self.every)
 
@@ -345,7 +345,7 @@ class _Work:
         return hash_of([sha256(self.frames(block)[0].tobytes()).hexdigest() for block in self.blocks(camera)])
 
     def networks(self, detector: Detector) -> KeypointNetworks:
-        """The detector, loaded once by each thread: its networks may be used by one at a time."""
+        """Load the detector once for each thread, because only one thread may use its networks at a time."""
         if not hasattr(self._of_thread, "networks"):
             self._of_thread.networks = detector.load(threads=1)
         networks: KeypointNetworks = self._of_thread.networks
@@ -389,7 +389,7 @@ def _produce(
 
 
 def _decoded_ahead(pictures: Pictures, numbers: list[int]) -> Generator[Picture | None]:
-    """The pictures of these numbers; the next one is decoded while the networks look at this one."""
+    """Yield the pictures of these numbers; the next one is decoded while the networks process this one."""
     with ThreadPoolExecutor(1) as decoder:
         coming = deque(decoder.submit(pictures.read, number) for number in numbers[:1])
         for number in numbers[1:]:
@@ -418,7 +418,7 @@ def _table(
 def _assemble(
     folder: Path, media: Mapping[str, MediaEntry], blocks: list[Block], folders: list[Path]
 ) -> dict[str, dict[str, int]]:
-    """The tables of all cameras from those of their blocks, and what was counted on the way."""
+    """Join the tables of the blocks to one for each camera, and return the summed counts."""
     import pandas as pd
 
     counts: dict[str, dict[str, int]] = {}

@@ -1,4 +1,4 @@
-"""Stage `draft`: files and folders in, a flight.yaml out that can be ingested, or says what is missing."""
+"""Stage `draft`: write a flight.yaml for files and folders; it can be ingested or says what is missing."""
 
 from __future__ import annotations
 
@@ -54,20 +54,20 @@ from pipelines.session.registries import (
 from pipelines.session.storage import as_data_error
 from pipelines.session.telemetry import TelemetryChoice, TelemetryFormat
 
-_FRAME_TIMES = "frame_times"  # the one format that no protocol tells apart
-_TRANSFORMS_ASKED = 2000  # messages of a topic, for the names of its frames
+_FRAME_TIMES = "frame_times"  # the only format without a protocol of its own
+_TRANSFORMS_ASKED = 2000  # messages of a topic that are read for the names of its frames
 
 
 @dataclass(frozen=True)
 class Drafted:
-    """A manifest that was written, and what is to be said of it."""
+    """A manifest that was written, with remarks on it."""
 
     path: Path
     text: str
     cameras: list[str]
-    missing: list[str]  # without it the flight cannot be ingested
-    assumed: list[str]  # it can, but the result depends on it
-    left_out: dict[Path, str]  # what was looked at in vain, and why
+    missing: list[str]  # the flight cannot be ingested without it
+    assumed: list[str]  # the flight can be ingested, but results depend on it
+    left_out: dict[Path, str]  # paths that were not used, with the reason
 
 
 def draft(
@@ -77,19 +77,19 @@ def draft(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Drafted:
-    """Look into files and folders and write the manifest of their flight.
+    """Examine files and folders and write the manifest of their flight.
 
-    Folders are looked through; hidden files and sessions are left out. What the files cannot say stands in
-    comments of the manifest, beside the line that it is about.
+    Folders are searched, without hidden files and sessions. Things that the files do not determine are in
+    comments of the manifest, beside the line that they concern.
 
     Args:
-        paths: what the team brought home.
-        output: the manifest; by default flight.yaml in the folder that all paths have in common.
-        overwrite: replace a file that is there.
-        progress: who watches.
+        paths: the files and folders of the flight.
+        output: the manifest; by default flight.yaml in the folder that all paths share.
+        overwrite: replace an existing file.
+        progress: receives the progress.
 
     Raises:
-        DataError: nothing was recognised, a path is missing, or the output is there or cannot be written.
+        DataError: nothing was recognised, a path is missing, or the output exists or cannot be written.
     """
     search = Search()
     things, home = search.look([_absolute(path) for path in paths])
@@ -115,7 +115,7 @@ def draft(
 
 
 def _nothing(home: Path, left_out: Sequence[LeftOut]) -> tuple[Path, str, str]:
-    """What to say where nothing can be used."""
+    """Write the parts of the error for a search without usable files."""
     known = f"known formats: {', '.join(FORMATS.names())}"
     if len(left_out) == 1:
         return left_out[0].path, left_out[0].reason, known
@@ -123,19 +123,19 @@ def _nothing(home: Path, left_out: Sequence[LeftOut]) -> tuple[Path, str, str]:
 
 
 def _absolute(path: Path) -> Path:
-    """The path without `..`; links are not followed, for a manifest states what the user sees."""
+    """Return the path without `..`; links are not followed, so the manifest states what the user sees."""
     return Path(os.path.abspath(path))  # noqa: PTH100 - resolve() follows links
 
 
 def _stated(path: Path, folder: Path) -> str:
-    """A path as a manifest in a folder states it, with slashes: relative if it lies there, else in full."""
+    """Write a path as in a manifest in a folder, with slashes: relative if it is below it, else absolute."""
     return (
         path.relative_to(_absolute(folder)) if path.is_relative_to(_absolute(folder)) else path
     ).as_posix()
 
 
 def _write(target: Path, text: str) -> str:
-    """Write the manifest, whole or not at all; what keeps it from being valid, if anything does."""
+    """Write the manifest completely or not at all; return the problem if it is not valid, else ''."""
     temporary = target.with_name(f"{target.name}.new")
     try:
         temporary.write_text(text, encoding="utf-8", newline="\n")
@@ -155,7 +155,7 @@ def _write(target: Path, text: str) -> str:
 
 
 def _read_all(things: Sequence[Thing], home: Path, progress: Progress) -> tuple[Findings, list[LeftOut]]:
-    """What is in them, as far as it helps to tell what belongs together, and what says nothing."""
+    """Read all things as far as the matching needs it; return also those that are of no use."""
     progress.start("Reading", len(things))
     found: list[Found] = []
     unread: list[LeftOut] = []
@@ -179,9 +179,9 @@ def _read_all(things: Sequence[Thing], home: Path, progress: Progress) -> tuple[
 
 
 def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Found], str]:
-    """A thing as every kind that it is, of several formats of a kind as the first that can read it.
+    """Read a thing as every kind that it can be; of several formats of a kind, the first that works is used.
 
-    Also what to say where it is none.
+    Return also the reason if it is of no kind.
     """
     found: dict[type[Found], Found] = {}
     problems: list[str] = []
@@ -201,7 +201,7 @@ def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Found
 
 
 def _described(head: Found, format_: Format, ambiguous: bool) -> Found | None:
-    """What is in a thing, by the kind of its format; None for kinds that no manifest states.
+    """Describe a thing by the kind of its format; None for kinds that manifests cannot name.
 
     Raises:
         DataError: it cannot be read.
@@ -243,14 +243,14 @@ def _span(t_ns: Int64) -> Span:
 
 
 def _drone_log(head: Found, format_: TelemetryFormat) -> DroneLog | None:
-    """What a drone's own log says of its poses, whether or not it says where the drone looked.
+    """Describe the poses in a drone's own log, with or without attitudes.
 
     Raises:
         DataError: it cannot be read, or holds no position.
     """
     try:
         telemetry = format_.read_telemetry(head.path, TelemetryChoice())
-    except DataError:  # where a height is all that is missing, one that is stated helps
+    except DataError:  # if only heights are missing, reading with a stated height works
         telemetry = format_.read_telemetry(head.path, TelemetryChoice(altitude=0.0))
     track = telemetry.position
     keys: tuple[Literal["dji"], Literal["ulog"], Literal["ardupilot"]] = ("dji", "ulog", "ardupilot")
@@ -282,7 +282,7 @@ def _drone_log(head: Found, format_: TelemetryFormat) -> DroneLog | None:
 
 
 def _recording(head: Found, format_: LogFormat) -> Recording:
-    """The topics of a log, with the frames that its poses and transforms speak of."""
+    """Describe the topics of a log, with the frames of its poses and transforms."""
     with format_.open_log([head.path]) as log:
         topics: dict[str, TopicFound] = {}
         for topic in log.topics:
@@ -306,7 +306,7 @@ def _recording(head: Found, format_: LogFormat) -> Recording:
 
 
 def _drivers(log: Log) -> Iterator[Driver]:
-    """The drones whose drivers' usual topics are in a log."""
+    """Yield the drones whose drivers' usual topics are in a log."""
     topics = {topic.name: topic for topic in log.topics if topic.count}
     every = namespaces(list(topics))
     for preset, namespace in every:
@@ -326,7 +326,7 @@ def _drivers(log: Log) -> Iterator[Driver]:
 
 
 def _pose_samples(log: Log, topic: str, messages: int, source: Path) -> Iterator[PoseSample]:
-    """What the first messages of a topic say; those that cannot be read say nothing here."""
+    """Yield the poses in the first messages of a topic; those that cannot be read are skipped."""
     for message in islice(log.messages([topic]), messages):
         try:
             yield from (sample for sample in samples(message, source) if isinstance(sample, PoseSample))

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PICTURES_HZ = 2.0
-"""How many pictures of a camera go into a recording each second, unless the user says otherwise."""
+"""Default number of pictures of a camera in a recording per second."""
 
 _RECORD = "export.json"
 _WORK = ".writing"
@@ -45,11 +45,11 @@ _SCHEMA = 1
 
 @dataclass(frozen=True)
 class Exported:
-    """Where everything went."""
+    """Result of an export."""
 
     folder: Path
     written: list[Path]
-    unchanged: list[Path]  # the same bytes were there already
+    unchanged: list[Path]  # files that existed already with the same bytes
 
 
 def export(
@@ -63,24 +63,23 @@ def export(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Exported:
-    """Write a session in other formats, and `export.json`: what each file is, and what was noted on the way.
+    """Write a session in other formats, and `export.json` with a description of each file and its notes.
 
-    Nothing appears under its own name before everything is written. Files of an earlier export that nobody
-    touched since are replaced; what a killed one left half written goes.
+    No file gets its final name before everything is written. Files of an earlier export that are unchanged
+    since are replaced. Half-written files of a killed export are removed.
 
     Args:
         folder: the session.
         formats: registered names.
-        output: where to; by default beside the session, `.export` in the place of `.session`.
-        unit: of lengths, for formats that have a choice; each format's usual one by default.
-        axes: z-up or y-up, likewise.
-        pictures_hz: how many pictures of each camera go into recordings that hold pictures, per second; 0
-            is none.
-        overwrite: replace files that are there and were not written by an export, or were changed since.
-        progress: who watches.
+        output: the output folder; by default beside the session, with `.export` instead of `.session`.
+        unit: of lengths, for formats that have a choice; by default that of each format.
+        axes: z-up or y-up, for formats that have a choice; by default those of each format.
+        pictures_hz: pictures of each camera per second, for recordings that hold pictures; 0 is none.
+        overwrite: replace existing files that no export wrote, or that were changed since.
+        progress: receives the progress.
 
     Raises:
-        DataError: no such format, none that has a choice of the unit or axes, nothing to export, tables or
+        DataError: no such format, a format without a choice of unit or axes, nothing to export, tables or
             pictures that were changed, or a file would be overwritten.
         BusyError: another process exports to the same folder.
     """
@@ -118,7 +117,7 @@ def export(
 
 @dataclass(frozen=True)
 class _Notes:
-    """Hands on what is said, and keeps the notes for those who read the files later."""
+    """Progress that passes everything on and keeps the notes for export.json."""
 
     whom: Progress
     said: list[str] = field(default_factory=list)
@@ -138,7 +137,7 @@ class _Notes:
 
 
 def _shape(format_: Export, unit: str | None, axes: str | None) -> tuple[str, str] | None:
-    """The unit and axes that a format is written in; None where it has no choice."""
+    """Choose the unit and axes of a format; None if it has no choice."""
     if not isinstance(format_, ChoiceOfAxes):
         return None
     for wanted, there, what in ((unit, format_.units, "unit"), (axes, format_.axes, "axes")):
@@ -164,7 +163,7 @@ def _refuse_idle_choice(
 
 
 def load_recording(folder: Path, *, pictures_hz: float = 0.0) -> Recording:
-    """The skeleton and the cameras of a session, its maps, and so many pictures per second.
+    """Load skeleton, cameras and maps of a session, with a given number of pictures per second.
 
     Raises:
         DataError: not a session, or damaged; a table of it was changed.
@@ -198,7 +197,7 @@ Stills = Callable[[str], Iterable[tuple[int, Picture]]]
 
 
 def _pictures(folder: Path, description: Description, record: StageRecord | None, rate_hz: float) -> Stills:
-    """The pictures of a camera that are still there, by world time."""
+    """Make the function that yields a camera's existing pictures with their world times."""
 
     def of(camera: str) -> Iterator[tuple[int, Picture]]:
         frames = read_table(folder / "cameras" / camera / "frames.parquet", FRAMES)
@@ -220,13 +219,13 @@ def _overlays(
     skeleton: pd.DataFrame | None,
     rate_hz: float,
 ) -> Stills:
-    """The same with the skeleton drawn over them."""
+    """Make the function that yields the same pictures with the skeleton drawn over them."""
     if record is None or skeleton is None or not rate_hz:
         return lambda _: ()
 
     @cache
     def drawn() -> tuple[Motion, dict[str, FilmedCamera]]:
-        """What is drawn, and the cameras; made for the first picture that is asked for."""
+        """Load the motion and the cameras when the first picture is requested."""
         frames = {
             name: read_table(folder / "cameras" / name / "frames.parquet", FRAMES)
             for name, entry in description.cameras.items()
@@ -254,7 +253,7 @@ def _overlays(
 def _stills(
     folder: Path, description: Description, camera: str, frame: Int64, rows: Int64
 ) -> Iterator[tuple[int, Picture]]:
-    """Row and picture, as far as they can be decoded; none of a camera whose pictures are gone."""
+    """Yield row and picture of those that can be decoded; none of a camera whose pictures are gone."""
     media = description.cameras[camera].media
     if media is None or not len(rows) or any(not (folder / path).exists() for path in media.paths):
         return
@@ -270,10 +269,10 @@ def _stills(
 
 @contextmanager
 def _work_in(target: Path) -> Iterator[Path]:
-    """A folder of the target for what is half written: empty at first, gone in the end.
+    """Make a working folder in the target, empty at first and removed at the end.
 
     Raises:
-        BusyError: another process has it.
+        BusyError: another process uses it.
     """
     work = target / _WORK
     work.mkdir(exist_ok=True)
@@ -288,7 +287,7 @@ def _work_in(target: Path) -> Iterator[Path]:
 
     try:
         with lock:
-            for killed in target.glob(f"{_WORK}-*"):  # as they were called before they had a lock
+            for killed in target.glob(f"{_WORK}-*"):  # their name in versions without a lock
                 remove_tree(killed)
             clear()
             try:
@@ -302,7 +301,7 @@ def _work_in(target: Path) -> Iterator[Path]:
 
 
 def _move(made: Mapping[Path, dict[str, Any]], target: Path, overwrite: bool) -> Exported:
-    """Move finished files to their place: all of them, or none where one may not be replaced."""
+    """Move finished files to the target: all of them, or none if one of the old files may not be replaced."""
     record = target / _RECORD
     ours = _earlier(record)
     unchanged: list[tuple[Path, Path]] = []
@@ -325,7 +324,7 @@ def _move(made: Mapping[Path, dict[str, Any]], target: Path, overwrite: bool) ->
 
 
 def _earlier(record: Path) -> dict[str, dict[str, Any]]:
-    """What earlier exports wrote into a folder, by name; a record that cannot be read vouches for nothing."""
+    """Read which files earlier exports wrote into a folder, by name; empty if the record cannot be read."""
     if not record.is_file():
         return {}
     try:

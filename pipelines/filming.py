@@ -1,8 +1,8 @@
-"""Stage `film`: the arms of a comparison filmed, and a real detector on the pictures.
+"""Stage `film`: rendered films of a comparison's arms, with a real detector on the pictures.
 
 Build the scenario's world and actor again; render what every camera of an arm would have seen; run the
-detector; reconstruct, and measure against the truth; draw the skeleton over the pictures. The pictures are
-simulated, the detector is the real one. `replan` is read and left as it is.
+detector; reconstruct, and measure errors against the truth; draw the skeleton over the pictures. The pictures
+are simulated, the detector is real. `replan` is only read.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ Bool = NDArray[np.bool_]
 
 FILM = Stage("film", revision=2)
 
-_SAME_M = 0.05  # between the scenario's hips and the session's truth, which is interpolated
+_SAME_M = 0.05  # tolerance between the scenario's hips and the session's truth, which is interpolated
 _HIPS = ("left_hip", "right_hip")
 _QUALITY = 20  # of the videos that are drawn on
 _INLET_HEIGHTS = 1.3  # of the person
@@ -63,22 +63,22 @@ _INLET_HEIGHTS = 1.3  # of the person
 
 @dataclass(frozen=True)
 class Shooting:
-    """What is filmed, and who looks at it."""
+    """Settings of filming: rate, span and detector."""
 
     rate_hz: float = 5.0
-    start_s: float | None = None  # since the replay's first moment; from there by default
-    end_s: float | None = None  # to the last by default
+    start_s: float | None = None  # since the replay's first moment, which is the default
+    end_s: float | None = None  # the default is the replay's last moment
     detector: str = "blazepose"
 
 
 @dataclass(frozen=True)
 class Filmed:
-    """What filming left behind."""
+    """Result of filming."""
 
     folder: Path
     record: StageRecord
     metrics: dict[str, Any]
-    skipped: bool  # nothing had changed
+    skipped: bool  # True if nothing had changed
 
 
 def film(
@@ -93,15 +93,15 @@ def film(
 
     Args:
         folder: the session; `replan` has run.
-        shooting: what decides the result.
-        scenario: of the simulated flight; looked for beside its pictures and the session by default.
-        force: do it again although nothing changed.
-        progress: who watches.
+        shooting: the settings that determine the result.
+        scenario: of the simulated flight; by default it is searched beside its pictures and the session.
+        force: run it again even if nothing changed.
+        progress: receives the progress.
 
     Raises:
         DataError: nothing was compared yet, a table of the session was changed, the flight was not simulated,
-            its scenario is not there or another flight's, the span holds no two pictures, or the detector's
-            files are missing.
+            its scenario is missing or another flight's, the span holds fewer than two pictures, or the
+            detector's files are missing.
         BusyError: another process writes the session.
     """
     shooting = shooting or Shooting()
@@ -116,7 +116,7 @@ def film(
             raise DataError(folder, "was really flown: only simulated flights can be filmed again")
         path = scenario or _scenario_of(folder, description)
         detector = find_detector(shooting.detector)
-        detector.load(threads=1)  # says at once what is missing
+        detector.load(threads=1)  # raises an error at once if a file is missing
         plan = read_scenario(path)
         inputs = {"replan": compared.key, "scenario": hash_of(plan.identity())}
         if hashes := {name: sha256_of(file) for name, (file, _) in plan.motion_files(path.parent).items()}:
@@ -184,18 +184,18 @@ def film(
 
 @dataclass(frozen=True)
 class _Arm:
-    """The cameras N of an arm at the moments T of its pictures, and whom they film."""
+    """The N cameras of an arm at the T moments of its pictures, and the person that they film."""
 
     names: tuple[str, ...]
     of: Walk
     others: list[tuple[Person, BodyMotion]]  # who is in the pictures, too
     seen_by: Formation
-    actor: Float | None  # [T, 3] m, where the log has the actor
+    actor: Float | None  # [T, 3] m, positions of the logged actor
     noise: tuple[NoiseModel, ...]
 
 
 def _scenario_of(folder: Path, description: Description) -> Path:
-    """The scenario that `mocap simulate` left beside the flight."""
+    """Find the scenario that `mocap simulate` left beside the flight."""
     beside = [folder.parent, folder.with_suffix("")]
     for entry in description.cameras.values():
         if entry.media is not None:
@@ -265,7 +265,7 @@ def _arm(
 
 
 def _rows(t_ns: Int64, shooting: Shooting) -> Int64:
-    """The moments [T] nearest to even ones at the wanted rate, each once."""
+    """Find the rows of the moments [T] nearest to evenly spaced ones at the wanted rate, each once."""
     since_s = (t_ns - t_ns[0]) / 1e9
     first = shooting.start_s or 0.0
     behind = since_s[-1] + 1e-9 if shooting.end_s is None else shooting.end_s
@@ -281,7 +281,7 @@ def _rows(t_ns: Int64, shooting: Shooting) -> Int64:
 def _shoot(
     arm: _Arm, camera: int, renderer: Renderer, detector: Detector, progress: Progress, folder: Path
 ) -> None:
-    """Write one camera's pictures, and what the detector finds in them: xy [T, J, 2], confidence [T, J]."""
+    """Write one camera's pictures and the detector's keypoints: xy [T, J, 2], confidence [T, J]."""
     of, lens = arm.of, arm.seen_by.lens
     follower = FollowedAlone(detector.load(threads=1), of.person.joints)
     found: list[tuple[Float, Float]] = []
@@ -325,7 +325,7 @@ def _read_sightings(parts: Sequence[Path]) -> Sightings:
 
 
 def _triangulated(arm: _Arm, sightings: Sightings, seed: int) -> tuple[Views, Float]:
-    """What triangulation is given, and its points [T, J, 3]; poses err as the comparison's do, once."""
+    """Triangulate one draw of the comparison's pose noise; return the views and the points [T, J, 3]."""
     views = views_of(arm.of, arm.seen_by, sightings, arm.noise, seed=seed, trial=0)
     told = replace(views, pixel_sigma=estimate_noise(views))
     found = triangulate_pictures(told, picture=views.pose_index, pixel_sigma=views.pixel_sigma)
@@ -352,7 +352,7 @@ def _measured(
 
 
 def _write_arm(folder: Path, arm: _Arm, sightings: Sightings, points: Float, parts: Sequence[Path]) -> None:
-    """Write what was reconstructed of an arm, and each camera's pictures with it drawn on them."""
+    """Write the skeleton of an arm, and each camera's pictures with it drawn over them."""
     folder.mkdir()
     motion = JointMotion(arm.of.t_ns, arm.of.person.joints, points[:, None])
     write_table(folder / "skeleton.parquet", motion_table(motion), TRUTH)

@@ -1,8 +1,8 @@
-"""Stage `ingest`: everything that `flight.yaml` names, read once, checked, and stored as one session.
+"""Stage `ingest`: read everything that `flight.yaml` names once, check it, and store it as one session.
 
-Frames get their world times here, poses their world axes, intrinsics the size of the pictures. What is
-doubtful is counted and said; what cannot be used is refused with the file at fault. Each camera is a
-chunk of its own: an interrupted ingest continues with the cameras that it had not finished.
+Frames get their world times here, poses their world axes, intrinsics the size of the pictures. Doubtful data
+are counted and reported. Unusable data are refused, with the file at fault. Each camera is a chunk of its
+own: an interrupted ingest continues with the cameras that it had not finished.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ INGEST = Stage("ingest", revision=5)
 
 @dataclass(frozen=True)
 class Ingested:
-    """What an ingest left behind."""
+    """Result of an ingest."""
 
     folder: Path
     record: StageRecord
     description: Description
-    skipped: bool  # nothing had changed
+    skipped: bool  # True if nothing had changed
 
 
 def ingest(
@@ -60,16 +60,16 @@ def ingest(
 
     Args:
         flight_path: the manifest.
-        session: where to; by default `<name of the manifest>.session` beside it.
+        session: the output folder; by default `<name of the manifest>.session` beside it.
         max_pose_gap_s: frames between two logged poses further apart than this have no pose.
         max_extrapolation_s: frames further than this before or after all logged poses have none.
-        strict: refuse a flight of which anything could not be read or used.
-        overwrite: take a target that holds something else.
-        force: read everything again although nothing changed.
-        progress: who watches.
+        strict: refuse a flight if any part of it could not be read or used.
+        overwrite: write also to a target that holds something else.
+        force: read everything again even if nothing changed.
+        progress: receives the progress.
 
     Raises:
-        DataError: something cannot be used, or was written to meanwhile; the session stays as it was.
+        DataError: something cannot be used, or was changed while it was read; the session stays as it was.
         BusyError: another process writes the session.
     """
     progress = progress or Silent()
@@ -81,7 +81,7 @@ def ingest(
     interpolation = Interpolation(max_gap_s=max_pose_gap_s, max_extrapolation_s=max_extrapolation_s)
     settings = {
         "flight": flight.model_dump(mode="json"),
-        "cameras": list(flight.cameras),  # their order decides between equals
+        "cameras": list(flight.cameras),  # their order breaks ties
         "pose_interpolation": interpolation.model_dump(),
         "flight_from_session": Path(os.path.relpath(flight_path.parent, target)).as_posix(),  # for media
     }
@@ -89,7 +89,7 @@ def ingest(
     with FlightReader(flight, flight_path, target, interpolation) as reader:
         stamps = source_stamps(flight, flight_path.parent)
         check_sources = partial(refuse_written, flight, flight_path.parent, stamps)
-        # Where nothing can be skipped, what is hashed is read at the same time.
+        # If nothing can be skipped, sources are read while they are hashed.
         meanwhile = reader.read_ahead() if force or _is_new(target) else iter(())
         sources, damage = hash_sources(flight, flight_path.parent, progress, meanwhile)
         with locked(target, create=True, overwrite=overwrite) as writable:
@@ -144,7 +144,7 @@ def _store_cameras(
     check_sources: Callable[[], None],
     progress: Progress,
 ) -> tuple[dict[str, CameraEntry], list[str]]:
-    """Read the cameras that an interrupted ingest has not read; what the session says of each, and doubts."""
+    """Read the cameras that no interrupted ingest has read; return their entries, and warnings."""
     entries: dict[str, CameraEntry] = {}
     warnings: list[str] = []
     for name in names:
@@ -158,13 +158,13 @@ def _store_cameras(
 
 
 def _store_camera(reader: FlightReader, name: str, check_sources: Callable[[], None], folder: Path) -> None:
-    """Store one camera; nothing is kept of sources that were written to meanwhile."""
+    """Store one camera; raise an error if its sources were changed meanwhile."""
     reader.store_camera(name, folder)
     check_sources()
 
 
 def _refuse_losses(flight_path: Path, description: Description) -> None:
-    """Refuse, in one line, a flight of which something was dropped: all of it, by part and cause."""
+    """Refuse a flight of which anything was dropped, in one line with all losses by part and cause."""
     parts = {
         f"{name}: {what}": dropped
         for name, camera in description.cameras.items()
@@ -191,7 +191,7 @@ def _refuse_losses(flight_path: Path, description: Description) -> None:
 
 
 def _refuse_unread_parts(flight: Flight, path: Path) -> None:
-    """Refuse, in one line, what is valid in a manifest but has no reader in this version."""
+    """Refuse, in one line, parts that are valid in a manifest but have no reader in this version."""
     if flight.actors:
         raise NotYetReadError(
             path,
@@ -218,7 +218,7 @@ def _refuse_other_flight(target: Path, flight: Flight, overwrite: bool) -> None:
     try:
         held = read_json(existing).get("flight", flight.name)
     except DataError:
-        return  # a damaged session is simply written anew
+        return  # a damaged session is written again
     if held != flight.name:
         raise DataError(
             target,
@@ -228,7 +228,7 @@ def _refuse_other_flight(target: Path, flight: Flight, overwrite: bool) -> None:
 
 
 def _is_new(target: Path) -> bool:
-    """Whether no ingest was finished or interrupted here."""
+    """Return True if no ingest was finished or interrupted here."""
     return not any((target / entry).exists() for entry in (INGEST.name, ".partial"))
 
 
@@ -242,7 +242,7 @@ def _counts(entries: Mapping[str, CameraEntry]) -> dict[str, object]:
 
 
 def _check_overlap(flight_path: Path, entries: Mapping[str, CameraEntry]) -> None:
-    """Refuse cameras whose frames share no moment with the others', not even by way of a third camera."""
+    """Refuse cameras whose frames overlap in time with no others, not even through a third camera."""
     ordered = sorted(entries, key=lambda name: entries[name].frames.first_t_ns)
     reached_ns = entries[ordered[0]].frames.last_t_ns
     for place, name in enumerate(ordered):

@@ -1,8 +1,8 @@
-"""Stage `overlay`: the skeleton over every picture of a camera, as a video for the eye to check.
+"""Stage `overlay`: videos of the skeleton over every picture of a camera, for a visual check.
 
-Read the skeleton, the cameras' poses and the keypoints of a session; draw them into picture after picture,
-block by block; join the blocks to one video for each camera, with the stamps of its pictures. Nothing is
-made of the videos, and they go with the skeleton that they show.
+Read the skeleton, the cameras' poses and the keypoints of a session; draw them into every picture, block by
+block; join the blocks to one video for each camera, with the stamps of its pictures. No other stage reads
+the videos. They are removed when the skeleton that they show is replaced.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from pipelines.session.tabular import rows_between
 
 OVERLAY = Stage("overlay", revision=5)
 
-_BLOCK = 300  # pictures that are drawn and encoded together, and kept when the work is interrupted
+_BLOCK = 300  # pictures that are drawn and encoded together, and kept after an interrupt
 _TICK_NS = int(TICK_S * 10**9) + 1
 
 
@@ -51,25 +51,25 @@ def write_overlays(
 ) -> list[Path]:
     """Write overlay/<camera>.mp4 of a reconstructed session.
 
-    Pictures that cannot be decoded are grey and say so. Without `cameras`, those whose pictures are not
-    there any more are left out, which is said.
+    Pictures that cannot be decoded are grey, with a text. Without `cameras`, cameras whose pictures do not
+    exist any more are left out, with a note.
 
     Args:
         folder: the session.
-        cameras: which ones; all that have pictures by default.
-        start_s: pictures from then on only, in seconds since the first frame of the flight's cameras.
-        end_s: and those before then.
-        workers: blocks of pictures drawn at once; what they show does not depend on them.
-        force: do it again although nothing changed, and replace what is no overlay.
-        progress: who watches.
+        cameras: names of cameras; by default all that have pictures.
+        start_s: use only pictures at or after this time, in seconds since the flight's first frame.
+        end_s: use only pictures before this time.
+        workers: the number of blocks in parallel; the pictures do not depend on it.
+        force: run it again even if nothing changed, and replace a folder that is no overlay.
+        progress: receives the progress.
 
     Returns:
         The videos, in the order of the session's cameras.
 
     Raises:
-        DataError: the session holds no skeleton or no pictures, or tables that were changed; a camera that
-            was named has none, or its pictures are gone, damaged or not those that were ingested; or the
-            place is taken.
+        DataError: the session holds no skeleton or no pictures, or tables that were changed; a named camera
+            has no pictures, or they are gone, damaged or not those that were ingested; or something else
+            has the name of the folder.
         BusyError: another process writes the session.
     """
     progress = progress or Silent()
@@ -85,7 +85,7 @@ def write_overlays(
         refuse_changed_pictures(folder, description, wanted)
         begin = partial(_begin, session, description, record, (start_s, end_s), force)
         run = begin(wanted)
-        if not run.finished:  # else pictures that are gone by now are not missed
+        if not run.finished:  # else pictures that are gone by now are not needed
             wanted = _still_there(folder, description, wanted, progress, all_of_them=cameras is not None)
             run = begin(wanted)
         if run.finished:
@@ -96,10 +96,10 @@ def write_overlays(
 
 
 def refuse_overlays(folder: Path, *, force: bool = False) -> None:
-    """Say before hours of work that `write_overlays` would find no picture to draw on, or no place.
+    """Refuse, before hours of work, a session for which `write_overlays` would fail.
 
     Raises:
-        DataError: as `write_overlays` does, but for the skeleton.
+        DataError: as in `write_overlays`, except for the skeleton.
     """
     session = open_session(folder)
     description = read_description(folder)
@@ -118,7 +118,7 @@ def _begin(
     force: bool,
     cameras: Sequence[str],
 ) -> Run:
-    """Begin the stage; the reconstruction's key stands for all tables that it was made of."""
+    """Begin the stage; the reconstruction's key covers all tables that it was made of."""
     start_s, end_s = span_s
     settings = {"cameras": list(cameras), "start_s": start_s, "end_s": end_s}
     inputs = {"reconstruct": record.key}
@@ -144,7 +144,7 @@ def _refuse_foreign(folder: Path, force: bool) -> None:
 
 
 def _with_pictures(folder: Path, description: Description, cameras: Sequence[str] | None) -> list[str]:
-    """The cameras to draw on, in the session's order."""
+    """List the cameras to draw on, in the session's order."""
     filmed = [name for name, entry in description.cameras.items() if entry.media is not None]
     for name in cameras or ():
         if name not in description.cameras:
@@ -163,7 +163,7 @@ def _with_pictures(folder: Path, description: Description, cameras: Sequence[str
 def _still_there(
     folder: Path, description: Description, cameras: Sequence[str], progress: Progress, *, all_of_them: bool
 ) -> list[str]:
-    """Those whose pictures lie where they lay when they were ingested."""
+    """List the cameras whose pictures are still where they were at ingest."""
     there, gone = [], []
     for name in cameras:
         missing = [path for path in _media(description, name).paths if not (folder / path).exists()]
@@ -200,7 +200,7 @@ class _Film:
 
     @property
     def blocks(self) -> list[range]:
-        """Which of the N are drawn together."""
+        """The ranges of the N pictures that are drawn together."""
         count = len(self.rows)
         return [range(first, min(first + _BLOCK, count)) for first in range(0, count, _BLOCK)]
 
@@ -230,7 +230,7 @@ def _films(
 
 
 def _apart(pts_ns: Int64) -> Int64:
-    """The stamps, where two would share a tick of the video, later by as much as it takes."""
+    """Move stamps later where two would share a tick of the video, by as little as possible."""
     least = np.arange(len(pts_ns)) * _TICK_NS
     spread: Int64 = np.maximum.accumulate(pts_ns - least) + least
     return spread
@@ -239,7 +239,7 @@ def _apart(pts_ns: Int64) -> Int64:
 def _picture_size(
     folder: Path, description: Description, camera: FilmedCamera, rows: range
 ) -> tuple[int, int]:
-    """Width and height of the first picture that can be decoded, else those of the calibration."""
+    """Read width and height of the first picture that can be decoded, else those of the calibration."""
     with open_pictures(folder, description, camera.name) as pictures:
         for frame in camera.frame[rows.start : rows.stop].tolist():
             picture = pictures.read(frame)
@@ -253,7 +253,7 @@ def _picture_size(
 
 @dataclass(frozen=True)
 class _Show:
-    """What is the same in all videos."""
+    """Data that all videos share."""
 
     description: Description
     motion: Motion
@@ -268,7 +268,7 @@ def _show(folder: Path, description: Description, record: StageRecord) -> _Show:
 def _draw(
     folder: Path, films: Sequence[_Film], show: _Show, run: Run, workers: int, progress: Progress
 ) -> dict[str, dict[str, int]]:
-    """Draw all blocks and join them to a video for each camera; how many pictures were what."""
+    """Draw all blocks and join them to a video for each camera; return the counts of pictures."""
     halt = Halt()
     progress.start("Drawing overlays", sum(len(film.rows) for film in films))
 
@@ -337,7 +337,7 @@ def _draw_block(
 
 
 def _of_size(picture: Picture, width: int, height: int) -> Picture:
-    """A log's pictures may change their size under way, a video's may not."""
+    """Resize a picture: those of a log may change their size, those of a video may not."""
     import cv2
 
     if picture.shape[:2] == (height, width):

@@ -1,8 +1,8 @@
-"""Stage `reconstruct`: from keypoints in moving cameras to a skeleton, its status and its errors.
+"""Stage `reconstruct`: compute a skeleton, its status and its errors from keypoints in moving cameras.
 
-Load the session's tables; find out who is who; bring every camera to common times; triangulate all
-joints at once; measure; store. Nothing is filled or smoothed unless it is asked for: a joint that could not
-be measured is NaN with a status that says why.
+Load the session's tables; associate people; interpolate every camera to common times; triangulate all
+joints at once; measure errors; store. Nothing is filled or smoothed without an option for it: a joint that
+could not be measured is NaN with a status that gives the reason.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ _LONGEST_FILL_S = 10.0
 
 @dataclass(frozen=True)
 class Settings:
-    """What decides the result, next to the session itself."""
+    """Settings that determine the result, in addition to the session itself."""
 
     method: Method | Literal["refined"] = "robust"
     rate_hz: float | None = None
@@ -91,24 +91,24 @@ class Settings:
     pose_noise: str | None = None
     detector: str = "blazepose"  # for cameras with pictures and without keypoints
     every: int = 1  # of their pictures
-    start_s: float | None = None  # since the flight's first picture: what the detector looks at
+    start_s: float | None = None  # since the flight's first picture: span of pictures for the detector
     end_s: float | None = None
-    fill_s: float | None = None  # the longest gap that is closed
+    fill_s: float | None = None  # the longest gap that is filled
     smooth: str | None = None  # as `smoothing.smoother` reads it
-    refine_cameras: Literal["background"] | None = None  # by what, before the skeleton
-    disturb_poses: str | None = None  # errors added to the logged poses, as `--pose-noise` states them
-    trials: int = 1  # draws of these
-    seed: int = 0  # where they come from
+    refine_cameras: Literal["background"] | None = None  # method to refine poses before triangulation
+    disturb_poses: str | None = None  # errors added to the logged poses, in the form of `--pose-noise`
+    trials: int = 1  # draws of these errors
+    seed: int = 0  # of these draws
 
 
 @dataclass(frozen=True)
 class Reconstructed:
-    """What a reconstruction left behind."""
+    """Result of a reconstruction."""
 
     folder: Path
     record: StageRecord
     metrics: dict[str, Any]
-    skipped: bool  # nothing had changed
+    skipped: bool  # True if nothing had changed
 
 
 def reconstruct(
@@ -123,14 +123,14 @@ def reconstruct(
 
     Args:
         folder: the session.
-        settings: what decides the result.
-        workers: threads; the result does not depend on them.
-        force: do it again although nothing changed, the detection as well.
-        progress: who watches.
+        settings: the settings that determine the result.
+        workers: the number of threads; the result does not depend on it.
+        force: run it again even if nothing changed, and the detection too.
+        progress: receives the progress.
 
     Raises:
         DataError: the session cannot be used, one of its tables or the pictures were changed, or nothing
-            could be reconstructed; the message says which gate stopped it.
+            could be reconstructed; the message gives the counts of the reasons.
         BusyError: another process writes the session.
     """
     settings = settings or Settings()
@@ -212,7 +212,7 @@ def reconstruct(
 def _detected(
     session: WritableSession, settings: Settings, workers: int, force: bool, progress: Progress
 ) -> StageRecord | None:
-    """The stage before this one; None where every camera came with keypoints."""
+    """Run the stage `detect`; return None if every camera has imported keypoints."""
     detected = detect(
         session,
         detector=settings.detector,
@@ -235,7 +235,7 @@ def _detected(
 
 
 def _stated(settings: Settings, detected: StageRecord | None) -> dict[str, object]:
-    """The settings; a model of the user's is known by what it found, not by where it lies."""
+    """Return the settings; the detector's name is that of the detection, without the paths of model files."""
     return asdict(settings) | {"detector": detected.settings["detector"] if detected else None}
 
 
@@ -283,7 +283,7 @@ def _write(folder: Path, attempt: _Attempt, metrics: Mapping[str, object]) -> No
 
 
 def _counts(metrics: Mapping[str, Any], attempt: _Attempt, swaps: Mapping[str, object]) -> dict[str, object]:
-    """What was found, undone, filled and smoothed; how people were told apart, one number for each."""
+    """Count joints by status, undone swaps, filled and smoothed joints, and events of the association."""
     told_apart = ("views", "ambiguous", "switches", "refused", "resumed")
     return {
         **metrics["status_counts"],
@@ -295,7 +295,7 @@ def _counts(metrics: Mapping[str, Any], attempt: _Attempt, swaps: Mapping[str, o
 
 
 def _tell_replaced(run: Run, progress: Progress) -> None:
-    """Say what an earlier reconstruction was made with, and what showed it."""
+    """Report the changed settings of a replaced reconstruction, and the stages removed with it."""
     for name, (before, now) in run.replaces.items():
         progress.note(f"replaced the reconstruction made with {name} = {before} (now {now})")
     for name in run.outdated:
@@ -307,7 +307,7 @@ def _tell_replaced(run: Run, progress: Progress) -> None:
 
 @dataclass(frozen=True)
 class _Flight:
-    """What is the same for every trial."""
+    """Data that all trials share."""
 
     description: Description
     followed: Mapping[str, Followed | str]  # the backgrounds of the cameras that are refined by them
@@ -317,15 +317,15 @@ class _Flight:
 
 @dataclass(frozen=True)
 class _Attempt:
-    """One reconstruction of the flight, from its cameras to its figures."""
+    """Result of one reconstruction of the flight (one trial)."""
 
     observations: Observations
     views: Views
     result: Triangulation
     association: Association
-    between_views: dict[str, int]  # left and right, see `swaps_across_views`
+    between_views: dict[str, int]  # counts of left-right swaps, see `swaps_across_views`
     metrics: dict[str, Any]
-    poses: pd.DataFrame | None  # of every picture, where they are not the log's
+    poses: pd.DataFrame | None  # of every picture, if they are not those of the log
     warnings: list[str]
 
 
@@ -353,7 +353,7 @@ def _attempt(
         refined = _refine(cameras, seen, views, result, description, settings, workers)
         observations, views = refined.observations, refined.views
         result = refused_people(refined.result, observations, seen.anybody)
-        if refined.cameras is None:  # not believed: `robust` instead, with the loss that it has of its own
+        if refined.cameras is None:  # refinement rejected: fall back to `robust`, with its own loss
             solve = solver_for(
                 "robust", cameras, observations, pixel_sigma=settings.pixel_sigma, threads=workers
             )
@@ -391,18 +391,18 @@ def _attempt(
 
 @dataclass(frozen=True)
 class _Seen:
-    """All that was seen, and what of it is each person's."""
+    """All detections, and their association with people."""
 
     found: Candidates
     association: Association
     observations: Observations  # at the skeleton's times, on these sides
     sides: Int64  # [T, P, J, C], see `on_sides`
-    between_views: dict[str, int]  # left and right, see `swaps_across_views`
-    anybody: NDArray[np.bool_]  # [T] whether anybody was seen
+    between_views: dict[str, int]  # counts of left-right swaps, see `swaps_across_views`
+    anybody: NDArray[np.bool_]  # [T] True if any person was detected
 
 
 def _observe(flight: _Flight, cameras: list[Camera], settings: Settings) -> _Seen:
-    """Tell people apart, bring what was seen of each to common times, and left from right."""
+    """Associate people, interpolate their keypoints to common times, and correct left-right swaps."""
     between, pixel_sigma = flight.description.pose_interpolation, settings.pixel_sigma
     found = candidates(cameras, between)
     association = associate(
@@ -427,7 +427,7 @@ def _observe(flight: _Flight, cameras: list[Camera], settings: Settings) -> _See
 
 
 def _with_background(description: Description) -> list[str]:
-    """The moving cameras with pictures."""
+    """List the moving cameras with pictures."""
     return [
         name
         for name, entry in description.cameras.items()
@@ -436,7 +436,7 @@ def _with_background(description: Description) -> list[str]:
 
 
 def _people_seen(cameras: Sequence[Camera], association: Association) -> dict[str, Any]:
-    """Count the people whom the cameras saw against those that were asked for, and what was not used."""
+    """Count people seen at once, times with more people than requested, and unused detections."""
     asked = association.choice.shape[2]
     return {
         "asked": asked,
@@ -450,7 +450,7 @@ def _people_seen(cameras: Sequence[Camera], association: Association) -> dict[st
 
 
 def _said_people(people: Mapping[str, Any]) -> list[str]:
-    """Say how many detections were not used, and how many people cameras saw beyond those asked for."""
+    """Write a warning on unused detections, and on more people than requested."""
     unused = [f"{name} {count}" for name, count in people["detections_not_used"].items() if count]
     if not unused:
         return []
@@ -467,7 +467,7 @@ def _said_people(people: Mapping[str, Any]) -> list[str]:
 def _follow_backgrounds(
     folder: Path, description: Description, cameras: list[Camera], progress: Progress
 ) -> dict[str, Followed | str]:
-    """The background of every moving camera with pictures; of the others why it is not there."""
+    """Track the background of every moving camera with pictures; for the others, return the reason."""
     followed: dict[str, Followed | str] = {}
     for camera in cameras:
         if camera.static:
@@ -525,7 +525,7 @@ def _poses_stored(
     background: Mapping[str, Any] | None,
     between: Interpolation,
 ) -> pd.DataFrame | None:
-    """The pose of every picture that has one, of the cameras where anything but the log decided."""
+    """Make a table of the poses of all pictures, for the cameras whose poses are not those of the log."""
     if refined is not None and refined.cameras is not None:
         return refined.cameras
     corrected = [camera for camera in cameras if background is not None and background[camera.name]["used"]]
@@ -533,7 +533,7 @@ def _poses_stored(
 
 
 def _without_swaps(cameras: list[Camera]) -> tuple[list[Camera], dict[str, dict[str, int]]]:
-    """Left and right given back to the side they belong to, by how they move in each camera."""
+    """Undo left-right swaps over time, from the motion of joints in each camera; return also counts."""
     mended, counts = [], {}
     for camera in cameras:
         detections, counts[camera.name] = undo_swaps_of_tracks(camera.detections, camera.frame_t_ns)
@@ -542,7 +542,7 @@ def _without_swaps(cameras: list[Camera]) -> tuple[list[Camera], dict[str, dict[
 
 
 def _agreeing_sides(observations: Observations, sigma: Float) -> tuple[Int64, dict[str, int]]:
-    """Left and right as most cameras see them [T, P, J, C]; see `swaps_across_views`."""
+    """Find the sides [T, P, J, C] on which most cameras agree; see `swaps_across_views`."""
     sides = np.empty(observations.confidence.shape, dtype=np.int64)
     total: Counter[str] = Counter()
     for person in range(observations.xy.shape[1]):
@@ -585,7 +585,7 @@ def _refine(
 
 
 def _refuse_nothing(folder: Path, attempt: _Attempt) -> None:
-    """Where not a single joint came out, say which gate stopped them."""
+    """Refuse a result without any joint; the message gives the counts by status."""
     status = attempt.result.status
     if (status == STATUS.index("ok")).any():
         return
@@ -601,7 +601,7 @@ def _refuse_nothing(folder: Path, attempt: _Attempt) -> None:
 
 
 def _unused(cameras: list[Camera], result: Triangulation) -> list[str]:
-    """The cameras that contributed nothing: in the wrong place, at the wrong time, or of somebody else."""
+    """Write a warning for cameras without inliers: wrong place, wrong time, or another person."""
     used = np.atleast_1d(result.inlier.any(axis=0))
     return [
         f"{camera.name}: none of its views was used"

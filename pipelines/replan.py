@@ -1,7 +1,7 @@
-"""Stage `replan`: the formation planners flown again, offline, against the logged actor and the maps.
+"""Stage `replan`: fly the formation planners again, offline, with the logged actor and the maps.
 
-Load what was flown; fly every arm and film the actor's own skeleton from its cameras; score all alike and
-compare; store. What was simulated says so in metrics.json; how long planning took stands in run.json.
+Load the flown trajectories; fly every arm and film the actor's own skeleton from its cameras; score all arms
+in the same way and compare; store. metrics.json marks what was simulated; run.json has the planning times.
 """
 
 from __future__ import annotations
@@ -52,19 +52,19 @@ if TYPE_CHECKING:
 
 REPLAN_STAGE = Stage("replan", revision=3)
 
-_HEIGHT_M = 1.75  # of the person, for how large a detector sees them
+_HEIGHT_M = 1.75  # of the person, for their size in the modelled detector's pictures
 _SKELETON = "reconstruct/skeleton.parquet"
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What decides the result, next to the session itself; None is what the session says."""
+    """Settings that determine the result, in addition to the session; None takes the session's value."""
 
     arms: tuple[str, ...] | None = (
-        None  # adaptive, fixed, flown where cameras moved, planned where that is logged
+        None  # adaptive and fixed, flown if cameras moved, planned if commands are logged
     )
-    drones: int | None = None  # as many as there are cameras, 2 to 8
-    yaw_deg: float | None = None  # where the first camera was
+    drones: int | None = None  # the number of cameras, 2 to 8
+    yaw_deg: float | None = None  # that of the first camera
     mode: Mode = "closed-loop"
     trials: int = 20
     seed: int = 0
@@ -74,23 +74,23 @@ class Settings:
 
 @dataclass(frozen=True)
 class Replanned:
-    """What a comparison left behind."""
+    """Result of a comparison."""
 
     folder: Path
     record: StageRecord
     metrics: dict[str, Any]
-    skipped: bool  # nothing had changed
+    skipped: bool  # True if nothing had changed
 
 
 def planner_settings(
     path: Path | None, changes: Mapping[str, object], *, horizon_s: float | None = None
 ) -> PlannerConfig:
-    """Planner settings of a YAML file (docs/planner.md), if there is one, with some of them changed.
+    """Read planner settings of a YAML file (docs/planner.md), if there is one, and change some of them.
 
     Args:
         path: the file.
-        changes: settings that win over it.
-        horizon_s: how far the search looks ahead, rounded up to whole knots.
+        changes: settings that override the file.
+        horizon_s: the time that the search looks ahead, rounded up to whole knots.
 
     Raises:
         DataError: the file cannot be read, or a setting is unknown or out of range.
@@ -115,12 +115,12 @@ def replan(
 
     Args:
         folder: the session.
-        settings: what decides the result.
-        force: do it again although nothing changed.
-        progress: who watches.
+        settings: the settings that determine the result.
+        force: run it again even if nothing changed.
+        progress: receives the progress.
 
     Raises:
-        DataError: the session cannot be used (nobody knows where the actor was, or a table was changed), or a
+        DataError: the session cannot be used (it has no positions of the actor, or a table was changed), or a
             setting is wrong.
         BusyError: another process writes the session.
     """
@@ -174,9 +174,9 @@ def replan(
 
 
 def _inputs(session: WritableSession) -> tuple[Description, StageRecord | None, dict[str, str]]:
-    """What is read: all that was ingested, and the reconstruction where truth or actor are not known.
+    """Load the inputs: all that was ingested, and the reconstruction if there is no truth or no actor.
 
-    Where the errors of the session's own detector were measured, its arms see with those.
+    If the errors of the session's own detector were measured, the arms are scored with those.
     """
     ingested = session.intact_record("ingest")
     if ingested is None:
@@ -194,14 +194,14 @@ def _inputs(session: WritableSession) -> tuple[Description, StageRecord | None, 
 
 
 def _detector_errors(session: WritableSession) -> DetectorErrors:
-    """The errors of the detector that ran on the session's pictures, if measured; else the usual ones."""
+    """Choose the errors of the detector that ran on the session's pictures, if measured; else the default."""
     detected = session.record("detect")
     name = None if detected is None else detected.settings["detector"]
     return DetectorErrors(detector=name) if name in MODELLED else DetectorErrors()
 
 
 def _flat(settings: Settings) -> dict[str, object]:
-    """Settings by name, the planner's one by one: what replaces what can be said of each."""
+    """Flatten the settings to names and values, so that a change of each planner setting can be reported."""
     stated = asdict(settings)
     planner = stated.pop("planner")
     return stated | {f"planner.{name}": value for name, value in planner.items()}
@@ -258,7 +258,7 @@ def _detect(
     joints: tuple[str, ...],
     errors: DetectorErrors,
 ) -> tuple[Float, Float]:
-    """The modelled detector, by tilt and distance (`measuring.Detect`)."""
+    """Simulate the detector by a model with tilt and distance (`measuring.Detect`)."""
     tilt_deg, height_px = view_of(camera, target, height_m=_HEIGHT_M, focal_px=focal_px)
     return detect_keypoints(pixels, free, tilt_deg, height_px, errors, rng, joints=joints)
 
@@ -267,7 +267,7 @@ def _detect(
 
 
 def _fly(scene: Scene, errors: DetectorErrors, arm: str, folder: Path) -> None:
-    """Fly and film one arm; all that the comparison needs of it goes into the folder."""
+    """Fly and film one arm; write everything that the comparison needs to the folder."""
     flown = logged_arm(scene, arm) if arm in LOGGED else fly_arm(scene, PLANNER_ARMS.get(arm))
     joints = scene.flight.skeleton.joints if scene.flight.skeleton else ()
     measured = film_arm(scene, flown, partial(_detect, joints=joints, errors=errors))
@@ -302,7 +302,7 @@ def _read_entrant(folder: Path) -> Entrant:
 
 
 def _percentiles(planning_s: Mapping[str, Any]) -> dict[str, object]:
-    """Milliseconds that calls of each planner took."""
+    """Compute mean, median and 95th percentile of each planner's time per call, ms."""
     found: dict[str, object] = {}
     for name, seconds in planning_s.items():
         if len(seconds):
@@ -313,7 +313,7 @@ def _percentiles(planning_s: Mapping[str, Any]) -> dict[str, object]:
 
 
 def _note_planning_times(folder: Path, times: Mapping[str, object]) -> None:
-    """Beside the stage's own time: measured durations live in run.json alone."""
+    """Add planning times to the last run of run.json; measured durations are only there."""
     path = folder / "run.json"
     runs = read_json(path)
     runs["runs"][-1]["planning"] = dict(times)
@@ -321,7 +321,7 @@ def _note_planning_times(folder: Path, times: Mapping[str, object]) -> None:
 
 
 def _actor_table(scene: Scene) -> pd.DataFrame:
-    """The actor that arms were scored against, as rows of `tables.ACTOR`."""
+    """Make rows of `tables.ACTOR` from the actor that was used to score the arms."""
     import pandas as pd
 
     table = pd.DataFrame({"t_ns": scene.t_ns, "person": 0})

@@ -1,4 +1,4 @@
-"""Stage `report`: one self-contained page about a session, and one that sets sessions side by side."""
+"""Stage `report`: one self-contained page about a session, and one that compares several sessions."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ _FIGURES_REVISION = 3
 
 @dataclass(frozen=True)
 class Reported:
-    """Where the page is."""
+    """Result of a report."""
 
     page: Path
     record: StageRecord
-    skipped: bool  # nothing had changed
+    skipped: bool  # True if nothing had changed
 
 
 def report(folder: Path, *, studies: Sequence[Path] = (), force: bool = False) -> Reported:
@@ -65,8 +65,8 @@ def report(folder: Path, *, studies: Sequence[Path] = (), force: bool = False) -
 
     Args:
         folder: the session.
-        studies: folders of `mocap ablate` that the page shows, too.
-        force: do it again although nothing changed.
+        studies: folders of `mocap ablate` that the page shows as well.
+        force: run it again even if nothing changed.
 
     Raises:
         DataError: not a session, or damaged; a table of it, or pictures, were changed; a folder that holds no
@@ -102,26 +102,26 @@ def report(folder: Path, *, studies: Sequence[Path] = (), force: bool = False) -
 
 @dataclass(frozen=True)
 class Compared:
-    """Where the page about several sessions is."""
+    """Result of a comparison of several sessions."""
 
     page: Path
-    skipped: bool  # the same bytes were there already
+    skipped: bool  # True if the page existed already with the same bytes
 
 
 def compare_sessions(
     folders: Sequence[Path], output: Path | None = None, *, overwrite: bool = False
 ) -> Compared:
-    """Write the page that sets sessions side by side, every one against the first.
+    """Write the page that compares every session with the first.
 
     Args:
-        folders: the sessions, two at least.
+        folders: the sessions, at least two.
         output: the file; by default comparison/index.html beside the first session. A page of an earlier
-            comparison is written anew.
-        overwrite: write also where something else lies.
+            comparison is replaced.
+        overwrite: replace also a file that is no comparison.
 
     Raises:
-        DataError: not a session, damaged, changed by hand, stated twice, or something else lies where the
-            page goes.
+        DataError: not a session, damaged, changed by hand, stated twice, or the file exists and is no
+            comparison.
     """
     resolved = [folder.resolve() for folder in folders]
     for folder, place in zip(folders, resolved, strict=True):
@@ -144,10 +144,10 @@ def compare_sessions(
 
 @dataclass(frozen=True)
 class Figures:
-    """Where the figures of a page lie as files."""
+    """Result of writing the figures of a page as files."""
 
     folder: Path
-    skipped: bool  # nothing had changed
+    skipped: bool  # True if nothing had changed
 
 
 def write_figures_of(
@@ -160,15 +160,15 @@ def write_figures_of(
 ) -> Figures:
     """Write the figures of a session's page, or of the page that compares several, as files.
 
-    PNG, SVG and PDF 180 mm wide (90 mm where two stand side by side), the numbers behind each as CSV, and
-    figures.json with titles and captions. The 3D viewer is not among them.
+    The files are PNG, SVG and PDF 180 mm wide (90 mm where two are side by side), the numbers of each figure
+    as CSV, and figures.json with titles and captions. The 3D viewer is left out.
 
     Args:
-        folders: the sessions; two or more are compared, every one with the first.
+        folders: the sessions; two or more are compared, each with the first.
         target: the folder; figures that an earlier run wrote there are replaced.
-        studies: folders of `mocap ablate` that the page of a single session shows, too.
-        overwrite: replace a folder with other things in it, too; never a session.
-        force: do it again although nothing changed.
+        studies: folders of `mocap ablate` that the page of a single session shows as well.
+        overwrite: replace also a folder with other things in it, but never a session.
+        force: run it again even if nothing changed.
 
     Raises:
         DataError: not a session, or damaged; a table of it, or pictures, were changed; the folder holds
@@ -214,7 +214,7 @@ def write_figures_of(
 
 
 def read_study(folder: Path) -> StudyContent:
-    """What `mocap ablate` left in a folder.
+    """Read the result of `mocap ablate` in a folder.
 
     Raises:
         DataError: it holds no study, or a damaged one.
@@ -233,7 +233,7 @@ def read_study(folder: Path) -> StudyContent:
 
 
 def _named(studies: Sequence[StudyContent]) -> list[dict[str, object]]:
-    """Studies as settings: what made them, and the hash of what they found."""
+    """Describe studies for the settings: their command, and the hash of their results."""
     return [{"command": each.command, STUDY_MARK: each.digest} for each in studies]
 
 
@@ -242,7 +242,7 @@ def _labels(resolved: Sequence[Path]) -> list[str]:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that it is there whole or as it was before."""
+    """Write a file completely or leave it as it was."""
     new = path.with_name(f".{path.name}.new")
     try:
         new.write_bytes(content)
@@ -252,7 +252,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def _refuse_foreign(page: Path) -> None:
-    """A page of ours says so near its beginning."""
+    """Refuse to replace a file that is no comparison; such pages name their generator near the beginning."""
     if page.is_dir():
         raise DataError(page, "is a folder", "name a file with --output")
     if not page.exists():
@@ -280,7 +280,7 @@ def _refuse_changed_pictures(folder: Path, description: Description) -> None:
 
 
 def _pictures_there(folder: Path, description: Description) -> list[str]:
-    """The cameras whose pictures are still where they were."""
+    """List the cameras whose pictures are still where they were at ingest."""
     media = {name: entry.media for name, entry in description.cameras.items() if entry.media}
     return [name for name, entry in media.items() if all((folder / path).exists() for path in entry.paths)]
 
@@ -288,7 +288,7 @@ def _pictures_there(folder: Path, description: Description) -> list[str]:
 def _open_pictures(
     folder: Path, description: Description, stack: ExitStack
 ) -> tuple[dict[str, Pictures], list[str]]:
-    """The pictures of every camera that still has them; missing ones cost overlays only, and are said."""
+    """Open the pictures of every camera that still has them; return a warning for each other camera."""
     opened, warnings = {}, []
     for name, entry in description.cameras.items():
         if entry.media is None:
@@ -351,7 +351,7 @@ def _load(folder: Path, description: Description, records: dict[str, StageRecord
 def _load_hidden(
     folder: Path, description: Description, records: dict[str, StageRecord], maps: list[Occupancy]
 ) -> dict[str, float]:
-    """For how much of the flight the map hides the actor; empty without a map, or without an actor."""
+    """Compute the share of the flight in which the map hides the actor; empty without a map or an actor."""
     if not maps:
         return {}
     try:
@@ -362,7 +362,7 @@ def _load_hidden(
 
 
 def _by_camera(folder: Path, name: str, record: StageRecord | None) -> dict[str, pd.DataFrame]:
-    """The poses of a table of all cameras; empty where the stage of this record wrote none."""
+    """Split a table of poses by camera; empty if the stage of this record wrote none."""
     if record is None or name not in record.outputs:
         return {}
     table = read_table(folder / name, CAMERA_POSES).sort_values(["camera", "t_ns"])

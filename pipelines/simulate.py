@@ -1,7 +1,7 @@
-"""Stage `simulate`: a flight with known truth, in the files that a real one would bring home.
+"""Stage `simulate`: a flight with known truth, in the same files as those of a real flight.
 
-Read the scenario; fly it; write logs, calibration, map and truth; film it, or put what a detector would
-have found in the place of videos; tie all of it together with a flight.yaml.
+Read the scenario; fly it; write logs, calibration, map and truth; film it, or write keypoints with a
+detector's errors instead of videos; write a flight.yaml that names all of these files.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ from pipelines.simulation.world.scene import World
 
 _REVISION = 5
 _OWN = ("drone*", "flight.yaml", "true_poses.yaml", "scenario.yaml", "site.*", "truth", SIMULATION_MARK)
-_BLOCK = 60  # pictures that are rendered and encoded together, and kept when the work is interrupted
+_BLOCK = 60  # pictures that are rendered and encoded together, and kept after an interrupt
 _RING = "ring"
-_LEAST_SIGMA_M = 0.01  # of the actor's estimate, for a filter that cannot take none
+_LEAST_SIGMA_M = 0.01  # of the actor's estimate, for a filter that does not accept 0
 
 
 @dataclass(frozen=True)
 class Simulated:
-    """What a simulation left behind."""
+    """Result of a simulation."""
 
     folder: Path
     summary: dict[str, Any]
-    skipped: bool  # it was there already
+    skipped: bool  # True if the simulation existed already
 
 
 def simulate(
@@ -71,12 +71,12 @@ def simulate(
 
     Args:
         scenario_path: the scenario.
-        folder: where to; an earlier simulation there is replaced if nothing else lies beside its files.
-        video: render videos; else keypoints with the errors of a detector take their place.
-        workers: pictures rendered at once; logs, truth and pictures do not depend on them.
-        overwrite: replace a folder that is no simulation, or holds more than one.
-        force: do it again although nothing changed.
-        progress: who watches.
+        folder: the output folder; an earlier simulation there is replaced if it holds no other files.
+        video: render videos; else write keypoints with the errors of a detector instead.
+        workers: the number of blocks in parallel; logs, truth and pictures do not depend on it.
+        overwrite: replace a folder that is no simulation, or that holds other files as well.
+        force: run it again even if nothing changed.
+        progress: receives the progress.
 
     Raises:
         DataError: the scenario cannot be used, or the folder cannot be written.
@@ -123,9 +123,9 @@ def simulate(
 
 
 def _refuse_to_lose_others(folder: Path) -> None:
-    """A session that was made beside its flight.yaml would go with the old flight."""
+    """Refuse to replace a simulation with other files in its folder, such as a session of the old flight."""
     if not (folder / SIMULATION_MARK).is_file():
-        return  # whole_folder looks at what is no simulation
+        return  # whole_folder checks folders that are no simulation
     names = sorted(path.name for path in folder.iterdir())
     if others := [name for name in names if not any(fnmatch(name, own) for own in _OWN)]:
         raise DataError(
@@ -136,7 +136,7 @@ def _refuse_to_lose_others(folder: Path) -> None:
 
 
 def _key(scenario: Scenario, path: Path, video: bool) -> str:
-    """Equal for equal flights."""
+    """Compute the key of a simulation; it is equal for equal flights."""
     ingredients: dict[str, object] = {
         "revision": _REVISION,
         "scenario": scenario.identity(),
@@ -158,7 +158,7 @@ def _motions(scenario: Scenario, path: Path) -> dict[str, SkeletalMotion]:
 
 
 def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | None:
-    """The formation planner that the scenario names; None for the ring."""
+    """Make the formation planner that the scenario names; None for the ring."""
     formation, count = scenario.drones.formation, scenario.drones.count
     if formation.planner == _RING:
         return None
@@ -196,7 +196,7 @@ def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | Non
             for t_s, place in zip(known.actor_t_s[measured:], known.actor[measured:], strict=True):
                 pilot.measure(float(t_s), place)
             measured = len(known.actor_t_s)
-            if not measured:  # nobody knows yet where the actor is: hover
+            if not measured:  # the actor's position is not known yet: hover
                 return known.position, np.zeros_like(known.position)
             command = pilot.step(known.t_s, known.position, known.velocity, field)
             return command.position, command.velocity
@@ -210,7 +210,7 @@ def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | Non
 
 
 def _write_grid(path: Path, occupancy: Occupancy) -> None:
-    """The map as `map:` takes arrays, too."""
+    """Write the map as arrays too, in the npz layout that `map:` reads."""
     np.savez_compressed(
         path,
         probability=occupancy.probability,
@@ -220,7 +220,7 @@ def _write_grid(path: Path, occupancy: Occupancy) -> None:
 
 
 def _write_log(path: Path, flight: SimulatedFlight, drone: SimulatedDrone) -> None:
-    """What the recorder on one drone wrote, message by message in the order of receipt."""
+    """Write the log of one drone's recorder, message by message in the order of receipt."""
     with Ros2Recording(path) as log:
         for message in logged_messages(flight, drone):
             log.write(message.topic, message.type, message.received_ns, message.fields)

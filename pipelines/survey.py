@@ -1,4 +1,4 @@
-"""Stage `survey`: what is in this file or folder? The answer of `mocap info`."""
+"""Stage `survey`: description of a file or folder, for `mocap info`."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from pipelines.simulation.scenario import Scenario, read_scenario
 
 @dataclass(frozen=True)
 class Survey:
-    """What a path holds."""
+    """Description of a path."""
 
     path: Path
-    title: str  # what it is
-    facts: dict[str, Any]  # what is inside, JSON-able, in reading order
+    title: str  # name of its kind
+    facts: dict[str, Any]  # its content, JSON-able, in reading order
 
 
 def survey(path: Path) -> list[Survey]:
-    """Look into what mocap writes, what users write for it, or a file of any registered format.
+    """Describe a result of mocap, a file that users write for it, or a file of any registered format.
 
-    One answer for each reading: a file may be of several formats.
+    There is one description for each format that recognises the file.
 
     Raises:
         DataError: the path is missing, damaged, or of no known kind.
@@ -98,7 +98,7 @@ def _of_session(path: Path) -> dict[str, Any]:
 
 
 def _of_summary(path: Path) -> Survey | None:
-    """A folder of `mocap simulate` or `mocap ablate`, or the summary in it; None where it is neither."""
+    """Describe a folder of `mocap simulate` or `mocap ablate`, or its summary; None if it is neither."""
     for mark, title, reader in (
         (SIMULATION_MARK, "simulated flight", _of_simulation),
         (STUDY_MARK, "study of simulated flights", _of_study),
@@ -107,7 +107,7 @@ def _of_summary(path: Path) -> Survey | None:
         if file.name != mark or not file.is_file():
             continue
         summary: Mapping[str, Any] = {}
-        with suppress(DataError):  # damaged, or somebody else's of that name: told as any file is
+        with suppress(DataError):  # damaged, or another program's file of that name: described as any file
             summary = read_json(file)
         if summary.get("simulated") is True:
             return Survey(path, title, _told(file, summary, reader))
@@ -131,7 +131,7 @@ def _of_simulation(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _of_study(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """What was asked, and the mean error of every condition and method."""
+    """Describe the settings of a study, and the mean error of every condition and method."""
     asked = summary["settings"]
     names = ("tilts_deg", "drones", "noise", "methods", "seconds", "rate_hz", "trials", "seed")
     errors: dict[str, dict[str, Any]] = {}
@@ -151,7 +151,7 @@ def _of_study(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _of_yaml(path: Path) -> Survey:
-    """A flight manifest, a scenario or planner settings, whichever most of its keys belong to."""
+    """Describe a flight manifest, a scenario or planner settings; the kind is that of most of the keys."""
     stated = read_yaml(path)
     kinds = {
         "flight manifest": (keys_of(Flight), _of_manifest),
@@ -160,7 +160,7 @@ def _of_yaml(path: Path) -> Survey:
     }
     known = {title: len(keys & stated.keys()) for title, (keys, _) in kinds.items()}
     title, most = max(known.items(), key=lambda each: each[1])
-    if list(known.values()).count(most) > 1:  # `schema` and `name` say nothing
+    if list(known.values()).count(most) > 1:  # `schema` and `name` are keys of several kinds
         raise DataError(
             path,
             "is YAML, but of no known kind",
