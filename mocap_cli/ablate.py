@@ -1,4 +1,4 @@
-"""`mocap ablate`: what the reconstruction error depends on."""
+"""`mocap ablate`: studies of the reconstruction error on simulated flights."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def ablate_command() -> None:
 
 
 def _shared_options(command: Command) -> Command:
-    """What every study takes."""
+    """Add the options that every study has."""
     for option in reversed(
         [
             click.option("-o", "--output", type=any_path, required=True, help="Folder of the results."),

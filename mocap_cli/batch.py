@@ -1,4 +1,4 @@
-"""`mocap batch`: all of it over many flights."""
+"""`mocap batch`: all stages over many flights."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def batch_command(
             progress=progress,
         )
     failures = [row for row in result.rows if row.error is not None]
-    if quiet:  # else they were told as they came
+    if quiet:  # else they were printed when they happened
         for row in failures:
             say(f"failed: {one_line(str(row.error))}", err=True)
     if as_json:

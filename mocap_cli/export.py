@@ -1,4 +1,4 @@
-"""`mocap export`: a session for other programs."""
+"""`mocap export`: a session in the formats of other programs."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _LONGEST_LIST = 4  # files
 
 
 class _ListsFormats(click.Command):
-    """Its help ends with the formats there are, those of other packages among them."""
+    """Command whose help ends with a list of all formats, also of those from other packages."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        """One line for each format: its name, what it is, and the units and axes that it has."""
+        """Write one line for each format: its name, its title, and its units and axes."""
         from pipelines.session.registries import EXPORTS, ChoiceOfAxes
 
         rows = []
@@ -108,7 +108,7 @@ def export_command(
 
 
 def _print(what: str, paths: Sequence[Path]) -> None:
-    """Print a line for each of a few files; of many the first, and how many more there are."""
+    """Print a line for each of a few files; of many, print the first ones and the number of the rest."""
     shown = paths if len(paths) <= _LONGEST_LIST else paths[: _LONGEST_LIST - 1]
     for path in shown:
         say(f"{what}: {path}")

@@ -1,4 +1,4 @@
-"""`--render` of `mocap replan-compare`: every arm filmed, with a real detector on the pictures."""
+"""`--render` of `mocap replan-compare`: film every arm and run a real detector on the pictures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 @dataclass(frozen=True)
 class Rendering:
-    """What was asked for."""
+    """The values of the render options."""
 
     rate_hz: float
     start_s: float | None
@@ -31,7 +31,7 @@ class Rendering:
 
 
 def render_options(command: Command) -> Command:
-    """Add --render and what belongs to it; the command takes `rendering: Rendering | None`."""
+    """Add --render and its options; the command takes `rendering: Rendering | None`."""
 
     @click.option(
         "--render",
@@ -69,7 +69,7 @@ def render_options(command: Command) -> Command:
 
 
 def film_arms(session: Path, asked: Rendering, *, force: bool, progress: Progress) -> dict[str, Any]:
-    """Film the session's arms; their figures."""
+    """Film the session's arms and return their figures."""
     from pipelines.filming import Shooting, film
 
     shooting = Shooting(asked.rate_hz, asked.start_s, asked.end_s, asked.detector)
@@ -77,7 +77,7 @@ def film_arms(session: Path, asked: Rendering, *, force: bool, progress: Progres
 
 
 def print_filmed(metrics: dict[str, Any]) -> None:
-    """One row for each arm."""
+    """Print a table with one row for each arm."""
     say()
     say(f"filmed (simulated) at {metrics['rate_hz']:g} Hz, keypoints by {metrics['detector']}:")
     header = [

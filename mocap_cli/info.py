@@ -1,4 +1,4 @@
-"""`mocap info`: what is in this file or folder?"""
+"""`mocap info`: the content of a file or folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`mocap ingest`: a flight.yaml into a session."""
+"""`mocap ingest`: the flight of a flight.yaml read into a session."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def ingest_command(
 
 
 def _print_stamps(result: Ingested) -> None:
-    """Which of a log's two times was taken, because recorders differ in which is right."""
+    """Print which stamps of the logs were used, because recorders differ in which are right."""
     for stamps in ("header", "receive"):
         names = [name for name, c in result.description.cameras.items() if c.poses.stamps == stamps]
         if names:
@@ -99,7 +99,7 @@ def _print_stamps(result: Ingested) -> None:
 
 
 def _print_origin(result: Ingested) -> None:
-    """Where on Earth the world's origin was laid."""
+    """Print the place on Earth of the world's origin."""
     if origin := result.description.origin:
         say(
             f"world origin: {origin.latitude_deg:.7f}, {origin.longitude_deg:.7f}, {origin.altitude_m:.2f} m"

@@ -1,4 +1,4 @@
-"""`mocap init`: what was brought home into a flight.yaml."""
+"""`mocap init`: the draft of a flight.yaml for the files of a flight."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import click
 from mocap_cli.options import any_path, json_option, level, overwrite_option, verbosity_options
 from mocap_cli.terminal import one_line, print_json, say, watching
 
-_MANY = 5  # files of one kind in one folder that are told one by one
+_MANY = 5  # most files of one kind in one folder that are listed one by one
 
 
 @click.command("init", short_help="Draft a flight.yaml from what was brought home.")
@@ -61,12 +61,12 @@ def init_command(
 
 
 def _from_here(path: Path) -> Path:
-    """The path as one would type it."""
+    """Return the path relative to the working directory, if it is below it."""
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def _left_out(left_out: Mapping[Path, str]) -> Iterator[str]:
-    """A line for each file, or for all of one kind in a folder where they are many."""
+    """Yield a line for each file, or one line for many files of one kind in a folder."""
     alike: dict[tuple[Path, str, str], list[Path]] = defaultdict(list)
     for path, reason in left_out.items():
         alike[path.parent, path.suffix, reason].append(path)

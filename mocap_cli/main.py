@@ -1,4 +1,4 @@
-"""The `mocap` command: its group, and the one place where errors become a line and an exit status."""
+"""The `mocap` command: its group, and the only place that turns errors into a line and an exit status."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from mocap_cli.simulate import simulate_command
 from mocap_cli.terminal import one_line, say
 from pipelines.session.errors import MocapError
 
-_INTERRUPTED = 130  # what shells expect after Ctrl-C
+_INTERRUPTED = 130  # the exit status that shells expect after Ctrl-C
 
 
 class Mocap(click.Group):
-    """Lists commands in the order in which they are used, and tells errors in one line."""
+    """Group that lists commands in the order of their use and prints errors in one line."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  # click calls it so
-        """The commands, in the order of their work."""
+        """List the commands in the order of their use."""
         return list(self.commands)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; what a user can mend is one line on stderr and exit status 1."""
+        """Run a command; an error that the user can correct is one line on stderr and exit status 1."""
         try:
             return super().invoke(ctx)
         except MocapError as error:
@@ -42,7 +42,7 @@ class Mocap(click.Group):
         except click.UsageError as error:
             if error.ctx is not None and error.message == error.ctx.get_help():
                 raise  # `mocap ablate` alone: click shows its help this way
-            # A shell's pattern brings names of files, which may be anything.
+            # Patterns of the shell expand to file names, which may hold any character.
             raise click.UsageError(one_line(error.format_message()), error.ctx) from None
         except KeyboardInterrupt:
             say("mocap: interrupted; nothing is lost, the same command continues", err=True)
@@ -77,7 +77,7 @@ for command in (
 
 
 def run() -> None:
-    """Entry point of the `mocap` script."""
+    """Run the `mocap` script (its entry point)."""
     try:
         mocap()
     except BrokenPipeError:
@@ -89,6 +89,6 @@ def run() -> None:
 
 
 def _leave_stdout() -> None:
-    """End without trying to write what is still to be written."""
+    """Exit with status 1 without writing the rest of the output."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(1)

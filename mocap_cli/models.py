@@ -1,4 +1,4 @@
-"""`mocap models`: which keypoint detectors are there, and how to get their files."""
+"""`mocap models`: list of keypoint detectors, and download of their files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def list_command(context: click.Context, as_json: bool) -> None:
 
 
 def _list(as_json: bool) -> None:
-    """Print the detectors that are registered, with their files, and the families of users' own models."""
+    """Print the registered detectors with their files, and the families for users' own models."""
     from pipelines.session.registries import DETECTORS, DetectorFamily
 
     registered = DETECTORS.all()
@@ -98,7 +98,7 @@ def _listed(detector: Detector) -> dict[str, object]:
 
 
 def _figures(detector: Detector) -> dict[str, float | None]:
-    """The accuracy and the time of a detector; None where they were not measured."""
+    """Return the accuracy and the time of a detector; None if they were not measured."""
     from pipelines.session.registries import MeasuredDetector
 
     measured = detector.measured if isinstance(detector, MeasuredDetector) else None

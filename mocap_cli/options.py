@@ -12,7 +12,7 @@ import click
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 any_path = click.Path(path_type=Path)
-"""Whether a path is there and of the right kind is told by whoever reads it, in the words of the house."""
+"""A path that click does not check: the function that reads it reports a missing path or a wrong kind."""
 
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Write where something else lies. Never done without this."
@@ -58,24 +58,24 @@ def with_provider(detector: str, provider: str | None) -> str:
 
 
 def workers_option(help_text: str) -> Callable[[Command], Command]:
-    """Threads of a simulation: two, unless the user says otherwise."""
+    """Make the option --workers of a simulation; two by default."""
     return click.option(
         "--workers", type=click.IntRange(1, 256), default=2, show_default=True, help=help_text
     )
 
 
 def seed_option(help_text: str) -> Callable[[Command], Command]:
-    """Where random numbers come from."""
+    """Make the option --seed of random numbers."""
     return click.option(
         "--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help=help_text
     )
 
 
 class FiniteRange(click.FloatRange):
-    """A range of numbers without NaN and infinity, which click lets through."""
+    """A range of numbers that refuses NaN and infinity, which click accepts."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The number, or a usage error."""
+        """Convert the value to a number, or raise a usage error."""
         number = super().convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} is no finite number.", param, ctx)
@@ -90,5 +90,5 @@ def verbosity_options(command: Command) -> Command:
 
 
 def level(quiet: bool, verbose: int) -> int:
-    """One number for both: -1 quiet, 0 as usual, 1 and above more."""
+    """Combine both to one number: -1 is quiet, 0 is normal, 1 and above is more."""
     return -1 if quiet else verbose

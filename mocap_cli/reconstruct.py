@@ -1,4 +1,4 @@
-"""`mocap reconstruct`: the skeleton of the actor, joint by joint, with its errors."""
+"""`mocap reconstruct`: the actor's skeleton with its errors."""
 
 from __future__ import annotations
 
@@ -224,7 +224,7 @@ _ERRORS = {
 
 
 def _print_summary(metrics: dict[str, Any]) -> None:
-    """The figures that matter most: those against the truth where there is one, and those without."""
+    """Print the main figures: errors against the truth if there is one, and figures without truth."""
     reprojection, shape = metrics["reprojection_px"], metrics["shape"]
     shown = {"reconstructed_share": ("reconstructed %", 100)}
     if metrics["mpjpe_mm"] is not None:
@@ -266,7 +266,7 @@ def _ends(interval: list[float] | None, scale: int = 1) -> str:
 
 
 def _mean_median(figures: dict[str, Any] | None) -> float | None:
-    """The mean over the cameras; None with fewer than three."""
+    """Compute the mean of the cameras' medians; None without figures (fewer than three cameras)."""
     return None if figures is None else _mean(figure["median"] for figure in figures.values())
 
 

@@ -1,4 +1,4 @@
-"""`mocap replan-compare`: whether the adaptive formation would have been better than the fixed one."""
+"""`mocap replan-compare`: comparison of formation planners on a logged flight."""
 
 from __future__ import annotations
 

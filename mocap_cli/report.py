@@ -80,7 +80,7 @@ def report_command(
                     raise
                 failed[str(session)] = tell(error)
             progress.advance()
-        if len(ones) > 1 and not failed:  # else the first may be missing, which all are compared with
+        if len(ones) > 1 and not failed:  # else the first, with which all are compared, may be missing
             compared = compare_sessions(ones, output, overwrite=overwrite)
             progress.advance()
         if figures is not None and not failed:

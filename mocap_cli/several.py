@@ -1,4 +1,4 @@
-"""Commands of one flight or session, for several: one after the other, a failure stops none of the rest."""
+"""Commands for one flight or session, applied to several in turn; a failure does not stop the others."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Command = Callable[..., dict[str, Any] | None]
 
 
 def expanded(paths: Iterable[str | Path]) -> list[Path]:
-    """The paths, with the patterns among them that no shell expanded, each once.
+    """Expand the patterns among paths that the shell did not expand; return each path once.
 
     Raises:
-        DataError: nothing is called like a pattern.
+        DataError: nothing matches a pattern.
     """
     found: dict[Path, None] = {}
     for text in map(str, paths):
@@ -39,15 +39,15 @@ def expanded(paths: Iterable[str | Path]) -> list[Path]:
 def each(
     argument: str, metavar: str, suffix: str = "", *, titled: bool = True
 ) -> Callable[[Command], Callable[..., None]]:
-    """Let a command of one flight or session take several, or patterns.
+    """Let a command for one flight or session take several, or patterns.
 
-    The command returns what --json prints; it must print that not itself.
+    The command returns the result for --json and must not print it itself.
 
     Args:
-        argument: its name there.
-        metavar: as it is shown.
+        argument: the name of the command's argument for one path.
+        metavar: the name of the paths in the help text.
         suffix: of the folders that are made below --output for several.
-        titled: of several, each path is printed before what the command prints.
+        titled: for several, print each path before the command's output.
     """
 
     def decorated(command: Command) -> Callable[..., None]:
@@ -74,7 +74,7 @@ def each(
 
 
 def _outputs(paths: list[Path], folder: Path | None, suffix: str) -> list[Path | None]:
-    """The --output of each, below the one that was given for all."""
+    """Return the --output of each path, below the --output for all."""
     if folder is None:
         return [None] * len(paths)
     if folder.is_file() or (folder / "session.json").exists():
@@ -103,14 +103,14 @@ def _run_all(
 
 
 def tell(error: MocapError) -> str:
-    """The line of one that failed, which stops none of the others."""
+    """Print the error of one that failed, and return the line; the others still run."""
     line = one_line(str(error))
     say(f"mocap: {line}", err=True)
     return line
 
 
 def end(failed: Collection[str], paths: Collection[Path]) -> None:
-    """Exit with 1, and the count, where any failed."""
+    """Print the number of failures and exit with status 1, if any failed."""
     if failed:
         say(f"mocap: {len(failed)} of {len(paths)} failed", err=True)
         click.get_current_context().exit(1)

@@ -1,7 +1,7 @@
-"""What the terminal shows: progress and notes on stderr, results on stdout.
+"""Output to the terminal: progress and notes on stderr, results on stdout.
 
-All that commands print goes through here. Names of files, topics and cameras and texts of files come from
-others: whatever in them could steer a terminal or begin a line of its own is made visible instead.
+Everything that commands print goes through this module. Names and texts in files come from others. Characters
+in them that could control the terminal or start a new line are replaced by visible ones.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ _LONGEST_LINE = 2000
 
 
 def one_line(text: str) -> str:
-    """The text without line breaks and control characters: names from files must not steer a terminal."""
+    """Remove line breaks and control characters from a text: names in files must not control a terminal."""
     printable = "".join(c if c.isprintable() else " " for c in text)
     shown = " ".join(printable.split())
     return shown if len(shown) <= _LONGEST_LINE else shown[:_LONGEST_LINE] + " ..."
 
 
 def say(text: str = "", *, err: bool = False) -> None:
-    """Print one line. Control characters, line breaks and bytes that are no text become question marks."""
+    """Print one line; control characters, line breaks and bytes that are no text become question marks."""
     click.echo("".join(c if _is_shown(c) else "?" for c in text), err=err)
 
 
@@ -52,7 +52,7 @@ class _Notes:
             say(f"{one_line(task)} ({total})", err=True)
 
     def advance(self, steps: int = 1) -> None:
-        """Nothing moves without a bar."""
+        """Do nothing: there is no bar."""
 
     def note(self, message: str) -> None:
         if self._verbosity >= 0:
@@ -83,7 +83,7 @@ class _BarsOnStderr(_Notes):
 
 @contextmanager
 def watching(verbosity: int) -> Iterator[Progress]:
-    """Someone who watches a stage: bars when stderr is a terminal, notes otherwise, silence with -q."""
+    """Make the progress of a stage: bars if stderr is a terminal, else notes; nothing with -q."""
     if verbosity < 0 or not sys.stderr.isatty():
         yield _Notes(verbosity)
         return
@@ -95,20 +95,20 @@ def watching(verbosity: int) -> Iterator[Progress]:
 
 
 def say_warnings(warnings: Sequence[str], quiet: bool) -> None:
-    """What is doubtful, on stderr."""
+    """Print warnings on stderr, unless quiet."""
     if not quiet:
         for warning in warnings:
             say(f"warning: {one_line(warning)}", err=True)
 
 
 def print_json(result: Mapping[str, object]) -> None:
-    """Print the machine-readable result; what is not printable is escaped, so that nothing of it is lost."""
+    """Print the machine-readable result; unprintable characters are escaped, so that no data are lost."""
     text = json.dumps(result, indent=2, ensure_ascii=False, allow_nan=False)
     click.echo("".join(c if _is_shown(c) or c == "\n" else json.dumps(c)[1:-1] for c in text))
 
 
 def print_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    """A plain table: text to the left, numbers to the right; empty where there is nothing."""
+    """Print a plain table: text aligned left, numbers right, `-` for a missing value."""
     texts = [[_cell(value) for value in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(header, *texts, strict=True)]
     numeric = [
