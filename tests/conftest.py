@@ -1,6 +1,6 @@
-"""What all tests live in.
+"""Settings and fixtures of all tests.
 
-Hypothesis has no deadlines here, and the same examples every time unless asked to explore:
+Hypothesis has no deadlines here, and uses the same examples every time, except with the profile `explore`:
 
 HYPOTHESIS_PROFILE=explore make test
 """
@@ -17,19 +17,19 @@ from hypothesis import settings
 
 import pipelines  # noqa: F401  # before numpy, as commands do: linear algebra on one thread
 
-# A shared machine is sometimes slow: time is watched by the tests that are about time.
+# A shared machine is sometimes slow, so only the tests about time check times.
 settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.register_profile("explore", deadline=None, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 
-# A shell that starts the tests in the background has children ignore Ctrl-C; commands under test must not.
+# A shell that starts the tests in the background lets children ignore Ctrl-C; commands under test must not.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 _HERE = Path(__file__).parent
 
-# Where most code is compiled, heaviest first. Two workers that begin with these compile hardly anything
+# Test files that compile most code, slowest first. Two workers that begin with these compile little code
 # twice, and the other files find it in the cache.
 _COMPILING = (
     "reconstruction/test_refinement.py",
@@ -43,7 +43,7 @@ _COMPILING = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files that compile come first, then those with slow tests, so that workers end at the same time."""
+    """Sort files that compile first, then those with slow tests, so that workers end at the same time."""
     first = {_HERE / name: place for place, name in enumerate(_COMPILING)}
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: (first.get(item.path, len(first)), item.path not in slow))
@@ -51,7 +51,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(autouse=True, scope="session")
 def _no_waiting_for_the_disk() -> Iterator[None]:
-    """No test pulls the plug; tests/session/test_stages.py sees that what is published was synced."""
+    """Replace fsync, because no test cuts the power; tests/session/test_stages.py checks the syncs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda _: None)
         yield

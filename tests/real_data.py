@@ -1,4 +1,4 @@
-"""Where the real recordings lie that some tests use; a clone without them skips those tests."""
+"""Paths of the real recordings that some tests use; a clone without them skips those tests."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _ROOT = Path(__file__).resolve().parent.parent
 
 
 def real_data(relative: str) -> Path:
-    """The path of a real input; skips the calling test where it is absent."""
+    """Return the path of a real input; skip the calling test if it is absent."""
     folder = Path(os.environ.get("MOCAP_REAL_DATA", _ROOT.parent / "shared" / "data"))
     path = folder / relative
     if not path.exists():

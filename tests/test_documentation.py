@@ -1,4 +1,4 @@
-"""The reference pages name what there is, and the diagram shows the imports that are there."""
+"""The documentation: reference pages name all keys, columns and models, the diagram shows the imports."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _words(page: str) -> set[str]:
 
 
 def _keys(model: type[BaseModel]) -> set[str]:
-    """Every key of a manifest, also of the parts within."""
+    """Collect every key of a manifest, also those of its parts."""
     keys: set[str] = set()
     for name, field in model.model_fields.items():
         keys.add(field.alias or name)

@@ -1,4 +1,4 @@
-"""What importing costs and in which order: things that only a fresh process can show."""
+"""Cost and order of imports, which only a fresh process can show."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 
 from tests.commands.runner import MOCAP
 
-# Without the order settled in pipelines/__init__.py this hangs or aborts where pycolmap comes first.
+# Without the order set in pipelines/__init__.py, this hangs or aborts if pycolmap is imported first.
 PNG_AFTER_PYCOLMAP = """
 import pipelines
 import pycolmap
@@ -58,7 +58,7 @@ def test_help_loads_nothing_heavy() -> None:
 
 
 def test_help_costs_at_most_300_ms_more_than_python_itself() -> None:
-    """In CPU seconds, and at best, since a busy machine makes everybody wait."""
+    """Compare the least CPU seconds of several runs, because a busy machine slows every run."""
 
     def least_s(command: list[str]) -> float:
         return min(_cpu_s_of(command) for _ in range(5))

@@ -1,7 +1,7 @@
-"""Runs `mocap` as users do, and tells its exit status and what it printed.
+"""Runner of `mocap` commands, which returns exit status and output.
 
-In this process, since starting Python and importing everything takes longer than most commands. What is about
-the process itself (signals, its memory, what it imports) starts one, by `mocap_process` or from `MOCAP`.
+Commands run in this process, because starting Python with all imports takes longer than most commands. Tests
+of the process itself (signals, memory, imports) start one, by `mocap_process` or from `MOCAP`.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ MOCAP = str(Path(sys.executable).with_name("mocap"))
 
 
 def mocap(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run the command to its end, in this process; an exception that it tells in no line fails the test."""
+    """Run the command to its end, in this process; an exception without an error line fails the test."""
     given = [MOCAP, *map(str, arguments)]
-    # Encoded as streams of a process are, so that what cannot be written is found here as well.
+    # Encoded like the streams of a process, so that text that cannot be written is found here as well.
     printed, told = BytesIO(), BytesIO()
     out = TextIOWrapper(printed, "utf-8", write_through=True)
     err = TextIOWrapper(told, "utf-8", "backslashreplace", write_through=True)
@@ -45,19 +45,19 @@ def mocap_process(*arguments: str | Path, timeout: float = 120) -> subprocess.Co
 
 
 def succeeds(*arguments: str | Path) -> str:
-    """Run a command that must succeed; its stdout."""
+    """Run a command that must succeed; return its stdout."""
     done = mocap(*arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
 def refused(*arguments: str | Path) -> str:
-    """Run a command that must refuse its input in one line and exit 1; that line."""
+    """Run a command that must refuse its input in one line and exit 1; return that line."""
     return refusal(mocap(*arguments))
 
 
 def refusal(done: subprocess.CompletedProcess[str]) -> str:
-    """The one line of a command that refused its input and exited 1."""
+    """Check that a command refused its input in one line and exited 1; return that line."""
     assert done.returncode == 1, (done.returncode, done.stdout, done.stderr)
     lines = done.stderr.strip().splitlines()
     assert len(lines) == 1, done.stderr
@@ -67,7 +67,7 @@ def refusal(done: subprocess.CompletedProcess[str]) -> str:
 
 
 def as_if_written(session: Path, name: str, stage: str) -> None:
-    """Let a file that a test put into a session count as one that the stage wrote."""
+    """Record a file that a test put into a session as one that the stage wrote."""
     path = session / stage / "stage.json"
     record = json.loads(path.read_text(encoding="utf-8"))
     record["outputs"][name] = hashlib.sha256((session / name).read_bytes()).hexdigest()
@@ -75,7 +75,7 @@ def as_if_written(session: Path, name: str, stage: str) -> None:
 
 
 def content(folder: Path) -> dict[str, str]:
-    """Hash of every file of a session that is a result: all but times of day and locks."""
+    """Hash every file of a session that is a result: all except run.json and locks."""
     return {
         path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(folder.rglob("*"))

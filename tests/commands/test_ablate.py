@@ -1,4 +1,4 @@
-"""The studies: exact data give nothing, errors have the size and the shape that geometry gives them."""
+"""Studies: exact data give no error, and errors have the size and the shape that geometry predicts."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ SMALL = ("--seconds", "8", "--rate", "5", "--trials", "2", "--workers", "1", *TR
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A study of numbers alone: its figure takes longer than these small ones."""
+    """Leave out the figure of a study, which takes longer than these small studies."""
     monkeypatch.setattr(stage, "draw", lambda *_: None)
 
 
 def run(*arguments: str | Path) -> Any:
-    """The command in this process, as the group runs it."""
+    """Run the command in this process, in its group."""
     return CliRunner().invoke(Mocap(commands=[ablate_command]), ["ablate", *map(str, arguments)])
 
 
@@ -44,18 +44,18 @@ def succeeds(*arguments: str | Path) -> str:
 
 
 def study(*arguments: str | Path) -> dict[tuple[float, int, str, str], dict[str, Any]]:
-    """The cells of a study by tilt, drones, noise and method."""
+    """Run a study and return its cells by tilt, drones, noise and method."""
     cells = json.loads(succeeds(*arguments, "--json"))["cells"]
     return {(cell["tilt_deg"], cell["drones"], cell["noise"], cell["method"]): cell for cell in cells}
 
 
 def keypoints_of(folder: Path) -> object:
-    """What a study says of its keypoints."""
+    """Read the source of keypoints in a study's summary."""
     return json.loads((folder / "summary.json").read_text(encoding="utf-8"))["keypoints"]
 
 
 def covariance_trace(cameras: int, tilt_deg: float) -> float:
-    """Trace of the covariance of a point in units of one ray's variance: rays err across themselves."""
+    """Compute the trace of a point's covariance in units of one ray's variance, which is across the ray."""
     yaw = (np.pi / 2 if cameras == 2 else 2 * np.pi / cameras) * np.arange(cameras)
     tilt = np.radians(tilt_deg)
     ray = np.stack([np.cos(yaw) * np.cos(tilt), np.sin(yaw) * np.cos(tilt), np.full(cameras, np.sin(tilt))])
@@ -68,7 +68,7 @@ def rms_m(cell: dict[str, Any]) -> float:
 
 @pytest.mark.usefixtures("undrawn")
 def test_exact_keypoints_and_poses_give_nothing(tmp_path: Path) -> None:
-    """Only rounding is left: 1e-16 of 30 m, a thousandfold for the conditioning of two rays."""
+    """Allow rounding errors only: 1e-16 of 30 m, times a thousand for the conditioning of two rays."""
     cells = study("tilt", *SMALL, "--keypoints", "exact", "--levels", "none", "-o", tmp_path / "out")
     assert keypoints_of(tmp_path / "out") == "exact"
     assert {cell[0] for cell in cells} == {0, 15, 30, 45, 60}
@@ -82,12 +82,12 @@ def test_exact_keypoints_and_poses_give_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("what", ["tilt", "robots"])
 @pytest.mark.usefixtures("undrawn")
 def test_errors_of_poses_have_the_size_and_shape_of_the_geometry(tmp_path: Path, what: str) -> None:
-    """Small white pose noise, exact keypoints: RMS = s sqrt(trace), s^2 = (range sigma_rot)^2 + sigma_pos^2.
+    """Expect RMS = s sqrt(trace), s^2 = (range sigma_rot)^2 + sigma_pos^2, for small white pose noise.
 
-    All joints of a frame share its errors, so that there are as many independent draws as frames and
-    trials: 8 s x 25 Hz x 4 = 800, each with about 2 effective degrees of freedom. The RMS of so many
-    scatters by 1 / sqrt(2 x 2 x 800) = 1.8 %; four times that, and 1 % for joints up to 1 m off the middle
-    of the ring (the mean of (distance / 10 m)^2), are allowed.
+    Keypoints are exact. All joints of a frame share its errors, so there are as many independent draws as
+    frames and trials: 8 s x 25 Hz x 4 = 800, each with about 2 effective degrees of freedom. The RMS of them
+    scatters by 1 / sqrt(2 x 2 x 800) = 1.8 %. The tolerance is four times that, plus 1 % for joints up to
+    1 m off the middle of the ring (the mean of (distance / 10 m)^2).
     """
     noise = "white:position_m=0.02,rotation_deg=0.1"
     cells = study(
@@ -102,10 +102,11 @@ def test_errors_of_poses_have_the_size_and_shape_of_the_geometry(tmp_path: Path,
 
 @pytest.mark.usefixtures("undrawn")
 def test_the_studies_of_the_paper_have_its_shapes(tmp_path: Path) -> None:
-    """High noise. By `covariance_trace` 30 deg cost 3 % more than 0, 60 deg 43 %; 5 drones 38 % less than 2.
+    """Compare with `covariance_trace`: +3 % error at 30 deg, +43 % at 60; -38 % for 5 drones instead of 2.
 
-    Trials have the same chance behind them everywhere, but rays differ: 8 s x 15 Hz x 3 trials = 360 draws
-    scatter by 2.6 % in a mean, 3.7 % in a ratio; the bounds are 2.5 of those away and more.
+    Tilts are compared with 0 deg. The noise is high. Trials use the same random numbers everywhere, but rays differ. So 8 s x 15 Hz x 3
+    trials = 360 draws scatter by 2.6 % in a mean and 3.7 % in a ratio. The bounds are at least 2.5 of those
+    away.
     """
     options = ("--seconds", "8", "--rate", "15", "--trials", "3", "--levels", "high", *TRUSTING)
     tilted = study("tilt", *options, "--tilts", "0,30,60", "-o", tmp_path / "tilt")
@@ -133,7 +134,7 @@ def test_modelled_keypoints_and_exact_poses_stay_below_60_mm(tmp_path: Path) -> 
 
 
 def test_trials_of_two_formations_share_their_chance() -> None:
-    """The same draws move the first camera by the same vectors wherever it is, twice the sigma by twice."""
+    """Check that equal draws move the first camera by equal vectors in any place, and scale with sigma."""
     of = walk(2.0, 5.0, 0)
     moved = []
     for tilt_deg, sigma in ((0.0, 0.1), (45.0, 0.2)):
@@ -147,13 +148,13 @@ def test_trials_of_two_formations_share_their_chance() -> None:
 
 
 class _Networks:
-    """Knows all joints but the last of COCO, in another order."""
+    """Networks with all joints of COCO except the last, in another order."""
 
     joints = tuple(reversed(get_skeleton("coco17").joints[:-1]))
 
 
 class _Pointing:
-    """A detector that has every joint where it was told that the person is."""
+    """A detector that puts every joint at the hint."""
 
     name, title = "pointing", "Pointing"
 
@@ -165,7 +166,7 @@ class _Pointing:
 
 
 class _Follower:
-    """In place of the tracker: who is there stands at the hint, each joint a pixel right of the last."""
+    """Stand-in for the tracker: the person is at the hint, each joint one pixel right of the last."""
 
     def __init__(self, networks: _Networks) -> None:
         self.right = np.array([1.0, 0.0]) * np.arange(len(networks.joints))[:, None]
@@ -181,7 +182,7 @@ class _Follower:
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_a_detector_looks_at_rendered_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Joint k is k pixels right of the middle in two views at right angles: as far off in the world."""
+    """Put joint k at k pixels right of the middle in two perpendicular views: this gives its position."""
     for module in (stage, settings):
         monkeypatch.setattr(module, "find_detector", lambda _: _Pointing())
     monkeypatch.setattr("pipelines.keypoints.alone.PeopleTracker", _Follower)
@@ -223,7 +224,7 @@ def test_every_kind_of_noise_is_there_and_drift_is_as_large_as_the_rest(tmp_path
 
 @pytest.mark.usefixtures("undrawn")
 def test_methods_are_compared_where_all_of_them_have_a_point(tmp_path: Path) -> None:
-    """At n = 2 robust rejects what does not agree; the others are judged without it, and say so."""
+    """Check that with 2 cameras all methods are compared without the joint-frames that robust rejects."""
     output = tmp_path / "out"
     cells = study("tilt", *SMALL, "--tilts", "45", "--levels", "none", "-o", output)
     linear, robust = (cells[45, 2, "none", method]["metrics"] for method in ("dlt", "robust"))
@@ -241,9 +242,10 @@ def test_methods_are_compared_where_all_of_them_have_a_point(tmp_path: Path) -> 
 
 @pytest.mark.usefixtures("undrawn")
 def test_refined_is_one_of_the_methods_and_says_where_it_fell_back(tmp_path: Path) -> None:
-    """White errors are new in every picture: of n that a smooth walk ties together 1/sqrt(n) is left.
+    """Expect half the error: white errors are new in every picture, so n pictures reduce them by sqrt(n).
 
-    Steps of a walk last half a second, 8 pictures at 15 Hz: a third would be left, and a half is allowed.
+    A step of the walk takes half a second, 8 pictures at 15 Hz. So a third of the error would remain, and a
+    half is allowed.
     """
     noise = "white:position_m=0.3,rotation_deg=1"
     options = ("--seconds", "4", "--rate", "15", "--trials", "1", "--methods", "midpoint,robust,refined")

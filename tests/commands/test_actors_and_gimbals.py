@@ -20,7 +20,7 @@ from tests.synthetic.logs import Entry, write_log
 
 
 def write_actor(flight: SyntheticFlight, folder: Path) -> None:
-    """The actor's hip, as a tracker on board would log it."""
+    """Write a log of the actor's hip, as from a tracker on board."""
     hip = flight.position[:, [flight.joints.index(f"{side}_hip") for side in ("left", "right")]].mean(axis=1)
     entries = [
         Entry(
@@ -124,7 +124,7 @@ def test_a_floor_plan_is_read_again_when_its_picture_changes(tmp_path: Path) -> 
 
 
 def test_what_the_logs_of_a_gimbal_and_an_actor_lose_is_counted(tmp_path: Path) -> None:
-    """A gimbal's quaternion that is none and an actor's fixes without a fix, each in a log of its own."""
+    """Use invalid quaternions of a gimbal and invalid fixes of an actor, each in its own log."""
     flight = write_flight(tmp_path, cameras=2, clean=True)
     camera = flight.settings["cameras"]["drone1"]
     angles = [(0.0, 0.0, 0.0, 1.0)] * len(flight.t_ns)

@@ -1,4 +1,4 @@
-"""`mocap batch`: many flights on Dask, with what single runs would have made of them."""
+"""`mocap batch`: many flights on Dask, with the same results as single runs."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ FEW_STAGES = "ingest,reconstruct"
 
 @dataclass
 class Skipped:
-    """Of a stage's result all that a batch asks for."""
+    """The part of a stage's result that a batch needs."""
 
     skipped: bool
 
 
 class Cluster:
-    """A Dask scheduler and two workers, each a process of its own, that talk over TCP."""
+    """A Dask scheduler and two workers, each in its own process, connected by TCP."""
 
     def __init__(self, folder: Path) -> None:
         self._stack = ExitStack()
@@ -77,7 +77,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 
 def flights_and_single_runs(folder: Path, count: int) -> tuple[list[Path], list[dict[str, str]]]:
-    """Manifests in folders of their own, and what single runs make of copies of them."""
+    """Write manifests in separate folders; return them and the results of single runs on copies of them."""
     manifests, single = [], []
     for k in range(count):
         for place in ("alone", "batch"):

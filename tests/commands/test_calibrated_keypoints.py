@@ -1,4 +1,4 @@
-"""What a detector's confidences are worth decides how keypoints weigh, not which are used and drawn."""
+"""Calibrated confidences of a detector: they change the weights of keypoints, not which are used or drawn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that changed since they were ingested or written: no stage uses them unseen, one command mends it."""
+"""Files changed since they were ingested or written: every stage notices, and one command repairs it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FRAMES = 12
 
 
 def mirror(video: Path) -> None:
-    """Put another video in the place of one: left and right exchanged, frames and their times as before."""
+    """Replace a video by its mirror image with the same frames and times."""
     with VideoReader(video) as reader:
         pictures = [np.ascontiguousarray(picture[:, ::-1]) for _, picture in reader.frames()]
     write_pictures(video, pictures)
@@ -39,7 +39,7 @@ def mirror(video: Path) -> None:
 
 @pytest.fixture(scope="module")
 def detected(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A flight of two cameras with videos alone, ingested and reconstructed: flight.session."""
+    """Ingest and reconstruct a flight of two cameras with only videos: flight.session."""
     folder = tmp_path_factory.mktemp("detected")
     manifest = write_spotted_flight(folder, FRAMES)
     detector = spot_detector(folder)
@@ -50,12 +50,12 @@ def detected(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def flight(detected: Path, tmp_path: Path) -> Path:
-    """A copy of it, with the models it was detected with."""
+    """Copy the flight, with the models of its detector."""
     return Path(shutil.copytree(detected, tmp_path / "copy", copy_function=shutil.copy2))
 
 
 def again(flight: Path, *options: str) -> list[str | Path]:
-    """The command that reconstructed the flight; models are known by their content, wherever they lie."""
+    """Return the command that reconstructed the flight; models are identified by their content, not path."""
     return ["reconstruct", flight / "flight.session", "--detector", spot_detector(flight), *options]
 
 
@@ -164,7 +164,7 @@ def test_videos_that_are_gone_do_not_stop_what_needs_them_no_more(flight: Path) 
 
 
 class Meddler(Silent):
-    """Progress that does something at a step."""
+    """Progress that calls a function at a step."""
 
     def __init__(self, step: int, what: Callable[[], None]) -> None:
         self._left, self._what = step, what
@@ -243,7 +243,7 @@ def test_a_source_that_is_written_while_it_is_ingested_is_refused(tmp_path: Path
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A reconstructed session with imported keypoints, and videos beside it."""
+    """Make a reconstructed session with imported keypoints, and videos beside it."""
     folder = tmp_path_factory.mktemp("filmed")
     flight = filmed_flight(folder)
     succeeds("ingest", flight.manifest)

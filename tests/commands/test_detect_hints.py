@@ -1,4 +1,4 @@
-"""What the log tells the detector of the actor's place, and what makes the stage run again."""
+"""Hints for the detector from the actor's log, and changes that make the stage run again."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Flight:
         self.settings: dict[str, Any] = YAML(typ="safe").load(self.manifest)
 
     def log_actor(self, point: str, height_m: float) -> None:
-        """Someone who stands in the origin, at which both cameras look at 1 m."""
+        """Log an actor who stands in the origin, where both cameras look at 1 m height."""
         stamps = [START_S * 10**9 + round(k * 1e9 / FPS) for k in range(FRAMES)]
         pose = {"position": {"x": 0.0, "y": 0.0, "z": height_m}, "orientation": {"w": 1.0}}
         entries = [

@@ -1,4 +1,4 @@
-"""The user's own model through the commands: spans, errors, and what a kill in the middle leaves behind."""
+"""The user's own model through the commands: spans, errors, and a kill in the middle."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_stopped_in_the_middle_it_goes_on_with_what_is_finished(tmp_path: Path) 
 
 
 def stopped_with(how: signal.Signals, blocks: int, session: Path, detector: str) -> int:
-    """Send a signal to `mocap reconstruct` once so many blocks are finished; its exit status."""
+    """Send a signal to `mocap reconstruct` after some finished blocks; return its exit status."""
     arguments = [MOCAP, "reconstruct", str(session), "--detector", detector, "--workers", "1"]
     process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
@@ -135,6 +135,6 @@ def stopped_with(how: signal.Signals, blocks: int, session: Path, detector: str)
 
 
 def finished(session: Path) -> dict[str, int]:
-    """The blocks that are finished, with the inode of their table."""
+    """Find the finished blocks, with the inode of their table."""
     blocks = (session / ".partial").glob("detect-*/*/keypoints.parquet")
     return {table.parent.name: table.stat().st_ino for table in blocks if table.parent.suffix != ".new"}

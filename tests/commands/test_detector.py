@@ -22,7 +22,7 @@ EVERY = 10
 
 @pytest.fixture
 def flight(tmp_path: Path) -> Path:
-    """Four videos, their calibration, and no keypoints."""
+    """Make a flight of four videos with their calibration, without keypoints."""
     if None in find_detector("blazepose").models().values():
         fetched = mocap_process("models", "fetch", "blazepose", timeout=300)
         if fetched.returncode:

@@ -1,4 +1,4 @@
-"""Flights whose poses come from the drones' own logs, through the commands: every camera where it was."""
+"""Flights with poses from the drones' own logs, through the commands: every camera's poses are right."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def poses_of(flight: SyntheticFlight, name: str) -> pd.DataFrame:
 
 
 def errors(flight: SyntheticFlight, k: int) -> tuple[float, float]:
-    """The largest errors of a camera's poses, in m and deg, at those frames that have one."""
+    """Compute the largest errors of a camera's poses, in m and deg, over the frames that have one."""
     poses = poses_of(flight, flight.cameras[k]).set_index("t_ns")
     # Clocks in whole microseconds or milliseconds: cameras move by 1 mm in a ms at most.
     times = poses.index.to_numpy()
@@ -69,7 +69,7 @@ def errors(flight: SyntheticFlight, k: int) -> tuple[float, float]:
 
 
 def with_poses(folder: Path, poses: Any, mount: dict[str, Any] | None = None) -> SyntheticFlight:
-    """A clean flight of two cameras; `poses` writes a drone's log and says what the manifest states of it."""
+    """Write a clean flight of two cameras; `poses` writes a drone's log and returns its manifest entry."""
     flight = write_flight(folder, cameras=2, seconds=1.0, clean=True)
     flight.settings["world"] |= WORLD
     for k, name in enumerate(flight.cameras):
@@ -167,7 +167,7 @@ def test_drones_that_log_body_and_gimbal(tmp_path: Path, write: Any, metres: flo
 @pytest.mark.parametrize("says_north", [True, False])
 @pytest.mark.parametrize("meant", ["world", "body", "heading"])
 def test_what_angles_count_from_is_as_the_user_says(tmp_path: Path, meant: str, says_north: bool) -> None:
-    """Whatever the flags of the log say: angles of another reference than they claim are mended."""
+    """Check that the user's statement overrides the log's flags on the reference of its angles."""
 
     def write(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
         k = 0 if name == "drone1" else 1

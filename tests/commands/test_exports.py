@@ -24,7 +24,7 @@ from tests.synthetic.flights import START_NS, write_flight
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A reconstructed session of 12 frames with videos beside it."""
+    """Make a reconstructed session of 12 frames with videos beside it."""
     return session_of(filmed_flight(tmp_path_factory.mktemp("filmed")))
 
 

@@ -1,4 +1,4 @@
-"""`mocap info`: what each of mocap's own files and folders is, and what is wrong with others'."""
+"""`mocap info`: descriptions of mocap's own files and folders, and errors of others."""
 
 from __future__ import annotations
 

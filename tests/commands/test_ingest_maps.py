@@ -1,4 +1,4 @@
-"""Maps from logs as commands see them: stored with their times, like those of files, and replayed."""
+"""Maps from logs through the commands: stored with their times, like those of files, and replayed."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def site(side: int) -> Occupancy:
 def flight_with_maps(
     folder: Path, container: Container = "mcap-cdr", *, seconds: float = 1.0
 ) -> SyntheticFlight:
-    """A flight during which the map grows once; it is published five times."""
+    """Write a flight with five published maps; the map grows once."""
     flight = write_synthetic_flight(
         folder, cameras=2, seconds=seconds, clean=True, keypoint_format="alphapose"
     )
@@ -76,7 +76,7 @@ def test_maps_of_a_log_are_stored_with_their_times(tmp_path: Path, container: Co
 
 
 def test_the_same_map_from_a_file_and_from_a_log(tmp_path: Path) -> None:
-    """Byte for byte, but for the time from which it holds."""
+    """Compare both byte for byte, except for the time from which the map is valid."""
     flight = flight_with_maps(tmp_path)
     start_ns = int(flight.t_ns[0])
     file = as_bt(site(6), tmp_path / "site")
@@ -123,7 +123,7 @@ def test_place_clock_and_axes_of_the_log_are_applied(tmp_path: Path) -> None:
 
 
 def test_maps_change_during_the_replay(tmp_path: Path) -> None:
-    """The replay knows nothing before the first map, and says so."""
+    """Check that the replay has no map before the first one, and reports this."""
     flight = flight_with_maps(tmp_path, seconds=2.0)
     flight.settings["logs"] = {"ground": {"path": flight.settings["map"]["log"], "clock": {"offset_s": 0.5}}}
     flight.settings["map"] = {"log": "ground"}
@@ -184,7 +184,7 @@ HUSKY = "logs/ros1/husky_gps_imu_odom.bag"
 
 @pytest.mark.parametrize("name", ["octomap_geb079.bt", "octomap_ecmrv4_withfree.ot"])
 def test_real_octomap_in_a_log(tmp_path: Path, name: str) -> None:
-    """Real trees as the messages that would carry them: counted as OctoMap's own library counts."""
+    """Put real octrees into messages and compare the voxel counts with those of OctoMap's own library."""
     told = facts(f"maps/{name}")
     first_s = facts(HUSKY)["topics"]["/husky_velocity_controller/odom"]["header_stamp_range"][0]
     entry = octomap_entry(real_data(f"maps/{name}").read_bytes(), round(first_s * 1e9))
@@ -203,7 +203,7 @@ def test_real_octomap_in_a_log(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.slow
 def test_real_lidar(tmp_path: Path) -> None:
-    """Five clouds of a car's lidar; the log does not say where the sensor is."""
+    """Use five clouds of a car's lidar; the log does not state the sensor's pose."""
     name = "logs/ros1/embag_pointcloud2_lidar.bag"
     told = facts(name)["topics"]["/luminar_pointcloud"]
     first_s = facts(HUSKY)["topics"]["/husky_velocity_controller/odom"]["header_stamp_range"][0]
@@ -229,7 +229,7 @@ def test_real_lidar(tmp_path: Path) -> None:
 
 
 def _voxels_of_lidar(name: str, side: float) -> int:
-    """Counted with the ordinary reader of bags."""
+    """Count voxels with the public reader of bags."""
     from rosbags.highlevel import AnyReader
 
     found = []

@@ -1,4 +1,4 @@
-"""Ingest opens each log once, closes it whatever happens, and needs no more memory for a longer one."""
+"""Ingest of logs: it opens each log once, always closes it, and needs no more memory for a longer one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.synthetic.logs import Entry, write_log
 
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[OpenLog]:
-    """The MCAP logs that were opened."""
+    """Record the MCAP logs that are opened."""
     logs: list[OpenLog] = []
     open_log = McapLog.open_log
 
@@ -69,7 +69,7 @@ def test_logs_are_closed_after_a_fault(tmp_path: Path, opened: list[OpenLog]) ->
 
 
 def test_losses_count_for_the_topic_that_lost_them(tmp_path: Path) -> None:
-    """The log stays open, yet what one topic lost is not said of the next."""
+    """Check that losses of one topic are not counted for the next, although the log stays open."""
     flight = write_logged_flight(tmp_path, "ros1")
     stamp_ns = 1_700_000_000_000_000_000
     header = {"stamp": stamp_ns}
@@ -98,7 +98,7 @@ def test_losses_count_for_the_topic_that_lost_them(tmp_path: Path) -> None:
 
 
 def test_a_frozen_estimator_is_told_from_a_camera_at_rest() -> None:
-    """100 Hz for ten seconds; x stands from second 2 to 4.5 and, too shortly, from 6 to 6.9."""
+    """Use 100 Hz for ten seconds; x stands still from 2 to 4.5 s and, too short to count, from 6 to 6.9 s."""
     k = np.arange(1000)
     x = np.where(k < 200, k, np.where(k < 451, 200, np.where(k < 600, k, np.where(k < 691, 600, k)))) / 100.0
     position = np.stack([x, np.zeros(1000), np.full(1000, 5.0)], axis=1)
@@ -117,7 +117,7 @@ def test_a_frozen_estimator_is_told_from_a_camera_at_rest() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("container", CONTAINERS)
 def test_memory_is_bounded(tmp_path: Path, container: str) -> None:
-    """60 MB more of pictures, which nothing holds, cost less than a quarter of that."""
+    """Check that 60 MB more of pictures, which ingest does not keep, cost less than a quarter of that."""
     tiny, small, large = (
         write(tmp_path / str(megabytes), container, RECORDER, 200_000, megabytes) for megabytes in (1, 20, 80)
     )

@@ -1,4 +1,4 @@
-"""`mocap init`: what it drafts is what the flight was, or says what is missing."""
+"""`mocap init`: the draft describes the flight correctly, or says what is missing."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from tests.synthetic.videos import even_ticks, write_video
 
 
 def drafted(folder: Path) -> tuple[Drafted, dict[str, Any]]:
-    """The manifest of a folder, and what it says as plain YAML."""
+    """Draft the manifest of a folder; return the result and its content as plain YAML."""
     result = draft([folder])
     return result, YAML(typ="safe", pure=True).load(result.text)
 
 
 def edit(manifest: Path, edits: dict[str, str]) -> None:
-    """Replace what the manifest says, wherever it stands, as a user would."""
+    """Replace texts anywhere in the manifest, as a user would."""
     text = manifest.read_text(encoding="utf-8")
     for old, new in edits.items():
         assert old in text
@@ -43,7 +43,7 @@ def tables(session: Path) -> dict[str, str]:
 
 
 def write_lenses(flight: SyntheticFlight) -> None:
-    """The intrinsics that the flight's manifest holds inline, as a calibration of all cameras."""
+    """Write the intrinsics in the flight's manifest as a calibration file of all cameras."""
     matrix = [[LENS.fx, 0.0, LENS.cx], [0.0, LENS.fy, LENS.cy], [0.0, 0.0, 1.0]]
     lines = [
         f'[cam_{k}]\nname = "{name}"\nsize = [{LENS.width}, {LENS.height}]\nmatrix = {matrix}\n'

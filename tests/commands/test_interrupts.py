@@ -1,4 +1,4 @@
-"""Two writers: the second says so. What kills leave is tested in tests/kills."""
+"""Two writers: the second one reports the first. Kills are tested in tests/kills."""
 
 from __future__ import annotations
 

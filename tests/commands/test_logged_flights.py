@@ -1,4 +1,4 @@
-"""Flights whose poses, intrinsics and pictures are in logs: every container, and what damage does."""
+"""Flights with poses, intrinsics and pictures in logs: every container, and effects of damage."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def ingested(folder: Path) -> tuple[Path, dict[str, Any]]:
 
 
 def tables(session: Path) -> dict[str, str]:
-    """What the session holds of the flight; session.json names the logs, which differ."""
+    """Hash the tables of the session, without session.json, which names the logs."""
     return {name: digest for name, digest in content(session).items() if name.endswith(".parquet")}
 
 

@@ -1,4 +1,4 @@
-"""`mocap models`, as users run it; no test here needs a network."""
+"""`mocap models`; no test here needs a network."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HEAVY = "pose_landmark_heavy.tflite"
 
 @pytest.fixture
 def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """No models in the cache, and no network for pip."""
+    """Set an empty cache of models, and no network for pip."""
     monkeypatch.setenv("MOCAP_MODELS", str(tmp_path / "cache"))
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
@@ -39,7 +39,7 @@ def test_what_is_missing_is_listed_with_the_command_that_gets_it(empty_cache: Pa
 
 
 def test_accuracy_and_time_are_those_of_the_documentation(empty_cache: Path) -> None:
-    """The table of docs/detector.md is what `python -m benchmarks.detectors` printed."""
+    """Compare with the table of docs/detector.md, which `python -m benchmarks.detectors` printed."""
     page = (Path(__file__).parents[2] / "docs" / "detector.md").read_text(encoding="utf-8")
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if "|" in line]
     documented = {row[0]: (float(row[1]), float(row[-1])) for row in rows if row[0].startswith("blazepose")}

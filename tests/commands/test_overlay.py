@@ -1,4 +1,4 @@
-"""Reprojection videos: what is drawn lies where geometry says, on every picture, at its own time."""
+"""Overlay videos: the skeleton is drawn where geometry predicts, on every picture, at its own time."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ STEPS_NS = np.array([0, 33, 67, 100, 133, 150, 217, 250, 283, 317, 350, 400]) * 
 
 
 class Watcher:
-    """Progress that remembers what was said, and can interrupt the work."""
+    """Progress that records notes, and can interrupt the work."""
 
     def __init__(self, stop_after: int | None = None) -> None:
         self.notes: list[str] = []
@@ -56,7 +56,7 @@ class Watcher:
 
 
 def filmed_flight(folder: Path) -> SyntheticFlight:
-    """A clean flight of 0.4 s with plain grey videos; drone2 films at an uneven rate, at times of its own."""
+    """Write a clean flight of 0.4 s with plain grey videos; drone2 has an uneven rate and other times."""
     flight = write_flight(folder, seconds=FRAMES / 30, clean=True)
     film_at(flight, "drone2", START_NS + STEPS_NS)
     stamps = {"drone1": flight.t_ns - START_NS, "drone2": STEPS_NS}
@@ -85,7 +85,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> tuple[SyntheticFlight, P
 
 @pytest.fixture
 def session(filmed: tuple[SyntheticFlight, Path], tmp_path: Path) -> Path:
-    """A copy of a reconstructed session, with its videos beside it."""
+    """Copy a reconstructed session, with its videos beside it."""
     flight, _ = filmed
     shutil.copytree(flight.manifest.parent, tmp_path / "copy")
     return tmp_path / "copy" / "flight.session"
@@ -96,7 +96,7 @@ def summary(session: Path) -> dict[str, Any]:
 
 
 def is_near(picture: NDArray[np.uint8], pixel: NDArray[np.float64], colour: tuple[int, ...]) -> bool:
-    """Whether within 2 px there is one that is nearer to a colour than to the ground or another side's."""
+    """Test if a pixel within 2 px is nearer to a colour than to the ground or to another side's colour."""
     x, y = np.round(pixel).astype(int)
     part = picture[y - 2 : y + 3, x - 2 : x + 3].reshape(-1, 3).astype(float)
     others = np.array([*SIDES.values(), (GREY,) * 3, (0, 0, 0)], float)
@@ -105,7 +105,7 @@ def is_near(picture: NDArray[np.uint8], pixel: NDArray[np.float64], colour: tupl
 
 
 def true_pixels(flight: SyntheticFlight, name: str) -> NDArray[np.float64]:
-    """[F, J, 2] where the joints are seen, as the flight's clean keypoints say it."""
+    """Read the true pixels [F, J, 2] of the joints from the flight's clean keypoints."""
     people = json.loads((flight.manifest.parent / f"{name}.json").read_text(encoding="utf-8"))
     return np.array([person["keypoints"] for person in people]).reshape(FRAMES, -1, 3)[..., :2]
 
@@ -120,7 +120,7 @@ def side_colour(joint: str) -> tuple[int, int, int]:
 
 
 def alone(pixels: NDArray[np.float64], joint: int) -> bool:
-    """Whether no other joint's dot, of 3 px, can cover the one here."""
+    """Test if no other joint's dot, of 3 px, can cover this one."""
     apart = np.linalg.norm(pixels - pixels[joint], axis=-1)
     return bool((np.delete(apart, joint) > 7).all())
 

@@ -1,4 +1,4 @@
-"""Flights with pictures: container stamps, overlays on frames, and what happens when they are gone."""
+"""Flights with pictures: container stamps, overlays on frames, and pictures that are gone."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HALF_SECOND = 15
 
 
 def with_videos(folder: Path) -> SyntheticFlight:
-    """A clean flight whose frames are stamped by its videos; the lens is scaled to their size."""
+    """Write a clean flight with frame times from its videos; the lens is scaled to their size."""
     flight = write_flight(folder, seconds=0.5, clean=True)
     for name in flight.cameras:
         write_video(folder / f"{name}.mp4", even_ticks(HALF_SECOND))

@@ -1,4 +1,4 @@
-"""The whole way from files to a measured skeleton, as commands."""
+"""The whole pipeline from files to a measured skeleton, as commands."""
 
 from __future__ import annotations
 

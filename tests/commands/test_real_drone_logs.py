@@ -28,7 +28,7 @@ def facts(name: str) -> dict[str, Any]:
 
 
 def write_flight(folder: Path, name: str, start_s: float, pose: dict[str, Any], **camera: Any) -> Path:
-    """One camera whose poses come from a real log, copied beside the manifest."""
+    """Write a flight of one camera with poses from a real log, copied beside the manifest."""
     log = folder / Path(name).name
     shutil.copyfile(real_data(name), log)
     joints = [value for j in range(17) for value in (100 + j, 200, 0.9)]

@@ -1,4 +1,4 @@
-"""Real logs, maps and calibrations, ingested as commands: what is in the session is what facts.json says."""
+"""Real logs, maps and calibrations, ingested by commands: the session agrees with facts.json."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def facts(name: str) -> dict[str, Any]:
 
 
 def write_flight(folder: Path, pose: dict[str, Any], start_s: float, **parts: Any) -> Path:
-    """One camera whose poses come from a real log; its keypoints are two joints that are always there."""
+    """Write a flight of one camera with poses from a real log, and keypoints that are always present."""
     people = [
         {
             "image_id": k,

@@ -1,4 +1,4 @@
-"""`mocap reconstruct` as users run it: disturbed poses, filled gaps, smoothing, logged covariances."""
+"""Options of `mocap reconstruct`: disturbed poses, filled gaps, smoothing, logged covariances."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.synthetic.logged_flights import write_logged_flight
 
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory: pytest.TempPathFactory) -> tuple[SyntheticFlight, Path]:
-    """A flight without any error, ingested, whose first camera missed the left wrist for four frames."""
+    """Ingest a flight without errors, whose first camera misses the left wrist for four frames."""
     folder = tmp_path_factory.mktemp("clean")
     flight = write_flight(folder, cameras=2, seconds=2.0, clean=True)
     keypoints = json.loads((folder / "drone1.json").read_text(encoding="utf-8"))
@@ -35,7 +35,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> tuple[SyntheticFlight, Pa
 
 
 def command(session: Path, *options: str) -> Result:
-    """The command in this process: starting one takes longer than what it does."""
+    """Run the command in this process, because starting one takes longer than the work."""
     arguments = ["reconstruct", str(session), "--workers", "1", *options]
     return CliRunner().invoke(Mocap(commands=[reconstruct_command]), arguments)
 
@@ -157,7 +157,7 @@ def test_smoothing_is_said_and_lowers_what_noise_does(tmp_path: Path) -> None:
 
 
 def test_a_logged_covariance_is_the_prior_unless_noise_is_stated(tmp_path: Path) -> None:
-    """The log says 0.2, 0.2, 0.3 m and 0.01 rad: heights are known less well, and the skeleton says so."""
+    """Check that logged sigmas of 0.2, 0.2, 0.3 m and 0.01 rad make the skeleton's heights less certain."""
     flight = write_logged_flight(tmp_path, "mcap-cdr", seconds=0.4)
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest, "-o", session)
@@ -179,7 +179,7 @@ def test_a_logged_covariance_is_the_prior_unless_noise_is_stated(tmp_path: Path)
 
 
 def point_variances(flight: SyntheticFlight, position_covariance: Any) -> Any:
-    """Variances [3] of a point in the middle of the body: each ray is off across itself."""
+    """Compute the variances [3] of a point in the middle of the body, from errors across each ray."""
     middle = flight.position.mean(axis=1)
     variances = []
     for t, point in enumerate(middle):

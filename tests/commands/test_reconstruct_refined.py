@@ -1,4 +1,4 @@
-"""`mocap reconstruct --method refined`, as a user runs it."""
+"""`mocap reconstruct --method refined` as a command."""
 
 from __future__ import annotations
 
@@ -116,14 +116,14 @@ def test_refined_finds_the_clock_of_a_moving_camera(offset_s: float, tmp_path: P
 
 
 def half_a_second_late(folder: Path) -> SyntheticFlight:
-    """A clock is called known and is not: no pose errors explain what its camera saw."""
+    """Write a flight with a wrong clock that is stated as known; no pose errors explain its keypoints."""
     flight = write_flight(folder, cameras=3, seconds=1.5, pose_noise={})
     flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": 0.5, "sigma_s": 0}
     return flight
 
 
 def half_a_second_long(folder: Path) -> SyntheticFlight:
-    """Too short to learn anything from; of still cameras, for which `robust` has a loss of its own."""
+    """Write a flight too short for refinement; its cameras are still, so `robust` uses its own loss."""
     flight = write_flight(folder, cameras=3, seconds=0.5, static=True)
     for camera in flight.settings["cameras"].values():
         del camera["pose_noise"]

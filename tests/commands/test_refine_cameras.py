@@ -1,4 +1,4 @@
-"""`--refine-cameras background`: on the rendered pictures of the sample flight, and where there are none."""
+"""`--refine-cameras background`: on the rendered pictures of the sample flight, and without pictures."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_without_pictures_it_is_refused_in_a_line(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_background_of_the_sample_flight_halves_the_errors_of_attitudes(tmp_path: Path) -> None:
-    """Rendered pictures, known poses, 4 s of 12; all of both cameras are in docs/decisions."""
+    """Use rendered pictures with known poses, 4 s of 12; results for all of both are in docs/decisions."""
     session = tmp_path / "sample.session"
     succeeds("ingest", SAMPLE / "flight.yaml", "-o", session)
     entry = read_description(session).cameras["drone2"]

@@ -1,4 +1,4 @@
-"""`mocap replan-compare` on short simulated flights: order of the arms, what is stored and refused."""
+"""`mocap replan-compare` on short simulated flights: order of the arms, stored results and refusals."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ DESIGN_KEYS = {
 
 
 def compare(*arguments: str | Path) -> Result:
-    """The command behind the place that turns errors into a line."""
+    """Run the command in the group that turns errors into a line."""
     group = Mocap("mocap", commands=[replan_compare_command])
     return CliRunner().invoke(group, ["replan-compare", *map(str, arguments)])
 
 
 def compared(*arguments: str | Path) -> dict[str, Any]:
-    """Its metrics."""
+    """Run the command and return its metrics."""
     done = compare(*arguments, "--json")
     assert done.exit_code == 0, done.stderr
     metrics: dict[str, Any] = json.loads(done.stdout)
@@ -83,7 +83,7 @@ def refused(*arguments: str | Path) -> str:
 
 
 def session_of(folder: Path, scenario: str) -> Path:
-    """The session of a simulated flight without video."""
+    """Simulate a flight without video and ingest it; return the session."""
     path = folder / "scenario.yaml"
     path.write_text(scenario, encoding="utf-8")
     simulate(path, folder / "flight", video=False)
@@ -116,7 +116,7 @@ def test_arms_see_with_the_errors_of_the_detector_that_the_session_used(calm: Pa
 
 
 def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_better(mound: Path) -> None:
-    """METHODS' reference: 38 deg for fixed, 17 for adaptive; asked for: the order, with a margin."""
+    """Require the order of the arms, with a margin; the reference is 38 deg for fixed, 17 for adaptive."""
     metrics = compared(mound, "--trials", "8", "--seed", "3")
     arms = metrics["arms"]
     assert list(arms) == ["adaptive", "fixed", "flown"]
@@ -223,7 +223,7 @@ def test_an_interrupted_comparison_flies_only_what_is_missing(
 
 
 def test_in_the_open_nothing_is_found_between_the_arms(calm: Path) -> None:
-    """Equal flights of equal seeds: the difference is exactly nothing."""
+    """Check that equal flights with equal seeds have a difference of exactly zero."""
     metrics = compared(calm, "--arms", "fixed,adaptive", "--trials", "3", "--mode", "plan-only")
     (difference,) = metrics["differences"]
     assert (difference["arm"], difference["against"]) == ("adaptive", "fixed")
@@ -257,7 +257,7 @@ def test_the_options_reach_the_planner(calm: Path, tmp_path: Path) -> None:
 
 
 def test_yaws_count_from_the_heading_of_who_walks_north(tmp_path: Path) -> None:
-    """Who looks east at first, and turns on the spot for two seconds."""
+    """Use an actor who looks east at first, and turns on the spot for two seconds."""
     north = CALM.replace("walk: {distance_m: 5}", "walk: {to: [0, 5]}").replace("_s: 4", "_s: 6")
     session = session_of(tmp_path, north)
     asked = ("--arms", "fixed", "--yaw", "90", "--trials", "1", "--mode", "plan-only")
@@ -291,7 +291,7 @@ def test_without_an_actor_the_reconstruction_says_where_he_was(tmp_path: Path) -
 
 
 def test_who_knows_no_skeleton_is_told_so(tmp_path: Path) -> None:
-    """A flight with a logged actor and without truth; what is reconstructed later is looked at."""
+    """Use a flight with a logged actor and no truth; after a reconstruction, its skeleton is used."""
     session = _without_truth(tmp_path)
     done = compare(session, "--trials", "2")
     assert done.exit_code == 0, done.stderr
@@ -341,7 +341,7 @@ def test_what_the_map_and_the_log_leave_open_is_said(tmp_path: Path) -> None:
 
 
 def test_a_real_map_is_loaded_and_flown_in(tmp_path: Path) -> None:
-    """Building 079 at Freiburg; 185673 of its voxels are occupied, says its README."""
+    """Use building 079 at Freiburg; its README states 185673 occupied voxels."""
     site = real_data("maps/octomap_geb079.bt")
     session_of(tmp_path, CALM)
     manifest = tmp_path / "flight" / "flight.yaml"

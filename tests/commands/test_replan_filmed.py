@@ -67,7 +67,7 @@ def test_arms_are_filmed_and_a_detector_looks_at_them(tmp_path: Path) -> None:
 
 
 class BegunError(Exception):
-    """Raised with the inputs of a stage, in the place of running it."""
+    """Error with the inputs of a stage, raised instead of running it."""
 
 
 def test_another_motion_file_is_another_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

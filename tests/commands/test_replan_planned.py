@@ -1,4 +1,4 @@
-"""`plan:` of flight.yaml, and what was commanded in flight as the arm `planned`."""
+"""`plan:` of flight.yaml: the commands in flight as the arm `planned`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Float = NDArray[np.float64]
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A flight of two drones at 15 deg, whose planner wanted them at 40 deg and 8 m, east and north."""
+    """Make a flight of two drones at 15 deg; its planner commanded 40 deg and 8 m, east and north."""
     folder = tmp_path_factory.mktemp("planned")
     session = session_of(folder, CALM)
     flight = folder / "flight"
@@ -44,14 +44,14 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def true_hips(session: Path) -> tuple[NDArray[np.int64], Float]:
-    """Where they were, at every moment that the truth speaks of."""
+    """Read the times and the positions of the true hips."""
     truth = pd.read_parquet(session / "truth.parquet")
     hips = truth[truth["joint"].isin(["left_hip", "right_hip"])].groupby("t_ns")[["x", "y", "z"]].mean()
     return hips.index.to_numpy(np.int64), hips.to_numpy(np.float64)
 
 
 def with_plan(flight: Path, name: str, **plan: Any) -> Path:
-    """The flight's manifest once more, with a plan."""
+    """Write a copy of the flight's manifest with a plan."""
     yaml = YAML(typ="safe", pure=True)
     stated = yaml.load((flight / "flight.yaml").read_text(encoding="utf-8"))
     path = flight / f"{name}.yaml"
@@ -101,7 +101,7 @@ def test_what_was_commanded_is_an_arm_like_the_others(flown: Path, tmp_path: Pat
 
 
 def test_one_drone_alone_and_a_gap_in_its_commands(flown: Path, tmp_path: Path) -> None:
-    """Commands that stop for longer than they hold are said, and the way between is straight."""
+    """Check that a gap in commands is reported, and that the path across it is straight."""
     rows = (flown / "drone2.tum").read_text(encoding="utf-8").splitlines()
     (flown / "gap.tum").write_text("\n".join([*rows[:4], *rows[-4:]]) + "\n", encoding="utf-8")
     session = tmp_path / "alone.session"

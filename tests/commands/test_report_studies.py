@@ -1,4 +1,4 @@
-"""`mocap report --study`: a study on a session's page, only while it is asked for."""
+"""`mocap report --study`: a study on a session's page, only if it is requested."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STUDY = ("--seconds", "4", "--rate", "5", "--trials", "2", "--methods", "dlt", "
 
 @pytest.fixture
 def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A flight; studies are made without their own figure, which takes longer than these small ones."""
+    """Ingest a flight; studies run without their figure, which takes longer than these small ones."""
     monkeypatch.setattr("pipelines.ablate.draw", lambda *_: None)
     flight = write_flight(tmp_path, seconds=1.0)
     ingest(flight.manifest, session=tmp_path / "flight.session")
@@ -68,7 +68,7 @@ def test_what_is_no_study_gets_one_line(session: Path, tmp_path: Path) -> None:
 
 
 def test_a_study_in_a_session_disturbs_nothing_and_replaces_no_session(session: Path) -> None:
-    """Not even with --overwrite, which replaces other people's folders."""
+    """Check that --overwrite does not replace a session either."""
     succeeds("report", session)
     succeeds("ablate", "robots", "--robots", "2", *STUDY, "-o", session / "study")
     assert "unchanged" in succeeds("report", session)

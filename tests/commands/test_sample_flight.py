@@ -1,4 +1,4 @@
-"""The sample flight through the real detector: what the README says of it."""
+"""The sample flight with the real detector: results that the README states."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ LEGS = ("left_knee", "right_knee", "left_ankle", "right_ankle")
 def test_the_detector_and_true_poses_give_the_skeleton(
     tmp_path: Path, detector: str, most_mm: float, advised: int
 ) -> None:
-    """At most 45 or 36 mm at 95 %: about half is what the detector means by hips and shoulders."""
+    """Allow 45 or 36 mm at 95 %: half of it is the detector's different definition of hips and shoulders."""
     session, said = reconstructed(tmp_path, detector, "--every", "6")
     metrics: dict[str, Any] = read_json(session / "reconstruct" / "metrics.json")
     assert metrics["mpjpe_mm"] < most_mm
     assert metrics["reconstructed_share"] > 0.95
-    # Where heavy was not asked for, one line says that it is there.
+    # Without heavy, one line advises to use it.
     assert sum("--detector blazepose-heavy" in line for line in said.splitlines()) == advised
 
     # Its confidences are weighed by its own calibration, and the report names it.
@@ -48,9 +48,9 @@ def test_the_detector_and_true_poses_give_the_skeleton(
 
 @pytest.mark.slow
 def test_no_leg_is_taken_for_the_other(tmp_path: Path) -> None:
-    """Seen from the side, BlazePose takes one for the other in 8 of the first 110 pictures of drone1.
+    """Check that no leg is swapped, as BlazePose does in 8 of drone1's first 110 pictures from the side.
 
-    A foot is then 0.3 to 0.6 m from truth; the detector's other errors stay below that.
+    A foot is then 0.3 to 0.6 m from truth; the detector's other errors are smaller.
     """
     session, _ = reconstructed(tmp_path, "blazepose", "--end", "3.6")
     skeleton = motion_from(read_table(session / "reconstruct" / "skeleton.parquet", SKELETON), LEGS)
@@ -63,7 +63,7 @@ def test_no_leg_is_taken_for_the_other(tmp_path: Path) -> None:
 
 
 def reconstructed(folder: Path, detector: str, *options: str) -> tuple[Path, str]:
-    """Ingest the sample with its true poses, and reconstruct it; the session, and what was said."""
+    """Ingest the sample with its true poses, and reconstruct it; return the session and the output."""
     if None in find_detector(detector).models().values():
         fetched = mocap_process("models", "fetch", detector, timeout=300)
         if fetched.returncode:
@@ -77,9 +77,9 @@ def reconstructed(folder: Path, detector: str, *options: str) -> tuple[Path, str
 
 @pytest.mark.slow
 def test_adaptive_films_it_better_than_fixed(tmp_path: Path) -> None:
-    """Lower, seen more of the time and nearer to the truth: all three with intervals that exclude zero.
+    """Require lower tilt, less occlusion and smaller error, all three with intervals that exclude zero.
 
-    The errors are drawn 25 times, 4 mm of standard error against some 14 mm between the arms.
+    The errors are drawn 25 times: the standard error is 4 mm, the difference of the arms about 14 mm.
     """
     session = tmp_path / "flight.session"
     succeeds("ingest", SAMPLE / "flight.yaml", "-o", session)

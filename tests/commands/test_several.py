@@ -1,4 +1,4 @@
-"""Every command of one flight or session takes several, or a pattern that no shell expanded."""
+"""Several flights or sessions for one command, or a pattern that the shell did not expand."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.synthetic.flights import write_flight
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two flights, and one between them that is none."""
+    """Make two flights, and a damaged one between them."""
     made = tmp_path_factory.mktemp("several")
     for k, name in enumerate(("friday", "monday")):
         write_flight(made / name, seconds=0.2, seed=k)

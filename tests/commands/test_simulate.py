@@ -1,4 +1,4 @@
-"""Simulated flights through the commands: the truth closes, the files are what others read."""
+"""Simulated flights through the commands: results agree with the truth, other programs read the files."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def scenario(folder: Path, text: str) -> Path:
 
 
 def simulated(folder: Path, text: str, *options: str) -> Path:
-    """The flight.yaml of a simulated flight."""
+    """Simulate a flight and return its flight.yaml."""
     output = folder / "flight"
     succeeds("simulate", scenario(folder, text), "-o", output, *options)
     return output / "flight.yaml"
@@ -84,7 +84,7 @@ def simulated(folder: Path, text: str, *options: str) -> Path:
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The flight.yaml of the small flight without videos, to look at and not to change."""
+    """Simulate the small flight without videos and return its flight.yaml; tests must not change it."""
     return simulated(tmp_path_factory.mktemp("small"), SMALL, "--no-video")
 
 
@@ -110,7 +110,7 @@ def reconstructed(flight: Path, *options: str) -> dict[str, Any]:
 
 
 def test_the_truth_closes(tmp_path: Path) -> None:
-    """Exact keypoints and poses: what is left is interpolating poses, linear between 50 Hz stamps."""
+    """Allow only the error of linear pose interpolation between 50 Hz stamps: all data are exact."""
     metrics = reconstructed(simulated(tmp_path, EXACT, "--no-video"))
     assert metrics["mpjpe_mm"] < 0.5
     # The field of view holds the person throughout and nothing stands in the way.
@@ -207,7 +207,7 @@ def test_the_map_is_read_by_octomap_itself(small: Path) -> None:
 
 
 def test_what_stands_in_the_way_is_told(tmp_path: Path) -> None:
-    """A wall between the actor and the first drone hides the actor from it, and from no other."""
+    """Check that a wall between the actor and the first drone hides the actor only from that drone."""
     wall = "world: {walls: [{start: [3, -6], end: [3, 6], height_m: 5}]}\ndrones:"
     text = EXACT.replace("drones:", wall).replace("count: 3", "count: 2")
     begin, end = text.index("  motion:"), text.index("world:")
@@ -355,7 +355,7 @@ def test_what_was_made_beside_a_flight_does_not_go_with_it(tmp_path: Path) -> No
 
 
 def test_any_name_reads_back(tmp_path: Path) -> None:
-    """Quotes, line breaks and control characters stay inside of the manifest's one scalar."""
+    """Check that quotes, line breaks and control characters stay inside one scalar of the manifest."""
     name = 'said "hi" \\ \n#: {a}\t\x07\x7f\x85\u2028\ufeff \U0001f6b6'
     text = SMALL.replace("name: Small", f"name: {json.dumps(name)}".replace("\x7f", "\\x7f"))
     text = text.replace("\\ud83d\\udeb6", "\\U0001f6b6")  # JSON has pairs of surrogates, YAML has not
@@ -409,7 +409,7 @@ def test_an_interrupted_rendering_goes_on_where_it_was(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_planner_flies_around_what_the_ring_flies_into(tmp_path: Path) -> None:
-    """A wall across the ring, at the height of the drones: the planner keeps away, the ring does not."""
+    """Put a wall across the ring, at the height of the drones: the planner avoids it, the ring does not."""
     wall = "world: {walls: [{start: [6, 0.5], end: [16, 0.5], height_m: 6}], ground: {size_m: 40}}\ndrones:"
     text = (
         EXACT.replace("drones:", wall)

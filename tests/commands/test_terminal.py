@@ -1,4 +1,4 @@
-"""What commands print: names and texts from outside must not steer a terminal or begin lines of their own."""
+"""Output of commands: names and texts from files must not control a terminal or start new lines."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STEERING = {"Cc", "Cf", "Zl", "Zp", "Cs"}
 
 
 def steering(text: str) -> set[str]:
-    """What is in a text and could steer a terminal, but for the ends of lines."""
+    """Find the characters of a text that could control a terminal, except ends of lines."""
     return {c for c in text.replace("\n", "") if unicodedata.category(c) in STEERING}
 
 

@@ -1,4 +1,4 @@
-"""What a manifest says of times and numbers, from descriptions alone."""
+"""Times and numbers in drafted manifests, from descriptions alone."""
 
 from __future__ import annotations
 

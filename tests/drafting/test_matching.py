@@ -74,7 +74,7 @@ def camera(draft: Draft, name: str) -> CameraDraft:
 
 
 def taken(choice: Choice | None) -> str:
-    """What was chosen, in a word."""
+    """Return the name of the chosen candidate; empty without one."""
     if choice is None:
         return ""
     settings = choice.taken.settings

@@ -1,1 +1,1 @@
-"""What docs/extending.md shows, added from outside the package."""
+"""Extensions of docs/extending.md, added from outside the package."""

@@ -1,4 +1,4 @@
-"""The modules of docs/extending.md as somebody else's package, found by its entry points alone."""
+"""The modules of docs/extending.md as a separate package, found only by its entry points."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _GROUP = re.compile(r'\[project\.entry-points\."(.+)"\]\n(\w+) = "(.+)"')
 
 @pytest.fixture(scope="module")
 def outside(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder on the path with the page's modules and the metadata that installing them would write."""
+    """Make a folder for the path, with the page's modules and the metadata that pip would write."""
     folder = tmp_path_factory.mktemp("site")
     text = _PAGE.read_text(encoding="utf-8")
     modules = _MODULE.findall(text)
@@ -63,7 +63,7 @@ def _true_poses() -> list[list[float]]:
 
 @pytest.fixture(scope="module")
 def session(outside: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The sample flight's first camera with poses from a JSON-lines log; the other one as it was."""
+    """Ingest the sample flight with poses of the first camera from a JSON-lines log."""
     folder = tmp_path_factory.mktemp("flight")
     rows = [
         {"t": t, "topic": "/pose", "p": position, "q": quaternion}

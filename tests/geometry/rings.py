@@ -1,4 +1,4 @@
-"""A walking person in a ring of cameras, with exact image points, and what can be wrong with them."""
+"""A walking person in a ring of cameras, with exact image points, and functions that add errors."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ LEVELS = {"a": (0.1, 0.5), "b": (0.3, 1.0), "c": (0.5, 2.0)}  # m, deg per axis:
 
 
 def ring(frames: int, cameras: int) -> tuple[Float, Views]:
-    """The walk of the peers' table: 17 joints, 10 m ring at 15 deg that turns slowly, exact image points."""
+    """Make the walk of the peers' table: 17 joints, a slowly turning 10 m ring at 15 deg, exact points."""
     t_s = np.arange(frames) / 30
     joints = walk(t_s, radius_m=15.0)
     actor = joints.mean(axis=1)
@@ -44,14 +44,14 @@ def ring(frames: int, cameras: int) -> tuple[Float, Views]:
 
 
 def project(joints: Float, position: Float, rotation: Float) -> Float:
-    """[F, J, 3] points into [F, J, C, 2]."""
+    """Project points [F, J, 3] to [F, J, C, 2]."""
     seen = np.einsum("fcij,fkci->fkcj", rotation, joints[:, :, None] - position[:, None])
     xy: Float = seen[..., :2] / seen[..., 2:]
     return xy
 
 
 def turned(rotation: Float, vector: Float) -> Float:
-    """The rotation times that of a rotation vector in the camera's frame (Rodrigues)."""
+    """Multiply the rotation by that of a rotation vector in the camera's frame (Rodrigues)."""
     angle = np.linalg.norm(vector, axis=-1)[..., None, None]
     x, y, z = np.moveaxis(vector, -1, 0)
     o = np.zeros_like(x)
@@ -83,7 +83,7 @@ def with_pose_noise(
 
 
 def with_outliers(views: Views, rng: np.random.Generator, *, uniform: bool) -> tuple[Views, Bool]:
-    """5 % gross outliers, 5 % missing, and which views are good."""
+    """Add 5 % gross outliers and 5 % missing views; return also which views are good."""
     n, cameras = views.weight.shape
     bad = rng.random((n, cameras)) < 0.05
     missing = rng.random((n, cameras)) < 0.05

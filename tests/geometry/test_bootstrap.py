@@ -1,4 +1,4 @@
-"""Intervals of means over time, against the variances that are known of the series they are drawn from."""
+"""Intervals of means over time, against the known variances of the series."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def stamps(count: int = SAMPLES) -> NDArray[np.int64]:
 
 
 def mean_width(series: Float) -> float:
-    """The mean width of the intervals of many series [K, T]."""
+    """Compute the mean width of the intervals of many series [K, T]."""
     widths = []
     for k, values in enumerate(series):
         found = intervals({"x": (values, ONE)}, stamps(), seed=k)["x"]

@@ -35,7 +35,7 @@ EVERY = pytest.mark.parametrize(
 
 
 def points_in_view(camera: Intrinsics, count: int = 200) -> Float:
-    """Points whose undistorted image lies in the picture, 1 to 40 m away."""
+    """Draw points whose undistorted image lies in the picture, 1 to 40 m away."""
     rng = np.random.default_rng(3)
     pixels = rng.uniform([0, 0], [camera.width, camera.height], (count, 2))
     normalised = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]

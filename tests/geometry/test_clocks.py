@@ -11,7 +11,7 @@ START_NS = 1_700_000_000_000_000_000
 
 
 def _fit(drift_ppm: float, jitter_s: float, *, seconds: int = 600, wild: int = 0) -> tuple[ClockFit, int]:
-    """The fit of clocks that are 2.5 s apart in the middle, and what the other one reads at the end."""
+    """Fit clocks that are 2.5 s apart in the middle; return also the true other reading at the end."""
     rng = np.random.default_rng(1)
     this_ns = np.arange(0, seconds * 1_000_000_000, 200_000_000, dtype=np.int64)
     lead_s = 2.5 + (this_ns / 1e9 - seconds / 2) * drift_ppm * 1e-6

@@ -1,4 +1,4 @@
-"""The compiled code's cache: found again, damaged, or without a place."""
+"""Cache of compiled code: found again, damaged, or not writable."""
 
 import importlib
 import importlib.util
@@ -25,13 +25,13 @@ def quarter(x):
 
 @pytest.fixture(autouse=True)
 def _cache_beside_the_source(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wherever the user keeps numba's cache."""
+    """Put numba's cache beside the source, whatever the user has set."""
     monkeypatch.setattr("numba.config.CACHE_DIR", "")
 
 
 @pytest.fixture
 def load_quarter(tmp_path: Path) -> Callable[[], Callable[[float], float]]:
-    """Import the module anew, as the next process would."""
+    """Return a function that imports the module again, as the next process would."""
     path = tmp_path / "quarters.py"
     path.write_text(SOURCE)
 
@@ -70,7 +70,7 @@ def test_a_cache_file_cut_short_is_compiled_again(
 def test_a_change_of_a_helper_in_another_file_is_seen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two files away, and as long as before."""
+    """Change a helper that is two files away, without a change of its file's length."""
     helper = "from pipelines.geometry.compilation import helper\n\n@helper\ndef "
     (tmp_path / "doubting.py").write_text(f"{helper}doubt(x):\n    return 2.0 * x\n")
     (tmp_path / "passing.py").write_text(
@@ -98,7 +98,7 @@ def test_a_change_of_a_helper_in_another_file_is_seen(
 def test_a_cache_whose_types_moved_to_another_module_is_compiled_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: str | None
 ) -> None:
-    """As after an update: the index of what is cached names types where they were."""
+    """Read a cache as after an update: its index names types in their old modules."""
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     kind = "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    a: float\n    b: float\n"

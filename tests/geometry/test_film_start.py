@@ -22,14 +22,14 @@ SCATTER = 5e-4  # rad: a tenth of a pixel of pictures 320 px wide
 
 
 def turning(t_s: Float) -> tuple[Float, Rotation]:
-    """Looking about from one place, as nobody does twice alike: frequencies without a common measure."""
+    """Rotate a camera in one place; the frequencies have no common period, so the motion never repeats."""
     yaw = 0.5 * np.sin(0.7 * t_s) + 0.2 * np.sin(2.3 * t_s)
     pitch = 0.1 * np.sin(1.1 * t_s + 1)
     return np.zeros((len(t_s), 3)), Rotation.from_euler("YX", np.stack([yaw, pitch], axis=1))
 
 
 def flying(t_s: Float) -> tuple[Float, Rotation]:
-    """Beside somebody who walks, swaying, the view held on them: what moves in the picture is parallax."""
+    """Fly a swaying camera beside a walking person and aim at them, so that points move by parallax."""
     x = 1.3 * t_s + 0.5 * np.sin(0.9 * t_s)
     z = 0.8 * np.sin(0.55 * t_s)
     yaw = np.arctan2(1.3 * t_s - x, 10 - z)
@@ -44,7 +44,7 @@ def swinging(amplitude_rad: float, period_s: float) -> Motion:
 
 
 def seen(motion: Motion, start_s: float, seconds: float, scatter: float = SCATTER) -> Followed:
-    """Points 5 to 50 m away, anew in every stretch; each is found where it is but for some scatter."""
+    """Make points 5 to 50 m away, new ones in every stretch, with some scatter in the picture."""
     rng = np.random.default_rng(8)
     begin_s = np.arange(0.0, seconds - STRETCH_S, STRETCH_S)
     end_s = begin_s + STRETCH_S
@@ -90,7 +90,7 @@ def test_the_start_is_found_to_a_fraction_of_a_picture(motion: Motion) -> None:
 
 
 def test_the_sigma_is_that_of_the_errors() -> None:
-    """Points that err by a fifth of a pixel, a gap in the log: within four of its standard deviations."""
+    """Check errors against four sigma, with scatter of a fifth of a pixel and a gap in the log."""
     log_s = LOG_S[(LOG_S < 25) | (LOG_S > 26)]
     errors = []
     for start_s in (6.0, 11.3, 16.1, 21.7):
@@ -145,7 +145,7 @@ def test_pictures_of_another_flight_are_refused() -> None:
 
 
 def shaking(t_s: Float) -> tuple[Float, Rotation]:
-    """About both axes, by up to 8 deg, again and again but never twice alike."""
+    """Rotate about both axes by up to 8 deg, all the time but never in the same way."""
     yaw = 0.113 * np.sin(2.116 * t_s) + 0.034 * np.sin(4.866 * t_s)
     pitch = 0.049 * np.sin(2.521 * t_s + 1)
     return np.zeros((len(t_s), 3)), Rotation.from_euler("YX", np.stack([yaw, pitch], axis=1))
@@ -153,7 +153,7 @@ def shaking(t_s: Float) -> tuple[Float, Rotation]:
 
 @pytest.mark.parametrize("start_s", [6.0, 8.7, 11.3, 16.1, 19.6, 21.7])
 def test_points_that_hardly_scatter_say_the_start_no_worse(start_s: float) -> None:
-    """Their likelihood is so sharp that whole steps of Newton's method leap over its tip, to and fro."""
+    """Use a likelihood so sharp that full steps of Newton's method jump from side to side of its peak."""
     found = fitted(shaking, LOG_S, seen(shaking, start_s, 8.0, 1.4e-4), near_s=start_s + 0.3)
     assert (found.start_ns - EPOCH_NS) / 1e9 == pytest.approx(start_s, abs=4 * found.sigma_s + 1e-3)
     assert found.sigma_s < 0.01

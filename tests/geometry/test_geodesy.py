@@ -1,4 +1,4 @@
-"""From latitude and longitude to metres, against published worked examples and an independent inverse."""
+"""Conversion of latitude and longitude to metres, against published examples and an independent inverse."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_what_is_missing_stays_missing() -> None:
 
 
 def _geodetic(ecef: Float) -> Float:
-    """Latitude, longitude, altitude by iterating on the latitude (Hofmann-Wellenhof, GPS, ch. 10.2.1)."""
+    """Compute latitude, longitude, altitude by iteration (Hofmann-Wellenhof, GPS, ch. 10.2.1)."""
     flattening = 1 / 298.257223563
     e2 = flattening * (2 - flattening)
     x, y, z = ecef.T

@@ -1,4 +1,4 @@
-"""Errors worked out by hand on skeletons of a few joints, and what each metric must not see."""
+"""Errors calculated by hand for skeletons of a few joints, and changes that a metric must ignore."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def stamps(count: int, step_ms: int = 40) -> Int64:
 
 
 def walk(count: int = 6) -> Float:
-    """One person walking along x at 1.2 m/s, [T, 1, J, 3]."""
+    """Make one person who walks along x at 1.2 m/s, [T, 1, J, 3]."""
     path = np.arange(count)[:, None] * np.array([1.2 * 0.04, 0, 0])
     return np.asarray(STANCE + path[:, None, None])
 

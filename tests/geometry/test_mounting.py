@@ -52,7 +52,7 @@ NOSE_DOWN: Pose = (
 
 
 def on_paper(vector: Float, decimals: int = 4) -> str:
-    """A vector as the worked example writes it."""
+    """Write a vector in the form of the worked example."""
     rounded = np.round(np.ravel(vector), decimals) + 0.0  # no negative zero
     return "(" + ", ".join(f"{value:.{decimals}f}" for value in rounded) + ")"
 
@@ -194,7 +194,7 @@ def test_a_level_drone_heading_east_sees_what_lies_east_below_and_right_of_it() 
     ],
 )
 def test_dji_angles_in_the_world(angles: tuple[float, float, float], axis: Float, right: Float) -> None:
-    """Yaw clockwise from north, pitch up, roll right side down, whatever the body does."""
+    """Check yaw clockwise from north, pitch up, roll right side down, for any attitude of the body."""
     _, quaternion = gimbal_on_paper(NOSE_DOWN, angles, "world", "ned")
     np.testing.assert_allclose(rotate(quaternion[0], AXIS), axis, atol=1e-15)
     np.testing.assert_allclose(rotate(quaternion[0], RIGHT_OF_PICTURE), right, atol=1e-15)
@@ -217,7 +217,7 @@ def test_angles_relative_to_the_body(
 
 
 def test_an_frd_body_in_a_ned_world_is_the_flu_body_in_an_enu_world() -> None:
-    """Heading east, nose 10 degrees up, in PX4's angles: yaw 90, pitch 10."""
+    """Use a body that heads east with its nose 10 degrees up, in PX4's angles: yaw 90, pitch 10."""
     ned_from_frd = attitude_from_angles(np.array([90.0, 10, 0]), order="ypr", units="deg")
     covariance = np.diag([1.0, 2, 3, 4, 5, 6])
     covariance[3, 4] = covariance[4, 3] = 0.5
@@ -272,7 +272,7 @@ def test_a_gimbal_that_never_moves_is_a_fixed_mount(body: Float, down_deg: float
 
 @given(angles_deg)
 def test_axes_of_a_log_change_names_and_not_the_view(angles: Float) -> None:
-    """The same attitude stated in NED (heading 90 - yaw, pitch and yaw mirrored) and in ENU."""
+    """State the same attitude in NED (heading 90 - yaw, pitch and yaw mirrored) and in ENU."""
     yaw, pitch, roll = angles
     enu = attitude_from_angles(np.array([yaw, pitch, roll]), order="ypr", units="deg")
     ned = attitude_from_angles(np.array([90 - yaw, -pitch, roll]), order="ypr", units="deg")
@@ -299,7 +299,7 @@ def test_what_is_missing_stays_missing() -> None:
 
 
 def test_yaw_from_the_nose_with_pitch_and_roll_from_the_horizon() -> None:
-    """A body that heads 30 deg left of east and leans; FRD angles of 20 deg right and 40 deg down."""
+    """Use a body that heads 30 deg left of east and leans; FRD angles of 20 deg right and 40 deg down."""
     body = quaternion_from_rotation_vector(np.array([[0.0, 0.0, np.radians(30)]]))
     leaning = multiply(body, quaternion_from_rotation_vector(np.array([[0.2, 0.15, 0.0]])))
     stated = attitude_from_angles(np.array([[20.0, -40.0, 0.0]]), order="ypr", units="deg")

@@ -1,4 +1,4 @@
-"""Pose errors: what is drawn has the stated scatter, in the stated frame, and nonsense is refused."""
+"""Pose errors: draws have the stated scatter in the stated frame, and invalid parameters are refused."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ DRAWS = 3000
 
 
 def circling(t_s: Float) -> tuple[Int64, Float, Float]:
-    """A camera on a 10 m circle at 0.3 rad/s, turning with it."""
+    """Move a camera on a 10 m circle at 0.3 rad/s, turning with it."""
     angle = 0.3 * t_s
     position = 10 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     quaternion = quaternion_from_rotation_vector(angle[:, None] * np.array([0.0, 0, 1]))
@@ -52,14 +52,14 @@ def circling(t_s: Float) -> tuple[Int64, Float, Float]:
 
 
 def difference(log: tuple[Int64, Float, Float], noisy: tuple[Float, Float]) -> Float:
-    """[T, 6]: translation in the world, rotation vector in the camera."""
+    """Compute errors [T, 6]: translation in the world, rotation vector in the camera."""
     _, position, quaternion = log
     turned = rotation_vector_from_quaternion(multiply(conjugate(quaternion), noisy[1]))
     return np.concatenate([noisy[0] - position, turned], axis=1)
 
 
 def draws(models: list[NoiseModel], t_s: Float, count: int = DRAWS) -> Float:
-    """[count, T, 6] errors of independent draws."""
+    """Compute the errors [count, T, 6] of independent draws."""
     rng = np.random.default_rng(11)
     log = circling(t_s)
     return np.stack([difference(log, disturb(models, *log, rng)) for _ in range(count)])
@@ -89,7 +89,7 @@ def test_draws_scatter_as_the_marginal_sigma_says(model: NoiseModel) -> None:
 
 
 def correlation(found: Float) -> float:
-    """Between the first and the last time, over draws and axes of the position."""
+    """Compute the correlation of the first and the last time, over draws and axes of the position."""
     first, last = found[:, 0, :3].ravel(), found[:, -1, :3].ravel()
     return float(np.mean(first * last) / np.sqrt(np.mean(first**2) * np.mean(last**2)))
 

@@ -1,4 +1,4 @@
-"""Gross errors that pose noise hides: what a picture's joints share tells them, and nothing else changes."""
+"""Gross errors that pose noise hides: the picture gate finds them, and nothing else changes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def told(views: Views) -> Views:
 
 
 def gated(views: Views, picture: Int64 | None = None) -> Triangulation:
-    """Of one person, unless rows of the same person and picture are named."""
+    """Triangulate views of one person, or of the given rows of the same person and picture."""
     of = views.pose_index if picture is None else picture
     return triangulate_pictures(told(views), picture=of, pixel_sigma=views.pixel_sigma)
 
@@ -46,10 +46,10 @@ def same(one: Triangulation, other: Triangulation) -> bool:
 @pytest.mark.parametrize("level", ["0", *LEVELS])
 @pytest.mark.parametrize("cameras", [2, 3, 5])
 def test_where_nothing_errs_grossly_nothing_changes(cameras: int, level: str, constant: bool) -> None:
-    """Beyond eight standard deviations lie 1e-14 of normal errors.
+    """Expect no change: of normal errors, 1e-14 are beyond eight standard deviations.
 
-    0.5 m / 2 deg anew in every picture turn some cameras so far about their axes that the sides of the person
-    move apart: of the 100 pictures at most one may lose a joint or two.
+    With new errors of 0.5 m / 2 deg in every picture, some cameras rotate so far about their axes that the
+    sides of the person move apart. So at most one of the 100 pictures may lose one or two joints.
     """
     rng = np.random.default_rng(cameras)
     views = with_pixel_noise(ring(20, cameras)[1], rng)
@@ -73,10 +73,11 @@ def test_where_nothing_errs_grossly_nothing_changes(cameras: int, level: str, co
 def test_outliers_cost_no_more_than_their_views(
     cameras: int, level: str, constant: bool, stated: bool
 ) -> None:
-    """Twelve draws of pose errors that all see alike: methods are compared on the same draws.
+    """Compare methods on the same twelve draws of pose errors.
 
-    Beyond the good views alone 2 % are left for the joint-frames without two good views, 0.1 % of them, of
-    which each reconstructs others, at several times the mean error. A fifth is what outliers may cost at all.
+    The tolerance of 2 % over the good views alone is for joint-frames without two good views. These are
+    0.1 %; each method reconstructs different ones of them, at several times the mean error. Outliers may
+    increase the error by a fifth at most.
     """
     truth, exact = ring(40, cameras)
     errors = []
@@ -142,7 +143,7 @@ def test_rows_of_a_picture_need_not_stand_together() -> None:
 
 
 def test_a_picture_of_few_joints_tells_nothing() -> None:
-    """Of four joints of which one is 150 px off, at 0.3 m / 1 deg: as without the gate."""
+    """Use four joints, one of them off by 150 px, at 0.3 m / 1 deg: the result is that without the gate."""
     rng = np.random.default_rng(10)
     exact = ring(60, 3)[1]
     four = np.flatnonzero(np.arange(60 * 17) % 17 < 4)
@@ -157,7 +158,7 @@ def test_a_picture_of_few_joints_tells_nothing() -> None:
 
 
 def beside(one: Views, other: Views) -> tuple[Views, Int64]:
-    """Two people whom the same cameras see, rows of an instant together; and who of them in which picture."""
+    """Join the views of two people by instants; return also each row's picture number [N]."""
     frames = len(one.position)
     joints = len(one.weight) // frames
 
@@ -170,12 +171,12 @@ def beside(one: Views, other: Views) -> tuple[Views, Int64]:
 
 
 def test_people_far_apart_share_no_shift() -> None:
-    """One stands 4 m nearer to some cameras, whose errors of place move the pictures of both unlike."""
+    """Put one person 4 m nearer to some cameras, so that position errors shift the two differently."""
     rng = np.random.default_rng(11)
     truth, exact = ring(60, 5)
     aside = replace(exact, position=exact.position - np.array([4.0, 0.0, 0.0]))
     logged = with_pose_noise(exact, rng, "b", constant=True, told=True)
-    # Whoever stands 4 m to the east is seen as by cameras 4 m to the west.
+    # A person 4 m further east looks like one seen by cameras 4 m further west.
     seen = exact.xy.copy()
     away = np.einsum(
         "ncji,ncj->nci", aside.rotation[aside.pose_index], truth[:, None] - aside.position[aside.pose_index]

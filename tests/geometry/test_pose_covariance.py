@@ -1,4 +1,4 @@
-"""Covariances against samples: errors are drawn as the log means them and measured as we mean them."""
+"""Covariances against samples: errors are drawn in the log's convention and measured in the session's."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ LEVER_ARM = np.array([0.5, -0.2, 0.3])
 
 
 def logged_covariance() -> Float:
-    """Correlated, 1 to 10 cm and about 0.01 rad."""
+    """Make a covariance with correlations, 1 to 10 cm and about 0.01 rad."""
     generator = np.random.default_rng(3)
     factor = np.diag([0.1, 0.05, 0.01, 0.01, 0.005, 0.02]) @ (np.eye(6) + 0.5 * generator.normal(size=(6, 6)))
     return np.asarray(factor @ factor.T)
 
 
 def drawn_errors() -> tuple[Float, Rotation]:
-    """Position errors in the world, and rotation errors about the world's fixed axes."""
+    """Draw position errors in the world, and rotation errors about the world's fixed axes."""
     drawn = np.random.default_rng(4).multivariate_normal(np.zeros(6), logged_covariance(), SAMPLES)
     return drawn[:, :3], Rotation.from_rotvec(drawn[:, 3:])
 
@@ -53,7 +53,7 @@ def test_the_rotation_of_a_log_turns_about_the_world_and_ours_about_the_body() -
 
 @pytest.mark.parametrize("on_gimbal", [False, True])
 def test_a_lever_arm_turns_the_errors_of_attitude_into_errors_of_position(on_gimbal: bool) -> None:
-    """A camera fixed to the body, or held in the world by an attitude that errs as the body's does."""
+    """Use a camera fixed to the body, or one held in the world with the error of the body's attitude."""
     position, rotation = drawn_errors()
     world_from_camera = CAMERA if on_gimbal else BODY * CAMERA
     moved = position + (rotation * BODY).apply(LEVER_ARM) - BODY.apply(LEVER_ARM)
@@ -72,7 +72,7 @@ def test_many_at_once_and_unknown_stays_zero() -> None:
 
 
 def test_a_long_log_gives_the_same_as_its_parts() -> None:
-    """9000 poses are carried a few thousand at a time; each as if it were alone, to the last bit."""
+    """Transform 9000 poses, a few thousand at a time; each equals that of a single pose to the last bit."""
     generator = np.random.default_rng(5)
     covariance = generator.normal(size=(9000, 6, 6))
     body, camera = (Rotation.random(9000, rng=generator).as_quat() for _ in range(2))

@@ -44,7 +44,7 @@ def same_rotation(a: Float, b: Float, atol: float = 1e-12) -> None:
 
 
 def turning(t_s: Float) -> tuple[Float, Float]:
-    """Constant velocity (1, -2, 0.5) m/s and a constant turn of 0.8 rad/s about a slanted axis."""
+    """Move with velocity (1, -2, 0.5) m/s and rotate at a constant 0.8 rad/s about a slanted axis."""
     axis = np.array([2.0, -1.0, 2.0]) / 3
     start = np.array([0.1, 0.2, -0.3])
     quaternion = multiply(

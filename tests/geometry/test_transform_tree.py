@@ -27,7 +27,7 @@ def about_z(turned_deg: Float) -> Rotation:
 
 
 def gliding(t_ns: Int64, velocity: tuple[float, float, float], turn_deg_s: float = 0.0) -> Link:
-    """Constant velocity and a constant turn about z: what interpolation reproduces exactly."""
+    """Make a link with constant velocity and turn rate about z, which interpolation reproduces exactly."""
     seconds = (t_ns - EPOCH) / S
     turned = about_z(turn_deg_s * seconds)
     return Link(t_ns, seconds[:, None] * np.array(velocity), turned.as_quat())
@@ -73,7 +73,7 @@ def test_the_way_back_is_the_inverse() -> None:
 
 @given(st.lists(st.booleans(), min_size=1, max_size=6), st.integers(0, 2**31))
 def test_links_may_be_stated_either_way_round(flipped: list[bool], seed: int) -> None:
-    """A chain of random static links; each is put into the tree as it is or inverted."""
+    """Use a chain of random static links; each is put into the tree as it is or inverted."""
     generator = np.random.default_rng(seed)
     links: dict[tuple[str, str], Link] = {}
     expected: tuple[Float, Float] = (np.zeros((1, 3)), np.array([[0.0, 0, 0, 1]]))

@@ -57,7 +57,7 @@ def test_exact_views_give_exact_points(method: Method, cameras: int) -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_two_pixel_noise_gives_the_error_of_the_peers(method: Method) -> None:
-    """The peers' mean on their walk was 12.6 mm; ours differs in the route and in where the joints are."""
+    """Compare with the peers' mean of 12.6 mm; our walk has another route and other joint positions."""
     truth, views = ring(2250, 5)
 
     result = triangulate(with_pixel_noise(views, np.random.default_rng(1)), method=method)
@@ -102,7 +102,7 @@ def test_robust_is_as_good_as_least_squares_under_pose_errors(cameras: int, leve
 
 
 def test_pose_errors_and_outliers_together() -> None:
-    """Gates as wide as 0.3 m / 1 deg needs let some outliers through, never as many as least squares."""
+    """Expect an error below that of least squares, although gates for 0.3 m / 1 deg accept some outliers."""
     truth, views = ring(200, 5)
     errors = []
     for seed in range(12):

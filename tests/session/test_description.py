@@ -1,4 +1,4 @@
-"""session.json of a session from elsewhere: what it names must be what flight.yaml may name."""
+"""session.json of a foreign session: it may only hold names that flight.yaml may hold."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_what_names_no_camera_is_refused(session: Path, key: str) -> None:
 
 
 def changed(session: Path, change: Any, problem: str) -> None:
-    """Change session.json for as long as it takes to see it refused."""
+    """Change session.json, check that it is refused, and restore it."""
     path = session / "session.json"
     kept = path.read_bytes()
     document = json.loads(kept)

@@ -1,4 +1,4 @@
-"""What is said of libraries that are missing: every hint names what there is, and brings what is imported."""
+"""Hints on missing libraries: every hint names existing packages, and these provide the imported module."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def name_of(requirement: str) -> str:
 
 
 def users_libraries() -> set[str]:
-    """What users install: not what tests and pages need."""
+    """List the libraries that users install, without those for tests and pages."""
     listed = [PROJECT["dependencies"], *(EXTRAS[extra] for extra in EXTRAS.keys() - {"dev", "docs"})]
     return {name_of(requirement) for requirements in listed for requirement in requirements}
 
 
 def calls() -> list[tuple[str, str]]:
-    """Module and extra of every call of `need` in the program."""
+    """Find module and extra of every call of `need` in the program."""
     found = []
     for path in sorted((ROOT / "pipelines").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

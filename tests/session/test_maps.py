@@ -1,4 +1,4 @@
-"""Maps of a session: what is stored comes back, byte for byte the same, and nothing bad is believed."""
+"""Maps of a session: they are stored and read back byte for byte, and bad files are refused."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_damaged_sessions_are_refused(tmp_path: Path, index: str, problem: str) 
 
 
 def archive(path: Path, **members: bytes | NDArray[Any] | list[Any] | float) -> Path:
-    """An npz of arrays, or of bytes that claim to be some; None leaves one out."""
+    """Write an npz of arrays, or of bytes in place of an array; None leaves one out."""
     content: dict[str, Any] = {"origin": [0.0, 0, 0], "resolution_m": 0.2, **members}
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
         for name, value in content.items():
@@ -109,7 +109,7 @@ def npy(value: object) -> bytes:
 
 
 def claiming(shape: object, descr: str = "<f4", body: bytes = b"\0" * 64) -> bytes:
-    """An npy whose header says what it likes."""
+    """Make an npy with a given header, which may not match its content."""
     text = f"{{'descr': {descr!r}, 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode() + body
 

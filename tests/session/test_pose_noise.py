@@ -1,4 +1,4 @@
-"""What of logged covariances is believed."""
+"""Use of logged covariances: which of them are accepted."""
 
 from __future__ import annotations
 

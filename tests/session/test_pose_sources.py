@@ -1,4 +1,4 @@
-"""What a manifest may say of where poses come from."""
+"""Sources of poses that a manifest may state."""
 
 from __future__ import annotations
 

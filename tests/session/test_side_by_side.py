@@ -1,4 +1,4 @@
-"""Parts at once: results in order, and one failure ends the others."""
+"""Parallel parts: results are in order, and one failure ends the others."""
 
 from __future__ import annotations
 

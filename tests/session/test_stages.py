@@ -31,7 +31,7 @@ OVERLAY = Stage("overlay", 1)
 
 
 def ingest(folder: Path, flight: str, files: dict[str, str], **options: bool) -> Run:
-    """A small ingest: a session.json and `files`, path to content."""
+    """Run a small ingest: a session.json and `files`, path to content."""
     with locked(folder, create=True, **options) as session:
         run = session.begin(INGEST, settings={"flight": flight}, inputs={"flight": "0" * 64})
         if not run.finished:
@@ -45,7 +45,7 @@ def ingest(folder: Path, flight: str, files: dict[str, str], **options: bool) ->
 
 
 def reconstruct(folder: Path, method: str, *, force: bool = False) -> Run:
-    """A small long stage: two chunks, put together from what ingest wrote."""
+    """Run a small version of a long stage: two chunks, made of the files that ingest wrote."""
     with locked(folder) as session:
         inputs = {"session": sha256_of(folder / "session.json")}
         run = session.begin(
@@ -61,7 +61,7 @@ def reconstruct(folder: Path, method: str, *, force: bool = False) -> Run:
 
 
 def overlay(folder: Path) -> Run:
-    """A video of what is reconstructed."""
+    """Run an overlay stage: one file that shows the reconstruction."""
     with locked(folder) as session:
         record = session.record("reconstruct")
         assert record is not None
@@ -93,7 +93,7 @@ def work(folder: Path) -> None:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """All a session holds but the times of day; every leftover of a kill would show."""
+    """Read everything in a session except run.json and the lock; any leftover of a kill would appear."""
     files = {p.relative_to(folder).as_posix(): p for p in sorted(folder.rglob("*")) if p.is_file()}
     folders = {f"{p.relative_to(folder).as_posix()}/": b"" for p in sorted(folder.rglob("*")) if p.is_dir()}
     ours = {name: path.read_bytes() for name, path in files.items() if name not in {".lock", "run.json"}}
@@ -101,7 +101,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def assert_every_stage_is_whole(folder: Path) -> None:
-    """Each stage is the old one or the new one, never a mixture; what is not listed is not there."""
+    """Check that each stage is the old or the new one, never a mixture, without files that are not listed."""
     session = open_session(folder)
     listed = set()
     for stage in ("ingest", "reconstruct", "overlay"):
@@ -120,7 +120,7 @@ def assert_every_stage_is_whole(folder: Path) -> None:
 
 
 class Killed(BaseException):
-    """Stands for SIGKILL: once raised, no call that changes a file gets through, clean-up included."""
+    """Stand-in for SIGKILL: once raised, every call that changes a file fails, also in clean-up."""
 
 
 @contextmanager
@@ -143,7 +143,7 @@ def failing_at(step: int, failure: BaseException, *, for_good: bool) -> Iterator
 
 @pytest.fixture(scope="module", params=["fresh", "replacing"])
 def prepared(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Where the work starts from (perhaps nothing), and where it ends when nothing disturbs it."""
+    """Make the session at the start (it may be absent), and the one after undisturbed work."""
     start = tmp_path_factory.mktemp(request.param) / "start.session"
     end = start.with_name("end.session")
     if request.param == "replacing":
@@ -213,7 +213,7 @@ def test_a_full_disk_at_every_step_is_one_line(prepared: tuple[Path, Path], tmp_
 
 
 def test_what_is_published_was_synced_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stage and its parts outlast a loss of power, from the rename on that makes them count."""
+    """Check that a stage and its parts were synced before the rename that publishes them."""
     folder = tmp_path / "a.session"
     synced: set[int] = set()
     published: set[str] = set()
@@ -298,7 +298,7 @@ def test_a_second_writer_is_told_who_writes_until_that_one_is_killed(tmp_path: P
 
 
 def interrupt_publication(folder: Path) -> None:
-    """As if killed between the renaming away of the old stage and that of the new one."""
+    """Leave a session as after a kill between the renames of the old and the new stage."""
     (folder / ".reconstruct.old").mkdir()
     (folder / "reconstruct").rename(folder / "reconstruct.new")
 

@@ -1,4 +1,4 @@
-"""JSON that is always the same, hashes that see every change, errors that are one line."""
+"""Storage: JSON is reproducible, hashes detect every change, errors are one line."""
 
 from __future__ import annotations
 

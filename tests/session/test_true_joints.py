@@ -1,4 +1,4 @@
-"""Truth between its samples: however they are spaced, holes stay holes."""
+"""Truth between its samples: gaps stay gaps for any spacing of the samples."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Int64 = NDArray[np.int64]
 
 
 def known_at(t_ns: Int64, at_ns: Int64) -> NDArray[np.bool_]:
-    """Whether one joint that moves evenly is known at some times; where it is, it lies on its line."""
+    """Test at which times a joint with constant velocity is known; check that it is then on its line."""
     x = t_ns / 1e9
     truth = JointMotion(t_ns, ("nose",), np.stack([x, 2 * x, -x], axis=1)[:, None, None])
     found = true_joints_at(truth, at_ns)[:, 0, 0]

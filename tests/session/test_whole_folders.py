@@ -1,4 +1,4 @@
-"""A folder appears whole or not at all, and what was finished before an interrupt is not done again."""
+"""Whole folders: they appear complete or not at all, and finished parts survive an interrupt."""
 
 from __future__ import annotations
 
