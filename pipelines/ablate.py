@@ -216,7 +216,7 @@ def _condition(cell: Cell) -> Row:
 def reconstructed(
     method: StudyMethod, views: Views, filmed: Walk, models: Sequence[NoiseModel]
 ) -> tuple[Float, str | None]:
-    """Triangulate views by a method: points [N, 3] m, NaN if rejected, and the reason for a fallback if any.
+    """Triangulate views by a method: points [N, 3] m, NaN where there is none, and the reason for a fallback.
 
     All methods know the standard deviations of the poses. `robust` and `refined` also estimate the noise of
     keypoints. `refined` also knows the noise models, and so the correlation of pose errors in time.

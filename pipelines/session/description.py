@@ -232,7 +232,7 @@ class Description(Entry):
 
     schema_version: int = Field(alias="schema")
     flight: str  # the name in the manifest
-    simulated: bool = False  # as the manifest states it: nobody flew
+    simulated: bool = False  # as the manifest states it: not a real flight
     clock_reference: str
     pose_interpolation: Interpolation
     origin: OriginEntry | None = None

@@ -19,7 +19,7 @@ class Progress(Protocol):
 
 
 class Silent:
-    """Progress that nobody watches (notebooks, tests)."""
+    """Progress without output (notebooks, tests)."""
 
     def start(self, task: str, total: int) -> None:
         """Ignore it."""

@@ -118,8 +118,8 @@ class Recording:
     """Pictures of a camera in order, at the rate that was asked for: world time, [height, width, 3] BGR."""
     overlays: Callable[[str], Iterable[tuple[int, NDArray[np.uint8]]]] = field(default=lambda _: ())
     """The same pictures with the skeleton drawn into them."""
-    unit: str | None = None  # of lengths, where the user asks for one that the export has
-    axes: str | None = None  # z-up or y-up, likewise
+    unit: str | None = None  # of lengths, if the user chooses one that the export has
+    axes: str | None = None  # z-up or y-up, if the user chooses them
     progress: Progress = field(default_factory=Silent)  # receives notes on held, moved and thinned samples
 
     @property

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pipelines.geometry.poses import interpolate_points
 from pipelines.session.records import Float, Int64, JointMotion
 
-_MOST_STREAMS = 8  # cameras or trackers whose samples take turns
+_MOST_STREAMS = 8  # most cameras or trackers with interleaved samples
 _LEAST_TURNS = 4  # fewest repetitions to call a pattern periodic
 _ALIKE = 0.2  # of the mean step: largest difference between times that count as equal
 _MOST = 0.6  # smallest share of times that must be equal

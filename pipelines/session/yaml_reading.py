@@ -52,7 +52,7 @@ def _refuse_impossible_values(path: Path, value: object) -> None:
         seen.add(id(item))
         if isinstance(item, Mapping):
             waiting += [(part, (*place, key)) for key, part in item.items()]
-            waiting += [(key, place) for key in item]  # last, so looked at before they name places
+            waiting += [(key, place) for key in item]  # last, so keys are checked before they name places
         elif isinstance(item, list | tuple):  # a tuple is a key
             waiting += [(part, (*place, index)) for index, part in enumerate(item)]
         elif isinstance(item, str) and ("\0" in item or not _is_unicode(item)):

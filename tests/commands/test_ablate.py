@@ -104,9 +104,9 @@ def test_errors_of_poses_have_the_size_and_shape_of_the_geometry(tmp_path: Path,
 def test_the_studies_of_the_paper_have_its_shapes(tmp_path: Path) -> None:
     """Compare with `covariance_trace`: +3 % error at 30 deg, +43 % at 60; -38 % for 5 drones instead of 2.
 
-    Tilts are compared with 0 deg. The noise is high. Trials use the same random numbers everywhere, but rays differ. So 8 s x 15 Hz x 3
-    trials = 360 draws scatter by 2.6 % in a mean and 3.7 % in a ratio. The bounds are at least 2.5 of those
-    away.
+    Tilts are compared with 0 deg. The noise is high. Trials use the same random numbers everywhere, but rays
+    differ. So 8 s x 15 Hz x 3 trials = 360 draws scatter by 2.6 % in a mean and 3.7 % in a ratio. The bounds
+    are at least 2.5 of those away.
     """
     options = ("--seconds", "8", "--rate", "15", "--trials", "3", "--levels", "high", *TRUSTING)
     tilted = study("tilt", *options, "--tilts", "0,30,60", "-o", tmp_path / "tilt")

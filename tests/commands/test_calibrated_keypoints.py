@@ -21,7 +21,7 @@ from tests.keypoints.spotted_flights import CAMERAS, spot_detector, write_spotte
 def test_keypoints_of_little_worth_are_used_and_drawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Wrists are worth 0.1 whatever the detector says, less than the least confidence; all others 0.9.
+    # The calibrated confidence of wrists is always 0.1, below the least confidence; that of others is 0.9.
     knots = {name: np.array([[0.5, worth, 100.0]]) for name, worth in (("*", 0.9), ("wrist", 0.1))}
     measured = tmp_path / "measured.csv"
     write_calibration(measured, Calibration("a test", "near", knots))

@@ -77,7 +77,7 @@ def test_an_exchanged_video_is_refused_until_it_is_ingested_and_its_keypoints_go
         assert str(flight / "left.mp4") in line
         assert "mocap ingest" in line
     assert content(session) == before
-    # A flight that had the other video from the start says what is right now.
+    # A flight that had the other video from the start gives the right result.
     fresh = tmp_path / "fresh"
     fresh.mkdir()
     for source in flight.iterdir():

@@ -350,7 +350,7 @@ def test_fixes_and_attitudes_of_any_driver_an_actor_with_a_receiver_and_triggers
         np.testing.assert_array_equal(frames["t_ns"], flight.t_ns)
     actor = pd.read_parquet(flight.manifest.with_suffix(".session") / "actor.parquet")
     np.testing.assert_allclose(actor[["x", "y", "z"]].to_numpy(), hip, atol=1e-5)
-    # Without a place on Earth for the world nothing can be said of where the actor was.
+    # Without a place on Earth for the world, the actor's position is not known.
     del flight.settings["world"]["origin"]
     for name in flight.cameras:
         camera = flight.settings["cameras"][name]

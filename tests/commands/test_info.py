@@ -79,7 +79,7 @@ def test_a_study_tells_the_error_of_every_condition(tmp_path: Path) -> None:
         [cell["metrics"]["mpjpe_mm"]["mean"]] for cell in cells
     ]
     assert list(told["mpjpe_mm"]) == [f"{tilt} deg, 2 drones, noise low" for tilt in (0, 30)]
-    (tmp_path / "summary.json").write_text("[1, 2]")  # somebody else's
+    (tmp_path / "summary.json").write_text("[1, 2]")  # a file of another program
     assert "is of no known kind" in refused("info", tmp_path / "summary.json")
 
 
@@ -125,7 +125,7 @@ def test_detections_of_a_session_are_the_imported_or_the_found_ones(tmp_path: Pa
         return {name: camera["detections"] for name, camera in reading(session)["cameras"].items()}
 
     succeeds("ingest", manifest)
-    assert detections() == dict.fromkeys(CAMERAS)  # nobody has looked yet: not 0
+    assert detections() == dict.fromkeys(CAMERAS)  # no detection has run yet: None, not 0
     succeeds("reconstruct", session, "--detector", spot_detector(tmp_path))
     assert detections() == dict.fromkeys(CAMERAS, 6)  # one person in each of the pictures
     flight = write_flight(tmp_path / "imported", seconds=0.2, clean=True)

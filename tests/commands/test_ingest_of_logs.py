@@ -85,7 +85,7 @@ def test_losses_count_for_the_topic_that_lost_them(tmp_path: Path) -> None:
         ],
     )
     whole = path.read_bytes()
-    # The data of the picture, said to be twice as long as they are.
+    # The stated length of the picture's data is twice the real one.
     broken = whole.replace(b"\x03\0\0\0\xff\xd8\xff", b"\x06\0\0\0\xff\xd8\xff")
     assert broken != whole
     path.write_bytes(broken)

@@ -207,7 +207,7 @@ def test_names_hostile_to_yaml_stay_names(tmp_path: Path, name: str) -> None:
     folder.mkdir()
     for suffix in (".json", ".tum"):
         (source / f"drone1{suffix}").rename(folder / f"{name}{suffix}")
-    # The same name twice: the second is told in a comment.
+    # The same name twice: the second is in a comment.
     (folder / "again").mkdir()
     shutil.copy(folder / f"{name}.tum", folder / "again")
     write_lenses(flight)

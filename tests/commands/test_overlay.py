@@ -348,7 +348,7 @@ def test_estimated_clocks_move_the_skeleton_along(
 ) -> None:
     flight, _ = filmed
     metrics = read_json(session / "reconstruct" / "metrics.json")
-    # Picture k was taken when picture k + 6 says it was.
+    # Picture k was taken at the time that picture k + 6 states.
     write_json(session / "reconstruct" / "metrics.json", {**metrics, "clock_offsets_s": {"drone1": 0.2}})
     as_if_written(session, "reconstruct/metrics.json", "reconstruct")
     picture = decoded(write_overlays(session, cameras=["drone1"])[0])[4]

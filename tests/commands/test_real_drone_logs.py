@@ -73,7 +73,7 @@ def test_a_phantom_with_gimbal_angles_as_a_command(tmp_path: Path) -> None:
     poses = poses_of(path)
     assert len(poses) == told["positions"]
     assert poses["z"].min() == pytest.approx(told["H_m"]["min"], abs=0.04)  # the Earth falls away on 700 m
-    # D is how far the drone says that it is from where it took off, by its own unrounded positions.
+    # D is the drone's own distance from its take-off, from its unrounded positions.
     flown = np.hypot(*(poses[axis].iloc[-1] - poses[axis].iloc[0] for axis in ("x", "y")))
     assert flown == pytest.approx(660, abs=5)
 

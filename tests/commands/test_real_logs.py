@@ -172,7 +172,7 @@ def test_info_of_real_logs(name: str) -> None:
     told = facts(name)
     (reading,) = json.loads(succeeds("info", real_data(name), "--json"))["readings"]
     assert reading["messages"] == told["messages"]
-    # The ordinary reader believes metadata.yaml; where that is wrong, both are said.
+    # The public reader trusts metadata.yaml; if that is wrong, the reading has both values.
     assert reading.get("metadata.yaml states", reading)["first_ns"] == told["start_ns"]
     assert {topic: seen["messages"] for topic, seen in reading["topics"].items()} == {
         topic: seen["count"] for topic, seen in told["topics"].items()

@@ -69,7 +69,7 @@ def test_disturbed_poses_err_as_their_model_says(clean: tuple[SyntheticFlight, P
     # trace of docs/studies.md). Four draws of three numbers scatter by 1 / sqrt(2 x 12) = 20 %.
     rms = np.sqrt(np.mean([each["e_recon_per_joint_frame_m2"] for each in trials["each"]]))
     assert rms == pytest.approx(0.158, rel=0.6)
-    # Stored is the first trial, and the stage says so.
+    # The first trial is stored, and a warning of the stage says so.
     skeleton = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
     points = skeleton[["x", "y", "z"]].to_numpy().reshape(len(flight.t_ns), -1, 3)
     distance = np.linalg.norm(points - flight.position, axis=-1)
@@ -123,7 +123,7 @@ def test_gaps_stay_open_until_somebody_asks(clean: tuple[SyntheticFlight, Path])
         "filled": 4,
     }
     assert stage(session)["counts"]["filled"]["joint_frames"] == 4
-    # What is filled changes no figure of what was measured.
+    # Filled joints change no figure of the measured ones.
     assert closed["mpjpe_mm"] == open_gap["mpjpe_mm"]
     assert closed["reconstructed_share"] == open_gap["reconstructed_share"]
     skeleton = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")

@@ -339,7 +339,7 @@ def test_numbers_beyond_all_bounds(tmp_path: Path, old: str, new: str, place: st
     assert old in text
     path = tmp_path / "flight.yaml"
     path.write_text(text.replace(old, new), encoding="utf-8")
-    # In a process of its own: what computes for ever must not keep the other tests.
+    # In a process of its own: an endless computation must not block the other tests.
     assert place in refusal(mocap_process("ingest", path, timeout=60))
 
 

@@ -130,7 +130,7 @@ def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_better(mound: 
     assert against_fixed["tilt_near_obstacle_deg"]["mean"] < -5
     assert against_fixed["tilt_near_obstacle_deg"]["interval"][1] < 0
     assert against_fixed["mpjpe_mm"]["interval"][1] < 0
-    # The sentence and the table speak of the same joints.
+    # The sentence and the table are about the same joints.
     in_the_table = arms["adaptive"]["mpjpe_mm"] - arms["fixed"]["mpjpe_mm"]
     assert against_fixed["mpjpe_mm"]["mean"] == pytest.approx(in_the_table)
     # What is violated stands first: the ring, that is flown, goes through the mound.

@@ -40,7 +40,7 @@ def test_the_report_shows_the_comparison_of_the_session(tmp_path: Path) -> None:
     metrics = json.loads((session / "replan" / "metrics.json").read_text(encoding="utf-8"))
     assert metrics["verdict"][1:] in unescape(shown)
     assert all(f'id="figure-arms-{key}"' in shown for key in ("top", "time", "yaw"))
-    # What the figures say of the tables is what the metrics say.
+    # Figures that are computed from the tables agree with the metrics.
     told = re.search(r'id="figure-arms-time-desc">(.*?)</desc>', shown)
     assert told is not None
     for arm in ("adaptive", "fixed", "flown"):

@@ -15,7 +15,7 @@ from mocap_cli.terminal import say
 from tests.commands.runner import mocap, succeeds
 from tests.synthetic.flights import write_flight
 
-# A colour, the same by one byte of C1, a title with BEL, reversed reading order, lines begun anew or forged.
+# A colour, the same by one byte of C1, a title with BEL, reversed reading order, new or forged lines.
 EVIL = ["\x1b[31m", "\x9b31m", "\x1b]0;t\x07", "\u202e", "\r", "\nmocap: all is well", "\x7f", "\u2028"]
 STEERING = {"Cc", "Cf", "Zl", "Zp", "Cs"}
 

@@ -55,7 +55,7 @@ def written(findings: Findings) -> tuple[ManifestText, dict[str, Any]]:
         ((0, 99), 100, None),
         ((1, 100), 100, 1),  # counted from 1: the last would lie beyond the video
         ((1, 99), 100, None),
-        ((7, 42), None, None),  # a detector that saw nobody before
+        ((7, 42), None, None),  # a detector that found no person before
         ((785, 884), None, 785),  # more frames before the first than after it
         ((0, 400), 100, None),  # another video's: no first frame mends that
     ],

@@ -203,7 +203,7 @@ def test_two_clean_views_among_three_outliers_are_found() -> None:
 
     right = np.linalg.norm(result.points - truth, axis=1) < 0.1
     # A pair with an outlier agrees by chance in about 2 x 4 x 2 px x sqrt(2)/500 px = 5 % of cases; 9 such
-    # pairs leave some 65 % of joints without a rival. The others are rejected, hardly any is wrong.
+    # pairs leave some 65 % of joints without a rival. The others are rejected; very few are wrong.
     assert right.mean() > 0.5
     assert ((result.status == 0) & ~right).mean() < 0.06
     assert (result.inlier[right] == [True, True, False, False, False]).all(axis=1).mean() > 0.99

@@ -21,7 +21,7 @@ def test_a_failure_ends_the_others() -> None:
         together.wait()
         if part == 0:
             raise ValueError("the first")
-        while True:  # for good, unless it is told
+        while True:  # for ever, unless it is asked to stop
             try:
                 halt.check()
             except InterruptedError:
