@@ -1,4 +1,4 @@
-"""Where a camera should see the logged actor, picture by picture."""
+"""Expected place of the logged actor in each picture of a camera."""
 
 from __future__ import annotations
 
@@ -12,9 +12,12 @@ from pipelines.session.pose_noise import stated_noise
 from pipelines.session.records import Float, Int64, Trajectory
 
 ACTOR_SIGMA_M = 1.0
-"""Of the actor's log, as it is taken for telling people apart."""
+"""Standard deviation of the actor's logged position, used to tell people apart."""
 UNKNOWN_SIGMA_RAD = float(np.radians(1.0))
-"""Of a camera's rotation where nobody states it; the noise of its position is in the actor's then."""
+"""Standard deviation of a camera's rotation if the user states none.
+
+The position noise of such a camera counts as part of `ACTOR_SIGMA_M`.
+"""
 
 
 def actor_hints(
@@ -25,15 +28,15 @@ def actor_hints(
     between: Interpolation,
     t_ns: Int64,
 ) -> list[Hint | None]:
-    """Where the hips of the logged actor should be in a camera's pictures; None where log or pose is silent.
+    """Predict the logged actor's hips in a camera's pictures; None where the log or the pose is missing.
 
     Args:
-        actor: who was logged.
-        name: of the camera.
-        entry: what session.json says of it.
+        actor: the logged actor.
+        name: name of the camera.
+        entry: the camera's entry in session.json.
         trajectory: its logged poses.
-        between: how far they are trusted.
-        t_ns: [T] when the pictures were taken.
+        between: rules for interpolating between the logged poses.
+        t_ns: [T] times of the pictures.
     """
     position, quaternion = poses_at(trajectory, t_ns, between, static=entry.poses.static)
     sigma = hint_sigma(name, entry, trajectory, t_ns)
@@ -49,17 +52,18 @@ def actor_hints(
 
 
 def hint_sigma(name: str, entry: CameraEntry, trajectory: Trajectory, t_ns: Int64) -> Float:
-    """How far the logged actor may be from where a camera's logged pose has them.
+    """Compute the uncertainty of the logged actor as seen from a camera's logged pose.
 
     Args:
-        name: of the camera.
-        entry: what session.json says of it; its pose noise, else the log's covariances, are taken.
+        name: name of the camera.
+        entry: the camera's entry in session.json; its pose noise is used, else the log's covariances.
         trajectory: its logged poses.
-        t_ns: [T] when pictures were taken.
+        t_ns: [T] times of the pictures.
 
     Returns:
-        Standard deviation per axis [T, 2]: of the actor's position relative to the camera's (m), the errors
-        of both together, and of the camera's rotation (rad); of the logged pose before each picture.
+        Standard deviation per axis [T, 2]. First column: position of the actor relative to the camera (m),
+        with the errors of both. Second column: rotation of the camera (rad). Each row uses the noise of
+        the last logged pose before the picture.
     """
     stated = stated_noise(name, entry, trajectory).sigma
     if stated is None:

@@ -1,4 +1,4 @@
-"""The keypoints of somebody who is alone in the pictures: what studies and replays look at."""
+"""Keypoints of a person who is alone in the pictures, for studies and replays."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Float = NDArray[np.float64]
 
 
 class FollowedAlone:
-    """Follows the only person in the pictures of one camera, as `PeopleTracker` does everybody.
+    """Tracker of the only person in the pictures of one camera, built on `PeopleTracker`.
 
     Args:
         networks: the detector, loaded.
@@ -28,14 +28,14 @@ class FollowedAlone:
         self._column = [networks.joints.index(name) if name in networks.joints else None for name in joints]
 
     def step(self, picture: Picture, *, hint: Hint | None) -> tuple[Float, Float]:
-        """The keypoints in the next picture, of whoever is most surely there.
+        """Return the keypoints of the person with the highest presence in the next picture.
 
         Args:
             picture: [H, W, 3] BGR.
-            hint: where the log says that the person is, if it does.
+            hint: place of the person by the log, None if unknown.
 
         Returns:
-            [J, 2] px, NaN for what was not found, and confidences [J], 0 for that.
+            Positions [J, 2] px, NaN for joints not found, and confidences [J], 0 for joints not found.
         """
         xy, confidence = np.full((len(self._column), 2), np.nan), np.zeros(len(self._column))
         people = self._tracker.step(picture, hint=hint)

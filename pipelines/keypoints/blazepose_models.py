@@ -1,4 +1,4 @@
-"""The model files of BlazePose: where they lie, and how they come out of the packages that ship them.
+"""Model files of BlazePose: their place in the cache and their extraction from published packages.
 
 The packages are downloaded and opened, never installed: mediapipe 0.10.21 would force an old numpy on
 everything, and of @mediapipe/pose only one file is wanted.
@@ -27,7 +27,7 @@ from pipelines.session.storage import as_data_error, sha256_of
 
 @dataclass(frozen=True)
 class ModelFile:
-    """One file that a package ships."""
+    """File that a package ships."""
 
     member: str  # its path inside the package
     size: int  # bytes
@@ -54,7 +54,7 @@ class Package(Protocol):
         """Download it into a folder and return its path; DataError about `detector` where that fails."""
 
     def read(self, archive: Path, files: Sequence[ModelFile]) -> dict[ModelFile, bytes]:
-        """Read files out of it, of each at most one byte more than is expected; none that is absent.
+        """Read files from the package, at most one byte more than expected of each; skip absent files.
 
         Raises:
             OSError: it cannot be read.
@@ -77,12 +77,12 @@ class Wheel:
         return f"{self.name} {self.version} wheel"
 
     def download(self, folder: Path, detector: str, remedy: str) -> Path:
-        """Let pip download it; errors as those of `Package.download`."""
+        """Download it with pip; raises the errors of `Package.download`."""
         python, abi, platform = self.tags
         done = _ran(
             [
                 *(sys.executable, "-m", "pip", "download", "--quiet", "--no-input", "--no-deps"),
-                # Two attempts: without a network the user should not wait for a minute to be told so.
+                # Two attempts: without a network the user should not wait a minute for the error.
                 *("--disable-pip-version-check", "--retries", "1", "--only-binary", ":all:"),
                 *("--implementation", "cp", "--python-version", python, "--abi", abi),
                 *("--platform", platform, "--dest", str(folder), f"{self.name}=={self.version}"),
@@ -123,7 +123,7 @@ class NpmPackage:
         return f"{self.name} {self.version} tarball"
 
     def download(self, folder: Path, detector: str, remedy: str) -> Path:
-        """Let npm download it; errors as those of `Package.download`."""
+        """Download it with npm; raises the errors of `Package.download`."""
         npm = shutil.which("npm")
         if npm is None:
             command = f"npm pack {self.name}@{self.version}"
@@ -176,19 +176,19 @@ class PackagedModels:
 
     @property
     def folder(self) -> Path:
-        """Where the files are kept."""
+        """Folder of the files."""
         if chosen := os.environ.get("MOCAP_MODELS"):
             return Path(chosen).expanduser().absolute() / self.detector
         cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
         return Path(cache).expanduser() / "mocap" / "models" / self.detector
 
     def present(self) -> dict[str, Path | None]:
-        """Every file by name: where it is, None where it is missing; the content is not looked at."""
+        """Return each file's path by name, None where it is missing; the content is not checked."""
         paths = {file.name: self.folder / file.name for file in self.files}
         return {name: path if path.is_file() else None for name, path in paths.items()}
 
     def verified(self) -> dict[str, Path]:
-        """Every file by name, each proven to be the one expected.
+        """Return each file's path by name, after checking its SHA-256.
 
         Raises:
             DataError: one is missing or has other content.
@@ -206,14 +206,13 @@ class PackagedModels:
         return {file.name: self.folder / file.name for file in self.files}
 
     def fetch(self, source: Path | None = None) -> None:
-        """Put the files that are missing or damaged into the cache; with all in place nothing is done.
+        """Put missing or damaged files into the cache; do nothing if all are in place.
 
         Args:
-            source: the package, or a folder with the files anywhere inside, where they are here already;
-                otherwise it is downloaded.
+            source: the package, or a folder that holds the files at any depth; None downloads the package.
 
         Raises:
-            DataError: no network, or what was found is not what was expected. The cache stays as it was.
+            DataError: no network, or a file is not the expected one. The cache stays unchanged.
         """
         wanted = [file for file in self.files if not self._is_good(file)]
         if not wanted:
@@ -242,7 +241,7 @@ class PackagedModels:
             raise as_data_error(error, source) from error
 
     def _contents(self, source: Path, files: Sequence[ModelFile]) -> dict[ModelFile, bytes]:
-        """The contents of files, from a folder or out of the package, proven to be those expected."""
+        """Read the contents of files from a folder or from the package, and check their SHA-256."""
         noun = self.package.noun
         if source.is_dir():
             paths = {file: path for file in files if (path := find_file(source, file.name)) is not None}
@@ -271,7 +270,7 @@ class PackagedModels:
 
 
 def find_file(folder: Path, name: str) -> Path | None:
-    """The first file of that name anywhere in a folder; None where there is none."""
+    """Find the first file of that name at any depth of a folder; None if there is none."""
     return next(iter(sorted(folder.rglob(name))), None)
 
 
@@ -287,7 +286,7 @@ def _ran(command: list[str], *, within: Path | None = None) -> subprocess.Comple
 
 
 def _reason_of_npm(done: subprocess.CompletedProcess[str]) -> str:
-    """The code of npm's error and its first sentence; advice about proxies and the trace follow them."""
+    """Return the code and the first sentence of npm's error; leave out proxy advice and the trace."""
     lines = re.findall(r"^npm (?:error|ERR!) +(.+)$", done.stderr, re.MULTILINE)
     code = [line for line in lines if line.startswith("code ")][:1]
     sentence = [line for line in lines if line.split()[0] not in ("code", "syscall", "errno")][:1]
@@ -304,7 +303,7 @@ def _not_readable(archive: Path, package: Package, error: Exception) -> DataErro
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write a file so that whoever looks finds all of it or nothing, also while others write the same."""
+    """Write a file atomically: readers find all of it or nothing, also with several writers."""
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     partial = Path(name)
     try:
@@ -337,7 +336,7 @@ BLAZEPOSE_MODELS = PackagedModels(
     ),
 )
 PERSON_MODELS = replace(BLAZEPOSE_MODELS, files=BLAZEPOSE_MODELS.files[:1])
-"""The person detector alone, which every BlazePose shares."""
+"""Person detector alone, common to all BlazePose detectors."""
 
 HEAVY_MODELS = PackagedModels(
     detector="blazepose-heavy",

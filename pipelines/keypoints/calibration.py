@@ -1,4 +1,4 @@
-"""What a detector's confidence is worth: from its raw number to the probability that a joint is good.
+"""Calibration of a detector's confidence: from the raw number to the probability that a joint is good.
 
 Fitted on keypoints whose error is known (rendered flights): for each group of joints the monotone map that
 is nearest to the outcomes in least squares (isotonic regression; Zadrozny and Elkan, "Transforming
@@ -32,7 +32,7 @@ class Calibration:
 
     Attributes:
         origin: the command and the data that it was measured with.
-        good: what a good joint is, in words.
+        good: definition of a good joint, in words.
         knots: for each group [K, 3] confidence (rising), probability (not falling) and count of keypoints.
             A group is a part of joints' names (`wrist`); `*` is for those of no group.
     """
@@ -42,7 +42,7 @@ class Calibration:
     knots: Mapping[str, Float]
 
     def probability(self, confidence: Float, joints: Sequence[str]) -> Float:
-        """Confidences [..., J] as probabilities; between knots linear, beyond them constant, NaN stays.
+        """Map confidences [..., J] to probabilities; linear between knots, constant beyond them, NaN stays.
 
         A confidence of 0 means that nothing was found, and stays 0.
         """
@@ -54,7 +54,7 @@ class Calibration:
         return np.where(np.isnan(confidence), np.nan, calibrated)
 
     def probabilities(self, confidence: Float, joint: NDArray[np.str_]) -> Float:
-        """The same of keypoints [N] in any order, each with the name of its joint."""
+        """Map confidences of keypoints [N] in any order, each with the name of its joint."""
         calibrated = np.empty(len(confidence))
         for name in np.unique(joint):
             rows = joint == name
@@ -63,13 +63,13 @@ class Calibration:
 
 
 def measured_for(detector: str) -> Path | None:
-    """Where the calibration of a detector lies, if its confidences were measured."""
+    """Return the path of a detector's calibration, None if its confidences were not measured."""
     path = file_of(detector)
     return path if path.is_file() else None
 
 
 def file_of(detector: str) -> Path:
-    """Where the calibration of a detector belongs."""
+    """Return the path at which a detector's calibration is stored."""
     return _MEASURED / f"{detector}_confidence.csv"
 
 
@@ -82,15 +82,15 @@ def fit(
     origin: str,
     good: str,
 ) -> Calibration:
-    """The calibration of keypoints whose outcome is known.
+    """Fit a calibration to keypoints with known outcome.
 
     Args:
         confidence: [N, J] raw; 0 and NaN are left out.
-        is_good: [N, J] whether the keypoint was near enough to the truth.
+        is_good: [N, J] True if the keypoint was near enough to the truth.
         joints: the names of the J joints.
-        groups: parts of joints' names that are fitted apart where they have keypoints enough.
+        groups: parts of joints' names; each group with enough keypoints gets its own map.
         origin: the command and the data.
-        good: what good means.
+        good: definition of a good joint, in words.
 
     Raises:
         ValueError: fewer than 20 keypoints.
@@ -109,12 +109,12 @@ def fit(
 
 
 def group_of(joint: str, groups: Mapping[str, object]) -> str:
-    """The group of a joint: the longest part of its name among them, else `*`."""
+    """Return the group of a joint: the longest group name that its name contains, else `*`."""
     return max((group for group in groups if group in joint), key=len, default=ANY_JOINT)
 
 
 def isotonic(values: Float, weight: Float) -> tuple[NDArray[np.intp], Float]:
-    """The not falling sequence nearest to values [N], by pool adjacent violators (Ayer et al., 1955).
+    """Fit the non-decreasing sequence nearest to values [N], by pool adjacent violators (Ayer et al., 1955).
 
     Args:
         values: [N] in the order in which they must not fall.
@@ -138,7 +138,7 @@ def isotonic(values: Float, weight: Float) -> tuple[NDArray[np.intp], Float]:
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Write the table, its origin in comments above it."""
+    """Write the table, with its origin in comments above it."""
     text = io.StringIO()
     text.write(f"# made by: {calibration.origin}\n# probability that a joint is {calibration.good}\n")
     rows = csv.writer(text, lineterminator="\n")
@@ -183,10 +183,10 @@ def _is_usable(knots: Float) -> bool:
 
 
 def _isotonic_knots(confidence: Float, outcome: Float) -> Float:
-    """[K, 3]: the mean confidence, the probability and the count of each block of at least 20 keypoints.
+    """Compute knots [K, 3]: mean confidence, probability and count of each block of at least 20 keypoints.
 
-    Equal confidences are pooled first, and consecutive ones to 20: blocks of a few at either end would
-    otherwise have probabilities of 0 and 1.
+    Equal confidences are pooled first. Consecutive ones are pooled to at least 20, because small blocks at
+    either end would otherwise have probabilities of 0 and 1.
     """
     level, inverse = np.unique(confidence, return_inverse=True)
     count = np.bincount(inverse).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Crops of a picture as networks see them, and where their pixels lie in it.
+"""Crops of a picture for networks, and the positions of their pixels in the picture.
 
 Everywhere here the centre of the top left pixel is (0, 0), in pictures and in crops.
 """
@@ -18,7 +18,7 @@ _STEPS = 32  # of a position between two pixels, as OpenCV 4 rounds it
 
 
 def sampled(picture: Picture, picture_from_crop: Float, size: tuple[int, int], *, beyond: str) -> Picture:
-    """The RGB values [height, width, 3] of a BGR picture where a crop's pixels lie, bilinear.
+    """Sample the RGB values [height, width, 3] of a BGR picture at a crop's pixels, bilinear.
 
     OpenCV 4 rounds positions to 1/32 px when it warps, as does the one inside MediaPipe; OpenCV 5 does
     not, which moves landmarks by 0.6 px (median) where the crop is coarser than the picture. Fixed-point
@@ -28,7 +28,7 @@ def sampled(picture: Picture, picture_from_crop: Float, size: tuple[int, int], *
         picture: [H, W, 3] BGR.
         picture_from_crop: [2, 3] from the crop's pixels to the picture's.
         size: width and height of the crop.
-        beyond: what lies around the picture: `edge` repeats its border, `black` is 0.
+        beyond: values around the picture: `edge` repeats its border, `black` is 0.
     """
     import cv2
 
@@ -49,7 +49,7 @@ def _as_int16(whole: np.int64) -> np.int64:
 def fixed_point_maps(
     picture_from_crop: Float, width: int, height: int
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    """What `cv2.convertMaps` makes of the positions of a crop's pixels, at once: a third of its time.
+    """Compute the maps of `cv2.convertMaps` for a crop's pixels in one pass, in a third of its time.
 
     Args:
         picture_from_crop: [2, 3] from the crop's pixels to the picture's.
@@ -75,10 +75,10 @@ def fixed_point_maps(
 
 
 def upright_crop(region: Region, size: tuple[int, int]) -> Float:
-    """[2, 3] picture_from_crop of a region whose side becomes the crop's longer side.
+    """Compute picture_from_crop [2, 3] for a region whose side becomes the crop's longer side.
 
-    What MMPose's TopdownAffine makes of a box of 1.25 times the body: the aspect of the network's input
-    is kept by widening the box, and the box is not turned. Its middle becomes the middle of the crop's
+    Equivalent to MMPose's TopdownAffine for a box of 1.25 times the body: the box is widened to the aspect
+    of the network's input and is not turned. Its middle becomes the middle of the crop's
     pixels, ((width - 1) / 2, (height - 1) / 2); MMPose puts it half a crop pixel beside that, and its
     outputs as well, so that positions agree. They are read off through the same matrix here.
     """
@@ -88,12 +88,12 @@ def upright_crop(region: Region, size: tuple[int, int]) -> Float:
 
 
 def in_picture(xy: Float, picture_from_crop: Float) -> Float:
-    """Positions [..., 2] of a crop in the picture."""
+    """Convert positions [..., 2] from crop pixels to picture pixels."""
     moved: Float = xy * np.diag(picture_from_crop[:, :2]) + picture_from_crop[:, 2]
     return moved
 
 
 def side_of_box(width: float, height: float, size: tuple[int, int], padding: float) -> float:
-    """The side of the region that holds a box with that padding, for a network of that input size."""
+    """Compute the side of the region that holds a padded box, for a network's input size (width, height)."""
     longer = max(size)
     return float(padding * max(width * longer / size[0], height * longer / size[1]))

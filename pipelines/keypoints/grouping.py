@@ -1,13 +1,13 @@
-"""Which detections of a frame are the same body, and which body is which over time.
+"""Grouping of a frame's detections into bodies, and identity of the bodies over time.
 
 Every frame is a small clustering problem: detections are nodes, a group holds at most one detection
 of each camera, and the score of a partition adds, over all pairs inside a group,
 
     3^2 + known_a + known_b - s_ab^2
 
-where s_ab is how many standard deviations the viewing rays of the pair's common joints pass each
-other at, and known is 1 when the detection continues, in its own camera's picture, what the group's
-track showed there last. Strangers must thus agree within 3 sigma; a known detection stays within 5,
+where s_ab is the distance, in standard deviations, at which the viewing rays of the pair's common joints
+pass each other. `known` is 1 if the detection continues the last picture of the group's track in the same
+camera. Detections without history must thus agree within 3 sigma. A known detection may stay up to 5 sigma,
 unless another one of its camera fits better.
 
 The sum of squares over a whole assignment matters: a pose error moves everybody in a picture alike, so
@@ -16,7 +16,7 @@ one (exchanging two people costs 2 (their separation)^2 whatever the pose error 
 part as the only detection of one more camera.
 
 `follow` is the one function called from outside. `grouping_rays` compares detections and places groups,
-`grouping_partition` finds the partition, `grouping_tracks` knows who was who in earlier frames.
+`grouping_partition` finds the partition, `grouping_tracks` keeps the identities of earlier frames.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _SPARE = 16  # tracks remembered beyond one for each possible detection
 
 
 class Followed(NamedTuple):
-    """Who each detection is: T times, C cameras, D detections."""
+    """Identity of each detection: T times, C cameras, D detections."""
 
     track: Int64  # [T, C, D] number of the track, -1 where the detection was not usable
     views: Int64  # [T, C, D] cameras in the detection's group, itself included; 0 where not usable
@@ -69,7 +69,7 @@ class Followed(NamedTuple):
 
 @helper
 def _doubtful(nodes: Nodes, n: int, a: int) -> bool:
-    """Whether another detection of the camera fits the group's rays within one sigma as well."""
+    """Test if another detection of the camera also fits the group's rays within one sigma."""
     label, c = nodes.label[a], nodes.camera[a]
     for b in range(n):
         if b == a or nodes.camera[b] != c:
@@ -87,7 +87,7 @@ def _doubtful(nodes: Nodes, n: int, a: int) -> bool:
 
 @helper
 def _overruled(nodes: Nodes, n: int, a: int) -> bool:
-    """Whether the track's picture in this camera went on in another detection than the chosen one."""
+    """Test if another detection than the chosen one continues the track's picture in this camera."""
     label, c = nodes.label[a], nodes.camera[a]
     for b in range(n):
         if (

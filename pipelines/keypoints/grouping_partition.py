@@ -1,4 +1,4 @@
-"""The partition of one frame's detections into people that scores best; see `grouping`."""
+"""Best-scoring partition of one frame's detections into people; see `grouping`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pipelines.keypoints.grouping_tracks import Tracks
 
 _KNOWN = 1.0  # each side of a pair that continues the track adds this; 8 locked wrong starts in for good
 _LOYAL = 14.0  # on top, for leaving company for none: a known detection is refused beyond 5 sigma
-_STAY = 4.0  # what continuing a track is worth to a detection that has no company
-_SURE = 0.3  # of the likeness 0..1 with a track's last picture: it is somebody known
+_STAY = 4.0  # score of continuing a track for a detection that is alone in its group
+_SURE = 0.3  # likeness 0..1 with a track's last picture above which the detection is a known person
 
 
 @helper
@@ -37,7 +37,7 @@ def begin_groups(nodes: Nodes, n: int, slots: int) -> None:
 
 @helper
 def _affinity(nodes: Nodes, one: int, two: int) -> float:
-    """Mean weight between two groups; -inf where they share a camera, 0 where nothing can be said."""
+    """Compute the mean weight between two groups; -inf if they share a camera, 0 without comparable pairs."""
     total: float = 0.0
     pairs = 0
     for c in range(nodes.member.shape[1]):
@@ -86,7 +86,7 @@ def join_groups(nodes: Nodes, n: int, tracks: Tracks) -> None:
 
 @helper
 def bind_known(nodes: Nodes, n: int, tracks: Tracks) -> None:
-    """What belonging to each track is worth: continuity less that of the best other track.
+    """Compute the bond of each detection to each track: continuity minus that of the best other track.
 
     A detection that continues somebody who once stood beside the track in one picture is not taken for
     it (the actor disappears behind a tree and the bystander stays), unless the two exchange places.
@@ -114,7 +114,7 @@ def bind_known(nodes: Nodes, n: int, tracks: Tracks) -> None:
 
 @helper
 def _gain(nodes: Nodes, a: int, label: int) -> float:
-    """What a detection adds to a group's score, whoever of its own camera may be in it."""
+    """Compute a detection's contribution to a group's score; ignore others of its own camera in the group."""
     bond = float(nodes.bond[a, label])
     total = _STAY * bond
     for c in range(nodes.member.shape[1]):

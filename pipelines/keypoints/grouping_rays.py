@@ -1,4 +1,4 @@
-"""The detections of one frame as rays: how far two pass each other, and where a group of them is."""
+"""Detections of one frame as rays: distance between two of them, and place of a group."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Int64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 _AGREE = 9.0  # a pair of detections without history is one person within 3 sigma
-_CAP = 100.0  # beyond 10 sigma further is no more wrong
+_CAP = 100.0  # squared: beyond 10 sigma the penalty does not grow
 FEW_JOINTS = 3.0  # common joints at which a pair has half the weight of a complete one
 _BODY_M = 0.05  # rays that pass this near are one body: joint definitions, left/right swaps, blur
 _SIZE_M = (0.03, 1.5)  # median distance of joints from their middle: 0.4 m for an adult, 0.06 for a face
@@ -23,7 +23,7 @@ _LOGGED_POINT_M = 0.5  # the log's point (a tag, a phone, the hip) against the j
 
 
 class Nodes(NamedTuple):
-    """The detections of one frame, cameras in order, left to right within a camera: arrays of room N."""
+    """Detections of one frame, cameras in order, left to right within a camera: arrays of room N."""
 
     camera: Int64  # [N]
     detection: Int64  # [N] index into D
@@ -31,7 +31,7 @@ class Nodes(NamedTuple):
     rays: Float  # [N, J, 3] unit, world
     size: Float  # [N] median distance of joints from their middle, normalised picture
     whole: Bool  # [N] enough joints for `size` to mean something
-    weight: Float  # [N, N] 3^2 - s^2, 0 where nothing can be said
+    weight: Float  # [N, N] 3^2 - s^2, 0 where a pair cannot be compared
     known: Float  # [N, S] how well the node continues each track's last picture, 0..1
     bond: Float  # [N, S + N] the same relative to the best other track, -1..1
     barred: Bool  # [N, S] the node continues somebody else than the track
@@ -40,7 +40,7 @@ class Nodes(NamedTuple):
 
 
 def empty_nodes(room: int, slots: int, cameras: int, joints: int) -> Nodes:
-    """Room for the detections of any frame; each fills it anew. The logged actor is one more camera."""
+    """Allocate arrays for the detections of any frame; the logged actor is one more camera."""
     return Nodes(
         camera=np.zeros(room, np.int64),
         detection=np.zeros(room, np.int64),
@@ -59,7 +59,7 @@ def empty_nodes(room: int, slots: int, cameras: int, joints: int) -> Nodes:
 
 @helper
 def median_of(values: Float, count: int) -> float:
-    """Median of the first `count` values, which are sorted in place."""
+    """Return the median of the first `count` values, which are sorted in place."""
     for i in range(1, count):
         value = values[i]
         j = i - 1
@@ -86,10 +86,10 @@ def collect_nodes(
     needed: int,
     scratch: Float,
 ) -> int:
-    """Fill in the detections that can be used; their number.
+    """Fill in the usable detections and return their number.
 
-    Their order depends on where they are in the picture and not on the order they came in, and with it
-    every tie and every rounding below.
+    Their order depends on their place in the picture and not on the order of the input. So all ties and
+    roundings below do not depend on the order of the input either.
     """
     cameras, detections, joints = confidence.shape
     key = np.empty((detections, 2))
@@ -124,7 +124,7 @@ def collect_nodes(
 
 @helper
 def _describe(nodes: Nodes, n: int, xy: Float, confidence: Float, rotation: Float, scratch: Float) -> None:
-    """Points, rays and size of one detection."""
+    """Compute the points, rays and size of one detection."""
     middle = np.empty(2)
     for axis in range(2):
         count = 0
@@ -154,7 +154,7 @@ def _describe(nodes: Nodes, n: int, xy: Float, confidence: Float, rotation: Floa
 
 @helper
 def add_logged_node(nodes: Nodes, n: int, cameras: int) -> int:
-    """Let the logged actor take part as the only detection of one more camera, without a picture."""
+    """Add the logged actor as the only detection of one more camera, which has no picture."""
     nodes.camera[n] = cameras
     for j in range(nodes.points.shape[1]):
         nodes.points[n, j, 0] = nodes.points[n, j, 1] = np.nan
@@ -165,9 +165,9 @@ def add_logged_node(nodes: Nodes, n: int, cameras: int) -> int:
 def compare_nodes(
     nodes: Nodes, n: int, position: Float, sigma: Float, log: Float, needed: int, scratch: Float
 ) -> float:
-    """Weigh every pair of detections of different cameras; the smallest s (NaN without a pair).
+    """Weigh every pair of detections of different cameras and return the smallest s (NaN without a pair).
 
-    A pair with few common joints says less: where a detector takes one person for two, the body wins
+    A pair with few common joints has less weight: if a detector splits one person in two, the body wins
     over the loose leg.
     """
     nearest = np.inf
@@ -190,11 +190,11 @@ def compare_nodes(
 def _disagreement(
     nodes: Nodes, a: int, b: int, position: Float, sigma: Float, squares: Float
 ) -> tuple[float, int]:
-    """Mean over the better three quarters of the common joints of the squared, whitened ray distance.
+    """Compute the mean squared, whitened ray distance over the better three quarters of the common joints.
 
     Two rays o + z d pass each other along n = d_a x d_b, at depths that follow from n (Hartley & Zisserman
-    12.1, the midpoint's); an angular error sigma moves a ray by sigma z along n. Joints whose rays are too
-    parallel for the depths to mean anything do not count. With it the number of joints.
+    12.1, the midpoint's); an angular error sigma moves a ray by sigma z along n. Joints with almost parallel
+    rays, which have no usable depth, do not count. Also returns the number of joints that count.
     """
     ca, cb = nodes.camera[a], nodes.camera[b]
     bx = position[cb, 0] - position[ca, 0]
@@ -239,7 +239,7 @@ def _disagreement(
 def _distance_from_log(
     nodes: Nodes, a: int, position: Float, sigma: Float, log: Float, squares: Float
 ) -> float:
-    """Median over the joints of the squared, whitened distance of the logged actor from the joint's ray."""
+    """Compute the median over joints of the squared, whitened distance of the logged actor from the ray."""
     c = nodes.camera[a]
     count = 0
     for j in range(nodes.points.shape[1]):
@@ -260,7 +260,7 @@ def _distance_from_log(
 
 @helper
 def size_of_group(nodes: Nodes, label: int) -> int:
-    """How many detections a group has, the logged actor among them."""
+    """Count the detections of a group, the logged actor included."""
     size = 0
     for c in range(nodes.member.shape[1]):
         if nodes.member[label, c] >= 0:
@@ -270,13 +270,13 @@ def size_of_group(nodes: Nodes, label: int) -> int:
 
 @helper
 def views_of_group(nodes: Nodes, label: int) -> int:
-    """Cameras in a group; the log, in the last column, is none."""
+    """Count the cameras in a group; the log, in the last column, does not count."""
     return size_of_group(nodes, label) - (1 if nodes.member[label, -1] >= 0 else 0)
 
 
 @helper
 def put_into_group(nodes: Nodes, a: int, label: int) -> None:
-    """Make a detection one of a group."""
+    """Put a detection into a group."""
     nodes.label[a] = label
     nodes.member[label, nodes.camera[a]] = a
 
@@ -285,10 +285,10 @@ def put_into_group(nodes: Nodes, a: int, label: int) -> None:
 def place_group(
     nodes: Nodes, label: int, position: Float, sigma: Float, middle: Float, scratch: Float
 ) -> float:
-    """Middle of a group's joints and its standard deviation (m); NaN where no joint has two views.
+    """Compute the middle of a group's joints and return its standard deviation (m), NaN without two views.
 
-    Least squares closest point to each joint's rays, then the median over joints, axis by axis, so that
-    stray joints do not move it.
+    Each joint is the point nearest to its rays by least squares. The middle is the median over joints, axis
+    by axis, so that outliers do not move it.
     """
     cameras, joints = len(sigma), nodes.points.shape[1]
     found = np.empty((joints, 3))
@@ -340,7 +340,7 @@ def _add_ray(normal: Float, target: Float, ray: Float, origin: Float, weight: fl
 
 @helper
 def _solve(normal: Float, target: Float, solution: Float) -> float:
-    """Solve the 3x3 system by its adjugate; the trace of the inverse, -1 where it is singular."""
+    """Solve the 3x3 system by its adjugate and return the trace of the inverse, -1 if it is singular."""
     xx, xy, xz, yy, yz, zz = normal[0], normal[1], normal[2], normal[3], normal[4], normal[5]
     ax, ay, az = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     by, bz, cz = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy

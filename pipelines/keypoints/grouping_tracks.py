@@ -1,4 +1,4 @@
-"""Who was who in earlier frames: recognising, taking up again, remembering."""
+"""Tracks of earlier frames: recognising, resuming and storing them."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
-_HOLD_S = 0.5  # how long a picture is worth comparing with a later one
+_HOLD_S = 0.5  # a picture is compared with later ones for this long
 _PACE_M_PER_S = 0.7  # random part of a walk, for taking up a track again
 _BODY_RADIUS_M = 0.3  # the middle of a body depends on which joints are seen
 
 
 class Tracks(NamedTuple):
-    """What is remembered of the people so far: arrays of S slots."""
+    """State of the people seen so far: arrays of S slots."""
 
     identity: Int64  # [S] number of the track, -1 free
     views: Int64  # [S] camera-frames in company of another camera
@@ -41,7 +41,7 @@ class Tracks(NamedTuple):
 
 
 def empty_tracks(slots: int, cameras: int, joints: int) -> Tracks:
-    """Nobody yet. The logged actor is one more camera."""
+    """Allocate tracks without any person; the logged actor is one more camera."""
     return Tracks(
         identity=np.full(slots, -1, np.int64),
         views=np.zeros(slots, np.int64),
@@ -56,7 +56,7 @@ def empty_tracks(slots: int, cameras: int, joints: int) -> Tracks:
 
 @helper
 def recognise_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, scratch: Float) -> None:
-    """How well each detection continues each track's last picture in the same camera."""
+    """Rate, 0..1, how well each detection continues each track's last picture in the same camera."""
     slots, cameras = tracks.held_s.shape[0], tracks.held_s.shape[1] - 1
     for a in range(n):
         c = nodes.camera[a]
@@ -85,7 +85,7 @@ def recognise_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, scratch: 
 
 @helper
 def resume_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, middle: Float, spread: Float) -> None:
-    """Give groups without a track the lost track that they can be, nearest first."""
+    """Assign lost tracks to groups without a track, nearest first."""
     slots = len(tracks.identity)
     while True:
         best, group, track = 9.0, -1, -1
@@ -124,7 +124,7 @@ def _rename(nodes: Nodes, old: int, new: int, middle: Float, spread: Float) -> N
 def found_tracks(
     nodes: Nodes, n: int, tracks: Tracks, now: float, identity: int, middle: Float, spread: Float
 ) -> int:
-    """Begin a track for every group that has none; the next free identity."""
+    """Start a track for every group that has none and return the next free identity."""
     slots = len(tracks.identity)
     for label in range(slots, slots + n):
         if size_of_group(nodes, label) == 0:
@@ -144,7 +144,7 @@ def found_tracks(
 
 @helper
 def _vacant(nodes: Nodes, tracks: Tracks, now: float) -> int:
-    """A slot to use: a free one, else one that nobody can return to, else the least seen."""
+    """Choose a slot: a free one, else one that no person can return to, else the least seen."""
     best, score = 0, np.inf
     for k in range(len(tracks.identity)):
         if tracks.identity[k] < 0:
@@ -162,7 +162,7 @@ def _vacant(nodes: Nodes, tracks: Tracks, now: float) -> int:
 
 @helper
 def remember_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, middle: Float, spread: Float) -> None:
-    """Hold the pictures and places of this frame."""
+    """Store the pictures and places of this frame."""
     slots, cameras = tracks.held_s.shape
     for k in range(slots):
         for c in range(cameras):
@@ -190,7 +190,7 @@ def remember_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, middle: Fl
 def _hand_over(nodes: Nodes, n: int, tracks: Tracks, k: int, c: int) -> None:
     """Forget a track's picture when its continuation was given to another track.
 
-    The detection would else be claimed by both for as long as the old picture is held.
+    Otherwise both tracks would claim the detection while the old picture is held.
     """
     best = -1
     for a in range(n):
@@ -206,7 +206,7 @@ def _hand_over(nodes: Nodes, n: int, tracks: Tracks, k: int, c: int) -> None:
 
 @helper
 def is_most_like(nodes: Nodes, a: int, track: int) -> bool:
-    """Whether no track is more like a detection than this one."""
+    """Test if no other track is more like a detection than this one."""
     greatest = 0.0
     for k in range(nodes.known.shape[1]):
         greatest = max(greatest, nodes.known[a, k])

@@ -1,4 +1,4 @@
-"""Where the log says that the actor is in a picture, and how far that can be off."""
+"""Place of the actor in a picture by the log, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _STEP = 1e-4  # of the range: small against a body, large against rounding
 
 @dataclass(frozen=True)
 class Hint:
-    """The actor's place in the picture as the log has it."""
+    """Place of the actor in a picture by the log."""
 
     centre: tuple[float, float]  # px
     height_px: float  # of the actor standing across the line of sight
@@ -34,11 +34,11 @@ def project_actor(
     sigma_rad: float,
     height_m: float = 1.75,
 ) -> Hint | None:
-    """The actor's logged position in a camera's picture.
+    """Project the actor's logged position into a camera's picture.
 
-    The height is that of a body across the line of sight, whatever the tilt: the length in which the
-    sizes of regions are measured. Lengths are turned into pixels where the actor appears, so distortion
-    and the stretch away from the axis are in them.
+    The height is that of a body across the line of sight, for any tilt of the camera; sizes of regions are
+    measured in it. Lengths are converted to pixels at the actor's place, so they include distortion
+    and the stretch away from the axis.
 
     Args:
         position_world: [3] m, the point of the actor that the log follows (hip or near it).
@@ -46,7 +46,7 @@ def project_actor(
         intrinsics: the camera.
         sigma_m: one sigma per axis of the actor's position relative to the camera's, both errors together.
         sigma_rad: one sigma per axis of the camera's rotation.
-        height_m: of the actor.
+        height_m: height of the actor.
 
     Returns:
         The hint; None where a number is missing (NaN), the actor is behind the camera or beyond the

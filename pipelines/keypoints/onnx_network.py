@@ -1,4 +1,4 @@
-"""One ONNX model with one input, a picture: its size, its batch, its layout and its colours."""
+"""ONNX model with one picture as input: its size, batch, layout and colours."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Layout = Literal["nchw", "nhwc"]
 _PROVIDER_OPTIONS = {"cuda": {"cudnn_conv_algo_search": "HEURISTIC"}}
 """Their settings. Unasked, CUDA times its algorithms and takes the fastest, so that two runs may differ."""
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
-_FATAL = 4  # ONNX Runtime's least talkative level: what fails is said by us
+_FATAL = 4  # ONNX Runtime's quietest level: failures are reported here as DataError
 
 
 @dataclass(frozen=True)
 class Colours:
-    """How a network wants its pixels: (value 0..255 - mean) / std, in its own order of channels."""
+    """Pixel normalisation of a network: (value 0..255 - mean) / std, in its own order of channels."""
 
     order: Literal["rgb", "bgr"]
     mean: tuple[float, float, float]
@@ -45,7 +45,7 @@ def provider_with_options(name: str) -> str:
 
 
 class OnnxNetwork:
-    """A loaded model. Not to be shared by threads: each takes its own.
+    """Loaded model. Not thread-safe: each thread needs its own.
 
     Args:
         path: the model.
@@ -93,9 +93,9 @@ class OnnxNetwork:
         self.shapes = {name: values.shape for name, values in self._outputs(blank, None).items()}
 
     def batch(self, rgb: NDArray[np.uint8], outputs: Sequence[str]) -> dict[str, NDArray[Any]]:
-        """Some outputs [N, ...], by name, for pictures [N, H, W, 3] of RGB values 0..255, N > 0.
+        """Compute some outputs [N, ...], by name, for pictures [N, H, W, 3] of RGB values 0..255, N > 0.
 
-        A graph of a fixed batch is run as often as it takes, the last time filled up with zeros.
+        A graph with a fixed batch runs several times; the last run is padded with zeros.
         """
         step = self._batch or len(rgb)
         short = -len(rgb) % step
@@ -106,7 +106,7 @@ class OnnxNetwork:
         return {name: np.concatenate([part[name] for part in parts])[: len(rgb)] for name in outputs}
 
     def single(self, rgb: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
-        """All outputs, by name, for one picture [H, W, 3]; their first axis need not be the batch's."""
+        """Compute all outputs, by name, for one picture [H, W, 3]; their first axis need not be the batch."""
         return self._outputs(rgb[None], None)
 
     def _outputs(self, rgb: NDArray[np.uint8], names: Sequence[str] | None) -> dict[str, NDArray[Any]]:
@@ -128,7 +128,7 @@ class OnnxNetwork:
 
 
 def _runtime() -> Any:
-    """Import ONNX Runtime, which brings no types."""
+    """Import ONNX Runtime, which has no type annotations."""
     return need("onnxruntime", "onnx")
 
 
@@ -192,7 +192,7 @@ def _written(shape: Sequence[object]) -> str:
 
 
 def written_shapes(shapes: Mapping[str, tuple[int, ...]]) -> str:
-    """Names and shapes for a message: `simcc_x [1,17,384], simcc_y [1,17,512]`."""
+    """Format names and shapes for a message: `simcc_x [1,17,384], simcc_y [1,17,512]`."""
     return ", ".join(f"{name} {_written(shape)}" for name, shape in shapes.items())
 
 

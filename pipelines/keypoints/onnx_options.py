@@ -1,4 +1,4 @@
-"""What stands behind `onnx:`: a model's path, and options where its graph does not say everything.
+"""Argument of `onnx:`: a model's path, and options for information that its graph lacks.
 
 `MODEL.onnx[,option=value...]`, for example `pose.onnx,skeleton=halpe26,people=yolox.onnx`.
 """
@@ -46,7 +46,7 @@ _PEOPLE_NORMS: dict[str, tuple[Three, Three]] = {
 
 @dataclass(frozen=True)
 class OnnxOptions:
-    """All of it, read."""
+    """Parsed argument of `onnx:`."""
 
     model: Path
     people: Path | None
@@ -62,10 +62,10 @@ class OnnxOptions:
 
 
 def parse_options(argument: str) -> OnnxOptions:
-    """Read what stands behind the colon; a path may hold commas.
+    """Parse the text after the colon; a path may contain commas.
 
     Raises:
-        DataError: an option that there is not, twice, or with a value out of its range.
+        DataError: an option is unknown, repeated, or has a value out of its range.
     """
     parts = argument.split(",")
     first = next((i for i, part in enumerate(parts) if i and _OPTION.match(part)), len(parts))
@@ -94,7 +94,7 @@ def parse_options(argument: str) -> OnnxOptions:
 
 
 def _colours(order: Literal["rgb", "bgr"], mean: Three, std: Three) -> Colours:
-    """Constants that are stated as R/G/B, put into the order of the network's channels."""
+    """Convert constants stated as R/G/B to the order of the network's channels."""
     return Colours(order, mean, std) if order == "rgb" else Colours(order, mean[::-1], std[::-1])
 
 

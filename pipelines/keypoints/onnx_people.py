@@ -1,4 +1,4 @@
-"""Person detectors as ONNX models: YOLOX and RTMDet as OpenMMLab and their authors export them."""
+"""Person detectors as ONNX models: YOLOX and RTMDet, as exported by OpenMMLab and by their authors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _PERSON = 0  # the class, in COCO and in every list of persons alone
 
 
 class OnnxPeople:
-    """A person detector; not to be shared by threads."""
+    """Person detector. Not thread-safe."""
 
     def __init__(self, network: OnnxNetwork) -> None:
         self._network = network
@@ -29,7 +29,7 @@ class OnnxPeople:
         self._grid = _grid(width, height)
 
     def find(self, picture: Picture) -> tuple[Float, Float]:
-        """People in a picture [H, W, 3] BGR, best first.
+        """Find people in a picture [H, W, 3] BGR, best first.
 
         The picture is fitted into the top left of the network's input. The network counts from the edge of
         the first pixel, the boxes returned from its centre.
@@ -38,7 +38,7 @@ class OnnxPeople:
             Boxes [N, 4] (left, top, right, bottom) in px, and scores [N].
 
         Raises:
-            DataError: the network's outputs are of no kind that is known.
+            DataError: the network's outputs are of no known kind.
         """
         width, height = self._network.size
         scale = max(picture.shape[1] / width, picture.shape[0] / height)
@@ -53,7 +53,7 @@ class OnnxPeople:
         return boxes[kept] * scale - 0.5, score[kept]
 
     def _read(self, outputs: Mapping[str, NDArray[Any]]) -> tuple[Float, Float]:
-        """Boxes [N, 4] in pixels of the input and scores [N], before anything is left out."""
+        """Read boxes [N, 4] in pixels of the input and scores [N], before any filtering."""
         tables = [np.asarray(v, np.float64) for v in outputs.values() if v.dtype.kind == "f"]
         tables = [table[0] if table.ndim == 3 and len(table) == 1 else table for table in tables]
         labels = [np.ravel(v) for v in outputs.values() if v.dtype.kind in "iu"]
@@ -78,7 +78,7 @@ class OnnxPeople:
 
 
 def distinct(boxes: Float, score: Float) -> NDArray[np.intp]:
-    """Rows of boxes [N, 4], best first, without those that overlap a better one (greedy suppression)."""
+    """Return row numbers of boxes [N, 4], best first, without those that overlap a better one (greedy)."""
     size = np.maximum(boxes[:, 2:] - boxes[:, :2], 0.0)
     area = size[:, 0] * size[:, 1]
     left = np.argsort(-score, kind="stable")
@@ -94,7 +94,7 @@ def distinct(boxes: Float, score: Float) -> NDArray[np.intp]:
 
 
 def _grid(width: int, height: int) -> Float:
-    """Column, row and stride [G, 3] of the cells that YOLOX's rows stand for."""
+    """Return column, row and stride [G, 3] of the cells to which YOLOX's rows belong."""
     levels = []
     for stride in _STRIDES:
         x, y = np.meshgrid(np.arange(width // stride), np.arange(height // stride))
@@ -103,7 +103,7 @@ def _grid(width: int, height: int) -> Float:
 
 
 def _raw_yolox(table: Float, grid: Float) -> tuple[Float, Float]:
-    """YOLOX before its decoding: [G, 5 + C] of centre, log size, objectness and class probabilities.
+    """Decode raw YOLOX rows [G, 5 + C]: centre, log size, objectness and class probabilities.
 
     Ge et al., "YOLOX: Exceeding YOLO Series in 2021", the authors' `demo_postprocess`.
     """

@@ -1,7 +1,7 @@
 """Detector `onnx:MODEL.onnx`: the user's own top-down model, run by ONNX Runtime.
 
 Crops follow MMPose's top-down models: upright, the box of a person padded by 1.25, the aspect of the
-network's input kept. Where a graph does not say all that is needed, an option does (see `onnx_options`).
+network's input kept. Options give the information that a graph lacks (see `onnx_options`).
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ _EYES, _ANKLES = 0.936, 0.039  # heights above the ground, as shares of the body
 
 
 class FindsPeople(Protocol):
-    """Where regions come from."""
+    """Source of regions."""
 
     def find_people(self, picture: Picture) -> list[tuple[Region, float]]:
-        """As that of KeypointNetworks."""
+        """Find people; see `KeypointNetworks.find_people`."""
 
 
 class OnnxPose:
-    """The loaded networks. Not to be shared by threads.
+    """Loaded networks. Not thread-safe.
 
     Args:
         network: the pose model.
         decoder: reads its outputs.
-        joints: what its first joints are called; more are left out.
-        people: who finds people; None where only the log tells where somebody is.
+        joints: names of its first joints; further joints are left out.
+        people: finder of people; None if only the log gives their place.
     """
 
     def __init__(
@@ -57,15 +57,15 @@ class OnnxPose:
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """What the joints are called."""
+        """Names of the joints."""
         return self._joints
 
     def find_people(self, picture: Picture) -> list[tuple[Region, float]]:
-        """People in a picture [H, W, 3] BGR, best first; nobody without a person detector."""
+        """Find people in a picture [H, W, 3] BGR, best first; none without a person detector."""
         return [] if self._people is None else self._people.find_people(picture)
 
     def locate(self, picture: Picture, regions: Sequence[Region]) -> list[Person]:
-        """The joints of the person in each region, all regions in one run where the graph's batch is open.
+        """Locate the joints of the person in each region, in one run if the graph's batch is open.
 
         `presence` is the share of joints with a score of at least 0.3.
         """
@@ -85,7 +85,7 @@ class OnnxPose:
         return Person(xy, score, float(sure.mean()), self._next_region(xy[sure], region))
 
     def _next_region(self, xy: Float, region: Region) -> Region:
-        """The region of the body whose joints these are; the same again where there are none.
+        """Compute the region of the body with these joints; keep the old region for fewer than two joints.
 
         Joints reach from the ankles to the eyes only, unless the skeleton has heels and the head's top.
         """
@@ -98,7 +98,7 @@ class OnnxPose:
 
 
 class _BoxedPeople:
-    """Regions from a person detector's boxes, for a pose model of that input size."""
+    """Adapter from a person detector's boxes to regions for a pose model of that input size."""
 
     def __init__(self, people: OnnxPeople, size: tuple[int, int]) -> None:
         self._people = people
@@ -118,7 +118,7 @@ class _BoxedPeople:
 
 @dataclass(frozen=True)
 class OnnxDetector:
-    """One model with its options."""
+    """Pose model with its options."""
 
     options: OnnxOptions
 
@@ -130,7 +130,7 @@ class OnnxDetector:
 
     @property
     def title(self) -> str:
-        """What it is, and who finds people for it."""
+        """File name of the model, and the finder of people."""
         if self.options.people is not None:
             finder = f"people found by {self.options.people.name}"
         elif self._has_blazepose:
@@ -144,7 +144,7 @@ class OnnxDetector:
         return None not in BLAZEPOSE.models().values()
 
     def models(self) -> dict[str, Path | None]:
-        """The pose model, and the one that finds people."""
+        """Return the files of the pose model and of the person detector, None where missing."""
         paths: dict[str, Path | None] = {"pose": self.options.model}
         if self.options.people is not None:
             paths["people"] = self.options.people
@@ -153,7 +153,7 @@ class OnnxDetector:
         return {name: path if path is not None and path.is_file() else None for name, path in paths.items()}
 
     def fetch(self, source: Path | None = None) -> None:  # noqa: ARG002  # the protocol's
-        """Nothing: the user's models are where the user says.
+        """Refuse: the user's own models cannot be fetched.
 
         Raises:
             DataError: always.
@@ -164,7 +164,7 @@ class OnnxDetector:
         """Load the networks; the results do not depend on `threads`.
 
         Raises:
-            DataError: ONNX Runtime or a file is missing, or a model is of no kind that is known.
+            DataError: ONNX Runtime or a file is missing, or a model is of no known kind.
         """
         options = self.options
         network = OnnxNetwork(
@@ -208,14 +208,14 @@ def _joints(path: Path, decoder: PoseDecoder, stated: str | None) -> tuple[str, 
 
 
 class OnnxFamily:
-    """What `mocap models` and `--detector onnx:...` see of it."""
+    """Family of detectors `onnx:...` for `mocap models` and `--detector`."""
 
     name = "onnx"
     title = "Your own top-down model (ONNX Runtime)"
     usage = USAGE
 
     def configured(self, argument: str) -> OnnxDetector:
-        """The detector of a model and its options.
+        """Build the detector from a model and its options.
 
         Raises:
             DataError: the file is missing, or an option is wrong.

@@ -1,12 +1,12 @@
-"""From the outputs of top-down pose networks to joints in their input: SimCC and heatmaps.
+"""Decoding of the outputs of top-down pose networks, SimCC and heatmaps, to joints in their input.
 
 Positions are pixels of the network's input, the centre of the top left one at (0, 0).
 
 - SimCC (Li et al., "SimCC: a Simple Coordinate Classification Perspective", 2022; RTMPose): one score for
   each bin of x and of y, `split` bins to a pixel; bin b lies at b / split, as MMPose encodes and decodes.
-  Networks are trained on Gaussians of several bins, so that their scores are about the logarithm of one, a
-  parabola: that through the best bin and two on either side, by least squares, has the joint at its top.
-  A soft argmax over all bins would be drawn to the middle by what other people and noise leave in them.
+  Networks are trained on Gaussians of several bins, so their scores are about the logarithm of a Gaussian: a
+  parabola. It is fitted by least squares to the best bin and two on either side; the joint is at its top.
+  A soft argmax over all bins would be biased to the middle by other people and noise.
 - Heatmaps (HRNet, ViTPose, AlphaPose's FastPose): cell k of w lies at k (W - 1) / (w - 1) where they were
   trained unbiased (`udp`: Huang et al., "The Devil Is in the Details", 2020; ViTPose), and at k W / w where
   not (`msra`: HRNet and FastPose as published). Between the cells, the logarithm of the smoothed map is
@@ -37,11 +37,11 @@ _FLOOR = 1e-10
 
 @dataclass(frozen=True)
 class PoseDecoder:
-    """How the outputs of one network are read.
+    """Decoder of one network's outputs.
 
     Attributes:
         outputs: names of the x and y scores, or of the heatmaps.
-        count: how many joints there are.
+        count: number of joints.
         per_px: [2] bins or cells for each pixel of the input, in x and y.
     """
 
@@ -51,11 +51,11 @@ class PoseDecoder:
 
     @property
     def kind(self) -> str:
-        """SimCC or heatmaps."""
+        """Kind of outputs: SimCC or heatmaps."""
         return "SimCC" if len(self.outputs) == 2 else "heatmaps"
 
     def decode(self, outputs: dict[str, NDArray[Any]]) -> tuple[Float, Float]:
-        """Joints [N, K, 2] in pixels of the input, NaN where nothing is above 0, and scores [N, K] 0..1."""
+        """Decode joints [N, K, 2] in pixels of the input, NaN if no score is above 0, and scores [N, K]."""
         maps = [outputs[name].astype(np.float64) for name in self.outputs]
         place, score = simcc_peaks(*maps) if len(maps) == 2 else heatmap_peaks(maps[0])
         xy = place / np.array(self.per_px)
@@ -65,16 +65,16 @@ class PoseDecoder:
 def decoder_for(
     path: Path, shapes: Mapping[str, tuple[int, ...]], size: tuple[int, int], cells: HeatmapCells
 ) -> PoseDecoder:
-    """How to read a network's outputs, from their shapes.
+    """Choose the decoder of a network's outputs from their shapes.
 
     Args:
         path: of the model, for the message.
         shapes: of the outputs for one picture, by name.
         size: width and height of the network's input.
-        cells: where the cells of heatmaps lie.
+        cells: convention for the place of heatmap cells.
 
     Raises:
-        DataError: they are of no kind that is known.
+        DataError: they are of no known kind.
     """
     width, height = size
     lines = {name: shape for name, shape in shapes.items() if len(shape) == 3}
@@ -98,16 +98,16 @@ def decoder_for(
 
 
 def simcc_peaks(x: Float, y: Float) -> tuple[Float, Float]:
-    """The joints' places [N, K, 2] in bins and their scores [N, K]: the smaller of the two best ones."""
+    """Find joints [N, K, 2] in bins and their scores [N, K], the smaller of the best scores in x and y."""
     places, scores = zip(*(_line_peaks(line) for line in (x, y)), strict=True)
     return np.stack(places, axis=-1), np.minimum(*scores)
 
 
 def _line_peaks(scores: Float) -> tuple[Float, Float]:
-    """The tops [N, K] of parabolas about the best bins of [N, K, B], within a bin of them.
+    """Find the tops [N, K] of parabolas around the best bins of [N, K, B], at most one bin away.
 
-    Least squares of a + b d + c d^2 to d = -2..2: b = sum(d s) / 10, c = sum((d^2 - 2) s) / 14. The best
-    bin is left where it is at either end of the line.
+    Least squares of a + b d + c d^2 to d = -2..2: b = sum(d s) / 10, c = sum((d^2 - 2) s) / 14. Near
+    either end of the line the best bin is kept. Also returns the scores [N, K] of the best bins.
     """
     last = scores.shape[-1] - 1
     best = scores.argmax(axis=-1)
@@ -121,7 +121,7 @@ def _line_peaks(scores: Float) -> tuple[Float, Float]:
 
 
 def heatmap_peaks(maps: Float) -> tuple[Float, Float]:
-    """The joints' places [N, K, 2] in cells and the maps' [N, K, h, w] largest values [N, K].
+    """Find joints [N, K, 2] in cells and the largest values [N, K] of maps [N, K, h, w].
 
     One Newton step from the best cell, at most one cell in each direction; none at the border, where the
     derivatives are not known, or where the map bends upwards.
@@ -138,7 +138,7 @@ def heatmap_peaks(maps: Float) -> tuple[Float, Float]:
 
 
 def _log_around(maps: Float, row: NDArray[np.intp], column: NDArray[np.intp]) -> Float:
-    """The logarithm [M, 3, 3] of smoothed maps [M, h, w] around one cell each, 0 beyond the border."""
+    """Compute the logarithm [M, 3, 3] of smoothed maps [M, h, w] around one cell each, padded with 0."""
     reach = _SMOOTHING_CELLS // 2
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SMOOTHING_SIGMA) ** 2)
     shifted = np.stack([np.pad(kernel / kernel.sum(), (shift, 2 - shift)) for shift in range(3)])
@@ -152,7 +152,7 @@ def _log_around(maps: Float, row: NDArray[np.intp], column: NDArray[np.intp]) ->
 
 
 def _newton_steps(around: Float) -> Float:
-    """From the middle of [M, 3, 3] values to the tops [M, 2] of paraboloids through them, x and y."""
+    """Compute steps [M, 2] (x, y) from the middle of [M, 3, 3] values to the tops of their paraboloids."""
     dx, dy = (around[:, 1, 2] - around[:, 1, 0]) / 2, (around[:, 2, 1] - around[:, 0, 1]) / 2
     dxx = around[:, 1, 2] - 2 * around[:, 1, 1] + around[:, 1, 0]
     dyy = around[:, 2, 1] - 2 * around[:, 1, 1] + around[:, 0, 1]

@@ -1,10 +1,10 @@
-"""Left and right taken for each other, found by how joints move in one camera.
+"""Exchanges of left and right, found from the motion of joints in one camera.
 
-An exchange makes two joints jump by their distance, there and, when it ends, back. Two hypotheses at each
-picture, exchanged or not, are weighed by how well every joint goes on as it moved: Viterbi's shortest path
+An exchange makes two joints jump by their distance, and jump back when it ends. Each picture has two
+hypotheses, exchanged or not, weighed by how well every joint continues its motion: Viterbi's shortest path
 over the errors of prediction at constant velocity. First for the arms and for the legs, then for the face,
 which goes with them where both were exchanged, then for hands, feet and each other pair of joints. Which of
-the two sides is the right one is the majority's word: an exchange in most pictures cannot be seen here.
+the two sides is right is decided by the majority: an exchange in most pictures cannot be detected here.
 
 Exchanges often begin or end where legs cross in the picture. Nothing jumps there, and detectors place
 joints that hide each other badly for some pictures. What happens at a crossing therefore decides nothing: a
@@ -28,7 +28,7 @@ Bools = NDArray[np.bool_]
 Pair = tuple[int, int]
 
 VISIBLE = 60.0
-"""Squared distances of left and right, in variances of a coordinate, whose exchange stands out from noise."""
+"""Squared left-right distance, in variances of a coordinate, above which an exchange is visible in noise."""
 
 _LIMBS = {
     "face": ("eye", "ear", "mouth"),
@@ -36,14 +36,14 @@ _LIMBS = {
     "legs": ("hip", "knee", "ankle", "heel", "toe"),
 }
 _PARTS = {"hand": ("wrist", "pinky", "index", "thumb"), "foot": ("ankle", "heel", "toe")}
-_CHANGE = 16.0  # what a change between the hypotheses costs: four standard deviations of one coordinate
+_CHANGE = 16.0  # cost of a change between the hypotheses: four standard deviations of one coordinate
 _HIDDEN_CHANGE = 4.0  # the same where joints cross, which is where detectors change most
-_EXCHANGED = 2.0  # what each picture costs in which left and right are exchanged: the majority is right
-_JUMP = 45.0  # what each end of an exchange must save against going on unchanged
+_EXCHANGED = 2.0  # cost of each exchanged picture: the majority is right
+_JUMP = 45.0  # each end of an exchange must save this against continuing unchanged
 _TAIL = 16.0  # variances from which on an error of prediction counts by its logarithm: limbs accelerate
 _LEAST_NOISE = 0.01  # of the body's size (median distance of joints from their middle), 4 mm
 _LONGEST_S = 0.3  # the longest exchange with one visible end: walkers' legs cross every half second
-_GAP_S = 0.5  # nothing is predicted over more
+_GAP_S = 0.5  # longer gaps are not predicted over
 _MOST = 0.6  # of the pairs usually seen: pictures with fewer are decided by the pictures beside them
 _APART = 0.3  # of the body's size: left and right nearer to each other than this are crossing
 
@@ -51,7 +51,7 @@ _APART = 0.3  # of the body's size: left and right nearer to each other than thi
 def undo_swaps(
     t_s: Float, xy: Float, confidence: Float, joints: Sequence[str]
 ) -> tuple[Float, Float, dict[str, int]]:
-    """Give joints back to the side they belong to.
+    """Undo exchanges of left and right.
 
     Args:
         t_s: [T] seconds, strictly increasing.
@@ -63,7 +63,7 @@ def undo_swaps(
         Positions and confidences with the exchanges undone, and the number of pictures in which there was
         one: of the `arms`, the `legs`, the `face` apart from those, of a `hand` or a `foot`, and of a single
         pair as `knee`.
-        What had none is the same to the last bit.
+        Values without an exchange are the same to the last bit.
     """
     xy, confidence = xy.copy(), confidence.copy()
     pairs = {name.removeprefix("left_"): pair for name, pair in mirrored_pairs(joints).items()}
@@ -89,11 +89,11 @@ def undo_swaps(
 
 
 def undo_swaps_of_tracks(found: Detections, frame_t_ns: Int64) -> tuple[Detections, dict[str, int]]:
-    """The same for everybody whom one camera followed: detections with one number are one person.
+    """Undo exchanges for all people that one camera followed; detections with one number are one person.
 
     Args:
         found: of one camera, sorted by frame.
-        frame_t_ns: [F] when each of its frames was taken.
+        frame_t_ns: [F] time of each of its frames.
 
     Returns:
         The detections, and the pictures with an exchange by limb, summed over the people.
@@ -109,7 +109,7 @@ def undo_swaps_of_tracks(found: Detections, frame_t_ns: Int64) -> tuple[Detectio
 
 
 def mirrored_pairs(joints: Sequence[str]) -> dict[str, Pair]:
-    """The columns of a left joint and of its mirror, by the left one's name."""
+    """Return the columns of each left joint and of its mirror, by the left one's name."""
     column = {joint: index for index, joint in enumerate(joints)}
     return {
         joint: (index, column[mirrored(joint)])
@@ -119,7 +119,7 @@ def mirrored_pairs(joints: Sequence[str]) -> dict[str, Pair]:
 
 
 def limb_pairs(joints: Sequence[str]) -> dict[str, list[Pair]]:
-    """The mirrored pairs of the face, the arms and the legs; empty where there are none."""
+    """Return the mirrored pairs of the face, the arms and the legs; empty lists where there are none."""
     pairs = mirrored_pairs(joints)
     return {
         limb: [pair for name, pair in pairs.items() if any(part in name for part in parts)]
@@ -152,7 +152,7 @@ def exchanged_pictures(t_s: Float, xy: Float, pairs: Sequence[Pair], *, size: fl
         t_s: [T] seconds.
         xy: [T, J, 2].
         pairs: columns of left and right joints.
-        size: of the body, in the unit of `xy`.
+        size: size of the body, in the unit of `xy`.
     """
     left, right = (xy[:, [pair[side] for pair in pairs]] for side in (0, 1))
     seen = (np.isfinite(left) & np.isfinite(right)).all(-1).sum(-1)
@@ -186,8 +186,8 @@ def exchanged_pictures(t_s: Float, xy: Float, pairs: Sequence[Pair], *, size: fl
 def _with_visible_ends(t_s: Float, path: Bools, linked: Bools, crossing: Bools, cost: Float) -> Bools:
     """Keep the runs of a path [R] that begin and end with a jump, and short ones with a single visible end.
 
-    The path has chosen the crossing, or the end of what was seen, that makes such a run shortest. A longer
-    one is left alone: the pictures on the other side of the jump might as well be the exchanged ones.
+    The path has already chosen the crossing, or the end of the data, that makes such a run shortest. Longer
+    runs with a single visible end are dropped: the exchanged pictures could be those beyond the jump.
     """
     kept = path.copy()
     edges = np.flatnonzero(np.diff(path, prepend=False, append=False))
@@ -201,7 +201,7 @@ def _with_visible_ends(t_s: Float, path: Bools, linked: Bools, crossing: Bools, 
 
 
 def _jumps(end: int, path: Bools, linked: Bools, crossing: Bools, cost: Float) -> bool:
-    """Test if the change before row `end` was seen as a jump; at the ends of what was seen none was."""
+    """Test if the change before row `end` is a visible jump; False at the ends of the data."""
     if not 0 < end < len(path) or not linked[end] or crossing[end]:
         return False
     before, now = int(path[end - 1]), int(path[end])
@@ -213,7 +213,7 @@ def _jumps(end: int, path: Bools, linked: Bools, crossing: Bools, cost: Float) -
 
 
 def _body_size(xy: Float) -> float:
-    """Median distance of joints from the middle of their picture."""
+    """Compute the median distance of joints from their mean in each picture."""
     seen = xy[np.isfinite(xy).all(-1).sum(-1) >= 2]
     if not len(seen):
         return 0.0
@@ -222,19 +222,19 @@ def _body_size(xy: Float) -> float:
 
 
 def _costs(t_s: Float, left: Float, right: Float, least_noise: float) -> tuple[Float, Bools, float]:
-    """What each row adds to the length of a path.
+    """Compute the cost that each row adds to the length of a path.
 
     Args:
         t_s: [R] seconds.
-        left: [R, K, 2] joints that are called left.
-        right: [R, K, 2] and those called right.
-        least_noise: that positions have at least, in their unit.
+        left: [R, K, 2] joints labelled left.
+        right: [R, K, 2] joints labelled right.
+        least_noise: lower limit of the noise of positions, in their unit.
 
     Returns:
         Costs [R, 2, 2, 2, K] for the hypotheses two rows before, one before, and now: the squared errors of
         prediction in units of their variance, large ones by their logarithm, of both joints of a pair; 0 in
-        the first two rows and behind a gap. Then [R] whether a row follows the one before, so that a change
-        of hypothesis has its price; and the noise of a coordinate.
+        the first two rows and after a gap. Then [R] True if a row follows the one before without a gap, so
+        that a change of hypothesis has a cost; and the noise of a coordinate.
     """
     step = np.diff(t_s)
     ratio = step[1:] / step[:-1]
@@ -262,8 +262,8 @@ def _costs(t_s: Float, left: Float, right: Float, least_noise: float) -> tuple[F
 def _shortest_path(cost: Float, change: Float, exchanged: float) -> Bools:
     """Find the hypotheses [R] of the shortest path through costs [R, 2, 2, 2] (Viterbi over pairs of rows).
 
-    A change before a row costs `change` [R], an exchanged row `exchanged`. Of equally short ones that which
-    is longer not exchanged.
+    A change before a row costs `change` [R], an exchanged row `exchanged`. Ties go to the path that stays
+    unexchanged longer.
     """
     rows = len(cost)
     length = np.empty((2, 2))  # by the hypotheses of the last row and of this one

@@ -1,7 +1,7 @@
-"""Left and right taken for each other in one or two of several cameras at the same time.
+"""Exchanges of left and right in one or two of several cameras at the same time.
 
-Where the viewing rays of a limb's joints do not meet, exchanging left and right in a few cameras may make
-them. All sets of one or two cameras are tried; each limb for itself, then each pair of joints.
+If the viewing rays of a limb's joints do not meet, exchanging left and right in one or two cameras can make
+them meet. All sets of one or two cameras are tried, first for each limb, then for each pair of joints.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ def swaps_across_views(
 ) -> tuple[Int64, dict[str, int]]:
     """Find the side of each joint where the rays of the other cameras meet.
 
-    Where an exchange in exactly half of the cameras mends it (one of two), nobody knows which half is
-    right: the limb is dropped from all of them at that time.
+    If an exchange in exactly half of the cameras (one of two) mends it, the right half is unknown: the limb
+    is dropped from all cameras at that time.
 
     Args:
         xy: [T, J, C, 2] one person's joints, undistorted normalised picture coordinates, NaN not seen.
@@ -37,8 +37,8 @@ def swaps_across_views(
         joints: the names of the J joints.
 
     Returns:
-        Which joint's view is the one of each joint [T, J, C]: its own number, its mirror's where the two are
-        exchanged, -1 where it is dropped; and how many joint views were `undone` and `dropped`.
+        The joint [T, J, C] whose view belongs to each joint: its own number, its mirror's if the two are
+        exchanged, -1 if it is dropped; and the numbers of joint views `undone` and `dropped`.
     """
     xy, sides = xy.copy(), np.tile(np.arange(xy.shape[1])[:, None], (len(xy), 1, xy.shape[2]))
     counts: Counter[str] = Counter()
@@ -60,7 +60,7 @@ def swaps_across_views(
 def _wrong_views(
     xy: Float, position: Float, rotation: Float, sigma: Float, pairs: int
 ) -> tuple[Bools, Bools]:
-    """Where a limb [T, 2 K, C, 2] (left, right, left, ...) is exchanged [T, C], and where undecided [T]."""
+    """Find in which views a limb [T, 2 K, C, 2] (left, right, ...) is exchanged [T, C], or undecided [T]."""
     times, _, cameras, _ = xy.shape
     flipped, undecided = np.zeros((times, cameras), np.bool_), np.zeros(times, np.bool_)
     rays = _world_rays(xy, rotation).reshape(times, pairs, 2, cameras, 3)
@@ -100,7 +100,7 @@ def _wrong_views(
 
 
 def _world_rays(xy: Float, rotation: Float) -> Float:
-    """Unit vectors [T, J, C, 3] in the world."""
+    """Compute the viewing rays as unit vectors [T, J, C, 3] in the world."""
     camera = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
     world: Float = np.einsum("tcik,tjck->tjci", rotation, camera)
     unit: Float = world / np.linalg.norm(world, axis=-1, keepdims=True)
@@ -108,10 +108,10 @@ def _world_rays(xy: Float, rotation: Float) -> Float:
 
 
 def _misses(rays: Float, seen: Bools, position: Float, sigma: Float) -> Float:
-    """Squared distances [T, K, 2, C] of rays from the point nearest to all, in variances; NaN where not seen.
+    """Compute squared distances [T, K, 2, C] of rays from their common point, in variances; NaN if not seen.
 
-    The least squares midpoint of rays weighed by their accuracy; a ray's error is its angle's times the
-    distance. NaN too where fewer than two rays meet there, or all are parallel.
+    The point is the least squares midpoint of the rays, weighed by their accuracy. A ray's error is its
+    angular error times the distance. Also NaN for fewer than two rays, or if all are parallel.
     """
     weight = np.where(seen, 1 / sigma[:, None, None] ** 2, 0.0)
     rays = np.where(seen[..., None], rays, 0.0)
@@ -132,7 +132,7 @@ def _misses(rays: Float, seen: Bools, position: Float, sigma: Float) -> Float:
 
 
 def _mean(misses: Float) -> Float:
-    """[T] mean of what there is; 0 for nothing."""
+    """Compute the mean [T] of the finite values; 0 if there are none."""
     axes = tuple(range(1, misses.ndim))
     count = np.isfinite(misses).sum(axis=axes)
     mean: Float = np.nansum(misses, axis=axes) / np.maximum(count, 1)

@@ -1,7 +1,8 @@
-"""Finding people who are small in a large picture: by the person detector on squares cut from it.
+"""Search for people who are small in a large picture: the person detector runs on squares cut from it.
 
-The detector looks at a picture shrunk to a few hundred pixels and finds bodies of about a third of it,
-hardly any of a tenth (measured with BlazePose: all in a square of 3 body heights, none on full frames).
+The detector shrinks a picture to a few hundred pixels. It finds bodies of about a third of the picture's
+size, and almost none of a tenth (measured with BlazePose: all in a square of 3 body heights, none on full
+frames).
 """
 
 from __future__ import annotations
@@ -41,12 +42,12 @@ class Tile:
     height: int
 
     def cut(self, picture: Picture) -> Picture:
-        """That part of a picture [H, W, 3], without a copy."""
+        """Cut the tile from a picture [H, W, 3], without a copy."""
         return picture[self.top : self.top + self.height, self.left : self.left + self.width]
 
 
 def tiles(width: int, height: int) -> list[Tile]:
-    """The whole picture, then squares of its short side, of half and of a quarter of it; coarse to fine.
+    """List tiles, coarse to fine: the picture, then squares of its short side, of half and a quarter of it.
 
     Neighbours overlap by a third or more, and together they cover the picture: 85 tiles at 16:9. Sizes
     below 150 px are left out, as bodies in them have too few pixels for joints.
@@ -64,7 +65,7 @@ def tiles(width: int, height: int) -> list[Tile]:
 
 
 def square_about(centre: tuple[float, float], side: float, width: int, height: int) -> Tile:
-    """A square about a place, moved into the picture where it reaches beyond, and cut where it is larger."""
+    """Place a square around a point; shift it into the picture, and cut it if it is larger than that."""
     across, down = (max(1, min(round(side), size)) for size in (width, height))
     left = min(max(round(centre[0] - across / 2), 0), width - across)
     top = min(max(round(centre[1] - down / 2), 0), height - down)
@@ -74,7 +75,7 @@ def square_about(centre: tuple[float, float], side: float, width: int, height: i
 def squares_about(
     centre: tuple[float, float], height_px: float, margin_px: float, width: int, height: int
 ) -> list[Tile]:
-    """Squares of 3 body heights that hold a body whose centre is known to a margin; at most 3 x 3.
+    """List squares of 3 body heights that cover a body with an uncertain centre; at most 3 x 3.
 
     A square holds whole bodies whose centres are within one height of its own.
     """
@@ -88,12 +89,12 @@ def squares_about(
 
 
 def find_in(networks: KeypointNetworks, picture: Picture, parts: Iterable[Tile]) -> list[Candidate]:
-    """People in parts of a picture, each once.
+    """Find people in parts of a picture, each person once.
 
     Args:
         networks: the detector.
         picture: [H, W, 3] BGR.
-        parts: where to look.
+        parts: tiles to search.
 
     Returns:
         Regions in pixels of the whole picture and their scores: whole bodies before those that a tile's
@@ -111,10 +112,10 @@ def find_in(networks: KeypointNetworks, picture: Picture, parts: Iterable[Tile])
 
 
 def same_place(a: Region, b: Region) -> bool:
-    """Whether two regions are about one person.
+    """Test if two regions are around one person.
 
-    By their centres and not by their overlap: regions are much wider than people, so those of two
-    people side by side overlap by more than half.
+    The test uses centres and not overlap: regions are much wider than people, so the regions of two people
+    side by side overlap by more than half.
     """
     return math.dist(a.centre, b.centre) < _SAME * max(a.side, b.side)
 
@@ -130,7 +131,7 @@ def _moved(region: Region, part: Tile) -> Region:
 
 
 def _is_cut(region: Region, part: Tile, picture: Picture) -> bool:
-    """Whether a body reaches a tile's border inside the picture: its centre is then only guessed."""
+    """Test if a tile's border inside the picture cuts a body; its centre is then only a guess."""
     reach = region.side / SIDE_PER_HEIGHT / 2
     for start, length, size, centre in (
         (part.left, part.width, picture.shape[1], region.centre[0]),

@@ -1,4 +1,4 @@
-"""Following people through the pictures of one camera: where to look, who is whom, lost and found."""
+"""Tracking of people through the pictures of one camera: search, identity, loss and return."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ _PRESENT = 0.5
 _CENTRED = 0.3  # a margin (3 sigma) of this many heights, 0.1 per sigma, leaves the region good enough
 _SMALLEST_PX = 8.0
 _WIDER = 1.3  # the last region of somebody just lost
-_PATIENCE = 5  # pictures in which somebody not seen is still looked for at the last place
+_PATIENCE = 5  # a person not seen is searched at the last place for this many pictures
 _MEMORY = 30  # pictures after which a number is not given to the same place again
 _ONE_BODY = 0.06  # median distance of joints, in region sides: about the scatter of one body's two estimates
-_TILES_BESIDE = 8  # looked at in one picture while somebody is followed
-_TILES_ALONE = 24  # and while nobody is
+_TILES_BESIDE = 8  # tiles searched in one picture while a person is followed
+_TILES_ALONE = 24  # the same while nobody is followed
 
 
 @dataclass(frozen=True)
 class TrackedPerson:
-    """A person seen in a picture, under the number kept since they were found."""
+    """Person seen in a picture, with the track number assigned when they were found."""
 
     track: int
     person: Person
@@ -53,14 +53,15 @@ class _Track:
 
 
 class PeopleTracker:
-    """Follows people through the pictures of one camera.
+    """Tracker of people through the pictures of one camera.
 
-    A person is looked for where the last picture's joints say. Where nobody is followed, the log's
-    actor is not, or every `search_every` pictures, the person detector looks: about those just lost and
-    the hint first, then at tiles of the whole picture, some in each search and in turn, so that the cost
-    of a large picture spreads over several. The first picture is searched until somebody is found.
+    A person is searched at the place of the joints in the last picture. The person detector runs around
+    people just lost, and around the hint if the logged actor is not followed. It runs on tiles of the whole
+    picture if nobody is followed, and every `search_every` pictures. Each such search takes the next few
+    tiles, so that the cost of a large picture spreads over several. The first picture is searched until a
+    person is found.
 
-    What is found depends on the pictures and hints so far and on nothing else.
+    Results depend only on the pictures and hints so far.
 
     Attributes:
         counts: frames; searched (frames in which the person detector ran); found (new numbers); lost
@@ -79,14 +80,14 @@ class PeopleTracker:
         self._next_tile = 0
 
     def step(self, picture: Picture, *, hint: Hint | None) -> list[TrackedPerson]:
-        """The people in the next picture.
+        """Find the people in the next picture.
 
         Args:
             picture: [H, W, 3] BGR.
-            hint: where the log says that the actor is, if it does.
+            hint: place of the actor by the log, None if unknown.
 
         Returns:
-            Those seen in this picture, by number.
+            The people seen in this picture, sorted by number.
         """
         self._follow(picture)
         self._merge()
@@ -99,7 +100,7 @@ class PeopleTracker:
     # --- those known -----------------------------------------------------------------------------------
 
     def _follow(self, picture: Picture) -> None:
-        """Look for everybody at the last place; two passes for those who were not seen there."""
+        """Search each person at the last place; two passes for those not seen in the last picture."""
         followed, missed = self._seen(), [t for t in self._tracks if 0 < t.missing <= _PATIENCE]
         for track in self._tracks:
             track.missing += 1
@@ -109,14 +110,14 @@ class PeopleTracker:
                 track.see(person)
         wide = [replace(t.person.region, side=t.person.region.side * _WIDER) for t in missed]
         for track, person in zip(missed, self._locate_twice(picture, wide), strict=True):
-            # Whoever hides behind somebody must not come back as them.
+            # A person hidden behind another one must not return as that one.
             if person is not None and not self._is_followed(person):
                 track.see(person)
         self.counts["lost"] += sum(track.missing == _PATIENCE + 1 for track in self._tracks)
         self._tracks = [track for track in self._tracks if track.missing <= _MEMORY]
 
     def _merge(self) -> None:
-        """Two tracks on one body become one."""
+        """Merge tracks on one body; the older one stays."""
         kept: list[_Track] = []
         for track in sorted(self._seen(), key=lambda track: track.number):
             if any(_one_body(track.person, older.person) for older in kept):
@@ -151,7 +152,7 @@ class PeopleTracker:
         self.counts["searched"] += bool(likely) or tiled
 
     def _search_tiles(self, picture: Picture, hint: Hint | None) -> None:
-        """Look at the next tiles in turn; in the first picture at all of them, until somebody is found."""
+        """Search the next tiles in turn; in the first picture all of them, until a person is found."""
         cover = tiles(picture.shape[1], picture.shape[0])
         rounds = math.ceil(len(cover) / _TILES_ALONE) if self.counts["frames"] == 0 else 1
         for _ in range(rounds):
@@ -163,7 +164,7 @@ class PeopleTracker:
                 break
 
     def _take_up(self, picture: Picture, regions: Sequence[Region], hint: Hint | None) -> None:
-        """Follow the people in these regions, best first, who are not followed already."""
+        """Follow the people in these regions who are not followed already, best first."""
         new = [r for r in regions if not any(same_place(r, t.person.region) for t in self._seen())]
         for person in self._locate_twice(picture, new):
             if person is None or self._is_followed(person):
@@ -182,7 +183,7 @@ class PeopleTracker:
                 self.counts["beyond the most"] += 1
 
     def _lost_at(self, region: Region) -> _Track | None:
-        """Who was lost nearest to that place, within the region's side."""
+        """Find the track lost nearest to that place, within the region's side; None if there is none."""
         reach = [
             (math.dist(track.person.region.centre, region.centre), track.number, track)
             for track in self._tracks
@@ -192,12 +193,12 @@ class PeopleTracker:
         return track if distance < region.side else None
 
     def _has_place_for(self, track: _Track | None) -> bool:
-        """Whether somebody more may be followed; those just lost keep their place."""
+        """Test if another person may be followed; people just lost keep their place."""
         held = [other for other in self._tracks if other.missing <= _PATIENCE]
         return track in held or len(held) < self._most_people
 
     def _make_place(self, hint: Hint) -> None:
-        """Give up the latest found of those who cannot be the actor, whom bystanders must not keep out."""
+        """Drop the newest track that cannot be the actor: bystanders must not keep the actor out."""
         others = [t for t in self._tracks if t.missing <= _PATIENCE and not _agrees(t.person.region, hint)]
         if others:
             self._tracks.remove(max(others, key=lambda track: track.number))
@@ -212,28 +213,28 @@ class PeopleTracker:
         return any(_agrees(track.person.region, hint) for track in self._seen())
 
     def _is_followed(self, person: Person) -> bool:
-        """Also where the joints differ: a poor second estimate of somebody is no second person."""
+        """Test if a person is followed, by place or joints: a poor second estimate is no second person."""
         return any(
             same_place(person.region, track.person.region) or _one_body(person, track.person)
             for track in self._seen()
         )
 
     def _locate(self, picture: Picture, regions: Sequence[Region]) -> list[Person | None]:
-        """Who is in each region, None where nobody is."""
+        """Locate the person in each region, None if there is none."""
         if not regions:
             return []
         people = self._networks.locate(picture, regions)
         return [person if _is_present(person, picture) else None for person in people]
 
     def _locate_twice(self, picture: Picture, regions: Sequence[Region]) -> list[Person | None]:
-        """The same from regions that are not the person's own: one pass alone flips left and right."""
+        """Locate people twice, for regions not from their own joints: one pass alone flips left and right."""
         first = self._locate(picture, regions)
         second = iter(self._locate(picture, [person.region for person in first if person is not None]))
         return [None if person is None else next(second) for person in first]
 
 
 def _is_present(person: Person, picture: Picture) -> bool:
-    """Whether there is somebody, at a place that the next picture can be looked at."""
+    """Test if a person is present, with a region that the next picture can be searched in."""
     region, (height, width) = person.region, picture.shape[:2]
     x, y = region.centre
     reach = region.side / 2
@@ -242,7 +243,7 @@ def _is_present(person: Person, picture: Picture) -> bool:
 
 
 def _one_body(a: Person, b: Person) -> bool:
-    """Whether most joints of two people are in the same places; False if no joint was found in both."""
+    """Test if most joints of two people are at the same places; False if no joint was found in both."""
     distance: NDArray[np.float64] = np.linalg.norm(a.xy - b.xy, axis=1)
     distance = distance[np.isfinite(distance)]
     if not distance.size:
@@ -251,7 +252,7 @@ def _one_body(a: Person, b: Person) -> bool:
 
 
 def _agrees(region: Region, hint: Hint) -> bool:
-    """Whether a person may be the actor of the log."""
+    """Test if a person can be the logged actor."""
     return math.dist(region.centre, hint.centre) <= hint.margin_px + hint.height_px / 2
 
 
