@@ -1,8 +1,8 @@
-"""Option `--refine-cameras background`: poses of moving cameras refined by what stands still.
+"""Option `--refine-cameras background`: poses of moving cameras refined by the static background.
 
-Once for each camera its background is followed through the pictures; then its poses are adjusted, and take
-the place of the logged ones in everything that comes after. Where a camera's background says too little the
-logged poses stay, with the reason in one line.
+Each camera's background is followed through its pictures once. Then its poses are adjusted and replace the
+logged poses in all later steps. If a camera's background is not informative enough, the logged poses stay,
+with the reason in one line.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from pipelines.reconstruction.refinement.problem import ROTATION, SHIFT_IN_WORLD
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Float, Int64, Trajectory
 
-_RATE_HZ = 15.0  # of the pictures that are looked at: between them poses are interpolated
-_LASTS_S = 10.0  # over which drift is taken for a constant
+_RATE_HZ = 15.0  # of the pictures used: between them poses are interpolated
+_LASTS_S = 10.0  # drift over this time is treated as a constant error
 
 
 @dataclass(frozen=True)
 class Followed:
-    """The background of one camera."""
+    """Background of one camera."""
 
     rows: Int64  # [T] of its frames
-    tracks: Tracks  # whose pictures count these
+    tracks: Tracks  # their `picture` counts these rows
 
 
 def rows_to_follow(camera: Camera) -> Int64:
-    """The frames [T] at which a camera's background is looked at, the last one included."""
+    """Choose the frames [T] in which a camera's background is followed, the last one included."""
     frames = len(camera.frame_t_ns)
     if frames < 2:
         return np.arange(frames)
@@ -45,11 +45,11 @@ def rows_to_follow(camera: Camera) -> Int64:
 
 
 def prior_of(errors: PoseErrors | None, level: Float) -> PosePrior:
-    """How far a camera's log may be off.
+    """Compute the prior of a camera's logged poses.
 
     Args:
-        errors: as somebody states it over time; None when nobody does.
-        level: [2] m, rad per axis, where nobody does: half of the variance is taken for lasting.
+        errors: stated pose errors over time; None if none are stated.
+        level: [2] m, rad per axis, used without `errors`: half of the variance is taken as constant.
     """
     if errors is None:
         half = (float(level[0] / np.sqrt(2)), float(level[1] / np.sqrt(2)))
@@ -69,17 +69,18 @@ def refine_cameras(
     between: Interpolation,
     stated: bool,
 ) -> tuple[list[Camera], dict[str, Any], list[str]]:
-    """Cameras with the poses that their backgrounds tell.
+    """Refine the poses of cameras by their backgrounds.
 
     Args:
         cameras: all of them.
-        followed: of each by its name, or why nothing was followed.
-        priors: how far each log may be off.
-        between: how far logged poses are trusted.
-        stated: whether somebody stated the priors: `refined` then takes what is left as its own.
+        followed: background of each camera by its name, or the reason why none was followed.
+        priors: prior of each camera's log.
+        between: rules for interpolating between logged poses.
+        stated: True if the priors were stated by the user: `refined` then uses the remaining errors as its
+            own prior.
 
     Returns:
-        The cameras; what metrics.json says of each; a line for each whose logged poses stay.
+        The cameras; the entry of each in metrics.json; a line for each camera that keeps its logged poses.
     """
     refined: list[Camera] = []
     told: dict[str, Any] = {}
@@ -114,7 +115,7 @@ def _with_poses(camera: Camera, t_ns: Int64, found: Adjusted, prior: PosePrior, 
     covariance = found.covariance[posed]
     variances = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
     sigma = np.sqrt(variances.mean(axis=2))
-    # What is left of attitudes changes slowly: neighbouring pictures share their points.
+    # The remaining attitude errors change slowly: neighbouring pictures share their points.
     turn = float(np.median(sigma[:, 1]))
     left = PoseErrors(
         (max(float(np.sqrt(max(np.median(sigma[:, 0]) ** 2 - prior.lasting[0] ** 2, 0.0))), 1e-3), turn / 2),

@@ -1,12 +1,12 @@
-"""Camera poses from what stands still: bundle adjustment of one camera's pictures, its log as the prior.
+"""Camera poses from the static background: bundle adjustment of one camera, with its log as the prior.
 
-Unknown are the points, an error of every logged pose, and the part of these errors that lasts through a
-stretch of the flight. A turned camera sees the world pass differently from what its logged path says:
-attitudes come out of it sharply, positions hardly (a whole path may be moved without a trace). Nor
-does a straight way tell of a turn about itself: then that axis keeps the log's word.
-pycolmap's adjustment knows priors of positions alone; here the attitude's is what matters.
+Unknowns are the points, an error of every logged pose, and the part of these errors that is constant over a
+stretch of the flight. Attitudes are well determined, because an attitude error changes the motion of the
+background against the logged path. Positions are not: the whole path can be moved without any residual.
+On a straight path the rotation about the path is not determined either; that axis keeps the log's value.
+pycolmap's adjustment has priors of positions only; here the attitude prior matters.
 
-Points are eliminated (Schur complement); Cauchy's loss for what is no background or was lost on the way.
+Points are eliminated (Schur complement). Cauchy's loss handles points off the background and lost tracks.
 """
 
 from __future__ import annotations
@@ -20,37 +20,37 @@ from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rot
 from pipelines.session.records import Float, Int64
 
 STRETCH = 200
-"""Pictures that are adjusted together, about: beyond, points are new, and the matrices large."""
+"""Approximate number of pictures adjusted together: more would share no points and make large matrices."""
 
 _PIXEL_SIGMA = 0.5  # of a followed point; they drift by some tenths
 _LOSS = 2.0  # standard deviations at which a sighting counts half
 _FEWEST_SIGHTINGS = 5  # of a point
 _FEWEST_POINTS = 50
-_PARALLAX = 1e-4  # of a point's rays: mean square of the sine of what they differ by
+_PARALLAX = 1e-4  # of a point's rays: mean square of the sine of the angle between them
 _NEAREST_M, _FARTHEST_M = 1.0, 300.0
 _WORST_PX = 2.0
 _ROUNDS = 8
 _CONVERGED = 1e-4  # m and rad
 _SIGMAS = 4.0
 _DAMPING = 1e-9
-_LEAST_GAIN = 0.9  # of the attitude's prior: above, the background says nothing
+_LEAST_GAIN = 0.9  # of the attitude's prior sigma: above it the background adds no information
 
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Standard deviations (m, rad) per axis of what is new in every logged pose, and of what lasts."""
+    """Standard deviations (m, rad) per axis of the white and of the constant part of logged pose errors."""
 
     fresh: tuple[float, float]
     lasting: tuple[float, float]
 
     @property
     def level(self) -> Float:
-        """Of both together [2]."""
+        """Standard deviation of both parts together [2] (m, rad)."""
         level: Float = np.hypot(self.fresh, self.lasting)
         return level
 
     def covariance(self, times: int) -> Float:
-        """Of the poses [times, 6, 6] as they are logged."""
+        """Return the covariance [times, 6, 6] of the logged poses."""
         return np.tile(np.diag(np.repeat(self.level**2, 3)), (times, 1, 1))
 
 
@@ -63,7 +63,7 @@ class Adjusted:
     covariance: Float  # [T, 6, 6] position in the world (m^2), then rotation vector in the camera (rad^2)
     points: int  # that were used
     reprojection_px: float  # median; NaN where refused
-    refused: str | None  # why the logged poses stay, in one plain line
+    refused: str | None  # reason why the logged poses stay, in one line
 
 
 def adjust(
@@ -81,14 +81,14 @@ def adjust(
         picture: [K] row of the poses in which a point was seen.
         point: [K] its number.
         xy: [K, 2] normalised undistorted image coordinates.
-        focal_px: to turn them into pixels.
+        focal_px: focal length, to convert them to pixels.
         position: [T, 3] m, logged; NaN without a pose.
         rotation: [T, 3, 3] logged world_from_camera.
-        prior: how far the log may be off.
+        prior: standard deviations of the log's errors.
 
     Returns:
-        Adjusted poses, stretch by stretch of about 200 pictures; the logged ones where `refused`, which a
-        single stretch may cause. Pictures without a pose stay without.
+        Adjusted poses, in stretches of about 200 pictures. If one stretch is refused, all logged poses stay
+        and `refused` gives the reason. Pictures without a pose stay without one.
     """
     new_position, new_rotation = position.copy(), rotation.copy()
     covariance = prior.covariance(len(position))
@@ -96,7 +96,7 @@ def adjust(
     posed = np.flatnonzero(np.isfinite(position[:, 0]))
     if not len(posed):
         return _refused(position, rotation, prior, 0, "none of its pictures has a pose")
-    # Alike long: the few pictures of a remainder would show too little.
+    # Equal lengths: a short remainder would have too little parallax.
     for rows in np.array_split(posed, max(round(len(posed) / STRETCH), 1)):
         place = np.full(len(position), -1)
         place[rows] = np.arange(len(rows))
@@ -165,7 +165,7 @@ class _Stretch:
         rotation: Float,
         prior: PosePrior,
     ) -> _Stretch:
-        """Points that were seen often enough, from far enough apart, in front of the camera."""
+        """Build a stretch from the points seen often enough, with enough parallax, in front of the camera."""
         names, number = np.unique(point, return_inverse=True)
         count = np.bincount(number, minlength=len(names))
         ray = np.einsum("kij,kj->ki", rotation[picture], np.append(xy, np.ones((len(xy), 1)), axis=1))
@@ -193,11 +193,14 @@ class _Stretch:
         )
 
     def solve(self) -> tuple[Float, Float, Float, Float, float] | None:
-        """Positions, rotations, their covariances, the errors found [T, 6], the median residual in px."""
+        """Solve for positions, rotations, their covariances, pose errors [T, 6] and the median residual (px).
+
+        Returns None if the adjustment does not converge.
+        """
         times = len(self.position)
         errors, lasting, points = np.zeros((times, 6)), np.zeros(6), self.start
         fresh = np.repeat(self.prior.fresh, 3)
-        # A whole path that is moved leaves no trace: it stays where the log has it.
+        # A shift of the whole path causes no residual: the path stays at the logged position.
         steady = np.repeat([0.0, self.prior.lasting[1]], 3)
         fresh, steady = np.maximum(fresh, 1e-5), np.maximum(steady, 1e-5)
         normal = np.empty((0, 0))
@@ -226,12 +229,12 @@ class _Stretch:
         return position, rotation, covariance, errors, _PIXEL_SIGMA * float(np.median(whitened))
 
     def _poses(self, errors: Float) -> tuple[Float, Float]:
-        """What the logged poses are without these errors: (p - e, R exp(-w))."""
+        """Remove errors from the logged poses: (p - e, R exp(-w))."""
         back = matrix_from_quaternion(quaternion_from_rotation_vector(-errors[:, 3:]))
         return self.position - errors[:, :3], self.rotation @ back
 
     def _linearised(self, position: Float, rotation: Float, points: Float) -> tuple[Float, Float, Float]:
-        """Derivatives of the image points by the pose's error [K, 2, 6] and the point, and the residuals."""
+        """Compute derivatives of image points by pose error [K, 2, 6] and point [K, 2, 3], and residuals."""
         own = rotation[self.picture]
         seen = np.einsum("kji,kj->ki", own, points[self.point] - position[self.picture])
         depth = np.where(np.abs(seen[:, 2]) > 1e-3, seen[:, 2], 1e-3)
@@ -258,7 +261,7 @@ class _Stretch:
         fresh: Float,
         steady: Float,
     ) -> tuple[Float, Float, Float]:
-        """One Gauss-Newton step: the reduced normal matrix, the poses' step, and the points'."""
+        """Compute one Gauss-Newton step: reduced normal matrix, step of the poses, and of the points."""
         from scipy.sparse import csr_matrix
 
         times, points = len(self.position), self.points_count
@@ -295,7 +298,7 @@ class _Stretch:
 
 
 def _sum_by(values: Float, number: Int64, count: int) -> Float:
-    """Sums of the values [K, ...] of each number: [count, ...]."""
+    """Sum the values [K, ...] with the same number: [count, ...]."""
     flat = values.reshape(len(values), math.prod(values.shape[1:]))
     sums = np.stack([np.bincount(number, weights=column, minlength=count) for column in flat.T], axis=-1)
     return np.asarray(sums, dtype=np.float64).reshape(count, *values.shape[1:])

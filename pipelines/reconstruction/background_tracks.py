@@ -1,7 +1,7 @@
 """Points of the background followed through the pictures of one camera, people left out.
 
-Corners (Shi & Tomasi 1994) are followed by pyramidal Lucas-Kanade, forwards and back again: what does not
-come back to where it began is dropped. Everything inside the boxes of people who were found is left out.
+Corners (Shi & Tomasi 1994) are followed by pyramidal Lucas-Kanade, forwards and back again. Points that do
+not return to their start are dropped. Everything inside the boxes of detected people is left out.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _AROUND_PX = 20.0
 
 @dataclass(frozen=True)
 class Tracks:
-    """Where background points were seen: K sightings."""
+    """Sightings of background points: K of them."""
 
     picture: Int64  # [K] row of the pictures
     point: Int64  # [K] number of the point
@@ -37,9 +37,9 @@ class Tracks:
 
 
 def people_boxes(camera: Camera) -> Float:
-    """Around everybody in each frame [F, D, 4] (left, top, right, bottom) px; NaN for nobody.
+    """Compute boxes around all people in each frame [F, D, 4] (left, top, right, bottom) px; NaN for none.
 
-    A frame in which nobody was found has the boxes of the last one in which somebody was, or else the first.
+    A frame without people has the boxes of the last frame with people before it, or else of the first one.
     """
     found = camera.detections
     frames = len(camera.frame_t_ns)
@@ -62,9 +62,9 @@ def follow(pictures: Iterable[UInt8 | None], boxes: Float) -> Tracks:
     """Follow points through pictures.
 
     Args:
-        pictures: in the order of time, each grey [H, W]; None for one that cannot be decoded, over which
-            nothing is followed.
-        boxes: [F, D, 4] px of each picture, what to leave out; NaN for none.
+        pictures: in the order of time, each grey [H, W]; None for one that cannot be decoded. No point is
+            followed across it.
+        boxes: [F, D, 4] px of each picture, areas to leave out; NaN for none.
     """
     import cv2
 
@@ -101,7 +101,7 @@ def follow(pictures: Iterable[UInt8 | None], boxes: Float) -> Tracks:
 
 
 def _flow(before: UInt8, after: UInt8, points: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Where points [N, 1, 2] of one picture are in the other, and whether they were found [N, 1]."""
+    """Find points [N, 1, 2] of one picture in the other; also return found [N, 1], 0 or 1."""
     import cv2
 
     window = (_WINDOW_PX, _WINDOW_PX)
@@ -112,7 +112,7 @@ def _flow(before: UInt8, after: UInt8, points: NDArray[Any]) -> tuple[NDArray[An
 
 
 def _free(xy: NDArray[np.float32], boxes: Float, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Which points [N] are in the picture and on nobody."""
+    """Mark the points [N] that are inside the picture and on no person."""
     size = np.array([shape[1], shape[0]])
     free = ((xy > _EDGE_PX) & (xy < size - _EDGE_PX)).all(axis=1)
     for box in boxes[np.isfinite(boxes[:, 0])]:
@@ -121,7 +121,7 @@ def _free(xy: NDArray[np.float32], boxes: Float, shape: tuple[int, ...]) -> NDAr
 
 
 def _mask(picture: UInt8, points: NDArray[np.float32], boxes: Float) -> UInt8:
-    """Where new corners may be: not near old ones, and on nobody."""
+    """Build the mask for new corners: away from old points and from people."""
     import cv2
 
     mask = np.full(picture.shape, 255, np.uint8)

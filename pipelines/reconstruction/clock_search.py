@@ -1,7 +1,7 @@
-"""Where the search for clocks begins: by how much stamps have to be shifted for views to agree.
+"""Initial clock offsets for the refinement: the shift of the stamps at which views agree best.
 
-The refinement finds offsets of a few pictures from where it starts. Half a second is as much as half a
-stride, and limbs that are seen at the wrong end of their swing lead it astray.
+The refinement converges from a start within a few pictures of the true offset. Half a second is about half
+a stride: limbs are then seen at the wrong end of their swing and lead it to a wrong offset.
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ from pipelines.session.records import Float
 Bool = NDArray[np.bool_]
 
 _STEP_S = 1 / 15  # limbs swing for longer than that
-_REACH = 2.0  # standard deviations of what is stated of a clock
-_CLEARER = 0.8  # of the disagreement without a shift: what nothing moves for is left where it is
-_LIMBS = 75.0  # percentile: half of the joints hardly swing, and some views are wrong
+_REACH = 2.0  # standard deviations of the stated clock offset
+_CLEARER = 0.8  # share of the disagreement without a shift that the best shift must go below
+_LIMBS = 75.0  # percentile: half of the joints swing too little, and some views are wrong
 
 
 def begun_offsets_s(views_at: Callable[[float], Views], instants: int, clock_sigma_s: Float) -> Float:
-    """Offset [C] s of every clock from which to go on, of the order of two pictures; 0 for those known.
+    """Find an initial offset [C] s of every clock, to about two pictures; 0 for known clocks.
 
-    Views agree at the right offset. Pose errors move all joints of a view together and are left out: how
-    joints disagree beside the median of their view is what counts.
+    Views agree at the right offset. Pose errors move all joints of a view together and must not count: the
+    disagreement is measured after subtracting the median of each view.
 
     Args:
-        views_at: what was seen with all unknown clocks put forward by so many seconds; joint-frames stand
-            together by their time, as many of each.
-        instants: how many times these are of.
-        clock_sigma_s: [C] how far each clock may be off, 0 for one that is known. One has to be.
+        views_at: function that returns the views with all unknown clocks moved forward by a number of
+            seconds; joint-frames are grouped by time, the same number at each time.
+        instants: number of these times.
+        clock_sigma_s: [C] prior standard deviation of each offset, 0 for a known clock. Without a known
+            clock all offsets are 0.
     """
     begun = np.zeros(len(clock_sigma_s))
     unknown = np.flatnonzero(clock_sigma_s > 0)
@@ -54,7 +55,7 @@ def begun_offsets_s(views_at: Callable[[float], Views], instants: int, clock_sig
 
 
 def _disagreement(views: Views, instants: int, known: Bool, camera: int) -> float:
-    """How far joints miss what a camera and those of known clocks saw, beside the others of their view."""
+    """Compute the disagreement of a camera with those of known clocks, beside the median of each view."""
     chosen = np.append(np.flatnonzero(known), camera)
     views = replace(
         views,

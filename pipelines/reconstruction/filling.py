@@ -1,10 +1,10 @@
-"""Gaps in a skeleton, closed where the user asks for it: never by default, and always marked.
+"""Filling of gaps in a skeleton, only at the user's request; filled samples are always marked.
 
 A gap is a stretch of times at which a joint was not measured, between two at which it was; its length is the
 time between those two. A joint is interpolated by PCHIP (Fritsch & Butland 1984), which uses the two measured
-samples before and after, and never swings beyond them. How far that misses is measured where the joint
-is there: the same interpolation across gaps of the same number of samples that are no gaps. That is
-what the covariance grows by.
+samples before and after, and never swings beyond them. The interpolation error is measured on complete
+stretches of the same joint: the same number of samples is left out, interpolated and compared. The
+covariance grows by that error.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from pipelines.session.records import Float, Int64
 
 _OK, _FILLED = STATUS.index("ok"), STATUS.index("filled")
 _SIDES = 2  # measured samples on each side of a gap that decide what lies in it
-_PLACES = 24  # at which the miss is measured, at most
+_PLACES = 24  # stretches at which the interpolation error is measured, at most
 _FEWEST_PLACES = 4
 
 
 @dataclass(frozen=True)
 class Filled:
-    """A skeleton whose short gaps are closed."""
+    """Skeleton with its short gaps filled."""
 
     position: Float  # [T, P, J, 3] m
     covariance: Float  # [T, P, J, 3, 3] m^2
     status: NDArray[np.int8]  # [T, P, J] index into STATUS
-    counts: dict[str, int]  # gaps and joint-frames filled; short gaps left open since nothing judges them
+    counts: dict[str, int]  # gaps and joint-frames filled; short gaps left open for lack of an error estimate
 
 
 def fill_gaps(
@@ -38,19 +38,20 @@ def fill_gaps(
 ) -> Filled:
     """Interpolate joints across gaps of at most that length.
 
-    The covariance at share a of a gap is (1-a)^2 C0 + a^2 C1 + 4 a (1-a) M: that of the straight line between
-    the ends, and the mean outer product M of what the interpolation misses in the middle of such gaps.
+    The covariance at share a of a gap is (1-a)^2 C0 + a^2 C1 + 4 a (1-a) M. The first two terms are those of
+    a straight line between the ends. M is the mean outer product of the interpolation errors in the middle
+    of gaps of that length.
 
     Args:
         t_ns: [T] strictly increasing.
         position: [T, P, J, 3] m; NaN unless the status is "ok".
         covariance: [T, P, J, 3, 3] m^2.
         status: [T, P, J] index into STATUS.
-        max_gap_s: the longest gap that is closed, from the last measured sample to the next.
+        max_gap_s: the longest gap that is filled, from the last measured sample to the next.
 
     Returns:
-        What was measured is as it was. Gaps longer than that, before the first and after the last measured
-        sample, and next to a single sample between two gaps stay open.
+        Skeleton with unchanged measured samples. These gaps stay open: longer ones, those before the first
+        and after the last measured sample, and those next to a single sample between two gaps.
     """
     filled = Filled(position.copy(), covariance.copy(), status.copy(), {})
     t_s = (t_ns - t_ns[0]) / 1e9
@@ -84,7 +85,7 @@ def fill_gaps(
 
 
 def _gaps(t_s: Float, there: NDArray[np.bool_], max_gap_s: float) -> list[tuple[int, int]]:
-    """The measured samples before and after every gap that may be closed."""
+    """List the measured samples before and after every gap that may be filled."""
     (measured,) = np.nonzero(there)
     wide = np.diff(measured) > 1
     short = np.diff(t_s[measured]) <= max_gap_s * (1 + 1e-9)
@@ -98,7 +99,10 @@ def _gaps(t_s: Float, there: NDArray[np.bool_], max_gap_s: float) -> list[tuple[
 
 
 def _miss(t_s: Float, position: Float, there: NDArray[np.bool_], missing: int) -> Float | None:
-    """Mean outer product [3, 3] of what interpolation misses in the middle of a gap of so many samples."""
+    """Compute the mean outer product [3, 3] of interpolation errors in the middle of gaps of that length.
+
+    Returns None if fewer than 4 complete stretches exist.
+    """
     span = missing + 2 * _SIDES
     if len(t_s) < span:
         return None

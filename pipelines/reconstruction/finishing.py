@@ -1,4 +1,4 @@
-"""What a user may ask to be done to a skeleton that was measured: short gaps closed, then smoothed."""
+"""Optional steps after triangulation: filling of short gaps, then smoothing."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ def finish(
     fill_s: float | None,
     smoother: Smoother | None,
 ) -> tuple[Triangulation, dict[str, Any]]:
-    """Close gaps of at most `fill_s`, smooth, and say what was done.
+    """Fill gaps of at most `fill_s`, smooth, and report both.
 
     Args:
-        observations: what was triangulated.
+        observations: the triangulated observations.
         views: the same, one row for each joint-frame.
-        result: what came out.
-        fill_s: the longest gap that is closed, None for none.
-        smoother: None for none.
+        result: their triangulation.
+        fill_s: the longest gap to fill, None to fill none.
+        smoother: the smoother, None for no smoothing.
 
     Returns:
-        The result, and JSON-able `filled` and `smoothing`, None for what was not asked for. Residuals are
-        those of the new positions; filled joints have none, and no views.
+        The result, and JSON-able `filled` and `smoothing`, None for a step not requested. Residuals are
+        those of the new positions. Filled joints have no residuals and no views.
     """
     told: dict[str, Any] = {"filled": None, "smoothing": None}
     shape = observations.confidence.shape[:3]

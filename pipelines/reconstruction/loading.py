@@ -1,4 +1,4 @@
-"""What a reconstruction needs of a session: its cameras, what is known of their errors, the truth."""
+"""Inputs of a reconstruction from a session: its cameras, the priors of their errors, the truth."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from pipelines.session.stage_records import StageRecord
 from pipelines.session.tables import FRAMES, KEYPOINTS, POSES, TRUTH, read_table
 from pipelines.session.tabular import detections_from, most_confident, motion_from, trajectory_from
 
-_MOST_PEOPLE = 12  # in one picture; more are mistakes of a detector, and memory goes with their number
+_MOST_PEOPLE = 12  # in one picture; more are detector errors, and memory grows with their number
 
 Calibrated = Callable[[Float, NDArray[np.str_]], Float]
 
 
 @dataclass(frozen=True)
 class _Keypoints:
-    """Where the keypoints of a camera lie: those that came with it, or those that were detected."""
+    """Source of a camera's keypoints: imported with the flight, or detected."""
 
     table: Path
     joints: tuple[str, ...]
@@ -41,7 +41,7 @@ class _Keypoints:
 
 
 def _keypoints(folder: Path, description: Description, detected: StageRecord | None) -> dict[str, _Keypoints]:
-    """The keypoints of every camera that has any."""
+    """Find the source of keypoints for every camera that has one."""
     sources = {}
     for name, entry in description.cameras.items():
         if entry.keypoints is not None:
@@ -50,7 +50,7 @@ def _keypoints(folder: Path, description: Description, detected: StageRecord | N
         elif detected is not None and name in detected.counts["cameras"]:
             table = folder / "detect" / name / "keypoints.parquet"
             first, stop = detected.counts["rows"][name]
-            if first < stop:  # else none of its pictures lies in the span that was asked for
+            if first < stop:  # else none of its pictures lies in the requested span
                 looked_at = slice(first, stop, int(detected.settings["every"]))
                 sources[name] = _Keypoints(table, tuple(detected.counts["joints"]), looked_at)
     return sources
@@ -65,16 +65,16 @@ def load_cameras(
     pose_noise: str | None,
     calibrated: Calibrated | None = None,
 ) -> tuple[list[Camera], list[str]]:
-    """Every camera with keypoints, and what is to be said of them.
+    """Load every camera with keypoints; also return warnings.
 
     Args:
         folder: the session.
         description: its session.json.
         detected: the record of the detector's stage, if it ran.
-        min_confidence: keypoints below are not used, by their detector's own confidence.
-        pose_noise: what is known of the poses' errors, in place of what the flight says.
-        calibrated: what the detector's own confidences [N] of joints [N] are worth; they are taken as they
-            are without it, as those of imported keypoints always are.
+        min_confidence: keypoints with a lower raw confidence are not used.
+        pose_noise: pose noise that replaces the flight's own, None to keep that.
+        calibrated: function from the detector's raw confidences [N] of joints [N] to probabilities. Without
+            it raw confidences are used; those of imported keypoints are never calibrated.
 
     Raises:
         DataError: fewer than two cameras have keypoints, or they share no joint.
@@ -96,7 +96,7 @@ def load_cameras(
 
 
 def _common_joints(folder: Path, sources: Mapping[str, _Keypoints]) -> tuple[str, ...]:
-    """The joints that two cameras at least can see, in the order of the camera that knows the most."""
+    """List the joints that at least two cameras know, in the order of the camera that knows the most."""
     known = [source.joints for source in sources.values()]
     shared = [name for name in max(known, key=len) if sum(name in joints for joints in known) > 1]
     if not shared:
@@ -146,11 +146,11 @@ def _load_camera(
 def load_pose_errors(
     description: Description, cameras: Sequence[Camera], pose_noise: str | None
 ) -> list[PoseErrors] | None:
-    """What is known of each camera's pose errors over time; None where nobody stated it for all that move.
+    """Load the prior of each camera's pose errors over time; None unless known for all moving cameras.
 
-    A logged covariance says how large errors are, not how long they last (`errors_of_level`): what is new in
-    a pose has its own covariance, what lasts the median. A still camera of which nothing is said was
-    calibrated, and counts as exact beside others that are stated.
+    A logged covariance gives the size of errors, not their correlation over time (`errors_of_level`): the
+    white part uses the covariance of each pose, the lasting part the median. A static camera without stated
+    noise was calibrated, and counts as exact beside cameras with stated noise.
     """
     stated: list[PoseErrors | None] = []
     for camera in cameras:
@@ -169,14 +169,14 @@ def load_pose_errors(
 
 
 def errors_of_level(level: Float) -> PoseErrors:
-    """Pose errors of which only the level [2] (m, rad) is known: half of the variance new, half lasting."""
+    """Build pose errors from their level [2] (m, rad) alone: half of the variance white, half constant."""
     new, lasting = np.sqrt(NEW_SHARE) * level, np.sqrt(1 - NEW_SHARE) * level
     processes = (Process(SHIFT_IN_WORLD, float(lasting[0])), Process(ROTATION, float(lasting[1])))
     return PoseErrors((float(new[0]), float(new[1])), processes)
 
 
 def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> Float:
-    """How far each camera's clock may be off [C] in s; the reference camera's is held."""
+    """Load the prior standard deviation [C] s of each camera's clock offset; 0 for the reference camera."""
     held = description.clock_reference
     if held not in {camera.name for camera in cameras}:
         held = cameras[0].name
@@ -186,7 +186,7 @@ def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> Flo
 
 
 def load_truth(folder: Path, description: Description, joints: tuple[str, ...]) -> JointMotion | None:
-    """The true joints; NaN for those that only the skeleton has. None where nothing is known to be true."""
+    """Load the true joints, NaN for joints without truth; None if the session has no truth."""
     if not description.has_true_joints:
         return None
     return motion_from(read_table(folder / "truth.parquet", TRUTH), joints)

@@ -1,7 +1,7 @@
-"""From the tables of a session to arrays over one time base: what every camera saw, from where.
+"""Observations: keypoints and poses of all cameras as arrays over one time base, from a session's tables.
 
-Cameras keep their own frames until somebody has said which detection is the person; only then are the
-person's keypoints interpolated to the common times, and never across a frame that misses them.
+Cameras keep their own frames until each person's detections are chosen. Only then are the person's keypoints
+interpolated to the common times, and never across a frame without them.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ _USUAL = 1.5  # times the median frame period
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera of a session.
+    """Camera of a session.
 
     `sigma` is the standard deviation per axis of position (m) and rotation (rad) at each pose of the
-    trajectory, as a prior or the log's covariance states it; None when nobody does. `covariance` is the
-    log's own where `sigma` is its level: position in world, rotation vector in camera. Detections count
+    trajectory, from the stated pose noise or the log's covariance; None without either. `covariance` is the
+    log's own if `sigma` comes from it: position in world, rotation vector in camera. Detections count
     frames by their row in `frame_t_ns`; where `follows` is False, pictures are missing before that row.
     """
 
@@ -37,17 +37,17 @@ class Camera:
     intrinsics: Intrinsics
     frame_number: Int64  # [F] as the pictures count them
     frame_t_ns: Int64  # [F]
-    follows: NDArray[np.bool_]  # [F] whether the frame is the next picture after the row before
+    follows: NDArray[np.bool_]  # [F] True if the frame is the next picture after the row before
     trajectory: Trajectory
     static: bool
     sigma: Float | None  # [N, 2]
     detections: Detections
     covariance: Float | None = None  # [N, 6, 6]
-    errors: PoseErrors | None = None  # what is left of its poses' errors, where they were refined beforehand
+    errors: PoseErrors | None = None  # remaining errors of its poses, if they were refined beforehand
 
     @cached_property
     def focal_px(self) -> float:
-        """Mean focal length, to turn pixels into angles."""
+        """Mean focal length (px), to convert pixels to angles."""
         return (self.intrinsics.fx + self.intrinsics.fy) / 2
 
     @cached_property
@@ -68,7 +68,7 @@ class Camera:
 
     @cached_property
     def _rank(self) -> NDArray[np.intp]:
-        """The place of every detection among those of its frame; detections are sorted by frame."""
+        """Index of every detection among those of its frame; detections are sorted by frame."""
         frame = self.detections.frame
         first_of_frame = np.searchsorted(frame, frame, side="left")
         return np.arange(len(frame)) - first_of_frame
@@ -78,16 +78,16 @@ class Camera:
         return int(self._rank.max(initial=0)) + 1
 
     def poses_at(self, t_ns: Int64, between: Interpolation) -> tuple[Float, Float]:
-        """world_from_camera at given times: position [T, 3] and rotation [T, 3, 3], NaN without a pose."""
+        """Return world_from_camera at given times: position [T, 3], rotation [T, 3, 3]; NaN if unknown."""
         position, quaternion = poses_at(self.trajectory, t_ns, between, static=self.static)
         return position, matrix_from_quaternion(quaternion)
 
     def sigma_at(self, t_ns: Int64) -> Float | None:
-        """The stated pose noise [T, 2] at given times, of the logged pose before each."""
+        """Return the pose noise [T, 2] at given times, that of the logged pose before each."""
         return None if self.sigma is None else self.sigma[self._pose_before(t_ns)]
 
     def covariance_at(self, t_ns: Int64) -> Float | None:
-        """The logged pose covariance [T, 6, 6] at given times, of the logged pose before each."""
+        """Return the logged pose covariance [T, 6, 6] at given times, that of the logged pose before each."""
         return None if self.covariance is None else self.covariance[self._pose_before(t_ns)]
 
     def _pose_before(self, t_ns: Int64) -> NDArray[np.intp]:
@@ -97,7 +97,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Every detection at the times where the cameras are compared: who is who is still open."""
+    """Detections of all cameras at common times, not yet assigned to people."""
 
     t_ns: Int64  # [T]
     frame: Int64  # [T, C] the camera's frame nearest in time, -1 if none is near
@@ -109,7 +109,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Observations:
-    """What every camera saw of each person at the common times."""
+    """Keypoints of each person in every camera at the common times."""
 
     t_ns: Int64  # [T]
     joints: tuple[str, ...]
@@ -117,12 +117,12 @@ class Observations:
     confidence: Float  # [T, P, J, C]
     position: Float  # [T, C, 3]
     rotation: Float  # [T, C, 3, 3]
-    pose_sigma: Float | None  # [T, C, 2]; None when nobody stated the pose noise of any camera
-    pose_covariance: Float | None = None  # [T, C, 6, 6]; None unless the log of any camera states its own
+    pose_sigma: Float | None  # [T, C, 2]; None if no camera has known pose noise
+    pose_covariance: Float | None = None  # [T, C, 6, 6]; None if no camera's log has covariances
 
 
 def time_base(cameras: list[Camera], rate_hz: float | None) -> Int64:
-    """The times of the skeleton: the frames of the camera with the most of them, or a stated rate.
+    """Choose the times of the skeleton: the frames of the camera with the most of them, or a stated rate.
 
     Ties go to the first listed. With a rate, the times fill the span of all cameras' frames.
     """
@@ -135,7 +135,7 @@ def time_base(cameras: list[Camera], rate_hz: float | None) -> Int64:
 
 
 def candidates(cameras: list[Camera], between: Interpolation) -> Candidates:
-    """All detections of all cameras on one timeline on which every frame of every camera appears."""
+    """Collect all detections on one timeline that contains every frame of every camera."""
     t_ns = _timeline(cameras)
     frame = np.stack([_nearest_frame(camera.frame_t_ns, t_ns) for camera in cameras], axis=1)
     people = max(camera.rays.shape[1] for camera in cameras)
@@ -160,14 +160,14 @@ def observe(
     t_ns: Int64,
     between: Interpolation,
 ) -> Observations:
-    """The chosen people's keypoints, interpolated to the common times together with the cameras' poses.
+    """Interpolate the chosen people's keypoints and the cameras' poses to the common times.
 
     Args:
         cameras: all of them, in order.
-        found: where `choice` was made.
+        found: the candidates to which `choice` refers.
         choice: [T', C, P] index of each person's detection in the camera's frame, -1 for none.
         t_ns: [T] the common times.
-        between: how far logged poses are trusted.
+        between: rules for interpolating between logged poses.
     """
     views, weights, poses, sigmas = [], [], [], []
     for c, camera in enumerate(cameras):
@@ -192,12 +192,12 @@ def observe(
 
 
 def on_sides(xy: Float, confidence: Float, sides: Int64) -> tuple[Float, Float]:
-    """Each joint with the view that is its own, where left and right were taken for each other.
+    """Give each joint its own view where left and right were exchanged.
 
     Args:
         xy: [T, P, J, ..., 2].
         confidence: [T, P, J, ...].
-        sides: [T, P, J, ...] which joint's view is the one of each joint; -1 for none.
+        sides: [T, P, J, ...] the joint whose view belongs to each joint; -1 for none.
 
     Returns:
         Both in the same shape; NaN and 0 where no view is left.
@@ -209,9 +209,9 @@ def on_sides(xy: Float, confidence: Float, sides: Int64) -> tuple[Float, Float]:
 
 
 def _all_sigmas(cameras: list[Camera], sigmas: list[Float | None]) -> Float:
-    """The pose noise [T, C, 2]: as stated; for moving cameras of which nobody states it, the others' median.
+    """Build the pose noise [T, C, 2]: as stated; the median of the others for moving cameras without it.
 
-    A still camera of which nothing is stated was calibrated, and counts as exact.
+    A static camera without stated noise was calibrated, and counts as exact.
     """
     stated = [sigma for sigma in sigmas if sigma is not None]
     usual = np.median(stated, axis=0)
@@ -225,7 +225,7 @@ def _all_sigmas(cameras: list[Camera], sigmas: list[Float | None]) -> Float:
 
 
 def _all_covariances(cameras: list[Camera], sigma: Float | None, t_ns: Int64) -> Float | None:
-    """The pose covariances [T, C, 6, 6] where a log states any; of other cameras, what `sigma` says."""
+    """Build the pose covariances [T, C, 6, 6]: from the log, else from `sigma`; None if no log has any."""
     if sigma is None or all(camera.covariance is None for camera in cameras):
         return None
     every = np.repeat(sigma**2, 3, axis=2)[..., None] * np.eye(6)
@@ -237,7 +237,7 @@ def _all_covariances(cameras: list[Camera], sigma: Float | None, t_ns: Int64) ->
 
 
 def _timeline(cameras: list[Camera]) -> Int64:
-    """The frames of the fastest camera, and of the others those that would not be nearest to any of them."""
+    """List the times of the fastest camera's frames, and of other frames that are nearest to none of them."""
     t_ns = time_base(cameras, None)
     for camera in cameras:
         visited = np.unique(_nearest_frame(camera.frame_t_ns, t_ns))
@@ -247,7 +247,7 @@ def _timeline(cameras: list[Camera]) -> Int64:
 
 
 def _nearest_frame(frame_t_ns: Int64, t_ns: Int64) -> Int64:
-    """The frame [T] nearest to each time, -1 where none lies within a frame period."""
+    """Find the frame [T] nearest to each time, -1 where none lies within a frame period."""
     after = np.clip(np.searchsorted(frame_t_ns, t_ns), 1, max(len(frame_t_ns) - 1, 1))
     after = np.minimum(after, len(frame_t_ns) - 1)
     before = np.maximum(after - 1, 0)
@@ -257,9 +257,9 @@ def _nearest_frame(frame_t_ns: Int64, t_ns: Int64) -> Int64:
 
 
 def sightings_of(camera: Camera, found: Candidates, c: int, choice: Int64) -> tuple[Float, Float]:
-    """Rays [F, P, J, 2] and confidence [F, P, J] of each person in the camera's own frames, NaN where unseen.
+    """Return rays [F, P, J, 2] and confidence [F, P, J] of people in the camera's own frames; NaN unseen.
 
-    A frame of a slow camera stands at several times of the timeline: the time nearest to it decides.
+    A frame of a slow camera appears at several times of the timeline: the time nearest to it decides.
     """
     shape = (len(camera.frame_t_ns), choice.shape[1], camera.rays.shape[2])
     xy = np.full((*shape, 2), np.nan)
@@ -276,7 +276,7 @@ def sightings_of(camera: Camera, found: Candidates, c: int, choice: Int64) -> tu
 
 
 def _at(camera: Camera, values: Float, t_ns: Int64) -> Float:
-    """Values [F, ...] of a camera's frames at other times [T, ...]; NaN where pictures are missing."""
+    """Interpolate values [F, ...] of a camera's frames to times [T, ...]; NaN where pictures are missing."""
     stamps = camera.frame_t_ns
     period = int(np.median(np.diff(stamps))) if len(stamps) > 1 else 0
     # A missing picture is a row of NaN between its neighbours.

@@ -1,9 +1,9 @@
-"""Logged 6x6 pose covariances taken as they are: for the weights of `robust`, and for its covariances.
+"""Weights and covariances of `robust` from the full logged 6x6 pose covariances.
 
-Triangulation knows one standard deviation for a position and one for a rotation; its gates and its choice
-of views need no more. A log may know better: satellite positioning errs more upwards, a compass more than
-a level, and a lever arm ties position to rotation. With each view's own 2x2 covariance the inliers are
-weighted once more: Gauss-Newton on the reprojection, a few steps from where `robust` ended.
+Triangulation uses one standard deviation for a position and one for a rotation; its gates and its choice
+of views need no more. Logs contain more: satellite positioning errs more upwards, a compass more than
+a level, and a lever arm correlates position and rotation. With each view's own 2x2 covariance the inliers
+are weighted again: a few Gauss-Newton steps on the reprojection, from the result of `robust`.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ _BLOCK = 8192  # joint-frames at once: memory
 def triangulate_weighted(
     views: Views, *, solve: Callable[[Views], Triangulation], pose_covariance: Float
 ) -> Triangulation:
-    """`robust`, its inliers weighed by their poses' full covariances.
+    """Triangulate with `robust`, then weigh its inliers by their poses' full covariances.
 
     Args:
-        views: what was seen; `pose_sigma` holds the level of the same covariances.
-        solve: `robust`, as these views need it.
+        views: the views; `pose_sigma` holds the level of the same covariances.
+        solve: `robust` with the options for these views.
         pose_covariance: [F, C, 6, 6] position in the world (m^2), then rotation vector in the camera (rad^2).
     """
     first = solve(views)
@@ -44,7 +44,7 @@ def triangulate_weighted(
 
 
 def _refit(views: Views, first: Triangulation, pose_covariance: Float, rows: Int64) -> tuple[Float, Float]:
-    """Points [N, 3] and covariances [N, 3, 3] of these joint-frames."""
+    """Refit these joint-frames: points [N, 3] and covariances [N, 3, 3]."""
     pose = views.pose_index[rows]
     rotation, centre = views.rotation[pose], views.position[pose]
     inlier = first.inlier[rows]
@@ -80,7 +80,7 @@ def _refit(views: Views, first: Triangulation, pose_covariance: Float, rows: Int
 
 
 def _cross_matrix(vector: Float) -> Float:
-    """[..., 3, 3] with which a product is the cross product: (v x) u."""
+    """Return the cross-product matrix [..., 3, 3] of v: (v x) u."""
     x, y, z = np.moveaxis(vector, -1, 0)
     o = np.zeros_like(x)
     rows = [[o, -z, y], [z, o, -x], [-y, x, o]]

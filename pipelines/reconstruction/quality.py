@@ -1,6 +1,6 @@
-"""How good a reconstruction is: against the truth where there is one, and in itself.
+"""Quality of a reconstruction: errors against the truth if known, and internal consistency.
 
-Everything here is JSON-able, with null for what could not be measured.
+Everything here is JSON-able, with null for figures that could not be measured.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _PER_JOINT = (
 _UNMEASURED = dict.fromkeys(
     [*(field.name for field in fields(JointErrors)), "root_frames_left_out", "pa_frames_left_out"]
 )
-"""What stands in the place of errors where there is no truth."""
+"""Placeholder for errors without truth."""
 
 
 def assess(
@@ -45,20 +45,20 @@ def assess(
     truth: Float | None,
     solve: Callable[[Views], Triangulation],
 ) -> dict[str, Any]:
-    """Every figure of metrics.json.
+    """Compute every figure of metrics.json.
 
     Args:
-        observations: what was triangulated.
+        observations: the triangulated observations.
         views: the same, one row for each joint-frame.
-        result: what came out.
-        cameras: their names.
-        method: how it was triangulated.
+        result: their triangulation.
+        cameras: names of the cameras.
+        method: name of the triangulation method.
         truth: [T, P', J, 3] the true joints at the same times, in any order of people.
-        solve: the same way again, for the triangulations that leave one camera out.
+        solve: the same triangulation, for the runs that leave one camera out.
 
     Returns:
-        Errors, shape and shares are those of measured joints; what was filled is judged apart, in
-        `filled_mpjpe_mm`.
+        The figures. Errors, shape and shares are those of measured joints; filled joints have their own
+        figure, `filled_mpjpe_mm`.
     """
     shape = observations.confidence.shape[:3]
     status = result.status.reshape(shape)
@@ -102,7 +102,7 @@ def _intervals(
     joints: tuple[str, ...],
     t_ns: Int64,
 ) -> dict[str, Any]:
-    """How sure the means over the flight are, from resampled stretches of it (`geometry.bootstrap`)."""
+    """Compute confidence intervals of the means over the flight by block bootstrap (`geometry.bootstrap`)."""
     whole: dict[str, Series] = {}
     per_joint: dict[str, dict[str, Series]] = {name: {} for name in joints}
     if own is not None:
@@ -129,7 +129,7 @@ def _intervals(
 
 
 def _share(status: NDArray[np.int8]) -> Series:
-    """Measured joint-frames and all of them, moment by moment."""
+    """Count measured joint-frames and all joint-frames at each time."""
     measured = (status == _OK).sum(axis=(1, 2), dtype=np.float64)
     return measured, np.full(len(status), float(status[0].size))
 
@@ -157,13 +157,13 @@ def _figures(status: NDArray[np.int8], residual: Float) -> dict[str, Any]:
 
 
 def _of_truth(errors: dict[str, Any]) -> dict[str, Any]:
-    """The errors, their share named as what it is: of the joint-frames that have truth."""
+    """Rename the reconstructed share among errors: it counts joint-frames with truth only."""
     share = {"reconstructed_share_of_truth": errors["reconstructed_share"]}
     return share | {name: value for name, value in errors.items() if name != "reconstructed_share"}
 
 
 def _spread(residual: Float) -> dict[str, float | None]:
-    """Median and mean over all views that saw a reconstructed joint, rejected views included."""
+    """Compute median and mean over all views that saw a reconstructed joint, rejected views included."""
     distances = residual[np.isfinite(residual)]
     if not len(distances):
         return {"median": None, "mean": None}
@@ -171,7 +171,7 @@ def _spread(residual: Float) -> dict[str, float | None]:
 
 
 def _own_truth(position: Float, truth: Float) -> Float:
-    """For each reconstructed person [T, P, J, 3] the true person that is nearest, each taken once."""
+    """Match each reconstructed person [T, P, J, 3] to the nearest true person, each used once."""
     from scipy.optimize import linear_sum_assignment
 
     distance = np.linalg.norm(position[:, :, None] - truth[:, None, :], axis=-1)
@@ -189,7 +189,7 @@ def _own_truth(position: Float, truth: Float) -> Float:
 def _leave_one_out(
     views: Views, cameras: Sequence[str], solve: Callable[[Views], Triangulation]
 ) -> dict[str, dict[str, float | None]] | None:
-    """How far each camera's keypoints lie from the skeleton of the others; needs three cameras."""
+    """Measure each camera's keypoints against the skeleton of the others (px); None below three cameras."""
     if len(cameras) < 3:
         return None
     figures = {}

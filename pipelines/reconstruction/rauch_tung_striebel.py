@@ -1,9 +1,9 @@
-"""The smoother of Rauch, Tung & Striebel (1965) for many joints at once, and how it finds its one parameter.
+"""Smoother of Rauch, Tung & Striebel (1965) for many joints at once, and the estimate of its one parameter.
 
 A joint's state is its position and the first n - 1 derivatives, the n-th derivative is white noise of a
-density that is the same on all axes. Joints are independent of each other and stand side by side [T, M].
-The Kalman filter runs forwards, the smoother backwards; a run begins from nothing known, so that what lies
-before it is of no consequence. The result is that of least squares over the run with the same weights.
+density that is the same on all axes. Joints are independent of each other and stored as columns [T, M].
+The Kalman filter runs forwards, the smoother backwards. Each run starts with a very wide prior, so that
+earlier samples have no effect. The result equals least squares over the run with the same weights.
 """
 
 from __future__ import annotations
@@ -18,11 +18,13 @@ from pipelines.session.records import Float
 Bool = NDArray[np.bool_]
 
 STATES = {"acceleration": 3, "jerk": 4}
-"""How many derivatives, the position included, the model of that name keeps."""
+"""Number of derivatives in the state of each model, the position included."""
 
 UNKNOWN = (1e2, 1e2, 1e3, 1e4)
-"""Standard deviation of the state where a run begins, in m, m/s, m/s^2, m/s^3 from its first sample: a body's
-motion is a hundredth of it, and more would cost digits."""
+"""Prior standard deviation of the state at the start of a run, in m, m/s, m/s^2, m/s^3 from its first sample.
+
+A body's motion is a hundredth of it; a larger value would lose digits.
+"""
 
 _CORNERS = np.logspace(-2, 0.5, 26)  # rad per sample: the smoother's corner frequency
 
@@ -30,14 +32,14 @@ _CORNERS = np.logspace(-2, 0.5, 26)  # rad per sample: the smoother's corner fre
 def smooth_positions(
     t_s: Float, position: Float, covariance: Float, used: Bool, begins: Bool, density: Float, states: int
 ) -> tuple[Float, Float]:
-    """Smoothed positions and their covariances.
+    """Smooth positions and compute their covariances.
 
     Args:
         t_s: [T] strictly increasing.
         position: [T, M, 3] m; read where `used`.
         covariance: [T, M, 3, 3] m^2, of errors that are independent from sample to sample.
-        used: [T, M] which samples belong to a run.
-        begins: [T, M] where runs begin.
+        used: [T, M] True for samples that belong to a run.
+        begins: [T, M] True at the first sample of a run.
         density: [M] square root of the spectral density of the n-th derivative, m/s^n per sqrt(Hz).
         states: n, 3 or 4.
 
@@ -61,7 +63,7 @@ def smooth_positions(
         gain = np.swapaxes(np.linalg.solve(spread[:, :3, :3] + noise[t], spread[:, :3]), 1, 2)
         gain *= used[t][:, None, None]
         mean = mean + np.einsum("mij,mj->mi", gain, innovation)
-        # Joseph's form: symmetric and positive whatever is rounded.
+        # Joseph's form: stays symmetric and positive in spite of rounding.
         left = np.eye(size) - np.concatenate([gain, np.zeros((columns, size, size - 3))], axis=2)
         spread = left @ spread @ np.swapaxes(left, 1, 2) + gain @ noise[t] @ np.swapaxes(gain, 1, 2)
         means[t], spreads[t] = mean, spread
@@ -77,7 +79,7 @@ def smooth_positions(
 def find_density(
     t_s: Float, position: Float, covariance: Float, used: Bool, begins: Bool, states: int
 ) -> tuple[Float, Float]:
-    """The density under which each joint's samples are likeliest, and the factor on its covariances.
+    """Find the maximum-likelihood density of each joint, and the factor on its covariances.
 
     The likelihood of a Kalman filter's innovations with the common factor at its best (concentrated: Harvey
     1989, 3.4.3), over a grid of ratios of density to noise; axes alike, with a third of the trace as
@@ -116,7 +118,7 @@ def find_density(
             gain[:, :, None] * gain[:, None, :]
         )
         age = np.where(begins[t], 0, age + 1)
-        counted = np.repeat(used[t] & (age >= states), repeat)  # before, nothing was expected
+        counted = np.repeat(used[t] & (age >= states), repeat)  # before that the prior decides
         squared += np.where(counted, (innovation**2).sum(axis=1) / expected, 0.0)
         logarithm += np.where(counted, 3 * np.log(expected), 0.0)
         count += 3 * counted
@@ -132,7 +134,7 @@ def find_density(
 def _transition(
     t_s: Float, t: int, begins: Bool, density2: Float, states: int, axes: int = 3
 ) -> tuple[Float, Float]:
-    """How the state [M] moves to the time t, and the covariance that is added; a run begins anew."""
+    """Compute the transition of the state [M] to time t and the added covariance; restart at new runs."""
     elapsed = float(t_s[t] - t_s[t - 1]) if t else 0.0
     move, drive = np.eye(states), np.empty((states, states))
     for i in range(states):
@@ -153,6 +155,6 @@ def _transition(
 
 
 def _first(position: Float, used: Bool) -> Float:
-    """Each joint's first sample [M, 3]: far from the origin digits would be lost."""
+    """Return each joint's first used sample [M, 3], to work near the origin and keep digits."""
     first: Float = np.take_along_axis(position, used.argmax(axis=0)[None, :, None], axis=0)[0]
     return np.nan_to_num(first)

@@ -1,7 +1,7 @@
-"""Method `refined` for a flight: from cameras and who is who to a skeleton, poses and clocks.
+"""Method `refined` for a flight: from cameras and the people's detections to a skeleton, poses and clocks.
 
-The refinement starts from `robust` and ends with it: which views are good, and which joints may be called
-reconstructed, is what `robust` says with the corrected poses. Positions and covariances are the estimate's.
+The refinement starts from `robust` and ends with it: `robust` with the corrected poses decides which views
+are inliers and which joints are reconstructed. Positions and covariances are those of the estimate.
 """
 
 from __future__ import annotations
@@ -42,39 +42,39 @@ from pipelines.session.skeletons import bones_of
 if TYPE_CHECKING:
     import pandas as pd
 
-_SEARCHED = 300  # times of the skeleton at which the search for clocks looks
+_SEARCHED = 300  # times of the skeleton that the search for clock offsets uses, at most
 _MOST_SHIFTS = 6  # of the clocks; offsets of 0.2 s took one to five
-_UNTOLD = 0.5  # share of its prior that a clock's standard deviation may keep; above, pictures do not tell it
+_UNTOLD = 0.5  # a clock is determined if its posterior sigma is below this share of its prior sigma
 _HEAD = ("nose", "left_eye", "right_eye", "left_ear", "right_ear")  # as rigid as a bone
 
 
 @dataclass(frozen=True)
 class RobustFlight:
-    """What `robust` made of a flight, and how far what went into it may be off."""
+    """Result of `robust` for one flight, with the uncertainties of its inputs."""
 
     cameras: Sequence[Camera]  # all of them
-    found: Candidates  # every detection, at the times where people were told apart
+    found: Candidates  # every detection, at the times at which people were associated
     choice: Int64  # [T', C, P] each person's detection, see `observe`
     observations: Observations  # at the skeleton's times, on those sides
-    sides: Int64  # [T, P, J, C] which joint's view is the one of each joint, -1 for none, see `on_sides`
+    sides: Int64  # [T, P, J, C] the joint whose view belongs to each joint, -1 for none, see `on_sides`
     views: Views  # the same, one row for each joint-frame
     result: Triangulation  # `robust` of the views
-    prior: Sequence[PoseErrors] | None  # of each camera's pose; None when nobody stated anything
-    clock_sigma_s: Float  # [C] how far each clock may be off, 0 for one that is known
+    prior: Sequence[PoseErrors] | None  # of each camera's pose; None without stated noise
+    clock_sigma_s: Float  # [C] prior standard deviation of each clock offset, 0 for a known clock
     pixel_sigma: float  # px, of a good keypoint
-    between: Interpolation  # how far logged poses are trusted
+    between: Interpolation  # rules for interpolating between logged poses
     threads: int  # see `triangulate`
 
     @property
     def t_s(self) -> Float:
-        """[T] seconds since the skeleton's first time."""
+        """Seconds [T] since the skeleton's first time."""
         seconds: Float = (self.observations.t_ns - self.observations.t_ns[0]) / 1e9
         return seconds
 
 
 @dataclass(frozen=True)
 class RefinedFlight:
-    """What the refinement made of a flight; what went in, where it must not be believed."""
+    """Result of the refinement for one flight; its inputs after a fallback."""
 
     observations: Observations
     views: Views
@@ -85,7 +85,7 @@ class RefinedFlight:
 
 
 def refine_flight(flight: RobustFlight) -> RefinedFlight:
-    """Refine what `robust` made of a flight."""
+    """Refine the result of `robust` for a flight."""
     refined, offset_s = _settle_clocks(flight, _begun_offsets_s(flight))
     warnings = [
         *refined.warnings,
@@ -107,7 +107,7 @@ def refine_flight(flight: RobustFlight) -> RefinedFlight:
 
 
 def _begun_offsets_s(flight: RobustFlight) -> Float:
-    """The offset [C] of every clock to begin with, see `begun_offsets_s`, from some times of the flight."""
+    """Find the initial offset [C] s of every clock from some times of the flight, see `begun_offsets_s`."""
     times = len(flight.observations.t_ns)
     every = -(-times // _SEARCHED)
 
@@ -118,11 +118,11 @@ def _begun_offsets_s(flight: RobustFlight) -> Float:
 
 
 def _settle_clocks(flight: RobustFlight, offset_s: Float) -> tuple[Refined, Float]:
-    """The refinement, and by how much [C] in s the clocks were put forward in the end.
+    """Refine until the clocks settle; return the refinement and the total clock offsets [C] s.
 
-    A picture is joined to the three times nearest to its stamp, from which motion cannot be told far away,
-    and levels of pose noise that are found beside a large offset hold part of it. So the stamps follow the
-    clocks until little is left to correct.
+    A picture is joined to the three times nearest to its stamp, which is not accurate for large offsets.
+    Also, estimated levels of pose noise absorb part of a large offset. So the stamps are shifted by the
+    estimated offsets, and the refinement is repeated until the remaining correction is small.
     """
     started = _robustly(flight, offset_s) if offset_s.any() else flight.result
     for _ in range(1 + _MOST_SHIFTS):
@@ -135,7 +135,7 @@ def _settle_clocks(flight: RobustFlight, offset_s: Float) -> tuple[Refined, Floa
 
 
 def _refined_from(flight: RobustFlight, offset_s: Float, started: Triangulation) -> Refined:
-    """The refinement with these clocks, from these points."""
+    """Run the refinement with these clock offsets, starting from these points."""
     _, people, joints, _ = flight.observations.confidence.shape
     cameras = _shifted(flight.cameras, offset_s)
     return refine(
@@ -150,7 +150,7 @@ def _refined_from(flight: RobustFlight, offset_s: Float, started: Triangulation)
 
 
 def _robustly(flight: RobustFlight, offset_s: Float) -> Triangulation:
-    """What `robust` makes of the flight with these clocks."""
+    """Triangulate the flight by `robust` with these clock offsets."""
     _, views = _seen_from(flight, offset_s)
     views = replace(views, pixel_sigma=estimate_noise(views, threads=flight.threads))
     return triangulate_pictures(
@@ -162,7 +162,7 @@ def _robustly(flight: RobustFlight, offset_s: Float) -> Triangulation:
 
 
 def _untold_clocks(refined: Refined, cameras: Sequence[Camera], prior_s: Float) -> list[str]:
-    """Clocks that pictures hardly tell: nothing moved, or cameras that fly straight make up for it."""
+    """List clocks that pictures do not determine: nothing moved, or straight camera paths compensate."""
     return [
         f"refined: the pictures do not tell the clock of {camera.name}: its offset is known to {sigma:.2g} s "
         f"where {prior:.2g} s were stated"
@@ -172,7 +172,7 @@ def _untold_clocks(refined: Refined, cameras: Sequence[Camera], prior_s: Float) 
 
 
 def _unsettled_clocks(refined: Refined, cameras: Sequence[Camera]) -> list[str]:
-    """Clocks that each estimate from shifted stamps still moved."""
+    """List clocks that the last estimate still moved."""
     return [
         f"refined: the clock of {camera.name} did not settle: the last of {1 + _MOST_SHIFTS} estimates still "
         f"moved it by {1e3 * abs(left):.1f} ms"
@@ -181,11 +181,11 @@ def _unsettled_clocks(refined: Refined, cameras: Sequence[Camera]) -> list[str]:
     ]
 
 
-# --- what was seen, with other clocks and poses --------------------------------------------------------
+# --- observations with other clocks and poses -----------------------------------------------------------
 
 
 def _seen_from(flight: RobustFlight, offset_s: Float, every: int = 1) -> tuple[Observations, Views]:
-    """What was seen with these clocks, at every k-th of the skeleton's times."""
+    """Observe with these clock offsets, at every k-th time of the skeleton."""
     cameras = _shifted(flight.cameras, offset_s)
     t_ns, sides = flight.observations.t_ns[::every], flight.sides[::every]
     observed = observe(cameras, flight.found, flight.choice, t_ns, flight.between)
@@ -204,7 +204,7 @@ def _seen_from(flight: RobustFlight, offset_s: Float, every: int = 1) -> tuple[O
 
 
 def _seen_with(refined: Refined, flight: RobustFlight, offset_s: Float) -> tuple[Observations, Views]:
-    """What was seen with these clocks and the corrected poses, which are taken for exact."""
+    """Observe with these clock offsets and the corrected poses, which count as exact."""
     observed, views = _seen_from(flight, offset_s) if offset_s.any() else (flight.observations, flight.views)
     position, rotation = observed.position.copy(), observed.rotation.copy()
     for c in range(len(flight.cameras)):
@@ -222,7 +222,7 @@ def _seen_with(refined: Refined, flight: RobustFlight, offset_s: Float) -> tuple
 
 
 def _believed(refined: Refined, views: Views, threads: int) -> Triangulation:
-    """The estimate's points and covariances, where `robust` reconstructs the joint from these views."""
+    """Keep the estimate's points and covariances where `robust` reconstructs the joint from these views."""
     gated = triangulate(views, method="robust", threads=threads)
     position, covariance = refined.position.reshape(-1, 3), refined.covariance.reshape(-1, 3, 3)
     ok = (gated.status == STATUS.index("ok")) & ~np.isnan(position[:, 0])
@@ -236,7 +236,7 @@ def _believed(refined: Refined, views: Views, threads: int) -> Triangulation:
 
 
 def _shifted(cameras: Sequence[Camera], offset_s: Float) -> list[Camera]:
-    """The cameras, their clocks put forward."""
+    """Return the cameras with their clocks moved forward by offsets [C] s."""
     return [
         replace(camera, frame_t_ns=camera.frame_t_ns + round(1e9 * offset))
         for camera, offset in zip(cameras, offset_s, strict=True)
@@ -244,9 +244,9 @@ def _shifted(cameras: Sequence[Camera], offset_s: Float) -> list[Camera]:
 
 
 def _sighting(flight: RobustFlight, c: int, camera: Camera) -> Sighting:
-    """What camera `c`, its clock put forward, saw in its own pictures, all people side by side.
+    """Build the sighting of camera `c`, its clock shifted, in its own pictures, all people side by side.
 
-    Left and right are on the sides of the nearest of the skeleton's times.
+    Left and right are corrected as at the skeleton's nearest time.
     """
     t_ns, frame_t_ns = flight.observations.t_ns, camera.frame_t_ns
     nearest = np.searchsorted((t_ns[:-1] + t_ns[1:]) // 2, frame_t_ns)
@@ -266,13 +266,13 @@ def _sighting(flight: RobustFlight, c: int, camera: Camera) -> Sighting:
 
 
 def white_covariance(camera: Camera, prior: PoseErrors) -> Float | None:
-    """Covariances [F, 6, 6] of what is new in each picture's pose, where the log states them pose by pose."""
+    """Return covariances [F, 6, 6] of the white error of each picture's pose; None if not in the log."""
     logged = camera.covariance_at(camera.frame_t_ns) if prior.logged else None
     return None if logged is None else NEW_SHARE * logged
 
 
 def rigid_pairs(joints: tuple[str, ...], people: int) -> Int64:
-    """Pairs of joints [B, 2] whose distance hardly changes: bones, and the points of the head."""
+    """List pairs of joints [B, 2] with a nearly constant distance: bones, and the points of the head."""
     number = {name: index for index, name in enumerate(joints)}
     head = [number[name] for name in _HEAD if name in number]
     pairs = {(number[a], number[b]) for a, b in bones_of(joints)} | {(i, j) for i in head for j in head}
@@ -281,14 +281,14 @@ def rigid_pairs(joints: tuple[str, ...], people: int) -> Int64:
 
 
 def _numbers_at(correction: tuple[Float, Float], t_s: Float) -> Float:
-    """The ten numbers [N, 10] of a camera at other times: linear between its pictures, held outside them."""
+    """Interpolate the ten numbers [N, 10] of a camera to other times; constant outside its pictures."""
     when, numbers = correction
     if not len(when):
         return np.zeros((len(t_s), 10))
     return np.stack([np.interp(t_s, when, column) for column in numbers.T], axis=1)
 
 
-# --- what is told of it ---------------------------------------------------------------------------------
+# --- reporting ------------------------------------------------------------------------------------------
 
 
 def _metrics(refined: Refined, cameras: Sequence[Camera], offset_s: Float) -> dict[str, Any]:
@@ -310,7 +310,7 @@ def _metrics(refined: Refined, cameras: Sequence[Camera], offset_s: Float) -> di
 
 
 def _camera_table(flight: RobustFlight, refined: Refined, offset_s: Float) -> pd.DataFrame:
-    """The corrected pose of every picture that has one."""
+    """Build the table of corrected poses of every picture that has one."""
     import pandas as pd
 
     parts = []

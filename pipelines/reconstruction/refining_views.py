@@ -1,7 +1,7 @@
-"""Method `refined` for cameras that share their times: what studies make of their views.
+"""Method `refined` for cameras that share their times, used by studies.
 
-As `refining` does for a flight: the estimate starts from `robust` and ends with it. Which joint-frames may be
-called reconstructed is what `robust` says with the corrected poses.
+As in `refining`, the estimate starts from `robust` and ends with it: `robust` with the corrected poses
+decides which joint-frames are reconstructed.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from pipelines.session.records import Float
 def refined_points(
     views: Views, t_s: Float, joints: tuple[str, ...], models: Sequence[NoiseModel]
 ) -> tuple[Float, str | None]:
-    """The points that `refined` makes of one person's views, and why it fell back to `robust` if it did.
+    """Compute the points of one person by `refined`, and the reason of a fallback to `robust`, if any.
 
     Args:
         views: N = T * J joint-frames, joints fastest; one row of poses for each of the T times. The pose
             noise in them is for `robust`.
         t_s: [T] strictly increasing.
         joints: the J names.
-        models: what is known of the pose errors of every camera; none for exact poses.
+        models: pose noise, the same for every camera; an empty list for exact poses.
 
     Returns:
-        [N, 3] m, NaN for none.
+        Points [N, 3] m, NaN for none, and the reason of the fallback, None without one.
     """
     times, cameras = views.position.shape[:2]
     told = replace(views, pixel_sigma=estimate_noise(views))

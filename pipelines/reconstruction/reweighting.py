@@ -1,8 +1,8 @@
-"""A heavy-tailed loss for still, calibrated cameras, where what disagrees is the detector.
+"""Heavy-tailed loss for static, calibrated cameras, where disagreement comes from the detector.
 
 Noisy poses move all joints of a view together and by a normal amount: least squares is right for them,
-and weighting views by their own residuals costs 11 % at five cameras. Where poses were calibrated and
-nobody states noise, a view that disagrees has mistaken its joint, and how far off it is says little:
+and weighting views by their own residuals costs 11 % at five cameras. With calibrated poses and no stated
+noise, a view that disagrees shows a wrong joint, and the size of its residual has no meaning:
 its weight should fall with its residual (docs/decisions/0002-loss-of-still-cameras.md).
 """
 
@@ -14,18 +14,18 @@ import numpy as np
 
 from pipelines.geometry.triangulation import Triangulation, Views, reprojection_px, triangulate
 
-_ROUNDS = 12  # docs/decisions/0002-loss-of-still-cameras.md says what more would change
+_ROUNDS = 12  # the effect of more rounds: docs/decisions/0002-loss-of-still-cameras.md
 
 
 def triangulate_heavy_tailed(views: Views, *, threads: int) -> Triangulation:
-    """`robust` triangulation, its inliers weighed by Cauchy's loss: iteratively reweighted least squares.
+    """Triangulate with `robust`, then weigh its inliers by Cauchy's loss (iteratively reweighted).
 
-    A view of whitened residual r counts 1 / (1 + r^2) as much (Holland and Welsch 1977, table 1, with
-    the scale that `views.pixel_sigma` states instead of their tuning constant). Which views are inliers
-    is what `robust` says; the covariance is that of the weights in the last round.
+    A view of whitened residual r gets the weight 1 / (1 + r^2) (Holland and Welsch 1977, table 1, with
+    the scale `views.pixel_sigma` instead of their tuning constant). `robust` decides which views are
+    inliers; the covariance is that of the weights in the last round.
 
     Args:
-        views: what was seen; `pixel_sigma` as `estimate_noise` found it.
+        views: the views; `pixel_sigma` from `estimate_noise`.
         threads: see `triangulate`.
     """
     first = triangulate(views, method="robust", threads=threads)

@@ -1,10 +1,10 @@
-"""Smoothing of a skeleton, where the user asks for it: a zero-phase Butterworth filter, or an RTS smoother.
+"""Smoothing of a skeleton at the user's request: a zero-phase Butterworth filter, or an RTS smoother.
 
 Both work on contiguous runs of a joint's samples and never across a gap. `filled` samples belong to runs.
 
-- `butterworth`: what biomechanists expect. A pass of order n/2 forwards and one backwards (so nothing lags);
-  the cutoff of a pass is raised so that both together have -3 dB at `cutoff_hz` (Robertson & Dowling 2003;
-  Winter 2009, 3.4.4.2), exactly, for the digital filter.
+- `butterworth`: the usual filter in biomechanics. A pass of order n/2 forwards and one backwards (so there is
+  no lag); the cutoff of a pass is raised so that both together have -3 dB at `cutoff_hz` (Robertson & Dowling
+  2003; Winter 2009, 3.4.4.2), exactly, for the digital filter.
 - `rts`: a Kalman filter and the smoother of Rauch, Tung & Striebel (1965) on a model of constant acceleration
   (driven by white jerk) or constant jerk (driven by white snap), weighing each sample by its covariance.
 """
@@ -28,21 +28,21 @@ Bool = NDArray[np.bool_]
 
 _PLACE = "--smooth"
 _USUAL_STEP = 1.5  # times the median step: a longer one is a gap
-_UNEVEN = 0.25  # of the step: a filter of fixed rate is wrong for stamps that stray further
+_UNEVEN = 0.25  # of the step: a filter of fixed rate is wrong for larger jitter of the stamps
 
 
 @dataclass(frozen=True)
 class Smoothed:
-    """A skeleton after smoothing, and what was done to it."""
+    """Skeleton after smoothing, with a report of the filter."""
 
     position: Float  # [T, P, J, 3] m
     covariance: Float  # [T, P, J, 3, 3] m^2
-    told: dict[str, Any]  # JSON-able: the filter, its effective cutoff or density, what was too short
+    told: dict[str, Any]  # JSON-able: the filter, its effective cutoff or density, runs that were too short
 
 
 @dataclass(frozen=True)
 class Butterworth:
-    """A zero-phase low-pass filter, as users write it."""
+    """Zero-phase low-pass filter with the options of `--smooth butterworth`."""
 
     cutoff_hz: float = 6.0
     order: float = 4
@@ -54,7 +54,7 @@ class Butterworth:
             raise ValueError(f"order is {self.order:g}; both passes together have 2, 4, 6 or 8")
 
     def apply(self, t_ns: Int64, position: Float, covariance: Float) -> Smoothed:
-        """Filter every run; covariances stay: what a filter takes away of errors that last is not known."""
+        """Filter every run; covariances stay, because the filter's effect on correlated errors is unknown."""
         from scipy.signal import butter, sosfiltfilt
 
         step_s, rate_hz = _even_rate(t_ns)
@@ -67,7 +67,7 @@ class Butterworth:
         passes = int(self.order) // 2
         design_hz = self._design_hz(rate_hz)
         sections = butter(passes, design_hz, fs=rate_hz, output="sos")
-        # Ends are mirrored in their last sample, for as long as the filter remembers.
+        # Ends are mirrored in their last sample, over the memory of the filter.
         padding = max(3 * (2 * len(sections) + 1), round(rate_hz / self.cutoff_hz))
         smooth = position.copy()
         runs = _runs(t_ns, position, step_s)
@@ -95,7 +95,7 @@ class Butterworth:
         return Smoothed(smooth, covariance, told)
 
     def _design_hz(self, rate_hz: float) -> float:
-        """The -3 dB frequency of one pass with which two have theirs at `cutoff_hz`.
+        """Compute the -3 dB frequency of one pass for which two passes have theirs at `cutoff_hz`.
 
         A digital pass has the gain 1 / (1 + (tan(pi f / rate) / tan(pi d / rate))^2m) (bilinear transform),
         two have its square; that is 1/2 where the ratio to the power of 2m is sqrt(2) - 1.
@@ -107,7 +107,7 @@ class Butterworth:
 
 @dataclass(frozen=True)
 class RauchTungStriebel:
-    """The smoother, as users write it; without a density the data tell it."""
+    """Smoother with the options of `--smooth rts`; without a density it is estimated from the data."""
 
     model: Literal["acceleration", "jerk"] = "acceleration"
     density: float | None = None
@@ -121,9 +121,9 @@ class RauchTungStriebel:
     def apply(self, t_ns: Int64, position: Float, covariance: Float) -> Smoothed:
         """Smooth every run.
 
-        With a stated density covariances are taken at their word: errors that are new at every sample. Found
-        from the data, a factor on them comes out as well: the share of the variance that is new at every
-        sample. Only that share is smoothed away; the rest, which lasts, stays in the covariance.
+        With a stated density, covariances count as white errors, independent from sample to sample. If the
+        density is estimated, a factor on the covariances is estimated too: the white share of the variance.
+        Only that share is smoothed away; the rest, correlated over time, stays in the covariance.
         """
         step_s = float(np.median(np.diff(t_ns))) / 1e9 if len(t_ns) > 1 else 0.0
         states = STATES[self.model]
@@ -174,10 +174,10 @@ _SMOOTHERS: Mapping[str, Callable[..., Smoother]] = {"butterworth": Butterworth,
 
 
 def smoother(text: str | None) -> Smoother | None:
-    """The smoother of a text like `butterworth:cutoff_hz=6,order=4` or `rts`; None of none.
+    """Parse a text like `butterworth:cutoff_hz=6,order=4` or `rts` to a smoother; None stays None.
 
     Raises:
-        DataError: the text does not read so, or names what there is not.
+        DataError: the text has another form, or an unknown filter or option.
     """
     if text is None:
         return None
@@ -205,7 +205,7 @@ def smoother(text: str | None) -> Smoother | None:
 
 
 def _even_rate(t_ns: Int64) -> tuple[float, float]:
-    """The skeleton's step in s and rate in Hz."""
+    """Compute the skeleton's step (s) and rate (Hz); refuse uneven times."""
     if len(t_ns) < 2:
         raise DataError(_PLACE, "a single sample has no rate to filter at", "leave it out")
     steps = np.diff(t_ns)
@@ -223,7 +223,7 @@ def _even_rate(t_ns: Int64) -> tuple[float, float]:
 
 
 def _runs(t_ns: Int64, position: Float, step_s: float) -> list[tuple[int, int, int, int]]:
-    """Person, joint, first sample and the one after the last of every stretch without a gap."""
+    """List every run without a gap: person, joint, first sample, and the one after the last."""
     runs = []
     gap = np.append(np.diff(t_ns) > _USUAL_STEP * step_s * 1e9, True)
     there = np.isfinite(position[..., 0])
@@ -236,7 +236,7 @@ def _runs(t_ns: Int64, position: Float, step_s: float) -> list[tuple[int, int, i
 
 
 def _marks(shape: tuple[int, ...], runs: list[tuple[int, int, int, int]]) -> tuple[Bool, Bool]:
-    """Where runs begin, and which samples belong to one [T, P, J]."""
+    """Mark the first samples of runs, and the samples that belong to a run, both [T, P, J]."""
     begins, used = np.zeros(shape, dtype=np.bool_), np.zeros(shape, dtype=np.bool_)
     for person, joint, first, stop in runs:
         begins[first, person, joint] = True
@@ -247,7 +247,7 @@ def _marks(shape: tuple[int, ...], runs: list[tuple[int, int, int, int]]) -> tup
 def _cutoff_hz(
     density: Float, share: Float, covariance: Float, used: Bool, step_s: float, states: int
 ) -> float | None:
-    """Where the smoother's gain is 1/sqrt(2) (-3 dB): median over the joints.
+    """Compute the frequency at which the smoother's gain is 1/sqrt(2) (-3 dB): median over the joints.
 
     Far from the ends the smoother of n states has the gain 1 / (1 + (w / w0)^2n) with w0^2n = density^2 /
     (variance x step), for steps that are short beside it (Wiener); -3 dB lie at w0 (sqrt(2) - 1)^(1/2n).

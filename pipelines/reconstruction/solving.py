@@ -1,4 +1,4 @@
-"""What the solvers of joint-frames are told: rays, noise, and which of them looks at what."""
+"""Inputs of the solvers of joint-frames: rays, noise, and the choice of the solver."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Float, Int64
 
 UNKNOWN_SIGMA = (0.3, np.radians(1.0))
-"""Camera pose noise (m, rad) taken for telling people apart where nobody states it: the studies' medium."""
+"""Camera pose noise (m, rad) for associating people if none is stated: the studies' medium level."""
 
 
 def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float, *, pixel_sigma: float) -> Float:
-    """Standard deviation [T, C] in rad of a viewing ray, enough to tell people apart.
+    """Compute the standard deviation [T, C] rad of a viewing ray, accurate enough to associate people.
 
-    The distance to the actor is not known yet: the distance to the middle of the cameras, which
-    surround it, stands for it.
+    The distance to the actor is not known yet. The distance to the middle of the cameras replaces it,
+    because they surround the actor.
 
     Args:
         cameras: C of them.
@@ -62,10 +62,10 @@ def ray_sigma(cameras: Sequence[Camera], t_ns: Int64, position: Float, *, pixel_
 def views_with_noise(
     cameras: Sequence[Camera], observations: Observations, *, pixel_sigma: float, threads: int
 ) -> Views:
-    """All joint-frames in one row each, with the noise that the gates must know.
+    """Build the views, one row for each joint-frame, with the noise that the gates need.
 
-    Whatever the stated noise leaves unexplained is added as pixel noise: gates that know too little
-    throw good views out.
+    Residuals that the stated noise does not explain are added as pixel noise: with too little noise the
+    gates would reject good views.
     """
     times, people, joints, count = observations.confidence.shape
     focal = np.array([camera.focal_px for camera in cameras])
@@ -91,10 +91,10 @@ def solver_for(
     pixel_sigma: float,
     threads: int,
 ) -> Callable[[Views], Triangulation]:
-    """How views become points, for `refined` at first.
+    """Choose the solver from views to points; for `refined`, the solver of its start.
 
-    `robust` has a loss of its own for calibrated cameras; where poses err, a gate that knows what a picture's
-    joints share, and weights for logged covariances.
+    For calibrated cameras, `robust` has its own loss. For poses with errors, it has a gate that knows the
+    common error of a picture's joints, and weights from logged covariances.
     """
     calibrated = observations.pose_sigma is None and all(camera.static for camera in cameras)
     if method == "robust" and calibrated:
@@ -113,7 +113,7 @@ def solver_for(
 
 
 def pictures_of(observations: Observations) -> Int64:
-    """Which person in which picture [T * P * J] each joint-frame belongs to."""
+    """Number the person-pictures: index [T * P * J] of the time and person of each joint-frame."""
     times, people, joints, _ = observations.confidence.shape
     return np.repeat(np.arange(times * people), joints)
 
@@ -121,7 +121,7 @@ def pictures_of(observations: Observations) -> Int64:
 def refused_people(
     result: Triangulation, observations: Observations, seen: NDArray[np.bool_]
 ) -> Triangulation:
-    """Joints of a person for whom no view was taken, although `seen` [T] says somebody was, are rejected."""
+    """Mark joints of a person without any chosen view as rejected, at times when `seen` [T] is True."""
     shape = observations.confidence.shape[:3]
     status = result.status.reshape(shape)
     nobody = (status == STATUS.index("not_detected")).all(axis=2)
@@ -131,7 +131,7 @@ def refused_people(
 
 
 def said_noise(views: Views) -> str:
-    """The noise that the gates were told of."""
+    """Describe the noise that the gates used."""
     position_m, rotation_rad = np.median(views.pose_sigma, axis=(0, 1))
     pixels = float(np.median(views.pixel_sigma))
     rotation_deg = np.degrees(rotation_rad)

@@ -1,4 +1,4 @@
-"""What is stored of a reconstruction, as rows of the session's tables."""
+"""Stored results of a reconstruction, as rows of the session's tables."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def skeleton_table(observations: Observations, result: Triangulation) -> pd.DataFrame:
-    """Every joint of every person at every time, as rows of `tables.SKELETON`."""
+    """Build the rows of `tables.SKELETON`: every joint of every person at every time."""
     import pandas as pd
 
     times, people, joints, _ = observations.confidence.shape
@@ -39,9 +39,9 @@ def skeleton_table(observations: Observations, result: Triangulation) -> pd.Data
 
 
 def camera_poses_table(cameras: Sequence[Camera], between: Interpolation) -> pd.DataFrame:
-    """The poses of cameras at their pictures, as rows of `tables.CAMERA_POSES`.
+    """Build the rows of `tables.CAMERA_POSES`: the poses of cameras at their pictures.
 
-    Pictures that have none, as in a pause of the log, have no row.
+    Pictures without a pose, for example in a pause of the log, have no row.
     """
     import pandas as pd
 
@@ -57,7 +57,7 @@ def camera_poses_table(cameras: Sequence[Camera], between: Interpolation) -> pd.
 
 
 def _row_mean(values: Float) -> Float:
-    """Mean of each row without its NaN; NaN for a row of nothing else."""
+    """Compute the mean of each row without its NaN; NaN for a row of only NaN."""
     count = (~np.isnan(values)).sum(axis=1)
     mean: Float = np.where(count > 0, np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)
     return mean

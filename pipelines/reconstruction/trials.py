@@ -1,7 +1,7 @@
-"""Reconstructing again with poses that err more than they do: the draws, and what they say together.
+"""Trials: repeated reconstructions with extra pose errors, their draws and their summary.
 
-Chance of trial k and camera i is the same whatever else is asked, so that two models of noise, or two
-methods, are compared on like draws.
+The random draws of trial k and camera i do not depend on other options, so that two noise models, or two
+methods, are compared on the same draws.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.registries import parsed_noise_models
 
 STORED = 0
-"""The trial whose skeleton is stored."""
+"""Number of the trial with the stored skeleton."""
 
 _FIGURES = (
     "mpjpe_mm",
@@ -37,10 +37,10 @@ _TAIL_PERCENT = 2.5
 
 
 def disturbances(text: str | None, trials: int) -> list[NoiseModel] | None:
-    """The errors that are asked for, None for none.
+    """Parse the requested pose errors; None for none.
 
     Raises:
-        DataError: they do not read, err by nothing, or there are trials of nothing.
+        DataError: they cannot be parsed, all sizes are 0, or the number of trials does not fit.
     """
     place = "--disturb-poses"
     if text is None:
@@ -57,7 +57,7 @@ def disturbances(text: str | None, trials: int) -> list[NoiseModel] | None:
 
 
 def disturbed(cameras: Sequence[Camera], models: Sequence[NoiseModel], seed: int, trial: int) -> list[Camera]:
-    """The cameras with errors added to every pose of their logs; what is known of the logs stays the same."""
+    """Add errors to every logged pose of the cameras; the stated noise of the logs stays the same."""
     moved = []
     for c, camera in enumerate(cameras):
         log = camera.trajectory
@@ -68,15 +68,15 @@ def disturbed(cameras: Sequence[Camera], models: Sequence[NoiseModel], seed: int
 
 
 def told_together(metrics: Sequence[Mapping[str, Any]], text: str, seed: int) -> dict[str, Any]:
-    """What metrics.json says of all trials.
+    """Summarise all trials for metrics.json.
 
     Args:
-        metrics: of every trial.
+        metrics: figures of every trial.
         text: the errors, as users write them.
-        seed: of the draws, and of the resampling of trials.
+        seed: seed of the draws, and of the resampling of trials.
 
     Returns:
-        JSON-able, null for what could not be measured: `each` trial's figures, their `mean`, their `std`
+        JSON-able, null for figures that could not be measured: `each` trial's figures, their `mean`, `std`
         (about the mean, n - 1) and the `intervals` that hold 95 % of the means of resampled trials (Efron &
         Tibshirani 1993, 13.3); both null for less than two trials.
     """
