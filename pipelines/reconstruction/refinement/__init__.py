@@ -1,1 +1,1 @@
-"""One maximum a posteriori estimate of a skeleton, of its cameras' pose errors, and of clocks."""
+"""Combined maximum a posteriori estimate of a skeleton, of its cameras' pose errors, and of clocks."""

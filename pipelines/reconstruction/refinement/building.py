@@ -1,4 +1,4 @@
-"""From what every camera saw at its own times to a problem over the skeleton's times."""
+"""Construction of the refinement problem over the skeleton's times from the cameras' pictures."""
 
 from __future__ import annotations
 
@@ -15,18 +15,16 @@ Int64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
 
 KNOT_S = 0.5
-"""Distance of the knots between which slow pose errors are linear; what strays between is white."""
+"""Distance of the knots between which slow pose errors are linear; deviations from that count as white."""
 
-_NEAR = (
-    0.75  # steps of the skeleton: a picture further from its nearest time says nothing of the motion there
-)
+_NEAR = 0.75  # steps of the skeleton: a picture further from its nearest time is not used
 _RATE_S = 0.25  # to both sides
-_GAP = 3.5  # usual steps: three times further apart than this cannot be interpolated between
+_GAP = 3.5  # usual steps: no interpolation if three consecutive times span more than this
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """What one camera saw in its F pictures, and where its log says that it was."""
+    """Keypoints of one camera in its F pictures, with its logged poses."""
 
     t_s: Float  # [F] strictly increasing, on the skeleton's clock
     xy: Float  # [F, J, 2] normalised, undistorted; NaN where nothing was seen
@@ -39,17 +37,17 @@ class Sighting:
 
     @property
     def range_of(self) -> Bool:
-        """Which pictures [F] have a pose and a keypoint."""
+        """True for pictures [F] with a pose and a keypoint."""
         return ~np.isnan(self.position[:, 0]) & ~np.isnan(self.xy[..., 0]).all(axis=1)
 
 
 def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64, *, threads: int = 1) -> Problem:
-    """Sort all pictures by the skeleton's times around them; those near none of them are left out.
+    """Build the problem: sort pictures by the skeleton's times around them; leave out those near none.
 
     Args:
         t_s: [T] strictly increasing times of the skeleton, at least three.
-        sightings: what each camera saw.
-        bones: [B, 2] joints whose distance hardly changes.
+        sightings: keypoints and poses of each camera.
+        bones: [B, 2] joints with a nearly constant distance.
         threads: see `Problem`.
     """
     parts, covariances, logged = [], [np.empty((0, 6, 6))], 0
@@ -90,7 +88,7 @@ def _pictures(t_s: Float, sighting: Sighting, camera: int, logged: int) -> tuple
 
 
 def _first_of_three(t_s: Float, at_s: Float, step: float) -> tuple[Int64, Bool]:
-    """The first of three consecutive times of the skeleton around each asked one, and whether there are."""
+    """Find the first of three consecutive times of the skeleton around each time; mark if they exist."""
     after = np.clip(np.searchsorted(t_s, at_s), 1, len(t_s) - 1)
     nearest = np.where(at_s - t_s[after - 1] <= t_s[after] - at_s, after - 1, after)
     span = np.full(len(t_s) + 2, np.inf)  # of the three times that begin at index - 2
@@ -103,10 +101,10 @@ def _first_of_three(t_s: Float, at_s: Float, step: float) -> tuple[Int64, Bool]:
 
 
 def _rates(sighting: Sighting) -> tuple[Float, Float]:
-    """Speed [F, 3] in the world and turn rate [F, 3] in the camera; 0 where unknown.
+    """Compute speed [F, 3] (m/s) in the world and turn rate [F, 3] (rad/s) in the camera; 0 where unknown.
 
-    Over half a second: from picture to picture, noisy poses would seem to fly and turn faster than people
-    walk, and a clock's offset would be found too small.
+    Rates are taken over half a second. From picture to picture, noisy poses would give rates larger than
+    people's motion, and estimated clock offsets would be too small.
     """
     count = len(sighting.t_s)
     if count < 3:

@@ -1,13 +1,13 @@
 """Gauss-Newton steps and posterior covariances, in time and memory linear in the length of the flight.
 
-The normal equations are banded in time with a border: a second difference ties three times together, a
-picture three times and two knots, and the shared unknowns touch everything. So joints and knots are
-eliminated in the order of time by one small dense front (Duff & Reid 1983, multifrontal; the same as a
-forward filter in information form), and found again backwards, with the covariances of every front on the
-way (Takahashi's recursion; in time, the smoother of Rauch, Tung & Striebel 1965). Two fronts start from both
-ends of the flight and meet in the middle. Nothing is approximated by windows. Factors of a long flight do not
-fit into memory: the fronts at every `_SEGMENT` times are kept, and a segment is factorised again when the way
-back reaches it.
+The normal equations are banded in time with a border. A second difference couples three times, a picture
+couples three times and two knots, and the shared unknowns are coupled with everything. So joints and knots
+are eliminated in the order of time by one small dense front (Duff & Reid 1983, multifrontal; equal to a
+forward filter in information form). A backward pass solves for them and computes the covariances of fronts
+(Takahashi's recursion; in time, the smoother of Rauch, Tung & Striebel 1965). Two fronts start from both
+ends of the flight and meet in the middle. The solution is exact, without windows. Factors of a long flight do
+not fit into memory: the fronts at every `_SEGMENT` times are kept, and a segment is factorised again when the
+backward pass reaches it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Int64 = NDArray[np.int64]
 Part = TypeVar("Part")
 Result = TypeVar("Result")
 
-# Their arguments are assembled from tuples, whose lengths types do not know.
+# Their arguments are assembled from tuples, whose lengths mypy does not know.
 _forwards: Callable[..., tuple[int, float]] = sweeps.forwards
 _visit: Callable[..., tuple[Float, int]] = sweeps.visit
 _whiten: Callable[..., None] = kernels.whiten
@@ -38,17 +38,17 @@ _whiten: Callable[..., None] = kernels.whiten
 _SEGMENT = 256  # times of the skeleton
 _KEPT_BYTES = 300e6  # of a half's factors, before segments are factorised twice
 _HELD = 1e10  # 1 / m^2, of a bone length
-_ANYWHERE_M = 100.0  # a joint that nobody saw lies within this of where the search began
+_ANYWHERE_M = 100.0  # prior sigma of an unseen joint around its start
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Posterior mean squares of what the levels are the deviations of, and posterior variances."""
+    """Posterior mean squares and variances of the quantities whose standard deviations are the levels."""
 
     acceleration: Float  # [2, J, J] sums of mean squares and of variances over the times
     bones: Float  # [B] sums of mean squares
-    image: Float  # [J, 2] weighted squares of residuals, and how many of them the fit leaves
-    white: Float  # [2, 3] of position, rotation: sums of mean squares, count, sum of told shares
+    image: Float  # [J, 2] weighted squares of residuals, and their degrees of freedom after the fit
+    white: Float  # [2, 3] of position, rotation: sums of mean squares, count, sum of determined shares
     walked: Float  # [c, 3] of the changes between knots per s: sums of mean squares, count, variances
     starting: Float  # [c + shared, 2] mean squares and variances at the first time
     times: int
@@ -56,13 +56,13 @@ class Moments:
 
 @dataclass
 class Eliminated:
-    """A state's equations after the elimination of all that is not alive where the halves meet."""
+    """Equations of a state after the elimination of all unknowns that are not alive where the halves meet."""
 
     state: State
     swept: tuple[_Swept, _Swept]
-    lower: Float  # Cholesky factor of what is left where the halves meet
+    lower: Float  # Cholesky factor of the remaining equations where the halves meet
     gradient: Float  # of the same, in the order of the first half
-    log_determinant: float  # half of it, of all equations, white errors too
+    log_determinant: float  # half the log determinant of all equations, white errors included
 
 
 def eliminate(system: System, state: State) -> Eliminated:
@@ -80,7 +80,7 @@ def eliminate(system: System, state: State) -> Eliminated:
 
 
 def step(system: System, at: Eliminated) -> State:
-    """The Gauss-Newton step."""
+    """Compute the Gauss-Newton step."""
     from scipy.linalg.lapack import dpotrs
 
     last = dpotrs(at.lower, -at.gradient, lower=1)[0]
@@ -88,7 +88,7 @@ def step(system: System, at: Eliminated) -> State:
 
 
 def covariances(system: System, at: Eliminated) -> Float:
-    """Posterior covariance [T, J, 3, 3] of every joint at every time."""
+    """Compute the posterior covariance [T, J, 3, 3] of every joint at every time."""
     shape = (system.problem.joints, 3, 3)
     whole = _last_covariance(at)
 
@@ -102,9 +102,9 @@ def covariances(system: System, at: Eliminated) -> Float:
 
 
 def moments(system: System, state: State, at: Eliminated, *, every: int) -> Moments:
-    """What the levels are estimated from, pictures from one in so many times.
+    """Compute the moments for the estimate of levels, using the pictures of every k-th time.
 
-    Covariances are those of the state that was eliminated, squares those of `state`, a step further.
+    Covariances are those of the eliminated state, squares those of `state`, one step further.
     """
     whole = _last_covariance(at)
 
@@ -115,14 +115,14 @@ def moments(system: System, state: State, at: Eliminated, *, every: int) -> Mome
 
 
 def shared_covariance(system: System, at: Eliminated) -> Float:
-    """Posterior covariance of what all times share."""
+    """Compute the posterior covariance of the unknowns shared by all times."""
     whole = _last_covariance(at)
     begins = len(whole) - system.layout.shared_count
     return whole[begins:, begins:]
 
 
 def samples(system: System, at: Eliminated, count: int, rng: np.random.Generator) -> Iterator[Float]:
-    """Draws [T, J, 3] from the posterior of the joints about 0: the errors that it expects."""
+    """Draw samples [T, J, 3] of the joints' errors from the posterior, with mean 0."""
     from scipy.linalg.lapack import dtrtrs
 
     for _ in range(count):
@@ -135,7 +135,7 @@ def samples(system: System, at: Eliminated, count: int, rng: np.random.Generator
 
 @dataclass
 class _Front:
-    """Normal equations of what is alive: joints at three times, knots around them, what all share."""
+    """Normal equations of the live unknowns: joints at three times, knots around them, shared unknowns."""
 
     matrix: Float  # [N, N] lower triangle
     gradient: Float  # [N]
@@ -147,7 +147,7 @@ class _Front:
 
 @dataclass
 class _Factors:
-    """What a segment's elimination leaves; see `sweeps.forwards`."""
+    """Factors of a segment's elimination; see `sweeps.forwards`."""
 
     first_interval: int
     inverse: Float
@@ -160,25 +160,25 @@ class _Factors:
 
 @dataclass
 class _Swept:
-    """A half after its elimination."""
+    """Half of the flight after its elimination."""
 
     half: Half
     state: State  # its part
-    fronts: list[_Front]  # at the beginning of every segment, from which its factors can be made again
-    factors: dict[int, _Factors]  # of segments, where they are kept
+    fronts: list[_Front]  # at the start of every segment, to recompute its factors
+    factors: dict[int, _Factors]  # of the segments whose factors are kept
     rest: _Front
     log_determinant: float
 
 
 def _segments(half: Half) -> list[tuple[int, int]]:
-    """A half without times of its own may still have knots."""
+    """List the segments [first, last) of a half; one empty segment without times, for its knots."""
     return [(first, min(first + _SEGMENT, half.count)) for first in range(0, max(half.count, 1), _SEGMENT)]
 
 
 def _on_both(
     both: tuple[Part, Part], work: Callable[[Part, Halt], Result], threads: int
 ) -> tuple[Result, Result]:
-    """The same for both halves, at once where there may be two threads; each writes its own results."""
+    """Run the same work on both halves, in parallel if two threads are allowed."""
     halt = Halt()
     first, second = side_by_side(lambda part: work(part, halt), both, workers=min(threads, 2), halt=halt)
     return first, second
@@ -201,7 +201,7 @@ def _sweep(half: Half, state: State, halt: Halt) -> _Swept:
 
 
 def _begin(half: Half, state: State) -> _Front:
-    """The first knots, tied; in the first half, the priors of what is there from the start."""
+    """Create the first front: the first knots, tied; in the first half also the priors at the start."""
     system = half.system
     front = _Front(np.zeros((system.size, system.size)), np.zeros(system.size), 0)
     if not half.turned:
@@ -221,7 +221,7 @@ def _begin(half: Half, state: State) -> _Front:
 
 
 def _add_priors(system: System, state: State, front: _Front) -> None:
-    """Of slow errors at the first knot and of what all times share."""
+    """Add the priors of slow errors at the first knot and of shared unknowns."""
     layout, n3 = system.layout, 9 * system.problem.joints
     for (_, process), (at_knots, column) in zip(layout.processes, layout.place, strict=True):
         value = state.knots[0] if at_knots else state.shared
@@ -235,12 +235,12 @@ def _add_priors(system: System, state: State, front: _Front) -> None:
             front.matrix[place, place] += 1 / sigma**2
             front.gradient[place] += state.shared[column] / sigma**2
     for place in range(n3 + 2 * layout.knot_count + layout.bone_column, system.size):
-        # A length that nothing speaks of stays where it is.
+        # A length without data keeps its value.
         front.matrix[place, place] += _HELD if system.held else 1e-6
 
 
 def _eliminate(half: Half, state: State, front: _Front, first: int, last: int) -> tuple[_Factors, float]:
-    """Eliminate the knots and joints of some times; the front is changed in place."""
+    """Eliminate the knots and joints of times from `first` to before `last`; change the front in place."""
     system = half.system
     n, c = 3 * system.problem.joints, system.layout.knot_count
     times, size = last - first, system.size
@@ -288,7 +288,7 @@ def _eliminate(half: Half, state: State, front: _Front, first: int, last: int) -
 
 
 def _meet(swept: tuple[_Swept, _Swept]) -> tuple[Float, Float]:
-    """Cholesky factor of what is alive in both halves, and the gradient, in the order of the first."""
+    """Compute the Cholesky factor and gradient of the unknowns alive in both halves, in the first's order."""
     from scipy.linalg.lapack import dpotrf
 
     system = swept[0].half.system
@@ -308,7 +308,7 @@ def _meet(swept: tuple[_Swept, _Swept]) -> tuple[Float, Float]:
 
 
 def _last_covariance(at: Eliminated) -> Float:
-    """Of what is alive where the halves meet, in the order of the first."""
+    """Compute the covariance of the unknowns alive where the halves meet, in the order of the first half."""
     from scipy.linalg.lapack import dpotri
 
     inverse, _ = dpotri(at.lower, lower=1)
@@ -331,7 +331,7 @@ def _factors_backwards(swept: _Swept, halt: Halt) -> Iterator[tuple[int, int, _F
 def _solve_back(
     system: System, at: Eliminated, last_solution: Float, rng: np.random.Generator | None = None
 ) -> State:
-    """The unknowns of all times from those of the meeting; a draw about 0 where `rng` says so."""
+    """Solve for the unknowns of all times from those of the meeting; with `rng`, draw a sample about 0."""
     layout, state = system.layout, at.state
     # Draws come from one source, so in order.
     threads = 1 if rng is not None else system.problem.threads
@@ -351,7 +351,7 @@ def _solve_back(
 def _follow_back(
     swept: _Swept, last_solution: Float, rng: np.random.Generator | None, halt: Halt
 ) -> tuple[Float, Float]:
-    """Joints [T, n] of a half, and all knots [K, c], of which those of the other half are 0."""
+    """Solve for the joints [T, n] of a half and for the knots [K, c]; knots of the other half stay 0."""
     half, state = swept.half, swept.state
     n, count = 3 * half.system.problem.joints, half.system.layout.knot_count
     alive = last_solution[half.met()]
@@ -385,7 +385,7 @@ def _follow_back(
 
 
 def _add_white(system: System, state: State, moved: State) -> None:
-    """Every picture's white error that belongs to a step of all else, put into it."""
+    """Add the step of every picture's white error to the step of all other unknowns, in place."""
     problem, pictures = system.problem, system.problem.pictures
     _whiten(
         problem.t_s,
@@ -413,7 +413,7 @@ def _add_white(system: System, state: State, moved: State) -> None:
 def _visit_back(
     swept: _Swept, state: State, last_covariance: Float, covariance: Float, every: int, halt: Halt
 ) -> Moments:
-    """Sums of a half, linearised at `state`; `covariance` is filled where it has a length."""
+    """Compute the moments of a half, linearised at `state`; fill `covariance` unless it is empty."""
     half = swept.half
     problem, layout = half.system.problem, half.system.layout
     joints, place = problem.joints, half.met()
@@ -459,7 +459,7 @@ def _visit_back(
 
 
 def _added(first: Moments, second: Moments) -> Moments:
-    """Sums of the whole flight; what stands at its start is the first half's."""
+    """Add the moments of both halves; `starting` is the first half's."""
     sums = {each.name: getattr(first, each.name) for each in fields(Moments)}
     for name in sums.keys() - {"starting"}:
         sums[name] = sums[name] + getattr(second, name)

@@ -1,4 +1,4 @@
-"""The estimate: Gauss-Newton on everything at once, its prior found from stretches of the flight."""
+"""Estimate: Gauss-Newton on all unknowns together, with a prior learned from stretches of the flight."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from pipelines.reconstruction.refinement.system import System, misfit, prior_cos
 Float = NDArray[np.float64]
 
 BOUND = 3.5
-"""Standard deviations of an image point beyond which its weight falls: one good view in 450."""
+"""Residual, in standard deviations, beyond which an image point's weight falls: one good view in 450."""
 
 REMEMBERED = 1.5
-"""Memory of keypoint errors above which it matters."""
+"""Memory (correlation length) of keypoint errors above which it is taken into account."""
 
 _CONVERGED_M = 2e-4
 _BOUNDS = (20.0, 8.0, BOUND)
-_MOST_GROWTH = 0.15  # of the body in a step: equations that are linear in its size hold no further
-_LEAST = 0.01  # of a step that raises the cost is made nevertheless
-_SETTLED = 3  # rounds after which an estimate is one of its prior
-_WIDE = 4.0  # times the usual residual of the start: poses are not corrected yet
+_MOST_GROWTH = 0.15  # of the body in a step: the linearisation in its size is not valid further
+_LEAST = 0.01  # smallest share of a step that is tried; it is made even if it raises the cost
+_SETTLED = 3  # rounds after which an estimate fits its prior
+_WIDE = 4.0  # times the usual residual of the start, because poses are not corrected yet
 
 
 def solve(
@@ -47,7 +47,7 @@ def solve(
     bounds: tuple[float, ...] = _BOUNDS,
     most_growth: float = np.inf,
 ) -> tuple[System, State, Eliminated]:
-    """Gauss-Newton with halved steps where the cost would rise; the robust bound tightens as it goes.
+    """Solve by Gauss-Newton, with steps halved if the cost would rise and a robust bound that tightens.
 
     A step that would change the logarithm of the body's size by more than `most_growth` is shortened by the
     ratio. The equations returned are those of the last step, within a step of the state.
@@ -60,7 +60,8 @@ def solve(
         if done < len(bounds):
             _, residual, _ = misfit(System(problem, known, layout, bound**2), state)
             bound = max(bound, _WIDE * float(np.sqrt(np.nanmedian((residual**2).sum(axis=-1)))))
-        # Where poses are noisy the start jumps from picture to picture, which a giant would do more easily.
+        # With noisy poses the start jumps from picture to picture. The motion prior scales with the body, so
+        # the body would grow to explain these jumps: bone lengths are held at first.
         system = System(problem, known, layout, bound**2, held=done < len(bounds))
         at = eliminate(system, state)
         direction = step(system, at)
@@ -73,11 +74,11 @@ def solve(
         moved = float(np.sqrt(np.mean((share * direction.position) ** 2)))
         if done >= rounds or (moved < _CONVERGED_M and done >= len(bounds)):
             return system, state, at
-        del at  # or the factors of two rounds would be held at once
+        del at  # otherwise the factors of two rounds would be in memory together
 
 
 def _growth(system: System, state: State, direction: State) -> float:
-    """By how much a step changes the logarithm of the mean bone's length."""
+    """Compute the absolute change of the logarithm of the mean bone length by a step."""
     column = system.layout.bone_column
     lengths, changes = state.shared[column:], direction.shared[column:]
     if not len(lengths):
@@ -86,29 +87,30 @@ def _growth(system: System, state: State, direction: State) -> float:
 
 
 def cost(system: System, state: State) -> float:
-    """Minus twice the logarithm of the posterior, up to a constant."""
+    """Compute minus twice the logarithm of the posterior, up to a constant."""
     return misfit(system, state)[0] + prior_cost(system, state)
 
 
 def learn(
     problem: Problem, known: Knowledge, state: State, *, poses: bool, rounds: int
 ) -> tuple[Knowledge, State]:
-    """Alternate Gauss-Newton steps and reestimates of the prior's parameters.
+    """Learn the prior: alternate Gauss-Newton steps and estimates of its parameters.
 
-    Halfway, when residuals hold few pose errors any more, the memory of keypoint errors is estimated. From
-    there on slow pose errors are held against keypoints that say accordingly less, and motion and image
-    noise, which are quick, stay as they are if that is much less.
+    Halfway, when residuals contain few pose errors, the memory of keypoint errors is estimated. From then on
+    keypoints count less by that factor against slow pose errors. If it exceeds `REMEMBERED`, motion and image
+    noise, which vary quickly, are no longer estimated.
 
-    New levels move an estimate little, but the size of a formation that hardly changes: two hovering cameras
-    went metres at a step, and the misfit was taken for image noise that lasts. The size may therefore change
-    by little in a step; more steps instead run away with it, since nothing tells it there.
+    New levels change an estimate little, except for the size of a nearly constant formation: two hovering
+    cameras moved by metres in a step, and the misfit was estimated as correlated image noise. Therefore the
+    size may change only a little in a step. More steps instead would let it diverge, because the data do not
+    determine it there.
 
     Args:
         problem: stretches of the flight.
-        known: where to begin.
-        state: where to begin.
-        poses: whether levels of pose errors are among the parameters.
-        rounds: how often.
+        known: initial parameters of the prior.
+        state: initial estimate.
+        poses: True to estimate the levels of pose errors too.
+        rounds: number of rounds.
     """
     for index in range(rounds):
         if index == 0:
@@ -127,10 +129,10 @@ def learn(
 
 
 def evidence(problem: Problem, known: Knowledge, state: State) -> float:
-    """Logarithm of how likely the pictures are under a prior, up to a constant of the pictures.
+    """Compute the log evidence of a prior given the pictures, up to a constant of the pictures.
 
-    Laplace's approximation about the estimate that belongs to the prior, at most three Gauss-Newton steps
-    from `state`. The pictures count as if only one in `known.memory` were there.
+    Laplace's approximation around the estimate under the prior, at most three Gauss-Newton steps from
+    `state`. The pictures count as if only one in `known.memory` existed.
     """
     system, state, _ = solve(problem, known, state, rounds=_SETTLED, bounds=(BOUND,))
     at = eliminate(system, state)
@@ -138,7 +140,7 @@ def evidence(problem: Problem, known: Knowledge, state: State) -> float:
     times = len(problem.t_s)
     value = -0.5 * cost(system, state) - at.log_determinant
     value -= 2 * float(problem.pictures.trust.sum()) / known.memory * np.log(known.pixel_scale)
-    # Motion and bones in units of the body, whose size beforehand is as likely to be any.
+    # Motion and bones in units of the body's size, which has a flat prior.
     _, log_determinant = np.linalg.slogdet(known.acceleration / known.size_m**2)
     value -= 1.5 * (times - 2) * float(log_determinant)
     value -= times * float(np.log(known.bone_sigma_m / known.size_m).sum())
@@ -155,7 +157,7 @@ def evidence(problem: Problem, known: Knowledge, state: State) -> float:
 
 
 def initial_state(problem: Problem, known: Knowledge, position: Float) -> State:
-    """No corrections, bones as long as in the median picture."""
+    """Build the initial state: no corrections, and each bone's length its median over the times."""
     layout = lay_out(known.poses, known.clock_sigma_s, len(problem.bones), problem.knot_t_s)
     shared = np.zeros(layout.shared_count)
     if len(problem.bones):

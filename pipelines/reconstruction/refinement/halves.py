@@ -1,8 +1,8 @@
-"""A flight seen from both its ends: two halves that are eliminated side by side and meet in the middle.
+"""Halves of a flight, eliminated in parallel from both ends until they meet in the middle.
 
-The equations do not know which way time runs. Turned round, the second half is a flight like the first:
-times, pictures and knots in the opposite order, and the same kernels. What is alive when the first half is
-through, the joints at two times, the knots around them and what all times share, is alive when the second is.
+The equations are symmetric in time. With times, pictures and knots in the opposite order, the second half is
+a flight like the first and uses the same kernels. The same unknowns are alive at the end of both halves: the
+joints at two times, the knots around them, and the unknowns shared by all times.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ Value = TypeVar("Value", bound=np.generic)
 
 @dataclass(frozen=True)
 class Half:
-    """One half, in the order of its elimination; T times, of which the last two are the other's too."""
+    """One half, in the order of its elimination; T times, the last two shared with the other half."""
 
     system: System
     turned: bool
     meeting: int  # the first of the flight's two times at which the halves meet
     pictures: int  # of the flight, that belong to the first half
-    t_s: Float  # [T] falling where it is turned round
-    of_time: Int64  # [T - 1] the knot before each time that is eliminated, and before the meeting
-    starts: Int64  # [T - 1] where the pictures of each time begin
+    t_s: Float  # [T] decreasing in the turned half
+    of_time: Int64  # [T - 1] the knot before each eliminated time, and before the meeting
+    starts: Int64  # [T - 1] index of the first picture of each time
     of_pictures: tuple[Any, ...]  # camera, time, fraction, `System.picture_arguments`, row of the white error
-    curvature: Float  # [T - 2, 3] weights that make an acceleration of three positions
-    spread: Float  # [T - 2] its variance against the usual
-    tie_before: Float  # [K - 1, c] times a knot, less
-    tie_after: Float  # [K - 1, c] times the next, is 0
-    tie_variance: Float  # [K - 1, c] with this variance; inf where the other half says so
+    curvature: Float  # [T - 2, 3] weights of three positions for their acceleration
+    spread: Float  # [T - 2] its variance relative to the usual
+    tie_before: Float  # [K - 1, c] prior of a tie: tie_before * knot - tie_after * next knot has mean 0
+    tie_after: Float  # [K - 1, c] factor of the next knot
+    tie_variance: Float  # [K - 1, c] variance of that difference; inf if the tie belongs to the other half
 
     @property
     def knot_t_s(self) -> Float:
@@ -48,20 +48,20 @@ class Half:
 
     @property
     def count(self) -> int:
-        """Times that are eliminated."""
+        """Number of eliminated times."""
         return len(self.t_s) - 2
 
     @property
     def own_times(self) -> int:
-        """How many of the last three times are this half's: those of the meeting are the first one's."""
+        """Number of the last three times that belong to this half; those of the meeting are the first's."""
         return 1 if self.turned else 3
 
     def of_times(self, values: NDArray[Value]) -> NDArray[Value]:
-        """What belongs to this half of values [T', ...] of the flight's times."""
+        """Return this half's part of values [T', ...] at the flight's times."""
         return _turned(values[self.meeting :]) if self.turned else values[: self.meeting + 2]
 
     def state(self, state: State) -> State:
-        """A state's part; of the knots there are all."""
+        """Return this half's part of a state, with all knots."""
         return State(
             self.of_times(state.position),
             _turned(state.knots) if self.turned else state.knots,
@@ -70,7 +70,7 @@ class Half:
         )
 
     def met(self) -> Int64:
-        """Where each of the unknowns alive at the meeting stands in the order of the first half."""
+        """Return the place of each unknown alive at the meeting, in the order of the first half."""
         n, c = 3 * self.system.problem.joints, self.system.layout.knot_count
         place = np.arange(2 * n + 2 * c + self.system.layout.shared_count)
         if self.turned:
@@ -79,7 +79,7 @@ class Half:
         return place
 
     def arguments(self, part: State) -> tuple[Any, ...]:
-        """What the sweeps need to know of the half and of where it is linearised."""
+        """Collect the arguments of the sweeps: the half and its linearisation point."""
         system = self.system
         camera, when_s, fraction, *seen, white_row = self.of_pictures
         return (
@@ -105,12 +105,12 @@ class Half:
 
 
 def halved(system: System) -> tuple[Half, Half]:
-    """Both halves of a flight of at least three times."""
+    """Split a flight of at least three times in the middle."""
     return parted(system, (len(system.problem.t_s) - 1) // 2)
 
 
 def parted(system: System, meeting: int) -> tuple[Half, Half]:
-    """The same for a meeting at any time but the first and the last of T: 1 to T - 2."""
+    """Split a flight of T times at any meeting time from 1 to T - 2."""
     pictures = int(np.searchsorted(system.problem.pictures.first, meeting))
     return _half(system, meeting, pictures, turned=False), _half(system, meeting, pictures, turned=True)
 
@@ -163,5 +163,5 @@ def _half(system: System, meeting: int, pictures: int, *, turned: bool) -> Half:
 
 
 def _turned(values: NDArray[Value]) -> NDArray[Value]:
-    """In the opposite order, of one piece: everything is compiled for that."""
+    """Reverse values into a contiguous array, the layout that everything is compiled for."""
     return np.ascontiguousarray(values[::-1])

@@ -1,4 +1,4 @@
-"""What one camera's picture says of joints and cameras: residuals, their derivatives, normal equations.
+"""Equations of one camera's picture for joints and cameras: residuals, derivatives, normal equations.
 
 A joint X appears in a camera at y = exp(r) R' (X - p + s) + b, where (p, R) is the logged
 world_from_camera, s a shift in the world (m), r a rotation vector in the camera (rad) and b a shift in
@@ -20,12 +20,15 @@ Bool = NDArray[np.bool_]
 
 NUMBERS = 10  # of a picture: shift in the world, rotation, shift in the camera, clock
 WHITE = 6  # the first of them have a white part
-_NEAREST_M = 0.1  # a joint nearer to the camera's plane says nothing
+_NEAREST_M = 0.1  # a joint nearer to the camera's plane is not used
 
 
 @helper
 def exponential(rotation_vector: Float, rotation: Float, jacobian: Float) -> None:
-    """exp(r) [3, 3] and its left Jacobian: exp(r + dr) = exp(J dr) exp(r) (Barfoot 2017, 7.77 and 7.85)."""
+    """Compute exp(r) [3, 3] and its left Jacobian: exp(r + dr) = exp(J dr) exp(r).
+
+    Source: Barfoot 2017, 7.77 and 7.85.
+    """
     angle2 = rotation_vector[0] ** 2 + rotation_vector[1] ** 2 + rotation_vector[2] ** 2
     if angle2 < 1e-8:
         a, b, c = 1.0 - angle2 / 6, 0.5 - angle2 / 24, 1.0 / 6 - angle2 / 120
@@ -50,7 +53,7 @@ def exponential(rotation_vector: Float, rotation: Float, jacobian: Float) -> Non
 
 @cached
 def turned(rotation_vectors: Float) -> Float:
-    """exp(r) [N, 3, 3] of rotation vectors [N, 3]."""
+    """Compute exp(r) [N, 3, 3] of rotation vectors [N, 3] (rad)."""
     rotations, unused = np.empty((len(rotation_vectors), 3, 3)), np.empty((3, 3))
     for n in range(len(rotation_vectors)):
         exponential(rotation_vectors[n], rotations[n], unused)
@@ -59,7 +62,7 @@ def turned(rotation_vectors: Float) -> Float:
 
 @helper
 def weights_between(t0: float, t1: float, t2: float, t: float, weight: Float, slope: Float) -> None:
-    """Lagrange's quadratic through three times: weights of the values, and of the derivative, at t."""
+    """Compute Lagrange's quadratic through three times: weights of values, and of the derivative, at t."""
     weight[0] = (t - t1) * (t - t2) / ((t0 - t1) * (t0 - t2))
     weight[1] = (t - t0) * (t - t2) / ((t1 - t0) * (t1 - t2))
     weight[2] = (t - t0) * (t - t1) / ((t2 - t0) * (t2 - t1))
@@ -83,13 +86,13 @@ def linearise(
     by_joint: Float,
     by_number: Float,
 ) -> None:
-    """Whitened residuals of a picture, and their derivatives.
+    """Compute the whitened residuals of a picture and their derivatives.
 
     Args:
         joints: [J, 3] m, world, at the picture's time.
         velocity: [J, 3] m/s.
         number: [10] the picture's corrections, see the module.
-        xy: [J, 2] normalised image points, NaN where nothing was seen.
+        xy: [J, 2] normalised image points, NaN for joints not seen.
         sharpness: [J] 1 / standard deviation of an image point.
         position: [3] m, the logged pose at the uncorrected time.
         rotation: [3, 3] world_from_camera.
@@ -162,9 +165,9 @@ def linearise(
 
 @helper
 def confidence_of(squared: float, bound2: float) -> float:
-    """Weight of a view by its whitened squared residual: full within the bound, redescending beyond.
+    """Compute a view's weight from its whitened squared residual: 1 within the bound, redescending beyond.
 
-    The loss that it belongs to stays below bound2: what lies far out pulls at nothing.
+    The loss is bounded (below 2 bound2), so that far outliers have no influence.
     """
     if not squared > bound2:
         return 1.0
@@ -173,7 +176,7 @@ def confidence_of(squared: float, bound2: float) -> float:
 
 @helper
 def loss_of(squared: float, bound2: float) -> float:
-    """The loss whose weights `confidence_of` gives: r^2 within the bound, 2 b - b^2 / r^2 beyond."""
+    """Compute the loss with the weights of `confidence_of`: r^2 within the bound, 2 b - b^2 / r^2 beyond."""
     if not squared > bound2:
         return squared
     return 2 * bound2 - bound2 * bound2 / squared
@@ -191,7 +194,7 @@ def normal_equations(
     joint_gradient: Float,
     number_gradient: Float,
 ) -> None:
-    """Sums of squares of a picture: [J, 3, 3], [J, 3, 10], [10, 10] and gradients [J, 3], [10]."""
+    """Sum the normal equations of a picture: [J, 3, 3], [J, 3, 10], [10, 10], gradients [J, 3], [10]."""
     of_joints[:] = 0.0
     across[:] = 0.0
     of_numbers[:] = 0.0
@@ -221,7 +224,7 @@ def normal_equations(
 
 @helper
 def factorise(matrix: Float) -> None:
-    """Lower Cholesky factor of a small matrix, in its place."""
+    """Replace a small matrix by its lower Cholesky factor."""
     n = len(matrix)
     for j in range(n):
         for i in range(j, n):
@@ -236,7 +239,7 @@ def factorise(matrix: Float) -> None:
 
 @helper
 def forward(factor: Float, vector: Float) -> None:
-    """L^-1 v in the place of v."""
+    """Replace v by L^-1 v."""
     for i in range(len(vector)):
         for k in range(i):
             vector[i] -= factor[i, k] * vector[k]
@@ -245,7 +248,7 @@ def forward(factor: Float, vector: Float) -> None:
 
 @helper
 def backward(factor: Float, vector: Float) -> None:
-    """L^-T v in the place of v."""
+    """Replace v by L^-T v."""
     for i in range(len(vector) - 1, -1, -1):
         for k in range(i + 1, len(vector)):
             vector[i] -= factor[k, i] * vector[k]
@@ -256,7 +259,7 @@ def backward(factor: Float, vector: Float) -> None:
 def at_picture(
     first: int, t_s: Float, when: float, position: Float, weight: Float, slope: Float, out: Float, rate: Float
 ) -> None:
-    """Joints and their velocities [J, 3] at a picture's time, from three times of the skeleton on `first`."""
+    """Interpolate joints (m) and velocities (m/s) [J, 3] to a picture's time from three times at `first`."""
     weights_between(t_s[first], t_s[first + 1], t_s[first + 2], when, weight, slope)
     for joint in range(len(out)):
         for i in range(3):
@@ -281,7 +284,7 @@ def numbers_of(
     white: Float,
     out: Float,
 ) -> None:
-    """The ten numbers of a picture out of the unknowns they are made of."""
+    """Compute the ten numbers of a picture from the unknowns."""
     out[:] = 0.0
     for e in range(entry_start[camera], entry_start[camera + 1]):
         column = entry_column[e]
@@ -308,7 +311,7 @@ def entries_of(
     of_number: Int64,
     share: Float,
 ) -> int:
-    """Which of the front's unknowns a picture's numbers are made of, and by which share; how many."""
+    """List the front's unknowns in a picture's numbers with their shares, and return their count."""
     entries = 0
     for e in range(entry_start[camera], entry_start[camera + 1]):
         if entry_knot[e]:
@@ -364,9 +367,9 @@ def assemble(
 
     Returns half the logarithm of the determinant of the white errors' equations, which are eliminated.
 
-    The front's unknowns are the joints at three times, the knots on both sides of the interval, what all
-    share; only its lower triangle is kept. Of a picture's white error `white_precision` [., 6, 6] at its
-    `white_row` [G] is the inverse covariance, of inf where there is none.
+    The front's unknowns are the joints at three times, the knots on both sides of the interval, and the
+    shared unknowns; only its lower triangle is kept. `white_precision` [., 6, 6] at row `white_row` [G] is
+    the inverse covariance of a picture's white error, inf if it has none.
     """
     J = position.shape[1]
     n = 3 * J
@@ -378,7 +381,7 @@ def assemble(
     joint_gradient, number_gradient = np.empty((J, 3)), np.empty(NUMBERS)
     believed = np.empty(J)
     factor, by_white = np.empty((WHITE, WHITE)), np.empty((n + NUMBERS + 1, WHITE))
-    z = by_white[n + NUMBERS]  # the gradient stands below the derivatives
+    z = by_white[n + NUMBERS]  # the gradient is stored below the derivatives
     most = 2 * (entry_column.size + 1)
     column, of_number, share = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
     half = 0.0
@@ -505,7 +508,7 @@ def whiten(
     clock_column: Int64,
     step_white: Float,
 ) -> None:
-    """The step of every picture's white error [G, 6] that belongs to a step of everything else."""
+    """Compute the step of every picture's white error [G, 6] for a given step of all other unknowns."""
     J = position.shape[1]
     out, rate = np.empty((J, 3)), np.empty((J, 3))
     weight, slope, number, numbers_by = np.empty(3), np.empty(3), np.empty(NUMBERS), np.empty(NUMBERS)
@@ -584,7 +587,7 @@ def misfit(
     residuals: Float,
     numbers: Float,
 ) -> float:
-    """The loss of all pictures; whitened residuals [G, J, 2] (NaN unseen) and numbers [G, 10] beside."""
+    """Compute the loss of all pictures; fill whitened residuals [G, J, 2] (NaN unseen), numbers [G, 10]."""
     J = position.shape[1]
     out, rate = np.empty((J, 3)), np.empty((J, 3))
     weight, slope = np.empty(3), np.empty(3)
@@ -648,13 +651,13 @@ def posterior_of_picture(
     of_numbers: Float,
     of_white: Float,
 ) -> None:
-    """Residuals of a picture with their weights and derivatives, and the posterior of what they follow.
+    """Compute a picture's residuals, weights and derivatives, and the posterior of their unknowns.
 
-    Out come `residual` [J, 2], whitened, `believed` [J], the weight of each view, 0 where nothing was seen,
-    `by_joint` [J, 2, 3] and `by_number` [J, 2, 10] as in `linearise`; from the covariance of the front,
-    `whole` [N, N], those of the joints at the picture's time, `of_joints` [J, 3, 3], with the picture's
-    numbers, `across` [J, 3, 10], and of these, `of_numbers` [10, 10], their white part among them; of that
-    part alone the variances, `of_white` [6].
+    Outputs as in `linearise`: `residual` [J, 2], whitened; `by_joint` [J, 2, 3]; `by_number` [J, 2, 10].
+    `believed` [J] is the weight of each view, 0 if not seen. From the front's covariance `whole` [N, N] come
+    the covariances of the joints at the picture's time, `of_joints` [J, 3, 3], of joints with the picture's
+    numbers, `across` [J, 3, 10], and of the numbers, `of_numbers` [10, 10], white part included. `of_white`
+    [6] are the variances of the white part alone.
     """
     J = position.shape[1]
     n = 3 * J
@@ -682,7 +685,7 @@ def posterior_of_picture(
         c, fraction[g], n, knot_count, entry_start, entry_number, entry_knot, entry_column, column, of_number,
         share,
     )  # fmt: skip
-    # The white error follows the front, by `follows` [6, N], and has a posterior of its own beside.
+    # The white error depends on the front by `follows` [6, N], and has its own posterior in addition.
     follows = np.zeros((WHITE, len(whole)))
     has_white = np.isfinite(white_precision[white_row[g], 0, 0])
     if has_white:
@@ -755,12 +758,11 @@ def add_motion(
     front: Float,
     gradient: Float,
 ) -> None:
-    """Add how unlikely the acceleration between three times is, in units of the body's size.
+    """Add the prior of the acceleration between three times, in units of the body's size.
 
     The size is the mean of the bone lengths. Without it the estimate would shrink: smaller bodies
-    accelerate less, and pictures do not tell the scale. `precision` [J, J] times `scale` is for every axis
-    at the size that the lengths have now; `hold` is added to the diagonal of the first time, and pulls
-    at nothing.
+    accelerate less, and pictures do not determine the scale. `precision` [J, J] times `scale` is that of
+    each axis at the present size. `hold` is added to the diagonal of the first time; it has no gradient.
     """
     J, B = position.shape[1], len(lengths)
     n = 3 * J
@@ -809,7 +811,7 @@ def add_bones(
     front: Float,
     gradient: Float,
 ) -> None:
-    """Add how far the bones of one time are from their lengths, in units of the body's size."""
+    """Add the prior of the bones at one time around their lengths, in units of the body's size."""
     shrinking = 1.0 / lengths.sum() if len(lengths) else 0.0
     direction, by_length = np.empty(3), np.empty(len(lengths))
     for b in range(len(bones)):

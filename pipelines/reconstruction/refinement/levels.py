@@ -1,10 +1,11 @@
-"""The parameters of the prior from the data: levels that are as large as what they are the deviations of.
+"""Estimates of the prior's parameters from the data: levels (standard deviations) of errors and motion.
 
 A variance becomes the sum of the estimates' squares over the number of them that the data determine,
 sum of 1 - posterior / prior variance (MacKay, "Bayesian interpolation", 1992). Its fixed points are those
-of expectation maximisation (Dempster, Laird & Rubin 1977), which was measured to be too slow here: where
-pictures say little of a level, eight rounds left it near where it began. All levels are estimated together:
-fitting a constant error alone to a log that drifts was measured to be ten times worse than trusting the log.
+of expectation maximisation (Dempster, Laird & Rubin 1977), which was measured to be too slow here: if
+pictures carry little information on a level, eight rounds left it near its start. All levels are estimated
+together: fitting a constant error alone to a drifting log was measured to be ten times worse than trusting
+the log.
 """
 
 from __future__ import annotations
@@ -30,29 +31,29 @@ from pipelines.reconstruction.refinement.system import System
 Float = NDArray[np.float64]
 
 _GAP = 3.0  # usual steps: between stretches of a flight
-_EVERY = 3  # pictures of every third time are enough to judge image noise and white errors
-_BODY_ACCELERATION, _BODY_COUNT = 1.5, 3.0  # m/s^2 beyond what limbs tell; the simulated walk's is 1.1
+_EVERY = 3  # pictures of every third time are enough to estimate image noise and white errors
+_BODY_ACCELERATION, _BODY_COUNT = 1.5, 3.0  # m/s^2, weight of this prior; the simulated walk's is 1.1
 _LEAST_ACCELERATION = 0.1  # m/s^2, along any combination of joints
 _LEAST_BONE_M = 0.001
-_STRIDE = 1.5  # how far beyond its goal a step goes, on a logarithmic scale
-_LEAST_TOLD = 0.03  # share of a level that data determine, at least: what nobody sees stays as it was
+_STRIDE = 1.5  # overshoot of a step over its goal, on a logarithmic scale
+_LEAST_TOLD = 0.03  # least share of a level determined by data: levels without data stay unchanged
 _BOUNDS = (0.04, 6.0)  # of the change of a variance in one round
 _MOST_OF_CONSTANT = 1.6
-"""The same upwards, of constant errors: a handful of numbers, which the scale can run away with."""
+"""Upper bound for constant errors: they are only a few numbers, and can diverge with the scale."""
 _LEAST_WHITE = (1e-4, 1e-5)  # m, rad
 _LEAST_CONSTANT = (1e-3, 1e-4)
 _LEAST_RATE = (1e-4, 1e-5)
 
 
 def reestimated(system: System, state: State, at: Eliminated, *, poses: bool, motion: bool) -> Knowledge:
-    """The prior's parameters that the posterior at `state` asks for.
+    """Estimate the prior's parameters again from the posterior at `state`.
 
     Args:
         system: the problem with the parameters so far.
         state: the estimate with them.
-        at: the equations whose solution it is.
-        poses: whether the levels of pose errors are free, pooled over the cameras.
-        motion: whether those of motion, bones and keypoints are.
+        at: the equations that it solves.
+        poses: True to estimate the levels of pose errors, pooled over the cameras.
+        motion: True to estimate those of motion, bones and keypoints.
     """
     known = system.knowledge
     found = moments(system, state, at, every=_EVERY)
@@ -75,18 +76,18 @@ def reestimated(system: System, state: State, at: Eliminated, *, poses: bool, mo
 
 
 def shrunk(acceleration: Float, t_s: Float, position: Float) -> Float:
-    """A covariance of accelerations [J, J] with correlations as small as the length of the flight asks for.
+    """Shrink the correlations of a covariance of accelerations [J, J] according to the flight's length.
 
-    Limbs repeat what they do, so a short flight shows few accelerations that are independent, and some
-    combination of joints seems to stay at rest by chance; refined with that, covariances came out a third
+    Limbs repeat their motion, so a short flight has few independent accelerations, and some combination of
+    joints seems to stay at rest by chance. With that prior, posterior covariances were a third
     too small. Correlations are multiplied by 1 - sum var(r) / sum r^2 (Schafer & Strimmer, "A shrinkage
     approach to large-scale covariance matrix estimation", 2005), where var(r) is (1 - r^2)^2 / (N - 1) and N
     the number of accelerations over 1 + 2 sum rho^2 of their autocorrelation (Bartlett 1946).
 
     Args:
         acceleration: [J, J] (m/s^2)^2, as estimated.
-        t_s: [T] times, and
-        position: [T, J, 3] m, the estimate that it comes from.
+        t_s: [T] times (s).
+        position: [T, J, 3] m, the estimate from which it was computed.
     """
     joints = len(acceleration)
     if joints < 2:
@@ -107,26 +108,27 @@ def shrunk(acceleration: Float, t_s: Float, position: Float) -> Float:
 
 
 def limber(acceleration: Float, spread: float) -> Float:
-    """Accelerations with which joints are estimated: larger beside the body's, where views tell little.
+    """Enlarge accelerations relative to the body's for the estimate of joints, if views are imprecise.
 
-    The accelerations of limbs repeat in a gait, and are not the white ones of the prior. The less views tell,
-    the longer joints are averaged over time, and the more of their swings would be lost. Standard deviations
-    beside the body's grow with those of triangulated points. The body is what A tells best: the mean of all
-    joints with weights A^-1 1, whose variance stays 1 / (1' A^-1 1).
+    The accelerations of limbs repeat in a gait and are not white as in the prior. With imprecise views,
+    joints are averaged over longer times, and more of their swings would be lost. Standard deviations
+    relative to the body grow with those of triangulated points. The body is the best-determined mean under
+    A: that of all joints with weights A^-1 1, whose variance stays 1 / (1' A^-1 1).
 
     Args:
-        acceleration: [J, J] (m/s^2)^2, as found.
-        spread: of a triangulated point about the truth, by that of its rays; below 1 nothing changes.
+        acceleration: [J, J] (m/s^2)^2, A, as estimated.
+        spread: standard deviation of a triangulated point over that of its rays; no change below 1.
     """
     body = np.full_like(acceleration, 1 / np.linalg.inv(acceleration).sum())
     return body + max(spread, 1.0) ** 2 * (acceleration - body)
 
 
 def _acceleration(before: Float, found: Moments, bodies: Float) -> Float:
-    """The covariance of accelerations: in coordinates where the one before is the identity.
+    """Estimate the covariance of accelerations, in coordinates where the previous one is the identity.
 
-    Of a body as a whole (`bodies` [J, P], one for its joints) noisy poses tell so little that a flight of
-    2 s holds less than one acceleration's worth; what walking bodies do counts `_BODY_COUNT` more.
+    With noisy poses, a flight of 2 s determines less than one acceleration of a body as a whole (`bodies`
+    [J, P], 1 for its joints). The acceleration of walking bodies is added as a prior with the weight of
+    `_BODY_COUNT` accelerations.
     """
     values, vectors = np.linalg.eigh(before)
     root, inverse = (vectors * values**power @ vectors.T for power in (0.5, -0.5))
@@ -151,7 +153,7 @@ def _acceleration(before: Float, found: Moments, bodies: Float) -> Float:
 
 
 def _bodies(problem: Problem) -> Float:
-    """[J, P] one where a joint belongs to a body: what bones connect."""
+    """Mark the joints of each body, the joints that bones connect: [J, P], 1 for its joints."""
     joints = problem.joints
     ends = problem.bones
     graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(joints, joints))
@@ -160,14 +162,14 @@ def _bodies(problem: Problem) -> Float:
 
 
 def _change(squares: float, told: float, count: float) -> float:
-    """By what a variance changes: mean square of the estimates, and the share of them that data tell."""
+    """Compute the factor on a variance from the mean square of estimates and the share the data determine."""
     known = max(told / count, _LEAST_TOLD)
     goal = (squares / count + known - told / count) / known
     return float(np.clip(max(goal, 1e-9) ** _STRIDE, *_BOUNDS))
 
 
 def _poses(system: System, found: Moments) -> tuple[PoseErrors, ...]:
-    """The levels of pose errors, the same for all cameras."""
+    """Estimate the levels of pose errors, the same for all cameras."""
     known, layout = system.knowledge, system.layout
     knot_s = float(layout.knot_t_s[1] - layout.knot_t_s[0])
     before = known.poses[0].white_with_stray(knot_s)

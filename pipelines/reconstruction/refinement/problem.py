@@ -1,4 +1,4 @@
-"""What is to be refined: pictures, the skeleton's times, and what is known of the errors beforehand."""
+"""Input of the refinement: pictures, the skeleton's times, and the priors of errors."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 SHIFT_IN_WORLD, ROTATION, SHIFT_IN_CAMERA, CLOCK = 0, 3, 6, 9
-"""Where the parts of a picture's ten numbers begin (see `kernels`)."""
+"""First index of each part of a picture's ten numbers (see `kernels`)."""
 
 EXACT = 1e-5
-"""m and rad: a constant error of this size stands for none; the equations stay well posed."""
+"""Constant error (m and rad) that stands for none, so that the equations stay well posed."""
 
 NEW_SHARE = 0.5
-"""Of a logged variance, which says how large an error is and not how long it lasts: new in every pose."""
+"""White share of a logged variance; a log gives the size of errors, not their correlation over time."""
 
 
 @dataclass(frozen=True)
 class Pictures:
     """G pictures of C cameras, sorted by `first`, then camera.
 
-    Image points are normalised and undistorted, NaN where nothing was seen. `first` is the first of the
+    Image points are normalised and undistorted, NaN for joints not seen. `first` is the first of the
     three times of the skeleton between which a picture's joints are interpolated.
     """
 
@@ -37,7 +37,7 @@ class Pictures:
     when_s: Float  # [G] on the skeleton's clock
     xy: Float  # [G, J, 2]
     sharpness: Float  # [G, J] 1 / standard deviation of an image point
-    trust: Float  # [G, J] 0 for what must not be used
+    trust: Float  # [G, J] 0 for points that must not be used
     position: Float  # [G, 3] m, the logged pose
     rotation: Float  # [G, 3, 3] world_from_camera
     speed: Float  # [G, 3] m/s, world
@@ -46,7 +46,7 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Process:
-    """A pose error of one kind over time, its three axes alike: sigma0 at the start, then a random walk.
+    """Pose error of one kind over time, the same on three axes: sigma0 at the start, then a random walk.
 
     With a correlation time it is a Gauss-Markov process whose standard deviation is always sigma0.
     """
@@ -58,11 +58,11 @@ class Process:
 
     @property
     def constant(self) -> bool:
-        """Whether it never changes."""
+        """True if it never changes."""
         return self.rate == 0 and not np.isfinite(self.correlation_s)
 
     def stray(self, elapsed_s: float) -> float:
-        """Mean variance about the straight line between two values that lie so far apart in time.
+        """Compute the mean variance about the straight line between two values `elapsed_s` apart.
 
         That of a Brownian bridge, rate^2 s (T - s) / T, over its length; a Gauss-Markov process is
         a walk of rate sigma sqrt(2 / correlation time) over short times.
@@ -73,7 +73,7 @@ class Process:
         return min(rate2 * elapsed_s / 6, max(self.sigma0, self.rate) ** 2)
 
     def step(self, elapsed_s: float) -> tuple[float, float]:
-        """How much of it is left after some time, and the variance that comes in addition."""
+        """Compute the share that is left after some time, and the added variance."""
         if np.isfinite(self.correlation_s):
             kept = float(np.exp(-elapsed_s / self.correlation_s))
             return kept, self.sigma0**2 * (1 - kept**2)
@@ -82,15 +82,15 @@ class Process:
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """What is known of one camera's pose errors."""
+    """Prior of one camera's pose errors."""
 
     white: tuple[float, float]  # m, rad per axis; 0, 0 for none
     processes: tuple[Process, ...]
     logged: bool = False
-    """White errors have the covariance of each pose, where the log states it; `white` is its level."""
+    """True if white errors have the logged covariance of each pose; `white` is then its level."""
 
     def white_with_stray(self, knot_s: float) -> Float:
-        """Standard deviation [2] (m, rad) of what is white, with what slow errors do between knots."""
+        """Compute the standard deviation [2] (m, rad) of white errors, with slow errors between knots."""
         variance = np.square(self.white)
         for process in self.processes:
             variance[1 if process.number == ROTATION else 0] += process.stray(knot_s)
@@ -100,13 +100,12 @@ class PoseErrors:
 
 
 def pose_errors(models: Sequence[NoiseModel]) -> PoseErrors:
-    """The prior that stated noise models are.
+    """Convert stated noise models to a prior.
 
-    Latency is left to the clock: a log that lags and a clock that is off differ only where cameras
-    accelerate.
+    Latency is left to the clock: a delayed log and a clock offset differ only where cameras accelerate.
 
     Raises:
-        ValueError: a model that is none of flight.yaml's.
+        ValueError: a model is not one of flight.yaml's.
     """
     white = np.zeros(2)
     merged: dict[int, tuple[float, float]] = {}
@@ -155,9 +154,9 @@ def _shift(frame: str) -> int:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the unknowns stand, besides the joints: at knots in time, or shared by all times.
+    """Places of the unknowns other than joints: at knots in time, or shared by all times.
 
-    A process adds to three of its camera's ten numbers. An entry says which unknown adds to which number.
+    A process adds to three of its camera's ten numbers. An entry links an unknown to the number it adds to.
     Shared unknowns are constant errors, then clocks, then bone lengths.
     """
 
@@ -167,7 +166,7 @@ class Layout:
     entry_number: Int64
     entry_knot: NDArray[np.bool_]
     entry_column: Int64
-    clock_column: Int64  # [C], -1 for a clock that is known
+    clock_column: Int64  # [C], -1 for a known clock
     clock_sigma_s: Float  # [C]
     knot_count: int  # unknowns of one knot
     bone_column: int
@@ -176,7 +175,7 @@ class Layout:
 
 
 def lay_out(errors: Sequence[PoseErrors], clock_sigma_s: Float, bones: int, knot_t_s: Float) -> Layout:
-    """Give every unknown its place; `clock_sigma_s` 0 is a clock that is known."""
+    """Assign a place to every unknown; `clock_sigma_s` is 0 for a known clock."""
     processes, place = [], []
     start, number, knot, column = [0], [], [], []
     knot_count = shared_count = 0
@@ -219,38 +218,38 @@ def lay_out(errors: Sequence[PoseErrors], clock_sigma_s: Float, bones: int, knot
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What is known or taken of all errors and of motion: the parameters of the prior."""
+    """Parameters of the prior of all errors and of motion."""
 
     poses: tuple[PoseErrors, ...]  # of each camera
     clock_sigma_s: Float  # [C]
     acceleration: Float  # [J, J] (m/s^2)^2, covariance of the joints' accelerations along an axis
-    bone_sigma_m: Float  # [B] how far a bone's length varies
-    size_m: float  # mean bone length of the body for which these two hold; they go with it
-    pixel_scale: float  # what the stated standard deviations of image points are to be multiplied by
+    bone_sigma_m: Float  # [B] standard deviation of a bone's length over time
+    size_m: float  # mean bone length of the body for which these two hold; they scale with it
+    pixel_scale: float  # factor on the stated standard deviations of image points
     memory: float = 1.0
-    """So many neighbouring image points of a joint in a camera say as much as one independent point."""
+    """Number of neighbouring image points of a joint in a camera that count as one independent point."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Everything but the parameters of the prior."""
+    """Refinement problem without the parameters of the prior."""
 
     t_s: Float  # [T] the skeleton's times, at least three
     pictures: Pictures
     bones: Int64  # [B, 2]
     knot_t_s: Float  # [K]
     pose_covariance: Float = field(default_factory=lambda: np.empty((0, 6, 6)))
-    """[L, 6, 6] of logged white pose errors: shift in the world (m), rotation vector in the camera (rad)."""
+    """Covariances [L, 6, 6] of logged white pose errors: world shift (m), camera rotation vector (rad)."""
     threads: int = 1
-    """At most so many work on it; the results do not depend on them."""
+    """Largest number of threads; the results do not depend on it."""
 
     @property
     def joints(self) -> int:
-        """How many joints there are, all people together."""
+        """Number of joints of all people together."""
         return int(self.pictures.xy.shape[1])
 
     def intervals(self) -> tuple[Int64, Float]:
-        """Of each time of the skeleton [T - 2] and picture [G]: the knot before it, and how far beyond."""
+        """Find the knot before each skeleton time [T - 2], and each picture's fraction [G] of the span."""
         last = max(len(self.knot_t_s) - 2, 0)
         of_time = np.clip(np.searchsorted(self.knot_t_s, self.t_s[:-2], side="right") - 1, 0, last)
         if len(self.knot_t_s) < 2:
@@ -262,7 +261,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class State:
-    """The unknowns' values."""
+    """Values of the unknowns."""
 
     position: Float  # [T, J, 3] m
     knots: Float  # [K, knot_count]
@@ -270,7 +269,7 @@ class State:
     white: Float  # [G, 6]
 
     def moved(self, step: State, share: float) -> State:
-        """The state a share of a step further."""
+        """Return the state moved by a share of a step."""
         return replace(
             self,
             position=self.position + share * step.position,

@@ -1,4 +1,4 @@
-"""Refinement of a whole flight: build, find the prior, estimate, and check before it is believed."""
+"""Refinement of a whole flight: build the problem, find the prior, estimate, and check the result."""
 
 from __future__ import annotations
 
@@ -43,33 +43,36 @@ Int64 = NDArray[np.int64]
 _WINDOWS, _WINDOW = 3, 100  # stretches of the flight, in times, from which the prior is found
 _LEARNING_ROUNDS, _FEWER_ROUNDS = 8, 3
 _ROUNDS = 8
-_ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2 where the search begins: a walking body, its limbs
+_ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2, initial values: a walking body, its limbs
 _BONE_SIGMA_M = 0.02
 _FEWEST_TIMES = 20
-_ABRUPT = 3.0  # times the accelerations of the body, where clocks and slow pose errors are told
+_ABRUPT = 3.0  # times the accelerations of the prior, for the estimate of clocks and slow pose errors
 SETTLED_S = 2e-3
 """Offset of a clock that may stay in the pictures' stamps."""
 _UNEXPLAINED = 1.15  # times the image noise that the pictures show between neighbours: the prior is wrong
 _LEFT_BY_GIVEN = 2**0.5
-"""Times the image noise that estimated levels leave: twice the variance. Right levels leave less."""
+"""Factor on the image noise under estimated levels: twice the variance. Right levels leave less."""
 _SIGMAS = 4.0
-_SETTLING = 4  # rounds to see how well given levels explain the pictures
-_STATED = 10.0  # by how much its evidence, a logarithm, is raised
-_STATED_DRIFT = 0.5  # and for every picture, where errors change: between knots they are taken for white
+_SETTLING = 4  # rounds to test how well given levels explain the pictures
+_STATED = 10.0  # bonus on the log evidence of stated levels
+_STATED_DRIFT = 0.5  # bonus per picture if errors change over time: between knots they count as white
 _HARDLY_COUNTS = 30.0
-"""Image points that say as little as one: of slow pose errors they say too little to estimate levels."""
-_SMALL_SCALE = 0.01  # standard deviation of the constellation's scale that is no matter
-_UNSEEN_SCALE = 0.85  # share of it that is left once the pictures were seen, from which they did not tell it
-_SLOW_SHARE = 0.2  # of the disagreement of views: slow errors where the search begins, at least
+"""Memory of image points from which levels of slow pose errors cannot be estimated."""
+_SMALL_SCALE = 0.01  # standard deviation of the formation's scale that does not matter
+_UNSEEN_SCALE = 0.85  # posterior over prior sigma of the scale above which pictures do not determine it
+_SLOW_SHARE = 0.2  # of the disagreement of views: least initial level of slow errors
 _MEDIAN_OF_TWO = 2 * np.log(2)  # of the chi-square distribution with two degrees of freedom
 _FARTHEST = 1.8
-"""Times what the disagreement of the views lets expect; good estimates moved by up to 1.6 of it."""
+"""Factor on the move expected from the disagreement of the views; good estimates moved by up to 1.6."""
 _FARTHEST_STATED = 3.2
-"""The same of stated levels, of which a constant error is one draw: sqrt(30.7 / 3), which the root of a
-chi-square variable with three degrees of freedom over three passes once in a million times."""
+"""The same factor for stated levels, where a constant error is one draw.
+
+sqrt(30.7 / 3): the root of a chi-square variable with three degrees of freedom over three exceeds it once in
+a million times.
+"""
 _TOLD_PLACE = 0.7
-"""Of what slow pose errors do to a triangulated point: a place that is known no better was not seen."""
-_REFUSED = 0.5  # for every picture: by how much stated levels may be less likely than those that are refused
+"""Share of a triangulated point's error by slow pose errors; above it, pictures do not determine a place."""
+_REFUSED = 0.5  # per picture: log evidence that stated levels may lie below the refused ones
 _UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; "
 _INSTEAD = {"estimated": "it was estimated instead", "exact": "the poses were taken as they are"}
 _PLACED_AS_LOGGED = (
@@ -84,17 +87,17 @@ _RESTS_ON_STATED = (
 
 @dataclass(frozen=True)
 class Refined:
-    """The estimate, or why there is none."""
+    """Result of the refinement, or the reason why there is none."""
 
-    position: Float  # [T, J, 3] m; NaN for joints that took no part
+    position: Float  # [T, J, 3] m; NaN for joints that were not refined
     covariance: Float  # [T, J, 3, 3] m^2
     corrections: tuple[tuple[Float, Float], ...]  # of each camera: times [F] and the ten numbers [F, 10]
-    clock_offset_s: Float  # [C] to be added to the pictures' times
-    clock_sigma_s: Float  # [C] how well that is known, 0 for clocks that were
+    clock_offset_s: Float  # [C] to add to the pictures' times
+    clock_sigma_s: Float  # [C] its posterior standard deviation, 0 for known clocks
     levels: dict[str, float]
-    bone_lengths_m: Float  # [B'] of the bones whose joints both took part
-    acceleration: Float  # [P, P] (m/s^2)^2, covariance of the P joints' accelerations that was estimated
-    learned: bool  # the levels of the pose errors were found from the pictures
+    bone_lengths_m: Float  # [B'] of the bones with two refined joints
+    acceleration: Float  # [P, P] (m/s^2)^2, estimated covariance of the P refined joints' accelerations
+    learned: bool  # the levels of the pose errors were estimated from the pictures
     warnings: tuple[str, ...]
     fallback: str | None  # why the result must not be used
 
@@ -109,16 +112,16 @@ def refine(
     *,
     threads: int = 1,
 ) -> Refined:
-    """One maximum a posteriori estimate of a skeleton, its cameras' pose errors and clocks.
+    """Estimate a skeleton, its cameras' pose errors and clocks together (maximum a posteriori).
 
     Args:
         t_s: [T] the skeleton's times, strictly increasing.
-        sightings: what each of C cameras saw, J joints.
+        sightings: keypoints and poses of each of C cameras, J joints.
         start: [T, J, 3] m, from a triangulation that trusts the poses; NaN where it found nothing.
-        bones: [B, 2] pairs of joints whose distance hardly changes; without any, the first two joints.
-        prior: what is known of each camera's pose errors; None when nobody stated anything.
-        clock_sigma_s: [C] how far each camera's clock may be off, 0 for one that is known.
-        threads: at most two work, on both halves of the flight; the result does not depend on it.
+        bones: [B, 2] pairs of joints with a nearly constant distance; without any, the first two joints.
+        prior: prior of each camera's pose errors; None without stated noise.
+        clock_sigma_s: [C] prior standard deviation of each clock offset, 0 for a known clock.
+        threads: at most two are used, one for each half of the flight; the result does not depend on it.
     """
     part = _participating(start)
     if part.sum() < 3 or len(t_s) < _FEWEST_TIMES:
@@ -141,16 +144,16 @@ def refine(
 
 @dataclass(frozen=True)
 class _Prior:
-    """Parameters of the prior that may explain the pictures."""
+    """Candidate parameters of the prior."""
 
     known: Knowledge
-    learned: bool  # pose errors are among what was estimated
+    learned: bool  # the levels of pose errors were not stated
     warnings: tuple[str, ...]
-    expected_m: float  # by how far the skeleton may move
+    expected_m: float  # largest allowed move of the skeleton
 
 
 def _refined(problem: Problem, start: Float, part: NDArray[np.bool_], begun: Float, prior: _Prior) -> Refined:
-    """The estimate under a prior, and whether it may be believed.
+    """Estimate under a prior, and check the result; `fallback` gives the reason if a check fails.
 
     Raises:
         LinAlgError: its equations are singular.
@@ -166,8 +169,8 @@ def _refined(problem: Problem, start: Float, part: NDArray[np.bool_], begun: Flo
     doubts = _doubts(system, state, at, learned=prior.learned)
     as_stated = not prior.learned and _scale_unseen(system, state, at)
     as_logged = prior.learned and _unplaced(system, state, at, covariance)
-    del at  # what follows has factors of its own
-    slowly = system, state  # what tells the poses
+    del at  # the next solutions have their own factors
+    slowly = system, state  # determines the poses
     if known.memory > REMEMBERED:
         quick = _quickly(*slowly, freely)
     elif _all_lasts(problem, known, state):
@@ -201,7 +204,7 @@ def _refined(problem: Problem, start: Float, part: NDArray[np.bool_], begun: Flo
 
 
 def _clocks(problem: Problem, known: Knowledge, state: State) -> tuple[Float, Float]:
-    """Offset of each clock and its standard deviation [C], 0 where it was known."""
+    """Estimate each clock's offset and its standard deviation [C] s, 0 for known clocks."""
     if not (known.clock_sigma_s > 0).any():
         return np.zeros(len(known.poses)), np.zeros(len(known.poses))
     system, state, at = _abruptly(problem, known, state)
@@ -210,9 +213,9 @@ def _clocks(problem: Problem, known: Knowledge, state: State) -> tuple[Float, Fl
 
 
 def _all_lasts(problem: Problem, known: Knowledge, state: State) -> bool:
-    """Whether pose errors last: new ones move a joint in the pictures by less than its keypoints err.
+    """Test if pose errors are mainly slow: white ones move a joint in the pictures less than keypoint noise.
 
-    Larger ones are told from motion by how smooth it is, and that must not be given up for the others.
+    Larger white errors are separated from motion only by the tight motion prior, which must then be kept.
     """
     pictures = problem.pictures
     _, distance = _residuals(problem, state.position)
@@ -223,33 +226,33 @@ def _all_lasts(problem: Problem, known: Knowledge, state: State) -> bool:
 
 
 def _spread_of(cameras: int) -> float:
-    """How far off a point is in space whose rays, from all around, each miss it by 1 on two axes."""
+    """Compute the error of a point whose rays, from all directions, each miss it by 1 on two axes."""
     return float(np.sqrt(4.5 / cameras))
 
 
 def _abruptly(problem: Problem, known: Knowledge, state: State) -> tuple[System, State, Eliminated]:
-    """What lasts, told with motion that is taken for three times as abrupt.
+    """Estimate clock offsets and slow pose errors with a looser motion prior (accelerations 3 times larger).
 
-    Nobody moves as by chance: the accelerations of a gait repeat. Held to be as smooth as it is, limbs come
-    out with smaller swings, which bones of constant length turn into offsets of clocks, of five standard
-    deviations in flights of 4 s, and which constant pose errors make room for. Were motion free, any picture
-    between two times of the skeleton would fit, and some clocks would stay there.
+    The accelerations of a gait repeat and are not random. The tight prior makes the swings of limbs smaller.
+    With bones of constant length, this biases clock offsets (by five standard deviations in flights of 4 s)
+    and constant pose errors. With no motion prior at all, a picture would fit anywhere between two times of
+    the skeleton, and some clocks would not be estimated.
     """
     abrupt = replace(known, acceleration=_ABRUPT**2 * known.acceleration)
     return solve(problem, abrupt, state, rounds=_ROUNDS)
 
 
 def _quickly(system: System, state: State, known: Knowledge) -> Float:
-    """The joints [T, J, 3] once slow pose errors are taken away, every keypoint counting in full.
+    """Estimate the joints [T, J, 3] after removing slow pose errors, with the full weight of keypoints.
 
-    Slow errors were found with keypoints that err for long made to count less, or with motion that is more
-    abrupt. That is right for them and wrong for limbs, which would be smoothed away, or tremble.
+    Slow errors were estimated with correlated keypoints weighted less, or with a looser motion prior. That is
+    right for slow errors and wrong for limbs: their motion would be smoothed away, or become jittery.
     """
     pictures = system.problem.pictures
     slow = replace(state, white=np.zeros_like(state.white))
     _, _, numbers = misfit(system, slow)
     position, rotation = corrected(pictures.position, pictures.rotation, numbers)
-    # Clocks and what goes with them stay unknowns.
+    # Clocks and the motion that depends on them stay unknowns.
     problem = replace(system.problem, pictures=replace(pictures, position=position, rotation=rotation))
     knot_s = float(problem.knot_t_s[1] - problem.knot_t_s[0])
     poses = []
@@ -263,12 +266,12 @@ def _quickly(system: System, state: State, known: Knowledge) -> Float:
 
 
 def corrected(position: Float, rotation: Float, numbers: Float) -> tuple[Float, Float]:
-    """What poses are once their errors are taken away: position [N, 3] and world_from_camera [N, 3, 3].
+    """Remove errors from poses: position [N, 3] m and world_from_camera [N, 3, 3].
 
     Args:
         position: [N, 3] m, as logged.
         rotation: [N, 3, 3] as logged.
-        numbers: [N, 10] the corrections at the same times; the clock's is left to the caller.
+        numbers: [N, 10] the corrections at the same times; the caller applies the clock's.
     """
     turns = np.ascontiguousarray(numbers[:, ROTATION : ROTATION + 3])
     true_rotation = np.einsum("nij,nkj->nik", rotation, turned(turns))
@@ -276,11 +279,11 @@ def corrected(position: Float, rotation: Float, numbers: Float) -> tuple[Float, 
     return position - shift, true_rotation
 
 
-# --- what takes part -----------------------------------------------------------------------------------
+# --- joints and bones ----------------------------------------------------------------------------------
 
 
 def _participating(start: Float) -> NDArray[np.bool_]:
-    """Joints [J] that were triangulated often enough to be followed."""
+    """Choose the joints [J] that were triangulated often enough to be refined."""
     part: NDArray[np.bool_] = (~np.isnan(start[..., 0])).sum(axis=0) >= _FEWEST_TIMES
     return part
 
@@ -294,13 +297,13 @@ def _renumbered(bones: Int64, part: NDArray[np.bool_]) -> Int64:
     there = part[bones].all(axis=1)
     renumbered: Int64 = number[bones[there]].astype(np.int64).reshape(-1, 2)
     if not len(renumbered):
-        # The size of the body has to be measured by something: whatever two joints there are.
+        # The size of the body needs a measure: any two joints will do.
         renumbered = np.array([[0, 1]], dtype=np.int64)
     return renumbered
 
 
 def _without_gaps(t_s: Float, start: Float) -> Float:
-    """Where the search begins: as triangulated, linear in between."""
+    """Fill the start: as triangulated, linear in between."""
     filled = start.copy()
     for joint in range(start.shape[1]):
         there = ~np.isnan(start[:, joint, 0])
@@ -319,11 +322,11 @@ def _priors(
     prior: Sequence[PoseErrors] | None,
     clock_sigma_s: Float,
 ) -> Iterator[_Prior]:
-    """The parameters of the prior from stretches of the flight, and what else to try if they are doubted.
+    """Yield parameters of the prior from stretches of the flight, then alternatives if a check refuses them.
 
-    Pose errors of estimated levels, none at all, and what was stated compete by their evidence. Estimated
-    levels that the checks refuse give way to what was stated, if that was hardly less likely: learning can
-    run away with the scale, which pictures tell least of all.
+    Estimated levels of pose errors, exact poses, and stated levels compete by their evidence. If the checks
+    refuse estimated levels, the stated ones are tried, provided that their evidence is only a little lower:
+    learning can diverge in the scale, which pictures determine worst.
 
     Raises:
         LinAlgError: none of them explains the pictures.
@@ -336,8 +339,8 @@ def _priors(
     begun = _unlearned(problem, start[chosen], (guess,) * len(sightings), clock_sigma_s)
     state = initial_state(problem, begun, start[chosen])
     free, state = learn(problem, begun, state, poses=True, rounds=_LEARNING_ROUNDS)
-    # The others under the same motion, bones and image noise: what learning those is worth changes from round
-    # to round by more than levels that are right differ in.
+    # The alternatives use the same motion, bones and image noise: from round to round, learning these changes
+    # the evidence by more than the differences between right levels.
     found = {}
     if free.memory < _HARDLY_COUNTS:
         found["estimated"] = (evidence(problem, free, state), free, state)
@@ -356,7 +359,7 @@ def _priors(
             continue
     if not found:
         raise np.linalg.LinAlgError("the equations are singular whatever the pose noise")
-    # What somebody knows is given up for a reason alone.
+    # Stated levels are replaced only for a clear difference of evidence.
     reason = {"stated": _reason(problem, prior, lasting=free.memory > REMEMBERED)}
     best = max(found, key=lambda name: found[name][0] + reason.get(name, 0.0))
     tried = [best]
@@ -382,16 +385,16 @@ def _priors(
 
 
 def _reason(problem: Problem, stated: Sequence[PoseErrors] | None, *, lasting: bool) -> float:
-    """By how much the evidence of other levels must exceed that of the stated ones.
+    """Compute the margin by which the evidence of other levels must exceed that of the stated ones.
 
-    Where keypoint errors last, evidence is of what hardly counts any more.
+    With correlated keypoint errors the margin is larger, because keypoints then count little in the evidence.
     """
     changes = any(not process.constant for errors in stated or () for process in errors.processes)
     return _STATED + (_STATED_DRIFT * len(problem.pictures.first) if changes or lasting else 0.0)
 
 
 def _stretches(times: int) -> Int64:
-    """Times from which the prior is learned: all of a short flight, else stretches spread over it."""
+    """Choose the times from which the prior is learned: all of a short flight, else stretches over it."""
     if times <= _WINDOWS * _WINDOW:
         return np.arange(times)
     begins = np.linspace(0, times - _WINDOW, _WINDOWS).astype(np.int64)
@@ -410,10 +413,10 @@ def _unlearned(
 
 
 def _first_guess(problem: Problem, start: Float) -> tuple[PoseErrors, float, float, float]:
-    """Levels of pose errors at which to begin, image noise between neighbours, disagreement and range in m.
+    """Guess initial levels of pose errors, image noise between neighbours, disagreement (m) and range (m).
 
-    The median residual of a picture's joints is common to them: the camera's. How it changes from one
-    picture to the next is white, the rest is slow. What joints do beyond it is the detector's.
+    The median residual of a picture's joints is attributed to the camera. Its change from one picture to the
+    next is white, the rest is slow. The joints' residuals relative to it are the detector's errors.
     """
     pictures = problem.pictures
     residual, distance = _residuals(problem, start)
@@ -428,7 +431,7 @@ def _first_guess(problem: Problem, start: Float) -> tuple[PoseErrors, float, flo
         white.append(_spread(np.diff(common[mine], axis=0)) / np.sqrt(2))
         total.append(float(np.sqrt(np.nanmedian(np.sum(common[mine] ** 2, axis=1)) / _MEDIAN_OF_TWO)))
         image.append(_spread(np.diff(own[mine], axis=0)) / np.sqrt(2))
-    # Of 2 n residuals of a joint three are lost to its position: of their sum, not of each camera's alike.
+    # A joint's position absorbs three of its 2 n residuals: of their sum, not equally in each camera.
     lost = np.sqrt(2 * cameras / (2 * cameras - 3))
     quick, all_of_it = lost * float(np.median(white)), lost * float(np.median(total))
     slow = 1.5 * float(np.sqrt(max(all_of_it**2 - quick**2, (_SLOW_SHARE * all_of_it) ** 2)))
@@ -444,7 +447,7 @@ def _first_guess(problem: Problem, start: Float) -> tuple[PoseErrors, float, flo
     )
     noise = lost * float(np.sqrt(np.mean(np.square(image))))
     if cameras == 2:
-        # Two views disagree across one line only: what they show is less than the stated noise of an image.
+        # Two views disagree across one line only, so their residuals show less than the stated image noise.
         noise = max(noise, 1.0)
     blur = noise / float(np.median(pictures.sharpness[pictures.sharpness > 0]))
     disagreement = float(np.hypot(lost * float(np.median(total)), blur))
@@ -452,7 +455,7 @@ def _first_guess(problem: Problem, start: Float) -> tuple[PoseErrors, float, flo
 
 
 def _ray_sigma_m(errors: PoseErrors, range_m: float) -> float:
-    """How far a viewing ray misses the actor by the stated errors, per axis."""
+    """Compute the miss (m per axis) of a viewing ray at the actor by the stated errors."""
     shift, turn = errors.white[0] ** 2, errors.white[1] ** 2
     for process in errors.processes:
         if process.number == ROTATION:
@@ -463,12 +466,12 @@ def _ray_sigma_m(errors: PoseErrors, range_m: float) -> float:
 
 
 def _spread(values: Float) -> float:
-    """Standard deviation, by the median."""
+    """Compute a robust standard deviation from the median."""
     return float(1.4826 * np.nanmedian(np.abs(values)))
 
 
 def _residuals(problem: Problem, position: Float) -> tuple[Float, Float]:
-    """Normalised residuals [G, J, 2] of the logged poses, and how far the joints are [G, J]."""
+    """Compute normalised residuals [G, J, 2] with the logged poses, and the depths of joints [G, J] (m)."""
     pictures = problem.pictures
     when = pictures.when_s
     nearest = pictures.first + np.argmin(
@@ -480,16 +483,16 @@ def _residuals(problem: Problem, position: Float) -> tuple[Float, Float]:
     return seen[..., :2] / depth[..., None] - pictures.xy, depth
 
 
-# --- what came out -------------------------------------------------------------------------------------
+# --- checks and results --------------------------------------------------------------------------------
 
 
 def _doubts(system: System, state: State, at: Eliminated, *, learned: bool) -> str | None:
-    """Why the estimate must not be believed."""
+    """Check the estimate; return the reason to refuse it, None if it passes."""
     if not np.isfinite(state.position).all():
         return "the estimate did not converge"
     pictures = system.problem.pictures
     _, _, numbers = misfit(system, state)
-    # The scale of the constellation: the one thing that pictures alone do not tell.
+    # The scale of the formation: pictures alone do not determine it.
     moved, _ = corrected(pictures.position, pictures.rotation, numbers)
     apart, apart_after = _apart(pictures, pictures.position), _apart(pictures, moved)
     grown = float(np.sum(apart * apart_after) / np.sum(apart**2)) - 1
@@ -513,11 +516,11 @@ def _doubts(system: System, state: State, at: Eliminated, *, learned: bool) -> s
 
 
 def _unplaced(system: System, state: State, at: Eliminated, covariance: Float) -> bool:
-    """Whether where the person is follows from estimated levels of slow errors rather than from pictures.
+    """Test if the person's absolute position is not determined by the pictures.
 
-    Constant errors are a handful of numbers, from which levels are had badly; where the estimate of a place
-    is hardly narrower than slow errors of these levels let it be, or the scale was not seen, it is a draw
-    from them, and no nearer to the truth than the log's.
+    Constant errors are only a few numbers, and their estimated levels are uncertain. If the posterior of the
+    position is almost as wide as these levels allow, or the scale is not determined, the estimated position
+    is a random draw from the levels, and no nearer to the truth than the logged one.
     """
     _, distance = _residuals(system.problem, state.position)
     range_m = float(np.nanmedian(distance))
@@ -532,32 +535,32 @@ def _unplaced(system: System, state: State, at: Eliminated, covariance: Float) -
 
 
 def _scale_unseen(system: System, state: State, at: Eliminated) -> bool:
-    """Whether the constellation's scale is hardly better known once the pictures were seen."""
+    """Test if the scale of the formation matters and its posterior is almost as wide as its prior."""
     return _scale_sigma(system) > _SMALL_SCALE and _scale_left(system, state, at) > _UNSEEN_SCALE
 
 
 def _scale_left(system: System, state: State, at: Eliminated) -> float:
-    """Share of the scale's standard deviation that is left once the pictures were seen."""
+    """Compute the ratio of posterior to prior standard deviation of the formation's scale."""
     lengths = state.shared[system.layout.bone_column :]
     told = shared_covariance(system, at)[system.layout.bone_column :, system.layout.bone_column :]
     return float(np.sqrt(told.sum())) / float(lengths.sum()) / _scale_sigma(system)
 
 
 def _scale_sigma(system: System) -> float:
-    """Standard deviation of the constellation's scale before the pictures were seen."""
+    """Compute the prior standard deviation of the formation's scale."""
     pictures = system.problem.pictures
     return _slow_sigma(system) / float(np.sqrt(np.sum(_apart(pictures, pictures.position) ** 2)))
 
 
 def _apart(pictures: Pictures, position: Float) -> Float:
-    """Where the cameras [C, 3] are on average, from their common middle, given positions [G, 3]."""
+    """Compute the cameras' mean positions [C, 3] relative to their centre, from positions [G, 3]."""
     centre = np.stack([position[pictures.camera == c].mean(axis=0) for c in np.unique(pictures.camera)])
     away: Float = centre - centre.mean(axis=0)
     return away
 
 
 def _too_far(position: Float, begun: Float, expected_m: float) -> str | None:
-    """Whether the skeleton was moved further than its views disagree."""
+    """Check the move of the skeleton; return the reason to refuse it if the views do not explain it."""
     moved_m = float(np.median(np.linalg.norm(position - begun, axis=-1)))
     if moved_m > expected_m:
         return f"the skeleton would move by {moved_m:.2f} m where the views let expect {expected_m:.2f} m"
@@ -565,7 +568,7 @@ def _too_far(position: Float, begun: Float, expected_m: float) -> str | None:
 
 
 def _slow_sigma(system: System) -> float:
-    """Standard deviation in m of the mean shift of a camera."""
+    """Compute the standard deviation (m) of the mean shift of a camera."""
     elapsed_s = float(system.problem.t_s[-1] - system.problem.t_s[0])
     variance = 1e-6
     for errors in system.knowledge.poses:
@@ -577,7 +580,7 @@ def _slow_sigma(system: System) -> float:
 
 
 def _corrections(system: System, state: State, shift: Float) -> tuple[tuple[Float, Float], ...]:
-    """Of each camera, with everything moved by `shift` [3] m."""
+    """Collect each camera's times [F] and corrections [F, 10], with everything moved by `shift` [3] m."""
     pictures = system.problem.pictures
     _, _, numbers = misfit(system, state)
     numbers[:, SHIFT_IN_WORLD : SHIFT_IN_WORLD + 3] -= shift
@@ -595,7 +598,7 @@ def _of_clocks(system: System, shared: Float) -> Float:
 
 
 def _levels(known: Knowledge) -> dict[str, float]:
-    """Median over the cameras of every level, in the units of the noise models."""
+    """Summarise every level by its median over the cameras, in the units of the noise models."""
     names = {SHIFT_IN_WORLD: "position_world", SHIFT_IN_CAMERA: "position_body", ROTATION: "rotation"}
     found: dict[str, list[float]] = {}
     for errors in known.poses:

@@ -1,8 +1,8 @@
-"""The elimination of a stretch of time, forwards and backwards, compiled.
+"""Elimination of a stretch of time, forwards and backwards, compiled.
 
-A front [N, N] holds the normal equations of what is alive, lower triangle: joints at three times (3 n), knots
-before and after (2 c), what all times share. Eliminated unknowns x follow the rest z of the front as
-x = R' (y - W' z), with R the inverse of the Cholesky factor of their own block and W = B R'.
+A front [N, N] holds the normal equations of the live unknowns, lower triangle: joints at three times (3 n),
+knots before and after (2 c), unknowns shared by all times. Eliminated unknowns x depend on the rest z of the
+front as x = R' (y - W' z), with R the inverse of the Cholesky factor of their own block and W = B R'.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from pipelines.reconstruction.refinement.kernels import (
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
-_STRIP = 48  # rows; with fewer, products are too small to be quick
+_STRIP = 48  # rows; with fewer, products are too small to be fast
 
 
 @helper
 def copy_block(source: Float, row: int, column: int, out: Float) -> None:
-    """Part of a matrix; assigned to a slice it would take seconds longer to compile."""
+    """Copy part of a matrix; an assignment to a slice would take seconds longer to compile."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             out[i, j] = source[row + i, column + j]
@@ -36,7 +36,7 @@ def copy_block(source: Float, row: int, column: int, out: Float) -> None:
 
 @helper
 def lower_square(rows: Float) -> Float:
-    """Lower triangle of W W', in strips; what stands above it means nothing."""
+    """Compute the lower triangle of W W', in strips; values above it are undefined."""
     size = len(rows)
     square = np.empty((size, size))
     for begin in range(0, size, _STRIP):
@@ -52,7 +52,7 @@ def lower_square(rows: Float) -> Float:
 def eliminate(
     own: Float, beside: Float, gradient: Float, inverse: Float, across: Float, y: Float
 ) -> tuple[Float, float]:
-    """R = L^-1, W = B R', y = -R g in place; W W' (lower) and half the log of the determinant of `own`."""
+    """Compute R = L^-1, W = B R', y = -R g in place; return W W' (lower) and half log det of `own`."""
     n = len(own)
     lower = np.linalg.cholesky(own)
     half = 0.0
@@ -129,12 +129,12 @@ def forwards(
     knot_across: Float,
     knot_solved: Float,
 ) -> tuple[int, float]:
-    """Eliminate joints and knots of the times from `first` to before `last`; the front changes in place.
+    """Eliminate joints and knots of the times from `first` to before `last`; change the front in place.
 
-    Of the last three times, bones of the first `own_times` count here. Factors go to row `time - first` of
-    `inverse` [., n, n], `across` [., m, n] and `solved` [., n], and those of knots to row `k - interval` of
-    the others. Returns the interval in which the front ends, that of the time `last`, and half the logarithm
-    of the determinant of all that was eliminated, white errors too.
+    Of the last three times, only bones of the first `own_times` count here. Factors go to row `time - first`
+    of `inverse` [., n, n], `across` [., m, n] and `solved` [., n]. Factors of knots go to row `k - interval`
+    of the knot arrays. Returns the interval of the time `last`, in which the front ends, and half the log
+    determinant of all eliminated unknowns, white errors included.
     """
     J = position.shape[1]
     n, c = 3 * J, knot_count
@@ -178,7 +178,7 @@ def forwards(
         w = across[row]
         less, part = eliminate(own, beside, gradient[:n], inverse[row], w, solved[row])
         half += part
-        # The joints at the next two times move up; those of a third come in, of which nothing is known yet.
+        # The joints at the next two times move up; those of a third enter without any information.
         for i in range(2 * n):
             down = 0.0
             for a in range(n):
@@ -216,7 +216,7 @@ def eliminate_knot(
     across: Float,
     solved: Float,
 ) -> float:
-    """Eliminate the knot before; the knot after takes its place, of the next nothing is known yet."""
+    """Eliminate the knot before; the knot after takes its place, and the next enters without information."""
     size = len(gradient)
     before, after = 3 * n, 3 * n + c
     copy_block(front, before, before, own)
@@ -272,7 +272,7 @@ def tie_knots(
     by_after: Float,
     variance: Float,
 ) -> None:
-    """The random walk between the knot before and the knot after."""
+    """Add the random walk between the knot before and the knot after."""
     before, after = 3 * n, 3 * n + c
     for i in range(c):
         b, a, q = by_before[interval, i], by_after[interval, i], variance[interval, i]
@@ -316,7 +316,7 @@ def backwards(
     knots: Float,
     shared: Float,
 ) -> int:
-    """Solve for joints [T, n] and knots [K, c] of a stretch from its end, in place; the interval reached."""
+    """Solve for joints [T, n] and knots [K, c] of a stretch from its end, in place; return the interval."""
     n, c = position.shape[1], knots.shape[1]
     s = len(shared)
     z, zk = np.empty(2 * n + 2 * c + s), np.empty(2 * n + c + s)
@@ -325,7 +325,7 @@ def backwards(
         zk[2 * n + c + i] = shared[i]
     rest_n, rest_c = np.empty(n), np.empty(c)
     for time in range(last - 1, first - 2, -1):
-        # Which knots were alive when this time was eliminated; last, those before the stretch.
+        # Solve knots eliminated after this time first; at the end, those before the stretch.
         while c and interval > (of_time[time] if time >= first else first_interval):
             interval -= 1
             follow_knot(
@@ -368,7 +368,7 @@ def follow_knot(
     position: Float,
     knots: Float,
 ) -> None:
-    """A knot, once the two times after it was eliminated, `time` + 1 and + 2, and the next knot are known."""
+    """Solve for a knot from the next knot and the joints at `time` + 1 and `time` + 2."""
     for i in range(n):
         z[i] = position[time + 1, i]
         z[n + i] = position[time + 2, i]
@@ -390,11 +390,11 @@ def follow_knot(
 
 @helper
 def join(inverse: Float, across: Float, others: Float) -> tuple[Float, Float]:
-    """Covariance of what was eliminated, and with the others, given that of the others."""
-    gain = np.dot(across, inverse)  # [m, n]; x follows the others by its negative, transposed
+    """Compute the covariance of eliminated unknowns, and (negated) with the others, from the others'."""
+    gain = np.dot(across, inverse)  # [m, n]; x depends on the others by its negative, transposed
     cross = np.dot(others, gain)  # [m, n], negative
     own, more = np.dot(inverse.T, inverse), np.dot(gain.T, cross)
-    # Rounding must not grow from step to step: what is not symmetric would.
+    # Symmetrise, because asymmetric rounding errors would grow from step to step.
     for i in range(len(own)):
         for j in range(i + 1):
             own[i, j] = own[i, j] + 0.5 * (more[i, j] + more[j, i])
@@ -453,15 +453,16 @@ def visit(
     walked: Float,
     starting: Float,
 ) -> tuple[Float, int]:
-    """Covariances of a stretch from its end, given those [m, m] of what was alive there; sums for the levels.
+    """Compute covariances of a stretch from its end, and sums for the levels.
 
-    `covariance` [T, J, 3, 3] is filled where it has a length, of the last three times the first `own_times`.
-    Sums are made where `every` is not 0, over the pictures of every so many times: `acceleration` [2, J, J]
-    posterior mean squares and variances; `bone_sums` [B]; `image` [J, 2] weighted squares, and how many of
-    them the fit leaves; `white_sums` [2, 3] of position and rotation: mean squares, count, what the pictures
-    tell (1 - posterior / prior variance); `walked` [c, 3] of every knot's change per s: mean squares, count,
-    posterior variances; `starting` [c + shared, 2] at time 0, where it has a length: mean square, variance.
-    Returns the covariance of what is alive at the beginning, and the interval there.
+    `others` [m, m] is the covariance of the unknowns alive at the end. `covariance` [T, J, 3, 3] is filled
+    unless empty; of the last three times only the first `own_times`. Sums are made unless `every` is 0, over
+    the pictures of every `every`-th time: `acceleration` [2, J, J] posterior mean squares and variances;
+    `bone_sums` [B]; `image` [J, 2] weighted squares, and their degrees of freedom after the fit; `white_sums`
+    [2, 3] of position and rotation: mean squares, count, share determined by the pictures (1 - posterior /
+    prior variance); `walked` [c, 3] of every knot's change per s: mean squares, count, posterior variances;
+    `starting` [c + shared, 2] at time 0, unless empty: mean square, variance. Returns the covariance of the
+    unknowns alive at the beginning, and the interval there.
     """
     J = position.shape[1]
     n, c = 3 * J, knot_count
@@ -475,7 +476,7 @@ def visit(
     of_numbers, of_white = np.empty((NUMBERS, NUMBERS)), np.empty(WHITE)
     last_time = len(t_s) - 3
     for time in range(last - 1, first - 2, -1):
-        # As on the way forwards; last, the knots before the stretch.
+        # As in the forward pass; at the end, the knots before the stretch.
         while c and interval > (of_time[time] if time >= first else first_interval):
             interval -= 1
             row = interval - first_interval
@@ -538,9 +539,9 @@ def visit(
 
 @helper
 def before_knot(alive: Float, n: int, c: int, inverse: Float, across: Float) -> Float:
-    """The covariance of what is alive while the knot that was eliminated still is, and the next after it."""
+    """Compute the covariance of the unknowns alive before the elimination of a knot."""
     m = len(alive)
-    place = np.empty(m - c, np.int64)  # what of it was alive then: all but the knot after the next
+    place = np.empty(m - c, np.int64)  # those alive then: all but the knot after the next
     for i in range(2 * n + c):
         place[i] = i
     for i in range(2 * n + 2 * c, m):
@@ -550,7 +551,7 @@ def before_knot(alive: Float, n: int, c: int, inverse: Float, across: Float) -> 
         for j in range(m - c):
             beside[i, j] = alive[place[i], place[j]]
     own, cross = join(inverse, across, beside)
-    for i in range(2 * n, 2 * n + c):  # what was the knot before is the knot after
+    for i in range(2 * n, 2 * n + c):  # the knot before becomes the knot after
         place[i] += c
     joined = np.empty((m, m))
     for i in range(m - c):
@@ -569,7 +570,7 @@ def before_knot(alive: Float, n: int, c: int, inverse: Float, across: Float) -> 
 def walk_of(
     alive: Float, n: int, c: int, knots: Float, knot_t_s: Float, interval: int, walked: Float
 ) -> None:
-    """Add how much the slow errors changed between two knots, per second."""
+    """Add the change of the slow errors between two knots, per second."""
     elapsed = abs(knot_t_s[interval + 1] - knot_t_s[interval])
     for i in range(c):
         p, q = 2 * n + i, 2 * n + c + i
@@ -618,7 +619,7 @@ def acceleration_of(
 
 @helper
 def bones_of(whole: Float, position: Float, shared: Float, bones: Int64, time: int, sums: Float) -> None:
-    """Add posterior mean squares [B] of how far the bones of a time are from their lengths."""
+    """Add posterior mean squares [B] of the deviations of bones from their lengths at a time."""
     B, size = len(bones), len(whole)
     column, by = np.empty(7, np.int64), np.empty(7)
     for b in range(B):
@@ -651,7 +652,7 @@ def noise_of(
     of_numbers: Float,
     sums: Float,
 ) -> None:
-    """Add what a picture says of image noise [J, 2]; the arguments are those of `posterior_of_picture`."""
+    """Add a picture's contribution to image noise [J, 2]; arguments as in `posterior_of_picture`."""
     for joint in range(len(believed)):
         if believed[joint] == 0.0:
             continue
@@ -675,7 +676,7 @@ def noise_of(
 
 @helper
 def white_of(white: Float, precision: Float, variance: Float, sums: Float) -> None:
-    """Add what a picture's white error [6] says of its level [2, 3], given its posterior `variance` [6]."""
+    """Add a picture's white error [6], with posterior `variance` [6], to the sums [2, 3] of its level."""
     for i in range(WHITE):
         if not np.isfinite(precision[i, i]):
             continue

@@ -1,6 +1,6 @@
-"""A problem with its prior: what every linearisation needs, and how unlikely a state is.
+"""Problem with its prior: values that every linearisation needs, and the cost of a state.
 
-Its equations are eliminated in `elimination`.
+`elimination` eliminates its equations.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from pipelines.reconstruction.refinement.problem import EXACT, Knowledge, Layout
 Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
-# Its arguments are assembled from tuples, whose lengths types do not know.
+# Its arguments are assembled from tuples, whose lengths mypy does not know.
 _misfit: Callable[..., float] = kernels.misfit
 
 
 @dataclass(frozen=True)
 class System:
-    """A problem with its prior, linearised at will."""
+    """Problem with its prior, ready to be linearised at any state."""
 
     problem: Problem
     knowledge: Knowledge
@@ -32,17 +32,17 @@ class System:
     bound2: float  # of the robust loss
     held: bool = False  # bone lengths stay as they are
     sharpness: Float = field(init=False)
-    white_row: Int64 = field(init=False)  # [G] where the next has the picture's
+    white_row: Int64 = field(init=False)  # [G] row of each picture in `white_precision`
     white_precision: Float = field(init=False)  # [., 6, 6] of each camera, then of logged poses; inf without
     inverse_acceleration: Float = field(init=False)  # [J, J]
     of_time: Int64 = field(init=False)  # [T - 2]
     fraction: Float = field(init=False)  # [G]
     usual_step_s: float = field(init=False)
     tie_kept: Float = field(init=False)  # [K - 1, c] share of a slow error that is left at the next knot
-    tie_variance: Float = field(init=False)  # [K - 1, c] what comes in addition
+    tie_variance: Float = field(init=False)  # [K - 1, c] variance added from knot to knot
 
     def __post_init__(self) -> None:
-        """Derive what every linearisation needs."""
+        """Derive the values that every linearisation needs."""
         problem, known = self.problem, self.knowledge
         of_time, fraction = problem.intervals()
         white_row, white_precision = _white_errors(problem, known.poses)
@@ -63,11 +63,11 @@ class System:
 
     @property
     def size(self) -> int:
-        """Of a front."""
+        """Number of unknowns of a front."""
         return 9 * self.problem.joints + 2 * self.layout.knot_count + self.layout.shared_count
 
     def picture_arguments(self) -> tuple[Any, ...]:
-        """What the kernels take between a picture's place in time and the robust bound."""
+        """Collect the kernels' arguments between a picture's place in time and the robust bound."""
         pictures = self.problem.pictures
         return (
             pictures.xy,
@@ -80,7 +80,7 @@ class System:
         )
 
     def entries(self) -> tuple[Any, ...]:
-        """What the kernels need to know of the layout."""
+        """Collect the kernels' arguments on the layout."""
         layout = self.layout
         return (
             layout.entry_start,
@@ -91,13 +91,13 @@ class System:
         )
 
     def grown(self, state: State) -> float:
-        """How much larger the body is than the one for which the prior of motion and bones holds."""
+        """Compute the ratio of the body's size to the one for which the prior of motion and bones holds."""
         lengths = state.shared[self.layout.bone_column :]
         return float(lengths.mean() / self.knowledge.size_m) if len(lengths) else 1.0
 
 
 def _white_errors(problem: Problem, poses: Sequence[PoseErrors]) -> tuple[Int64, Float]:
-    """Where the inverse covariance of each picture's white error stands [G], and all of them [., 6, 6]."""
+    """Compute the inverse covariances [., 6, 6] of white errors, and the row [G] of each picture in them."""
     knot_s = float(problem.knot_t_s[1] - problem.knot_t_s[0])
     pictures, logged = problem.pictures, problem.pose_covariance
     level = np.array([np.repeat(errors.white_with_stray(knot_s), 3) for errors in poses])
@@ -116,7 +116,7 @@ def _white_errors(problem: Problem, poses: Sequence[PoseErrors]) -> tuple[Int64,
 
 
 def _ties(layout: Layout) -> tuple[Float, Float]:
-    """How every unknown of a knot [K - 1, c] goes on to the next."""
+    """Compute the share kept and the variance added [K - 1, c] from each knot to the next."""
     elapsed_s = np.diff(layout.knot_t_s)
     kept, variance = (
         np.ones((len(elapsed_s), layout.knot_count)),
@@ -131,9 +131,9 @@ def _ties(layout: Layout) -> tuple[Float, Float]:
 
 
 def misfit(system: System, state: State) -> tuple[float, Float, Float]:
-    """Loss of the pictures, whitened residuals [G, J, 2], the ten numbers [G, 10] of each picture.
+    """Compute the loss of the pictures, whitened residuals [G, J, 2], and each picture's numbers [G, 10].
 
-    Residuals are NaN for what was not seen, or lies behind its camera, and cost nothing.
+    Residuals are NaN, and cost nothing, for joints that were not seen or lie behind the camera.
     """
     pictures = system.problem.pictures
     residual = np.empty(pictures.xy.shape)
@@ -159,7 +159,7 @@ def misfit(system: System, state: State) -> tuple[float, Float, Float]:
 
 
 def prior_cost(system: System, state: State) -> float:
-    """Minus twice the logarithm of the prior, up to a constant."""
+    """Compute minus twice the logarithm of the prior, up to a constant."""
     problem, known, layout = system.problem, system.knowledge, system.layout
     before, after = np.diff(problem.t_s)[:-1], np.diff(problem.t_s)[1:]
     slopes = np.diff(state.position, axis=0) / np.diff(problem.t_s)[:, None, None]
@@ -186,7 +186,7 @@ def prior_cost(system: System, state: State) -> float:
 
 
 def _bone_lengths(problem: Problem, position: Float) -> Float:
-    """[T, B] m."""
+    """Compute the bone lengths [T, B] m."""
     ends = position[:, problem.bones]
     lengths: Float = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
     return lengths
