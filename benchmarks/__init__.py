@@ -1,1 +1,1 @@
-"""Measurements beside what others use; docs/benchmarks.md holds their figures."""
+"""Benchmarks, with comparisons to other tools; docs/benchmarks.md holds their figures."""

@@ -1,8 +1,8 @@
-"""The arms past a mound, a wall and trees: `python -m benchmarks.arms [--weights | --seeds N]`.
+"""Planner arms past a mound, a wall and trees: `python -m benchmarks.arms [--weights | --seeds N]`.
 
 Each scenario of sample_data/planning is simulated without video, ingested, and flown again by the fixed and
 the adaptive formation with the weights of its planner.yaml, as `mocap replan-compare` does. All simulated.
-`--weights` flies them with other weights and resolutions too, and counts what each makes of the arms.
+`--weights` flies them with other weights and resolutions too, and prints the figures of each.
 `--seeds` flies them, and the sample flight, many times with different noise of the actor's log, detector and
 poses, and pairs the arms seed by seed.
 """
@@ -36,7 +36,7 @@ SCENARIOS = Path(__file__).parents[1] / "sample_data" / "planning"
 NAMES = ("mound", "wall", "trees")
 ARMS = ("adaptive", "fixed")
 ACTOR_NOISE_M = 0.2
-"""Per axis and measurement: what the planners are told that the log errs by."""
+"""Standard deviation of the actor's log per axis and measurement, as given to the planners."""
 
 VARIANTS: tuple[Mapping[str, float], ...] = (
     {},
@@ -46,7 +46,7 @@ VARIANTS: tuple[Mapping[str, float], ...] = (
     {"l_occ": 2},
     {"l_form": 1, "l_occ": 2, "yaws": 8, "knot_s": 2, "horizon_knots": 5},
 )
-"""What is changed of the defaults; the last was flown before they were measured here."""
+"""Changes to the defaults; the last were the settings before the defaults were measured here."""
 
 
 def main() -> None:
@@ -98,7 +98,7 @@ def _print_comparisons(sessions: Mapping[str, Path], trials: int) -> None:
 
 
 def _print_seeds(sessions: Mapping[str, Path], seeds: int) -> None:
-    """Differences of whole flights, and the largest tilt of any."""
+    """Print differences of whole flights, and the largest tilt of any."""
     columns = ("adaptive minus fixed", "tilt deg", "near obstacle", "hidden, points of %", "MPJPE mm")
     print("| " + " | ".join([*columns, "largest tilt deg: adaptive", "fixed"]) + " |")
     print("|" + " --- |" * 7)
@@ -117,7 +117,7 @@ def _print_seeds(sessions: Mapping[str, Path], seeds: int) -> None:
 
 
 def _flown(session: Path, seed: int) -> dict[str, Any]:
-    """Both arms with noise of this seed: one draw of all that errs."""
+    """Fly both arms with the noise of this seed: one draw of all errors."""
     planner = replace(PlannerConfig(), actor_noise_m=ACTOR_NOISE_M)
     settings = Settings(arms=ARMS, trials=1, seed=seed, planner=planner)
     return replan(session, settings).metrics
@@ -149,7 +149,7 @@ def _print_weights(scenes: Mapping[str, Scene]) -> None:
 
 
 def _figures(scene: Scene, arm: str) -> str:
-    """Tilt mean/max in deg, and how much of the time nothing is seen."""
+    """Format mean/max tilt (deg) and the share of the time without any view (%)."""
     flown = fly_arm(scene, PLANNER_ARMS.get(arm))
     scores = score(scene.t_s, flown.position, scene.actor, scene.field, scene.config)
     tilt = np.degrees(

@@ -1,9 +1,9 @@
-"""How long it takes to tell five people apart in five cameras and to triangulate them, per frame.
+"""Time per frame to associate five people in five cameras and to triangulate them.
 
 python -m benchmarks.association [--frames 900]
 
 Five people walk on circles among each other, five drones circle them; 17 joints, 3 px, detections in a random
-order in every picture. The mark is 1 ms a frame for both together (what RapidPoseTriangulation claims for
+order in every picture. The goal is 1 ms a frame for both together (the claim of RapidPoseTriangulation for
 association and triangulation of known cameras).
 """
 
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def people_at(t_s: Float) -> Float:
-    """Joints [T, P, J, 3] in m of people who walk on circles."""
+    """Simulate joints [T, P, J, 3] (m) of people who walk on circles."""
     starts = [(2.5 * np.cos(k), 2.5 * np.sin(k)) for k in range(PEOPLE)]
     people = [
         walk(t_s, start=start, heading_deg=70.0 * k, radius_m=2.0 + 0.4 * k) for k, start in enumerate(starts)
@@ -65,7 +65,7 @@ def people_at(t_s: Float) -> Float:
 
 
 def filmed(people: Float, t_s: Float) -> tuple[Float, Float, Float, Float]:
-    """Detections in a random order, and the poses of the cameras, as `associate` takes them."""
+    """Simulate detections in a random order, and the poses of the cameras, as `associate` takes them."""
     rng = np.random.default_rng(0)
     frames = len(t_s)
     middle = np.tile([0.0, 0.0, 1.0], (frames, 1))
@@ -85,7 +85,7 @@ def filmed(people: Float, t_s: Float) -> tuple[Float, Float, Float, Float]:
 
 
 def views_of(choice: Int64, xy: Float, confidence: Float, position: Float, rotation: Float) -> Views:
-    """What was chosen for each person, one row for each joint-frame."""
+    """Collect the chosen views of each person, one row for each joint-frame."""
     frames = len(choice)
     chosen = np.clip(choice, 0, None)[:, :, :, None]
     absent = (choice < 0)[:, :, :, None]

@@ -1,11 +1,11 @@
-"""What two workers of a batch gain over one: the figures of docs/scale.md.
+"""Gain of two workers of a batch over one: the figures of docs/scale.md.
 
 python -m benchmarks.batch [--flights 8] [--seconds 4]
 
 Small flights with keypoints, ingested and reconstructed by `mocap batch` with one worker and with two, in
-turns, three times each; into new folders, with kernels compiled before. Beside the clock stand the processor
-seconds of the worker that had most: what the clock would show on a machine of its own but for the start of
-Dask, also where other work keeps the cores busy. The least of three counts.
+turns, three times each; into new folders, with kernels compiled before. The table also gives the processor
+seconds of the busiest worker. They approximate the wall time on an idle machine without the start of Dask,
+also if other work keeps the cores busy. The minimum of three counts.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def main() -> None:
 
 
 def run(manifests: list[Path], output: Path, workers: int) -> tuple[float, float, float]:
-    """Seconds of the clock; processor seconds of the worker that had most, and of all."""
+    """Run a batch; return wall seconds, and processor seconds of the busiest worker and of all."""
     started = time.perf_counter()
     done = batch(manifests, output, Settings(stages=STAGES), workers=workers)
     seconds = time.perf_counter() - started

@@ -1,9 +1,9 @@
-"""The stage `detect` with BlazePose beside what cannot be saved: `python -m benchmarks.detection`.
+"""Overhead of the stage `detect` with BlazePose: `python -m benchmarks.detection`.
 
-What cannot be saved is decoding every picture and running the networks as often as the stage does, back to
-back, on as many threads as the stage has workers; the mark is a stage that takes at most 1.15 times as long.
-Both take turns on the sample flight (2 cameras, 1280 x 720), and of each the fastest turn counts: what else
-the machine does only ever adds. Processor seconds stand beside those of the clock.
+The lower bound is decoding every picture and running the networks as often as the stage does, back to back,
+on as many threads as the stage has workers. The goal is a stage that takes at most 1.15 times as long. Both
+take turns on the sample flight (2 cameras, 1280 x 720). The fastest turn of each counts, because other work
+on the machine only adds time. The table gives processor seconds too.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ _KEPT = 8  # pictures of each network: enough to see none twice in a row
 
 @dataclass
 class Runs:
-    """How often each network (by the side of its input) ran in the stage, and some of what it was given."""
+    """Number of runs of each network (by the side of its input) in the stage, with some of its inputs."""
 
     count: Counter[int] = field(default_factory=Counter)
     given: dict[int, list[NDArray[np.uint8]]] = field(default_factory=dict)
 
     def add(self, picture: NDArray[np.uint8]) -> None:
-        """One run on that picture."""
+        """Add one run on that picture."""
         side = len(picture)
         self.count[side] += 1
         if len(kept := self.given.setdefault(side, [])) < _KEPT:
@@ -62,7 +62,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="mocap-") as name:
         session = Path(name) / "flight.session"
         ingest(SAMPLE / "flight.yaml", session)
-        with counted() as runs:  # and everything is imported
+        with counted() as runs:  # this run also imports everything
             read = stage(session, 1, arguments.seconds)
         print(f"{sum(read.values())} pictures; networks run by the side of their input: {dict(runs.count)}\n")
         print("| workers | turn | decoding, s (CPU) | networks, s (CPU) | stage, s (CPU) |")
@@ -88,7 +88,7 @@ def main() -> None:
 
 
 def stage(session: Path, workers: int, seconds: float | None) -> dict[str, int]:
-    """Run the stage; the number of pictures of each camera."""
+    """Run the stage; return the number of pictures of each camera."""
     with locked(session) as writable:
         record = detect(writable, workers=workers, end_s=seconds, force=True)
     if record is None:
@@ -121,7 +121,7 @@ def _inferred(runs: Runs, share: int, of: int) -> None:
         raise TypeError("blazepose is another detector here")
     for network in (networks._people, networks._landmarks):
         side = network._interpreter.get_input_details()[0]["shape"][1]
-        # Nothing but the network: what it is given was turned into its numbers before.
+        # The network alone: its input was filled before.
         inputs = [np.float32(1 / 255) * picture[None] for picture in runs.given.get(side, [])]
         for picture in islice(cycle(inputs), len(range(share, runs.count[side], of))):
             network._interpreter.set_tensor(network._input, picture)
@@ -143,7 +143,7 @@ def counted() -> Iterator[Runs]:
 
 
 def taken(function: Callable[..., object], *arguments: object) -> tuple[float, float]:
-    """Seconds of the clock and of the processor that a call takes."""
+    """Measure wall and processor seconds of a call."""
     started, before = time.perf_counter(), _processor_s()
     function(*arguments)
     return time.perf_counter() - started, _processor_s() - before

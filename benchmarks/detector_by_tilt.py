@@ -1,12 +1,12 @@
-"""How well a keypoint detector sees people from above: errors by tilt, on rendered flights.
+"""Errors of a keypoint detector that sees people from above, by tilt, on rendered flights.
 
 python -m benchmarks.detector_by_tilt [--detectors NAME ...] [--folder FOLDER] [--write]
 
 For every tilt four people walk on level ground while a drone circles each of them once at 10 m, filming
 1280x720 with a field of view of 80 degrees. The flights go through `mocap simulate`, `ingest` and the
-detection of `reconstruct`, as a user's would. The pictures are rendered; the detector is real. `--write`
-makes the data that simulation takes a detector's errors from, and those that turn its confidences into
-probabilities, for each detector its own.
+detection of `reconstruct`, like a user's. The pictures are rendered; the detector is real. `--write` writes
+two data files for each detector: its errors for the simulation, and the calibration of its confidences to
+probabilities.
 """
 
 from __future__ import annotations
@@ -59,15 +59,15 @@ COMMAND = "python -m benchmarks.detector_by_tilt --write"
 JOINTS = get_skeleton("coco17").joints
 TORSO = (JOINTS.index("left_shoulder"), JOINTS.index("right_hip"))
 PCK = 0.2  # of the torso's length in the picture
-USED = 0.3  # probability from which on `reconstruct` uses a keypoint
+USED = 0.3  # least probability of a keypoint that `reconstruct` uses
 GOOD = 0.05  # of the person's height
 GROSS = 0.1  # of the person's height: beyond that a joint counts as missed
-SOMEBODY_ELSE = 0.5  # of the person's height: a detection further off is not of the actor
+SOMEBODY_ELSE = 0.5  # of the person's height: a detection further away is not the actor's
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """All joints of one flight, frame by frame."""
+    """Errors of all joints of one flight, frame by frame."""
 
     error_px: Float  # [F, J], NaN where not found
     height_px: Float  # [F] f H / d
@@ -79,7 +79,7 @@ class Sightings:
 
 
 def main() -> None:
-    """Simulate, detect, compare, print; write the data when asked to."""
+    """Simulate, detect, compare, print; write the data on request."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--detectors", nargs="+", choices=MODELLED, default=MODELLED)
     parser.add_argument("--folder", type=Path, help="keep the flights there")
@@ -104,7 +104,7 @@ def main() -> None:
 
 
 def scenario_text(tilt_deg: int, look: int) -> str:
-    """One person, one drone."""
+    """Write a scenario with one person and one drone."""
     return f"""\
 schema: 1
 name: Tilt {tilt_deg} look {look}
@@ -152,7 +152,7 @@ def measure(folder: Path, detector: str, tilt_deg: int, look: int) -> Sightings:
 
 
 def probability(found: pd.DataFrame, detector: str) -> Float:
-    """What the confidences are worth by the measurement before this one; at the first as they are."""
+    """Convert confidences to probabilities by the previous calibration; keep them raw without one."""
     confidence = found["confidence"].to_numpy(np.float64)
     measured = measured_for(detector)
     if measured is None:
@@ -161,14 +161,14 @@ def probability(found: pd.DataFrame, detector: str) -> Float:
 
 
 def without_swaps(found: pd.DataFrame, frame_t_ns: Int64) -> pd.DataFrame:
-    """The detections with left and right given back to their sides, as `reconstruct` does it."""
+    """Undo exchanges of left and right in detections, as `reconstruct` does."""
     detections = detections_from(found, tuple(dict.fromkeys(found["joint"])))
     undone, _ = undo_swaps_of_tracks(detections, frame_t_ns)
     return keypoints_table(undone, np.arange(len(frame_t_ns)), frame_t_ns)
 
 
 def compare(found: pd.DataFrame, pixels: Float, height_px: Float) -> tuple[Float, Float]:
-    """Errors [F, J] in px and confidences of the detection nearest to the actor in each frame."""
+    """Compute errors (px) and confidences [F, J] of the detection nearest to the actor in each frame."""
     error = np.full(pixels.shape[:2], np.nan)
     confidence = np.full(pixels.shape[:2], np.nan)
     for _, person in found.groupby(["frame", "person"], sort=True):
@@ -186,7 +186,7 @@ def compare(found: pd.DataFrame, pixels: Float, height_px: Float) -> tuple[Float
 
 
 def print_table(by_tilt: dict[int, list[Sightings]]) -> None:
-    """The table of docs/detector.md."""
+    """Print the table of docs/detector.md."""
     print("| tilt deg | pictures | found | px mean | px median | %H median | PCK@0.2 torso | confidence |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for flights in by_tilt.values():
@@ -205,7 +205,7 @@ def print_table(by_tilt: dict[int, list[Sightings]]) -> None:
 
 
 def print_telling(by_tilt: dict[int, list[Sightings]]) -> None:
-    """How well the confidence tells bad keypoints from good ones: the area under the ROC curve."""
+    """Print how well the confidence separates bad keypoints from good ones: the area under the ROC curve."""
     flights = [flight for own in by_tilt.values() for flight in own]
     share = np.concatenate([flight.error_px / flight.height_px[:, None] for flight in flights]).ravel()
     confidence = np.concatenate([flight.confidence for flight in flights]).ravel()
@@ -220,7 +220,7 @@ def print_telling(by_tilt: dict[int, list[Sightings]]) -> None:
 
 
 def print_swaps(flights: list[Sightings]) -> None:
-    """What undoing swaps does, in joints that move by more than half a pixel, and to the mean error."""
+    """Print the effect of undoing swaps: joints that move by more than half a pixel, and the mean error."""
     before = np.concatenate([flight.with_swaps_px for flight in flights])
     after = np.concatenate([flight.without_swaps_px for flight in flights])
     gain = before - after
@@ -231,7 +231,7 @@ def print_swaps(flights: list[Sightings]) -> None:
 
 
 def write_table(detector: str, by_tilt: dict[int, list[Sightings]]) -> None:
-    """The data of the simulator: every joint by itself, and all joints together."""
+    """Write the data of the simulator: every joint by itself, and all joints together."""
     lines = [line for line in (__doc__ or "").splitlines() if line and not line.startswith("python")]
     with errors_of(detector).open("w", encoding="utf-8", newline="") as file:
         file.writelines(f"# {line}\n" for line in lines)
@@ -247,7 +247,7 @@ def write_table(detector: str, by_tilt: dict[int, list[Sightings]]) -> None:
 
 
 def calibrated(by_tilt: dict[int, list[Sightings]]) -> Calibration:
-    """What a confidence is worth, over all tilts alike."""
+    """Fit the calibration of confidences over all tilts together."""
     flights = [flight for own in by_tilt.values() for flight in own]
     share = np.concatenate([flight.error_px / flight.height_px[:, None] for flight in flights])
     return fit(
@@ -261,7 +261,7 @@ def calibrated(by_tilt: dict[int, list[Sightings]]) -> Calibration:
 
 
 def table_rows(by_tilt: dict[int, list[Sightings]]) -> Iterator[tuple[str, ...]]:
-    """Rows of the data, joint by joint."""
+    """Yield the rows of the data, joint by joint."""
     for j, joint in [(slice(None), ANY_JOINT), *((slice(k, k + 1), name) for k, name in enumerate(JOINTS))]:
         for flights in by_tilt.values():
             tilt = np.concatenate([f.tilt_deg for f in flights]).mean()  # as flown

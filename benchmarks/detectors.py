@@ -1,11 +1,11 @@
-"""The detectors beside each other, on a rendered and on a real recording: `python -m benchmarks.detectors`.
+"""Comparison of the detectors on a rendered and on a real recording: `python -m benchmarks.detectors`.
 
 - The sample flight (`sample_data/mound_walk`, two drones, rendered pictures) with its true poses, so that
-  what is left is the detector's. MPJPE as it stands and with the hips in the truth's place.
-- A real recording of a walk by four still cameras (Pose2Sim's demo), which is no part of this repository:
-  `MOCAP_REAL_DATA` names the folder that holds `pose2sim_single`. It has no truth; the reprojection says how
-  far the joints of the skeleton are from the keypoints over all views, the spread of bones how far a bone's
-  length varies.
+  all errors are the detector's. MPJPE absolute, and with the hips moved to their true place.
+- A real recording of a walk by four static cameras (Pose2Sim's demo), which is not part of this repository:
+  `MOCAP_REAL_DATA` names the folder that holds `pose2sim_single`. It has no truth. The reprojection error is
+  the distance of the skeleton's joints from the keypoints over all views. The spread of bones is the
+  variation of a bone's length.
 - Milliseconds of the processor for one person in one picture: its crop, the landmark network on one thread
   and the reading of its heatmaps; the median over crops of the sample flight.
 """
@@ -63,7 +63,7 @@ def main() -> None:
 
 
 def real_flight(folder: Path) -> Path:
-    """A flight.yaml of the real recording: its videos and its calibration, no keypoints."""
+    """Write a flight.yaml of the real recording: its videos and its calibration, no keypoints."""
     calibration = REAL / "calibration" / "Calib_qualisys.toml"
     lines = ["schema: 1", "name: Walk", "cameras:"]
     for name in CAMERAS:
@@ -77,26 +77,26 @@ def real_flight(folder: Path) -> Path:
 
 
 def of_sample(session: Path, detector: str, every: int) -> Iterator[str]:
-    """MPJPE and root-relative MPJPE in mm, PCK@150 in percent."""
+    """Yield MPJPE and root-relative MPJPE (mm), and PCK@150 (percent)."""
     metrics = found_by(session, detector, every)
     yield from (f"{metrics[name]:.1f}" for name in ("mpjpe_mm", "root_mpjpe_mm"))
     yield f"{100 * metrics['pck150']:.1f} %"
 
 
 def of_real(session: Path, detector: str, every: int) -> Iterator[str]:
-    """Median and mean reprojection error in px, spread of bone lengths in mm."""
+    """Yield median and mean reprojection error (px), and spread of bone lengths (mm)."""
     metrics = found_by(session, detector, every)
     yield from (f"{metrics['reprojection_px'][name]:.1f}" for name in ("median", "mean"))
     yield f"{metrics['shape']['bone_spread_mm']:.1f}"
 
 
 def found_by(session: Path, detector: str, every: int) -> dict[str, Any]:
-    """The figures of a reconstruction from what a detector finds."""
+    """Reconstruct from a detector's keypoints and return the figures."""
     return reconstruct(session, Settings(detector=detector, every=every), workers=2).metrics
 
 
 def person_ms(detector: str) -> float:
-    """The median processor time for one person in one picture, on one thread."""
+    """Measure the median processor time (ms) for one person in one picture, on one thread."""
     networks = find_detector(detector).load(threads=1)
     taken_s: list[float] = []
     for _, picture in frames(SAMPLE / "drone1.mp4", 0, CROPS):

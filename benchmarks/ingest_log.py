@@ -1,4 +1,4 @@
-"""How fast logs are read and ingested, and in how much memory: the figures of docs/benchmarks-logs.md.
+"""Speed and memory of reading and ingesting logs: the figures of docs/benchmarks-logs.md.
 
 python -m benchmarks.ingest_log [--log recorder|pictures] [--megabytes 500] [--picture-kb 60] [--cold]
     [--container ros1|ros2-sqlite3|ros2-mcap]
@@ -12,13 +12,13 @@ in turns, and the best of three counts:
 - ingest: the whole call of `pipelines.ingest.ingest` with force, from flight.yaml to the published session:
   hashing the log, poses and frame times from it, the tables written and synced.
 
-Each process first does the same to a log of 1 MB. So imports, and the code that rosbags makes of
-definitions, are left out; that first ingest is stated by itself. Logs are in the page cache, or with
-`--cold` come from the disk: the system is asked to forget them before each run. At the end stands
-whether every ratio of an ingest and its memory are as they should be.
+Each process first does the same with a log of 1 MB. So imports, and the code that rosbags generates from
+definitions, are left out; the time of that first ingest is given separately. Logs are in the page cache. With
+`--cold` they come from the disk: the system is asked to drop them before each run. The last line tells if
+every ratio of an ingest and its memory meet the goals.
 
-"thread" are processor seconds of the thread that reads: hashing has threads of its own. On a machine with a
-core to spare their ratio is that of the clock; on one that others keep busy it is the better judge.
+"thread" are processor seconds of the thread that reads: hashing has its own threads. On a machine with a free
+core their ratio equals that of wall times; on a busy machine it is more reliable.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ POSE, PICTURE = "/drone1/odometry", "/drone1/camera/image/compressed"
 TICKS_HZ = 600
 LEAST_RATIO, MOST_MB = 0.7, 400
 Topics = Mapping[str, tuple[str, int]]
-"""Type, and how many ticks lie between two messages."""
+"""Type, and number of ticks between two messages, by topic."""
 
 PICTURES: Topics = {POSE: ("nav_msgs/msg/Odometry", 6), PICTURE: ("sensor_msgs/msg/CompressedImage", 20)}
 RECORDER: Topics = {
@@ -120,7 +120,7 @@ def main() -> None:
 def best_of_three(
     readings: Mapping[str, Reading], small: Path, large: Path, cold: bool
 ) -> dict[str, dict[str, float]]:
-    """The figures of the fastest of three runs of each, which take turns."""
+    """Run each reading three times in turns and return the figures of its fastest run."""
     runs: dict[str, list[dict[str, float]]] = {name: [] for name in readings}
     for _ in range(3):
         for name, reading in readings.items():
@@ -129,13 +129,13 @@ def best_of_three(
 
 
 def in_a_process(function: Callable[..., Any], *arguments: object) -> Any:
-    """Call it in a fresh process, whose peak memory is its own."""
+    """Call a function in a fresh process with its own peak memory."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         return pool.apply(function, arguments)
 
 
 def timed(reading: Reading, small: Path, large: Path, cold: bool = False) -> dict[str, float]:
-    """Seconds for a log, on the clock and of this thread; for a small one before it; the peak memory."""
+    """Measure wall and thread seconds for a log, seconds for a small one before it, and peak memory."""
     start = time.perf_counter()
     reading(small)
     first_s = time.perf_counter() - start
@@ -149,35 +149,35 @@ def timed(reading: Reading, small: Path, large: Path, cold: bool = False) -> dic
 
 
 def evict(log: Path) -> None:
-    """Ask the system to forget the content of a log, so that it comes from the disk."""
+    """Ask the system to drop a log from the page cache, so that it comes from the disk."""
     for path in log.rglob("*") if log.is_dir() else [log]:
         if path.is_file():
             with path.open("rb") as file:
-                os.fsync(file.fileno())  # only what is on the disk can be forgotten
+                os.fsync(file.fileno())  # only pages that are on the disk can be dropped
                 os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
 def peak_mb() -> float:
-    """The most memory that this program held; `getrusage` counts what its parent held, too."""
+    """Return the peak memory (MB) of this program; `getrusage` would include its parent's."""
     status = Path("/proc/self/status").read_text(encoding="ascii")
     (peak,) = (line.split()[1] for line in status.splitlines() if line.startswith("VmHWM:"))
     return int(peak) / 1024
 
 
 def with_rosbags(log: Path) -> int:
-    """The bytes of every message."""
+    """Read the bytes of every message with rosbags; return the count of messages with content."""
     with AnyReader([log]) as reader:
         return sum(len(data) > 0 for _, _, data in reader.messages())
 
 
 def with_mcap(log: Path) -> int:
-    """The bytes of every message."""
+    """Read the bytes of every message with mcap; return the count of messages with content."""
     with next(log.glob("*.mcap")).open("rb") as file:
         return sum(len(message.data) > 0 for _, _, message in make_reader(file).iter_messages())
 
 
 def decoded(log: Path) -> int:
-    """Every message of odometry and pictures, decoded."""
+    """Decode every message of odometry and pictures; return their count."""
     with recognise(log, LogFormat, "log").open_log([log]) as recording:
         count = sum(message.value.header is not None for message in recording.messages([POSE, PICTURE]))
         assert not recording.dropped
@@ -185,7 +185,7 @@ def decoded(log: Path) -> int:
 
 
 def ingested(log: Path) -> int:
-    """The log as one camera of a session; how many frames it has."""
+    """Ingest the log as one camera of a session; return its number of frames."""
     manifest = log.parent / "flight.yaml"
     manifest.write_text(MANIFEST.format(log=log.name))
     found = ingest(manifest, force=True)

@@ -1,10 +1,10 @@
-"""Count the large errors that are `ok`: the sample flight and four rendered flights with other motions.
+"""Large errors with status `ok`: counts on the sample flight and four rendered flights with other motions.
 
 python -m benchmarks.legs [--folder FOLDER] [FLIGHT ...]
 
 Every flight is reconstructed with the true camera poses and with the logged ones. The pictures are
 rendered; the detector is real. The constants of `pipelines/keypoints/swaps.py` were tuned on the sample,
-`walk` and `jog`; `kick` and `turns` were kept aside.
+`walk` and `jog`; `kick` and `turns` were held out.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ LARGE_MM, GOOD_MM = 300.0, 150.0
 
 
 def main() -> None:
-    """Make the flights that are not there yet, reconstruct all, print the table."""
+    """Simulate missing flights, reconstruct all, print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--folder", type=Path, help="keep the flights there")
     parser.add_argument("flights", nargs="*", help="sample, " + ", ".join(FLIGHTS))

@@ -1,4 +1,4 @@
-"""What a heavy-tailed loss costs under noisy poses: the measurement behind docs/decisions/0002.
+"""Cost of a heavy-tailed loss under noisy poses: the measurement behind docs/decisions/0002.
 
 python -m benchmarks.loss
 """
@@ -31,7 +31,7 @@ def main() -> None:
 
 
 def both_errors_mm(cameras: int, level: str, seed: int) -> tuple[float, float]:
-    """Mean error over the joint-frames that both losses reconstruct, in one draw."""
+    """Compute the mean errors (mm) over joint-frames that both losses reconstruct, in one draw."""
     rng = np.random.default_rng([seed, cameras])
     truth, exact = ring(FRAMES, cameras)
     views = with_pose_noise(with_pixel_noise(exact, rng), rng, level, constant=True, told=False)

@@ -1,8 +1,8 @@
-"""Processor time of the planners beside the 1.3 ms of Ho et al.: `python -m benchmarks.planning`.
+"""Processor time of the planners, compared with the 1.3 ms of Ho et al.: `python -m benchmarks.planning`.
 
 The mound of tests/planning/worlds.py (sigma 7 x 3 m, 6 m high), an actor who walks past it at 1.2 m/s.
-Warm code, one thread, its own processor time. Other work on the machine still slows memory and caches: of
-several turns of the same central plans, each plan counts as in the fastest.
+Warm code, one thread, its own processor time. Other work on the machine still slows memory and caches, so the
+same central plans run in several turns, and the fastest time of each plan counts.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from tests.planning.worlds import mound, trees, walker, wall
 
 SEPARATIONS = ((3.5, 50.0), (3.5, 200.0), (4.5, 50.0), (4.5, 200.0))
 CENTRAL_AIMS_MS = {(8, 5, 2): 0.15, (72, 20, 5): 1.3}
-"""Median at most, by D yaws, T knots and n drones; the first is the seed's size."""
+"""Largest allowed median by D yaws, T knots and n drones; the first is the seed's size."""
 LOCAL_AIMS_MS = (1.0, 5.0)
-"""Mean and 95th percentile of a local plan."""
+"""Largest allowed mean and 95th percentile of a local plan (ms)."""
 REPLAY_AIM_S = 2.0
-"""`fixed` and `adaptive` over 75 s with two drones, closed loop."""
+"""Largest allowed time of `fixed` and `adaptive` together over 75 s with two drones, closed loop."""
 GROWTH = (
     *((yaws, 5, 2) for yaws in (8, 24, 72)),
     *((32, knots, 2) for knots in (5, 10, 20)),
@@ -59,7 +59,7 @@ def main() -> None:
 
 
 def print_central(repeats: int, turns: int) -> list[tuple[str, float, float]]:
-    """The formation search, cost map included, by its size; what is asked for."""
+    """Print times of the formation search, cost map included, by its size; return measured values, goals."""
     field = mound(resolution_m=0.2)
     aims = []
     print("| arm | D | T | n | median ms | best ms |")
@@ -79,7 +79,7 @@ def print_central(repeats: int, turns: int) -> list[tuple[str, float, float]]:
 def _print_central(
     arm: Arm, size: tuple[int, int, int], field: DistanceField, repeats: int, turns: int
 ) -> float:
-    """Plans along the way past the mound; the median in ms."""
+    """Time plans along the way past the mound, print a row, and return the median (ms)."""
     yaws, knots, drones = size
     config = replace(PlannerConfig(), yaws=yaws, horizon_knots=knots, knot_s=10.0 / knots)
     planner = arm.start(config, drones=drones, yaw_rad=0.7)
@@ -100,9 +100,9 @@ def _print_central(
 
 
 def print_replays(turns: int) -> list[tuple[str, float, float]]:
-    """Closed-loop flights of 75 s with 2 drones: local planner, whole replay, and what came of it.
+    """Print closed-loop flights of 75 s with 2 drones: local planner, whole replay, and their results.
 
-    Each plan and each replay as in the fastest turn.
+    The fastest turn of each plan and of each replay counts.
     """
     print("\n| world | arm | local mean ms | p95 ms | replay s | tilt mean deg | max | occluded |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
@@ -126,7 +126,7 @@ def print_replays(turns: int) -> list[tuple[str, float, float]]:
                 runs_s.append(time.thread_time() - started)
                 locals_s.append(result.times.local_s)
             took_s = min(runs_s[1:])
-            local = 1e3 * np.array(locals_s[1:]).min(axis=0)  # of the same plans, each time
+            local = 1e3 * np.array(locals_s[1:]).min(axis=0)  # every turn has the same plans
             if arm in (FIXED, ADAPTIVE):
                 both_s += took_s
                 plans.append(local)
@@ -147,7 +147,7 @@ def print_replays(turns: int) -> list[tuple[str, float, float]]:
 
 
 def print_separations() -> None:
-    """How often plans had to be pushed apart, by where and how strongly they begin to avoid each other."""
+    """Print how often plans were projected apart, by distance and weight of the soft separation cost."""
     print("\n| soft m | l_sep | local plans | projected | rejected | broken | nearest m |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     worlds: list[DistanceField] = [trees(), wall(), mound()]

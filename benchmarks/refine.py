@@ -1,4 +1,4 @@
-"""How far `refined` gets beside `robust`, and how fast: its speed in docs/decisions/0004-refined.md.
+"""Accuracy of `refined` compared with `robust`, and its speed, given in docs/decisions/0004-refined.md.
 
 python -m benchmarks.refine [--seeds N] [--times T] [--cameras N ...] [--long T]
 
@@ -39,7 +39,7 @@ PEERS: Mapping[str, tuple[float, float, float]] = {
     "aniposelib, optimised": (5.2, 7.4, 16.3),
     "aniposelib, with bone lengths": (3.4, 6.5, 14.2),
 }
-"""k joint-frames/s, mean mm with 2 px, and with outliers; never run here.
+"""Figures of other tools: k joint-frames/s, mean mm with 2 px, and with outliers; not run by this script.
 
 As measured for this project in 2026, once, on another machine, at true poses: 2,250 frames of such a walk,
 seen by five such cameras.
@@ -62,7 +62,7 @@ def main() -> None:
 
 
 def print_speed(times: int) -> None:
-    """Time, memory and error on the walk of the peers' table."""
+    """Print time, memory and error on the walk of the peers' table."""
     print(f"{times} frames, 17 joints, 5 cameras, 2 px, true poses\n")
     print("| data | robust mm | refined mm | seconds | CPU s | k joint-frames/s | peak MB |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
@@ -88,7 +88,7 @@ def print_speed(times: int) -> None:
 
 
 def print_noise(times: int, cameras: Sequence[int], seeds: int) -> None:
-    """Every noise model, told and not told, hovering and moving cameras."""
+    """Print results for every noise model, stated (told) or not, with hovering and moving cameras."""
     print(f"\n{seeds} flights of {times} frames, 0.3 m / 1 deg, 2 px: mean mm, absolute / root-relative")
     print("| noise | cameras | formation | told | robust | refined | ratio (worst) | NEES | fell back |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
@@ -117,7 +117,7 @@ def print_noise(times: int, cameras: Sequence[int], seeds: int) -> None:
 def row_of(
     times: int, cameras: int, models: Sequence[NoiseModel], seed: int, *, still: bool, told: bool
 ) -> list[float]:
-    """Errors of `robust` and of what `refined` returns (after a fallback: `robust`'s), NEES, fell back."""
+    """Compute errors of `robust` and `refined` (`robust`'s after a fallback), NEES, and fallback (0 or 1)."""
     flight, result = formation_and_refined(times, cameras, models, seed, told=told, still=still)
     fell = result.fallback is not None
     position = flight.start if fell else result.position
@@ -135,26 +135,26 @@ def row_of(
 def formation_and_refined(
     times: int, cameras: int, models: Sequence[NoiseModel], seed: int, *, told: bool, still: bool = False
 ) -> tuple[Formation, Refined]:
-    """A flight, and what the refinement makes of it."""
+    """Simulate a flight and refine it."""
     flight = formation(times, cameras, models, seed, still=still)
     return flight, refined_of(flight, models, told=told)
 
 
 def refined_of(flight: Formation, models: Sequence[NoiseModel], *, told: bool, threads: int = 1) -> Refined:
-    """What the refinement makes of a flight; not told, it has to find the levels itself."""
+    """Refine a flight; without stated noise (`told` False) the refinement estimates the levels itself."""
     count = len(flight.sightings)
     prior = [pose_errors(models)] * count if told else None
     return refine(flight.t_s, flight.sightings, flight.start, BONES, prior, np.zeros(count), threads=threads)
 
 
 def rooted(position: Float) -> Float:
-    """Joints from the middle of the hips."""
+    """Return joints relative to the middle of the hips."""
     relative: Float = position - position[:, 11:13].mean(axis=1, keepdims=True)
     return relative
 
 
 def mean_nees(result: Refined, truth: Float) -> float:
-    """Mean of e' S^-1 e: 3 where the covariances are right."""
+    """Compute the mean of e' S^-1 e; it is 3 for correct covariances."""
     error = result.position - truth
     return float(np.einsum("tji,tjik,tjk->tj", error, np.linalg.inv(result.covariance), error).mean())
 

@@ -1,17 +1,19 @@
-"""How far `refined` is from the information bound, and are its covariances calibrated? Many short flights.
+"""Distance of `refined` from the information bound, and calibration of its covariances, on short flights.
 
 python -m benchmarks.refine_calibration [--noise NAME ...] [--draws N] [--times T] [--cameras N ...]
     [--told WHAT]
 
-Simulated: the walk and the formations of `benchmarks.refine`, moving cameras, every flight with keypoint and
-pose errors of its own. All joint-frames of a flight share its pose errors, so a flight is one draw: standard
-errors are those of the flights' means. What fell back counts as `robust` in errors, and not in NEES.
+Simulated: the walk and the formations of `benchmarks.refine`, moving cameras, every flight with its own
+keypoint and pose errors. All joint-frames of a flight share its pose errors, so a flight is one draw:
+standard errors are those of the flights' means. After a fallback, errors are those of `robust`, and NEES has
+no value.
 
-The bound is what the estimator's own model expects at the truth, with levels as they are: pictures, pose
-errors, bones, and accelerations with a covariance. Errors are drawn from that posterior and measured like
-any others. There are two bounds. "learned": the covariance is the one that the estimator found in the same
-flight, so with the temporal terms that it uses. "known": the covariance that the walk's accelerations have,
-which nobody can know who saw a few seconds of it. Under the table stand the flights that fell back, and why.
+The bound is the expected error of the estimator's own model at the truth, with the true levels: pictures,
+pose errors, bones, and accelerations with a covariance. Errors are drawn from that posterior and measured
+like any others. There are two bounds. "learned" uses the covariance of accelerations that the estimator
+found in the same flight, so the same temporal terms. "known" uses the true covariance of the walk's
+accelerations, which cannot be known from a few seconds of it. The flights that fell back, and the reasons,
+are printed last.
 Two processes; set OPENBLAS_NUM_THREADS=1.
 """
 
@@ -47,12 +49,12 @@ _EXPECTED, _OF_ONE = 200, 8  # draws from the posterior at the truth, and from t
 
 @dataclass(frozen=True)
 class Draw:
-    """One flight: RMS errors in mm (absolute, root-relative, PA), squares against the stated covariance."""
+    """Results of one flight: RMS errors (absolute, root-relative, PA), squares over their covariance."""
 
     robust_mm: Float  # [3]
     refined_mm: Float  # [3]
-    bound_mm: Float  # [3] with the temporal terms that were learned; NaN where `refined` fell back
-    squares: Float | None  # [N] e' S^-1 e of what was estimated; None where `refined` fell back
+    bound_mm: Float  # [3] with the learned temporal terms; NaN after a fallback
+    squares: Float | None  # [N] e' S^-1 e of the estimated joints; None after a fallback
     fallback: str | None
     cpu_s: float
 
@@ -86,7 +88,7 @@ def main() -> None:
 
 
 def drawn(name: str, times: int, cameras: int, told: bool, seed: int) -> Draw:
-    """A flight; its processor time is that of the refinement."""
+    """Simulate and refine one flight; its processor time is that of the refinement."""
     flight = formation(times, cameras, MODELS[name], seed, pixel_px=_PIXEL_PX)
     began = time.process_time()
     result = refined_of(flight, MODELS[name], told=told)
@@ -97,12 +99,12 @@ def drawn(name: str, times: int, cameras: int, told: bool, seed: int) -> Draw:
     error = result.position - flight.truth
     squares: Float = np.einsum("tji,tjik,tjk->tj", error, np.linalg.inv(result.covariance), error)
     bound_mm = expected_mm(flight, MODELS[name], result.acceleration, _OF_ONE, seed=seed)
-    found: Float = squares[np.isfinite(squares)]  # joints that were hardly triangulated take no part
+    found: Float = squares[np.isfinite(squares)]  # joints with too few triangulated frames are not refined
     return Draw(robust_mm, errors_mm(error, flight.truth), bound_mm, found, None, cpu_s)
 
 
 def row_of(draws: Sequence[Draw], known_mm: Float) -> str:
-    """The cells of one noise model."""
+    """Format the cells of one noise model."""
     believed = [draw.squares for draw in draws if draw.squares is not None]
     robust, refined, learned = (
         np.sqrt(np.nanmean(np.square([getattr(draw, f"{name}_mm") for draw in draws]), axis=0))
@@ -120,7 +122,7 @@ def row_of(draws: Sequence[Draw], known_mm: Float) -> str:
 
 
 def accelerations(position: Float) -> Float:
-    """Covariance [J, J] (m/s^2)^2 of the accelerations of joints [T, J, 3] at `FPS`."""
+    """Compute the covariance [J, J] (m/s^2)^2 of the accelerations of joints [T, J, 3] at `FPS`."""
     change = np.diff(position, 2, axis=0) * FPS**2
     covariance: Float = np.einsum("tji,tki->jk", change, change) / (3 * len(change))
     return covariance + _LEAST_ACCELERATION**2 * np.eye(len(covariance))
@@ -129,14 +131,14 @@ def accelerations(position: Float) -> Float:
 def expected_mm(
     flight: Formation, models: Sequence[NoiseModel], acceleration: Float, count: int, *, seed: int
 ) -> Float:
-    """The information bound [3]: RMS errors that the posterior at the truth expects.
+    """Compute the information bound [3] (mm): expected RMS errors under the posterior at the truth.
 
     Args:
-        flight: its truth counts, its logs and keypoints do not.
-        models: what the poses are said to be like.
+        flight: the flight; its truth is used, its logs and keypoints are not.
+        models: noise of the poses.
         acceleration: [J, J] (m/s^2)^2, covariance of the joints' accelerations.
-        count: draws from the posterior, and
-        seed: of their chance.
+        count: number of draws from the posterior.
+        seed: seed of the draws.
     """
     cameras = len(flight.sightings)
     exact = []
@@ -168,7 +170,7 @@ def expected_mm(
 
 
 def errors_mm(error: Float, truth: Float) -> Float:
-    """RMS [3] of errors [T, J, 3] m, where there are any: absolute, root-relative, PA (similarity)."""
+    """Compute the RMS [3] (mm) of finite errors [T, J, 3] m: absolute, root-relative, PA (similarity)."""
     relative = rooted(truth + error) - rooted(truth)
     aligned = aligned_distances(truth + error, truth)
     squares = [np.nanmean(np.sum(error**2, axis=-1)), np.nanmean(np.sum(relative**2, axis=-1))]
@@ -177,12 +179,12 @@ def errors_mm(error: Float, truth: Float) -> Float:
 
 
 def slashed(values: Float) -> str:
-    """Three errors in one cell."""
+    """Format three errors in one cell."""
     return " / ".join(f"{value:.0f}" if value >= 100 else f"{value:.1f}" for value in values)
 
 
 def with_error(values: Sequence[float], digits: int) -> str:
-    """Mean of independent values and its standard error."""
+    """Format the mean of independent values and its standard error."""
     if len(values) < 2:
         return ", ".join(f"{value:.{digits}f}" for value in values)
     error = np.std(values, ddof=1) / np.sqrt(len(values))

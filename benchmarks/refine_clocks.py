@@ -1,10 +1,10 @@
-"""How well `mocap reconstruct --method refined` finds clocks: two cameras, one of them stamped wrong.
+"""Accuracy of clock offsets by `mocap reconstruct --method refined`: two cameras, one with wrong stamps.
 
 python -m benchmarks.refine_clocks [--seconds S] [--offsets S ...] [--sigma S] [--seeds N]
 
 Simulated: a person walks in a circle of 4 m, keypoints of 2 px, poses logged at 200 Hz by a common clock.
 Pictures of the second camera are stamped late or early. Moving cameras fly a turning ring and weave, so that
-they accelerate; still ones do not, and only the walk tells.
+they accelerate; still ones do not, so that only the walk determines the clock.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ def main() -> None:
 
 
 def row_of(name: str, offset_s: float, sigma_s: float, seed: int, seconds: float) -> str:
-    """One flight as a row of the table."""
+    """Simulate and reconstruct one flight; return its row of the table."""
     static, noise = POSES[name]
     with tempfile.TemporaryDirectory() as folder:
         flight = write_flight(Path(folder), seconds=seconds, static=static, pose_noise=noise, seed=seed)
-        # Its pictures are stamped as much too early as its clock has to be put forward.
+        # Its pictures are stamped too early by the offset that its clock needs.
         flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": -offset_s, "sigma_s": sigma_s}
         flight.save()
         session = Path(folder) / "flight.session"

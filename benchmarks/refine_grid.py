@@ -1,13 +1,14 @@
-"""Is `refined` ever worse than `robust`? Every noise model, told, told wrongly and not told.
+"""Search for cases where `refined` is worse than `robust`: noise stated, stated wrongly and not stated.
 
 python -m benchmarks.refine_grid [--seeds N] [--times T] [--cameras N ...] [--tilts DEG ...]
     [--noise NAME ...] [--told WHAT ...] [--formation KIND ...] [--keypoints KIND ...]
     [--bad-share SHARE] [--csv FILE]
 
 Simulated: the walk and the formations of `benchmarks.refine`, 0.3 m / 1 deg, 2 px. A cell is a noise model, a
-number of cameras, hovering or moving, a tilt and what was told; its ratio is that of the mean errors over the
-seeds, what fell back counting as `robust`. With `--bad-share 0.05` the same flights with the same noise have
-5 % of their keypoints 100 to 300 px off, and 5 % missing. Two processes; set OPENBLAS_NUM_THREADS=1.
+number of cameras, hovering or moving, a tilt and the stated noise (`--told`). Its ratio is that of the mean
+errors over the seeds; after a fallback the errors of `robust` count. With `--bad-share 0.05` the same flights
+with the same noise have 5 % of their keypoints 100 to 300 px off, and 5 % missing. Two processes; set
+OPENBLAS_NUM_THREADS=1.
 """
 
 from __future__ import annotations
@@ -38,12 +39,12 @@ _WRONG: Mapping[str, Sequence[NoiseModel]] = {
     "bias + drift": _BIAS,
     "Gauss-Markov 20 s": _BIAS,
 }
-"""What was told although something else was true."""
+"""Wrongly stated noise for each true noise model."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One flight of one cell."""
+    """Settings of one flight of a cell."""
 
     noise: str
     cameras: int
@@ -51,14 +52,14 @@ class Case:
     tilt_deg: float
     told: str  # right, wrong, nothing
     keypoints: str  # white; correlated: as a detector's, see `KEYPOINTS`
-    bad_share: float  # of the keypoints is far off, and as many are missing
+    bad_share: float  # share of keypoints that are far off, and share that are missing
     times: int
     seed: int
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of it; mm, of the returned skeleton (after a fallback: that of `robust`)."""
+    """Results of one flight in mm, of the returned skeleton (after a fallback: that of `robust`)."""
 
     robust_mm: float
     robust_root_mm: float
@@ -73,11 +74,11 @@ KEYPOINTS: Mapping[str, tuple[float, float, float]] = {
     "white": (2.0, 0.0, 0.0),
     "correlated": (4.0, 0.9, 2.0),
 }
-"""Noise in px, how much of it stays from frame to frame, how far every joint is off all along in px."""
+"""Keypoint noise (px), its correlation from frame to frame, and constant error of each joint (px)."""
 
 
 def main() -> None:
-    """Print a row for each cell, then which cells miss the mark."""
+    """Print a row for each cell, then the cells that miss the goal."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--times", type=int, default=150)
@@ -128,13 +129,13 @@ def main() -> None:
 
 
 def run_all(cases: Sequence[Case]) -> Iterator[tuple[Case, Outcome]]:
-    """Every flight, in order, two at a time."""
+    """Run every flight, two at a time; yield results in order."""
     with get_context("spawn").Pool(2) as pool:
         yield from zip(cases, pool.imap(outcome_of, cases), strict=True)
 
 
 def outcome_of(case: Case) -> Outcome:
-    """Fly it, refine it, compare it."""
+    """Simulate one flight, refine it, and compare it with the truth."""
     models = MODELS[case.noise]
     pixel_px, memory, constant_px = KEYPOINTS[case.keypoints]
     flight = formation(
@@ -169,7 +170,7 @@ def outcome_of(case: Case) -> Outcome:
 
 
 def summary(found: Sequence[tuple[Case, Outcome]]) -> tuple[str, float]:
-    """A cell as a row of the table, and its ratio."""
+    """Format a cell as a row of the table, and compute its ratio."""
     case = found[0][0]
     robust = np.array([o.robust_mm for _, o in found])
     refined = np.array([o.refined_mm for _, o in found])

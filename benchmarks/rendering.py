@@ -1,11 +1,11 @@
-"""What a rendered picture costs: the figures of docs/decisions/0003-renderer.md.
+"""Time of a rendered picture: the figures of docs/decisions/0003-renderer.md.
 
 python -m benchmarks.rendering [--pictures 20] [--threads 2] [--save FOLDER]
 
 The scene is a site of 60 m with a mound, 15 trees of some 2,700 triangles each, and a person of 20,000
-triangles made of capsules, seen from 10 m at five tilts. Times are the processor's, of one thread (others'
-load is not in them): the best and the mean of the pictures, after a first one that compiles or loads the
-code. "Wall" is the time by the clock for each picture while several threads share the renderer.
+triangles made of capsules, seen from 10 m at five tilts. Times are processor times of one thread, without
+the load of other programs: the best and the mean of the pictures, after a first one that compiles or loads
+the code. "Wall" is the wall time for each picture while several threads share the renderer.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ SHIRT = (0.45, 0.08, 0.07)
 
 
 def main() -> None:
-    """Build the scene, take the pictures, print a table."""
+    """Build the scene, render the pictures, print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pictures", type=int, default=20)
     parser.add_argument("--threads", type=int, default=2)
@@ -86,13 +86,13 @@ def main() -> None:
 
 
 def camera(width: int, height: int) -> Intrinsics:
-    """A pinhole of 65 degrees."""
+    """Return a pinhole camera with a field of view of 65 degrees."""
     focal = width / 2 / np.tan(np.radians(65) / 2)
     return Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 def look(tilt_deg: float, k: int, distance_m: float = 10.0) -> tuple[Float, Float]:
-    """A pose that looks at the person from above by the tilt, each k from another side."""
+    """Return a camera pose that looks at the person from above at the tilt, each k from another side."""
     around, tilt = np.radians(40 + 45 * k), np.radians(tilt_deg)
     target = np.array([0.0, 0.0, 1.0])
     back = np.array([np.cos(tilt) * np.cos(around), np.cos(tilt) * np.sin(around), np.sin(tilt)])
@@ -102,7 +102,7 @@ def look(tilt_deg: float, k: int, distance_m: float = 10.0) -> tuple[Float, Floa
 
 
 def site(size_m: float = 60.0, cell_m: float = 0.4) -> Surface:
-    """Grassland with a mound."""
+    """Build grassland with a mound."""
     axis = np.linspace(-size_m / 2, size_m / 2, round(size_m / cell_m) + 1)
     x, y = np.meshgrid(axis, axis)
     z = 1.2 * np.exp(-((x - 9) ** 2 + (y + 8) ** 2) / (2 * 2.6**2))
@@ -112,7 +112,7 @@ def site(size_m: float = 60.0, cell_m: float = 0.4) -> Surface:
 
 
 def trees(count: int) -> list[Surface]:
-    """A trunk and six rough balls of leaves each, 13 to 27 m away."""
+    """Build trees 13 to 27 m away, each with a trunk and six rough balls of leaves."""
     rng = np.random.default_rng(5)
     surfaces = []
     for _ in range(count):
@@ -132,7 +132,7 @@ def trees(count: int) -> list[Surface]:
 
 
 def person(t_s: float) -> Surface:
-    """Capsules along the limbs of the walking person, 20,000 triangles."""
+    """Build capsules along the limbs of the walking person, 20,000 triangles."""
     joints = dict(zip(COCO17, walk(np.array([t_s]), speed_mps=1.0, start=(-t_s, 0.0))[0], strict=True))
     parts = []
     for (upper, lower), radius in RADII_M.items():
@@ -147,7 +147,7 @@ def person(t_s: float) -> Surface:
 def capsule(
     start: Float, end: Float, radius: float, sectors: int, rings: int, colour: tuple[float, float, float]
 ) -> Surface:
-    """A cylinder with round ends: 2 * sectors * rings triangles."""
+    """Build a cylinder with round ends: 2 * sectors * rings triangles."""
     along = (end - start) / np.sqrt(np.sum((end - start) ** 2))
     across = np.cross(along, [0.3, 0.9, 0.1] if abs(along[0]) < 0.5 else [0.0, 0.9, 0.4])
     across /= np.sqrt(np.sum(across**2))
@@ -172,7 +172,7 @@ def save(picture: NDArray[np.uint8], path: Path) -> None:
 
 
 def _grid_faces(rows: int, columns: int) -> NDArray[np.int32]:
-    """Two triangles for each cell of a grid of corners."""
+    """List two triangles for each cell of a grid of corners."""
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     lower = np.stack([corner, corner + 1, corner + columns], axis=1)
     upper = np.stack([corner + 1, corner + columns + 1, corner + columns], axis=1)

@@ -1,9 +1,9 @@
-"""Everything that docs/results.md shows, from a clean clone: `python -m benchmarks.results`.
+"""Results of docs/results.md, measured from a clean clone: `python -m benchmarks.results`.
 
 Runs the commands that the page names, one after the other, keeps their numbers in docs/results.json and their
 figures in docs/figures/, and writes the page from them. Needs the detector (`mocap models fetch blazepose`).
-`--resume` goes on with what an interrupted run left, `--only SECTION` measures one section again and keeps
-the others, `--page` writes the page alone.
+`--resume` continues an interrupted run, `--only SECTION` measures one section again and keeps the others,
+`--page` writes the page alone.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def main() -> None:
 
 
 def measured(sections: Sequence[str]) -> Numbers:
-    """The numbers of these sections; their figures are copied beside the page."""
+    """Measure the numbers of these sections; copy their figures beside the page."""
     (ROOT / PLACE).mkdir(parents=True, exist_ok=True)
     (DOCS / "figures").mkdir(exist_ok=True)
     numbers: Numbers = {section: SECTIONS[section]() for section in sections}
@@ -144,7 +144,7 @@ def _run(command: str) -> None:
     if done.returncode:
         raise SystemExit(f"{command}\n{done.stderr}")
     spent = _spent()
-    # A stage that an interrupted run finished is skipped: what it took then counts.
+    # A stage that an interrupted run finished is skipped: its time of that run counts.
     spent[command] = max(spent.get(command, 0.0), _children_s() - before)
     (ROOT / _TIMES).write_text(json.dumps(spent), encoding="utf-8")
 
@@ -155,7 +155,7 @@ def _children_s() -> float:
 
 
 def _spent() -> dict[str, float]:
-    """Processor time of the commands so far, in s."""
+    """Read the processor time (s) of the commands so far."""
     path = ROOT / _TIMES
     told: dict[str, float] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     return told
@@ -171,12 +171,12 @@ def _keep(figure: str, name: str) -> None:
 
 
 def _keep_still(film: Path) -> None:
-    """What both cameras of both arms saw when the fixed formation measured the fewest joints."""
+    """Save pictures of both cameras of both arms when the fixed formation measured the fewest joints."""
     measured = {
         arm: pd.read_parquet(film / arm / "skeleton.parquet").groupby("t_ns")["x"].count()
         for arm in ("adaptive", "fixed")
     }
-    pictures = measured["adaptive"].index.union(measured["fixed"].index)  # one at least measures anything
+    pictures = measured["adaptive"].index.union(measured["fixed"].index)  # at least one arm has a joint
     picture = int(measured["fixed"].reindex(pictures, fill_value=0).to_numpy().argmin())
     rows = [np.hstack([_picture(film / arm / f"drone{k}.mp4", picture) for k in (1, 2)]) for arm in measured]
     cv2.imwrite(str(DOCS / "figures" / STILL), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 85])
@@ -189,7 +189,7 @@ def _picture(video: Path, number: int) -> NDArray[np.uint8]:
 
 
 def _study(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """What the study's tables are made of."""
+    """Select the values for the study's tables."""
     cells = [
         {**{key: cell[key] for key in _CELL}, "metrics": {key: cell["metrics"][key] for key in METRICS}}
         for cell in summary["cells"]
@@ -203,7 +203,7 @@ def _arms(metrics: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _rounded(value: Any) -> Any:
-    """The same with numbers to six digits: more is noise, and differs between machines."""
+    """Round all numbers to six digits: further digits are noise, and differ between machines."""
     match value:
         case float():
             return float(f"{value:.{_DIGITS}g}")
@@ -215,7 +215,7 @@ def _rounded(value: Any) -> Any:
 
 
 def figures_of(page: str) -> Iterator[str]:
-    """The files that a page shows."""
+    """Yield the names of the figures in a page."""
     for piece in page.split("](figures/")[1:]:
         yield piece.partition(")")[0]
 

@@ -1,4 +1,4 @@
-"""docs/results.md as text, from the numbers that `python -m benchmarks.results` measured."""
+"""Text of docs/results.md, from the numbers that `python -m benchmarks.results` measured."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _STUDY_TABLES = ("mpjpe_mm", "root_mpjpe_mm", "reconstructed_share", "ratio")
 
 @dataclass(frozen=True)
 class PosesSection:
-    """The sample flight with three kinds of poses: commands by session."""
+    """Section on the sample flight with three kinds of poses: commands by session."""
 
     commands: Mapping[str, tuple[str, ...]]
     names: Mapping[str, str]
@@ -105,13 +105,13 @@ FILMED = {
     "jog": _filmed("jog", "real_e3_jog", f"{_E3} --render-start 4 --render-end 9"),
     "soccer": _filmed("soccer", "real_e3_soccer", f"{_E3} --render-start 5 --render-end 10"),
 }
-"""Flights that are rendered and looked at by the real detector: commands by name."""
+"""Flights that are rendered and passed to the real detector: commands by name."""
 FILMED_NAMES = {"e2": "E2, mound", "jog": "E3, jogging", "soccer": "E3, soccer"}
 STILL = "e2-filmed.jpg"
 
 
 def render(numbers: Numbers) -> str:
-    """The page; the same numbers give the same text."""
+    """Write the page as text; the same numbers give the same text."""
     return "\n".join(
         [*_head(numbers), *_poses(numbers), *_studies(numbers), *_arms(numbers), *_filming(numbers)]
     )
@@ -259,7 +259,7 @@ def _code(commands: Sequence[str]) -> list[str]:
 
 
 def arm_figures(scores: Mapping[str, Any], error: str) -> list[str]:
-    """What `ARM_COLUMNS` name of the scores in replan/metrics.json; `error` as it is to be said."""
+    """Format the scores of replan/metrics.json for `ARM_COLUMNS`; `error` is inserted as given."""
     tilt, coverage = scores["tilt_deg"], scores["reconstruction_error"]["coverage"]
     return [
         _fixed(tilt["mean"], 1),
@@ -272,7 +272,7 @@ def arm_figures(scores: Mapping[str, Any], error: str) -> list[str]:
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """A table, and an empty line behind it."""
+    """Format a table, with an empty line after it."""
     lines = [header, ["---"] * len(header), *rows]
     return [*(f"| {' | '.join(line)} |" for line in lines), ""]
 

@@ -1,8 +1,8 @@
-"""Speed and error of triangulation beside numpy, OpenCV and pycolmap: `python -m benchmarks.triangulation`.
+"""Speed and error of triangulation, and of numpy, OpenCV and pycolmap: `python -m benchmarks.triangulation`.
 
 The walk of tests/geometry/rings.py: 17 joints, 10 m ring, f = 1500 px, 2 px noise. Speeds are whole
 calls, the best of several, after a first call that compiles. Peers compute points alone, so `locate` is
-what compares; `triangulate` adds the covariance and every view's residual.
+the one to compare; `triangulate` adds the covariance and every view's residual.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tests.geometry.rings import FOCAL, LEVELS, ring, with_outliers, with_pixel_
 
 Float = NDArray[np.float64]
 
-GATE_PX = 15.0  # what users of pycolmap and Pose2Sim choose
+GATE_PX = 15.0  # usual choice of users of pycolmap and Pose2Sim
 
 
 def main() -> None:
@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def print_speeds(frames: int, repeats: int) -> None:
-    """Joint-frames per second and mean error, with and without outliers."""
+    """Print joint-frames per second and mean error, with and without outliers."""
     rng = np.random.default_rng(1)
     truth, exact = ring(frames, 5)
     noisy = with_pixel_noise(exact, rng)
@@ -75,7 +75,7 @@ def print_speeds(frames: int, repeats: int) -> None:
 
 
 def pictures_row(label: str, views: Views, truth: Float, threads: int, repeats: int) -> str:
-    """The line of `robust` with the gate of pictures, as moving cameras have it."""
+    """Format the row of `robust` with the gate of pictures, as used for moving cameras."""
     seen = replace(views, pixel_sigma=estimate_noise(views))
     whole = best_s(
         lambda: triangulate_pictures(
@@ -92,7 +92,7 @@ def pictures_row(label: str, views: Views, truth: Float, threads: int, repeats: 
 
 
 def print_peers(truth: Float, noisy: Views, outliers: Views, repeats: int) -> None:
-    """The same of what others have."""
+    """Print the same figures of other tools."""
     two_views = Views(
         noisy.xy[:, :2],
         noisy.weight[:, :2],
@@ -122,7 +122,7 @@ def print_peers(truth: Float, noisy: Views, outliers: Views, repeats: int) -> No
 
 
 def print_pose_errors(draws: int) -> None:
-    """Mean error under constant pose errors, as many independent draws as asked for."""
+    """Print the mean error under constant pose errors over `draws` independent draws."""
     print(f"\nMean mm over {draws} draws of a constant pose error, 2 px; told: pose_sigma states it")
     print("joints alone: told, without the gate of pictures")
     print(
@@ -148,7 +148,7 @@ def print_pose_errors(draws: int) -> None:
 
 
 def errors_of(exact: Views, truth: Float, level: str, draw: int) -> list[float]:
-    """One draw: errors without outliers, with them and of good views only; reconstructed shares."""
+    """Compute one draw: errors without and with outliers and of good views only; reconstructed shares."""
     rng = np.random.default_rng(draw)
     told = with_pose_noise(with_pixel_noise(exact, rng), rng, level, constant=True, told=True)
     outliers, good = with_outliers(told, rng, uniform=False)
@@ -171,30 +171,30 @@ def errors_of(exact: Views, truth: Float, level: str, draw: int) -> list[float]:
 
 
 def robustly(views: Views) -> Float:
-    """`robust` as moving cameras have it."""
+    """Triangulate with `robust` as used for moving cameras."""
     told = replace(views, pixel_sigma=estimate_noise(views))
     return triangulate_pictures(told, picture=views.pose_index, pixel_sigma=views.pixel_sigma).points
 
 
 def silent(views: Views) -> Views:
-    """The same without a word of the poses' errors."""
+    """Return the views without pose noise."""
     return replace(views, pose_sigma=np.zeros_like(views.pose_sigma))
 
 
 def reconstructed(points: Float) -> float:
-    """Share of the points that are there."""
+    """Compute the share of finite points."""
     return float(np.isfinite(points[:, 0]).mean())
 
 
 def peer_row(name: str, run: Callable[[Views], Float], data: list[Views], truth: Float, repeats: int) -> str:
-    """One line of the peers' table."""
+    """Format one row of the peers' table."""
     speed = len(truth) / best_s(lambda: run(data[0]), repeats) / 1e6
     errors = [f"{error_mm(run(views), truth):.2f}" for views in data]
     return f"| {name} | {speed:.3f} | {' | '.join([*errors, ''][:2])} |"
 
 
 def numpy_svd(views: Views) -> Float:
-    """Homogeneous linear triangulation by numpy's batched SVD."""
+    """Triangulate by the homogeneous linear method with numpy's batched SVD."""
     P = projections(views)[views.pose_index]
     rows = views.xy[..., None] * P[:, :, 2:] - P[:, :, :2]
     X = np.linalg.svd(rows.reshape(len(rows), -1, 4))[2][:, -1]
@@ -203,7 +203,7 @@ def numpy_svd(views: Views) -> Float:
 
 
 def opencv(views: Views) -> Float:
-    """cv2.triangulatePoints, which takes two cameras and one pose of them per call."""
+    """Triangulate with cv2.triangulatePoints, which takes two cameras and one pose of them per call."""
     P = projections(views)
     joints = len(views.xy) // len(P)
     pairs = views.xy.reshape(len(P), joints, 2, 2)
@@ -216,7 +216,7 @@ def opencv(views: Views) -> Float:
 
 
 def pycolmap_ransac(views: Views) -> Float:
-    """pycolmap's robust triangulation, a call per joint-frame."""
+    """Triangulate with pycolmap's robust method, one call per joint-frame."""
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1920, height=1080, params=[FOCAL, 960, 540])
     options = pycolmap.EstimateTriangulationOptions()
     options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
@@ -234,13 +234,13 @@ def pycolmap_ransac(views: Views) -> Float:
 
 
 def projections(views: Views) -> Float:
-    """[F, C, 3, 4] camera_from_world."""
+    """Compute projection matrices camera_from_world [F, C, 3, 4]."""
     camera_from_world = np.swapaxes(views.rotation, -1, -2)
     return np.concatenate([camera_from_world, -camera_from_world @ views.position[..., None]], axis=-1)
 
 
 def part(views: Views, rows: slice) -> Views:
-    """Some joint-frames and the poses that belong to them."""
+    """Select some joint-frames and their poses."""
     instants = slice(0, int(views.pose_index[rows].max()) + 1)
     return replace(
         views,
@@ -254,12 +254,12 @@ def part(views: Views, rows: slice) -> Views:
 
 
 def error_mm(points: Float, truth: Float) -> float:
-    """Mean distance over the points that are there."""
+    """Compute the mean distance (mm) over finite points."""
     return 1e3 * float(np.nanmean(np.linalg.norm(points - truth, axis=1)))
 
 
 def best_s(run: Callable[[], object], repeats: int) -> float:
-    """Shortest time of several runs."""
+    """Measure the shortest time (s) of several runs."""
     times = []
     for _ in range(repeats):
         started = time.perf_counter()

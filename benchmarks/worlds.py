@@ -37,36 +37,36 @@ ARMS = ("fixed", "adaptive", "covariance", "greedy")
 KINDS = ("wall", "boxes", "forest", "hills", "overhang", "beside")
 COUNT = 300
 BEFORE = Path(__file__).with_name("worlds_before.json")
-WORSE = 1.05  # at most, of what flights that were safe before had
+WORSE = 1.05  # largest ratio to the earlier value, for flights that were safe before
 
 _SECONDS, _HIPS_M = 12.0, 1.0
 _SIZE_M, _HIGH_M = 52.0, 16.0
-_CLEAR_OF_ACTOR_M = 2.0  # obstacles keep as far from the actor's way
-_CLEAR_OF_START_M = 0.8  # and from the drones' first slots, but for `beside`
-_BESIDE_M = (0.1, 1.0)  # how near to a first slot an obstacle stands there
-_FINE = 4  # looks at the analytic surfaces between two tracking steps
-_MOST_ERROR_M = 2.0  # what an undetermined position counts as
+_CLEAR_OF_ACTOR_M = 2.0  # least distance of obstacles from the actor's way
+_CLEAR_OF_START_M = 0.8  # and from the drones' first slots, except for `beside`
+_BESIDE_M = (0.1, 1.0)  # distance of an obstacle from a first slot for `beside`
+_FINE = 4  # checks against the analytic surfaces per tracking step
+_MOST_ERROR_M = 2.0  # value for an undetermined position
 _CONFIG = PlannerConfig()
 _KEPT = ("seed", "arm", "clearance_m", "ground_m", "limits", "tilt_deg", "hidden", "error_m")
 
 
 class Solid(Protocol):
-    """Something that drones must not touch."""
+    """Solid that drones must not touch."""
 
     def distance(self, points: Float) -> Float:
-        """Signed distances [...] in metres from points [..., 3] to its surface, negative inside."""
+        """Compute signed distances [...] (m) from points [..., 3] to its surface, negative inside."""
 
 
 @dataclass(frozen=True)
 class Box:
-    """A box on edge or lying, turned about the vertical."""
+    """Box, upright or lying, turned about the vertical."""
 
     centre: tuple[float, float, float]
     half: tuple[float, float, float]
     yaw_rad: float = 0.0
 
     def distance(self, points: Float) -> Float:
-        """The exact distance."""
+        """Compute the exact signed distance."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         away = points - np.array(self.centre)
         x, y = c * away[..., 0] + s * away[..., 1], c * away[..., 1] - s * away[..., 0]
@@ -77,14 +77,14 @@ class Box:
 
 @dataclass(frozen=True)
 class Tree:
-    """A trunk and a round crown."""
+    """Tree with a trunk and a round crown."""
 
     east_north: tuple[float, float]
     height_m: float
     crown_m: float
 
     def distance(self, points: Float) -> Float:
-        """The exact distance outside of it."""
+        """Compute the signed distance, exact outside of the tree."""
         level = np.linalg.norm(points[..., :2] - np.array(self.east_north), axis=-1)
         top = self.height_m - self.crown_m
         trunk = np.hypot(np.maximum(level - 0.4, 0.0), np.maximum(points[..., 2] - top, 0.0))
@@ -96,19 +96,19 @@ class Tree:
 
 @dataclass(frozen=True)
 class Ground:
-    """The ground at height 0 with Gaussian hills."""
+    """Ground at height 0 with Gaussian hills."""
 
     hills: tuple[tuple[float, float, float, float], ...] = ()  # east, north, sigma, height
 
     def height(self, east: Float, north: Float) -> Float:
-        """Metres above the plain."""
+        """Compute the height (m) above the plain."""
         total = np.zeros(np.broadcast(east, north).shape)
         for x, y, sigma, high in self.hills:
             total = total + high * np.exp(-((east - x) ** 2 + (north - y) ** 2) / (2 * sigma**2))
         return total
 
     def distance(self, points: Float) -> Float:
-        """A lower bound of the distance outside with the right sign: the gap over the steepest slope."""
+        """Compute a lower bound of the distance outside, with its sign: the gap over the steepest slope."""
         slope = sum(high / sigma * np.exp(-0.5) for _, _, sigma, high in self.hills)
         gap = points[..., 2] - self.height(points[..., 0], points[..., 1])
         return np.asarray(gap / np.sqrt(1.0 + slope**2))
@@ -116,7 +116,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class World:
-    """One world with a flight through it."""
+    """World with a flight through it."""
 
     seed: int
     kind: str
@@ -129,13 +129,13 @@ class World:
     solids: tuple[Solid, ...]
 
     def distance(self, points: Float) -> Float:
-        """Analytic signed distance [...] to whatever is nearest."""
+        """Compute the analytic signed distance [...] to the nearest surface."""
         solids = (self.ground, *self.solids)
         nearest: Float = np.minimum.reduce([solid.distance(points) for solid in solids])
         return nearest
 
     def field(self) -> DistanceField:
-        """The planner's map: a voxel is occupied if its centre is inside of something."""
+        """Build the planner's map: a voxel is occupied if its centre is inside a solid or the ground."""
         side = self.resolution_m
         count = (round(_SIZE_M / side), round(_SIZE_M / side), round(_HIGH_M / side))
         origin = np.append(self.actor[:, :2].mean(axis=0) - _SIZE_M / 2, -2 * side)
@@ -148,7 +148,7 @@ class World:
         return distance_field(Occupancy(occupied, origin, side))
 
     def first_slots(self) -> Float:
-        """[N, 3] where the drones start."""
+        """Compute the start positions [N, 3] (m) of the drones."""
         slots = formation_slots(
             np.array(self.yaw_rad), self.drones, tilt_rad=_CONFIG.tilt_rad, range_m=_CONFIG.radius_m
         )
@@ -157,7 +157,7 @@ class World:
 
 
 def world_of(seed: int) -> World:
-    """The world of a seed; equal seeds give equal worlds."""
+    """Build the world of a seed; equal seeds give equal worlds."""
     rng = np.random.default_rng([2026, seed])
     kind = KINDS[seed % len(KINDS)]
     t_s, way = _walk(rng)
@@ -195,7 +195,7 @@ def world_of(seed: int) -> World:
 
 
 def _walk(rng: np.random.Generator) -> tuple[Float, Float]:
-    """Times [A] s and a way [A, 2] m that bends, walked or jogged, with a stop in some."""
+    """Draw times [A] s and a winding way [A, 2] m, walked or jogged, sometimes with a stop."""
     t_s = np.arange(0.0, _SECONDS + 1e-9, 0.1)
     speed = np.full(len(t_s), rng.uniform(0.8, 2.5))
     if rng.random() < 0.2:
@@ -206,7 +206,7 @@ def _walk(rng: np.random.Generator) -> tuple[Float, Float]:
 
 
 def _hills(rng: np.random.Generator, way: Float) -> tuple[tuple[float, float, float, float], ...]:
-    """Hills beside the way."""
+    """Draw hills beside the way."""
     found = []
     for _ in range(rng.integers(1, 4)):
         sigma = rng.uniform(2.5, 5.0)
@@ -216,7 +216,7 @@ def _hills(rng: np.random.Generator, way: Float) -> tuple[tuple[float, float, fl
 
 
 def _solid(rng: np.random.Generator, world: World) -> Solid:
-    """Something of the world's kind, somewhere about the actor's way."""
+    """Draw a solid of the world's kind near the actor's way."""
     place = world.actor[rng.integers(len(world.actor)), :2] + rng.uniform(-13, 13, 2)
     east, north = float(place[0]), float(place[1])
     yaw = float(rng.uniform(0, np.pi))
@@ -239,7 +239,7 @@ def _solid(rng: np.random.Generator, world: World) -> Solid:
 
 
 def _beside(rng: np.random.Generator, world: World) -> Solid:
-    """A wall so near to the first slot of one drone that it may lie within the drone's radius."""
+    """Draw a wall so near to the first slot of one drone that it may lie within the drone's radius."""
     slot = world.first_slots()[rng.integers(world.drones)]
     thick = world.resolution_m * float(rng.choice([1.0, 2.0]))
     high, long = float(rng.uniform(4, 10)), float(rng.uniform(2, 6))
@@ -251,7 +251,7 @@ def _beside(rng: np.random.Generator, world: World) -> Solid:
 
 
 def fly(seed: int, arms: Sequence[str] = ARMS) -> list[dict[str, Any]]:
-    """All arms through one world: what each flight did, measured on the analytic surfaces."""
+    """Fly all arms through one world; return figures of each flight, measured on the analytic surfaces."""
     world = world_of(seed)
     field = world.field()
     rows = []
@@ -294,7 +294,7 @@ def fly(seed: int, arms: Sequence[str] = ARMS) -> list[dict[str, Any]]:
 
 
 def _finely(position: Float) -> Float:
-    """[N, S, 3] the path with further points between its steps."""
+    """Add points [N, S, 3] between the steps of the path."""
     share = (np.arange(_FINE) / _FINE)[:, None]
     start, end = position[:, :-1, None], position[:, 1:, None]
     between = start + share * (end - start)
@@ -307,7 +307,7 @@ def is_safe(row: dict[str, Any]) -> bool:
 
 
 def main() -> None:
-    """Fly, print the tables, and exit with 1 if anything is not as it must be."""
+    """Fly, print the tables, and exit with 1 if any check fails."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--first", type=int, default=0, help="seed of the first world (default 0)")
     parser.add_argument("--count", type=int, default=COUNT, help=f"worlds (default {COUNT})")
@@ -328,7 +328,7 @@ def main() -> None:
 
 
 def flown(seeds: Iterable[int], workers: int) -> Iterable[dict[str, Any]]:
-    """The flights of some worlds, in the order of their seeds."""
+    """Fly some worlds; yield their flights in the order of their seeds."""
     if workers == 1:
         for seed in seeds:
             yield from fly(seed)
@@ -339,7 +339,7 @@ def flown(seeds: Iterable[int], workers: int) -> Iterable[dict[str, Any]]:
 
 
 def report(rows: list[dict[str, Any]], before: list[dict[str, Any]]) -> list[str]:
-    """Print what the flights did, and say what is not as it must be."""
+    """Print the figures of the flights, and return the failed checks."""
     old = {(row["seed"], row["arm"]): row for row in before}
     pairs = [(row, old[row["seed"], row["arm"]]) for row in rows if (row["seed"], row["arm"]) in old]
     trouble = []
