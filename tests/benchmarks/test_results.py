@@ -1,4 +1,4 @@
-"""The results page is what its command writes from the numbers beside it, and its figures are there."""
+"""Results page: equal to the text that its command writes from the stored numbers, with all its figures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_the_page_is_what_the_command_writes_of_its_numbers(numbers: dict[str, A
 
 
 def test_every_table_is_whole() -> None:
-    """Each line has as many cells as the header, and each row a number at least."""
+    """Count the cells: each line has as many as the header, and each row at least one number."""
     tables = re.findall(r"(?:^\|.*\n)+", PAGE, flags=re.MULTILINE)
     assert len(tables) == 1 + 4 * len(STUDIES) + 1 + 1
     for table in tables:
@@ -73,7 +73,7 @@ def test_every_command_that_the_page_names_is_one(numbers: dict[str, Any]) -> No
 
 
 def test_the_real_e2_is_the_one_that_the_paper_flew(numbers: dict[str, Any]) -> None:
-    """The fixed formation above 45 deg, the detector failing there, and a reconstruction that breaks."""
+    """Expect the fixed formation above 45 deg, missed detections there, and larger reconstruction errors."""
     adaptive, fixed = (numbers["filmed"]["e2"][arm] for arm in ("adaptive", "fixed"))
     assert fixed["tilt_deg"]["mean"] > 45 > adaptive["tilt_deg"]["max"]
     assert fixed["detected_share"] < adaptive["detected_share"]

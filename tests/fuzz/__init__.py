@@ -1,4 +1,4 @@
-"""Damaged files for every reader: each is read, or refused in one line.
+"""Fuzz tests: damaged files for every reader; each must be read, or refused in one line.
 
 python -m tests.fuzz --inputs 2000
 """

@@ -1,4 +1,4 @@
-"""`python -m tests.fuzz`: the long run."""
+"""Long run of the fuzz tests: `python -m tests.fuzz`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.fuzz.seeds import SEEDS
 
 
 def main() -> int:
-    """Fuzz all readers; 1 if anything but reading and refusing came of it."""
+    """Fuzz all readers; return 1 if any input was neither read nor refused."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--inputs", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)

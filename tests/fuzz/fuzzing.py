@@ -1,4 +1,4 @@
-"""Damages seeds and watches the process that reads them."""
+"""Driver of the fuzz tests: damages seeds and watches the process that reads them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _WAIT_S = 120.0  # for an answer, however busy the machine is; the worker counts
 
 @dataclass(frozen=True)
 class Trouble:
-    """An input that was neither read nor refused."""
+    """Input that was neither read nor refused."""
 
     seed: str
     number: int
@@ -32,7 +32,7 @@ class Trouble:
 
 @dataclass(frozen=True)
 class Fuzzed:
-    """What became of all inputs."""
+    """Results of all inputs."""
 
     inputs: int
     read: int  # ways in which inputs were read
@@ -45,8 +45,8 @@ def fuzz(folder: Path, inputs: int, *, seed: int = 0, names: Sequence[str] | Non
 
     Args:
         folder: an empty one to work in; inputs that made trouble stay below `trouble/`.
-        inputs: how many.
-        seed: of all damage; input k is the same however many there are.
+        inputs: number of inputs.
+        seed: seed of all damage; input k does not depend on the number of inputs.
         names: the seeds, all by default.
     """
     chosen = list(names or SEEDS)
@@ -72,12 +72,12 @@ def fuzz(folder: Path, inputs: int, *, seed: int = 0, names: Sequence[str] | Non
 
 
 def format_of(name: str) -> str:
-    """The format of a seed."""
+    """Return the format of a seed."""
     return name.replace(",", " ").split()[0]
 
 
 def _damaged_copy(source: Path, place: Path, choice: random.Random) -> tuple[Path, str]:
-    """A copy of a seed with a damaged file; the copy, and which file that is."""
+    """Copy a seed and damage one file; return the copy and the name of that file."""
     together = source.parent if source.name in {"map.yaml", "flight.yaml"} else source
     if together.is_dir():
         target = place / together.name
@@ -90,7 +90,7 @@ def _damaged_copy(source: Path, place: Path, choice: random.Random) -> tuple[Pat
 
 
 class _Reader:
-    """The process that reads; another one after it died."""
+    """Process that reads; replaced by another one after it died."""
 
     def __init__(self, warm: list[list[str]]) -> None:
         self._warm = json.dumps(warm)

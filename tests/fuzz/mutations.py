@@ -1,4 +1,4 @@
-"""Damage as disks, networks and hostile people do it, the same for the same seed."""
+"""Damage to files as by disks, networks and attackers, the same for the same seed."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _PIECES = (
 
 
 def damaged(content: bytes, choice: random.Random) -> bytes:
-    """A copy with one to four pieces of damage."""
+    """Return a copy with one to four pieces of damage."""
     changed = bytearray(content)
     is_text = b"\0" not in content[:4096]
     for _ in range(choice.randint(1, 4)):
@@ -42,7 +42,7 @@ def damaged(content: bytes, choice: random.Random) -> bytes:
 
 
 def damage_one(path: Path, choice: random.Random) -> str:
-    """Damage one file of a folder, or the file; its name."""
+    """Damage one file of a folder, or the file itself; return its name."""
     files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
     file = choice.choice(files)
     file.write_bytes(damaged(file.read_bytes(), choice))
@@ -50,7 +50,7 @@ def damage_one(path: Path, choice: random.Random) -> str:
 
 
 def _place(content: bytearray, choice: random.Random) -> int:
-    """Anywhere; headers are a small part of a file and the better target, so every other hit goes there."""
+    """Choose a place; half of the hits go to the header, a small part of a file and the better target."""
     end = min(len(content), 400) if choice.random() < 0.5 else len(content)
     return choice.randrange(end + 1)
 

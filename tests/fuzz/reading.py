@@ -1,4 +1,4 @@
-"""Everything that commands do with a file they were given, by every reader that takes it."""
+"""Reading of a file in all ways that commands use, by every reader that takes it."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from pipelines.session.telemetry import TelemetryChoice, TelemetryFormat, Trigge
 
 
 class NotOneLineError(AssertionError):
-    """A refusal that a terminal would show on several lines."""
+    """Refusal that a terminal would show on several lines."""
 
 
 def read_or_refuse(path: Path, stated: str) -> tuple[int, int]:
-    """Read a file in every way; how many ways worked, and how many refused it in one line.
+    """Read a file in every way; count the ways that worked, and those that refused it in one line.
 
     Args:
         path: the file, the folder, or a flight.yaml.
         stated: the format that a user names, whatever the content says.
 
     Raises:
-        Exception: whatever a reader lets through that is no refusal.
+        Exception: any exception of a reader other than a refusal.
     """
     read = refused = 0
     for way in _ways(path, stated):

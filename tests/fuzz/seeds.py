@@ -1,4 +1,4 @@
-"""A small sound file, or folder, of every format and of its variants: what is damaged."""
+"""Seeds to damage: a small valid file, or folder, of every format and of its variants."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.synthetic.flights import write_flight
 from tests.synthetic.logged_flights import write_logged_flight
 
 Writer = Callable[[Path], object]
-"""Writes into an empty folder. What lies there then, if it is one entry, is what is read; else the folder."""
+"""Writer into an empty folder. A single entry is then read itself; of several entries, the folder is read."""
 
 
 TREE = test_octomap.at([7] * 13, [3.5, None, -2.0, [3.5, None] * 4, *[None] * 4])
@@ -161,14 +161,14 @@ SEEDS: dict[str, Writer] = {
 
 
 def sown(folder: Path, names: list[str] | None = None) -> dict[str, Path]:
-    """Write the seeds, each into its own folder; what is to be read of each."""
+    """Write the seeds, each into its own folder; return the path to read for each."""
     paths = {}
     for number, name in enumerate(names or SEEDS):
         place = folder / f"{number}"
         place.mkdir(parents=True)
         SEEDS[name](place)
         inside = sorted(place.iterdir())
-        # What stands alone is read as it is; of a floor plan and a flight the file that names the others.
+        # A single file is read as it is; for a floor plan and a flight, the file that names the others.
         heads = [entry for entry in inside if entry.name in {"map.yaml", "flight.yaml"}]
         paths[name] = heads[0] if heads else inside[0] if len(inside) == 1 else place
     return paths

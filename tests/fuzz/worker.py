@@ -1,4 +1,4 @@
-"""The process that reads damaged files: bounded in memory and time, so that a bad reader ends it alone.
+"""Process that reads damaged files, with limits on memory and time: a bad reader ends only this process.
 
 Paths and formats come as JSON lines on stdin, outcomes leave on stdout.
 """
@@ -19,14 +19,14 @@ MOST_BYTES = 10**9
 
 
 def main() -> None:
-    """Read one file after the other until there are no more."""
+    """Read files one after the other until there are no more."""
     from pipelines.session.registries import FORMATS
     from tests.fuzz.reading import read_or_refuse
 
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # libraries that print must not be taken for answers
     FORMATS.all()
-    warm = json.loads(sys.stdin.readline())  # sound files load the libraries before memory is counted
+    warm = json.loads(sys.stdin.readline())  # valid files load the libraries before memory is counted
     for path, stated in warm:
         read_or_refuse(Path(path), stated)
     most = _data_bytes() + MOST_BYTES
@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def _data_bytes() -> int:
-    """What the process holds by itself: its heap and anonymous memory, touched or not."""
+    """Return the size of the process's own data: its heap and anonymous memory, touched or not."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmData:"):
             return int(line.split()[1]) * 1024

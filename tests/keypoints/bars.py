@@ -1,6 +1,6 @@
-"""Pictures of people drawn as bars, and networks that read them from the pixels, so that truth is known.
+"""Pictures of people drawn as bars, and fake networks that read them from the pixels, with known truth.
 
-A person is an upright bar of H x 0.4 H in a colour of their own. The networks share the limits that were
+A person is an upright bar of H x 0.4 H in a colour of their own. The networks have the limits that were
 measured on the real ones: the person detector sees bodies between a quarter and nine tenths of the
 picture's longer side, joints come from a region of about 1.25 H, and one pass from a region that is not
 centred confuses left and right.
@@ -25,7 +25,7 @@ WIDTH_PER_HEIGHT = 0.4
 
 @dataclass(frozen=True)
 class Bar:
-    """One person: odd sizes in pixels make the centre a pixel's."""
+    """Bar of one person; with odd sizes in pixels the centre is a pixel's centre."""
 
     x: float
     y: float
@@ -33,7 +33,7 @@ class Bar:
 
     @property
     def box(self) -> tuple[int, int, int, int]:
-        """First and last column, first and last row."""
+        """Bounds of the bar: first and last column, first and last row."""
         half, half_width = self.height / 2, self.height * WIDTH_PER_HEIGHT / 2
         return (
             round(self.x - half_width),
@@ -43,12 +43,12 @@ class Bar:
         )
 
     def joints(self) -> Float:
-        """[5, 2] px."""
+        """Compute the joints [5, 2] px."""
         return _joints(*self.box)
 
 
 def draw(width: int, height: int, *people: Bar) -> Picture:
-    """A picture of people; the colour is the place in the order, later ones stand in front."""
+    """Draw a picture of people; the colour is the place in the order, later ones are in front."""
     picture = np.zeros((height, width, 3), np.uint8)
     for colour, person in enumerate(people, start=1):
         left, right, top, bottom = person.box
@@ -58,14 +58,14 @@ def draw(width: int, height: int, *people: Bar) -> Picture:
 
 @dataclass
 class BarNetworks:
-    """The fake detector; it notes the pictures and regions that it was given."""
+    """Fake detector that records the pictures and regions it receives."""
 
     joints: tuple[str, ...] = JOINTS
     searched: list[tuple[int, int]] = field(default_factory=list)  # width, height
     located: list[Region] = field(default_factory=list)
 
     def find_people(self, picture: Picture) -> list[tuple[Region, float]]:
-        """Everybody of a suitable size, whole or cut off at the border."""
+        """Find all people of a suitable size, whole or cut at the border."""
         height, width = picture.shape[:2]
         self.searched.append((width, height))
         found = []
@@ -76,7 +76,7 @@ class BarNetworks:
         return sorted(found, key=lambda candidate: -candidate[1])
 
     def locate(self, picture: Picture, regions: Sequence[Region]) -> list[Person]:
-        """Whoever fills most of each region."""
+        """Locate the person who fills most of each region."""
         self.located += regions
         return [_look(picture, region) for region in regions]
 

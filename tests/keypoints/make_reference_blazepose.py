@@ -1,6 +1,6 @@
-"""Makes reference_blazepose.json again, with MediaPipe itself.
+"""Script that makes reference_blazepose.json with MediaPipe itself.
 
-It needs an environment of its own, because mediapipe 0.10.21 does not go together with ours:
+It needs its own environment, because mediapipe 0.10.21 is not compatible with ours:
 
     python3.11 -m venv /tmp/reference && /tmp/reference/bin/pip install mediapipe==0.10.21
     /tmp/reference/bin/python tests/keypoints/make_reference_blazepose.py FOLDER_OF_VIDEOS

@@ -1,7 +1,7 @@
-"""Small real ONNX models whose answers are known: they find bright spots, or say what they were told to.
+"""Small real ONNX models with known answers: they find bright spots, or return constants.
 
-A pose model here divides its input into bands of equal height, two unless asked for others: joint j is
-where the band j modulo their number is brightest.
+A pose model here divides its input into bands of equal height, two by default: joint j is the brightest
+place of the band j modulo their number.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def heatmap_model(
     bands: int = 2,
     channel: tuple[float, float, float] = (1 / 3, 1 / 3, 1 / 3),
 ) -> Path:
-    """Cell k is the brightness at pixel k (W - 1) / (w - 1) (`udp`) or at k `stride` (`msra`)."""
+    """Build a heatmap model: cell k is the brightness at pixel k (W - 1) / (w - 1) (`udp`) or k `stride`."""
     width, height = size
     columns, rows = width // stride, height // stride
     constants = _pose_constants(size, joints, channel, bands)
@@ -67,7 +67,7 @@ def simcc_model(
     split: int = 2,
     batch: int | str = "n",
 ) -> Path:
-    """Bin b is the brightness of the columns, or rows, about b / split: their sum, smoothed, / 16."""
+    """Build a SimCC model: bin b is the smoothed sum of columns, or rows, around b / split, over 16."""
     width, height = size
     constants = _pose_constants(size, joints, (1 / 3, 1 / 3, 1 / 3))
     nodes = _brightness("nchw")
@@ -89,7 +89,7 @@ def simcc_model(
 def constant_model(
     path: Path, size: tuple[int, int], outputs: dict[str, NDArray[np.float32] | NDArray[np.int64]]
 ) -> Path:
-    """A model that says the same whatever it is shown."""
+    """Build a model that returns the same outputs for every input."""
     constants: dict[str, NDArray[np.float32] | NDArray[np.int64]] = {
         f"{name}_value": value for name, value in outputs.items()
     }
@@ -153,7 +153,7 @@ def _save(
 def spots(
     width: int, height: int, places: Sequence[tuple[float, float]], sigma_px: float, colour: int | None = None
 ) -> NDArray[np.uint8]:
-    """A black picture [H, W, 3] BGR with round Gaussian spots; of one BGR channel only where it is given."""
+    """Draw a black picture [H, W, 3] BGR with round Gaussian spots, in one BGR channel if it is given."""
     x, y = (
         np.exp(-((np.arange(length) - np.array(at)[:, None]) ** 2) / (2 * sigma_px**2))
         for length, at in zip((width, height), zip(*places, strict=True), strict=True)

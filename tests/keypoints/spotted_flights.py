@@ -1,4 +1,4 @@
-"""Flights with videos of a person made of three bright spots, and the ONNX models that see them."""
+"""Flights with videos of a person made of three bright spots, and ONNX models that find them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ _SPOT_PX = 3.0
 
 
 def person_at(t_s: Float) -> Float:
-    """The three spots [T, 3, 3] m, from above: someone who sways along x. Joint j of 17 is spot j % 3."""
+    """Compute the three spots [T, 3, 3] m, top first, of a person who sways along x.
+
+    Joint j of 17 is spot j % 3.
+    """
     middle = np.stack([0.5 * np.sin(t_s), np.zeros_like(t_s)], axis=-1)
     return np.stack(
         [np.column_stack([middle, np.full(len(t_s), height)]) for height in (1.6, 1.0, 0.4)], axis=1
@@ -33,7 +36,7 @@ def person_at(t_s: Float) -> Float:
 
 
 def write_spotted_flight(folder: Path, frames: int) -> Path:
-    """A flight of two cameras with videos of 320x240, without keypoints; its flight.yaml."""
+    """Write a flight of two cameras with videos of 320x240, without keypoints; return its flight.yaml."""
     t_s = np.arange(frames) / FPS
     stamps = START_S * 10**9 + np.round(t_s * 1e9).astype(np.int64)
     lines = ["schema: 1", "name: Spots", "world: {frame: enu}", "cameras:"]
@@ -56,7 +59,7 @@ def write_spotted_flight(folder: Path, frames: int) -> Path:
 
 
 def spot_detector(folder: Path) -> str:
-    """What to write after `--detector`: models that see the spots, and a person in every picture."""
+    """Return the value of `--detector`: models that find the spots, and a person in every picture."""
     pose = heatmap_model(folder / "pose.onnx", bands=3)
     box = np.array([(100.0, 60.0, 220.0, 180.0, 0.9)], np.float32)
     people = constant_model(folder / "people.onnx", (320, 320), {"dets": box})
@@ -64,7 +67,7 @@ def spot_detector(folder: Path) -> str:
 
 
 def write_pictures(path: Path, pictures: Iterable[NDArray[np.uint8]]) -> None:
-    """An H.264 video of BGR pictures at 30 Hz."""
+    """Write an H.264 video of BGR pictures at 30 Hz."""
     with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
         stream = None
         for number, picture in enumerate(pictures):

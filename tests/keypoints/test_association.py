@@ -1,7 +1,7 @@
-"""Choosing one person across cameras, on people whose paths and identities are known.
+"""Association of people across cameras, on people with known paths and identities.
 
 Rigid bodies of 17 points walk on closed-form paths inside a ring of cameras 10 m away that look down at
-15 degrees. Identity is the index of the body; detections are shuffled before they are handed over.
+15 degrees. Identity is the index of the body; detections are shuffled before association.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ JOINTS = 17
 
 @dataclass(frozen=True)
 class Scene:
-    """What the cameras see: arguments of `associate`, and who each detection is."""
+    """Views of the cameras: arguments of `associate`, and the true person of each detection."""
 
     time_s: Float
     xy: Float  # [T, C, D, J, 2]
@@ -54,13 +54,13 @@ class Scene:
         )
 
     def chosen(self, result: Association, person: int = 0) -> Int64:
-        """[T, C] who was chosen, -1 nobody."""
+        """Return the true person [T, C] of each chosen detection, -1 for none."""
         choice = result.choice[..., person]
         found = np.take_along_axis(self.who, np.maximum(choice, 0)[..., None], -1)[..., 0]
         return np.where(choice >= 0, found, -1)
 
     def hide(self, person: int, camera: int, times: slice = slice(None)) -> Scene:
-        """The same, but for one person in one camera."""
+        """Return the scene without one person in one camera."""
         xy = self.xy.copy()
         xy[times, camera][self.who[times, camera] == person] = np.nan
         return replace(self, xy=xy, who=np.where(np.isfinite(xy[..., 0, 0]), self.who, -1))
@@ -71,7 +71,7 @@ def straight(start: tuple[float, float], velocity: tuple[float, float]) -> Path:
 
 
 def bodies(paths: list[Path], time_s: Float) -> Float:
-    """[T, P, J, 3] bodies 1.7 m tall and 0.4 m wide, turned differently, that swing a little as they walk."""
+    """Simulate bodies [T, P, J, 3] 1.7 m tall and 0.4 m wide, turned differently, that swing as they walk."""
     j = np.arange(JOINTS)
     upright = np.stack([0.2 * np.sin(2.4 * j), 0.1 * np.cos(1.7 * j), 0.1 + 0.1 * j], -1)
     joints = np.empty((len(time_s), len(paths), JOINTS, 3))
@@ -85,7 +85,7 @@ def bodies(paths: list[Path], time_s: Float) -> Float:
 
 
 def rotations(vectors: Float) -> Float:
-    """Rotation matrices of small rotation vectors [..., 3], Rodrigues to machine precision."""
+    """Compute rotation matrices of small rotation vectors [..., 3], Rodrigues to machine precision."""
     from scipy.spatial.transform import Rotation
 
     matrices: Float = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
@@ -103,7 +103,7 @@ def film(
     outliers: float = 0.0,
     seed: int = 0,
 ) -> Scene:
-    """Everybody seen by a ring of cameras; pose errors are (m, deg) on each axis, and told in sigma."""
+    """Film all people with a ring of cameras; pose errors are (m, deg) per axis, and included in sigma."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
     joints = bodies(paths, time_s)
@@ -164,7 +164,7 @@ NONE, MEDIUM = (0.0, 0.0), (0.3, 1.0)
 
 @pytest.mark.slow  # compiles much
 def test_three_people_who_cross_keep_their_identities() -> None:
-    """Without pose noise a wrong pair is tens of sigma off, so every detection goes where it belongs."""
+    """Expect every detection at its person: without pose noise a wrong pair is tens of sigma off."""
     scene = film([ACTOR, CROSSING, ACROSS], missing=0.1, outliers=0.05)
     result = scene.associate(people=3)
     chosen = [scene.chosen(result, person) for person in range(3)]
@@ -186,7 +186,7 @@ def test_three_people_who_cross_keep_their_identities() -> None:
 @pytest.mark.parametrize("cameras", [2, 5])
 @pytest.mark.parametrize("noise", ["white", "bias"])
 def test_a_lone_actor_never_loses_a_view_to_outliers_and_pose_noise(cameras: int, noise: str) -> None:
-    """Pairs of right views lie within 3 sigma with p = 0.997 and 5 sigma once known: none is refused."""
+    """Refuse no right view: pairs lie within 3 sigma with p = 0.997, and within 5 sigma once known."""
     for seed in range(3):
         white, bias = (MEDIUM, NONE) if noise == "white" else (NONE, MEDIUM)
         scene = film([ACTOR], cameras=cameras, outliers=0.05, white=white, bias=bias, seed=seed)
@@ -197,10 +197,10 @@ def test_a_lone_actor_never_loses_a_view_to_outliers_and_pose_noise(cameras: int
 
 @pytest.mark.parametrize("cameras", [2, 3, 5])
 def test_the_logged_actor_is_found_among_people_under_pose_noise(cameras: int) -> None:
-    """At 0.3 m and 1 deg a ray is 0.35 m wide and the log 0.7 m; people pass at 0.6 m.
+    """Test at 0.3 m and 1 deg: a ray is 0.35 m wide and the log 0.7 m; people pass at 0.6 m.
 
-    Mean over 40 draws: right 0.989, 0.984, 1.000, wrong 0.013, 0.015, 0.000 for 2, 3, 5 cameras. What is
-    wrong is two people who stand behind each other for one camera when the film begins.
+    Mean over 40 draws: right 0.989, 0.984, 1.000, wrong 0.013, 0.015, 0.000 for 2, 3, 5 cameras. The wrong
+    choices are two people who stand behind each other for one camera when the film begins.
     """
     right, wrong = [], []
     for seed in range(12):
@@ -228,7 +228,7 @@ def test_a_log_that_is_near_nobody_is_reported() -> None:
 
 
 def test_a_bystander_is_not_taken_for_the_actor_where_the_actor_is_hidden() -> None:
-    """Hidden in one camera for good, the other cameras agree; the bystander there is refused and counted."""
+    """Hide the actor in one camera for good: the bystander there is refused and counted."""
     bystander = straight((1.0, 2.0), (0.0, 0.0))
     scene = film([ACTOR, bystander]).hide(0, camera=2)
     for camera in (0, 1, 3, 4):
@@ -242,7 +242,7 @@ def test_a_bystander_is_not_taken_for_the_actor_where_the_actor_is_hidden() -> N
 
 
 def test_a_bystander_who_stood_beside_the_actor_is_refused_under_pose_noise() -> None:
-    """At two metres the gate of 3 sigma lets him pass; that both were in the picture tells them apart."""
+    """Refuse a bystander at two metres, inside the gate of 3 sigma: both were once in one picture."""
     beside = straight((-3.0, 2.0), (1.0, 0.0))
     scene = film([ACTOR, beside], bias=MEDIUM, seed=4).hide(0, camera=2, times=slice(30, 90))
     chosen = scene.chosen(scene.associate(log=ACTOR))
@@ -251,7 +251,7 @@ def test_a_bystander_who_stood_beside_the_actor_is_refused_under_pose_noise() ->
 
 
 def test_the_actor_is_taken_up_again_after_all_cameras_lost_him() -> None:
-    """Three seconds at 1 m/s, while a bystander 4 m away stays: the place tells who comes back."""
+    """Lose the actor for three seconds at 1 m/s; a bystander 4 m away stays, so the place identifies him."""
     scene = film([ACTOR, straight((2.0, 5.0), (0.0, 0.0))])
     for camera in range(5):
         scene = scene.hide(0, camera, slice(30, 75))
@@ -265,7 +265,7 @@ def test_the_actor_is_taken_up_again_after_all_cameras_lost_him() -> None:
 
 @pytest.mark.parametrize("cameras", [[2], [0, 1, 2, 3]])
 def test_the_more_complete_detection_of_a_person_is_taken(cameras: list[int]) -> None:
-    """A detector that takes one body for two leaves a fragment, here in one camera and in all."""
+    """Add fragments of a body, as from a detector that splits one body in two, in one camera and in all."""
     scene = film([ACTOR, ACROSS], cameras=4)  # who is 1 becomes a copy of four joints of 0
     xy, who = scene.xy.copy(), scene.who.copy()
     for t, c in np.ndindex(*who.shape[:2]):
@@ -319,7 +319,7 @@ CROWD_RESULT: list[Association] = []
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_the_order_of_detections_does_not_matter(seed: int) -> None:
-    """The same bodies are chosen whatever the order they come in, also where the choice is in doubt."""
+    """Shuffle the detections: the same bodies are chosen, also where the choice is ambiguous."""
     if not CROWD_RESULT:
         CROWD_RESULT.append(CROWD.associate(people=3))
     times, cameras, detections = CROWD.who.shape

@@ -1,4 +1,4 @@
-"""The default detector against MediaPipe itself, and its parts against closed forms."""
+"""Default detector against MediaPipe itself, and its parts against closed forms."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Picture = NDArray[np.uint8]
 
 @pytest.fixture(scope="module")
 def networks() -> BlazePose:
-    """The real networks; a machine that neither has them nor a network skips."""
+    """Load the real networks; skip without the files and without an internet connection."""
     try:
         DETECTOR.fetch()
     except DataError as error:
@@ -38,7 +38,7 @@ def networks() -> BlazePose:
 
 @dataclass(frozen=True)
 class Sample:
-    """A real picture, what MediaPipe makes of it, and that in our convention."""
+    """Real picture with MediaPipe's results, converted to our convention."""
 
     picture: Picture
     region: Region
@@ -63,7 +63,7 @@ def sample(folder: Path, entry: dict[str, Any]) -> Sample:
     # Numbers of other pixels would compare decoders, not detectors.
     assert hashlib.sha256(picture.tobytes()).hexdigest() == entry["sha256"]
     x, y, side, angle = entry["region"]
-    # MediaPipe says u + 1/2 crop pixels where the crop's pixels, counted from their centres, lie at u.
+    # MediaPipe reports u + 1/2 crop pixels for a position u that is counted from pixel centres.
     half = crop_pixel(side, angle) @ (0.5, 0.5)
     next_x, next_y, next_side, next_angle = entry["next_region"]
     return Sample(
@@ -76,7 +76,7 @@ def sample(folder: Path, entry: dict[str, Any]) -> Sample:
 
 
 def crop_pixel(side: float, angle: float) -> Float:
-    """Columns: one crop pixel to the right and one down, clockwise by the angle, in picture pixels."""
+    """Return as columns one crop pixel to the right and one down, turned clockwise, in picture pixels."""
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     return turn * side / CROP
 
@@ -92,9 +92,9 @@ def assert_same_region(found: Region, expected: Region, px: float) -> None:
     assert found.angle_rad == pytest.approx(expected.angle_rad, abs=2 * px / expected.side)
 
 
-# The mark is 0.1 px (median). The locked OpenCV gives 0.005 px from the same region and 0.006 px from the
+# The goal is 0.1 px (median). The locked OpenCV gives 0.005 px from the same region and 0.006 px from the
 # picture (95 %: 0.02, largest: 0.09). Warping without rounding positions to 1/32 px gives 0.09 and 0.61 px:
-# the marks are tighter so that they see it.
+# the limits are tighter to detect this.
 MEDIAN_PX = 0.02
 LARGEST_PX = 0.5
 
@@ -128,10 +128,10 @@ def test_the_next_region_is_the_one_mediapipe_tracks_with(networks: BlazePose, s
 
 
 def test_a_mirrored_person_has_mirrored_joints(networks: BlazePose, samples: list[Sample]) -> None:
-    """Settles the half pixel: over many joints the network knows no left and right.
+    """Check the half-pixel convention: over many joints the network is symmetric in left and right.
 
-    Taken for the centres of pixels, what it says of the edges would put the mirrored joints one crop pixel
-    beside; measured are 0.1 to 0.2 (it is no exact mirror, and the heatmap's window is cut to cells).
+    With edges taken for centres of pixels, the mirrored joints would be one crop pixel off. Measured are
+    0.1 to 0.2 (the mirror is not exact, and the heatmap's window is cut to cells).
     """
     joints = networks.joints
     swapped = [
@@ -148,14 +148,14 @@ def test_a_mirrored_person_has_mirrored_joints(networks: BlazePose, samples: lis
         mirrored = networks.locate(np.ascontiguousarray(s.picture[:, ::-1]), [mirror])[0]
         sure = (person.confidence > 0.7) & (mirrored.confidence[swapped] > 0.7)
         back = np.column_stack([width - 1 - mirrored.xy[swapped, 0], mirrored.xy[swapped, 1]])
-        # Along the crop's own x: that is the direction that was mirrored.
+        # Along the crop's own x, the mirrored direction.
         right = crop_pixel(s.region.side, s.region.angle_rad)[:, 0] * CROP / s.region.side
         off.append(((person.xy - back)[sure] @ right) * CROP / s.region.side)
     assert abs(np.median(np.concatenate(off))) < 0.4
 
 
 def test_a_turned_picture_has_turned_joints(networks: BlazePose) -> None:
-    """The same crop out of a picture turned by a quarter: only the last bits of the positions differ."""
+    """Cut the same crop from a picture turned by 90 deg: only the last bits of the positions differ."""
     rng = np.random.default_rng(1)
     coarse = rng.integers(0, 255, (30, 40, 3)).astype(np.uint8)
     picture = np.repeat(np.repeat(coarse, 16, axis=0), 16, axis=1)
@@ -180,7 +180,7 @@ def test_nobody_is_found_in_an_empty_picture(networks: BlazePose) -> None:
 
 
 def test_joints_outside_of_the_crop_have_no_confidence(networks: BlazePose, samples: list[Sample]) -> None:
-    """Around the head, half as wide as it should be: the legs are guesses, and said to be."""
+    """Use a region around the head of half the right width: joints outside of it get confidence 0."""
     outside = 0
     for s in samples:
         region = Region((float(s.xy[0, 0]), float(s.xy[0, 1])), s.region.side / 2, s.region.angle_rad)
@@ -207,7 +207,7 @@ def test_loading_says_nothing(networks: BlazePose, capfd: pytest.CaptureFixture[
 
 
 def test_a_crop_takes_the_colours_where_its_pixels_lie() -> None:
-    """On a picture whose red grows along x and green along y, a sample's colour is its position.
+    """Sample a picture whose red grows along x and green along y: a sample's colour is its position.
 
     The picture holds whole numbers and positions are rounded to 1/32 px: each costs at most a half, so that
     values are within 1/2 + 1/64 of a position in [0, 255].
@@ -255,7 +255,7 @@ def test_overlapping_people_become_one_weighted_by_their_scores() -> None:
 
 
 def test_a_heatmap_moves_a_joint_to_its_middle_where_it_is_sure() -> None:
-    """Logits so far from zero that cells count 1 or 0: the middle is the mean of the cells that are lit."""
+    """Use logits so far from zero that cells count 1 or 0: the middle is the mean of the cells with 1."""
     heatmap = np.full((64, 64, 4), -80.0)
     heatmap[20, 30, 0] = heatmap[20, 32, 0] = heatmap[23, 31, 0] = 80
     heatmap[20, 30, 1] = np.log(0.4 / 0.6)  # a peak of 0.4 moves nothing

@@ -1,4 +1,4 @@
-"""Fetching model files out of packages: with pip and npm themselves, but from here instead of a network."""
+"""Fetching of model files from packages, with pip and npm themselves but local sources."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ CONTENT = {"pose/first.tflite": b"first network" * 100, "pose/second.tflite": b"
 
 
 def models(**changed: bytes) -> PackagedModels:
-    """The models of the test's own wheel; `changed` where other content is expected than it has."""
+    """Describe the models of the test's own wheel; `changed` expects other content than it has."""
     files = [
         ModelFile(member, len(content), hashlib.sha256(changed.get(member[5:-7], content)).hexdigest())
         for member, content in CONTENT.items()
@@ -45,7 +45,7 @@ def models(**changed: bytes) -> PackagedModels:
 
 @pytest.fixture
 def shelf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where pip looks instead of the network; the cache is a temporary folder as well."""
+    """Create a folder that pip uses instead of the network; the cache is temporary as well."""
     folder = tmp_path / "shelf"
     folder.mkdir()
     monkeypatch.setenv("PIP_NO_INDEX", "1")
@@ -62,7 +62,7 @@ def write_wheel(folder: Path, content: dict[str, bytes] = CONTENT) -> Path:
             wheel.writestr(member, data)
         wheel.writestr(
             f"{info}/METADATA",
-            # pip must neither want this Python nor follow what it depends on.
+            # pip must not require this Python, and must not follow dependencies.
             "Metadata-Version: 2.1\nName: mocap-test-models\nVersion: 1.2\n"
             "Requires-Python: ==3.11.*\nRequires-Dist: there-is-no-such-package\n",
         )
@@ -140,7 +140,7 @@ def test_damaged_and_wrong_sources_are_named(shelf: Path, tmp_path: Path) -> Non
 
 
 def test_a_bomb_is_not_unpacked(shelf: Path, tmp_path: Path) -> None:
-    """A member far larger than the file that is expected: only a byte more than that is read."""
+    """Refuse a member far larger than the expected file, after reading one byte more than expected."""
     bomb = write_wheel(tmp_path, {**CONTENT, "pose/first.tflite": bytes(200_000_000)})
     with pytest.raises(DataError, match="is not the one that was expected"):
         models().fetch(bomb)
@@ -162,7 +162,7 @@ NETWORK = {"package/third.tflite": b"third network" * 300}
 
 
 def npm_models(content: dict[str, bytes] = NETWORK) -> PackagedModels:
-    """Models of the test's own package, with the content that is expected."""
+    """Describe the models of the test's own package, with the expected content."""
     files = [ModelFile(name, len(data), hashlib.sha256(data).hexdigest()) for name, data in content.items()]
     return PackagedModels("testpose", NpmPackage("mocap-test-models", "1.2.0"), tuple(files))
 
@@ -180,7 +180,7 @@ def write_tarball(folder: Path, content: dict[str, bytes] = NETWORK) -> Path:
 
 @contextmanager
 def served(folder: Path) -> Iterator[str]:
-    """The address of a server of that folder's files: npm's registry for a while."""
+    """Serve the folder's files as npm's registry for a while; yield the address."""
     handler = partial(QuietHandler, directory=str(folder))
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         thread = threading.Thread(target=server.serve_forever)
@@ -191,10 +191,10 @@ def served(folder: Path) -> Iterator[str]:
 
 
 class QuietHandler(SimpleHTTPRequestHandler):
-    """A server that says nothing."""
+    """Server without log output."""
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002  # the library's name
-        """Say nothing."""
+        """Print nothing."""
 
 
 def test_files_come_out_of_the_tarball_that_npm_downloads(

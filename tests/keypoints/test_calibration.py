@@ -1,4 +1,4 @@
-"""Calibration of confidences whose worth is known."""
+"""Calibration of confidences with known probabilities."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WRISTS = [joint.endswith("wrist") for joint in COCO17]
 
 
 def worth(confidence: Float) -> Float:
-    """The true probability of the others; wrists have half of it."""
+    """Compute the true probability of joints other than wrists; wrists have half of it."""
     probability: Float = confidence**2
     return probability
 
@@ -114,6 +114,6 @@ def test_keypoints_in_any_order_are_worth_the_same(detector: str) -> None:
     assert np.array_equal(
         calibration.probabilities(confidence.ravel()[order], names[order]), expected.ravel()[order]
     )
-    # What the detector is sure of is right more often than not, and the other way round.
+    # Joints with high confidence are right more often than not, and the other way round.
     assert calibration.probability(np.array([[0.9]]), ("left_knee",))[0, 0] > 0.9
     assert calibration.probability(np.array([[0.2]]), ("left_knee",))[0, 0] < 0.5

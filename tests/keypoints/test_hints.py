@@ -1,4 +1,4 @@
-"""The actor's place in the picture, against a pinhole worked out by hand."""
+"""Place of the actor in the picture, against a pinhole computed by hand."""
 
 from __future__ import annotations
 

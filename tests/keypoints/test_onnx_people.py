@@ -1,4 +1,4 @@
-"""Boxes of person detectors, in each of the ways in which they are exported."""
+"""Boxes of person detectors, in each form in which they are exported."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Outputs = dict[str, NDArray[np.float32] | NDArray[np.int64]]
 
 
 def with_labels() -> Outputs:
-    """RTMDet, and YOLOX as MMDeploy exports it."""
+    """Return outputs of RTMDet, and of YOLOX as MMDeploy exports it."""
     boxes = [(*BESIDE, 0.6), (*BOX, 0.9), (*CAR, 0.95), (0, 0, 9, 9, 0.1)]
     return {"dets": np.array([boxes], np.float32), "labels": np.array([[0, 0, 2, 0]], np.int64)}
 
@@ -37,7 +37,7 @@ def alone() -> Outputs:
 
 
 def raw_yolox() -> Outputs:
-    """The same boxes by the cells of stride 8 and 16 around their centres; each twice, a little apart."""
+    """Encode the same boxes in the cells of stride 8 and 16 around their centres; each twice."""
     table = np.zeros((1, 40 * 40 + 20 * 20 + 10 * 10, 7), np.float32)
     for (left, top, right, bottom), score, kind in ((BOX, 0.9, 0), (BESIDE, 0.6, 0), (CAR, 0.95, 1)):
         x, y = (left + right) / 2, (top + bottom) / 2

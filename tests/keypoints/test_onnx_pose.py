@@ -1,4 +1,4 @@
-"""The user's own model: from a picture through crop, network and decoding to joints whose place is known."""
+"""Detector with the user's own model: crop, network and decoding give joints at known places."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.keypoints.onnx_graphs import constant_model, heatmap_model, simcc_mod
 GREY = "mean=0/0/0,std=255/255/255"  # brightness as it is: 0..1
 UPPER, LOWER = (301.37, 160.81), (307.62, 243.18)
 REGION = Region((304.0, 200.0), 160.0)  # scale 160 / 128 = 1.25 picture pixels for one of the input
-SPOT_PX = 7.5  # 6 pixels of the input, 1.5 cells: what pose networks are trained on
+SPOT_PX = 7.5  # 6 pixels of the input, 1.5 cells: the size that pose networks are trained on
 
 # How far off joints may be, in picture pixels, 1.25 for one of the input. Where pixels are sampled is
 # rounded to 1/32 px: 1/64. Heatmaps: the slope of the smoothed logarithm is wrong by at most half a grey
@@ -105,7 +105,7 @@ def test_an_open_size_is_stated(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("order", "bgr"), [("rgb", 2), ("bgr", 0)])
 def test_colours_come_in_the_order_stated(tmp_path: Path, order: str, bgr: int) -> None:
-    """A network that sees its first channel only: red as RGB, blue as BGR."""
+    """Use a network that reads its first channel only: red as RGB, blue as BGR."""
     path = heatmap_model(tmp_path / "m.onnx", channel=(1.0, 0.0, 0.0))
     picture = spots(640, 400, [UPPER, LOWER], SPOT_PX, colour=bgr)
     (person,) = load(path, f"{GREY},colours={order}").locate(picture, [REGION])
@@ -116,7 +116,7 @@ def test_colours_come_in_the_order_stated(tmp_path: Path, order: str, bgr: int) 
 
 
 def test_imagenet_is_the_default_norm(tmp_path: Path) -> None:
-    """A white picture is (255 - mean) / std; the mean over the channels is what the cells hold."""
+    """Expect (255 - mean) / std in each channel of a white picture; cells hold the weighted channels."""
     path = heatmap_model(tmp_path / "m.onnx", channel=(0.25, 0.0, 0.0))
     white = np.full((400, 640, 3), 255, np.uint8)
     (person,) = load(path, "").locate(white, [REGION])

@@ -1,4 +1,4 @@
-"""A real recording: four still cameras, one person of interest, bystanders in two of the pictures."""
+"""Real recording: four static cameras, one person of interest, bystanders in two of the views."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ Float = NDArray[np.float64]
 
 
 def people(folder: Path, camera: str, frame: int) -> list[Float]:
-    """[J, 3] x, y, confidence of everybody in one picture; an entry without keypoints is nobody."""
+    """Read x, y, confidence [J, 3] of all people in one picture; skip entries without keypoints."""
     found = json.loads((folder / f"{camera}_json" / f"{camera}.{frame:04d}.json").read_text())["people"]
     return [np.array(one["pose_keypoints_2d"]).reshape(JOINTS, 3) for one in found if one]
 
 
 def test_the_person_of_interest_is_the_one_the_peer_associated() -> None:
-    """Agreement with Pose2Sim's own association, which tries all combinations of detections.
+    """Compare with Pose2Sim's own association, which tries all combinations of detections.
 
     It names a person in 399 of the 400 camera-frames and we choose that detection in 398. The other
     one is frame 37 of cam01, where the detector took the person for two: the peer keeps the upper body with

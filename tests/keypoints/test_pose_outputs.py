@@ -21,9 +21,9 @@ def test_a_gaussian_in_a_heatmap_is_read_exactly(x: float, y: float, sigma: floa
     row, column = np.mgrid[:64, :48]
     heatmap = height * np.exp(-((column - x) ** 2 + (row - y) ** 2) / (2 * sigma**2))
     place, score = heatmap_peaks(heatmap[None, None])
-    # Smoothing stops 5 cells away. For a sigma of 3 and 1.5 cells from the top, what it would have summed is
-    # normal about 1.5 * 4 / 13 with the variance 1 / (1/4 + 1/9): 0.32 % lies beyond. The slope is then wrong
-    # by at most half of that, and the step by 13 times as much.
+    # Smoothing stops 5 cells away. For a sigma of 3, at 1.5 cells from the top, the weights of the full sum
+    # are normal about 1.5 * 4 / 13 with the variance 1 / (1/4 + 1/9): 0.32 % lies beyond. The slope is then
+    # wrong by at most half of that, and the step by 13 times as much.
     np.testing.assert_allclose(place[0, 0], (x, y), atol=13 * 0.0032 / 2)
     assert score[0, 0] == heatmap.max()
 

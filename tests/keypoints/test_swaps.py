@@ -1,4 +1,4 @@
-"""Left and right exchanged in a walk whose joints are known, in one camera that circles it."""
+"""Exchanges of left and right in a walk with known joints, in one camera that circles it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ T_S = np.arange(SECONDS * FPS) / FPS
 
 
 def pixels(turn_deg: float, tilt_deg: float = 20.0, noise_px: float = NOISE_PX, seed: int = 0) -> Float:
-    """[T, 17, 2] px of a walk along a circle, seen from 10 m: from all sides in its 21 s."""
+    """Project a walk along a circle to [T, 17, 2] px, from 10 m: from all sides in its 21 s."""
     joints = walk(T_S, radius_m=4.0)
     tilt, turn = np.radians(tilt_deg), np.radians(turn_deg)
     away = 10 * np.array([np.cos(tilt) * np.cos(turn), np.cos(tilt) * np.sin(turn), np.sin(tilt)])
@@ -90,7 +90,7 @@ def test_exchanges_are_undone(what: str, longest: int, turn_deg: float) -> None:
     columns = [side for pair in group for side in pair]
     restored = (found[:, columns] == truth[:, columns]).all(axis=(1, 2))
     assert restored[visible].mean() >= 0.95
-    # The others stay, but for those up to a crossing that are fewer than the exchanged ones beyond it.
+    # The others stay, except those up to a crossing that are fewer than the exchanged ones beyond it.
     assert restored[~swapped].mean() >= 0.98
     assert sum(counts.values()) >= 0.9 * visible.sum()
 
@@ -121,13 +121,13 @@ def test_short_or_empty_tracks_are_left_alone() -> None:
 
 
 def squared_distance(xy: Float, pairs: list[tuple[int, int]]) -> Float:
-    """[T] of left and right, summed over some pairs."""
+    """Compute the squared distance [T] of left and right, summed over some pairs."""
     total: Float = np.sum([((xy[:, a] - xy[:, b]) ** 2).sum(-1) for a, b in pairs], axis=0)
     return total
 
 
 def runs(count: int, longest: int, rng: np.random.Generator) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Runs of up to so many pictures, about 10 % of all, none at the ends."""
+    """Draw runs of up to `longest` pictures, about 10 % of all, none at the ends."""
     where = np.zeros(count, np.bool_)
     while where.mean() < 0.1:
         first = int(rng.integers(3, count - longest - 3))
@@ -136,7 +136,7 @@ def runs(count: int, longest: int, rng: np.random.Generator) -> np.ndarray[tuple
 
 
 def step_sideways(crossing_s: float, step_s: float = 0.5, seconds: float = 4.0) -> tuple[Float, Float]:
-    """Knees and feet of a walker seen from the side at 30 Hz: [T] s and [T, 17, 2] px, without noise.
+    """Simulate knees and feet of a walker seen from the side at 30 Hz: [T] s, [T, 17, 2] px, no noise.
 
     Left and right swing against each other by 25 px and cross every half second, one time at `crossing_s`.
     Where they are nearer than 12 px, one hides the other, and detectors find both in the middle.
@@ -159,7 +159,7 @@ def step_sideways(crossing_s: float, step_s: float = 0.5, seconds: float = 4.0) 
 def test_an_exchange_from_or_to_a_crossing_is_undone_and_no_other_picture_is_exchanged(
     pictures: int, behind: bool
 ) -> None:
-    """Detectors take legs for each other up to where they cross: only the other end jumps.
+    """Exchange legs up to the picture where they cross, so that only the other end jumps.
 
     The exchange lasts less than half of the 15 pictures between two crossings. To exchange the rest of these
     instead would make the same jump vanish.

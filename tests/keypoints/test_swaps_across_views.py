@@ -1,4 +1,4 @@
-"""Left and right exchanged in some of the cameras around a walk whose joints are known."""
+"""Exchanges of left and right in some of the cameras around a walk with known joints."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SIGMA = NOISE_PX / LENS.fx
 
 
 class Views:
-    """What cameras on a ring of 10 m see; pixels of [C, T, 17, 2]."""
+    """Views of cameras on a ring of 10 m; pixels of [C, T, 17, 2]."""
 
     def __init__(self, cameras: int, noise_px: float = NOISE_PX) -> None:
         joints = walk(T_S, radius_m=2.0)

@@ -1,4 +1,4 @@
-"""Squares of large pictures: what they cover, and that everybody in them is found once."""
+"""Tiles of large pictures: their cover, and detection of each person exactly once."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.keypoints.bars import Bar, BarNetworks, draw
 
 
 def _holds(tile: Tile, x: float, y: float, size: float) -> bool:
-    """Whether a square of that size about a place is whole in the tile, to the pixel's rounding."""
+    """Test if a square of that size around a place is whole in the tile, up to a pixel of rounding."""
     across = tile.left - 1 <= x - size / 2 and x + size / 2 <= tile.left + tile.width + 1
     return across and tile.top - 1 <= y - size / 2 and y + size / 2 <= tile.top + tile.height + 1
 

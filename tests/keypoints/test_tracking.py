@@ -1,4 +1,4 @@
-"""Following people through pictures in which their places are known."""
+"""Tracking of people through pictures in which their places are known."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _run(
 
 
 class _Shortsighted(BarNetworks):
-    """A person detector that misses everybody."""
+    """Person detector that misses everybody."""
 
     def find_people(self, picture: Picture) -> list[tuple[Region, float]]:
         return super().find_people(np.zeros_like(picture))
@@ -89,7 +89,7 @@ def test_an_empty_picture_has_nobody() -> None:
 
 
 def test_a_tile_is_looked_at_in_every_round_of_searches() -> None:
-    """With nobody in view, the tiles of a 4K picture are seen in turn: 85 tiles, 24 in each picture."""
+    """Search the tiles of an empty 4K picture in turn: 85 tiles, 24 in each picture."""
     late = Bar(3700, 2000, 181)
     pictures = [draw(3840, 2160)] + [draw(3840, 2160, late)] * 4
 
@@ -140,7 +140,7 @@ def test_the_actor_is_searched_at_once_where_the_hint_is_and_nobody_followed() -
 
 
 def test_two_passes_are_made_from_regions_that_are_not_the_persons_own() -> None:
-    """The hint is 0.2 H off: the first pass has left and right confused, the second must not."""
+    """Use a hint that is 0.2 H off: the first pass exchanges left and right, the second must not."""
     truth = Bar(480, 270, 121)
     networks = BarNetworks()
     hint = Hint((500.0, 255.0), 121.0, 30.0)
@@ -187,7 +187,7 @@ def test_far_away_or_much_later_is_somebody_new(gap: int, place: int) -> None:
 
 
 def test_two_numbers_on_one_body_become_the_older() -> None:
-    """Number 0 disappears while their region holds number 1 as well."""
+    """Let number 0 disappear while its region also holds number 1."""
     first, second = Bar(530, 270, 121), Bar(470, 270, 131)
     pictures = [draw(WIDTH, HEIGHT, first)]
     pictures += [draw(WIDTH, HEIGHT, first, second)] * 100
@@ -217,7 +217,7 @@ def test_no_more_people_than_asked_for_but_the_actor_always() -> None:
 @settings(max_examples=10, deadline=None)
 @given(st.lists(st.tuples(st.integers(60, 900), st.booleans()), min_size=2, max_size=15))
 def test_what_is_found_depends_on_the_pictures_alone(scenes: list[tuple[int, bool]]) -> None:
-    """Two trackers, one step each in turn on the same networks, agree to the bit."""
+    """Compare two trackers that step in turn on the same networks: they agree to the bit."""
     networks = BarNetworks()
     trackers = [PeopleTracker(networks, search_every=3) for _ in range(2)]
     for x, shown in scenes:

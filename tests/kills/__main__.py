@@ -1,4 +1,4 @@
-"""`python -m tests.kills`: the long run."""
+"""Long run of the kill tests: `python -m tests.kills`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.kills.killing import commands_on, soak
 
 
 def main() -> int:
-    """Kill all commands; 1 if any did not end as it would have undisturbed."""
+    """Kill all commands; return 1 if any result differs from that of an undisturbed run."""
     parser = argparse.ArgumentParser(prog="python -m tests.kills", description=__doc__)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)

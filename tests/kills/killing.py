@@ -1,4 +1,4 @@
-"""Kill commands at random moments, run them again, compare what they leave with an undisturbed run."""
+"""Kills of commands at random moments, second runs, and comparison of their files with an undisturbed run."""
 
 from __future__ import annotations
 
@@ -40,28 +40,28 @@ drones:
 
 @dataclass(frozen=True)
 class Command:
-    """A command and the one folder that it writes."""
+    """Command with the one folder that it writes."""
 
     arguments: Sequence[str | Path]
     folder: Path
-    anew: Sequence[str] = ("--force",)  # what makes it do everything again; nothing where it always does
-    before: Path | None = None  # a copy of this is what it begins with
+    anew: Sequence[str] = ("--force",)  # options to do everything again; none if it always does
+    before: Path | None = None  # the command begins with a copy of this
 
 
 @dataclass(frozen=True)
 class Killed:
-    """How one kill went."""
+    """Result of one kill."""
 
     command: str
     after_s: float
     length_s: float  # of an undisturbed run
-    over_finished: bool  # what it writes was there already
+    over_finished: bool  # its results existed already
     hit: bool  # it had not ended by itself
     trouble: str  # empty if all is as it should be
 
 
 def commands_on(folder: Path) -> dict[str, Command]:
-    """The commands, by name, with the flight, the models and the scenario that they need."""
+    """Build the commands, by name, with the flight, the models and the scenario that they need."""
     folder.mkdir(parents=True, exist_ok=True)
     manifest = write_spotted_flight(folder, _FRAMES)
     detector = spot_detector(folder)
@@ -86,20 +86,20 @@ def soak(
 ) -> Iterator[Killed]:
     """Kill the commands in turns, each at a random moment of its run, and run it again.
 
-    Half of the kills hit a command whose folder does not have what it writes yet, half one that does
-    everything again over what is there.
+    Half of the kills hit a command that writes for the first time. The other half hit one that does
+    everything again over existing results.
 
     Args:
-        commands: as of `commands_on`, those that others begin with first.
-        kills: how many.
-        seed: of the moments.
-        known_s: how long the commands take; they are run once more to find out, where it is not said.
+        commands: from `commands_on`, in the order in which they depend on each other.
+        kills: number of kills.
+        seed: seed of the moments.
+        known_s: duration of each command (s); None measures it with another run.
     """
     moments = np.random.default_rng(seed)
     lengths, expected = {}, {}
     for name, command in commands.items():
         _begin_anew(command)
-        done = mocap(*command.arguments)  # which may compile kernels, so its length says nothing
+        done = mocap(*command.arguments)  # may compile kernels, so its duration is not used
         assert done.returncode == 0, done.stderr
         expected[name] = kept(command.folder)
         lengths[name] = known_s[name] if known_s else _length_s(command)
@@ -109,7 +109,7 @@ def soak(
 
 
 def kept(folder: Path) -> dict[str, str]:
-    """Every file and folder that is there, but locks and times of day; files with their hashes."""
+    """List every file and folder except locks and times of day; files with their hashes."""
     folders = {f"{path.relative_to(folder).as_posix()}/": "" for path in folder.rglob("*") if path.is_dir()}
     return folders | content(folder)
 
@@ -122,7 +122,7 @@ def _killed_once(
         over_finished = bool(moments.integers(2))
         if not over_finished:
             _begin_anew(command)
-        # One that has ended by itself was quicker this time, and may be again.
+        # A command that ended by itself was faster this time, and may be so again.
         after_s = float(moments.uniform(0.0, length_s * _QUICKER**attempt))
         hit = _kill(after_s, [*command.arguments, *(command.anew if over_finished else [])])
         if hit:

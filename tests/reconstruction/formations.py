@@ -33,7 +33,7 @@ BONES = np.array(sorted({(min(pair), max(pair)) for pair in PAIRS}), dtype=np.in
 
 @dataclass(frozen=True)
 class Formation:
-    """What the cameras saw, and what is true."""
+    """Sightings of the cameras, with the truth."""
 
     t_s: Float  # [T]
     truth: Float  # [T, 17, 3] m
@@ -58,21 +58,21 @@ def formation(
     tilt_deg: float = 15.0,
     late_s: Sequence[float] = (),
 ) -> Formation:
-    """A person who walks in a circle, filmed from 10 m.
+    """Simulate a person who walks in a circle, filmed from 10 m.
 
     Args:
         times: frames of every camera, at 30 Hz.
-        cameras: how many.
-        models: what is wrong with their logs; nobody tells `robust`.
-        seed: of all chance.
+        cameras: number of cameras.
+        models: errors of their logs, not stated to `robust`.
+        seed: seed of all random draws.
         pixel_px: noise of the keypoints, at f = 1500 px.
         memory: autocorrelation of that noise from one frame to the next.
-        constant_px: how far each joint is off in each camera, all along.
-        bad_share: of the keypoints are 100 to 300 px off, and as many are missing.
+        constant_px: constant error of each joint in each camera.
+        bad_share: share of keypoints that are 100 to 300 px off, and share that are missing.
         still: the cameras hover around the walk instead of following it.
-        variation: how far moving cameras leave the rigid ring.
+        variation: deviation of moving cameras from the rigid ring.
         tilt_deg: elevation of the cameras.
-        late_s: how much later than stamped each camera's pictures were taken; logs have the right time.
+        late_s: delay of each camera's pictures after their stamps (s); logs have the right time.
     """
     rng = np.random.default_rng([seed, cameras])
     t_s = np.arange(times) / FPS
@@ -134,7 +134,7 @@ def formation(
 
 
 def triangulated(sightings: Sequence[Sighting]) -> Float:
-    """`robust` [T, J, 3] of cameras that share their times."""
+    """Triangulate [T, J, 3] m by `robust` from cameras that share their times."""
     times, joints = sightings[0].confidence.shape
     count = len(sightings)
     views = Views(
@@ -154,7 +154,7 @@ def triangulated(sightings: Sequence[Sighting]) -> Float:
 
 
 def mean_mm(estimate: Float, truth: Float, where: Float | None = None) -> float:
-    """Mean distance in mm, over the joint-frames that `where` has too."""
+    """Compute the mean distance (mm) over joint-frames that are not NaN in `where`."""
     distance = np.linalg.norm(estimate - truth, axis=-1)
     if where is not None:
         distance = distance[~np.isnan(where[..., 0])]

@@ -1,4 +1,4 @@
-"""Attitudes from a still background: against true poses, where it says nothing, with people in the way."""
+"""Attitudes from a static background: against true poses, without parallax, with people in the pictures."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PRIOR = PosePrior((0.02, np.radians(0.2)), (0.05, np.radians(0.3)))
 
 
 def flown(pictures: int, way_m: float, turn_deg: float = 90.0) -> tuple[Float, Float]:
-    """A camera that looks 15 deg down and 90 deg left of its way, an arc 3 m above the ground."""
+    """Simulate a camera that looks 15 deg down and 90 deg left of its way, an arc 3 m above the ground."""
     angle = np.radians(turn_deg) * np.linspace(0, 1, pictures)
     step = way_m / pictures * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     position = np.cumsum(step, axis=0) + np.array([0.0, 0.0, 3.0])
@@ -41,7 +41,7 @@ def flown(pictures: int, way_m: float, turn_deg: float = 90.0) -> tuple[Float, F
 
 
 def sighted(position: Float, rotation: Float, rng: np.random.Generator) -> tuple[Int64, Int64, Float]:
-    """Points of the ground and of trees, wherever they fall into the picture, with 0.3 px of noise."""
+    """Project points of the ground and of trees that fall into the picture, with 0.3 px of noise."""
     points = rng.uniform([-40, -20, 0], [30, 40, 0.2], (900, 3))
     points[::4, 2] = rng.uniform(0, 5, len(points[::4]))
     away = np.einsum("tji,tnj->tni", rotation, points[None] - position[:, None])
@@ -52,7 +52,7 @@ def sighted(position: Float, rotation: Float, rng: np.random.Generator) -> tuple
 
 
 def logged(position: Float, rotation: Float, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Poses with errors of the prior."""
+    """Add errors drawn from the prior to poses."""
     lasting = rng.normal(0, 1, 6) * np.repeat(PRIOR.lasting, 3)
     error = lasting + rng.normal(0, 1, (len(position), 6)) * np.repeat(PRIOR.fresh, 3)
     turned = matrix_from_quaternion(quaternion_from_rotation_vector(error[:, 3:]))
@@ -60,14 +60,14 @@ def logged(position: Float, rotation: Float, rng: np.random.Generator) -> tuple[
 
 
 def turns_deg(one: Float, other: Float) -> Float:
-    """Angles [T] between rotations."""
+    """Compute the angles [T] (deg) between rotations."""
     trace = np.einsum("tij,tij->t", one, other)
     angle: Float = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
     return angle
 
 
 def refined(way_m: float, seed: int, lost: float = 0.0) -> tuple[Adjusted, Float, Float, Float, Float]:
-    """What comes out; the true attitudes; the logged ones; true and logged positions."""
+    """Return the adjustment, true and logged attitudes, true and logged positions."""
     rng = np.random.default_rng(seed)
     position, rotation = flown(40, way_m)
     picture, point, xy = sighted(position, rotation, rng)
@@ -79,8 +79,10 @@ def refined(way_m: float, seed: int, lost: float = 0.0) -> tuple[Adjusted, Float
 
 @pytest.mark.parametrize("lost", [0.0, 0.1])
 def test_attitudes_come_out_of_the_background(lost: float) -> None:
-    """12 m of way, of which a stretch of half is off by 0.02 m / sqrt(10) at each end, tells its course
-    to 0.1 deg: a third of the log's 0.6 deg is twice that; points lost on the way change little.
+    """Expect a third of the log's 0.6 deg, twice the accuracy that the way allows.
+
+    Over half of the 12 m of way, positions err by 0.02 m / sqrt(10) at each end, so its course is known to
+    0.1 deg. Points lost on the way change little.
     """
     found, truth, before, _, _ = refined(12.0, 1, lost)
     assert found.refused is None
@@ -90,7 +92,7 @@ def test_attitudes_come_out_of_the_background(lost: float) -> None:
 
 
 def test_the_stated_covariance_of_attitudes_is_what_they_have() -> None:
-    """e' C^-1 e has the mean 3; a flight's attitudes are nearly one draw, whose variance is 6."""
+    """Compare e' C^-1 e with its mean 3; a flight's attitudes are nearly one draw, with variance 6."""
     squared = []
     flights = 5
     for seed in range(flights):
@@ -99,16 +101,16 @@ def test_the_stated_covariance_of_attitudes_is_what_they_have() -> None:
         error = rotation_vector_from_quaternion(turned)
         whitened = np.linalg.solve(found.covariance[:, 3:, 3:], error[..., None])[..., 0]
         squared.append(float(np.einsum("ti,ti->t", error, whitened).mean()))
-        # Paths are not moved: what lasts of the positions' errors stays.
+        # Paths are not moved: the constant part of the positions' errors stays.
         moved = (found.position - at).mean(axis=0)
         np.testing.assert_allclose(moved, 0, atol=0.02)
         assert (found.covariance[:, range(3), range(3)] >= PRIOR.lasting[0] ** 2).all()
-    # Points are stated worse (0.5 px) than they are (0.3), and the loss keeps a tenth less of them.
+    # The stated noise of points (0.5 px) is larger than the true one (0.3), and the loss keeps 10 % fewer.
     assert 0.5 < np.mean(squared) < 3 + 2 * np.sqrt(6 / flights)
 
 
 def test_a_straight_way_tells_nothing_of_a_turn_about_itself() -> None:
-    """Here the way is the camera's x axis: what the log says of that axis stays, the other two are found."""
+    """Keep the log's rotation about the way, here the camera's x axis, and find the other two."""
     rng = np.random.default_rng(7)
     position, rotation = flown(40, 12.0, turn_deg=0.0)
     picture, point, xy = sighted(position, rotation, rng)
@@ -116,7 +118,7 @@ def test_a_straight_way_tells_nothing_of_a_turn_about_itself() -> None:
     found = adjust(picture, point, xy, FOCAL, at, turned, PRIOR)
     assert found.refused is None
     sigma = np.sqrt(np.diagonal(found.covariance[:, 3:, 3:], axis1=1, axis2=2).mean(axis=0))
-    # Of 40 poses the new part averages out (0.2 deg / sqrt(40)), what lasts does not.
+    # Over 40 poses the white part averages out (0.2 deg / sqrt(40)), the constant part does not.
     assert np.degrees(sigma[0]) == pytest.approx(0.3, rel=0.1)
     assert np.degrees(sigma[1:]).max() < 0.15
 
@@ -156,7 +158,7 @@ def test_a_few_pictures_more_than_a_stretch_cost_nothing(
 
 @pytest.mark.parametrize(("posed", "reason"), [(True, "0 points of the background"), (False, "a pose")])
 def test_a_camera_of_which_nothing_is_seen_keeps_its_logged_poses(posed: bool, reason: str) -> None:
-    """Fog or night, or a video that was taken before the log began."""
+    """Keep logged poses in fog or at night, or for a video taken before the log began."""
     position, rotation = flown(40, 12.0)
     position = position if posed else np.full_like(position, np.nan)
     nothing = np.empty(0, np.int64)
@@ -179,7 +181,7 @@ def test_pictures_without_a_pose_stay_without() -> None:
 
 
 def test_points_are_followed_and_people_left_out() -> None:
-    """A textured plane that moves by (3, 1) px a picture; a person's box in which nothing may be followed."""
+    """Follow a textured plane that moves by (3, 1) px a picture, with a person's box to leave out."""
     rng = np.random.default_rng(6)
     texture = cv2.GaussianBlur(rng.integers(0, 256, (400, 500), dtype=np.uint8), (0, 0), 2)
     texture = cv2.normalize(texture, np.empty_like(texture), 0, 255, cv2.NORM_MINMAX)

@@ -1,4 +1,4 @@
-"""The search for clocks begins within a step of the truth, whatever poses are like, or not at all."""
+"""Initial clock offsets: within a step of the truth for any pose errors, or 0."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ROUGH = [Bias(position_m=0.3, rotation_deg=1.0), White(position_m=0.1, rotation_
 
 
 def seen(flight: Formation, shift_s: float, unknown: NDArray[np.bool_]) -> Views:
-    """The flight's joint-frames with the stamps of those cameras put forward."""
+    """Build the flight's joint-frames with the stamps of unknown clocks moved forward."""
     views: list[Float] = []
     for camera, sighting in enumerate(flight.sightings):
         at_s = flight.t_s - (shift_s if unknown[camera] else 0.0)

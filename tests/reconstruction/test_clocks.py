@@ -1,4 +1,4 @@
-"""Clocks: an offset that motion shows is found, and where nothing moves it stays unknown and is said to."""
+"""Clock offsets: found if the person moves, and reported as unknown if nothing moves."""
 
 from __future__ import annotations
 

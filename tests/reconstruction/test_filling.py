@@ -1,4 +1,4 @@
-"""Gaps: which are closed, with what, and whether the covariance says how far off that is."""
+"""Filling of gaps: the choice of gaps, the filled values, and the calibration of their covariance."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def stamps(count: int) -> Int64:
 
 
 def skeleton(position: Float, missing: list[range]) -> tuple[Float, Float, NDArray[np.int8]]:
-    """One joint [T, 3] as [T, 1, 1, ...], rejected in these ranges; covariance 1 cm^2 times 1, 2, 3."""
+    """Build a skeleton of one joint [T, 3], rejected in these ranges; covariance 1 cm^2 times 1, 2, 3."""
     status = np.full((len(position), 1, 1), OK, dtype=np.int8)
     for gap in missing:
         status[gap] = REJECTED
@@ -95,11 +95,12 @@ def test_a_gap_that_nothing_like_it_judges_stays_open() -> None:
 
 
 def test_the_covariance_tells_how_far_the_middle_of_a_gap_is_off() -> None:
-    """A swinging wrist, measured with 1 cm on every axis; the squared error in units of the covariance.
+    """Compare the squared error with the covariance for a swinging wrist, measured with 1 cm per axis.
 
-    In the middle the covariance is half of a sample's and the mean outer product M of 24 misses, which hold
-    the noise of five samples themselves. Were M known, the mean would be below 3 (M holds noise of the
-    middle that an error against the truth has not); 24 misses make it up to 24 / 20 as large (Hotelling).
+    In the middle the covariance is half of a sample's plus the mean outer product M of 24 interpolation
+    errors, which include the noise of five samples. With M known, the mean would be below 3, because M
+    includes noise of the middle sample that an error against the truth has not. With 24 errors it is up to
+    24 / 20 as large (Hotelling).
     """
     rng = np.random.default_rng(5)
     squared = []

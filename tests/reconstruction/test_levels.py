@@ -1,4 +1,4 @@
-"""Covariances of accelerations: few accelerations show no correlations, few views do not stiffen limbs."""
+"""Covariances of accelerations: correlations shrink with few samples, limbs stay free with few views."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_limbs_move_more_and_the_body_as_before(seed: int, joints: int, spread: 
     one = np.ones(joints)
     # Both have condition numbers below 1e5: of the inverse ten digits are right.
     assert one @ np.linalg.solve(after, one) == pytest.approx(one @ np.linalg.solve(before, one), rel=1e-8)
-    # What two joints do beside each other holds nothing of the body.
+    # The difference of two joints contains no motion of the body.
     beside = np.eye(joints)[1:] - np.eye(joints)[0]
     np.testing.assert_allclose(
         beside @ after @ beside.T, spread**2 * beside @ before @ beside.T, rtol=1e-9, atol=1e-9

@@ -1,4 +1,4 @@
-"""White pose errors whose covariance the log states pose by pose."""
+"""White pose errors with a logged covariance for each pose."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ POOR = np.repeat([0.6, np.radians(2.0)], 3)
 
 
 def disturbed(root: Float, seed: int) -> Formation:
-    """A flight whose pose errors have the covariances root root' [C, T, 6, 6], which its logs state."""
+    """Simulate a flight whose pose errors have the logged covariances root root' [C, T, 6, 6]."""
     flight = formation(TIMES, CAMERAS, (), seed)
     drawn = np.random.default_rng(seed).normal(size=root.shape[:3])
     error = np.einsum("ctij,ctj->cti", root, drawn)
@@ -38,7 +38,7 @@ def disturbed(root: Float, seed: int) -> Formation:
 
 
 def refined(flight: Formation, *, logged: bool) -> Refined:
-    """What comes of it with the covariances, or with their level alone."""
+    """Refine with the covariances (`logged`), or with their level alone."""
     stated = [sighting.pose_covariance for sighting in flight.sightings]
     covariance = np.stack([own for own in stated if own is not None])
     variance = np.diagonal(covariance, axis1=2, axis2=3).mean(axis=(0, 1))
@@ -47,7 +47,7 @@ def refined(flight: Formation, *, logged: bool) -> Refined:
 
 
 def test_the_same_covariance_for_all_poses_is_a_level() -> None:
-    """Up to the constant that keeps inverses finite, (1e-5)^2 beside (1e-3)^2 and more."""
+    """Compare up to the constant that keeps inverses finite, (1e-5)^2 against (1e-3)^2 and more."""
     flight = disturbed(np.tile(np.diag(GOOD), (CAMERAS, TIMES, 1, 1)), seed=1)
     own, level = refined(flight, logged=True), refined(flight, logged=False)
     assert own.fallback is None
@@ -57,11 +57,11 @@ def test_the_same_covariance_for_all_poses_is_a_level() -> None:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_good_poses_hold_up_the_poor_ones(seed: int) -> None:
-    """Half of the poses are twenty times better, by turns: told as much, the skeleton is nearly as good.
+    """Expect a better skeleton if the log states that every other group of poses is twenty times better.
 
-    The mean of N poses that count alike errs by 1 / sqrt(2 N) of the poor level, by those that count as
-    they are by 1 / sqrt(N / 2) of the good one: by a tenth of that. The motion that is sought beside blurs
-    it, so a factor of two is asked for.
+    With equal weights, the mean of N poses errs by 1 / sqrt(2 N) of the poor level. With right weights, it
+    errs by 1 / sqrt(N / 2) of the good level, a tenth of that. Motion is estimated too and adds error, so
+    the test requires a factor of two.
     """
     poor = (np.arange(TIMES) // 10 + np.arange(CAMERAS)[:, None]) % 2 == 1
     root = np.where(poor[..., None], POOR, GOOD)[..., None] * np.eye(6)
@@ -73,7 +73,7 @@ def test_good_poses_hold_up_the_poor_ones(seed: int) -> None:
 
 
 def test_correlations_count() -> None:
-    """Where position and rotation err together (a lever arm), one unknown is left of six."""
+    """Use correlated errors of position and rotation (a lever arm): one unknown is left of six."""
     arm = np.zeros((6, 6))
     arm[:, 0] = [0.3, 0.2, 0.1, 0.01, 0.02, -0.01]
     arm += np.diag(GOOD / 10)

@@ -1,4 +1,4 @@
-"""Logged pose covariances as they are: the same result where they say no more, a better one where they do."""
+"""Full logged pose covariances: the same result if equal to a level, a better one if they contain more."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ OK = STATUS.index("ok")
 
 
 def level(covariance: Float) -> Float:
-    """Standard deviation per axis [..., 2] of position and rotation."""
+    """Compute the standard deviation per axis [..., 2] of position and rotation."""
     variances = np.diagonal(covariance, axis1=-2, axis2=-1)
     mean: Float = np.stack([variances[..., :3].mean(axis=-1), variances[..., 3:].mean(axis=-1)], axis=-1)
     return np.asarray(np.sqrt(mean), dtype=np.float64)
 
 
 def disturbed(views: Views, covariance: Float, rng: np.random.Generator) -> Views:
-    """Pose errors [F, C] drawn from these covariances, and what a log's level says of them."""
+    """Add pose errors [F, C] drawn from these covariances, with their level as `pose_sigma`."""
     root = np.linalg.cholesky(covariance)
     error = np.einsum("fcij,fcj->fci", root, rng.standard_normal((*covariance.shape[:2], 6)))
     return replace(
@@ -59,7 +59,7 @@ def test_alike_axes_give_what_triangulation_gives() -> None:
 
 
 def test_what_a_log_knows_of_its_axes_makes_points_better_and_covariances_true() -> None:
-    """Heights err by 0.3 m, the rest by 0.03 m; compasses by 2 deg, levels by 0.2 deg; and they are tied.
+    """Use heights that err by 0.3 m, the rest by 0.03 m; headings by 2 deg, levels by 0.2 deg; correlated.
 
     e' S^-1 e has the mean 3 and the variance 6; only joints of different frames are independent.
     """

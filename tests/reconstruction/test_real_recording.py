@@ -19,7 +19,7 @@ PEER_MEDIAN_PX = 10.7  # Pose2Sim's points over all views, rejected ones include
 
 
 def manifest_of(folder: Path, keypoints: str) -> Path:
-    """A flight.yaml of a dozen lines, as a user would write it."""
+    """Write a flight.yaml of a dozen lines, as a user would."""
     recording = real_data("pose2sim_single")
     calibration = recording / "calibration" / "Calib_qualisys.toml"
     lines = ["schema: 1", "name: Pose2Sim demo", "cameras:"]

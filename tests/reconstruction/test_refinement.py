@@ -1,4 +1,4 @@
-"""The refinement: derivatives, equations and covariances against slow ways, results against the truth."""
+"""Refinement: derivatives, equations and covariances against slow computations, results against the truth."""
 
 from __future__ import annotations
 
@@ -88,7 +88,10 @@ def test_derivatives_are_those_of_finite_differences(angle: float) -> None:
 
 
 def small_system(*, exact: bool, times: int = 5, knots: int = 3) -> tuple[System, State]:
-    """Few times, three joints, two cameras with every kind of unknown, one of them between the times."""
+    """Build a system with few times, three joints, two cameras with every kind of unknown.
+
+    The pictures of the second camera lie between the times unless `exact`.
+    """
     flight = formation(times, 2, [], 0, pixel_px=0.0 if exact else 4.0)
     shown = np.array([5, 11, 15])
     sightings = [replace(s, xy=s.xy[:, shown], confidence=s.confidence[:, shown]) for s in flight.sightings]
@@ -178,7 +181,7 @@ def test_covariances_are_those_of_the_whole_inverse(times: int, knots: int) -> N
 
 
 def picture_hessian(system: System, state: State, step: float = 1e-4) -> Float:
-    """Half the second derivatives of the loss of pictures that are met exactly: J' J of their residuals."""
+    """Compute half the second derivatives of the loss at zero residuals: J' J of the residuals."""
     at = packed(state)
 
     def residuals(vector: Float) -> Float:
@@ -191,7 +194,7 @@ def picture_hessian(system: System, state: State, step: float = 1e-4) -> Float:
 
 
 def prior_hessian(system: System, state: State, step: float = 1e-4) -> Float:
-    """Half the second derivatives of the prior, in which a white error goes with nothing else."""
+    """Compute half the second derivatives of the prior; white errors are not coupled to anything else."""
     at = packed(state)
 
     def cost(*moves: Float) -> float:
@@ -209,7 +212,7 @@ def prior_hessian(system: System, state: State, step: float = 1e-4) -> Float:
 
 
 def with_exact_pictures(system: System, state: State) -> System:
-    """The same system, its cameras having seen exactly what the state says."""
+    """Return the system with pictures that match the state exactly."""
     pictures = system.problem.pictures
     seen = np.einsum("gij,gki->gkj", pictures.rotation, state.position[0][None] - pictures.position[:, None])
     pictures = replace(pictures, xy=np.ascontiguousarray(seen[..., :2] / seen[..., 2:]))
@@ -296,10 +299,11 @@ def test_white_noise_is_averaged_over_time(told: bool) -> None:
 
 @pytest.mark.slow
 def test_covariances_of_white_noise_are_calibrated() -> None:
-    """24 flights of 2 s: NEES is 3 +- 0.19 then, since a flight's mean has a standard deviation of 0.95.
+    """Test 24 flights of 2 s: NEES is 3 +- 0.19, since a flight's mean has a standard deviation of 0.95.
 
-    That is what 400 flights have about their mean of 3.01 (docs/decisions/0004-refined.md). The share of 95 %
-    ellipsoids varies by 7 % from flight to flight there, so by 1.4 % in the mean. Both within four of these.
+    400 flights have this deviation around their mean of 3.01 (docs/decisions/0004-refined.md). The share of
+    95 % ellipsoids varies by 7 % from flight to flight there, so by 1.4 % in the mean. Tolerances are four
+    of these.
     """
     squares = []
     for seed in range(24):
@@ -364,7 +368,7 @@ def test_it_is_ahead_of_the_best_peer_at_true_poses(share: float, most_mm: float
 
 
 def test_two_hovering_cameras_do_not_run_away_with_the_size() -> None:
-    """Nearly free, it halved in a step of learning, and the joints ended 1.8 times as far off as before."""
+    """Limit the body's size in learning: without a limit it halved in a step, with 1.8 times the error."""
     flight = formation(60, 2, [BIAS], 8, still=True, tilt_deg=45.0)
     result = refine(flight.t_s, flight.sightings, flight.start, BONES, [pose_errors([BIAS])] * 2, np.zeros(2))
     assert result.fallback is None
@@ -373,7 +377,7 @@ def test_two_hovering_cameras_do_not_run_away_with_the_size() -> None:
 
 
 def test_a_place_that_nobody_saw_is_the_log_s() -> None:
-    # Two cameras whose logs drift, of which nobody told: levels come out that put the person a metre off.
+    # Two cameras with drifting logs and no stated noise: the estimated levels put the person a metre off.
     models: list[NoiseModel] = [BIAS, Drift(position_m_per_sqrt_s=0.03, rotation_deg_per_sqrt_s=0.15)]
     flight = formation(60, 2, models, 1, still=True)
     result = refine(flight.t_s, flight.sightings, flight.start, BONES, None, np.zeros(2))
@@ -391,7 +395,7 @@ def test_a_place_that_nobody_saw_is_the_log_s() -> None:
 
 
 def test_a_wrong_prior_is_noticed() -> None:
-    # Told a constant error of the medium level, given a walk: never worse than trusting the log.
+    # Stated is a constant error of the medium level, true is a random walk: never worse than the log.
     flight = formation(90, 3, [Drift(position_m_per_sqrt_s=0.03, rotation_deg_per_sqrt_s=0.15)], 4)
     position, _, fallback = refined(flight, [BIAS])
     if fallback is None:
@@ -400,7 +404,7 @@ def test_a_wrong_prior_is_noticed() -> None:
 
 @pytest.mark.parametrize("told", ["nothing", "wrong"])
 def test_exact_poses_are_recognised(told: str) -> None:
-    # Two views and no word of their poses: every level must come down from its guess, or evidence say so.
+    # Two views without stated noise: every level must come down from its guess, or the evidence reject it.
     flight = formation(90, 2, [], 0)
     position, _, fallback = refined(flight, [BIAS] if told == "wrong" else None)
     assert fallback is None
@@ -409,7 +413,7 @@ def test_exact_poses_are_recognised(told: str) -> None:
 
 
 def test_keypoint_errors_that_last_are_not_taken_for_pose_errors() -> None:
-    # With 0.9 kept from frame to frame 19 neighbours say as much as one: tau = (1 + 0.9) / (1 - 0.9).
+    # With an autocorrelation of 0.9, 19 neighbours count as one: tau = (1 + 0.9) / (1 - 0.9).
     flight = formation(150, 3, [], 0, pixel_px=4.0, memory=0.9)
     position, _, fallback = refined(flight, None)
     assert fallback is None
@@ -444,9 +448,9 @@ def test_what_was_stated_rightly_is_kept() -> None:
 
 
 def test_what_was_stated_is_tried_where_learned_levels_are_refused() -> None:
-    """Levels learned of this flight run away with the scale: 0.6 m of constant errors, which there are not.
+    """Refine a flight whose learned levels diverge with the scale: 0.6 m of constant errors, truly 0.
 
-    Its white noise was told. Believed, it leaves a fifth of what `robust` errs, as in other flights.
+    Its white noise was stated. With that, errors are a fifth of `robust`'s, as in other flights.
     """
     flight = formation(90, 2, [WHITE], 77)
     result = refine(
@@ -459,9 +463,9 @@ def test_what_was_stated_is_tried_where_learned_levels_are_refused() -> None:
 
 @pytest.mark.slow
 def test_a_hint_of_lasting_errors_does_not_make_limbs_tremble() -> None:
-    """Beside white errors larger than the keypoints' own, motion stays smooth.
+    """Keep motion smooth if white errors are larger than the keypoints' own.
 
-    Told with abrupt motion, limbs would err by a ninth more (12 % over four flights, where this is 0 %).
+    With the looser motion prior, limbs would err by a ninth more (12 % over four flights, where this is 0 %).
     """
     error = []
     cases: list[list[NoiseModel]] = [[WHITE], [WHITE, Bias(position_m=0.01, rotation_deg=0.05)]]

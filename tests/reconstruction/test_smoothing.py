@@ -1,4 +1,4 @@
-"""Filters against their closed forms, the smoother against least squares over everything at once."""
+"""Filters against their closed forms, and the smoother against least squares over a whole run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def stamps(count: int) -> Int64:
 
 
 def one_joint(values: Float) -> tuple[Float, Float]:
-    """Values [T, 3] as a skeleton of one joint, with covariances of 1 cm^2."""
+    """Build a skeleton of one joint from values [T, 3], with covariances of 1 cm^2."""
     position = values[:, None, None, :]
     return position, np.tile(1e-4 * np.eye(3), (*position.shape[:3], 1, 1))
 
@@ -34,7 +34,7 @@ def one_joint(values: Float) -> tuple[Float, Float]:
 
 @pytest.mark.parametrize("order", [2, 4, 6, 8])
 def test_the_gain_is_that_of_two_passes_and_nothing_lags(order: int) -> None:
-    """sin and cos at 2, 6 (the cutoff: -3 dB of both passes together) and 12 Hz, one on each axis."""
+    """Filter sines at 2, 6 (the cutoff: -3 dB of both passes together) and 12 Hz, one on each axis."""
     cutoff_hz, count = 6.0, 600
     frequency = np.array([2.0, 6.0, 12.0])
     t_s = np.arange(count) / RATE
@@ -96,7 +96,7 @@ def test_a_filter_needs_an_even_rate_and_a_cutoff_below_half_of_it() -> None:
 def least_squares(
     t_s: Float, position: Float, covariance: Float, density: float, n: int
 ) -> tuple[Float, Float]:
-    """Every state of a run at once: the prior of the first, the motion between, the measurements.
+    """Solve for every state of a run together: the prior of the first, the motion between, measurements.
 
     Returns positions [T, 3] and their covariances [T, 3, 3].
     """
@@ -140,7 +140,7 @@ def least_squares(
 
 @pytest.mark.parametrize("model", STATES)
 def test_the_smoother_is_least_squares_over_everything_at_once(model: str) -> None:
-    """Two joints, uneven steps, full covariances of their own; the second has two runs and a gap."""
+    """Use two joints with uneven steps and full covariances; the second has two runs and a gap."""
     n, count = STATES[model], 24
     rng = np.random.default_rng(6)
     t_s = np.cumsum(rng.uniform(0.02, 0.05, count))
@@ -168,7 +168,7 @@ def test_the_smoother_is_least_squares_over_everything_at_once(model: str) -> No
 
 @pytest.mark.parametrize("model", STATES)
 def test_the_density_is_found_where_the_motion_has_it(model: str) -> None:
-    """Motion drawn from the model itself; the grid's steps are 26 % in frequency, half a step either way.
+    """Draw motion from the model itself; the grid's steps are 26 % in frequency, half a step either way.
 
     Covariances are stated twice as large as they are: the share comes out as a half. From 600 samples on
     3 axes a variance is known to sqrt(2/1800) = 3.3 %, and the grid's step moves it by some per cent more.
@@ -196,7 +196,7 @@ def test_the_density_is_found_where_the_motion_has_it(model: str) -> None:
 
 
 def test_errors_that_last_are_not_smoothed_away() -> None:
-    """1 cm of new noise and 10 cm that never change: the covariance keeps the 10 cm."""
+    """Add 1 cm of white noise and a constant error of 10 cm: the covariance keeps the 10 cm."""
     count = 400
     t_s = np.arange(count) / RATE
     truth = np.stack([np.sin(2 * t_s), np.cos(2 * t_s), 0.1 * t_s], axis=-1)

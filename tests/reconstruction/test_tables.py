@@ -1,4 +1,4 @@
-"""Tables of a reconstruction: what has no pose has no row."""
+"""Tables of a reconstruction: pictures without a pose have no row."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SECOND_NS = 1_000_000_000
 
 
 def test_poses_are_not_made_up_in_pauses_of_the_log() -> None:
-    """Logged at 0, 1, 2, 12 and 13 s; pictures every second. Those in the pause have none."""
+    """Log poses at 0, 1, 2, 12 and 13 s; of the pictures every second, those in the pause have no pose."""
     logged_s = np.array([0, 1, 2, 12, 13])
     position = np.stack([logged_s, 0 * logged_s, 0 * logged_s], axis=1).astype(np.float64)
     log = Trajectory(logged_s * SECOND_NS, position, np.tile([0.0, 0, 0, 1], (5, 1)))

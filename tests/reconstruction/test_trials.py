@@ -1,4 +1,4 @@
-"""Disturbed poses: whose chance is whose, what is refused, and what several trials say together."""
+"""Disturbed poses: independence of the random draws, refused options, and the summary of several trials."""
 
 from __future__ import annotations
 

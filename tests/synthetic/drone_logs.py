@@ -1,6 +1,6 @@
-"""Logs as drones write them themselves, byte for byte: DJI's subtitles, DataFlash (.bin), ULog (.ulg).
+"""Logs in the formats of drones, byte for byte: DJI's subtitles, DataFlash (.bin), ULog (.ulg).
 
-Written by the published formats with `struct` alone, so that no library of the readers has a part in them.
+Written by the published formats with `struct` alone, without the libraries that the readers use.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ GPS_LEAP_S = 18
 
 @dataclass(frozen=True)
 class DroneTruth:
-    """What a drone that carries one camera of a flight would log: [N] rows each."""
+    """True values that a drone with one camera of a flight would log: [N] rows each."""
 
     t_ns: Int64  # UTC
     enu: Float  # [N, 3] m from HOME, of the body
@@ -48,13 +48,13 @@ class DroneTruth:
 
     @property
     def boot_us(self) -> Int64:
-        """[N] the autopilot's own clock."""
+        """Time [N] of the autopilot's own clock (us since boot)."""
         since_boot: Int64 = (self.t_ns - self.t_ns[0] + BOOT_NS) // 1000
         return since_boot
 
 
 def drone_of(flight: SyntheticFlight, k: int, *, tilted: bool = True) -> DroneTruth:
-    """The drone below which camera k hangs on a gimbal, at LEVER_ARM of its body.
+    """Simulate the drone that carries camera k below it on a gimbal, at LEVER_ARM of its body.
 
     The body heads elsewhere than the camera and, if it is tilted, pitches and rolls as it flies. Angles are
     taken from where things point, not by the formulas of the readers.
@@ -81,7 +81,7 @@ def drone_of(flight: SyntheticFlight, k: int, *, tilted: bool = True) -> DroneTr
 
 
 def _angles(ahead: Float, right: Float) -> Float:
-    """Yaw, pitch, roll [N, 3] of an FRD thing in NED, by where its nose and its right side point in ENU."""
+    """Compute yaw, pitch, roll [N, 3] (deg) of an FRD body in NED, from its nose and right side in ENU."""
     yaw = np.arctan2(ahead[:, 0], ahead[:, 1])  # from north to east
     pitch = np.arcsin(np.clip(ahead[:, 2], -1, 1))  # up
     level_right = np.stack([np.cos(yaw), -np.sin(yaw), np.zeros_like(yaw)], axis=1)
@@ -103,7 +103,7 @@ def write_srt(
     decimals: int = 9,
     newline: str = "\n",
 ) -> Path:
-    """Subtitles of each frame in the form since 2018; more decimals than drones write, unless told."""
+    """Write subtitles of each frame in the form since 2018, by default with more decimals than drones."""
     blocks = []
     for row, stamp_ns in enumerate(truth.t_ns.tolist()):
         since = (stamp_ns - int(truth.t_ns[0])) // 1_000_000
@@ -153,14 +153,14 @@ _STRUCTS = {"n": "4s", "N": "16s", "Z": "64s", "c": "h", "C": "H", "e": "i", "E"
 
 
 def dataflash(name: str, *values: Any) -> bytes:
-    """One message: two marks, its number, and its fields without any padding."""
+    """Encode one message: two marks, its number, and its fields without any padding."""
     number, letters, _ = DATAFLASH[name]
     layout = "<" + "".join(_STRUCTS.get(letter, letter) for letter in letters)
     return b"\xa3\x95" + bytes([number]) + struct.pack(layout, *values)
 
 
 def definition(name: str) -> bytes:
-    """The FMT message that defines another."""
+    """Encode the FMT message that defines another."""
     number, letters, columns = DATAFLASH[name]
     layout = "<" + "".join(_STRUCTS.get(letter, letter) for letter in letters)
     length = 3 + struct.calcsize(layout)
@@ -175,7 +175,7 @@ def write_dataflash(
     yaw_from_north: bool = True,
     drift_ppm: float = 0.0,
 ) -> Path:
-    """A log of ArduCopter; the autopilot's clock goes slow against GPS time by `drift_ppm`."""
+    """Write a log of ArduCopter; the autopilot's clock is slow against GPS time by `drift_ppm`."""
     log = [definition(name) for name in ("FMT", *kinds)]
     if "ORGN" in kinds:
         place = (
@@ -237,14 +237,14 @@ ULOG = {
 
 
 def ulog_record(kind: str, body: bytes) -> bytes:
-    """Length, kind and body."""
+    """Encode a record: length, kind and body."""
     return struct.pack("<HB", len(body), ord(kind)) + body
 
 
 def write_ulog(
     path: Path, rows: Sequence[tuple[str, int, tuple[Any, ...]]], *, formats: Mapping[str, str] | None = None
 ) -> Path:
-    """A log of rows (topic, instance, fields in the order of ULOG), stamped in microseconds since boot."""
+    """Write a log of rows (topic, instance, fields in the order of ULOG), stamps in us since boot."""
     log = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", BOOT_NS // 1000), ulog_record("B", bytes(40))]
     stated = formats or {name: fields for name, (fields, _) in ULOG.items()}
     log += [ulog_record("F", f"{name}:{fields}".encode()) for name, fields in stated.items()]
@@ -261,7 +261,7 @@ def write_ulog(
 def ulog_rows(
     truth: DroneTruth, *, from_north: bool = True, origin: Place | None = HOME
 ) -> list[tuple[str, int, tuple[Any, ...]]]:
-    """What PX4 would log: local position, attitude, GPS, gimbal and a trigger for each row."""
+    """List PX4's messages: local position, attitude, GPS, gimbal and a trigger for each row."""
     rows: list[tuple[str, int, tuple[Any, ...]]] = []
     for row, us in enumerate(truth.boot_us.tolist()):
         east, north, up = truth.enu[row].tolist()
@@ -287,7 +287,7 @@ def ulog_rows(
 
 
 def _wxyz(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, ...]:
-    """Quaternion of yaw, pitch, roll by the textbook formula (Diebel 2006, eq. 290), w first."""
+    """Compute the quaternion of yaw, pitch, roll by the textbook formula (Diebel 2006, eq. 290), w first."""
     (cy, sy), (cp, sp), (cr, sr) = (
         (np.cos(np.radians(angle) / 2), np.sin(np.radians(angle) / 2))
         for angle in (yaw_deg, pitch_deg, roll_deg)

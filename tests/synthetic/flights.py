@@ -38,10 +38,10 @@ _CIRCLE_M, _SPEED_MPS = 4.0, 1.2
 
 @dataclass(frozen=True)
 class SyntheticFlight:
-    """A flight on disk, and what is true of it. Every camera has its frames at `t_ns`."""
+    """Flight on disk, with its truth. Every camera has its frames at `t_ns`."""
 
     manifest: Path
-    settings: dict[str, Any]  # what the manifest holds; change it, then `save`
+    settings: dict[str, Any]  # content of the manifest; change it, then `save`
     t_ns: Int64  # [T]
     joints: tuple[str, ...]
     position: Float  # [T, 17, 3] m
@@ -51,7 +51,7 @@ class SyntheticFlight:
 
     @property
     def cameras(self) -> list[str]:
-        """The cameras' names, in the order of the arrays."""
+        """Names of the cameras, in the order of the arrays."""
         return list(self.settings["cameras"])
 
     def save(self) -> None:
@@ -84,19 +84,19 @@ def write_flight(
     <camera>_true.tum, or calibration.toml for static cameras. Cameras are called drone1, drone2, ...
 
     Args:
-        folder: made if it is not there.
-        cameras: how many.
+        folder: created if it does not exist.
+        cameras: number of cameras.
         seconds: length; the number of frames is rounded.
-        fps: of every camera.
-        clean: no noise at all. What is left is the rounding of pixels to 0.001, 0.01 mm at 10 m, and
+        fps: frames per second of every camera.
+        clean: no noise at all. Two errors remain: the rounding of pixels to 0.001, 0.01 mm at 10 m, and
             the interpolation of poses, 3 micrometres.
         static: the cameras stand still, and their poses come from a calibration in Pose2Sim's format.
-        bystander: a second person walks through the pictures, and stands first in every frame.
-        keypoint_noise: of the detector, unless clean.
-        pose_noise: of the logs as flight.yaml states it, unless clean; static cameras: a bias alone.
+        bystander: a second person walks through the pictures, and is listed first in every frame.
+        keypoint_noise: noise of the detector, unless clean.
+        pose_noise: noise of the logs as stated in flight.yaml, unless clean; static cameras: a bias alone.
         keypoint_format: alphapose, coco or openpose (with COCO's joints).
         pose_format: tum or csv.
-        seed: of all noise.
+        seed: seed of all noise.
     """
     folder.mkdir(parents=True, exist_ok=True)
     detector = CLEAN_KEYPOINTS if clean else keypoint_noise
@@ -158,7 +158,7 @@ def write_flight(
 
 
 def film_at(flight: SyntheticFlight, name: str, t_ns: Int64) -> None:
-    """Have one camera of a clean flight take its pictures at other times; its frame times become a CSV."""
+    """Film with one camera of a clean flight at other times; write its frame times to a CSV."""
     k = flight.cameras.index(name)
     position, quaternion = _camera_poses(_seconds(t_ns), len(flight.cameras), static=False)
     pixels = see(_actor(_seconds(t_ns)), position[k], quaternion[k], LENS)
@@ -186,7 +186,7 @@ def _bystander(t_s: Float) -> Float:
 
 
 def _camera_poses(t_s: Float, cameras: int, static: bool) -> tuple[Float, Float]:
-    """[N, T, 3] and [N, T, 4]: on a turning ring around the walk, or still around its circle."""
+    """Compute poses [N, T, 3], [N, T, 4]: on a turning ring around the walk, or still around its circle."""
     if static:
         centre = np.tile([0.0, 0.0, 1.0], (t_s.size, 1))
         position, _ = orbit(t_s, centre, cameras=cameras, yaw_rate_deg_per_s=0.0)
@@ -202,7 +202,7 @@ def _inline(lens: Intrinsics) -> dict[str, Any]:
 
 
 def _pose2sim_table(name: str, position: Float, quaternion: Float) -> str:
-    """A camera of a Pose2Sim calibration: rotation vector and translation are camera_from_world."""
+    """Format a camera of a Pose2Sim calibration: rotation vector and translation are camera_from_world."""
     translation, rotation = invert(position, quaternion)
     return "\n".join(
         [

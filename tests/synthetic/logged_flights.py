@@ -1,4 +1,4 @@
-"""The flight of two drones as their recorders bring it home: odometry, camera info and pictures in a log."""
+"""Flight of two drones as their recorders store it: odometry, camera info and pictures in a log."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def write_logged_flight(
     jump_s: float = 0.0,
     picture_size: tuple[int, int] = (LENS.width, LENS.height),
 ) -> SyntheticFlight:
-    """A clean flight whose poses, intrinsics and frame times are in one log for each drone.
+    """Write a clean flight whose poses, intrinsics and frame times are in one log for each drone.
 
     The clock that stamps the odometry of drone1 jumps by `jump_s` after three quarters of the flight.
 
-    The odometry is that of a body which carries its camera 30 degrees down on a lever arm. Pictures are
-    plain, and of the size of the lens unless another is asked for.
+    The odometry is that of a body that carries its camera 30 degrees down on a lever arm. Pictures are
+    plain, and have the size of the lens by default.
     """
     flight = write_flight(folder, cameras=cameras, seconds=seconds, clean=True, keypoint_format="alphapose")
     for k, name in enumerate(flight.cameras):
@@ -57,7 +57,7 @@ def write_logged_flight(
 
 
 def header(stamp_ns: int, frame: str) -> dict[str, Any]:
-    """A header as every stamped message has it."""
+    """Build the header of a stamped message."""
     return {"stamp": stamp_ns, "frame_id": frame}
 
 

@@ -1,4 +1,4 @@
-"""Small logs in every container, written by the libraries that others write theirs with.
+"""Small logs in every container, written by common libraries.
 
 An entry names a topic, a type, the stamp of receipt and the fields that are not zero, as a nested dict
 in the spelling of ROS 2; a stamp is a plain number of nanoseconds. The same entries go into a ROS 1 bag,
@@ -39,7 +39,7 @@ McapCompression = Literal["none", "lz4", "zstd"]
 
 @dataclass(frozen=True)
 class Entry:
-    """One message to write."""
+    """Message to write."""
 
     topic: str
     type: str
@@ -48,7 +48,7 @@ class Entry:
 
 
 def write_log(folder: Path, name: str, container: Container, entries: Sequence[Entry]) -> Path:
-    """Write a log of ROS messages; the path of its file, or of a ROS 2 bag's folder."""
+    """Write a log of ROS messages; return the path of its file, or of a ROS 2 bag's folder."""
     folder.mkdir(parents=True, exist_ok=True)
     if container == "ros1":
         return write_ros1(folder / f"{name}.bag", entries)
@@ -158,7 +158,7 @@ def write_mcap(
     chunked: bool = True,
     summary: bool = True,
 ) -> Path:
-    """Write MCAP; without `summary` there is no index, and nothing is said again at the end."""
+    """Write MCAP; without `summary` there is no index, and no repeated records at the end."""
     with _mcap_writer(path, compression, chunk_size, chunked, summary) as writer:
         profile = {"cdr": "ros2", "ros1": "ros1"}.get(encoding, "")
         writer.start(profile=profile, library="test")
@@ -193,7 +193,7 @@ def _mcap_writer(
 
 
 def cut(path: Path, share: float) -> Path:
-    """Leave only the first part of a file, as a drone does that falls."""
+    """Truncate a file to its first part, as if the drone had crashed."""
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
     return path
@@ -220,7 +220,7 @@ def _register(writer: McapWriter, type_: str, encoding: Encoding) -> int:
     return number
 
 
-# Enough of Foxglove's schemas for the one thing that JSON cannot say itself.
+# Enough of Foxglove's schemas for the one type that JSON alone cannot express.
 JSON_SCHEMA = {
     "type": "object",
     "properties": {"data": {"type": "string", "contentEncoding": "base64"}},

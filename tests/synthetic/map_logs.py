@@ -17,7 +17,7 @@ from pipelines.session.records import Occupancy
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import ROS1, ROS2, Entry
 
-# octomap_msgs/msg/Octomap.msg of OctoMap/octomap_msgs: rosbags knows the packages of ROS itself only.
+# octomap_msgs/msg/Octomap.msg of OctoMap/octomap_msgs: rosbags has only the packages of ROS itself.
 for _store in (ROS1, ROS2):
     _store.register(
         get_types_from_msg(
@@ -35,7 +35,7 @@ AT_REST: Pose = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 def octomap_entry(
     file: bytes, stamp_ns: int, *, frame: str = "map", topic: str = "/octomap", received_ns: int | None = None
 ) -> Entry:
-    """The message that carries what a .bt or .ot file holds: its data without its header."""
+    """Build the message with the content of a .bt or .ot file: its data without its header."""
     head, _, body = file.partition(b"\ndata\n")
     values = dict(re.findall(rb"(?m)^(id|res) (\S+)$", head))
     fields = {
@@ -49,7 +49,7 @@ def octomap_entry(
 
 
 def as_bt(occupancy: Occupancy, folder: Path) -> bytes:
-    """The .bt file of a map."""
+    """Convert a map to the bytes of a .bt file."""
     folder.mkdir(parents=True, exist_ok=True)
     write_octomap(folder / "map.bt", occupancy)
     return (folder / "map.bt").read_bytes()
@@ -64,7 +64,7 @@ def grid_entry(
     frame: str = "map",
     topic: str = "/map",
 ) -> Entry:
-    """A floor plan of cells [X, Y]."""
+    """Build the message of a floor plan of cells [X, Y]."""
     position, quaternion = origin
     info = {
         "resolution": cell_m,
@@ -88,7 +88,7 @@ def cloud_fields(
     row_padding: int = 0,
     order: str = "xyz",
 ) -> dict[str, Any]:
-    """A cloud's message without its header: points [N, 3] in records with other things between them."""
+    """Build a cloud's message without its header: points [N, 3] in records with other bytes between them."""
     size = int(kind[1])
     offsets = {name: 3 + k * (size + 1) for k, name in enumerate(order)}  # aligned nowhere
     stride = 3 + 3 * (size + 1) + 2
@@ -128,12 +128,12 @@ def cloud_fields(
 def cloud_entry(
     fields: Mapping[str, Any], stamp_ns: int, *, frame: str = "map", topic: str = "/cloud"
 ) -> Entry:
-    """The message of a cloud."""
+    """Build the message of a cloud."""
     return Entry(topic, POINT_CLOUD, stamp_ns, {"header": header(stamp_ns, frame), **fields})
 
 
 def transform_entry(parent: str, child: str, pose: Pose, stamp_ns: int, *, topic: str = "/tf") -> Entry:
-    """One transform of /tf or /tf_static."""
+    """Build one transform of /tf or /tf_static."""
     position, quaternion = pose
     stated = {
         "header": header(stamp_ns, parent),

@@ -1,4 +1,4 @@
-"""Small videos whose frames say their own number: a bar code of 16 blocks, white for a set bit."""
+"""Small videos whose frames show their own number: a bar code of 16 blocks, white for a set bit."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ TICK_S = Fraction(1, 90_000)
 
 
 def even_ticks(count: int, step: int = 3000, first: int = 0) -> list[int]:
-    """Stamps at a constant rate; 3000 ticks of TICK_S are 30 frames a second."""
+    """List stamps at a constant rate; 3000 ticks of TICK_S are 30 frames a second."""
     return [first + step * k for k in range(count)]
 
 
 def uneven_ticks(count: int, seed: int = 0) -> list[int]:
-    """Stamps of a rate that wanders between 15 and 60 Hz, with a pause of a second in the middle."""
+    """Draw stamps with a rate between 15 and 60 Hz, and a pause of a second in the middle."""
     steps = np.random.default_rng(seed).integers(1500, 6000, count - 1)
     steps[count // 2] = 90_000
     return [0, *np.cumsum(steps).tolist()]
 
 
 def bar_code(number: int) -> Picture:
-    """The picture of a frame: its bar code above a grey ramp that moves."""
+    """Draw the picture of a frame: its bar code above a grey ramp that moves."""
     width, height = SIZE
     picture = np.empty((height, width, 3), dtype=np.uint8)
     picture[:] = ((np.arange(width) + 3 * number) % 128)[:, None]
@@ -40,7 +40,7 @@ def bar_code(number: int) -> Picture:
 
 
 def read_bar_code(picture: Picture) -> int:
-    """The number in a picture; halfway between black and white decides, which no codec here blurs over."""
+    """Read the number in a picture; the threshold is halfway between black and white, safe for all codecs."""
     row = picture[SIZE[1] // 4, _BLOCK // 2 :: _BLOCK].mean(axis=-1)
     return sum(1 << bit for bit, value in enumerate(row) if value > 128)
 
@@ -89,7 +89,7 @@ def write_video(
 
 
 def write_sound(path: Path) -> Path:
-    """A tenth of a second of silence, without a picture."""
+    """Write a tenth of a second of silence, without a picture."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("aac", rate=48_000)
         frame = av.AudioFrame(format="fltp", layout="mono", samples=4800)
