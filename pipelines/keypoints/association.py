@@ -17,9 +17,9 @@ Bool = NDArray[np.bool_]
 _NEAR = 9.0  # within 3 sigma of the logged actor counts for a track, beyond against it
 _FAR = 25.0  # beyond 5 sigma a track is not the actor at that time
 _BODY_M = 0.5  # the log's point (hip, a tag, a phone) against the middle of the joints seen
-_PACE_M_PER_S = 3.0  # nobody is taken up again further away than a run
+_PACE_M_PER_S = 3.0  # a lost person is not resumed further away than a run
 _REACH_M = 1.0
-_OVERLAP = 0.05  # share of a track's frames in which it may stand beside the person it continues
+_OVERLAP = 0.05  # largest share of a track's frames that may overlap with the person it continues
 
 
 @dataclass(frozen=True)
@@ -80,12 +80,12 @@ def associate(
             clock error times the actor's angular speed.
         actor: [T, 3] m, the logged actor, NaN where unknown.
         actor_sigma_m: standard deviation of the log on each axis.
-        people: how many to choose.
+        people: number of people to choose.
 
     Returns:
         The choice and its counts. A lone view is kept where its picture continues the person's last one.
     """
-    if confidence.shape[2] == 0:  # nobody anywhere: room for one who is absent
+    if confidence.shape[2] == 0:  # no detections at all: make room for one absent person
         xy = np.full((*xy.shape[:2], 1, *xy.shape[3:]), np.nan)
         confidence = np.zeros(xy.shape[:-1])
     logged = None if actor is None else np.c_[actor, np.full(len(actor), actor_sigma_m)]

@@ -203,7 +203,7 @@ class _Network:
         self._step = np.float32((1 - lowest) / 255)
 
     def __call__(self, rgb: Picture) -> dict[str, NDArray[Any]]:
-        values = self._interpreter.tensor(self._input)()[0]  # where the network reads them
+        values = self._interpreter.tensor(self._input)()[0]  # the network's own input memory
         np.multiply(rgb, self._step, out=values)
         if self._lowest:
             values += self._lowest

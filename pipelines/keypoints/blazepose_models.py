@@ -35,12 +35,12 @@ class ModelFile:
 
     @property
     def name(self) -> str:
-        """The last part of its path."""
+        """Last part of its path."""
         return self.member.rpartition("/")[2]
 
 
 class Package(Protocol):
-    """A pinned version of somebody's package that ships model files."""
+    """Pinned version of a published package that ships model files."""
 
     @property
     def title(self) -> str:

@@ -53,8 +53,8 @@ def fixed_point_maps(
 
     Args:
         picture_from_crop: [2, 3] from the crop's pixels to the picture's.
-        width: of the crop.
-        height: of the crop.
+        width: width of the crop (px).
+        height: height of the crop (px).
 
     Returns:
         Whole pixels [height, width, xy], and parts of them [height, width] as 32 * y + x in 1/32 px.

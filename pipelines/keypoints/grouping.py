@@ -10,9 +10,9 @@ pass each other. `known` is 1 if the detection continues the last picture of the
 camera. Detections without history must thus agree within 3 sigma. A known detection may stay up to 5 sigma,
 unless another one of its camera fits better.
 
-The sum of squares over a whole assignment matters: a pose error moves everybody in a picture alike, so
+The sum of squares over a whole assignment matters: a pose error moves all people in a picture equally, so
 the assignment that keeps people apart wins even where one wrong pair happens to fit better than a right
-one (exchanging two people costs 2 (their separation)^2 whatever the pose error is). A logged actor takes
+one (exchanging two people costs 2 (their separation)^2 for any pose error). A logged actor takes
 part as the only detection of one more camera.
 
 `follow` is the one function called from outside. `grouping_rays` compares detections and places groups,

@@ -88,8 +88,8 @@ def join_groups(nodes: Nodes, n: int, tracks: Tracks) -> None:
 def bind_known(nodes: Nodes, n: int, tracks: Tracks) -> None:
     """Compute the bond of each detection to each track: continuity minus that of the best other track.
 
-    A detection that continues somebody who once stood beside the track in one picture is not taken for
-    it (the actor disappears behind a tree and the bystander stays), unless the two exchange places.
+    If a detection continues a person who was once seen beside the track in one picture, it is not assigned
+    to the track (the actor disappears behind a tree and the bystander stays), unless the two exchange places.
     """
     slots = len(tracks.identity)
     for a in range(n):

@@ -32,9 +32,9 @@ class Nodes(NamedTuple):
     size: Float  # [N] median distance of joints from their middle, normalised picture
     whole: Bool  # [N] enough joints for `size` to mean something
     weight: Float  # [N, N] 3^2 - s^2, 0 where a pair cannot be compared
-    known: Float  # [N, S] how well the node continues each track's last picture, 0..1
+    known: Float  # [N, S] 0..1, continuity of the node with each track's last picture
     bond: Float  # [N, S + N] the same relative to the best other track, -1..1
-    barred: Bool  # [N, S] the node continues somebody else than the track
+    barred: Bool  # [N, S] the node continues another person than the track
     label: Int64  # [N] track slot, or S + i for a group without a track
     member: Int64  # [S + N, C] node of each label in each camera, -1 none
 

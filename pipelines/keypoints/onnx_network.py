@@ -57,7 +57,7 @@ class OnnxNetwork:
 
     Attributes:
         size: width and height of its input.
-        shapes: of the outputs, by name, for one picture.
+        shapes: shapes of the outputs, by name, for one picture.
 
     Raises:
         DataError: not a model that ONNX Runtime can run, or not one of a single picture as input; no such

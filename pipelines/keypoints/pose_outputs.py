@@ -68,8 +68,8 @@ def decoder_for(
     """Choose the decoder of a network's outputs from their shapes.
 
     Args:
-        path: of the model, for the message.
-        shapes: of the outputs for one picture, by name.
+        path: path of the model, for the message.
+        shapes: shapes of the outputs for one picture, by name.
         size: width and height of the network's input.
         cells: convention for the place of heatmap cells.
 

@@ -7,8 +7,8 @@ which goes with them where both were exchanged, then for hands, feet and each ot
 the two sides is right is decided by the majority: an exchange in most pictures cannot be detected here.
 
 Exchanges often begin or end where legs cross in the picture. Nothing jumps there, and detectors place
-joints that hide each other badly for some pictures. What happens at a crossing therefore decides nothing: a
-jump at one end is needed, and of the crossings before and behind it, the nearer one is the other end.
+joints that hide each other badly for some pictures. Crossings are therefore no evidence: a jump at one end
+is needed, and the nearer one of the crossings before and behind it is the other end.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def undo_swaps_of_tracks(found: Detections, frame_t_ns: Int64) -> tuple[Detectio
     """Undo exchanges for all people that one camera followed; detections with one number are one person.
 
     Args:
-        found: of one camera, sorted by frame.
+        found: detections of one camera, sorted by frame.
         frame_t_ns: [F] time of each of its frames.
 
     Returns:

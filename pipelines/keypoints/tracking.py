@@ -26,7 +26,7 @@ from pipelines.session.registries import KeypointNetworks, Person, Region
 _PRESENT = 0.5
 _CENTRED = 0.3  # a margin (3 sigma) of this many heights, 0.1 per sigma, leaves the region good enough
 _SMALLEST_PX = 8.0
-_WIDER = 1.3  # the last region of somebody just lost
+_WIDER = 1.3  # factor on the last region of a person just lost
 _PATIENCE = 5  # a person not seen is searched at the last place for this many pictures
 _MEMORY = 30  # pictures after which a number is not given to the same place again
 _ONE_BODY = 0.06  # median distance of joints, in region sides: about the scatter of one body's two estimates

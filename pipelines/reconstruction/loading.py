@@ -149,7 +149,7 @@ def load_pose_errors(
     """Load the prior of each camera's pose errors over time; None unless known for all moving cameras.
 
     A logged covariance gives the size of errors, not their correlation over time (`errors_of_level`): the
-    white part uses the covariance of each pose, the lasting part the median. A static camera without stated
+    white part uses the covariance of each pose, the constant part the median. A static camera without stated
     noise was calibrated, and counts as exact beside cameras with stated noise.
     """
     stated: list[PoseErrors | None] = []

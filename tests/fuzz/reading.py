@@ -34,7 +34,7 @@ def read_or_refuse(path: Path, stated: str) -> tuple[int, int]:
 
     Args:
         path: the file, the folder, or a flight.yaml.
-        stated: the format that a user names, whatever the content says.
+        stated: the format that a user names, independent of the content.
 
     Raises:
         Exception: any exception of a reader other than a refusal.

@@ -24,7 +24,7 @@ def main() -> None:
     from tests.fuzz.reading import read_or_refuse
 
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # libraries that print must not be taken for answers
+    os.dup2(2, 1)  # output of libraries must not be read as answers
     FORMATS.all()
     warm = json.loads(sys.stdin.readline())  # valid files load the libraries before memory is counted
     for path, stated in warm:

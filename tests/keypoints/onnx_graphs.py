@@ -14,7 +14,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-OPSET, IR = 18, 9  # what ONNX Runtime 1.20 reads
+OPSET, IR = 18, 9  # versions that ONNX Runtime 1.20 reads
 
 Node = onnx.NodeProto
 

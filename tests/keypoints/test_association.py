@@ -266,7 +266,7 @@ def test_the_actor_is_taken_up_again_after_all_cameras_lost_him() -> None:
 @pytest.mark.parametrize("cameras", [[2], [0, 1, 2, 3]])
 def test_the_more_complete_detection_of_a_person_is_taken(cameras: list[int]) -> None:
     """Add fragments of a body, as from a detector that splits one body in two, in one camera and in all."""
-    scene = film([ACTOR, ACROSS], cameras=4)  # who is 1 becomes a copy of four joints of 0
+    scene = film([ACTOR, ACROSS], cameras=4)  # person 1 becomes a copy of four joints of person 0
     xy, who = scene.xy.copy(), scene.who.copy()
     for t, c in np.ndindex(*who.shape[:2]):
         body, fragment = np.argsort(scene.who[t, c])

@@ -161,8 +161,8 @@ def test_an_exchange_from_or_to_a_crossing_is_undone_and_no_other_picture_is_exc
 ) -> None:
     """Exchange legs up to the picture where they cross, so that only the other end jumps.
 
-    The exchange lasts less than half of the 15 pictures between two crossings. To exchange the rest of these
-    instead would make the same jump vanish.
+    The exchange covers less than half of the 15 pictures between two crossings. Exchanging the rest of these
+    instead would remove the same jump.
     """
     t_s, truth = step_sideways(crossing_s=2.0 + 0.5 / FPS)
     truth += np.random.default_rng(4).normal(0.0, 0.5, truth.shape)

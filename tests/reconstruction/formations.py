@@ -87,8 +87,8 @@ def formation(
         def flown(at_s: Float, camera: int = camera, middle: Float = middle) -> list[Float]:
             target = np.tile(middle, (times, 1))
             if not still:
-                # The path, not the gait: cameras that bob with the person make a larger person, who stands
-                # still in the air, more likely.
+                # The path, not the gait: cameras that bob with the person would make a larger person without
+                # vertical motion more likely.
                 target[:, :2] = route(SPEED_MPS * at_s, radius_m=RADIUS_M)[0]
             parts = orbit(
                 at_s,
@@ -100,7 +100,7 @@ def formation(
             )
             return [part[camera] for part in parts]
 
-        # Logs are right about the time, so a late picture shows what the log says of a later time.
+        # Logs have the right time, so a late picture matches a later time of the log.
         position, quaternion = flown(t_s)
         taken_from, taken_quaternion = flown(taken_s)
         rotation = matrix_from_quaternion(taken_quaternion)

@@ -23,7 +23,7 @@ def test_a_clock_is_known_where_the_person_moves_and_unknown_where_nothing_does(
     flight = formation(45, 2, [], 0, still=True, late_s=(0.0, 0.02))
     walking = refined(flight.sightings, flight.t_s, flight.start)
     assert walking.clock_offset_s[0] == walking.clock_sigma_s[0] == 0.0
-    # Half the pictures of a flight that was known to 0.8 ms; three times what is stated.
+    # Half the pictures of a flight whose clock was known to 0.8 ms; then three estimated sigmas.
     assert walking.clock_sigma_s[1] < 0.003
     assert abs(walking.clock_offset_s[1] - 0.02) < 3 * walking.clock_sigma_s[1]
 

@@ -46,7 +46,7 @@ def test_each_camera_and_trial_has_its_own_chance_whatever_else_is_asked() -> No
     assert not np.allclose(two[0], two[1])
     assert not np.allclose(two, moved("white:position_m=0.1", trial=1))
     assert not np.allclose(two, moved("white:position_m=0.1", seed=1))
-    # Latency moves nobody who stands still.
+    # Latency does not change a camera that stands still.
     assert not moved("latency:latency_ms=50").any()
 
 

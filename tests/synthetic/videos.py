@@ -63,7 +63,7 @@ def write_video(
         codec: FFmpeg's name of the encoder.
         tick_s: the unit of the stamps.
         key_every: frames from one key frame to the next.
-        b_frames: how many frames in a row refer to later ones.
+        b_frames: number of consecutive frames that refer to later ones.
         turned_deg: counter-clockwise rotation that the container states.
     """
     mp4 = path.suffix in {".mp4", ".mov"}

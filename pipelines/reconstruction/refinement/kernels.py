@@ -828,7 +828,7 @@ def add_bones(
         for axis in range(3):
             direction[axis] /= length
         low, high = offset + 3 * min(i, j), offset + 3 * max(i, j)
-        sign = 1.0 if j > i else -1.0  # of the joint that stands later
+        sign = 1.0 if j > i else -1.0  # of the joint with the larger number
         by_length[:] = -residual * shrinking
         by_length[b] -= 1.0
         for d in range(len(lengths)):

@@ -99,7 +99,7 @@ class Refined:
     acceleration: Float  # [P, P] (m/s^2)^2, estimated covariance of the P refined joints' accelerations
     learned: bool  # the levels of the pose errors were estimated from the pictures
     warnings: tuple[str, ...]
-    fallback: str | None  # why the result must not be used
+    fallback: str | None  # reason why the result must not be used
 
 
 def refine(
