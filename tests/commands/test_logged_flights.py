@@ -227,5 +227,5 @@ def test_logged_pictures_of_another_size_are_told_from_those_of_the_calibration(
     flight.save()
     _, description = ingested(tmp_path / "half")
     lens = description["cameras"]["drone1"]["intrinsics"]
-    assert (lens["width"], lens["height"], lens["fx"], lens["cy"]) == (640, 360, 381.0, 179.0)
+    assert (lens["width"], lens["height"], lens["fx"], lens["cy"]) == (640, 360, 381.0, 178.75)
     assert any("drone1: pictures are 640 x 360" in line for line in description["warnings"])
