@@ -4,8 +4,8 @@ Every world has a seed: walls down to one voxel thick, boxes, forests, hills, ov
 obstacles; 2, 3 or 5 drones; all arms. The map is made of voxels, and flights are checked against the analytic
 surfaces that the voxels were made from. All simulated. The command fails if a drone touches anything, comes
 below the ground or breaks a limit. It also fails if flights that were safe before (every drone at least its
-radius from all surfaces, limits kept) have become worse by more than 5 %. `worlds_before.json` holds the flights
-of commit 890a2c4, made by running this file there with `--write`.
+radius from all surfaces, limits kept) have become worse by more than 5 %. `worlds_before.json` holds the
+flights of commit 890a2c4, made by running this file there with `--write`.
 """
 
 from __future__ import annotations
