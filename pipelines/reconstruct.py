@@ -458,8 +458,9 @@ def _said_people(people: Mapping[str, Any]) -> list[str]:
     if people["times_with_more"]:
         line += (
             f"; two cameras or more detect up to {people['seen_at_once']} at once, and more than"
-            f" {people['asked']} at {people['times_with_more']} of {people['times']} times: if these are people"
-            f" (detectors also take trees for them), --persons {people['seen_at_once']} reconstructs them"
+            f" {people['asked']} at {people['times_with_more']} of {people['times']} times: if these are"
+            f" people (detectors also take trees for them), --persons {people['seen_at_once']} reconstructs"
+            " them"
         )
     return [line]
 
