@@ -45,6 +45,7 @@ from pipelines.reconstruction.observations import (
     candidates,
     observe,
     on_sides,
+    readout_of,
     time_base,
 )
 from pipelines.reconstruction.quality import assess
@@ -74,7 +75,7 @@ from pipelines.session.true_joints import true_joints_at
 if TYPE_CHECKING:
     import pandas as pd
 
-RECONSTRUCT = Stage("reconstruct", revision=13)
+RECONSTRUCT = Stage("reconstruct", revision=14)
 
 _LONGEST_FILL_S = 10.0
 
@@ -371,6 +372,7 @@ def _attempt(
         solve=solve,
     )
     people = {"people": _people_seen(cameras, seen.association)}
+    readout = _readout(cameras, seen)
     progress.advance()
     return _Attempt(
         observations,
@@ -378,13 +380,14 @@ def _attempt(
         result,
         seen.association,
         seen.between_views,
-        metrics | finished | background | people | (refined.metrics if refined else {}),
+        metrics | finished | background | people | readout | (refined.metrics if refined else {}),
         _poses_stored(cameras, refined, background["background"], description.pose_interpolation),
         [
             *warnings,
             *(refined.warnings if refined else []),
             *seen.association.reasons,
             *_said_people(people["people"]),
+            *_said_readout(readout),
         ],
     )
 
@@ -463,6 +466,26 @@ def _said_people(people: Mapping[str, Any]) -> list[str]:
             " them"
         )
     return [line]
+
+
+def _readout(cameras: Sequence[Camera], seen: _Seen) -> dict[str, Any]:
+    """Count the keypoints of rolling shutters that were moved to the stamps; empty without such cameras."""
+    rolling = {
+        camera.name: readout_of(camera, seen.found, c, seen.association.choice[:, c])
+        for c, camera in enumerate(cameras)
+        if camera.intrinsics.readout_s
+    }
+    return {"readout": rolling} if rolling else {}
+
+
+def _said_readout(readout: Mapping[str, Any]) -> list[str]:
+    """Say which cameras have keypoints that could not be moved."""
+    return [
+        f"{name}: {counts['without_motion']} keypoints stand at the picture's time instead of their row's:"
+        " no neighbouring picture shows the person"
+        for name, counts in readout.get("readout", {}).items()
+        if counts["without_motion"]
+    ]
 
 
 def _follow_backgrounds(

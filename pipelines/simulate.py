@@ -36,7 +36,8 @@ from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, fly_sce
 from pipelines.simulation.flying import Known, Planner
 from pipelines.simulation.log_messages import logged_messages
 from pipelines.simulation.manifest_text import manifest_text
-from pipelines.simulation.rendering.renderer import Renderer
+from pipelines.simulation.rendering.renderer import Moment, Renderer
+from pipelines.simulation.rendering.shutter import exposed_moments
 from pipelines.simulation.scenario import Scenario, read_scenario
 from pipelines.simulation.truth_files import write_keypoints, write_truth
 from pipelines.simulation.world.scene import World
@@ -270,27 +271,40 @@ def _film_block(
     progress: Progress,
     folder: Path,
 ) -> None:
-    truth = drone.at_frames
-    frames = range(first, min(first + _BLOCK, len(truth.t_ns)))
-    rows = flight.moments_of(drone)
+    stamps, lens, shot = drone.at_frames.t_ns, drone.intrinsics, flight.scenario.lens
+    frames = range(first, min(first + _BLOCK, len(stamps)))
+    offsets_s, weights = exposed_moments(
+        lens.height, exposure_s=(shot.exposure_ms or 0.0) / 1e3, readout_s=lens.readout_s
+    )
+    t_ns = (stamps[frames.start : frames.stop, None] + np.rint(1e9 * offsets_s).astype(np.int64)).ravel()
+    camera, motions = drone.at(t_ns), [each.moving(t_ns / 1e9) for each in flight.people]
 
     def pictures() -> Iterator[Picture]:
-        for frame in frames:
+        for number, frame in enumerate(frames):
             halt.check()
-            people = [person.surface(rows[frame]) for person in flight.people]
-            yield renderer.picture(
-                truth.camera_position[frame], truth.camera_quaternion_xyzw[frame], people, frame
-            )
+            of_frame = range(number * len(offsets_s), (number + 1) * len(offsets_s))
+            moments = [
+                Moment(
+                    camera.camera_position[k],
+                    camera.camera_quaternion_xyzw[k],
+                    [
+                        each.person.surface(motion.root[k], motion.rotation[k])
+                        for each, motion in zip(flight.people, motions, strict=True)
+                    ],
+                )
+                for k in of_frame
+            ]
+            yield renderer.exposed(moments, weights, frame)
             progress.advance()
 
-    lens = drone.intrinsics
-    since_first = truth.t_ns - truth.t_ns[0]
+    since_first = stamps - stamps[0]
     write_h264(
         folder / "part.mp4",
         pictures(),
         since_first[frames.start : frames.stop],
         width=lens.width,
         height=lens.height,
+        bits_per_s=round(1e6 * (shot.bitrate_mbps or 0.0)) or None,
     )
 
 

@@ -28,7 +28,8 @@ class Intrinsics:
 
     `radtan` is OpenCV's order k1 k2 p1 p2 [k3 [k4 k5 k6]], `fisheye` is OpenCV's k1 k2 k3 k4
     (equidistant). The centre of the top left pixel is (0, 0). `readout_s` is the time a rolling
-    shutter takes from the first to the last row, 0 when unknown.
+    shutter takes from the first (top) to the last row, 0 for a global shutter or when unknown; a
+    picture's stamp is its middle row's.
 
     Raises:
         ValueError: sizes or focal lengths that are not positive, numbers that are not finite, an unknown
@@ -116,6 +117,20 @@ def undistort(pixels: Float, intrinsics: Intrinsics) -> Float:
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         normalised[known] = _UNDISTORT[intrinsics.model](flat[known], intrinsics.distortion)
     return normalised.reshape(distorted.shape)
+
+
+def row_delay_s(row_px: Float, intrinsics: Intrinsics) -> Float:
+    """Compute how much later than the picture's stamp, its middle row's, a rolling shutter takes a row.
+
+    Args:
+        row_px: [...] px from the centre of the first row, which is read first; NaN stays.
+        intrinsics: the camera.
+
+    Returns:
+        [...] s, from -readout_s / 2 in the first row to readout_s / 2 in the last and on beyond them.
+    """
+    delay: Float = (row_px / max(intrinsics.height - 1, 1) - 0.5) * intrinsics.readout_s
+    return delay
 
 
 def rescaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:

@@ -220,6 +220,24 @@ def interpolate_points(t_ns: Int64, values: Float, at_ns: Int64, *, max_gap_ns: 
     return np.where(between.known.reshape(spread), points, np.nan)
 
 
+def velocities(t_s: Float, values: Float, follows: NDArray[np.bool_]) -> tuple[Float, Float]:
+    """Compute velocities from the sample before, and to the one after; each sample has a time of its own.
+
+    Args:
+        t_s: [N, ...] s when each value was sampled; NaN where it was not.
+        values: [N, ..., D]; NaN is missing.
+        follows: [N - 1, ...] whether a sample goes on from the one before; broadcast.
+
+    Returns:
+        [N, ..., D] per s, twice; NaN where a neighbour is missing or was not sampled earlier, or later.
+    """
+    step_s = np.diff(t_s, axis=0)
+    step_s = np.where(follows & (step_s > 0), step_s, np.nan)
+    between = np.diff(values, axis=0) / step_s[..., None]
+    nothing = np.full_like(values[:1], np.nan)
+    return np.concatenate([nothing, between]), np.concatenate([between, nothing])
+
+
 def rates(t_ns: Int64, position: Float, quaternion_xyzw: Float) -> tuple[Float, Float]:
     """Compute speed [N] in m/s and turn rate [N] in rad/s at each stamp, from its neighbours.
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.geometry.cameras import undistort
-from pipelines.geometry.poses import quaternion_from_matrix
+from pipelines.geometry.cameras import row_delay_s, undistort
+from pipelines.geometry.poses import quaternion_from_matrix, velocities
 from pipelines.reconstruction.background_poses import Adjusted, PosePrior, adjust
 from pipelines.reconstruction.background_tracks import Tracks
 from pipelines.reconstruction.observations import Camera
@@ -96,7 +96,7 @@ def refine_cameras(
             found = adjust(
                 seen.tracks.picture,
                 seen.tracks.point,
-                undistort(seen.tracks.xy, camera.intrinsics),
+                _rays(seen.tracks, camera, t_ns),
                 camera.focal_px,
                 *logged,
                 prior,
@@ -107,6 +107,27 @@ def refine_cameras(
             reason = told[camera.name]["reason"]
             refusals.append(f"{camera.name}: its logged poses stay, because {reason}")
     return refined, told, refusals
+
+
+def _rays(tracks: Tracks, camera: Camera, t_ns: Int64) -> Float:
+    """Compute the viewing rays [K, 2] of followed points at the stamps [T] of their pictures.
+
+    Points of a rolling shutter go on from their rows' times by their own velocities.
+    """
+    xy = undistort(tracks.xy, camera.intrinsics)
+    if not camera.intrinsics.readout_s:
+        return xy
+    delay_s = row_delay_s(tracks.xy[:, 1], camera.intrinsics)
+    order = np.lexsort((tracks.picture, tracks.point))
+    point, picture = tracks.point[order], tracks.picture[order]
+    follows = (np.diff(point) == 0) & (np.diff(picture) == 1)
+    t_s = (t_ns[picture] - t_ns[0]) / 1e9 + delay_s[order]
+    before, after = velocities(t_s, xy[order], follows)
+    sides = np.stack([np.where(np.isnan(before), after, before), np.where(np.isnan(after), before, after)])
+    motion = np.empty_like(xy)
+    motion[order] = sides.mean(axis=0) * delay_s[order, None]
+    # A point that was seen once has no velocity, and is used for nothing.
+    return xy - np.nan_to_num(motion)
 
 
 def _with_poses(camera: Camera, t_ns: Int64, found: Adjusted, prior: PosePrior, stated: bool) -> Camera:

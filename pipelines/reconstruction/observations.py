@@ -2,6 +2,10 @@
 
 Cameras keep their own frames until each person's detections are chosen. Only then are the person's keypoints
 interpolated to the common times, and never across a frame without them.
+
+A rolling shutter takes each row at a time of its own. A joint's image moves on from its row's time to the
+picture's stamp by its own velocity in the picture. So the camera's turning and the joint's motion during the
+readout both count, and everything after that may take each picture for one of a single moment.
 """
 
 from __future__ import annotations
@@ -12,8 +16,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.cameras import Intrinsics, undistort
-from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion
+from pipelines.geometry.cameras import Intrinsics, row_delay_s, undistort
+from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion, velocities
 from pipelines.reconstruction.refinement.problem import PoseErrors
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import Interpolation
@@ -57,6 +61,27 @@ class Camera:
         dense = np.full((len(self.frame_t_ns), self._most_people, len(found.joints), 2), np.nan)
         dense[found.frame, self._rank] = undistort(found.xy, self.intrinsics)
         return dense
+
+    @cached_property
+    def row_delay_s(self) -> Float:
+        """Delay (s) of each keypoint [F, D, J] against its frame's stamp (`cameras.row_delay_s`)."""
+        found = self.detections
+        dense = np.full((len(self.frame_t_ns), self._most_people, len(found.joints)), np.nan)
+        dense[found.frame, self._rank] = row_delay_s(found.xy[..., 1], self.intrinsics)
+        return dense
+
+    @cached_property
+    def bridged(self) -> NDArray[np.bool_]:
+        """[F - 1] True for frames after the first that may be interpolated to from the frame before."""
+        step_ns = np.diff(self.frame_t_ns)
+        return np.asarray(self.follows[1:] & (step_ns <= self.largest_gap_ns))
+
+    @property
+    def largest_gap_ns(self) -> int:
+        """The longest time between two of its frames over which keypoints are interpolated."""
+        stamps = self.frame_t_ns
+        period = int(np.median(np.diff(stamps))) if len(stamps) > 1 else 0
+        return max(_FRAME_GAP_NS, int(_USUAL * period))
 
     @cached_property
     def confidence(self) -> Float:
@@ -259,11 +284,53 @@ def _nearest_frame(frame_t_ns: Int64, t_ns: Int64) -> Int64:
 def sightings_of(camera: Camera, found: Candidates, c: int, choice: Int64) -> tuple[Float, Float]:
     """Return rays [F, P, J, 2] and confidence [F, P, J] of people in the camera's own frames; NaN unseen.
 
-    A frame of a slow camera appears at several times of the timeline: the time nearest to it decides.
+    A frame of a slow camera appears at several times of the timeline: the time nearest to it decides. Rays of
+    a rolling shutter are those of the frames' stamps.
     """
+    xy, confidence, delay_s = _chosen(camera, found, c, choice)
+    if camera.intrinsics.readout_s:
+        xy = xy - _row_motion(camera, xy, delay_s)
+    return xy, confidence
+
+
+def readout_of(camera: Camera, found: Candidates, c: int, choice: Int64) -> dict[str, float | int]:
+    """Say how many of a camera's chosen keypoints were moved from their rows' times to the stamps.
+
+    The others have no velocity: no neighbouring picture shows any joint of the person. They stay as they are.
+    """
+    xy, _, delay_s = _chosen(camera, found, c, choice)
+    seen = int(np.isfinite(xy[..., 0]).sum())
+    moved = int(np.isfinite(_velocity(camera, xy, delay_s)[..., 0])[np.isfinite(xy[..., 0])].sum())
+    return {"readout_s": camera.intrinsics.readout_s, "keypoints": moved, "without_motion": seen - moved}
+
+
+def _row_motion(camera: Camera, xy: Float, delay_s: Float) -> Float:
+    """Compute how far keypoints [F, P, J, 2] move from their frame's stamp to their row's time, or 0."""
+    return np.nan_to_num(_velocity(camera, xy, delay_s) * delay_s[..., None])
+
+
+def _velocity(camera: Camera, xy: Float, delay_s: Float) -> Float:
+    """Estimate velocities [F, P, J, 2] of keypoints at their rows' times; NaN of people in a lone picture.
+
+    Of the velocities from the picture before and to the one after, and the median of all joints of the person
+    on both sides, the median: an outlier in one picture then moves the keypoints beside it little. Where one
+    neighbour is missing, the other one decides; without any, the person's median.
+    """
+    t_s = (camera.frame_t_ns - camera.frame_t_ns[0])[:, None, None] / 1e9 + delay_s
+    before, after = velocities(t_s, xy, camera.bridged[:, None, None])
+    sides = np.concatenate([before, after], axis=2)
+    known = np.isfinite(sides).any(axis=2, keepdims=True)
+    body = np.where(known, np.nanmedian(np.where(known, sides, 0.0), axis=2, keepdims=True), np.nan)
+    middle = np.median(np.stack([before, after, np.broadcast_to(body, before.shape)]), axis=0)
+    either = np.where(np.isnan(before), after, before)
+    return np.where(np.isfinite(middle), middle, np.where(np.isfinite(either), either, body))
+
+
+def _chosen(camera: Camera, found: Candidates, c: int, choice: Int64) -> tuple[Float, Float, Float]:
+    """Gather rays, confidence and delay (s) of each person's keypoints in the camera's frames, as taken."""
     shape = (len(camera.frame_t_ns), choice.shape[1], camera.rays.shape[2])
     xy = np.full((*shape, 2), np.nan)
-    confidence = np.full(shape, np.nan)
+    confidence, delay_s = np.full(shape, np.nan), np.full(shape, np.nan)
     frame = found.frame[:, c]
     apart_ns = np.abs(found.t_ns - camera.frame_t_ns[frame])
     nearest_last = np.argsort(-apart_ns, kind="stable")
@@ -271,14 +338,14 @@ def sightings_of(camera: Camera, found: Candidates, c: int, choice: Int64) -> tu
         rows = nearest_last[(frame[nearest_last] >= 0) & (choice[nearest_last, person] >= 0)]
         xy[frame[rows], person] = camera.rays[frame[rows], choice[rows, person]]
         confidence[frame[rows], person] = camera.confidence[frame[rows], choice[rows, person]]
+        delay_s[frame[rows], person] = camera.row_delay_s[frame[rows], choice[rows, person]]
     confidence[np.isnan(xy[..., 0])] = np.nan
-    return xy, confidence
+    return xy, confidence, delay_s
 
 
 def _at(camera: Camera, values: Float, t_ns: Int64) -> Float:
     """Interpolate values [F, ...] of a camera's frames to times [T, ...]; NaN where pictures are missing."""
     stamps = camera.frame_t_ns
-    period = int(np.median(np.diff(stamps))) if len(stamps) > 1 else 0
     # A missing picture is a row of NaN between its neighbours.
     breaks = np.flatnonzero(~camera.follows[1:]) + 1
     between = (stamps[breaks - 1] + stamps[breaks]) // 2
@@ -287,5 +354,5 @@ def _at(camera: Camera, values: Float, t_ns: Int64) -> Float:
         np.insert(stamps, breaks[apart], between[apart]),
         np.insert(values, breaks[apart], np.nan, axis=0),
         t_ns,
-        max_gap_ns=max(_FRAME_GAP_NS, int(_USUAL * period)),
+        max_gap_ns=camera.largest_gap_ns,
     )

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.cameras import Intrinsics, project, row_delay_s, undistort
 from pipelines.geometry.noise import NoiseModel
+from pipelines.geometry.poses import invert, transform
 from pipelines.session.errors import DataError
 from pipelines.session.records import SkeletalMotion
 from pipelines.simulation.body import Person, make_body
@@ -42,6 +43,8 @@ LEAD_S = 0.2
 """Time that logs run, and the actor moves, before the first picture and after the last, s."""
 
 _PLANNER_HZ = 50.0  # rate of the planner's calls; it may replan less often
+_NODES = 5  # of the polynomial that a joint follows during a readout
+_ROW_STEPS = 5  # each takes away all but some percent of what is left
 _WAY_S = 0.25  # between the points of the actor's way that the wood keeps clear of
 # What chance decides, each with numbers of its own: changing one thing leaves the others as they were.
 _FRAMES, _LOG, _NOISE, _ACTOR, _KEYPOINTS, _MOTION = range(6)
@@ -58,6 +61,7 @@ class SimulatedDrone:
     at_frames: DronePoses  # [F] the truth when its pictures were taken
     at_log: DronePoses  # [M] the truth at the stamps of its log
     log: PoseLog  # [M] its log
+    at: Callable[[Int64], DronePoses]  # the truth at any moments within the log's span
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,7 @@ class SimulatedPerson:
     name: str
     look: Actor
     person: Person
+    moving: Moving  # at any seconds since the flight's start
     motion: BodyMotion  # at the moments T
     joints: Float  # [T, J, 3] m, of `person.joints`
     topic: str  # of the logged estimates
@@ -160,7 +165,7 @@ def fly_scenario(
     estimates = [_estimated(each, k, scenario, t_s) for k, each in enumerate(set_up.people)]
     actor_ns, actor = estimates[0]
     paths = _paths(scenario, t_s, followed.moving(t_s).root, actor_ns / 1e9, actor, world, planner)
-    lens = intrinsics_of(scenario.drones.camera)
+    lens = _usable(intrinsics_of(scenario.lens))
     drones = [_drone(scenario, lens, paths, index, noise, span_s) for index in range(scenario.drones.count)]
 
     t_ns = np.unique(np.concatenate([drone.at_frames.t_ns for drone in drones]))
@@ -183,18 +188,75 @@ def visible_joints(
 ) -> tuple[Float, Bool]:
     """Where a drone's pictures show a person's joints, and whether they do.
 
+    A rolling shutter takes each joint when it reads the row in which the joint is.
+
     Returns:
         [F, J, 2] exact px, NaN outside the picture; [F, J] whether a joint is in the picture and neither the
         world nor anybody else stands before it. The person's own body hides nothing here.
     """
-    rows = flight.moments_of(drone)
-    truth, joints = drone.at_frames, person.joints[rows]
-    pixels = see(joints, truth.camera_position, truth.camera_quaternion_xyzw, drone.intrinsics)
-    hidden = flight.world.hidden(truth.camera_position[:, None], joints)
+    truth, joints = drone.at_frames, person.joints[flight.moments_of(drone)]
+    t_ns = truth.t_ns[:, None]
+    place, turn = truth.camera_position[:, None], truth.camera_quaternion_xyzw[:, None]
+    if drone.intrinsics.readout_s:
+        t_ns, joints, place, turn = _at_their_rows(flight, drone, person)
+    pixels = see(joints, place, turn, drone.intrinsics)
+    hidden = flight.world.hidden(place, joints)
     for other in flight.people:
         if other is not person:
-            hidden |= _hidden_by_person(other, rows, truth.camera_position, joints)
+            hidden |= _hidden_by_person(other, _during_readouts(flight, drone, other), t_ns, place, joints)
     return pixels, np.isfinite(pixels).all(axis=-1) & ~hidden
+
+
+def _at_their_rows(
+    flight: SimulatedFlight, drone: SimulatedDrone, person: SimulatedPerson
+) -> tuple[Int64, Float, Float, Float]:
+    """Find the time at which each joint's row is read, and what is where then.
+
+    The row depends on the time and the time on the row: a step of the fixed point iteration leaves of an
+    error the share that an image moves up or down during the readout, some percent of the picture.
+
+    Returns:
+        [F, J] ns since the flight's start; joints [F, J, 3] m; the camera's poses, [F, J, 3] and [F, J, 4].
+    """
+    lens, stamps = drone.intrinsics, drone.at_frames.t_ns
+    nodes_s = _nodes_s(lens)
+    near = _during_readouts(flight, drone, person)
+    delay_s = np.zeros(near.shape[:2])
+    for _ in range(_ROW_STEPS):
+        t_ns = stamps[:, None] + np.rint(1e9 * delay_s).astype(np.int64)
+        joints = np.einsum("fjik,fjk->fji", near, _lagrange(nodes_s, delay_s))
+        poses = drone.at(t_ns.ravel())
+        place = poses.camera_position.reshape(*delay_s.shape, 3)
+        turn = poses.camera_quaternion_xyzw.reshape(*delay_s.shape, 4)
+        row = project(transform(invert(place, turn), joints), lens)[..., 1]
+        # A joint outside the picture is never read: its time only has to stay within the log.
+        row = np.clip(np.where(np.isnan(row), 0.0, row), 0, lens.height - 1)
+        delay_s = row_delay_s(row, lens)
+    return t_ns, joints, place, turn
+
+
+def _nodes_s(lens: Intrinsics) -> Float:
+    """Return times [N] of a readout to interpolate joints between, s after the picture's stamp."""
+    return np.linspace(-0.5, 0.5, _NODES) * lens.readout_s
+
+
+def _during_readouts(flight: SimulatedFlight, drone: SimulatedDrone, person: SimulatedPerson) -> Float:
+    """Compute a person's joints [F, J, 3, N] at the nodes of each picture's readout; N is 1 without one."""
+    if not drone.intrinsics.readout_s:
+        return person.joints[flight.moments_of(drone)][..., None]
+    t_s = drone.at_frames.t_ns / 1e9
+    at_nodes = [person.person.keypoints(person.moving(t_s + node)) for node in _nodes_s(drone.intrinsics)]
+    return np.stack(at_nodes, axis=-1)
+
+
+def _lagrange(nodes: Float, at: Float) -> Float:
+    """Compute the weights [..., N] of values at the nodes [N] for the polynomial's value at places [...]."""
+    away = at[..., None] - nodes
+    weights = [
+        np.prod(np.delete(away, k, axis=-1) / (nodes[k] - np.delete(nodes, k)), axis=-1)
+        for k in range(len(nodes))
+    ]
+    return np.stack(weights, axis=-1)
 
 
 def keypoints_of(
@@ -228,13 +290,40 @@ def keypoints_of(
 
 
 def intrinsics_of(lens: Lens) -> Intrinsics:
-    """Return a pinhole that looks straight ahead.
+    """Return the intrinsics of a camera that looks straight ahead.
 
     The principal point is the middle of the picture. It is (width - 1) / 2, because pixel centres are whole
-    numbers.
+    numbers. `hfov_deg` gives the focal length as without distortion.
     """
     focal = lens.width / 2 / float(np.tan(np.radians(lens.hfov_deg / 2)))
-    return Intrinsics(lens.width, lens.height, focal, focal, (lens.width - 1) / 2, (lens.height - 1) / 2)
+    return Intrinsics(
+        lens.width,
+        lens.height,
+        focal,
+        focal,
+        (lens.width - 1) / 2,
+        (lens.height - 1) / 2,
+        "radtan" if lens.distortion else "none",
+        tuple(lens.distortion or ()),
+        (lens.readout_ms or 0.0) / 1e3,
+    )
+
+
+def _usable(lens: Intrinsics) -> Intrinsics:
+    """Return the same camera, if its distortion reaches the whole picture.
+
+    Raises:
+        DataError: no ray reaches a corner.
+    """
+    right, bottom = lens.width - 0.5, lens.height - 0.5
+    corners = np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]])
+    if np.isnan(undistort(corners, lens)).any():
+        raise DataError(
+            "drones.camera.distortion",
+            f"no ray reaches the corners of a picture of {lens.width}x{lens.height} px and fx {lens.fx:.0f}",
+            "state the coefficients of such a lens, [] for none, or a smaller hfov_deg",
+        )
+    return lens
 
 
 def _span_s(scenario: Scenario) -> tuple[float, float]:
@@ -269,28 +358,42 @@ def _estimated(each: Performer, index: int, scenario: Scenario, t_s: Float) -> t
 def _person(
     each: Performer, estimated: tuple[Int64, Float], scenario: Scenario, t_ns: Int64
 ) -> SimulatedPerson:
+
+    def moving(t_s: Float) -> BodyMotion:
+        # A script is planned up to the last time asked for: the flight's last moment, as for the truth.
+        found = each.moving(np.append(t_s, t_ns[-1] / 1e9))
+        return BodyMotion(t_s, found.root[:-1], found.rotation[:-1])
+
     motion = each.moving(t_ns / 1e9)
     topic = "/actor" if scenario.actors is None else f"/actor/{each.name}"
     joints = each.person.keypoints(motion)
-    return SimulatedPerson(each.name, each.look, each.person, motion, joints, topic, *estimated)
+    return SimulatedPerson(each.name, each.look, each.person, moving, motion, joints, topic, *estimated)
 
 
-def _hidden_by_person(other: SimulatedPerson, rows: Int64, eye: Float, joints: Float) -> Bool:
+def _hidden_by_person(other: SimulatedPerson, around: Float, t_ns: Int64, eye: Float, joints: Float) -> Bool:
     """Which joints [F, J] of somebody a person's body hides.
 
     Args:
         other: who may stand in the way.
-        rows: [F] of the moments.
-        eye: [F, 3] m, of the camera.
+        around: [F, J, 3, N] m, their own joints during the readout of each picture.
+        t_ns: [F, 1] or [F, J], when the joints were taken, since the flight's start.
+        eye: [F, 1, 3] or [F, J, 3] m, of the camera at those times.
         joints: [F, J, 3] m.
     """
-    hidden = np.zeros(joints.shape[:2], dtype=np.bool_)
-    low, high = other.joints[rows].min(axis=1) - _REACH_M, other.joints[rows].max(axis=1) + _REACH_M
-    near = _meets_box(eye[:, None], joints, low[:, None], high[:, None])
-    for frame in np.flatnonzero(near.any(axis=1)).tolist():
-        asked = near[frame]
-        hidden[frame, asked] = hidden_by(other.surface(rows[frame]), eye[frame], joints[frame, asked])
-    return hidden
+    low, high = around.min(axis=(1, 3)) - _REACH_M, around.max(axis=(1, 3)) + _REACH_M
+    near = _meets_box(eye, joints, low[:, None], high[:, None])
+    # A global shutter takes all joints of a picture at once, a rolling one each of them at a time of its own.
+    asked, targets = near.reshape(*t_ns.shape, -1), joints.reshape(*t_ns.shape, -1, 3)
+    hidden = np.zeros_like(asked)
+    moments = np.nonzero(asked.any(axis=-1))
+    if not len(moments[0]):
+        return near
+    ascending_ns, row = np.unique(t_ns[moments], return_inverse=True)
+    motion = other.moving(ascending_ns / 1e9)
+    for k, frame, taken in zip(row.tolist(), *(axis.tolist() for axis in moments), strict=True):
+        surface, of = other.person.surface(motion.root[k], motion.rotation[k]), asked[frame, taken]
+        hidden[frame, taken, of] = hidden_by(surface, eye[frame, taken], targets[frame, taken, of])
+    return hidden.reshape(near.shape)
 
 
 def _meets_box(start: Float, end: Float, low: Float, high: Float) -> Bool:
@@ -374,6 +477,10 @@ def _drone(
 ) -> SimulatedDrone:
     drones, seed = scenario.drones, scenario.seed
     name, lens_spec = f"drone{index + 1}", drones.camera
+
+    def at(t_ns: Int64) -> DronePoses:
+        return poses_at(paths, index, t_ns)
+
     frames_ns = frame_times(lens_spec, scenario.duration_s, np.random.default_rng([seed, _FRAMES, index]))
     if not len(frames_ns):
         raise DataError(
@@ -387,7 +494,8 @@ def _drone(
         name=name,
         intrinsics=lens,
         clock_offset_s=offsets[index] if index < len(offsets) else 0.0,
-        at_frames=poses_at(paths, index, frames_ns),
+        at_frames=at(frames_ns),
         at_log=at_log,
         log=estimate(at_log, noise, np.random.default_rng([seed, _NOISE, index])),
+        at=at,
     )

@@ -69,8 +69,8 @@ def _camera_infos(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_S
     fields = {
         "width": lens.width,
         "height": lens.height,
-        "distortion_model": "plumb_bob",
-        "d": [0.0] * 5,
+        "distortion_model": "rational_polynomial" if len(lens.distortion) > 5 else "plumb_bob",
+        "d": [*lens.distortion, *[0.0] * (5 - len(lens.distortion))],
         "k": [lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0],
         "r": np.eye(3),
         "p": [lens.fx, 0.0, lens.cx, 0.0, 0.0, lens.fy, lens.cy, 0.0, 0.0, 0.0, 1.0, 0.0],

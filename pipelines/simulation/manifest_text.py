@@ -21,6 +21,7 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
     lines = [
         "# Simulated by `mocap simulate` from scenario.yaml; simulation.json says how.",
         *([] if video else [f"# The keypoints have the measured errors of {scenario.keypoints.detector}."]),
+        *_shot(flight),
         "schema: 1",
         f"name: {_quoted(scenario.name)}",
         "simulated: true",
@@ -43,6 +44,20 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
     return "\n".join(lines)
 
 
+def _shot(flight: SimulatedFlight) -> list[str]:
+    """Write a comment on exposure, readout and bit rate; none where all are off."""
+    lens = flight.scenario.lens
+    said = [
+        f"exposure {lens.exposure_ms:g} ms" if lens.exposure_ms else "",
+        f"readout {lens.readout_ms:g} ms" if lens.readout_ms else "",
+        f"{lens.bitrate_mbps:g} Mbit/s" if lens.bitrate_mbps else "",
+    ]
+    if not any(said):
+        return []
+    stamps = "a picture's time is the middle of the exposure of its middle row"
+    return [f"# Pictures: {', '.join(part for part in said if part)}; {stamps}."]
+
+
 def _quoted(text: str) -> str:
     """Return any text as a scalar of YAML on one line."""
     plain = text.replace("\\", "\\\\").replace('"', '\\"')
@@ -62,11 +77,14 @@ def _pictures(flight: SimulatedFlight, drone: SimulatedDrone, video: bool) -> li
             f"    keypoints: {{path: {name}_keypoints.json, format: alphapose, skeleton: coco17}}",
         ]
     sigma_s = 0 if known else _UNKNOWN_CLOCK_SIGMA_S
+    intrinsics, readout_s = f"{name}_camera.yaml", drone.intrinsics.readout_s
+    if readout_s:
+        intrinsics = f"{{path: {intrinsics}, readout_s: {readout_s:g}}}"
     return [
         f"  {name}:",
         *pictures,
         f"    clock: {{offset_s: 0, sigma_s: {sigma_s}}}",
-        f"    intrinsics: {name}_camera.yaml",
+        f"    intrinsics: {intrinsics}",
     ]
 
 

@@ -29,15 +29,17 @@ def see(joints: Float, position: Float, quaternion_xyzw: Float, intrinsics: Intr
 
     Args:
         joints: [T, J, 3] metres, world.
-        position: [T, 3] metres, world_from_camera.
-        quaternion_xyzw: [T, 4] unit.
+        position: [T, 3] metres, world_from_camera; or [T, J, 3] of each joint (or [T, 1, 3]).
+        quaternion_xyzw: [T, 4] unit, or as many as positions.
         intrinsics: the camera.
 
     Returns:
         [T, J, 2] px; NaN behind the camera and outside the picture, whose corner pixels have their
         centres at (0, 0) and (width - 1, height - 1).
     """
-    camera_from_world = invert(position[:, None], quaternion_xyzw[:, None])
+    if position.ndim == 2:
+        position, quaternion_xyzw = position[:, None], quaternion_xyzw[:, None]
+    camera_from_world = invert(position, quaternion_xyzw)
     pixels = project(transform(camera_from_world, joints), intrinsics)
     inside = (pixels >= -0.5) & (pixels <= np.array([intrinsics.width, intrinsics.height]) - 0.5)
     return np.where(inside.all(axis=-1, keepdims=True), pixels, np.nan)

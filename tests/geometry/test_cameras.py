@@ -17,6 +17,7 @@ from pipelines.geometry.cameras import (
     fit_to_size,
     project,
     rescaled,
+    row_delay_s,
     undistort,
 )
 
@@ -215,3 +216,10 @@ def test_impossible_intrinsics_are_refused(change: dict[str, object], message: s
 def test_all_problems_come_in_one_message() -> None:
     with pytest.raises(ValueError, match=r"picture size.*focal lengths.*principal point"):
         replace(PINHOLE, width=-1, fx=0.0, cy=np.nan)
+
+
+def test_rows_are_read_from_the_top_about_the_middle() -> None:
+    camera = Intrinsics(64, 49, 50.0, 50.0, 31.5, 24.0, readout_s=0.03)
+    delays = row_delay_s(np.array([0.0, 24.0, 48.0, np.nan]), camera)
+    np.testing.assert_allclose(delays, [-0.015, 0.0, 0.015, np.nan])
+    assert row_delay_s(np.array(7.0), replace(camera, readout_s=0.0)) == 0.0

@@ -26,6 +26,7 @@ from pipelines.geometry.poses import (
     rotate,
     rotation_vector_from_quaternion,
     transform,
+    velocities,
 )
 
 EPOCH = 1_700_000_000_123_456_789
@@ -245,3 +246,21 @@ def test_interpolated_rotations_turn_steadily_between_their_neighbours(data: st.
         return float(np.linalg.norm(rotation_vector_from_quaternion(multiply(conjugate(a), b))))
 
     assert angle(ends[0], got[0]) == pytest.approx(fraction / 1000 * angle(*ends), abs=1e-12)
+
+
+def test_velocities_are_those_to_the_samples_before_and_after() -> None:
+    """A parabola's secants, by hand; a break, a missing sample and one out of order have none."""
+    t_s = np.array([[0.0], [0.1], [0.3], [0.4], [0.35]])
+    values = t_s[..., None] ** 2 * [1.0, -2.0]
+    before, after = velocities(t_s, values, np.array([[True], [True], [False], [True]]))
+    secants = np.array([0.1, 0.4])  # (b^2 - a^2) / (b - a) = a + b
+    np.testing.assert_allclose(after[:2, 0, 0], secants)
+    np.testing.assert_allclose(before[1:3, 0, 1], -2 * secants)
+    assert np.isnan(before[[0, 3, 4]]).all()
+    assert np.isnan(after[2:]).all()
+    values[1] = np.nan
+    before, after = velocities(t_s, values, np.ones((4, 1), bool))
+    assert np.isnan(after[:2]).all()
+    assert np.isnan(before[1:3]).all()
+    lone, _ = velocities(np.zeros(1), np.ones((1, 2)), np.empty(0, bool))
+    assert np.isnan(lone).all()

@@ -33,6 +33,7 @@ def write_h264(
     height: int,
     quality: int = 23,
     key_every: int = 60,
+    bits_per_s: int | None = None,
 ) -> None:
     """Encode pictures as H.264, 4:2:0, in one thread.
 
@@ -44,6 +45,7 @@ def write_h264(
         height: of the pictures, even.
         quality: x264's constant rate factor; 18 looks lossless, 28 poor.
         key_every: frames from one key frame to the next; a seek goes to a key frame.
+        bits_per_s: a mean rate over a second, kept in place of the quality.
     """
     import av
 
@@ -53,7 +55,10 @@ def write_h264(
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.time_base = stream.codec_context.time_base = TICK_S
         stream.codec_context.thread_count = 1
-        stream.codec_context.options = {"crf": str(quality), "preset": "fast", "g": str(key_every), "bf": "0"}
+        rate = {"crf": str(quality)}
+        if bits_per_s is not None:
+            rate = {name: str(bits_per_s) for name in ("b", "maxrate", "bufsize")}
+        stream.codec_context.options = {**rate, "preset": "fast", "g": str(key_every), "bf": "0"}
         for pts, picture in zip(ticks, pictures, strict=True):
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="bgr24")
             frame.pts, frame.time_base = pts, TICK_S

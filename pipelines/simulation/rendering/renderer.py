@@ -1,8 +1,9 @@
-"""Pictures of people in a world, as a pinhole camera in daylight takes them."""
+"""Pictures of people in a world, as a camera in daylight takes them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.simulation.rendering.fragments import View, gather, room_for
 from pipelines.simulation.rendering.ground import ground_texture, paint
+from pipelines.simulation.rendering.lens import DistortingLens
 from pipelines.simulation.rendering.meshes import GROUND, Mesh, mesh_of, stacked
 from pipelines.simulation.rendering.raster import (
     CENTRES_PX,
@@ -39,6 +41,14 @@ _PERSON_TEXEL_M, _PERSON_TEXELS = 0.008, 1024
 _LEVEL_M = 0.05  # ground this close to its median height casts no shadow worth a map
 
 
+class Moment(NamedTuple):
+    """The camera's pose and the people before it at one moment."""
+
+    position: Float  # [3] m, of the camera in the world
+    quaternion_xyzw: Float  # [4] world_from_camera
+    people: Sequence[Surface]  # whoever moves
+
+
 class Renderer:
     """A world and a camera that takes pictures of it; several threads may share one.
 
@@ -47,21 +57,22 @@ class Renderer:
 
     Args:
         static: the surfaces that do not move.
-        intrinsics: the camera, without distortion.
+        intrinsics: the camera. Its readout is up to the caller, who asks for several moments (`exposed`).
         sun: [3] direction towards it, of any length.
         seed: of the ground's texture and of the sensor's noise.
 
     Raises:
-        ValueError: a camera with distortion, or a sun that is not above the horizon.
+        ValueError: distortion whose model does not reach the whole picture, or a sun that is not above the
+            horizon.
     """
 
     def __init__(self, static: Sequence[Surface], intrinsics: Intrinsics, *, sun: Float, seed: int) -> None:
-        if intrinsics.model != "none" and any(intrinsics.distortion):
-            raise ValueError(f"only cameras without distortion are rendered, not {intrinsics.model}")
         direction = np.asarray(sun, np.float64)
         if direction.shape != (3,) or not np.isfinite(direction).all() or direction[2] <= 0:
             raise ValueError(f"the sun must stand above the horizon, not at {direction.tolist()}")
-        self._intrinsics = intrinsics
+        self._lens = DistortingLens(intrinsics) if any(intrinsics.distortion) else None
+        self._size = intrinsics.height, intrinsics.width
+        self._intrinsics = intrinsics if self._lens is None else self._lens.pinhole
         self._seed = seed
         self._texture = ground_texture(seed)
         self._axes = sun_axes(direction)
@@ -83,10 +94,41 @@ class Renderer:
         Returns:
             [H, W, 3] BGR; equal arguments give equal bytes.
         """
-        width, height = self._intrinsics.width, self._intrinsics.height
-        position = np.asarray(position, np.float64)
-        rotation = matrix_from_quaternion(np.asarray(quaternion_xyzw, np.float64))
-        of_people = [mesh_of([person]) for person in people if len(person.faces)]
+        return self.exposed([Moment(position, quaternion_xyzw, people)], np.ones((1, self._size[0])), frame)
+
+    def exposed(self, moments: Sequence[Moment], weights: Float, frame: int) -> UInt8:
+        """Render what the camera sees while its rows are exposed.
+
+        Args:
+            moments: K of them, the picture's own time in the middle.
+            weights: [K, H] how much of each row's light is each moment's; columns add up to 1.
+            frame: number of the picture; with the seed and the middle moment's position it fixes the noise.
+
+        Returns:
+            [H, W, 3] BGR; equal arguments give equal bytes.
+        """
+        light = np.zeros((*self._size, 3), np.float32)
+        for moment, share in zip(moments, np.asarray(weights, np.float32), strict=True):
+            (rows,) = np.nonzero(share)
+            if len(rows):
+                part = slice(int(rows[0]), int(rows[-1]) + 1)
+                light[part] += share[part, None, None] * self._light(moment, part)
+        middle = np.asarray(moments[len(moments) // 2].position, np.float64)
+        return developed(light, _noise_key(self._seed, frame, middle))
+
+    def _light(self, moment: Moment, part: slice) -> Float32:
+        """Render the light [R, W, 3] of some rows of the picture at one moment."""
+        if self._lens is None:
+            return self._pinhole_light(moment, part)
+        needed = self._lens.rows(part)
+        return self._lens.bent(self._pinhole_light(moment, needed), needed.start, part)
+
+    def _pinhole_light(self, moment: Moment, part: slice) -> Float32:
+        """Render the same before the lens distorts it; rows count from `part.start` on."""
+        width = self._intrinsics.width
+        position = np.asarray(moment.position, np.float64)
+        rotation = matrix_from_quaternion(np.asarray(moment.quaternion_xyzw, np.float64))
+        of_people = [mesh_of([person]) for person in moment.people if len(person.faces)]
         mesh = stacked([self._static, *of_people])
         shadows = [*self._static_shadows, *(_person_map(each, self._axes) for each in of_people)]
         pinhole = np.array(
@@ -95,24 +137,27 @@ class Renderer:
         view = View(position, rotation, pinhole, self._land)
 
         triangles = projected(mesh.vertices, mesh.faces, position, rotation, self._intrinsics)
-        chosen, start = bands(triangles, height, _BAND_ROWS)
-        light = np.empty((height, width, 3), np.float32)
+        first_band, last_band = part.start // _BAND_ROWS, -(-part.stop // _BAND_ROWS)
+        chosen, start = bands(triangles, self._intrinsics.height, _BAND_ROWS)
+        top, bottom = _BAND_ROWS * first_band, min(_BAND_ROWS * last_band, self._intrinsics.height)
+        light = np.empty((bottom - top, width, 3), np.float32)
         fragments = room_for(SUBROWS * _BAND_ROWS * width)
         sky = np.empty(_BAND_ROWS * width, np.float32)
-        for k, first_row in enumerate(range(0, height, _BAND_ROWS)):
-            rows = light[first_row : first_row + _BAND_ROWS]
+        for k in range(first_band, last_band):
+            first_row = _BAND_ROWS * k
+            rows = light[first_row - top : first_row - top + _BAND_ROWS]
             band = empty_band(SUBROWS * len(rows), width)
             draw(triangles, chosen[start[k] : start[k + 1]], SHIFTS_PX, SUBROWS * first_row, band)
             count = gather(band, first_row, view, mesh, fragments, sky)
             paint(self._texture, fragments, count, view)
             sun = sunlight(shadows, self._axes, fragments, count)
             shade(fragments, count, sun, sky, first_row, view, rows)
-        return developed(light, _noise_key(self._seed, frame, position))
+        return light[part.start - top : part.stop - top]
 
     def silhouette(
         self, position: Float, quaternion_xyzw: Float, person: Surface, others: Sequence[Surface] = ()
     ) -> Bool:
-        """Return the pixels at whose centres the camera sees the person.
+        """Return the pixels at whose centres the camera sees the person, without the lens's distortion.
 
         Args:
             position: [3] m, of the camera in the world.
@@ -129,7 +174,7 @@ class Renderer:
         return mine
 
     def depth(self, position: Float, quaternion_xyzw: Float, people: Sequence[Surface] = ()) -> Float32:
-        """Return the depth of the surface at each pixel's centre, along the optical axis.
+        """Return the depth at each pixel's centre, along the optical axis, without the lens's distortion.
 
         Args:
             position: [3] m, of the camera in the world.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,13 +11,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipelines.geometry.cameras import Intrinsics, project, undistort
-from pipelines.geometry.poses import invert, quaternion_from_matrix, rotate, transform
+from pipelines.geometry.cameras import Intrinsics, project, row_delay_s, undistort
+from pipelines.geometry.poses import (
+    invert,
+    multiply,
+    quaternion_from_matrix,
+    quaternion_from_rotation_vector,
+    rotate,
+    transform,
+)
 from pipelines.simulation.body import make_body
 from pipelines.simulation.rendering import Renderer
 from pipelines.simulation.rendering.ground import FULL_SCALE, TILE_TEXELS, ground_texture
+from pipelines.simulation.rendering.renderer import Moment
 from pipelines.simulation.rendering.sensor import EXPOSURE, NOISE
 from pipelines.simulation.rendering.shading import HAZE_M, HORIZON_RGB
+from pipelines.simulation.rendering.shutter import STEP_S, exposed_moments
 from pipelines.simulation.rig import BONES
 from pipelines.simulation.scenario import Body
 from pipelines.simulation.surfaces import Surface, hidden_by
@@ -378,10 +388,112 @@ def test_far_ground_does_not_shimmer() -> None:
 @pytest.mark.parametrize(
     ("camera", "sun", "message"),
     [
-        (Intrinsics(64, 48, 50, 50, 31, 23, "radtan", (0.1, 0, 0, 0)), SUN, "without distortion"),
+        (Intrinsics(64, 48, 20, 20, 31, 23, "radtan", (-0.3, 0, 0, 0)), SUN, "no ray reaches"),
         (CAMERA, np.array([1.0, 0.0, -0.1]), "above the horizon"),
     ],
 )
 def test_what_cannot_be_rendered_is_refused(camera: Intrinsics, sun: Float, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Renderer([], camera, sun=sun, seed=0)
+
+
+LENS = Intrinsics(240, 180, 170.0, 165.0, 121.0, 88.0, "radtan", (-0.132, 0.111, 0.001, -0.002, -0.016), 0.03)
+TURN_RADPS = np.array([0.2, -1.5, 0.3])  # of the camera about its own axes: 255 px/s
+FALL_MPS = np.array([0.3, 0.0, -2.0])  # of the markers
+
+
+@pytest.mark.parametrize(("exposure_s", "readout_s"), [(0.0, 0.0), (0.004, 0.0), (0.0, 0.03), (0.003, 0.02)])
+def test_each_row_is_exposed_about_its_own_time(exposure_s: float, readout_s: float) -> None:
+    """Weights are a box of the exposure about the row's time: their mean and variance are the box's.
+
+    Light that is linear between moments adds the variance of the hat functions, 0 to 1/4 of a squared step.
+    """
+    lens = Intrinsics(64, 48, 50.0, 50.0, 31.0, 23.0, readout_s=readout_s)
+    moments, weights = exposed_moments(lens.height, exposure_s=exposure_s, readout_s=readout_s)
+    assert moments[len(moments) // 2] == pytest.approx(0.0, abs=1e-12)  # the picture's own time
+    assert (np.diff(moments) <= STEP_S + 1e-12).all()
+    assert weights.min() >= -1e-12
+    np.testing.assert_allclose(weights.sum(axis=0), 1.0, atol=1e-12)
+    middle = row_delay_s(np.arange(48.0), lens)
+    np.testing.assert_allclose(moments @ weights, middle, atol=1e-12)
+    variance = moments**2 @ weights - middle**2 - exposure_s**2 / 12
+    assert variance.min() > -1e-15
+    assert variance.max() <= STEP_S**2 / 4 + 1e-15
+
+
+@pytest.mark.parametrize("bend", [True, False])
+@pytest.mark.parametrize(("exposure_s", "readout_s"), [(0.0, 0.0), (0.004, 0.0), (0.0, 0.03), (0.004, 0.03)])
+def test_markers_lie_where_they_are_projected(exposure_s: float, readout_s: float, bend: bool) -> None:
+    """Dark balls fall while the camera turns: each is filmed where it is when its own row is read.
+
+    The centre of a ball's outline is 0.02 px from its centre's projection. Noise of 1.8 in steps of 8 bits
+    over some 50 pixels of 150 steps moves the centre of gravity by 0.01 px. Light that is linear between
+    moments of 1 ms is not off on average; within one the image moves by 0.3 px.
+    """
+    lens = replace(LENS, readout_s=readout_s)
+    if not bend:
+        lens = replace(lens, model="none", distortion=())
+    places = np.array([[x, 8.0, z] for x in (-4.0, 0.1, 4.2) for z in (-2.4, 0.3, 2.7)])
+    pose = looking((0.0, 0.0, 0.3), (0.0, 8.0, 0.2))
+
+    def at(t_s: float) -> tuple[Pose, Float]:
+        turned = multiply(pose[1], quaternion_from_rotation_vector(t_s * TURN_RADPS))
+        return (pose[0] + t_s * np.array([1.0, 0.5, 0.0]), turned), places + t_s * FALL_MPS
+
+    def moment(t_s: float, seen: bool) -> Moment:
+        camera, centres = at(t_s)
+        return Moment(*camera, [surface_of_all([sphere(c, 0.12, 24, 12) for c in centres])] if seen else [])
+
+    moments, weights = exposed_moments(lens.height, exposure_s=exposure_s, readout_s=readout_s)
+    one = renderer(intrinsics=lens)
+    with_balls, without = (
+        linear(one.exposed([moment(t_s, seen) for t_s in moments], weights, 0)) for seen in (True, False)
+    )
+    dark = (1 - with_balls / without).mean(axis=2)
+    y, x = np.mgrid[: lens.height, : lens.width]
+    moved = 0.0
+    for number in range(len(places)):
+        t_s = 0.0
+        for _ in range(6):
+            camera, centres = at(t_s)
+            expected = project(transform(invert(*camera), centres[number]), lens)
+            t_s = float(row_delay_s(expected[1], lens))
+        camera, centres = at(0.0)
+        moved = max(
+            moved, float(np.abs(expected - project(transform(invert(*camera), centres[number]), lens)).max())
+        )
+        near = np.hypot(x - expected[0], y - expected[1]) < 7
+        found = [(dark * near * axis).sum() / (dark * near).sum() for axis in (x, y)]
+        np.testing.assert_allclose(found, expected, atol=0.1)
+    assert (moved > 2.0) == (readout_s > 0)
+
+
+def surface_of_all(parts: list[Surface]) -> Surface:
+    """Black, as one surface."""
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    return surface(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + start for part, start in zip(parts, first, strict=False)]).astype(
+            np.int32
+        ),
+        0.0,
+    )
+
+
+def test_a_bent_picture_is_as_sharp_as_a_straight_one() -> None:
+    """A lens that bends by nothing that can be seen leaves all but the softness of cubics.
+
+    Half a pixel off, the worst place, cubics keep 0.80 of a quarter of the sampling rate, and bilinear 0.71.
+    """
+    ground = level(40.0)
+    textured = Surface(ground.vertices, ground.faces, ground.colour, ground=True)
+    straight = Intrinsics(240, 180, 170.0, 165.0, 121.0, 88.0)
+    bent = replace(straight, model="radtan", distortion=(1e-9, 0.0, 0.0, 0.0))
+    pose = looking((0.0, 0.0, 3.0), (0.0, 4.0, 0.0))
+    sharp, soft = (
+        np.abs(
+            np.diff(linear(renderer(textured, intrinsics=lens).picture(*pose, [], 0))[100:], axis=1)
+        ).mean()
+        for lens in (straight, bent)
+    )
+    assert soft > 0.8 * sharp
