@@ -1,20 +1,25 @@
 """Errors of a keypoint detector that sees people from above, by tilt, on rendered flights.
 
-python -m benchmarks.detector_by_tilt [--detectors NAME ...] [--folder FOLDER] [--write]
+python -m benchmarks.detector_by_tilt [--detectors NAME ...] [--folder FOLDER] [--write] [--film]
 
 For every tilt four people walk on level ground while a drone circles each of them once at 10 m, filming
 1280x720 with a field of view of 80 degrees. The flights go through `mocap simulate`, `ingest` and the
 detection of `reconstruct`, like a user's. The pictures are rendered; the detector is real. `--write` writes
 two data files for each detector: its errors for the simulation, and the calibration of its confidences to
 probabilities.
+
+`--film` measures something else: the cost of blur, readout, distortion and bit rate of a drone's film, in
+errors of the default detector and of the skeleton with true poses. One flight of three drones is filmed in
+each of these ways.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,6 +39,7 @@ from pipelines.keypoints.calibration import (
     write_calibration,
 )
 from pipelines.keypoints.swaps import undo_swaps_of_tracks
+from pipelines.reconstruct import reconstruct
 from pipelines.session.records import Int64
 from pipelines.session.registries import find_detector
 from pipelines.session.skeletons import get_skeleton
@@ -41,9 +47,9 @@ from pipelines.session.stages import locked
 from pipelines.session.tabular import detections_from, keypoints_table
 from pipelines.simulate import simulate
 from pipelines.simulation.detector_errors import ANY_JOINT, COLUMNS, MODELLED, errors_of, view_of
-from pipelines.simulation.flight import fly_scenario
+from pipelines.simulation.flight import fly_scenario, visible_joints
 from pipelines.simulation.observe import see
-from pipelines.simulation.scenario import read_scenario
+from pipelines.simulation.scenario import BITS_PER_PIXEL, DISTORTION, read_scenario
 
 Float = NDArray[np.float64]
 
@@ -59,6 +65,17 @@ COMMAND = "python -m benchmarks.detector_by_tilt --write"
 JOINTS = get_skeleton("coco17").joints
 TORSO = (JOINTS.index("left_shoulder"), JOINTS.index("right_hip"))
 PCK = 0.2  # of the torso's length in the picture
+FILMS: Mapping[str, Mapping[str, object] | None] = {
+    "none of it": {},
+    "exposure 2 ms (1/500 s)": {"exposure_ms": 2},
+    "exposure 4 ms (1/250 s)": {"exposure_ms": 4},
+    "readout 20 ms": {"readout_ms": 20},
+    "distortion": {"distortion": DISTORTION},
+    "bit rate of schema 2": {"bitrate_mbps": BITS_PER_PIXEL * 1280 * 720 * 30 / 1e6},
+    "1 Mbit/s": {"bitrate_mbps": 1},
+    "all of schema 2": None,
+}
+"""Keys of `drones.camera` by way of filming; None takes schema 2 as it is."""
 USED = 0.3  # least probability of a keypoint that `reconstruct` uses
 GOOD = 0.05  # of the person's height
 GROSS = 0.1  # of the person's height: beyond that a joint counts as missed
@@ -84,10 +101,14 @@ def main() -> None:
     parser.add_argument("--detectors", nargs="+", choices=MODELLED, default=MODELLED)
     parser.add_argument("--folder", type=Path, help="keep the flights there")
     parser.add_argument("--write", action="store_true", help="write the data of these detectors")
+    parser.add_argument("--film", action="store_true", help="compare ways of filming instead")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.folder or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
+        if options.film:
+            print_film({name: film(folder, name, camera) for name, camera in FILMS.items()})
+            return
         for name in options.detectors:
             detector = find_detector(name)
             print(f"\n{name}: {detector.title}")
@@ -180,6 +201,99 @@ def compare(found: pd.DataFrame, pixels: Float, height_px: Float) -> tuple[Float
         if middle < SOMEBODY_ELSE * height_px[frame] and middle < before:
             error[frame], confidence[frame] = distance, by_joint["confidence"].to_numpy()
     return error, confidence
+
+
+# --- ways of filming -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Film:
+    """Errors of the detector and of `reconstruct` with one way of filming."""
+
+    error_px: Float  # [F, J] of all drones, NaN where not found
+    height_px: Float  # [F]
+    torso_px: Float  # [F]
+    mbps: float  # of the video files, mean
+    mpjpe_mm: float
+    measured_share: float
+    unstated_mm: float | None  # where flight.yaml does not state the readout
+
+
+def film_text(camera: Mapping[str, object] | None) -> str:
+    """Write a scenario in which a person jogs and three drones circle at 8 m."""
+    switched = "" if camera is None else ", ".join(f"{name}: {value}" for name, value in camera.items())
+    return f"""\
+schema: {2 if camera is None else 1}
+name: Film
+seed: 7
+duration_s: 3
+actor:
+  motion: [jog: {{distance_m: 12, speed_mps: 2.8, turn_deg: 150}}]
+  estimate_sigma_m: 0.1
+drones:
+  count: 3
+  formation: {{radius_m: 8, tilt_deg: 20, yaw_rate_deg_per_s: 30}}
+  limits: {{speed_mps: 20, acceleration_mps2: 20}}
+  camera: {{{switched}}}
+"""
+
+
+def film(folder: Path, name: str, camera: Mapping[str, object] | None) -> Film:
+    """Film the flight, run the detector, reconstruct with the true poses."""
+    path = folder / f"{re.sub('[^a-z0-9]+', '-', name.lower())}.yaml"
+    path.write_text(film_text(camera), encoding="utf-8")
+    made = path.with_suffix("")
+    simulate(path, made, workers=2)
+    manifest = made / "true_poses.yaml"
+    session = ingest(manifest).folder
+    metrics = reconstruct(session, workers=2).metrics
+    unstated_mm = None
+    if "readout_s" in manifest.read_text(encoding="utf-8"):
+        other = made / "readout_not_stated.yaml"
+        text = re.sub("readout_s: [0-9.]+", "readout_s: 0", manifest.read_text(encoding="utf-8"))
+        other.write_text(text, encoding="utf-8")
+        unstated_mm = reconstruct(ingest(other).folder, workers=2).metrics["mpjpe_mm"]
+
+    flight = fly_scenario(read_scenario(path), [])
+    person = flight.people[0]
+    errors, heights, torsos, mbps = [], [], [], []
+    for drone in flight.drones:
+        pixels, _ = visible_joints(flight, drone, person)
+        found = pd.read_parquet(session / "detect" / drone.name / "keypoints.parquet")
+        _, height_px = view_of(
+            drone.at_frames.camera_position,
+            person.motion.root[flight.moments_of(drone)],
+            height_m=person.look.body.height_m,
+            focal_px=drone.intrinsics.fx,
+        )
+        errors.append(compare(found, pixels, height_px)[0])
+        heights.append(height_px)
+        torsos.append(np.sqrt(((pixels[:, TORSO[0]] - pixels[:, TORSO[1]]) ** 2).sum(axis=-1)))
+        mbps.append(8e-6 * (made / f"{drone.name}.mp4").stat().st_size / flight.scenario.duration_s)
+    return Film(
+        np.concatenate(errors),
+        np.concatenate(heights),
+        np.concatenate(torsos),
+        float(np.mean(mbps)),
+        metrics["mpjpe_mm"],
+        metrics["reconstructed_share"],
+        unstated_mm,
+    )
+
+
+def print_film(films: Mapping[str, Film]) -> None:
+    """Print the table of ways of filming for docs/detector.md."""
+    print("| film | Mbit/s | found | px mean | px median | %H median | PCK@0.2 torso | MPJPE mm | measured |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    for name, own in films.items():
+        error, seen = own.error_px, np.isfinite(own.error_px).any(axis=1)
+        right = np.nan_to_num(error, nan=np.inf) <= PCK * own.torso_px[:, None]
+        unstated = "" if own.unstated_mm is None else f" ({own.unstated_mm:.1f} with the readout not stated)"
+        print(
+            f"| {name} | {own.mbps:.1f} | {100 * seen.mean():.1f} % | {np.nanmean(error):.2f} | "
+            f"{np.nanmedian(error):.2f} | {100 * np.nanmedian(error / own.height_px[:, None]):.2f} | "
+            f"{100 * right.mean():.1f} % | {own.mpjpe_mm:.1f}{unstated} | {100 * own.measured_share:.1f} % |"
+        )
 
 
 # --- tables --------------------------------------------------------------------------------------------
