@@ -1,4 +1,4 @@
-"""What a crop costs `--detector onnx:` alone and in batches: `python -m benchmarks.onnx_batches`.
+"""Cost of a crop for `--detector onnx:`, alone and in batches: `python -m benchmarks.onnx_batches`.
 
 The model has the size of a real one: the ResNet-50 of Xiao et al., "Simple Baselines for Human Pose
 Estimation and Tracking" (ECCV 2018), for crops of 192 x 256 and 17 joints. Its 34 million weights are random.

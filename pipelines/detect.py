@@ -267,7 +267,7 @@ def _store_with_new_times(work: _Work, media: Mapping[str, MediaEntry], folder: 
 
 
 class _Hints:
-    """Where the logged actor should be in the pictures of the cameras."""
+    """Places of the logged actor in the pictures of the cameras."""
 
     def __init__(self, folder: Path, description: Description, cameras: Iterable[str]) -> None:
         self._description = description

@@ -186,7 +186,7 @@ def picture_stamps(flight: SimulatedFlight, drone: SimulatedDrone) -> Int64:
 def visible_joints(
     flight: SimulatedFlight, drone: SimulatedDrone, person: SimulatedPerson
 ) -> tuple[Float, Bool]:
-    """Where a drone's pictures show a person's joints, and whether they do.
+    """Project a person's joints into a drone's pictures, and test if they are seen there.
 
     A rolling shutter takes each joint when it reads the row in which the joint is.
 
@@ -262,7 +262,7 @@ def _lagrange(nodes: Float, at: Float) -> Float:
 def keypoints_of(
     flight: SimulatedFlight, drone: SimulatedDrone, person: SimulatedPerson
 ) -> tuple[Float, Float]:
-    """What a detector would find of a person in a drone's pictures, by the measured errors of one.
+    """Model the keypoints that a detector finds of a person in a drone's pictures, by measured errors.
 
     Returns:
         [F, J, 2] px, NaN for missed joints, and [F, J] confidences.
@@ -344,7 +344,7 @@ def _motion_seed(seed: int, person: int) -> int:
 
 
 def _estimated(each: Performer, index: int, scenario: Scenario, t_s: Float) -> tuple[Int64, Float]:
-    """Where a person was thought to be in flight (`estimate_actor`)."""
+    """Estimate a person's positions as a flight logs them (`estimate_actor`)."""
     return estimate_actor(
         t_s,
         each.moving(t_s).root,
@@ -371,7 +371,7 @@ def _person(
 
 
 def _hidden_by_person(other: SimulatedPerson, around: Float, t_ns: Int64, eye: Float, joints: Float) -> Bool:
-    """Which joints [F, J] of somebody a person's body hides.
+    """Find the joints [F, J] of somebody that a person's body hides.
 
     Args:
         other: who may stand in the way.
