@@ -14,11 +14,12 @@ import time
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, undistort
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.geometry.triangulation import Views, triangulate
 from pipelines.keypoints.association import associate
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 from pipelines.simulation.drone_paths import orbit
 from pipelines.simulation.observe import KeypointNoise, detect, see
 from pipelines.simulation.walk import walk

@@ -25,10 +25,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from pipelines.detect import detect
+from pipelines.geometry.arrays import Float
 from pipelines.ingest import ingest
 from pipelines.keypoints import calibration
 from pipelines.keypoints.calibration import (
@@ -50,8 +50,6 @@ from pipelines.simulation.detector_errors import ANY_JOINT, COLUMNS, MODELLED, e
 from pipelines.simulation.flight import fly_scenario, visible_joints
 from pipelines.simulation.observe import see
 from pipelines.simulation.scenario import BITS_PER_PIXEL, DISTORTION, read_scenario
-
-Float = NDArray[np.float64]
 
 TILTS_DEG = (0, 15, 30, 45, 60)
 LOOKS = (

@@ -13,14 +13,12 @@ import time
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import Bias, Drift, GaussMarkov, NoiseModel, White
 from pipelines.reconstruction.refinement.problem import pose_errors
 from pipelines.reconstruction.refinement.refine import Refined, refine
 from tests.reconstruction.formations import BONES, Formation, formation, mean_mm
-
-Float = NDArray[np.float64]
 
 MODELS: Mapping[str, Sequence[NoiseModel]] = {
     "exact": (),

@@ -27,9 +27,9 @@ from functools import partial
 from multiprocessing import get_context
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.refine import MODELS, refined_of, rooted
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import aligned_distances
 from pipelines.geometry.noise import NoiseModel
 from pipelines.reconstruction.refinement.building import build
@@ -38,8 +38,6 @@ from pipelines.reconstruction.refinement.estimate import BOUND, initial_state
 from pipelines.reconstruction.refinement.problem import Knowledge, lay_out, pose_errors
 from pipelines.reconstruction.refinement.system import System
 from tests.reconstruction.formations import BONES, FPS, STATED_PX, Formation, formation
-
-Float = NDArray[np.float64]
 
 CHI2_95 = 7.8147  # of the chi-square distribution with three degrees of freedom
 _PIXEL_PX = 2.0

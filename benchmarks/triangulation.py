@@ -17,13 +17,11 @@ from typing import get_args
 import cv2
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.picture_gate import triangulate_pictures
 from pipelines.geometry.triangulation import Method, Views, estimate_noise, locate, triangulate
 from tests.geometry.rings import FOCAL, LEVELS, ring, with_outliers, with_pixel_noise, with_pose_noise
-
-Float = NDArray[np.float64]
 
 GATE_PX = 15.0  # usual choice of users of pycolmap and Pose2Sim
 

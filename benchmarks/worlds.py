@@ -23,6 +23,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, distance_field
 from pipelines.planning.formation import formation_slots, slot_offsets
@@ -31,7 +32,6 @@ from pipelines.planning.scores import predicted_errors, score
 from pipelines.session.records import Occupancy
 from pipelines.session.registries import PLANNER_ARMS
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 ARMS = ("fixed", "adaptive", "covariance", "greedy")

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import PCK_THRESHOLD_M, common, measure
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.picture_gate import triangulate_pictures
@@ -25,7 +26,6 @@ from pipelines.reconstruction.refining_views import refined_points
 from pipelines.reporting.ablation import Row, draw, estimates, results_csv
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Float
 from pipelines.session.registries import Detector, find_detector, hashes_of_models
 from pipelines.session.side_by_side import Halt, side_by_side
 from pipelines.session.storage import hash_of, jsonable, read_json, sha256_of, write_json

@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.formats.flights.picture_encodings import Picture
 from pipelines.formats.flights.pictures import Pictures, open_pictures, refuse_changed_pictures
+from pipelines.geometry.arrays import Float, Picture
 from pipelines.keypoints.actor_hints import actor_hints
 from pipelines.keypoints.hints import Hint
 from pipelines.keypoints.tracking import PeopleTracker
@@ -37,7 +37,7 @@ from pipelines.session.description import (
 from pipelines.session.errors import DataError
 from pipelines.session.logged_actor import logged_actor
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Detections, Float, Int64
+from pipelines.session.records import Detections, Int64
 from pipelines.session.registries import (
     Detector,
     KeypointNetworks,

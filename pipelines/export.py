@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from pipelines.formats.flights.picture_encodings import Picture
 from pipelines.formats.flights.pictures import open_pictures
 from pipelines.formats.skeletons.even_frames import thinned
+from pipelines.geometry.arrays import Picture
 from pipelines.reporting.filmed import read_filmed, refined_poses
 from pipelines.reporting.frame_drawing import caption_of, draw_frame
 from pipelines.reporting.motion import Motion, motion_from_skeleton

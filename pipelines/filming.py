@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video import VideoReader
-from pipelines.formats.videos.video_writing import Picture, write_h264
+from pipelines.formats.videos.video_writing import write_h264
+from pipelines.geometry.arrays import Float, Picture
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.picture_gate import triangulate_pictures
@@ -34,7 +34,7 @@ from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.logged_actor import LoggedActor, logged_actor
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Float, Int64, JointMotion
+from pipelines.session.records import Int64, JointMotion
 from pipelines.session.registries import Detector, advice_on, find_detector, hashes_of_models
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import locked
@@ -50,8 +50,6 @@ from pipelines.simulation.rig import BodyMotion
 from pipelines.simulation.scenario import Scenario, read_scenario
 from pipelines.simulation.study.filming import Formation, Sightings, Walk, views_of
 from pipelines.simulation.study.measuring import errors_in_common, measure_arm
-
-Bool = NDArray[np.bool_]
 
 FILM = Stage("film", revision=2)
 

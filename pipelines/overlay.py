@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.flights.picture_encodings import Picture
 from pipelines.formats.flights.pictures import open_pictures, refuse_changed_pictures
 from pipelines.formats.videos.video_writing import TICK_S, join_videos, write_h264
+from pipelines.geometry.arrays import Picture
 from pipelines.reporting.filmed import read_filmed
 from pipelines.reporting.frame_drawing import blank_frame, caption_of, draw_frame, padded_to_even
 from pipelines.reporting.motion import Motion, motion_from_skeleton

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.detect import detect, hints_from, hints_of
-from pipelines.formats.flights.picture_encodings import Picture
 from pipelines.formats.flights.pictures import open_pictures, refuse_changed_pictures
+from pipelines.geometry.arrays import Float, Picture
 from pipelines.geometry.triangulation import (
     STATUS,
     Method,
@@ -65,7 +65,7 @@ from pipelines.session.description import Description, Interpolation, read_descr
 from pipelines.session.errors import DataError
 from pipelines.session.logged_actor import LoggedActor, logged_actor
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Float, Int64, JointMotion
+from pipelines.session.records import Int64, JointMotion
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.formats.common.yaml_text import read_yaml
+from pipelines.geometry.arrays import Float
 from pipelines.planning.arm_flights import (
     FLOWN,
     LOGGED,
@@ -37,7 +38,7 @@ from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Float, JointMotion
+from pipelines.session.records import JointMotion
 from pipelines.session.registries import PLANNER_ARMS
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import WritableSession, locked

@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.formats.flights.picture_encodings import Picture
 from pipelines.formats.flights.pictures import Pictures, open_pictures, refuse_changed_pictures
+from pipelines.geometry.arrays import Picture
 from pipelines.planning.hidden import hidden_shares
 from pipelines.planning.loading import load_flight
 from pipelines.reporting.comparison import compare, labels_of

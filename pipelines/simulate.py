@@ -20,13 +20,14 @@ from pipelines.formats.calibrations.camera_info_writing import write_camera_info
 from pipelines.formats.logs.ros2_recording import Ros2Recording
 from pipelines.formats.maps.octomap_writing import write_octomap
 from pipelines.formats.skeletons.bvh import read_motion
-from pipelines.formats.videos.video_writing import Picture, join_videos, write_h264
+from pipelines.formats.videos.video_writing import join_videos, write_h264
+from pipelines.geometry.arrays import Float, Picture
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import distance_field
 from pipelines.planning.pilot import Pilot
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Float, Occupancy, SkeletalMotion
+from pipelines.session.records import Occupancy, SkeletalMotion
 from pipelines.session.registries import PLANNER_ARMS, noise_models
 from pipelines.session.side_by_side import Halt, side_by_side
 from pipelines.session.storage import hash_of, read_json, sha256_of, write_json

@@ -9,9 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from pipelines.geometry.arrays import Float
 
 # Ratio of the second to the first singular value of the covariance below which the points count as
 # collinear: a bend of 0.02 mm over 0.6 m in both sets. Rounding 1 km from the origin stays below it.

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
+
 Int64 = NDArray[np.int64]
-Float = NDArray[np.float64]
 
 _MOST_PAIRS = 400  # events whose pairs give the slopes: 80,000 pairs
 _CLEAR = 4.0  # standard deviations from which a drift counts as significant

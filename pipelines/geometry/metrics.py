@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.alignment import align_each
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.bootstrap import Series
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 PCK_THRESHOLD_M = 0.15
 # A step longer than this many median steps is a gap in time: no acceleration or jerk is taken across it.

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import (
     compose,
     enu_from_ned,
@@ -20,7 +20,6 @@ from pipelines.geometry.poses import (
     rotate,
 )
 
-Float = NDArray[np.float64]
 Pose = tuple[Float, Float]
 Looks = Literal["forward", "backward", "left", "right", "down", "up"]
 

@@ -20,6 +20,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import (
     conjugate,
     interpolate_poses,
@@ -31,7 +32,6 @@ from pipelines.geometry.poses import (
 
 _LARGEST = 1e6  # of any parameter: larger ones make no sense, and their squares may overflow
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Frame = Literal["world", "body"]
 

@@ -16,11 +16,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.triangulation import (
     GATE,
     STATUS,
-    Bool,
-    Float,
     Int64,
     Triangulation,
     Views,

@@ -10,11 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion, rotate
-
-Float = NDArray[np.float64]
 
 _BLOCK = 4096  # poses at a time, so that intermediate arrays stay small for any length of log
 

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from pipelines.geometry.arrays import Float
+
 Int64 = NDArray[np.int64]
 
 # A half turn about the diagonal between north and east: (x, y, z) -> (y, x, -z).

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import compose, interpolate_poses, invert
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 

@@ -37,10 +37,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from pipelines.geometry.arrays import Bool, Float
+
 Int64 = NDArray[np.int64]
 Int8 = NDArray[np.int8]
-Bool = NDArray[np.bool_]
 Method = Literal["dlt", "midpoint", "robust"]
 
 MIN_PARALLAX_DEG = 2.0

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.keypoints.hints import Hint, project_actor
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import CameraEntry, Interpolation
 from pipelines.session.logged_actor import LoggedActor
 from pipelines.session.pose_noise import stated_noise
-from pipelines.session.records import Float, Int64, Trajectory
+from pipelines.session.records import Int64, Trajectory
 
 ACTOR_SIGMA_M = 1.0
 """Standard deviation of the actor's logged position, used to tell people apart."""

@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float, Picture
 from pipelines.keypoints.hints import Hint
-from pipelines.keypoints.tiles import Picture
 from pipelines.keypoints.tracking import PeopleTracker
 from pipelines.session.registries import KeypointNetworks
-
-Float = NDArray[np.float64]
 
 
 class FollowedAlone:

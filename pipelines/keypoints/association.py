@@ -8,11 +8,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.keypoints.grouping import Followed, follow
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 _NEAR = 9.0  # within 3 sigma of the logged actor counts for a track, beyond against it
 _FAR = 25.0  # beyond 5 sigma a track is not the actor at that time

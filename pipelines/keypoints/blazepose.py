@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float, Picture
 from pipelines.keypoints.blazepose_models import (
     BLAZEPOSE_MODELS,
     HEAVY_MODELS,
@@ -33,9 +34,8 @@ from pipelines.keypoints.blazepose_models import (
     PackagedModels,
     find_file,
 )
-from pipelines.keypoints.crops import Picture, sampled
+from pipelines.keypoints.crops import sampled
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float
 from pipelines.session.registries import Measured, Person, Region
 from pipelines.session.skeletons import get_skeleton
 

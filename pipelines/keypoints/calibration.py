@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float
 
 _MEASURED = Path(__file__).parent / "data"
 COLUMNS = ("joints", "confidence", "probability", "count")

@@ -8,11 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float, Picture
 from pipelines.geometry.compilation import cached, helper
-from pipelines.session.records import Float
 from pipelines.session.registries import Region
-
-Picture = NDArray[np.uint8]
 
 _STEPS = 32  # of a position between two pixels, as OpenCV 4 rounds it
 

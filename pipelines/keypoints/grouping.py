@@ -27,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.compilation import cached, helper
 from pipelines.keypoints.grouping_partition import begin_groups, bind_known, join_groups, settle_nodes
 from pipelines.keypoints.grouping_rays import (
@@ -48,9 +49,7 @@ from pipelines.keypoints.grouping_tracks import (
     resume_tracks,
 )
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 _SPARE = 16  # tracks remembered beyond one for each possible detection
 

@@ -8,11 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.compilation import helper
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 _AGREE = 9.0  # a pair of detections without history is one person within 3 sigma
 _CAP = 100.0  # squared: beyond 10 sigma the penalty does not grow

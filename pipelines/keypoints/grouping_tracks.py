@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.compilation import helper
 from pipelines.keypoints.grouping_rays import (
     FEW_JOINTS,
@@ -18,9 +19,7 @@ from pipelines.keypoints.grouping_rays import (
     views_of_group,
 )
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 _HOLD_S = 0.5  # a picture is compared with later ones for this long
 _PACE_M_PER_S = 0.7  # random part of a walk, for taking up a track again

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, project
 from pipelines.geometry.poses import invert, transform
-
-Float = NDArray[np.float64]
 
 _SIGMAS = 3.0
 _STEP = 1e-4  # of the range: small against a body, large against rounding

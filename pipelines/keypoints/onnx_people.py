@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.keypoints.crops import Picture, sampled
+from pipelines.geometry.arrays import Float, Picture
+from pipelines.keypoints.crops import sampled
 from pipelines.keypoints.onnx_network import OnnxNetwork, written_shapes
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float
 
 _SURE = 0.3  # as RTMLib draws boxes
 _SAME_PERSON = 0.45  # intersection over union, YOLOX's own

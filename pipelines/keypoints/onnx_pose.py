@@ -13,14 +13,14 @@ from typing import Protocol
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float, Picture
 from pipelines.keypoints.blazepose import DETECTOR as BLAZEPOSE
-from pipelines.keypoints.crops import Picture, in_picture, sampled, side_of_box, upright_crop
+from pipelines.keypoints.crops import in_picture, sampled, side_of_box, upright_crop
 from pipelines.keypoints.onnx_network import OnnxNetwork, provider_with_options
 from pipelines.keypoints.onnx_options import USAGE, OnnxOptions, parse_options
 from pipelines.keypoints.onnx_people import OnnxPeople
 from pipelines.keypoints.pose_outputs import PoseDecoder, decoder_for
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float
 from pipelines.session.registries import Person, Region
 from pipelines.session.skeletons import get_skeleton, skeleton_with
 

@@ -24,9 +24,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.keypoints.onnx_network import written_shapes
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float
 
 HeatmapCells = Literal["udp", "msra"]
 

@@ -18,13 +18,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.compilation import cached
-from pipelines.session.records import Detections, Float, Int64
+from pipelines.session.records import Detections, Int64
 from pipelines.session.skeletons import mirrored
 
-Bools = NDArray[np.bool_]
 Pair = tuple[int, int]
 
 VISIBLE = 60.0
@@ -71,7 +70,7 @@ def undo_swaps(
     size = _body_size(xy)
     counts: Counter[str] = Counter()
 
-    def undo(name: str, group: Sequence[Pair]) -> Bools:
+    def undo(name: str, group: Sequence[Pair]) -> Bool:
         exchanged = exchanged_pictures(t_s, xy, group, size=size)
         exchange(xy, exchanged, group)
         exchange(confidence, exchanged, group)
@@ -139,13 +138,13 @@ def _parts(pairs: Mapping[str, Pair]) -> dict[str, list[Pair]]:
     }
 
 
-def exchange(values: Float, where: Bools, pairs: Sequence[Pair]) -> None:
+def exchange(values: Float, where: Bool, pairs: Sequence[Pair]) -> None:
     """Exchange, in place, the two columns of each pair in some rows of values [T, J, ...]."""
     for left, right in pairs:
         values[where, left], values[where, right] = values[where, right], values[where, left]
 
 
-def exchanged_pictures(t_s: Float, xy: Float, pairs: Sequence[Pair], *, size: float) -> Bools:
+def exchanged_pictures(t_s: Float, xy: Float, pairs: Sequence[Pair], *, size: float) -> Bool:
     """Find the pictures [T] in which pairs of joints, all together, are more likely exchanged than not.
 
     Args:
@@ -183,7 +182,7 @@ def exchanged_pictures(t_s: Float, xy: Float, pairs: Sequence[Pair], *, size: fl
     return exchanged
 
 
-def _with_visible_ends(t_s: Float, path: Bools, linked: Bools, crossing: Bools, cost: Float) -> Bools:
+def _with_visible_ends(t_s: Float, path: Bool, linked: Bool, crossing: Bool, cost: Float) -> Bool:
     """Keep the runs of a path [R] that begin and end with a jump, and short ones with a single visible end.
 
     The path has already chosen the crossing, or the end of the data, that makes such a run shortest. Longer
@@ -200,7 +199,7 @@ def _with_visible_ends(t_s: Float, path: Bools, linked: Bools, crossing: Bools, 
     return kept
 
 
-def _jumps(end: int, path: Bools, linked: Bools, crossing: Bools, cost: Float) -> bool:
+def _jumps(end: int, path: Bool, linked: Bool, crossing: Bool, cost: Float) -> bool:
     """Test if the change before row `end` is a visible jump; False at the ends of the data."""
     if not 0 < end < len(path) or not linked[end] or crossing[end]:
         return False
@@ -221,7 +220,7 @@ def _body_size(xy: Float) -> float:
     return float(np.nanmedian(distance))
 
 
-def _costs(t_s: Float, left: Float, right: Float, least_noise: float) -> tuple[Float, Bools, float]:
+def _costs(t_s: Float, left: Float, right: Float, least_noise: float) -> tuple[Float, Bool, float]:
     """Compute the cost that each row adds to the length of a path.
 
     Args:
@@ -259,7 +258,7 @@ def _costs(t_s: Float, left: Float, right: Float, least_noise: float) -> tuple[F
 
 
 @cached
-def _shortest_path(cost: Float, change: Float, exchanged: float) -> Bools:
+def _shortest_path(cost: Float, change: Float, exchanged: float) -> Bool:
     """Find the hypotheses [R] of the shortest path through costs [R, 2, 2, 2] (Viterbi over pairs of rows).
 
     A change before a row costs `change` [R], an exchanged row `exchanged`. Ties go to the path that stays

@@ -12,8 +12,9 @@ from itertools import combinations
 
 import numpy as np
 
-from pipelines.keypoints.swaps import VISIBLE, Bools, limb_pairs, mirrored_pairs
-from pipelines.session.records import Float, Int64
+from pipelines.geometry.arrays import Bool, Float
+from pipelines.keypoints.swaps import VISIBLE, limb_pairs, mirrored_pairs
+from pipelines.session.records import Int64
 
 _MOST = 2  # cameras that are wrong at once
 _GAIN = 16.0  # squared misses, in variances, that an exchange must save
@@ -57,15 +58,13 @@ def swaps_across_views(
     return sides, dict(+counts)
 
 
-def _wrong_views(
-    xy: Float, position: Float, rotation: Float, sigma: Float, pairs: int
-) -> tuple[Bools, Bools]:
+def _wrong_views(xy: Float, position: Float, rotation: Float, sigma: Float, pairs: int) -> tuple[Bool, Bool]:
     """Find in which views a limb [T, 2 K, C, 2] (left, right, ...) is exchanged [T, C], or undecided [T]."""
     times, _, cameras, _ = xy.shape
     flipped, undecided = np.zeros((times, cameras), np.bool_), np.zeros(times, np.bool_)
     rays = _world_rays(xy, rotation).reshape(times, pairs, 2, cameras, 3)
     posed = np.asarray(np.isfinite(position).all(-1))[:, None, None]
-    seen: Bools = np.asarray(np.isfinite(rays).all(-1)) & posed
+    seen: Bool = np.asarray(np.isfinite(rays).all(-1)) & posed
     both = np.asarray(np.all(seen, axis=2))
     whole = np.asarray(np.any(both, axis=1))  # [T, C] cameras that see both sides of some pair
     misses = _misses(rays, seen, position, sigma)
@@ -107,7 +106,7 @@ def _world_rays(xy: Float, rotation: Float) -> Float:
     return unit
 
 
-def _misses(rays: Float, seen: Bools, position: Float, sigma: Float) -> Float:
+def _misses(rays: Float, seen: Bool, position: Float, sigma: Float) -> Float:
     """Compute squared distances [T, K, 2, C] of rays from their common point, in variances; NaN if not seen.
 
     The point is the least squares midpoint of the rays, weighed by their accuracy. A ray's error is its

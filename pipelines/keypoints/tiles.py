@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Picture
 from pipelines.session.registries import KeypointNetworks, Region
 
-Picture = NDArray[np.uint8]
 Candidate = tuple[Region, float]
 
 CROP_PER_HEIGHT = 3.0

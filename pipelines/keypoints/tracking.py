@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Picture
 from pipelines.keypoints.hints import Hint
 from pipelines.keypoints.tiles import (
     CROP_PER_HEIGHT,
     SIDE_PER_HEIGHT,
-    Picture,
     find_in,
     same_place,
     square_about,

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.poses import look_at
@@ -25,8 +25,6 @@ from pipelines.planning.sight import visible
 if TYPE_CHECKING:
     import pandas as pd
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 FLOWN = "flown"
 """Name of the arm that is no planner: the flight in the log."""

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.costs import SlotCosts, cost_map, costs_in_frame, costs_of_slots, error_map
 from pipelines.planning.distance_field import DistanceField
@@ -26,8 +26,6 @@ from pipelines.planning.formation import (
 from pipelines.planning.information import log_determinant, ray_information
 from pipelines.planning.search import best_sequence, lattice
 from pipelines.planning.search_kernels import Formations, Lattice, cheapest_slots, turn_the_shorter_way
-
-Float = NDArray[np.float64]
 
 _TOO_NEAR = 100.0  # cost of a slot within the separation of another drone's: more than any gain
 

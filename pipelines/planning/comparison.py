@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from pipelines.geometry.arrays import Bool, Float
+
 Float32 = NDArray[np.float32]
-Bool = NDArray[np.bool_]
 
 RESAMPLES = 2000
 LEVEL = 0.95

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.planning.arm_flights import LOGGED, ArmFlight
 from pipelines.planning.comparison import (
     LEVEL,
@@ -26,9 +27,7 @@ from pipelines.planning.scores import score
 from pipelines.planning.sight import visible
 from pipelines.planning.verdict import broken_limits, verdict
 
-Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
-Bool = NDArray[np.bool_]
 
 REFERENCE = "fixed"
 """Arm that the others are compared with; the first arm where it is missing."""

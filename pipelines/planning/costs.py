@@ -5,16 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField
 from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import slot_offsets, turned
 from pipelines.planning.information import predicted_error, ray_information
 from pipelines.planning.search_kernels import slot_costs, weighed
-
-Float = NDArray[np.float64]
 
 
 class SlotCosts(NamedTuple):

@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.planning.field_kernels import BRICK, Grid, Sight, fill_bricks, sample
 from pipelines.session.records import Occupancy
 
-Float = NDArray[np.float64]
 Unknown = Literal["free", "occupied"]
 
 OCCUPIED = 0.5  # probability from which a voxel is an obstacle

@@ -11,9 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached, helper
-
-Float = NDArray[np.float64]
 
 # A point is at most half a diagonal from its voxel's centre. It is at most a whole one from the corners
 # of the cell in which it is interpolated, and so are the corners from each other. In voxels:

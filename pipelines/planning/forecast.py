@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from pipelines.geometry.arrays import Float
 
 _FIRST_SPEED_MPS = 3.0  # standard deviation per axis before a second measurement: people run
 

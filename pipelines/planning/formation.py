@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached
-
-Float = NDArray[np.float64]
 
 YAW, TILT, RANGE = range(3)
 """Indices of a slot: yaw (rad, counterclockwise from east), tilt (rad above the actor), range (m)."""

@@ -18,8 +18,8 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField
@@ -32,8 +32,6 @@ from pipelines.planning.tracking import (
     roll_out,
     stopping_ticks,
 )
-
-Float = NDArray[np.float64]
 
 _CHECK_S = 0.05  # motions are checked as often, and every half voxel
 _ROUNDING_M = 1e-6

@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig
-
-Float = NDArray[np.float64]
 
 _SURE = 3.0  # standard deviations of the speed; its direction is used only above
 _FIRST_WAY_M = 1.0

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig
-
-Float = NDArray[np.float64]
 
 # Share of joints that a detector places within 0.2 torso lengths, by tilt: BlazePose on people rendered from
 # 10 m at 720p, eight yaws by four phases of a step. Constant below and above.

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel, White
 from pipelines.geometry.poses import gaps, interpolate_points
@@ -17,12 +18,11 @@ from pipelines.session.description import CameraEntry, Description, Interpolatio
 from pipelines.session.errors import DataError
 from pipelines.session.logged_actor import logged_actor
 from pipelines.session.pose_noise import COMMAND_LINE, known_variances, stated_models
-from pipelines.session.records import Float, Int64, JointMotion, Trajectory
+from pipelines.session.records import Int64, JointMotion, Trajectory
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.tables import CAMERA_POSES, PLAN, POSES, SKELETON, TRUTH, read_table
 from pipelines.session.tabular import motion_from, trajectory_from
 
-Bool = NDArray[np.bool_]
 Source = Literal["log", "reconstruction", "truth"]
 
 _LONGEST_STEP_NS = 200_000_000  # joints are interpolated across this much at least: 10 Hz and a missed frame

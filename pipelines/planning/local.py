@@ -21,14 +21,12 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField
 from pipelines.planning.local_kernels import Weights, descend, evaluate, factorise
 from pipelines.planning.tracking import Plan
-
-Float = NDArray[np.float64]
 
 TERMS = ("smooth", "form", "obs", "occ", "sep")
 _ASTRAY_M = 3.0  # a plan that ends farther off the slot may be in a local minimum

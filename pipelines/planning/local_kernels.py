@@ -10,12 +10,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached, helper
 from pipelines.planning.field_kernels import DIAGONAL, Grid, interpolate, nearest
-
-Float = NDArray[np.float64]
 
 _SLOWEST_STEP, _FASTEST_STEP = (
     1e4,

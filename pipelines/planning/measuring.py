@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.cameras import Intrinsics, project, undistort
 from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import invert, matrix_from_quaternion, rates, transform
@@ -20,10 +21,8 @@ from pipelines.geometry.triangulation import Views, locate
 from pipelines.planning.distance_field import DistanceField
 from pipelines.planning.sight import visible
 
-Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 PIXEL_SIGMA = 3.0
 """Standard deviation of a good keypoint for triangulation, px: the first value in `mocap reconstruct`."""

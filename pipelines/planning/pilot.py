@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.planning.arms import Arm
 from pipelines.planning.config import MOST_DRONES, PlannerConfig
 from pipelines.planning.distance_field import DistanceField
@@ -19,8 +19,6 @@ from pipelines.planning.guard import Guard
 from pipelines.planning.heading import YawZero
 from pipelines.planning.local import LocalPlanner, Separation
 from pipelines.planning.tracking import Plan
-
-Float = NDArray[np.float64]
 
 _NOW_S = 1e-6  # times are sums of periods: due this much early is due
 

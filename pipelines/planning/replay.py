@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.poses import look_at
 from pipelines.planning.arms import Arm
 from pipelines.planning.config import PlannerConfig
@@ -20,8 +21,6 @@ from pipelines.planning.local import Separation
 from pipelines.planning.pilot import Pilot, PlanningTimes
 from pipelines.planning.sight import visible
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 Int64 = NDArray[np.int64]
 Mode = Literal["plan-only", "closed-loop"]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.planning.comparison import stretches
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.costs import cost_map, costs_of_slots
@@ -19,9 +19,7 @@ from pipelines.planning.loading import LoggedFlight, SessionCamera, Source, flow
 from pipelines.planning.replay import Mode, replay_times
 from pipelines.planning.scores import near_obstacle
 from pipelines.session.description import Description
-from pipelines.session.records import Float, Int64, Occupancy
-
-Bool = NDArray[np.bool_]
+from pipelines.session.records import Int64, Occupancy
 
 MOST_DRONES = 8
 PICTURES_HZ = 25.0

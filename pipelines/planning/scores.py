@@ -5,16 +5,14 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField
 from pipelines.planning.formation import RANGE, TILT, YAW, slot_of, wrapped
 from pipelines.planning.information import predicted_error, ray_information
 from pipelines.planning.sight import visible
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 Scores = dict[str, object]
 
 NEAR_OBSTACLE_M = 15.0

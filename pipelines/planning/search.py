@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.planning.formation import YAW, wrapped
 from pipelines.planning.search_kernels import REACHED_S, Lattice, cheapest_sequence
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached, helper
 from pipelines.planning.field_kernels import (
     DIAGONAL,
@@ -25,7 +26,6 @@ from pipelines.planning.field_kernels import (
     sampling,
 )
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 REACHED_S = 1e-9  # a cell exactly as far as the rates allow is a neighbour

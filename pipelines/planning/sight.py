@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.compilation import cached
 from pipelines.planning.distance_field import DistanceField
 from pipelines.planning.field_kernels import Grid, line_shares
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 
 def visible(field: DistanceField, camera: Float, actor: Float, *, start_m: float) -> Bool:

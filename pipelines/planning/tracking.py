@@ -16,11 +16,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached, helper
-
-Float = NDArray[np.float64]
 
 POSITION, VELOCITY, ACCELERATION, INTEGRAL = range(4)
 """Rows of a drone's state [4, 3]: m, m/s, m/s^2, and the integral of the position error in m s."""

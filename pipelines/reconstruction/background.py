@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import row_delay_s, undistort
 from pipelines.geometry.poses import quaternion_from_matrix, velocities
 from pipelines.reconstruction.background_poses import Adjusted, PosePrior, adjust
@@ -20,7 +21,7 @@ from pipelines.reconstruction.background_tracks import Tracks
 from pipelines.reconstruction.observations import Camera
 from pipelines.reconstruction.refinement.problem import ROTATION, SHIFT_IN_WORLD, PoseErrors, Process
 from pipelines.session.description import Interpolation
-from pipelines.session.records import Float, Int64, Trajectory
+from pipelines.session.records import Int64, Trajectory
 
 _RATE_HZ = 15.0  # of the pictures used: between them poses are interpolated
 _LASTS_S = 10.0  # drift over this time is treated as a constant error

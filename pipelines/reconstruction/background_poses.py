@@ -16,8 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_rotation_vector
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 
 STRETCH = 200
 """Approximate number of pictures adjusted together: more would share no points and make large matrices."""

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.observations import Camera
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 
 UInt8 = NDArray[np.uint8]
 

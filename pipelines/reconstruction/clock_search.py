@@ -10,12 +10,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.triangulation import Views, locate
-from pipelines.session.records import Float
-
-Bool = NDArray[np.bool_]
 
 _STEP_S = 1 / 15  # limbs swing for longer than that
 _REACH = 2.0  # standard deviations of the stated clock offset

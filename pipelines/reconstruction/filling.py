@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.triangulation import STATUS
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 
 _OK, _FILLED = STATUS.index("ok"), STATUS.index("filled")
 _SIDES = 2  # measured samples on each side of a gap that decide what lies in it

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.observations import Camera
 from pipelines.reconstruction.refinement.problem import (
     NEW_SHARE,
@@ -21,7 +22,7 @@ from pipelines.reconstruction.refinement.problem import (
 from pipelines.session.description import CameraEntry, Description
 from pipelines.session.errors import DataError
 from pipelines.session.pose_noise import stated_models, stated_noise
-from pipelines.session.records import Float, JointMotion
+from pipelines.session.records import JointMotion
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.tables import FRAMES, KEYPOINTS, POSES, TRUTH, read_table
 from pipelines.session.tabular import detections_from, most_confident, motion_from, trajectory_from

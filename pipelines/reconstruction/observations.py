@@ -16,12 +16,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, row_delay_s, undistort
 from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion, velocities
 from pipelines.reconstruction.refinement.problem import PoseErrors
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import Interpolation
-from pipelines.session.records import Detections, Float, Int64, Trajectory
+from pipelines.session.records import Detections, Int64, Trajectory
 
 _FRAME_GAP_NS = 500_000_000  # consecutive frames further apart than this, and than usual, are not bridged
 _USUAL = 1.5  # times the median frame period

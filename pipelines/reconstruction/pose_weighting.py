@@ -13,8 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 
 _ROUNDS = 4  # the last moves the median joint by less than a thousandth of its standard deviation
 _BLOCK = 8192  # joint-frames at once: memory

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.bootstrap import LEVEL, RESAMPLES, Series, intervals, stretch_samples
 from pipelines.geometry.metrics import JointErrors, error_series, measure, measure_shape
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
 from pipelines.reconstruction.observations import Observations
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 from pipelines.session.skeletons import bones_of
 
 _OK, _FILLED = STATUS.index("ok"), STATUS.index("filled")

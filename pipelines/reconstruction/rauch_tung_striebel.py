@@ -11,11 +11,8 @@ from __future__ import annotations
 from math import factorial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.session.records import Float
-
-Bool = NDArray[np.bool_]
+from pipelines.geometry.arrays import Bool, Float
 
 STATES = {"acceleration": 3, "jerk": 4}
 """Number of derivatives in the state of each model, the position included."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.picture_gate import triangulate_pictures
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.geometry.triangulation import (
@@ -36,7 +37,7 @@ from pipelines.reconstruction.refinement.problem import NEW_SHARE, PoseErrors
 from pipelines.reconstruction.refinement.refine import SETTLED_S, Refined, corrected, refine
 from pipelines.reconstruction.solving import pictures_of
 from pipelines.session.description import Interpolation
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 from pipelines.session.skeletons import bones_of
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.picture_gate import triangulate_pictures
 from pipelines.geometry.triangulation import STATUS, Views, estimate_noise, triangulate
@@ -18,7 +19,6 @@ from pipelines.reconstruction.refinement.building import Sighting
 from pipelines.reconstruction.refinement.problem import pose_errors
 from pipelines.reconstruction.refinement.refine import corrected, refine
 from pipelines.reconstruction.refining import rigid_pairs
-from pipelines.session.records import Float
 
 
 def refined_points(

@@ -17,14 +17,12 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.noise import parse
 from pipelines.reconstruction.rauch_tung_striebel import STATES, find_density, smooth_positions
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, Int64
-
-Bool = NDArray[np.bool_]
+from pipelines.session.records import Int64
 
 _PLACE = "--smooth"
 _USUAL_STEP = 1.5  # times the median step: a longer one is a gap

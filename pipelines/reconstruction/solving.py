@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.picture_gate import triangulate_pictures
 from pipelines.geometry.triangulation import (
     STATUS,
@@ -23,7 +24,7 @@ from pipelines.reconstruction.observations import Camera, Observations
 from pipelines.reconstruction.pose_weighting import triangulate_weighted
 from pipelines.reconstruction.reweighting import triangulate_heavy_tailed
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 
 UNKNOWN_SIGMA = (0.3, np.radians(1.0))
 """Camera pose noise (m, rad) for associating people if none is stated: the studies' medium level."""

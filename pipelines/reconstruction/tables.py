@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.geometry.triangulation import STATUS, Triangulation
 from pipelines.reconstruction.observations import Camera, Observations
 from pipelines.session.description import Interpolation
-from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Float
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 
 if TYPE_CHECKING:
     import pandas as pd

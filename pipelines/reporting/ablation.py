@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.reporting.ablation_figure import Curve, Panel, StudyDrawing, save_study
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 
 Row = dict[str, Any]
 

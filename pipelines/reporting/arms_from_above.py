@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.reporting.plates import (
     LINE_STYLES,
     MOST_POINTS,
@@ -30,7 +31,6 @@ from pipelines.reporting.svg import (
 )
 from pipelines.reporting.terrain import LOWEST_M, Heights, heights
 from pipelines.reporting.wording import fixed, listing, plural, quantity, shortened
-from pipelines.session.records import Float
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.reporting.plates import MOST_POINTS, Plate, every, quiet, stacked, table
 from pipelines.reporting.replanned import Arm, span_s
 from pipelines.reporting.svg import CAMERAS, WIDTH_IN, page_style
 from pipelines.reporting.wording import fixed, percent, quantity, shortened
-from pipelines.session.records import Float
 
 if TYPE_CHECKING:
     import pandas as pd

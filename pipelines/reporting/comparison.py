@@ -17,13 +17,14 @@ from typing import Literal
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.bootstrap import Series, interval_of, intervals, resampled
 from pipelines.geometry.metrics import aligned_distances, bone_lengths, root_relative_distances
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.motion import Motion
 from pipelines.reporting.placing import camera_positions
 from pipelines.reporting.summary import Summary, summarise
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 from pipelines.session.skeletons import bones_of
 
 _PCK_M = 0.15

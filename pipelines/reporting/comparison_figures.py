@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.reporting.comparison import MEASURES, Comparison, Judged, Measure, Pair
 from pipelines.reporting.over_time import percentiles, time_bins
 from pipelines.reporting.plates import LINE_STYLES, Plate, quiet, stacked, table, tabled
 from pipelines.reporting.svg import CAMERAS, MUTED, WIDTH_IN, page_style
 from pipelines.reporting.wording import fixed, joint_label, listing, quantity, shortened
-from pipelines.session.records import Float
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float, Picture
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.bones import side_of
-from pipelines.reporting.overlays import Picture, View
-from pipelines.session.records import Float
+from pipelines.reporting.overlays import View
 from pipelines.session.skeletons import bones_of
 
 Colour = tuple[int, int, int]

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.triangulation import STATUS
-from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Float, Int64
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Int64
 from pipelines.session.tabular import motion_from
 from pipelines.session.true_joints import true_joints_at
 

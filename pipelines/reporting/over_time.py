@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.motion import Motion
 from pipelines.reporting.plates import (
@@ -24,7 +25,6 @@ from pipelines.reporting.wording import (
     STATUS_LABELS,
     quantity,
 )
-from pipelines.session.records import Float
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float, Picture
 from pipelines.geometry.cameras import Intrinsics, project
 from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion
 from pipelines.geometry.triangulation import STATUS
@@ -23,15 +24,13 @@ from pipelines.reporting.motion import Motion
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import Interpolation
-from pipelines.session.records import Float, Int64, Trajectory
+from pipelines.session.records import Int64, Trajectory
 from pipelines.session.skeletons import with_derived
 from pipelines.session.tabular import detections_from, trajectory_from
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Bool = NDArray[np.bool_]
-Picture = NDArray[np.uint8]  # [height, width, 3] BGR
 ReadFrame = Callable[[str, int], Picture | None]
 """Function that returns the picture of a camera's frame; None where there is none."""
 

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float, Picture
 from pipelines.reporting.bones import side_of
-from pipelines.reporting.overlays import Picture, View
-from pipelines.session.records import Float
+from pipelines.reporting.overlays import View
 from pipelines.session.skeletons import bones_of
 
 _MARGIN = 1.3  # size of a panel, relative to its contents

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import rotate
 from pipelines.reporting.motion import Motion
 from pipelines.reporting.plates import (
@@ -33,7 +34,7 @@ from pipelines.reporting.wording import (
     quantity,
     shortened,
 )
-from pipelines.session.records import Float, Int64, Trajectory
+from pipelines.session.records import Int64, Trajectory
 from pipelines.session.tabular import trajectory_from
 
 if TYPE_CHECKING:

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.reporting.content import SessionContent, number, section
 from pipelines.reporting.summary import Summary
 from pipelines.session.camera_poses import poses_at
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 from pipelines.session.tabular import trajectory_from
 
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.reporting.svg import GRID, inline_svg
 from pipelines.reporting.wording import fixed
-from pipelines.session.records import Float
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.reporting.bones import side_of
 from pipelines.reporting.motion import Motion
 from pipelines.reporting.plates import (
@@ -27,7 +28,6 @@ from pipelines.reporting.wording import (
     listing,
     plural,
 )
-from pipelines.session.records import Float
 from pipelines.session.skeletons import bones_of, with_derived
 
 if TYPE_CHECKING:

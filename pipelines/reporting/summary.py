@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.bones import Bone, watched_bones
 from pipelines.reporting.content import SessionContent, number, section
@@ -17,7 +18,6 @@ from pipelines.reporting.wording import (
     significant,
 )
 from pipelines.session.description import CameraEntry, Description
-from pipelines.session.records import Float
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.session.records import Float, Int64, Occupancy
+from pipelines.geometry.arrays import Float
+from pipelines.session.records import Int64, Occupancy
 
 LOWEST_M = 0.5
 """Least height above the ground of an obstacle; everything lower is ground."""

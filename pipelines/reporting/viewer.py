@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.reporting.bones import side_of
 from pipelines.reporting.motion import Motion
 from pipelines.reporting.replanned import Arm, Replan
@@ -21,7 +22,7 @@ from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.terrain import Surface, surface
 from pipelines.reporting.wording import joint_label, plural, quantity, whole
 from pipelines.session.camera_poses import poses_at
-from pipelines.session.records import Float, Int64, Trajectory
+from pipelines.session.records import Int64, Trajectory
 from pipelines.session.skeletons import DERIVED, bones_of
 from pipelines.session.tabular import trajectory_from
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import interpolate_poses
 from pipelines.session.description import Interpolation
-from pipelines.session.records import Float, Int64, Trajectory
+from pipelines.session.records import Int64, Trajectory
 
 
 def poses_at(

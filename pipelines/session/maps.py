@@ -26,9 +26,10 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.session.description import HeldMap
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, Occupancy
+from pipelines.session.records import Occupancy
 from pipelines.session.storage import as_data_error, jsonable, read_json, write_json
 
 MOST_VOXELS = 500_000_000

@@ -10,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import NoiseModel, sum_sigma
 from pipelines.geometry.poses import rates
 from pipelines.session.description import CameraEntry
-from pipelines.session.records import Float, Trajectory
+from pipelines.session.records import Trajectory
 from pipelines.session.registries import noise_models, parsed_noise_models
 
 COMMAND_LINE = "--pose-noise"

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.session.progress import Progress, Silent
 
 POINT_COVARIANCE_COLUMNS = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
 """Upper triangle of a joint's covariance, m^2, as tables name it."""
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 

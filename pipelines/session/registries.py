@@ -17,12 +17,12 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import NoiseModel, build, parse
 from pipelines.session.errors import DataError
 from pipelines.session.records import (
     CalibratedCamera,
     Detections,
-    Float,
     JointMotion,
     Message,
     Occupancy,

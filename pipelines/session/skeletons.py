@@ -14,11 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 
-Float = NDArray[np.float64]
 Bone = tuple[str, str]
 
 

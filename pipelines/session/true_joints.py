@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import interpolate_points
-from pipelines.session.records import Float, Int64, JointMotion
+from pipelines.session.records import Int64, JointMotion
 
 _MOST_STREAMS = 8  # most cameras or trackers with interleaved samples
 _LEAST_TURNS = 4  # fewest repetitions to call a pattern periodic

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.session.skeletons import get_skeleton
 from pipelines.simulation.body_asset import BUILDS, SEXES, UNIT_M
 from pipelines.simulation.body_neutral import neutral_offsets, neutral_turns
@@ -24,8 +25,6 @@ from pipelines.simulation.body_skinning import Skin, Skinning, make_skin, moving
 from pipelines.simulation.rig import BONE, BONES, SIDES, BodyMotion, Rig
 from pipelines.simulation.scenario import Body
 from pipelines.simulation.surfaces import Surface
-
-Float = NDArray[np.float64]
 
 _ASSET = Path(__file__).parent / "data" / "body.npz"
 _FRAMES_AT_ONCE = 1024  # bounds the memory of long motions: 5 MB of transforms

@@ -33,12 +33,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float, Index
 from pipelines.session.errors import DataError
 from pipelines.session.skeletons import get_skeleton
 from pipelines.simulation.rig import BONE, BONES
-
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 SEXES = ("female", "male")
 BUILDS = ("average", "slim", "heavy")

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
 from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES
-
-Float = NDArray[np.float64]
 
 
 def neutral_turns(rest_joint: Float, lean_rad: float) -> Float:

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.simulation.body_asset import PARTS
 from pipelines.simulation.body_patches import Patch, cut, normals, pick, together, triangles
 from pipelines.simulation.rig import BONE, SIDES
 
-Float = NDArray[np.float64]
 Colour = tuple[float, float, float]
 
 # Places along a limb: 0 at its root, 1 at the knee or elbow, 2 at the ankle or wrist.

@@ -17,11 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached
 from pipelines.geometry.poses import matrix_from_quaternion, multiply
 from pipelines.simulation.rig import BONE, BONES, PARENT
-
-Float = NDArray[np.float64]
 
 _BELOW = np.array([BONE[name] for name, parent in PARENT.items() if parent is not None])
 _ABOVE = np.array([BONE[parent] for parent in PARENT.values() if parent is not None])

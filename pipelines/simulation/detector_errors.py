@@ -14,14 +14,11 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.session.errors import DataError
 from pipelines.session.skeletons import mirrored
 from pipelines.simulation.scenario import DetectorErrors, ModelledDetector
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 MODELLED: tuple[str, ...] = get_args(ModelledDetector)
 """The detectors whose errors were measured, by the names that `--detector` takes; the usual one first."""

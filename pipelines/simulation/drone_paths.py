@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import look_at
-
-Float = NDArray[np.float64]
 
 # How far a camera strays from its slot at `variation` 1. METHODS of the noise studies use the same
 # amounts: they make a constant error of each drone's poses observable.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.cameras import Intrinsics, project, row_delay_s, undistort
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.poses import invert, transform
@@ -34,9 +35,7 @@ from pipelines.simulation.surfaces import Surface, hidden_by
 from pipelines.simulation.world.scene import World, build_world
 from pipelines.simulation.world.terrain import raise_mounds
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 Moving = Callable[[Float], BodyMotion]
 
 LEAD_S = 0.2

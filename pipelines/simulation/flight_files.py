@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from pipelines.geometry.arrays import Float
+
 Int64 = NDArray[np.int64]
 
 _BOX_MARGIN = 0.15  # of the keypoints' extent, as a person detector's box is larger than the joints

@@ -17,15 +17,13 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached, helper
 from pipelines.geometry.mounting import attitude_from_angles, body_from_camera
 from pipelines.geometry.poses import multiply, quaternion_from_matrix, rotate
 from pipelines.simulation.drone_paths import orbit
 from pipelines.simulation.scenario import Formation, Limits
-
-Float = NDArray[np.float64]
 
 STEP_S = 0.005
 """The integration's longest step."""

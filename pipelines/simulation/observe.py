@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, project
 from pipelines.geometry.poses import invert, transform
-
-Float = NDArray[np.float64]
 
 _OUTLIER_PX = (30.0, 150.0)  # distance of a gross outlier from the truth
 

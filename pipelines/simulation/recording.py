@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.noise import GaussMarkov, NoiseModel, disturb, sum_sigma
 from pipelines.geometry.pose_covariance import mounted_covariance
@@ -25,7 +26,6 @@ from pipelines.session.records import Trajectory
 from pipelines.simulation.flying import LEVER_ARM, DronePaths
 from pipelines.simulation.scenario import Lens
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 JITTER_SHARE = 0.02  # sigma of a log's stamps, of the time between them; at most ten times that

@@ -10,11 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import rotate
-
-Float = NDArray[np.float64]
 
 _TRUNK = {
     "pelvis": None,

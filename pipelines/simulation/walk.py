@@ -14,9 +14,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.session.skeletons import get_skeleton
-
-Float = NDArray[np.float64]
 
 SIDES = ("left", "right")
 COCO17 = get_skeleton("coco17").joints

@@ -12,12 +12,12 @@ import pytest
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
+from pipelines.geometry.arrays import Float
 from tests.commands.runner import refused, succeeds
 from tests.commands.test_replan import CALM, session_of
 from tests.synthetic.logs import Entry, write_log
 
 TILT_DEG, RANGE_M = 40.0, 8.0
-Float = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.session.records import Float
+from pipelines.geometry.arrays import Float
 
 POINTS: Float = np.array(
     [

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.bootstrap import RESAMPLES, STRETCH_S, intervals, stretch_samples
-
-Float = NDArray[np.float64]
 
 RATE = 30
 SAMPLES = 60 * RATE

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import (
-    Float,
     Intrinsics,
     camera_matrix,
     fit_to_size,

@@ -6,12 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.film_start import Followed, StartFit, fit_start
 
-Float = NDArray[np.float64]
 Motion = Callable[[Float], tuple[Float, Rotation]]
 """Positions m [N, 3] and attitudes [N] of a camera at times s [N]."""
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.geodesy import (
     Place,
     ecef_from_geodetic,
@@ -14,8 +14,6 @@ from pipelines.geometry.geodesy import (
     geodetic_from_ecef,
     place_at,
 )
-
-Float = NDArray[np.float64]
 
 # IOGP Guidance Note 7-2, method 9837: the topocentric origin of the worked example.
 NORTH_SEA = Place(55.0, 5.0, 200.0)

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, project
 from pipelines.geometry.mounting import (
-    Float,
     Looks,
     Pose,
     attitude_from_angles,

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import (
     Bias,
     Drift,
-    Float,
     GaussMarkov,
     Int64,
     Latency,

@@ -7,10 +7,10 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.picture_gate import triangulate_pictures
 from pipelines.geometry.triangulation import (
     STATUS,
-    Float,
     Int64,
     Triangulation,
     Views,

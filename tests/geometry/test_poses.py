@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import (
-    Float,
     Int64,
     compose,
     conjugate,

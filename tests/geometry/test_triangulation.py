@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.triangulation import (
     STATUS,
     Method,
@@ -28,8 +28,6 @@ from tests.geometry.rings import (
     with_pixel_noise,
     with_pose_noise,
 )
-
-Float = NDArray[np.float64]
 
 METHODS = get_args(Method)
 

@@ -12,12 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float, Picture
 from pipelines.session.registries import Person, Region
-
-Float = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 JOINTS = ("head", "foot", "left_hand", "right_hand", "hip")
 WIDTH_PER_HEIGHT = 0.4

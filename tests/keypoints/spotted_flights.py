@@ -10,13 +10,12 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.poses import look_at
 from pipelines.simulation.flight_files import write_tum
 from pipelines.simulation.observe import see
 from tests.keypoints.onnx_graphs import constant_model, heatmap_model, spots
-
-Float = NDArray[np.float64]
 
 START_S, FPS = 1_700_000_000, 30
 LENS = Intrinsics(320, 240, 300.0, 300.0, 159.5, 119.5, "none", ())

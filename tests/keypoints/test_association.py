@@ -15,9 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.keypoints.association import Association, associate
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Path = Callable[[Float], Float]  # seconds [T] to places on the ground [T, 2]
 

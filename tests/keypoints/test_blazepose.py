@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float, Picture
 from pipelines.keypoints import blazepose
 from pipelines.keypoints.blazepose import DETECTOR, BlazePose
 from pipelines.keypoints.crops import sampled
@@ -21,9 +21,6 @@ from tests.real_data import real_data
 
 REFERENCE = Path(__file__).with_name("reference_blazepose.json")
 CROP = 256
-
-Float = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import isotonic_regression
 
+from pipelines.geometry.arrays import Float
 from pipelines.keypoints.calibration import (
     fit,
     isotonic,
@@ -18,7 +19,6 @@ from pipelines.keypoints.calibration import (
     write_calibration,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float
 from pipelines.session.skeletons import get_skeleton
 
 COCO17 = get_skeleton("coco17").joints

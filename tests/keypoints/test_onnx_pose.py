@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.keypoints.crops import Picture
+from pipelines.geometry.arrays import Picture
 from pipelines.keypoints.onnx_network import OnnxNetwork
 from pipelines.keypoints.onnx_pose import DETECTOR, OnnxPose
 from pipelines.session.errors import DataError

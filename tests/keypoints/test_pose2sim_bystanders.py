@@ -7,8 +7,8 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.keypoints.association import associate
 from tests.real_data import real_data
 
@@ -17,8 +17,6 @@ FRAMES = 100
 JOINTS = 25
 MOST_PEOPLE = 3
 NOISE_PX = 10.0  # the published result reprojects at 10.7 px (median over all views)
-
-Float = NDArray[np.float64]
 
 
 def people(folder: Path, camera: str, frame: int) -> list[Float]:

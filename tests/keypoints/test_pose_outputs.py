@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipelines.geometry.arrays import Float
 from pipelines.keypoints.pose_outputs import decoder_for, heatmap_peaks, simcc_peaks
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float
 
 inner = st.floats(9.0, 38.0)
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import look_at
 from pipelines.keypoints.swaps import exchange, mirrored_pairs, undo_swaps
-from pipelines.session.records import Float
 from pipelines.simulation.observe import see
 from pipelines.simulation.walk import COCO17, walk
 from tests.synthetic.flights import LENS

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.poses import look_at, matrix_from_quaternion
 from pipelines.keypoints.swaps import Pair, mirrored_pairs
 from pipelines.keypoints.swaps_across_views import swaps_across_views
 from pipelines.reconstruction.observations import on_sides
-from pipelines.session.records import Float
 from pipelines.simulation.observe import see
 from pipelines.simulation.walk import COCO17, walk
 from tests.synthetic.flights import LENS

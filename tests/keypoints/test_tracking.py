@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipelines.geometry.arrays import Picture
 from pipelines.keypoints.hints import Hint
 from pipelines.keypoints.tracking import PeopleTracker, TrackedPerson
 from pipelines.session.registries import Region
-from tests.keypoints.bars import Bar, BarNetworks, Picture, draw
+from tests.keypoints.bars import Bar, BarNetworks, draw
 
 WIDTH, HEIGHT = 960, 540
 AWAY = Bar(-1000, -1000, 101)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from benchmarks.worlds import fly, world_of
+from pipelines.geometry.arrays import Float
 from pipelines.planning.arms import ADAPTIVE, FIXED
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, distance_field, open_space
@@ -22,7 +22,6 @@ from pipelines.planning.tracking import Plan
 from pipelines.session.records import Occupancy
 from tests.planning.worlds import walker
 
-Float = NDArray[np.float64]
 CONFIG = PlannerConfig()
 TICKS = round(CONFIG.tracking_hz / CONFIG.local_hz)
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.planning.arms import ADAPTIVE, COVARIANCE, FIXED, GREEDY, Arm
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.costs import cost_map, costs_of_slots
@@ -19,7 +20,6 @@ from pipelines.planning.heading import YawZero, first_heading
 from pipelines.planning.replay import replay
 from tests.planning.worlds import trees, walker
 
-Float = NDArray[np.float64]
 WORLD_FRAME = PlannerConfig()
 HEADING_FRAME = replace(WORLD_FRAME, yaw_frame="heading")
 WORLD = trees()

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, distance_field, open_space
 from pipelines.planning.local import TERMS, LocalPlanner, Separation, closest_approach
@@ -15,7 +15,6 @@ from pipelines.planning.tracking import Plan
 from pipelines.session.records import Occupancy
 from tests.planning.worlds import bare_ground, mound
 
-Float = NDArray[np.float64]
 CONFIG = PlannerConfig(eps_obs_m=1.5, soft_separation_m=3.5)
 NOBODY = np.empty((0, 20, 3))
 

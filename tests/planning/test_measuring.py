@@ -6,17 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import White
 from pipelines.geometry.poses import look_at
 from pipelines.planning.distance_field import open_space
 from pipelines.planning.measuring import Filming, film
 from tests.planning.worlds import wall
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 LENS = Intrinsics(1280, 720, 760.0, 760.0, 639.5, 359.5)
 TIMES, JOINTS = 40, 5

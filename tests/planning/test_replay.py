@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.planning.arms import ADAPTIVE, COVARIANCE, FIXED, GREEDY, Arm, FormationPlanner
 from pipelines.planning.config import PlannerConfig
@@ -19,7 +19,6 @@ from pipelines.planning.replay import ReplayResult, replay
 from pipelines.planning.scores import near_obstacle, score
 from tests.planning.worlds import bare_ground, high_wall, mound, trees, walker, wall
 
-Float = NDArray[np.float64]
 CONFIG = PlannerConfig()
 
 

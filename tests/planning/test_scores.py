@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import open_space
 from pipelines.planning.formation import formation_slots, slot_offsets
 from pipelines.planning.scores import near_obstacle, predicted_errors, score
 from tests.planning.worlds import bare_ground, wall
 
-Float = NDArray[np.float64]
 CONFIG = PlannerConfig()
 T_S = np.arange(0, 20.001, 0.02)
 

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.planning.formation import wrapped, yaw_set
 from pipelines.planning.search import best_sequence, lattice
 from pipelines.planning.search_kernels import Lattice
 
-Float = NDArray[np.float64]
 RATES = np.array([np.radians(22.5), np.radians(5.0), 1.0])
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.tracking import (
     ACCELERATION,
@@ -20,7 +20,6 @@ from pipelines.planning.tracking import (
     stopping_ticks,
 )
 
-Float = NDArray[np.float64]
 CONFIG = PlannerConfig()
 
 

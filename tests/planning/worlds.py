@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.planning.distance_field import DistanceField, distance_field
 from pipelines.session.records import Occupancy
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 ORIGIN = np.array([-25.0, -30.0, 0.0])
 SIZE_M = (80.0, 60.0, 30.0)

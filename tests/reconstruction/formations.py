@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import NoiseModel, disturb
 from pipelines.geometry.picture_gate import triangulate_pictures
 from pipelines.geometry.poses import matrix_from_quaternion
@@ -16,8 +16,6 @@ from pipelines.reconstruction.refinement.building import Sighting
 from pipelines.session.skeletons import bones_of
 from pipelines.simulation.drone_paths import orbit
 from pipelines.simulation.walk import COCO17, route, walk
-
-Float = NDArray[np.float64]
 
 FPS = 30.0
 FOCAL_PX = 1500.0

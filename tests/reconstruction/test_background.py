@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, row_delay_s
 from pipelines.geometry.poses import (
     matrix_from_quaternion,
@@ -25,7 +26,6 @@ from pipelines.reconstruction.refinement.problem import ROTATION, SHIFT_IN_WORLD
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Detections, Trajectory
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 FOCAL = 760.0

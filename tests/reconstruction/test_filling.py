@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reconstruction.filling import fill_gaps
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 OK, FILLED, REJECTED, FEW = (STATUS.index(name) for name in ("ok", "filled", "rejected", "few_views"))

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.refinement.levels import limber
-
-Float = NDArray[np.float64]
 
 
 def covariance(seed: int, joints: int) -> Float:

@@ -6,14 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.refinement.problem import PoseErrors
 from pipelines.reconstruction.refinement.refine import Refined, refine
 from tests.reconstruction.formations import BONES, Formation, formation, mean_mm, triangulated
-
-Float = NDArray[np.float64]
 
 CAMERAS, TIMES = 3, 60
 GOOD = np.repeat([0.03, np.radians(0.1)], 3)  # of position (m), rotation (rad)

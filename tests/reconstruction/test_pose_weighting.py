@@ -7,15 +7,13 @@ from functools import partial
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.triangulation import STATUS, Views, triangulate
 from pipelines.reconstruction.loading import errors_of_level
 from pipelines.reconstruction.pose_weighting import triangulate_weighted
 from pipelines.reconstruction.refinement.problem import ROTATION
 from tests.geometry.rings import ring, turned, with_pixel_noise
-
-Float = NDArray[np.float64]
 
 OK = STATUS.index("ok")
 

@@ -9,8 +9,8 @@ from functools import partial
 import numba
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import aligned_distances
 from pipelines.geometry.noise import Bias, Drift, NoiseModel, White
 from pipelines.reconstruction.refinement import elimination, kernels
@@ -34,8 +34,6 @@ from pipelines.reconstruction.refinement.problem import (
 from pipelines.reconstruction.refinement.refine import corrected, refine
 from pipelines.reconstruction.refinement.system import System, misfit, prior_cost
 from tests.reconstruction.formations import BONES, STATED_PX, Formation, formation, mean_mm
-
-Float = NDArray[np.float64]
 
 WHITE = White(position_m=0.3, rotation_deg=1.0)
 BIAS = Bias(position_m=0.3, rotation_deg=1.0)

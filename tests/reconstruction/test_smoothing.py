@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.rauch_tung_striebel import STATES, UNKNOWN, find_density, smooth_positions
 from pipelines.reconstruction.smoothing import Butterworth, RauchTungStriebel, smoother
 from pipelines.session.errors import DataError
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 RATE = 60.0

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Picture
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.frame_drawing import (
@@ -22,7 +23,7 @@ from pipelines.reporting.frame_drawing import (
     draw_frame,
     padded_to_even,
 )
-from pipelines.reporting.overlays import Picture, View
+from pipelines.reporting.overlays import View
 
 JOINTS = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 BODY = np.array([[[620.0, 300.0], [520.0, 300.0], [615.0, 380.0], [525.0, 380.0]]])

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.session.pose_noise import logged_covariance
 from pipelines.session.records import Trajectory
-
-Float = NDArray[np.float64]
 
 
 def logged(covariance: Float) -> Trajectory:

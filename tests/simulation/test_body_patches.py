@@ -3,11 +3,9 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.simulation.body_patches import Patch, cut, normals, pick, together, triangles
-
-Float = NDArray[np.float64]
 
 
 def sheet(n: int = 6) -> Patch:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.registries import find_detector
 from pipelines.session.skeletons import mirrored
@@ -30,8 +30,6 @@ from pipelines.simulation.detector_errors import (
 )
 from pipelines.simulation.scenario import DetectorErrors
 from pipelines.simulation.walk import COCO17
-
-Float = NDArray[np.float64]
 
 # Of a prototype's measurement, the same for all joints; what comes along is measured again now and then.
 EXAMPLE = read_errors(Path(__file__).parent / "example_detector_errors.csv")

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pipelines.formats.calibrations.anipose_toml import FORMAT as ANIPOSE
 from pipelines.formats.keypoint_files.alphapose import FORMAT as ALPHAPOSE
@@ -15,13 +14,13 @@ from pipelines.formats.keypoint_files.coco_results import FORMAT as COCO
 from pipelines.formats.keypoint_files.openpose import FORMAT as OPENPOSE
 from pipelines.formats.poses.pose_csv import FORMAT as POSE_CSV
 from pipelines.formats.poses.tum import FORMAT as TUM
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import undistort
 from pipelines.geometry.poses import interpolate_poses, rotate
 from pipelines.session.manifest import read_flight
 from pipelines.session.records import Detections, Trajectory
 from tests.synthetic.flights import LENS, SyntheticFlight, write_flight
 
-Float = NDArray[np.float64]
 READ_KEYPOINTS: dict[str, Callable[..., Detections]] = {
     "alphapose": ALPHAPOSE.read_keypoints,
     "coco": COCO.read_keypoints,

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.simulation.drone_paths import orbit
 from pipelines.simulation.flying import (
@@ -27,8 +27,6 @@ from pipelines.simulation.flying import (
     ring_slots,
 )
 from pipelines.simulation.scenario import Formation, Limits
-
-Float = NDArray[np.float64]
 
 T_S = moments(0.0, 20.0)
 MIDDLE = np.tile([0.0, 0.0, 1.0], (len(T_S), 1))

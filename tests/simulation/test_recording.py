@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pipelines.geometry.mounting import body_from_camera, compose_gimbal
 from pipelines.geometry.noise import Bias, GaussMarkov, Latency, NoiseModel, White
@@ -24,8 +23,6 @@ from pipelines.simulation.recording import (
     sample_log,
 )
 from pipelines.simulation.scenario import Formation, Lens, Limits
-
-Float = NDArray[np.float64]
 
 
 def flight(rate_hz: int = 100) -> DronePaths:

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool
 from pipelines.session.storage import hash_of
 from pipelines.simulation.flight import (
     SimulatedFlight,
@@ -18,8 +18,6 @@ from pipelines.simulation.flight import (
 )
 from pipelines.simulation.scenario import Scenario
 from pipelines.simulation.surfaces import hidden_by
-
-Bool = NDArray[np.bool_]
 
 STANDING: dict[str, Any] = {"motion": [{"stand": {"seconds": 1}}]}
 WALKING: dict[str, Any] = {"motion": [{"walk": {"distance_m": 6}}]}

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.session.skeletons import mirrored
 from pipelines.simulation.walk import COCO17, route, stride_m, walk
-
-Float = NDArray[np.float64]
 
 LIMBS = {  # fractions of the body's height, Drillis & Contini
     ("hip", "knee"): 0.530 - 0.285,

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.geodesy import Place, place_at
 from pipelines.geometry.poses import (
     matrix_from_quaternion,
@@ -24,7 +25,6 @@ from pipelines.geometry.poses import (
 )
 from tests.synthetic.flights import SyntheticFlight
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 HOME = Place(40.4433, -79.9436, 280.0)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
 from pipelines.geometry.noise import disturb
 from pipelines.geometry.poses import invert, look_at, rotation_vector_from_quaternion
@@ -21,7 +22,6 @@ from pipelines.simulation.flight_files import Sighting, write_alphapose, write_j
 from pipelines.simulation.observe import KeypointNoise, detect, see
 from pipelines.simulation.walk import COCO17, route, walk
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 START_NS = 1_700_000_000_000_000_000

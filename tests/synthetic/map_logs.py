@@ -13,6 +13,7 @@ from rosbags.typesys import get_types_from_msg
 
 from pipelines.formats.logs.map_topics import OCCUPANCY_GRID, OCTOMAP, POINT_CLOUD
 from pipelines.formats.maps.octomap_writing import write_octomap
+from pipelines.geometry.arrays import Float
 from pipelines.session.records import Occupancy
 from tests.synthetic.logged_flights import header
 from tests.synthetic.logs import ROS1, ROS2, Entry
@@ -25,7 +26,6 @@ for _store in (ROS1, ROS2):
         )
     )
 
-Float = NDArray[np.float64]
 Pose = tuple[tuple[float, ...], tuple[float, ...]]
 """Position and quaternion."""
 

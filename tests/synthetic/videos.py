@@ -8,9 +8,8 @@ from pathlib import Path
 
 import av
 import numpy as np
-from numpy.typing import NDArray
 
-Picture = NDArray[np.uint8]
+from pipelines.geometry.arrays import Picture
 
 _BLOCK = 20
 SIZE = (16 * _BLOCK, 96)  # width, height of the pictures, as coded

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float
 
 # k1 k2 p1 p2 k3 k4 k5 k6; the further ones of OpenCV (prism, tilt) are rare and mostly zero.
 _MOST_COEFFICIENTS = 8

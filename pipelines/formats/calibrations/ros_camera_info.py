@@ -11,8 +11,9 @@ from pipelines.formats.calibrations.camera_matrices import intrinsics
 from pipelines.formats.common.summaries import describe_cameras
 from pipelines.formats.common.text_tables import read_head, read_text
 from pipelines.formats.common.yaml_text import numbers, read_yaml
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.records import CalibratedCamera, Float
+from pipelines.session.records import CalibratedCamera
 
 _FISHEYE = {"equidistant", "fisheye"}
 # Drivers write an empty model if they were never calibrated, or if the lens has no distortion.

@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bytes
 from pipelines.session.errors import DataError
 from pipelines.session.storage import as_data_error, is_special, refuse_special
 
 LONGEST_HEADER = 64 * 1024
-
-Bytes = NDArray[np.uint8]
 
 
 def read_bytes(path: Path) -> bytes:

@@ -12,15 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Bool = NDArray[np.bool_]
 
 SECONDS, MILLISECONDS, MICROSECONDS, NANOSECONDS = 9, 6, 3, 0
 """Units of time, each as the power of ten by which it exceeds a nanosecond."""

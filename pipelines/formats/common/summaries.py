@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.session.records import CalibratedCamera, Float, Int64, JointMotion, Trajectory
+from pipelines.geometry.arrays import Float
+from pipelines.session.records import CalibratedCamera, Int64, JointMotion, Trajectory
 
 GAP_STEPS = 5
 """A gap is a step of more than this many median steps."""

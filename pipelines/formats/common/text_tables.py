@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float
 from pipelines.session.storage import is_special, refuse_special
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.text_tables import read_text
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float
 from pipelines.session.yaml_reading import plain_yaml
 
 _LARGEST = 1 << 20  # characters; the parser is slow, and calibrations are far smaller

@@ -23,7 +23,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.stamps import Bool
 from pipelines.formats.common.summaries import describe_times
 from pipelines.formats.common.text_tables import read_head
 from pipelines.formats.drone_logs.telemetry_rows import (
@@ -36,8 +35,9 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     whatever_from,
 )
 from pipelines.formats.poses.pose_rows import longest_rising
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 from pipelines.session.telemetry import AttitudeTrack, Height, Telemetry, TelemetryChoice
 
 _TIMECODE = r"(\d+):([0-5]\d):([0-6]\d)[,.](\d{3})"  # a Matrice 300 ends its 60th second at :60

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.stamps import Bool
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
     of_angles,
@@ -24,11 +23,12 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     world_from_heading,
 )
 from pipelines.formats.drone_logs.ulog_file import MAGIC, Topic, open_ulog, topics_of
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.geodesy import Place, enu_from_enu
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 from pipelines.session.telemetry import AttitudeTrack, PositionTrack, Telemetry, TelemetryChoice
 
 _FAR_OFF_NS = 5_000_000_000  # a stamp this far from most others is wrong

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.formats.common.stamps import Bool
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.session.errors import DataError
 from pipelines.session.extras import need
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 
 MAGIC = b"ULog\x01\x12\x35"
 _MOST_FIELDS = 20_000  # of one message with its nested types; PX4's largest has some hundreds

@@ -21,6 +21,7 @@ from pipelines.formats.flights.telemetry_poses import Origin, TelemetryPoses
 from pipelines.formats.flights.world_axes import body_in_enu, in_enu, in_world, refuse_projected
 from pipelines.formats.logs.map_topics import LoggedMaps
 from pipelines.formats.maps.ros_map import FORMAT as ROS_MAP
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.mounting import (
@@ -41,14 +42,7 @@ from pipelines.session.manifest import (
     Plan,
     TruthJoints,
 )
-from pipelines.session.records import (
-    Detections,
-    Float,
-    JointMotion,
-    Occupancy,
-    Trajectory,
-    VideoIndex,
-)
+from pipelines.session.records import Detections, JointMotion, Occupancy, Trajectory, VideoIndex
 from pipelines.session.registries import (
     FORMATS,
     JointFormat,

@@ -6,10 +6,11 @@ import numpy as np
 
 from pipelines.formats.drone_logs.telemetry_rows import turned_as_stated
 from pipelines.formats.flights.flight_logs import FlightLogs
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.geometry.poses import interpolate_poses
 from pipelines.session.manifest import Axes, Gimbal
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 from pipelines.session.telemetry import AttitudeTrack
 
 _FIXED = "fixed angles"

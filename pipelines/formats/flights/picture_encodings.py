@@ -6,11 +6,9 @@ Names and layouts are those of ROS' sensor_msgs/image_encodings.hpp, which Foxgl
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Picture
 from pipelines.session.records import PictureSample
-
-Picture = NDArray[np.uint8]
 
 _LAYOUTS: dict[str, tuple[int, str | None]] = {
     "mono8": (1, "GRAY2BGR"),

@@ -11,11 +11,12 @@ from typing import NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 
-from pipelines.formats.flights.picture_encodings import KNOWN, Picture, decode, is_known
+from pipelines.formats.flights.picture_encodings import KNOWN, decode, is_known
 from pipelines.formats.logs.messages import all_samples
 from pipelines.formats.logs.picture_layouts import HEAD_LENGTH, picture_decoder, read_stamps
 from pipelines.formats.logs.recordings import OpenLog, messages_alike
 from pipelines.formats.videos.video import VideoReader
+from pipelines.geometry.arrays import Picture
 from pipelines.session.description import Description, MediaEntry
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, PictureSample, Sample

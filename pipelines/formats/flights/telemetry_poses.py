@@ -17,6 +17,7 @@ from pipelines.formats.flights.flight_logs import FlightLogs
 from pipelines.formats.flights.gimbal_angles import attitudes_at, stated_angles
 from pipelines.formats.flights.log_times import world_times
 from pipelines.formats.flights.world_axes import in_world
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place, enu_from_enu, enu_from_geodetic
 from pipelines.geometry.mounting import attitude_in_enu, compose_gimbal, compose_mount, level_heading
@@ -29,7 +30,7 @@ from pipelines.geometry.poses import (
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Camera, Flight, PoseSource
 from pipelines.session.manifest import Log as LogSource
-from pipelines.session.records import Float, Int64, Trajectory
+from pipelines.session.records import Int64, Trajectory
 from pipelines.session.registries import FORMATS
 from pipelines.session.telemetry import (
     AttitudeTrack,

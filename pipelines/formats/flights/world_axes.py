@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.geodesy import Place
 from pipelines.geometry.mounting import flu_body_from_frd
 from pipelines.geometry.pose_covariance import carried_covariance
@@ -18,7 +19,7 @@ from pipelines.geometry.poses import (
 )
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Axes, Log
-from pipelines.session.records import Float, Trajectory
+from pipelines.session.records import Trajectory
 
 _FARTHEST_M = 100_000.0  # from the origin: no drone flies so far, and UTM eastings begin at 166 km
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.formats.keypoint_files.keypoint_json import (
     first_entry,
@@ -25,10 +24,9 @@ from pipelines.formats.keypoint_files.keypoint_json import (
     whole_number,
 )
 from pipelines.formats.keypoint_files.keypoint_people import Gathering, choose_skeleton, describe_detections
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import Detections
-
-Float = NDArray[np.float64]
 
 
 class Coco:

@@ -9,11 +9,9 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-
-Float = NDArray[np.float64]
 
 _SAMPLED_FILES = 8
 _FRAME_LIMIT = 2**62  # keeps frame numbers and their differences inside int64

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.keypoint_files.keypoint_json import frame_number, json_files, load_json
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import Detections
 from pipelines.session.skeletons import SKELETONS, Skeleton, get_skeleton, skeleton_with
-
-Float = NDArray[np.float64]
 
 _FARTHEST_PX = 1_000_000  # far larger than any picture: beyond it the file is faulty
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.formats.keypoint_files.keypoint_json import (
     frame_number,
@@ -22,10 +21,9 @@ from pipelines.formats.keypoint_files.keypoint_json import (
     whole_number,
 )
 from pipelines.formats.keypoint_files.keypoint_people import Gathering, choose_skeleton, describe_detections
+from pipelines.geometry.arrays import Float
 from pipelines.session.records import Detections
 from pipelines.session.skeletons import SKELETONS
-
-Float = NDArray[np.float64]
 
 
 class OpenPose:

@@ -24,10 +24,11 @@ from pipelines.formats.logs.map_topics import (
 from pipelines.formats.logs.messages import bytes_of
 from pipelines.formats.maps.placed_grids import Pose
 from pipelines.formats.maps.point_voxels import VoxelSet
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import transform
 from pipelines.session.errors import DataError
 from pipelines.session.maps import MOST_VOXELS
-from pipelines.session.records import Float, Message
+from pipelines.session.records import Message
 
 MOST_CLOUD_MAPS = 10
 """Largest number of times at which the points so far become a map."""

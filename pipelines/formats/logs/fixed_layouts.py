@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from pipelines.formats.logs.message_decoders import Schema, is_standard
 from pipelines.formats.logs.recordings import UnlikeError, messages_alike
-from pipelines.session.records import Float, Int64
+from pipelines.geometry.arrays import Float
+from pipelines.session.records import Int64
 from pipelines.session.registries import Log
 
 Messages = tuple[Int64, NDArray[np.uint8]]

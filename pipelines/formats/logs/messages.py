@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from pipelines.formats.calibrations.camera_matrices import intrinsics
 from pipelines.formats.logs.picture_layouts import PictureFields
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import (
     AngleSample,
-    Float,
     IntrinsicsSample,
     Message,
     PictureSample,

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.session.records import Float, Int64, Occupancy
+from pipelines.geometry.arrays import Float
+from pipelines.session.records import Int64, Occupancy
 
 MOST_CUBES = 1_000_000
 _SLAB = 16  # layers that are searched together

@@ -22,7 +22,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.formats.common.binary_files import Bytes, first_bytes, read_bytes, split_header
+from pipelines.formats.common.binary_files import first_bytes, read_bytes, split_header
+from pipelines.geometry.arrays import Bytes
 from pipelines.session.errors import DataError
 from pipelines.session.maps import check_resolution, check_size, describe_grid
 from pipelines.session.records import Occupancy

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.maps.octree_kernels import DEPTH, FREE, INNER, OCCUPIED
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, Occupancy
+from pipelines.session.records import Occupancy
 
 States = NDArray[np.uint8]
 Int64 = NDArray[np.int64]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bytes
 from pipelines.geometry.compilation import cached
 
 DEPTH = 16
@@ -16,7 +17,6 @@ BREAKS_OFF, TOO_DEEP = -1, -2
 
 Int32 = NDArray[np.int32]
 Float32 = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
 
 # The stack holds at most seven siblings of every level above the current node, and its eight children.
 _STACK = 8 * (DEPTH + 1)

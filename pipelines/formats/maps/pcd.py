@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.binary_files import Bytes, first_bytes, read_bytes, split_header
+from pipelines.formats.common.binary_files import first_bytes, read_bytes, split_header
 from pipelines.formats.maps.point_voxels import (
     check_count,
     describe_points,
@@ -24,8 +24,9 @@ from pipelines.formats.maps.point_voxels import (
     packed_points,
     written_points,
 )
+from pipelines.geometry.arrays import Bytes, Float
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, Occupancy
+from pipelines.session.records import Occupancy
 
 _KINDS = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 _NUMPY_KIND = {"F": "f", "I": "i", "U": "u"}

@@ -15,10 +15,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.errors import DataError
 from pipelines.session.maps import check_size
-from pipelines.session.records import Float, Occupancy
+from pipelines.session.records import Occupancy
 
 Pose = tuple[Float, Float]
 """Position [3] and quaternion [4] of one frame in another."""

@@ -18,8 +18,9 @@ from pipelines.formats.maps.point_voxels import (
     packed_points,
     written_points,
 )
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, Occupancy
+from pipelines.session.records import Occupancy
 
 _TYPES = {
     "char": "i1",

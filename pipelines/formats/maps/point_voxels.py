@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.formats.common.binary_files import Bytes
+from pipelines.geometry.arrays import Bytes, Float
 from pipelines.session.errors import DataError
 from pipelines.session.maps import MOST_VOXELS, check_resolution, check_size, describe_grid
-from pipelines.session.records import Float, Occupancy
+from pipelines.session.records import Occupancy
 
 DEFAULT_RESOLUTION_M = 0.2
 

@@ -24,9 +24,10 @@ from pipelines.formats.common.binary_files import first_bytes, read_bytes
 from pipelines.formats.common.stated_paths import leads_out
 from pipelines.formats.common.text_tables import read_head
 from pipelines.formats.common.yaml_text import numbers, read_yaml
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.maps import check_resolution, check_size, describe_grid
-from pipelines.session.records import Float, Occupancy
+from pipelines.session.records import Occupancy
 
 HEIGHT_M = 2.5
 """Height of the walls: an ordinary storey. Drones above it are above the map."""

@@ -13,8 +13,9 @@ from pipelines.formats.common.stamps import cell_name, parse_stamps, stamp_colum
 from pipelines.formats.common.summaries import describe_trajectory
 from pipelines.formats.common.text_tables import TextTable, parse_table, read_head, read_text
 from pipelines.formats.poses.pose_rows import clean_poses
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, Trajectory
+from pipelines.session.records import Trajectory
 
 _POSITION = ("x", "y", "z")
 _QUATERNION = ("qx", "qy", "qz", "qw")

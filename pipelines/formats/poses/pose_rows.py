@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.stamps import Bool
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, Int64, Trajectory
+from pipelines.session.records import Int64, Trajectory
 
 FARTHEST_M = 1e9
 """Largest coordinate: beyond the Moon, so no pose of a flight; squares of much larger ones overflow."""

@@ -33,9 +33,10 @@ from pipelines.formats.maps.map_surfaces import surface_of
 from pipelines.formats.scenes.jpegs import as_jpeg
 from pipelines.formats.scenes.uncertainty import ellipsoids_95
 from pipelines.formats.skeletons.even_frames import thinned
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, JointMotion, Recording, Trajectory
+from pipelines.session.records import JointMotion, Recording, Trajectory
 from pipelines.session.skeletons import bones_of, with_derived
 
 _TF_HZ, _ELLIPSOIDS_HZ, _PATH_HZ, _STANDING_HZ = 50.0, 10.0, 10.0, 1.0

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import quaternion_from_matrix
-from pipelines.session.records import Float
 
 CHI2_95 = 7.815
 """95 % of a Gaussian in three dimensions lie within {x : x' S^-1 x = 7.815} (chi-square)."""

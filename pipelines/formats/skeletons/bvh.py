@@ -22,9 +22,10 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.text_tables import read_head, read_text
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import multiply, rotate
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, SkeletalMotion
+from pipelines.session.records import SkeletalMotion
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 AXES = ("y-up", "z-up")

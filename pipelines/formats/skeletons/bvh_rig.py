@@ -25,14 +25,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.poses import conjugate, multiply, quaternion_from_matrix, rotate
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, JointMotion, SkeletalMotion
+from pipelines.session.records import JointMotion, SkeletalMotion
 from pipelines.session.skeletons import take_joints, with_derived
-
-Bool = NDArray[np.bool_]
 
 _AHEAD_UP = (0.5, 0.0, np.sqrt(0.75))
 _AHEAD_DOWN = (np.sqrt(0.75), 0.0, -0.5)

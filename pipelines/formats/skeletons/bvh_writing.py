@@ -10,9 +10,10 @@ from pipelines.formats.common.export_names import people_of
 from pipelines.formats.skeletons.bvh import METRES
 from pipelines.formats.skeletons.bvh_rig import Rigged, fit_rig
 from pipelines.formats.skeletons.even_frames import at_even_times
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, Recording, SkeletalMotion
+from pipelines.session.records import Recording, SkeletalMotion
 
 _IN_FILE = {"y-up": [1, 2, 0], "z-up": [0, 1, 2]}  # indices of the world's axes that are the file's x, y, z
 _DECIMALS = 6  # of a degree and of the unit

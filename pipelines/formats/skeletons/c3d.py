@@ -25,9 +25,10 @@ from pipelines.formats.common.summaries import describe_motion
 from pipelines.formats.skeletons.even_frames import EvenMotion, at_even_times
 from pipelines.formats.skeletons.joint_axes import METRES, to_metres_z_up, to_y_up
 from pipelines.formats.skeletons.trc import joint_names, marker_name, metric_unit
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.extras import need
-from pipelines.session.records import Float, Int64, JointMotion, Recording
+from pipelines.session.records import Int64, JointMotion, Recording
 from pipelines.session.storage import as_data_error
 
 _BLOCK = 512

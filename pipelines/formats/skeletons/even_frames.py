@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import interpolate_points
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress
-from pipelines.session.records import Float, Int64, JointMotion
+from pipelines.session.records import Int64, JointMotion
 
 _KEPT_NS = 500_000  # a sample this near to its frame keeps its position: 1 mm of a hand at 2 m/s
 _LONGEST_STEP = 1.5  # in frame steps: nothing is interpolated between times further apart

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 AXES = ("z-up", "y-up")

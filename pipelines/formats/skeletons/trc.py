@@ -20,8 +20,9 @@ from pipelines.formats.common.stamps import format_seconds, parse_stamps
 from pipelines.formats.common.summaries import describe_motion, median_step_ns
 from pipelines.formats.common.text_tables import read_head, read_text
 from pipelines.formats.skeletons.joint_axes import METRES, to_metres_z_up, to_y_up
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, JointMotion, Recording
+from pipelines.session.records import JointMotion, Recording
 from pipelines.session.skeletons import SKELETONS
 
 _UNITS = {

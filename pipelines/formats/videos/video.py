@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.formats.common.summaries import describe_times
 from pipelines.formats.videos.containers import container_format, is_shown, open_container, packets
+from pipelines.geometry.arrays import Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, VideoIndex
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.stream import VideoStream
 
-Picture = NDArray[np.uint8]  # [height, width, 3] blue, green, red
 
 _LATEST_S = 4 * 10**9  # the year 2096, counted from the epoch; int64 ns hold 292 years
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Picture
 from pipelines.session.records import Int64
 
 if TYPE_CHECKING:
@@ -20,8 +20,6 @@ TICK_S = Fraction(1, 90_000)
 
 # The edit list that shifts a part to its start counts in the movie's own unit, by default 1 ms.
 _OPTIONS = {"movflags": "faststart", "movie_timescale": str(TICK_S.denominator)}
-
-Picture = NDArray[np.uint8]
 
 
 def write_h264(

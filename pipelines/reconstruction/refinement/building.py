@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.reconstruction.refinement.problem import Pictures, Problem
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 KNOT_S = 0.5
 """Distance of the knots between which slow pose errors are linear; deviations from that count as white."""

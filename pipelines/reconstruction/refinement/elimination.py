@@ -19,13 +19,13 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.refinement import kernels, sweeps
 from pipelines.reconstruction.refinement.halves import Half, halved
 from pipelines.reconstruction.refinement.problem import State
 from pipelines.reconstruction.refinement.system import System
 from pipelines.session.side_by_side import Halt, side_by_side
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Part = TypeVar("Part")
 Result = TypeVar("Result")

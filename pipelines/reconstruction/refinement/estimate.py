@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.refinement.elimination import (
     Eliminated,
     eliminate,
@@ -21,8 +21,6 @@ from pipelines.reconstruction.refinement.problem import (
     lay_out,
 )
 from pipelines.reconstruction.refinement.system import System, misfit, prior_cost
-
-Float = NDArray[np.float64]
 
 BOUND = 3.5
 """Residual, in standard deviations, beyond which an image point's weight falls: one good view in 450."""

@@ -14,10 +14,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.refinement.problem import State
 from pipelines.reconstruction.refinement.system import System
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Value = TypeVar("Value", bound=np.generic)
 

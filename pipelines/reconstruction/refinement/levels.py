@@ -13,10 +13,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.refinement.elimination import Eliminated, Moments, moments
 from pipelines.reconstruction.refinement.problem import (
     ROTATION,
@@ -27,8 +27,6 @@ from pipelines.reconstruction.refinement.problem import (
     State,
 )
 from pipelines.reconstruction.refinement.system import System
-
-Float = NDArray[np.float64]
 
 _GAP = 3.0  # usual steps: between stretches of a flight
 _EVERY = 3  # pictures of every third time are enough to estimate image noise and white errors

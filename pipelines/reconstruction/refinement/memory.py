@@ -10,12 +10,10 @@ relative to the other joints. Residuals show only a part of the error, see `memo
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.refinement.problem import State
 from pipelines.reconstruction.refinement.system import System, misfit
-
-Float = NDArray[np.float64]
 
 _LONGEST_S = 2.0  # lags up to here
 _STOPS = 0.02  # an autocorrelation below this is chance; the sum stops there

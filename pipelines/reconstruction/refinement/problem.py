@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import Bias, Drift, GaussMarkov, Latency, NoiseModel, White
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 SHIFT_IN_WORLD, ROTATION, SHIFT_IN_CAMERA, CLOCK = 0, 3, 6, 9

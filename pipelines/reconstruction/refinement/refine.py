@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.refinement.building import Sighting, build
 from pipelines.reconstruction.refinement.elimination import (
     Eliminated,
@@ -37,7 +38,6 @@ from pipelines.reconstruction.refinement.problem import (
 )
 from pipelines.reconstruction.refinement.system import System, misfit
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 _WINDOWS, _WINDOW = 3, 100  # stretches of the flight, in times, from which the prior is found

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached, helper
 from pipelines.reconstruction.refinement.kernels import (
     NUMBERS,
@@ -20,7 +21,6 @@ from pipelines.reconstruction.refinement.kernels import (
     posterior_of_picture,
 )
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 _STRIP = 48  # rows; with fewer, products are too small to be fast

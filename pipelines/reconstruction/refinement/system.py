@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.refinement import kernels
 from pipelines.reconstruction.refinement.problem import EXACT, Knowledge, Layout, PoseErrors, Problem, State
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 # Its arguments are assembled from tuples, whose lengths mypy does not know.

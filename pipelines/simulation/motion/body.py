@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import multiply, rotate
 from pipelines.simulation.motion import gait
 from pipelines.simulation.motion.feet import Foot, foot_over_time, sole_of
@@ -17,7 +17,6 @@ from pipelines.simulation.motion.plan import Plan
 from pipelines.simulation.motion.turns import about, partly
 from pipelines.simulation.rig import BONE, BONES, SIDES, BodyMotion, Rig
 
-Float = NDArray[np.float64]
 Heights = Callable[[Float], Float]
 
 _WALKING_SOFTNESS_M, _RUNNING_SOFTNESS_M = 0.006, 0.026

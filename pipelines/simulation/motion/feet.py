@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import multiply, rotate
 from pipelines.simulation.motion.gait import Roll, roll
 from pipelines.simulation.motion.keys import Keys
@@ -21,7 +21,6 @@ from pipelines.simulation.motion.plan import Footstep
 from pipelines.simulation.motion.turns import about
 from pipelines.simulation.rig import BONE, SIDES, Rig
 
-Float = NDArray[np.float64]
 Heights = Callable[[Float], Float]
 
 _FULL_SWING_M = 1.3  # of a leg of 0.93 m

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from pipelines.geometry.arrays import Float
 
 _SAME_MOMENT_S = 1e-6
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.simulation.motion.feet import Foot
 from pipelines.simulation.motion.turns import about, from_axes, unit
 from pipelines.simulation.rig import BONE, SIDES, Rig
-
-Float = NDArray[np.float64]
 
 _HANGS_FREE_M = 0.02  # allowed height of the pelvis above the reach of a leg that does not carry
 _STRETCHED_M = 0.002  # near a straight limb, its reach is softened over about this length

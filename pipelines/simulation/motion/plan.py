@@ -6,13 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.simulation.motion import gait
 from pipelines.simulation.motion.keys import Keys
 from pipelines.simulation.motion.ways import Pace, Part, Way, pace
 
-Float = NDArray[np.float64]
 Curve = Callable[[Float], Float]
 
 LEFT, RIGHT = 0, 1

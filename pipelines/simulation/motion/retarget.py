@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.session.errors import DataError
 from pipelines.session.records import SkeletalMotion
@@ -15,8 +16,6 @@ from pipelines.simulation.motion.bone_names import match_bones
 from pipelines.simulation.motion.legs import two_bones
 from pipelines.simulation.motion.turns import about, between, partly
 from pipelines.simulation.rig import BONE, BONES, SIDES, BodyMotion, Rig, joint_centres, sole_points
-
-Float = NDArray[np.float64]
 
 _END_OF_LIMB = {"thigh": "shank", "shank": "foot", "upper_arm": "forearm", "forearm": "hand", "foot": "toes"}
 _FLAT_FOOT = np.radians(30.0)  # feet that point down by less than this in the rest pose are meant to stand

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.simulation.motion import gait
 from pipelines.simulation.motion.actions import crouch, kick, reach
 from pipelines.simulation.motion.body import Style, bodies
@@ -14,8 +14,6 @@ from pipelines.simulation.motion.plan import Plan
 from pipelines.simulation.motion.ways import Part
 from pipelines.simulation.rig import BONE, BodyMotion, Rig
 from pipelines.simulation.scenario import Step, Travel
-
-Float = NDArray[np.float64]
 
 _STOPS_AT_CORNER = np.radians(50.0)
 _PAUSE_S = 0.25

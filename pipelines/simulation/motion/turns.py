@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import (
     conjugate,
     multiply,
@@ -12,8 +12,6 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
     rotation_vector_from_quaternion,
 )
-
-Float = NDArray[np.float64]
 
 
 def about(axis: int, angle: Float) -> Float:

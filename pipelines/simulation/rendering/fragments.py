@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached
 from pipelines.simulation.rendering.meshes import GROUND, SMOOTH, Mesh
 from pipelines.simulation.rendering.raster import NOTHING, SHIFTS_PX, SUBROWS, Band
 
-Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
 UInt8 = NDArray[np.uint8]

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached, helper
 from pipelines.simulation.rendering.fragments import Fragments, View
 
-Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 

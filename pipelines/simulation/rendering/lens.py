@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, undistort
 
-Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
 _KNOT_PX = 8  # between rays that are solved for; a cubic spline lies between, right to 1e-5 px

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.simulation.rendering.fragments import View, gather, room_for
@@ -30,10 +31,8 @@ from pipelines.simulation.rendering.shading import shade
 from pipelines.simulation.rendering.shadows import ShadowMap, shadow_map, sun_axes, sunlight
 from pipelines.simulation.surfaces import Surface
 
-Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
-Bool = NDArray[np.bool_]
 
 _BAND_ROWS = 16  # pixel rows whose samples fit a processor's cache
 _STATIC_TEXEL_M, _STATIC_TEXELS = 0.02, 2048

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached
 from pipelines.simulation.rendering.fragments import Fragments
 from pipelines.simulation.rendering.meshes import Mesh
 from pipelines.simulation.rendering.raster import CENTRES_PX, Projected, draw, empty_band
 
-Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from pipelines.geometry.arrays import Float
 
 STEP_S = 1e-3
 """Longest time between moments: 1 px of an image that moves by 1,000 px/s.

@@ -14,11 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, undistort
 from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import matrix_from_quaternion, rates
 from pipelines.geometry.triangulation import Views
-from pipelines.session.records import Float, Int64
+from pipelines.session.records import Int64
 from pipelines.simulation.body import Person, make_body
 from pipelines.simulation.detector_errors import detect_keypoints, view_of
 from pipelines.simulation.drone_paths import orbit

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import common, measure
 from pipelines.geometry.triangulation import Views, reprojection_px
-from pipelines.session.records import Float
 from pipelines.simulation.study.filming import Formation, Sightings, Walk, exact_keypoints
 
 NEAR_SHARE = 0.1

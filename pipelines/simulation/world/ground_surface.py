@@ -7,11 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.simulation import scenario
 from pipelines.simulation.surfaces import Surface
 from pipelines.simulation.world.terrain import Terrain
 
-Float = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 _FAR_M = 2000.0  # beyond, the horizon is less than two pixels away for a drone at 5 m

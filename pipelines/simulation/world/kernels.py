@@ -19,10 +19,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.compilation import cached, helper
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 GRAZE_M = 1e-3
 """Allowed depth of a line of sight in the ground, m; steps can overlook another such depth."""

@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.simulation.surfaces import Surface, joined
 from pipelines.simulation.world.obstacles import Obstacles
 
-Float = NDArray[np.float64]
 Faces = NDArray[np.int32]
 
 _SIDES = 10  # of a trunk

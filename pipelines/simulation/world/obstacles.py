@@ -7,13 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.simulation import scenario
 from pipelines.simulation.world.terrain import Terrain
-
-Float = NDArray[np.float64]
 
 _CROWN_SHARE = 0.62  # of a tree's height
 _TRUNK_SHARE = 0.03  # its radius, of the tree's height

@@ -7,14 +7,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool
 from pipelines.session.records import Occupancy
 from pipelines.simulation import scenario
 from pipelines.simulation.world import kernels
 from pipelines.simulation.world.obstacles import Obstacles
 from pipelines.simulation.world.terrain import Terrain
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 _TOUCH_M = 1e-9  # level ground on the border between two voxels fills the lower one alone
 _FINE_ENOUGH = 0.05  # of a voxel: allowed rise of the ground between samples

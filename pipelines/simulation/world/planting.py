@@ -6,12 +6,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.simulation import scenario
-
-Float = NDArray[np.float64]
 
 _TRIES = 200  # places tried for each tree
 _APART = 0.9  # crown radii between the trunks of two trees: crowns may mingle, trees do not coincide

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.session.records import Occupancy
 from pipelines.simulation import scenario
 from pipelines.simulation.surfaces import Surface
@@ -17,9 +17,6 @@ from pipelines.simulation.world.obstacles import Obstacles, erect
 from pipelines.simulation.world.occupancy import map_world
 from pipelines.simulation.world.planting import plant
 from pipelines.simulation.world.terrain import Terrain, raise_mounds
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

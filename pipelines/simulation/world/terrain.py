@@ -7,12 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.simulation import scenario
 from pipelines.simulation.world import kernels
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,15 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from pipelines.formats.flights.calibration_sources import CalibrationSources
 from pipelines.formats.flights.flight_logs import FlightLogs
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Camera, Flight
 from pipelines.session.records import Detections
 from tests.commands.runner import refused, succeeds
 from tests.synthetic.flights import LENS, SyntheticFlight, write_flight
-
-Float = NDArray[np.float64]
 
 WIDTH, HEIGHT = 1280, 720
 LENS_OF = {"width": WIDTH, "height": HEIGHT, "fx": 800, "fy": 800, "cx": 640, "cy": 360}

@@ -6,15 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pipelines.formats.flights.picture_encodings import KNOWN, decode
 from pipelines.formats.flights.pictures import LoggedPictures
+from pipelines.geometry.arrays import Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import PictureSample
 from tests.synthetic.logs import CONTAINERS, Container, Entry, write_log
-
-Picture = NDArray[np.uint8]
 
 WIDTH, HEIGHT = 16, 12
 BLUE, GREEN, RED = 40, 120, 200

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.formats.maps import lzf, pcd
+from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float
 from pipelines.session.registries import MapFormat
 from tests.formats import clouds
 from tests.formats.damaged_maps import refuse_or_read

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from pipelines.formats.skeletons import bvh
 from pipelines.formats.skeletons.bvh import read_motion
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion, multiply, rotate
 from pipelines.session.errors import DataError
 from pipelines.session.records import SkeletalMotion
@@ -22,7 +22,6 @@ from pipelines.session.registries import Format
 from tests.real_data import real_data
 
 READER: Format = bvh.FORMAT
-Float = NDArray[np.float64]
 
 HIERARCHY = """HIERARCHY
 ROOT Hips

@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 from pipelines.formats.skeletons import bvh_writing
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.skeletons.bvh_rig import fit_rig, joint_positions
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.errors import DataError
-from pipelines.session.records import Float, JointMotion
+from pipelines.session.records import JointMotion
 from pipelines.session.registries import ChoiceOfAxes
 from pipelines.session.skeletons import take_joints, with_derived
 from tests.formats.exported import Listener, recording, walking, without

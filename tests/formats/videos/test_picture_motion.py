@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pipelines.formats.videos.picture_motion import followed_points
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
 from pipelines.geometry.film_start import fit_start
 from pipelines.geometry.poses import look_at
@@ -22,8 +23,6 @@ from pipelines.session.storage import read_json
 from pipelines.simulation.flight_files import write_tum
 from tests.commands.runner import refused, succeeds
 from tests.keypoints.spotted_flights import FPS, write_pictures
-
-Float = NDArray[np.float64]
 
 START_S = 1_700_000_000
 BEGINS_S = 7.2345  # start of the video after that of the log

@@ -6,14 +6,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import conjugate, multiply
 from pipelines.simulation.motion.script import perform
 from pipelines.simulation.rig import BONE, SIDES, BodyMotion, Rig, average_rig, joint_centres, sole_points
 from pipelines.simulation.scenario import Step
-
-Float = NDArray[np.float64]
 
 RIG = average_rig()
 

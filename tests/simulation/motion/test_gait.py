@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.simulation.body import make_body
 from pipelines.simulation.motion import gait
 from pipelines.simulation.rig import BONE, BONES, BodyMotion, Rig, average_rig, joint_centres
@@ -25,8 +25,6 @@ from tests.simulation.motion.performing import (
     slope,
 )
 from tests.simulation.motion.published_gait import AT_TOE_OFF, EVENTS, Event, stance_share
-
-Float = NDArray[np.float64]
 
 PENETRATION_M = 0.003
 ON_GROUND_M = 0.002  # a heel that comes down or a tip that lifts passes it within 1 % of a stride

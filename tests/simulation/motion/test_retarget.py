@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.session.errors import DataError
@@ -15,8 +14,6 @@ from pipelines.simulation.motion.bone_names import match_bones
 from pipelines.simulation.motion.retarget import retarget
 from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES, joint_centres
 from tests.simulation.motion.performing import RIG, clearance_m, flat, mound, performed
-
-Float = NDArray[np.float64]
 
 OURS = ("pelvis", "spine", "back", "chest", "neck", "head")
 SIDED = ("clavicle", "upper_arm", "forearm", "hand", "thigh", "shank", "foot", "toes")

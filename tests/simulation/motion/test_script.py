@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import rotate
 from pipelines.simulation.rig import BONE, BONES, average_rig, joint_centres
 from tests.simulation.motion.performing import RIG, bent_deg, clearance_m, flat, mound, performed
-
-Float = NDArray[np.float64]
 
 SWAY_M = 0.012  # of somebody standing, both axes together
 

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.cameras import Intrinsics, project, row_delay_s, undistort
 from pipelines.geometry.poses import (
     invert,
@@ -31,8 +32,6 @@ from pipelines.simulation.rig import BONES
 from pipelines.simulation.scenario import Body
 from pipelines.simulation.surfaces import Surface, hidden_by
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 Pose = tuple[Float, Float]
 
 SUN = np.array([0.4, -0.3, 0.8])

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.simulation import scenario
 from pipelines.simulation.world import World, build_world
-
-Float = NDArray[np.float64]
 
 NOBODY: Float = np.zeros((0, 2))
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.simulation.surfaces import Surface
 from tests.simulation.world.sites import TREES, WALLS, everything, site
-
-Float = NDArray[np.float64]
 
 
 def within_faces(surface: Surface, per_face: int) -> Float:

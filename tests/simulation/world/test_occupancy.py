@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.session.records import Occupancy
 from tests.simulation.world.sites import TREES, WALLS, everything, site
-
-Float = NDArray[np.float64]
 
 
 def points_within(occupancy: Occupancy, per_side: int) -> Float:

@@ -9,12 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from pipelines.simulation.world.kernels import GRAZE_M
 from tests.simulation.world.sites import everything, site
-
-Float = NDArray[np.float64]
 
 # Height 10: the crown is 6.2 high about z = 6.9, the trunk 0.3 in radius and ends there.
 TREE = {"position": [1.0, 2.0], "height_m": 10.0, "crown_radius_m": 2.0}

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipelines.geometry.arrays import Float
 from pipelines.simulation import scenario
 from pipelines.simulation.world.terrain import Terrain
 from tests.simulation.world.sites import MOUNDS, everything, site
-
-Float = NDArray[np.float64]
 
 
 def closed_form(xy: Float) -> Float:

@@ -1,0 +1,10 @@
+"""The arrays that functions take and return, by what they hold."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+Index = NDArray[np.intp]
+Bytes = NDArray[np.uint8]
+Picture = NDArray[np.uint8]  # [height, width, 3], blue, green, red; or [height, width], grey
