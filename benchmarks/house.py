@@ -80,8 +80,8 @@ def imported(tree: ast.Module, modules: set[str]) -> set[str]:
     return found & modules
 
 
-def longest_chain(graph: dict[str, set[str]]) -> list[str]:
-    """Find the longest chain of imports; a module that is met again in its own chain ends it."""
+def longest_chains(graph: dict[str, set[str]]) -> dict[str, list[str]]:
+    """Find the longest chain of imports below each module; one met again in its own chain ends it."""
     best: dict[str, list[str]] = {}
     open_modules: set[str] = set()
 
@@ -94,7 +94,7 @@ def longest_chain(graph: dict[str, set[str]]) -> list[str]:
         best[module] = [module, *max(chains, key=len, default=[])]
         return best[module]
 
-    return max((below(module) for module in sorted(graph)), key=len)
+    return {module: below(module) for module in sorted(graph)}
 
 
 def parameters(node: Function) -> int:
@@ -144,9 +144,10 @@ def main() -> None:
     modules = {path: tree for path, tree in rooms.items() if path.name != "__init__.py"}
     lines = {path: len(path.read_text().splitlines()) for path in rooms}
     names = {name_of(path) for path in house}
-    chain = longest_chain(
+    chains = longest_chains(
         {name_of(path): imported(tree, names) - {name_of(path)} for path, tree in house.items()}
     )
+    chain = max(chains.values(), key=len)
     functions = [
         (parameters(node), f"{name_of(path)}.{node.name}")
         for path, tree in house.items()
@@ -182,7 +183,11 @@ def main() -> None:
     table = "\n".join(["| | |", "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows.items())])
     print(table)
     if options.worst:
-        print("\nlongest chain of imports:", *chain, sep="\n  ")
+        rooms_of = sorted({".".join(name.split(".")[:2]) for name in chains})
+        print("\nlongest chains of imports:")
+        for room in rooms_of:
+            longest = max((c for n, c in chains.items() if n == room or n.startswith(f"{room}.")), key=len)
+            print(f"{len(longest):3d} {room}: {' > '.join(longest)}")
         print("\nmost parameters:", *(f"{n:3d} {name}" for n, name in sorted(functions)[:-31:-1]), sep="\n  ")
         print("\ndocstrings:", *openers, sep="\n  ")
         print("\nphrases:", *phrases, sep="\n  ")
