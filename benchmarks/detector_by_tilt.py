@@ -44,7 +44,7 @@ from pipelines.session.records import Int64
 from pipelines.session.registries import find_detector
 from pipelines.session.skeletons import get_skeleton
 from pipelines.session.stages import locked
-from pipelines.session.tabular import detections_from, keypoints_table
+from pipelines.session.tables import detections_from, keypoints_table
 from pipelines.simulate import simulate
 from pipelines.simulation.detector_errors import ANY_JOINT, COLUMNS, MODELLED, errors_of, view_of
 from pipelines.simulation.flight import fly_scenario, visible_joints

@@ -17,9 +17,8 @@ import numpy as np
 
 from pipelines.ingest import ingest
 from pipelines.reconstruct import reconstruct
-from pipelines.session.tables import SKELETON, TRUTH, read_table
-from pipelines.session.tabular import motion_from
-from pipelines.session.true_joints import true_joints_at
+from pipelines.session.people import true_joints_at
+from pipelines.session.tables import SKELETON, TRUTH, motion_from, read_table
 from pipelines.simulate import simulate
 
 SAMPLE = Path(__file__).parents[1] / "sample_data" / "mound_walk"

@@ -13,7 +13,6 @@ import click
 from mocap_cli.options import any_path
 from mocap_cli.terminal import one_line, print_json, say
 from pipelines.session.errors import DataError, MocapError
-from pipelines.session.several import names_of
 
 Command = Callable[..., dict[str, Any] | None]
 
@@ -82,6 +81,8 @@ def _outputs(paths: list[Path], folder: Path | None, suffix: str) -> list[Path |
         raise DataError(
             folder, f"is {what}: several need a folder around them all", "give another --output, or none"
         )
+    from pipelines.session.stages import names_of
+
     return [folder / f"{name}{suffix}" for name in names_of(paths)]
 
 

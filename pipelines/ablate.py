@@ -25,9 +25,8 @@ from pipelines.keypoints.hints import project_actor
 from pipelines.reconstruction.refining_views import refined_points
 from pipelines.reporting.ablation import Row, draw, estimates, results_csv
 from pipelines.session.errors import DataError
-from pipelines.session.progress import Progress, Silent
+from pipelines.session.progress import Halt, Progress, Silent, side_by_side
 from pipelines.session.registries import Detector, find_detector, hashes_of_models
-from pipelines.session.side_by_side import Halt, side_by_side
 from pipelines.session.storage import hash_of, jsonable, read_json, sha256_of, write_json
 from pipelines.session.whole_folders import STUDY_MARK, is_made, refuse_sessions, whole_folder
 from pipelines.simulation.detector_errors import errors_of

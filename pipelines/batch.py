@@ -29,9 +29,9 @@ from pipelines.reporting.flights import COLUMNS, FlightRow, render_flights
 from pipelines.reporting.wording import cell_text
 from pipelines.session.description import read_description
 from pipelines.session.errors import BusyError, DataError, MocapError
-from pipelines.session.extras import need
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.several import names_of
+from pipelines.session.registries import need
+from pipelines.session.stages import names_of
 from pipelines.session.storage import as_data_error, read_json, write_json
 
 STAGES = ("ingest", "reconstruct", "replan-compare", "report")

@@ -35,8 +35,8 @@ from pipelines.session.description import (
     read_description,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.logged_actor import logged_actor
-from pipelines.session.progress import Progress, Silent
+from pipelines.session.people import logged_actor
+from pipelines.session.progress import Halt, Progress, Silent, side_by_side
 from pipelines.session.records import Detections, Int64
 from pipelines.session.registries import (
     Detector,
@@ -45,12 +45,19 @@ from pipelines.session.registries import (
     find_detector,
     hashes_of_models,
 )
-from pipelines.session.side_by_side import Halt, side_by_side
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import WritableSession
 from pipelines.session.storage import hash_of, read_json, write_json
-from pipelines.session.tables import FRAMES, KEYPOINTS, POSES, read_table, write_table
-from pipelines.session.tabular import keypoints_table, rows_between, trajectory_from
+from pipelines.session.tables import (
+    FRAMES,
+    KEYPOINTS,
+    POSES,
+    keypoints_table,
+    read_table,
+    rows_between,
+    trajectory_from,
+    write_table,
+)
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -29,8 +29,7 @@ from pipelines.session.registries import EXPORTS, ChoiceOfAxes, Export
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.stages import open_session, session_name
 from pipelines.session.storage import as_data_error, read_json, remove_tree, sha256_of, write_json
-from pipelines.session.tables import FRAMES, POSES, SKELETON, read_table
-from pipelines.session.tabular import motion_from, trajectory_from
+from pipelines.session.tables import FRAMES, POSES, SKELETON, motion_from, read_table, trajectory_from
 
 if TYPE_CHECKING:
     import pandas as pd

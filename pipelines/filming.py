@@ -32,15 +32,14 @@ from pipelines.reporting.frame_drawing import draw_frame, with_inlet
 from pipelines.reporting.overlays import View
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
-from pipelines.session.logged_actor import LoggedActor, logged_actor
+from pipelines.session.people import LoggedActor, logged_actor
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Int64, JointMotion
 from pipelines.session.registries import Detector, advice_on, find_detector, hashes_of_models
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import locked
 from pipelines.session.storage import hash_of, jsonable, read_json, sha256_of, write_json
-from pipelines.session.tables import REPLAN, TRUTH, read_table, write_table
-from pipelines.session.tabular import motion_table
+from pipelines.session.tables import REPLAN, TRUTH, motion_table, read_table, write_table
 from pipelines.session.whole_folders import SIMULATION_MARK
 from pipelines.simulation.body import Person
 from pipelines.simulation.flight import Set, build_set

@@ -27,8 +27,7 @@ from pipelines.session.description import CameraEntry, Description, Interpolatio
 from pipelines.session.errors import DataError, NotYetReadError
 from pipelines.session.manifest import Flight, read_flight
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.run_notes import note_sources
-from pipelines.session.stage_records import Stage, StageRecord
+from pipelines.session.stage_records import Stage, StageRecord, note_sources
 from pipelines.session.stages import Run, locked
 from pipelines.session.storage import read_json, write_json
 

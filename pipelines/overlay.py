@@ -24,14 +24,12 @@ from pipelines.reporting.motion import Motion, motion_from_skeleton
 from pipelines.reporting.overlays import FilmedCamera, status_at, views_of
 from pipelines.session.description import Description, MediaEntry, read_description
 from pipelines.session.errors import DataError
-from pipelines.session.progress import Progress, Silent
+from pipelines.session.progress import Halt, Progress, Silent, side_by_side
 from pipelines.session.records import Int64
-from pipelines.session.side_by_side import Halt, side_by_side
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, WritableSession, locked, open_session
 from pipelines.session.storage import read_json, write_json
-from pipelines.session.tables import FRAMES, SKELETON, read_table
-from pipelines.session.tabular import rows_between
+from pipelines.session.tables import FRAMES, SKELETON, read_table, rows_between
 
 OVERLAY = Stage("overlay", revision=5)
 

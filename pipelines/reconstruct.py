@@ -63,14 +63,13 @@ from pipelines.reconstruction.tables import camera_poses_table, skeleton_table
 from pipelines.reconstruction.trials import disturbances, disturbed, told_together
 from pipelines.session.description import Description, Interpolation, read_description
 from pipelines.session.errors import DataError
-from pipelines.session.logged_actor import LoggedActor, logged_actor
+from pipelines.session.people import LoggedActor, logged_actor, true_joints_at
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Int64, JointMotion
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import CAMERA_POSES, SKELETON, write_table
-from pipelines.session.true_joints import true_joints_at
 
 if TYPE_CHECKING:
     import pandas as pd

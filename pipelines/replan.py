@@ -43,8 +43,16 @@ from pipelines.session.registries import PLANNER_ARMS
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
-from pipelines.session.tables import ACTOR, COST_MAP, REPLAN, SEEN, TRUTH, read_table, write_table
-from pipelines.session.tabular import motion_table
+from pipelines.session.tables import (
+    ACTOR,
+    COST_MAP,
+    REPLAN,
+    SEEN,
+    TRUTH,
+    motion_table,
+    read_table,
+    write_table,
+)
 from pipelines.simulation.detector_errors import MODELLED, detect_keypoints, errors_of, view_of
 from pipelines.simulation.scenario import DetectorErrors
 

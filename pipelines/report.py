@@ -24,8 +24,7 @@ from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
 from pipelines.session.records import Occupancy
-from pipelines.session.run_notes import versions_of
-from pipelines.session.stage_records import Stage, StageRecord, outdated
+from pipelines.session.stage_records import Stage, StageRecord, outdated, versions_of
 from pipelines.session.stages import Session, locked, open_session, session_name
 from pipelines.session.storage import as_data_error, hash_of, read_json, sha256_of
 from pipelines.session.tables import (

@@ -26,10 +26,9 @@ from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import distance_field
 from pipelines.planning.pilot import Pilot
 from pipelines.session.errors import DataError
-from pipelines.session.progress import Progress, Silent
+from pipelines.session.progress import Halt, Progress, Silent, side_by_side
 from pipelines.session.records import Occupancy, SkeletalMotion
 from pipelines.session.registries import PLANNER_ARMS, noise_models
-from pipelines.session.side_by_side import Halt, side_by_side
 from pipelines.session.storage import hash_of, read_json, sha256_of, write_json
 from pipelines.session.whole_folders import SIMULATION_MARK, is_made, whole_folder
 from pipelines.simulation.detector_errors import errors_of

@@ -18,7 +18,7 @@ from pipelines.session.stage_records import SCHEMA, STAGES, outdated
 from pipelines.session.stages import open_session
 from pipelines.session.storage import read_json, refuse_special
 from pipelines.session.whole_folders import SIMULATION_MARK, STUDY_MARK
-from pipelines.session.yaml_models import keys_of
+from pipelines.session.yaml_files import keys_of
 from pipelines.simulation.scenario import Scenario, read_scenario
 
 

@@ -6,10 +6,9 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.keypoints.hints import Hint, project_actor
-from pipelines.session.camera_poses import poses_at
+from pipelines.session.camera_poses import poses_at, stated_noise
 from pipelines.session.description import CameraEntry, Interpolation
-from pipelines.session.logged_actor import LoggedActor
-from pipelines.session.pose_noise import stated_noise
+from pipelines.session.people import LoggedActor
 from pipelines.session.records import Int64, Trajectory
 
 ACTOR_SIGMA_M = 1.0

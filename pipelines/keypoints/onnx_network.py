@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.session.errors import DataError
-from pipelines.session.extras import need
+from pipelines.session.registries import need
 
 Layout = Literal["nchw", "nhwc"]
 

@@ -13,15 +13,22 @@ from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel, White
 from pipelines.geometry.poses import gaps, interpolate_points
-from pipelines.session.camera_poses import poses_at
+from pipelines.session.camera_poses import COMMAND_LINE, known_variances, poses_at, stated_models
 from pipelines.session.description import CameraEntry, Description, Interpolation
 from pipelines.session.errors import DataError
-from pipelines.session.logged_actor import logged_actor
-from pipelines.session.pose_noise import COMMAND_LINE, known_variances, stated_models
+from pipelines.session.people import logged_actor
 from pipelines.session.records import Int64, JointMotion, Trajectory
 from pipelines.session.stage_records import StageRecord
-from pipelines.session.tables import CAMERA_POSES, PLAN, POSES, SKELETON, TRUTH, read_table
-from pipelines.session.tabular import motion_from, trajectory_from
+from pipelines.session.tables import (
+    CAMERA_POSES,
+    PLAN,
+    POSES,
+    SKELETON,
+    TRUTH,
+    motion_from,
+    read_table,
+    trajectory_from,
+)
 
 Source = Literal["log", "reconstruction", "truth"]
 

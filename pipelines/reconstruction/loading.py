@@ -19,13 +19,22 @@ from pipelines.reconstruction.refinement.problem import (
     Process,
     pose_errors,
 )
+from pipelines.session.camera_poses import stated_models, stated_noise
 from pipelines.session.description import CameraEntry, Description
 from pipelines.session.errors import DataError
-from pipelines.session.pose_noise import stated_models, stated_noise
 from pipelines.session.records import JointMotion
 from pipelines.session.stage_records import StageRecord
-from pipelines.session.tables import FRAMES, KEYPOINTS, POSES, TRUTH, read_table
-from pipelines.session.tabular import detections_from, most_confident, motion_from, trajectory_from
+from pipelines.session.tables import (
+    FRAMES,
+    KEYPOINTS,
+    POSES,
+    TRUTH,
+    detections_from,
+    most_confident,
+    motion_from,
+    read_table,
+    trajectory_from,
+)
 
 _MOST_PEOPLE = 12  # in one picture; more are detector errors, and memory grows with their number
 

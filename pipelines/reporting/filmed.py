@@ -14,8 +14,7 @@ from pipelines.session.description import Description
 from pipelines.session.records import Trajectory
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.storage import read_json
-from pipelines.session.tables import CAMERA_POSES, KEYPOINTS, POSES, read_table
-from pipelines.session.tabular import trajectory_from
+from pipelines.session.tables import CAMERA_POSES, KEYPOINTS, POSES, read_table, trajectory_from
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.triangulation import STATUS
+from pipelines.session.people import true_joints_at
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Int64
-from pipelines.session.tabular import motion_from
-from pipelines.session.true_joints import true_joints_at
+from pipelines.session.tables import motion_from
 
 if TYPE_CHECKING:
     import pandas as pd

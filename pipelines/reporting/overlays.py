@@ -26,7 +26,7 @@ from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Int64, Trajectory
 from pipelines.session.skeletons import with_derived
-from pipelines.session.tabular import detections_from, trajectory_from
+from pipelines.session.tables import detections_from, trajectory_from
 
 if TYPE_CHECKING:
     import pandas as pd

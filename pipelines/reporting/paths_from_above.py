@@ -35,7 +35,7 @@ from pipelines.reporting.wording import (
     shortened,
 )
 from pipelines.session.records import Int64, Trajectory
-from pipelines.session.tabular import trajectory_from
+from pipelines.session.tables import trajectory_from
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,7 +12,7 @@ from pipelines.reporting.content import SessionContent, number, section
 from pipelines.reporting.summary import Summary
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.records import Int64
-from pipelines.session.tabular import trajectory_from
+from pipelines.session.tables import trajectory_from
 
 
 def estimated_clocks(metrics: Mapping[str, object]) -> dict[str, int]:

@@ -11,8 +11,8 @@ from pipelines.geometry.poses import conjugate, interpolate_poses, multiply, rot
 from pipelines.reporting.content import SessionContent, number, section
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.wording import ABSENT, THIN, fixed, quantity
-from pipelines.session.pose_noise import logged_covariance
-from pipelines.session.tabular import trajectory_from
+from pipelines.session.camera_poses import logged_covariance
+from pipelines.session.tables import trajectory_from
 
 if TYPE_CHECKING:
     import pandas as pd

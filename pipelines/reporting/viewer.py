@@ -24,7 +24,7 @@ from pipelines.reporting.wording import joint_label, plural, quantity, whole
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.records import Int64, Trajectory
 from pipelines.session.skeletons import DERIVED, bones_of
-from pipelines.session.tabular import trajectory_from
+from pipelines.session.tables import trajectory_from
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,13 +1,22 @@
-"""Poses of a session's cameras at given times, interpolated as far as the manifest trusts the logs."""
+"""Poses of a session's cameras at given times, and their uncertainty.
+
+Poses are interpolated as far as the manifest trusts the logs. Their uncertainty is stated by the command
+line, flight.yaml, or the log itself; the first of these that states one is used, and all three may be silent.
+"""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.poses import interpolate_poses
-from pipelines.session.description import Interpolation
+from pipelines.geometry.noise import NoiseModel, sum_sigma
+from pipelines.geometry.poses import interpolate_poses, rates
+from pipelines.session.description import CameraEntry, Interpolation
 from pipelines.session.records import Int64, Trajectory
+from pipelines.session.registries import noise_models, parsed_noise_models
 
 
 def poses_at(
@@ -35,3 +44,102 @@ def poses_at(
         max_gap_ns=between.max_gap_ns,
         max_extrapolation_ns=between.max_extrapolation_ns,
     )
+
+
+COMMAND_LINE = "--pose-noise"
+_SANE_VARIANCE = (100.0, np.pi**2)  # m^2, rad^2: what ROS means by 1e6 is "unknown"
+_ROUNDED = 1e-6  # of an eigenvalue of correlations that logs have rounded
+
+
+class StatedNoise(NamedTuple):
+    """The standard deviations of N logged poses; None where no source states them."""
+
+    sigma: Float | None  # [N, 2] standard deviation per axis of position (m) and rotation (rad)
+    covariance: Float | None  # [N, 6, 6] the log's own, where `sigma` is computed from it
+
+
+def stated_models(name: str, entry: CameraEntry, pose_noise: str | None) -> list[NoiseModel] | None:
+    """Return the models of a camera's pose errors; None if neither command line nor flight.yaml names any.
+
+    Args:
+        name: of the camera.
+        entry: its entry in session.json.
+        pose_noise: the value of `--pose-noise`, if any.
+
+    Raises:
+        DataError: a model is not known.
+    """
+    if pose_noise:
+        return parsed_noise_models(COMMAND_LINE, pose_noise)
+    if entry.pose_noise:
+        return noise_models(f"pose_noise of {name}", entry.pose_noise)
+    return None
+
+
+def stated_noise(
+    name: str, entry: CameraEntry, trajectory: Trajectory, pose_noise: str | None = None
+) -> StatedNoise:
+    """Compute the uncertainty of each pose of a camera's log, from models or else from its covariances.
+
+    Args:
+        name: of the camera.
+        entry: its entry in session.json.
+        trajectory: its N logged poses.
+        pose_noise: the value of `--pose-noise`, if any.
+
+    Raises:
+        DataError: a model is not known.
+    """
+    models = stated_models(name, entry, pose_noise)
+    if models is None:
+        covariance = logged_covariance(trajectory)
+        return StatedNoise(None if covariance is None else _level(covariance), covariance)
+    elapsed_s = (trajectory.t_ns - trajectory.t_ns[0]) / 1e9
+    moved = rates(trajectory.t_ns, trajectory.position, trajectory.quaternion_xyzw)
+    return StatedNoise(sum_sigma(models, elapsed_s, *moved), None)
+
+
+def logged_covariance(trajectory: Trajectory) -> Float | None:
+    """Return the logged covariances [N, 6, 6] with unknown variances filled in.
+
+    An axis with an unknown variance (`known_variances`) gets the mean of the pose's known variances of its
+    kind (position or rotation), and no correlation with other axes. A pose without a known variance of a kind
+    gets the median of the other poses. The result is None if no pose has one. A matrix that is not a valid
+    covariance (an eigenvalue of its correlations is negative) keeps its variances only.
+    """
+    if trajectory.covariance is None:
+        return None
+    logged = trajectory.covariance
+    variances, known = known_variances(logged)
+    count = known.sum(axis=2)
+    mean = np.where(known, variances, 0.0).sum(axis=2) / np.maximum(count, 1)
+    if not (count > 0).any(axis=0).all():
+        return None
+    for block in range(2):
+        unknown = count[:, block] == 0
+        mean[unknown, block] = np.median(mean[~unknown, block])
+    axes = np.where(known, variances, mean[..., None]).reshape(-1, 6)
+    both = known.reshape(-1, 6)[:, :, None] & known.reshape(-1, 6)[:, None, :]
+    covariance = np.where(both & np.isfinite(logged), logged, 0.0)
+    covariance[:, np.arange(6), np.arange(6)] = axes
+    scale = np.sqrt(axes)
+    correlation = covariance / (scale[:, :, None] * scale[:, None, :])
+    contradictory = np.linalg.eigvalsh(correlation)[:, 0] < -_ROUNDED
+    covariance[contradictory] = axes[contradictory, :, None] * np.eye(6)
+    return covariance
+
+
+def known_variances(covariance: Float) -> tuple[Float, NDArray[np.bool_]]:
+    """Extract variances [N, 2, 3] of position (m^2) and rotation (rad^2), and a mask of those that are known.
+
+    `covariance` is [N, 6, 6]. Logs write zero, negative, NaN and absurdly large variances for "unknown".
+    """
+    variances = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
+    return variances, (variances > 0) & (variances < np.array(_SANE_VARIANCE)[:, None])
+
+
+def _level(covariance: Float) -> Float:
+    """Compute the standard deviation per axis [N, 2] of position and rotation: root of the mean variance."""
+    variances = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
+    sigma: Float = np.sqrt(variances.mean(axis=2))
+    return sigma

@@ -19,7 +19,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from pipelines.geometry.mounting import RelativeTo
-from pipelines.session.yaml_models import Part, read_yaml_model
+from pipelines.session.yaml_files import Part, read_yaml_model
 
 SCHEMA = 1
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")

@@ -1,8 +1,14 @@
-"""Progress of long work. The terminal's bar is one implementation, silence another."""
+"""Progress of long work, and parallel work on its parts; an error or Ctrl-C soon ends all of them.
+
+The terminal's bar is one implementation of progress, silence another.
+"""
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
+from typing import Protocol, TypeVar
 
 
 class Progress(Protocol):
@@ -29,3 +35,46 @@ class Silent:
 
     def note(self, message: str) -> None:
         """Ignore it."""
+
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+class Halt:
+    """A request to stop, which every worker checks from time to time."""
+
+    def __init__(self) -> None:
+        self._asked = Event()
+
+    def ask(self) -> None:
+        """Ask all workers to stop."""
+        self._asked.set()
+
+    def check(self) -> None:
+        """Raise an error if all workers are asked to stop.
+
+        Raises:
+            InterruptedError: they are asked to stop.
+        """
+        if self._asked.is_set():
+            raise InterruptedError("another part failed, or the user stopped it")
+
+
+def side_by_side(work: Callable[[T], R], parts: Iterable[T], *, workers: int, halt: Halt) -> list[R]:
+    """Call `work` on every part in parallel and return the results in the order of the parts.
+
+    Threads are enough, because the long calculations release the interpreter lock.
+
+    Args:
+        work: called with one part; it checks `halt` from time to time.
+        parts: the arguments of `work`.
+        workers: the number of threads.
+        halt: set when one part fails or the user interrupts; the exception is raised when all have stopped.
+    """
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            return list(pool.map(work, parts))
+        except BaseException:
+            halt.ask()  # or Ctrl-C would wait for what is under way
+            raise

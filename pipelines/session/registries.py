@@ -1,16 +1,20 @@
-"""Registries of extensions: formats, exports, detectors, noise models and planner arms.
+"""Registries of extensions: formats, exports, detectors, noise models, planner arms; optional libraries.
 
 Each is found through an entry point, so adding one takes one module and one line in a pyproject.toml,
 in this package or in the user's own. An entry point names an object that has the protocol defined here.
+Where an extension needs an optional library that is missing, the error gives the command that installs it.
 """
 
 from __future__ import annotations
 
 import json
+import re
+import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.metadata import EntryPoint, entry_points
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points, requires
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
@@ -426,3 +430,36 @@ def _built(place: str, parts: Iterable[tuple[str, Mapping[str, object]]]) -> lis
         return build(parts, classes)
     except ValueError as error:
         raise DataError(place, str(error)) from None
+
+
+_OF_EXTRA = re.compile(r"(?P<requirement>[^;]+?)\s*;\s*extra == ['\"](?P<extra>[^'\"]+)['\"]")
+
+
+def need(module: str, extra: str) -> Any:
+    """Import an optional library.
+
+    Args:
+        module: the name of the module.
+        extra: the extra of this package that lists it.
+
+    Raises:
+        DataError: it is not installed.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # SWIG's wrappers deprecate themselves
+            return import_module(module)
+    except ImportError as error:
+        raise DataError(module, "is not installed", f"run `{install_command(extra)}`") from error
+
+
+def install_command(extra: str) -> str:
+    """Write the command that installs the libraries of an extra, by their own names.
+
+    This package is on no package index, so pip would not find `mocap-pipeline[extra]`.
+    """
+    listed = [_OF_EXTRA.fullmatch(line) for line in requires("mocap-pipeline") or ()]
+    names = [found["requirement"] for found in listed if found and found["extra"] == extra]
+    if not names:
+        raise ValueError(f"mocap-pipeline has no extra {extra!r}")
+    return " ".join(["pip install", *(f'"{name}"' for name in sorted(names))])

@@ -22,7 +22,7 @@ from pydantic import (
 
 from pipelines.geometry.cameras import COEFFICIENT_COUNTS
 from pipelines.session.manifest import SecondsAsNs
-from pipelines.session.yaml_models import Part, read_yaml_model
+from pipelines.session.yaml_files import Part, read_yaml_model
 
 SCHEMA = 2
 _MOST_VOXELS = 20_000_000

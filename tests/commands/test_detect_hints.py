@@ -16,12 +16,12 @@ from pipelines.ingest import ingest
 from pipelines.keypoints.actor_hints import actor_hints, hint_sigma
 from pipelines.keypoints.hints import Hint
 from pipelines.session.description import read_description
-from pipelines.session.logged_actor import logged_actor
+from pipelines.session.people import logged_actor
 from pipelines.session.records import Trajectory
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.stages import locked
 from pipelines.session.storage import read_json
-from pipelines.session.tabular import trajectory_from
+from pipelines.session.tables import trajectory_from
 from tests.commands.runner import mocap
 from tests.keypoints.onnx_graphs import constant_model
 from tests.keypoints.spotted_flights import CAMERAS, FPS, LENS, START_S, spot_detector, write_spotted_flight

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.session.extras import need
+from pipelines.session.registries import need
 from tests.commands.runner import MOCAP, content, mocap, refused, succeeds
 from tests.keypoints.spotted_flights import CAMERAS, FPS, person_at, spot_detector, write_spotted_flight
 

@@ -13,7 +13,7 @@ import pytest
 
 from pipelines.formats.skeletons.trc import FORMAT as TRC
 from pipelines.session.registries import find_detector
-from pipelines.session.tabular import motion_from
+from pipelines.session.tables import motion_from
 from tests.commands.runner import content, mocap_process, refused, succeeds
 from tests.real_data import real_data
 

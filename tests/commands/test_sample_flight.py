@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from pipelines.keypoints.calibration import measured_for
+from pipelines.session.people import true_joints_at
 from pipelines.session.registries import find_detector
 from pipelines.session.storage import read_json, sha256_of
-from pipelines.session.tables import SKELETON, TRUTH, read_table
-from pipelines.session.tabular import motion_from
-from pipelines.session.true_joints import true_joints_at
+from pipelines.session.tables import SKELETON, TRUTH, motion_from, read_table
 from tests.commands.runner import mocap, mocap_process, succeeds
 
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "mound_walk"

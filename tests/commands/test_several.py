@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.session.several import names_of
+from pipelines.session.stages import names_of
 from tests.commands.runner import content, mocap, refused, succeeds
 from tests.synthetic.flights import write_flight
 

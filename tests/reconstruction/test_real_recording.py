@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from pipelines.formats.skeletons.trc import FORMAT as TRC
-from pipelines.session.tabular import motion_from
+from pipelines.session.tables import motion_from
 from tests.commands.runner import succeeds
 from tests.real_data import real_data
 

@@ -9,7 +9,7 @@ import numpy as np
 from pipelines.formats.common.text_tables import read_text
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.yaml_reading import plain_yaml
+from pipelines.session.yaml_files import plain_yaml
 
 _LARGEST = 1 << 20  # characters; the parser is slow, and calibrations are far smaller
 

@@ -32,8 +32,8 @@ from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.geodesy import Place
 from pipelines.geometry.mounting import RelativeTo, attitude_in_enu
 from pipelines.session.errors import DataError
-from pipelines.session.extras import need
 from pipelines.session.records import Int64
+from pipelines.session.registries import need
 from pipelines.session.telemetry import AttitudeTrack, PositionTrack, Telemetry, TelemetryChoice
 
 _START = b"\xa3\x95\x80"  # a FMT message: the first of every log

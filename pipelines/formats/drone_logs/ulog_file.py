@@ -18,8 +18,8 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.session.errors import DataError
-from pipelines.session.extras import need
 from pipelines.session.records import Int64
+from pipelines.session.registries import need
 
 MAGIC = b"ULog\x01\x12\x35"
 _MOST_FIELDS = 20_000  # of one message with its nested types; PX4's largest has some hundreds

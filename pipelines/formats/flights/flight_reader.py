@@ -47,9 +47,13 @@ from pipelines.session.tables import (
     POSES,
     POSES_WITH_COVARIANCE,
     TRUTH,
+    actor_table,
+    frames_table,
+    keypoints_table,
+    motion_table,
+    pose_table,
     write_table,
 )
-from pipelines.session.tabular import actor_table, frames_table, keypoints_table, motion_table, pose_table
 
 _MUCH_SHORTER = 0.9  # a video that covers less than this share of its pose log gets a note
 _SHORTER_S = 1.0

@@ -21,7 +21,7 @@ from pipelines.session.description import Description, MediaEntry
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, PictureSample, Sample
 from pipelines.session.registries import Log, LogFormat, recognise
-from pipelines.session.run_notes import noted_stamps
+from pipelines.session.stage_records import noted_stamps
 from pipelines.session.storage import file_stamp, sha256_of
 
 _MAY_LEAP_NS = 1_000_000_000  # transport and decoding take less time

@@ -27,7 +27,7 @@ from pipelines.formats.logs.recordings import (
 from pipelines.formats.logs.ros2_sqlite3 import MAGIC, Sqlite3Part, has_bag_tables
 from pipelines.session.errors import DataError
 from pipelines.session.storage import is_special
-from pipelines.session.yaml_reading import plain_yaml
+from pipelines.session.yaml_files import plain_yaml
 
 _INFORMATION = "rosbag2_bagfile_information"
 _METADATA_LIMIT = 16 << 20  # bytes of a metadata.yaml

@@ -27,8 +27,8 @@ from pipelines.formats.scenes.uncertainty import ellipsoids_95
 from pipelines.formats.skeletons.even_frames import thinned
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
 from pipelines.session.errors import DataError
-from pipelines.session.extras import need
 from pipelines.session.records import Int64, JointMotion, Recording, Trajectory
+from pipelines.session.registries import need
 from pipelines.session.skeletons import bones_of, with_derived
 
 _PATH_HZ = 10.0

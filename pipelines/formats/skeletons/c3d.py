@@ -27,8 +27,8 @@ from pipelines.formats.skeletons.joint_axes import METRES, to_metres_z_up, to_y_
 from pipelines.formats.skeletons.trc import joint_names, marker_name, metric_unit
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.extras import need
 from pipelines.session.records import Int64, JointMotion, Recording
+from pipelines.session.registries import need
 from pipelines.session.storage import as_data_error
 
 _BLOCK = 512

@@ -8,8 +8,7 @@ import numpy as np
 
 from pipelines.formats.common.export_names import write_tables
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording, Trajectory
-from pipelines.session.tables import POSES, POSES_WITH_COVARIANCE, SKELETON, write_table
-from pipelines.session.tabular import pose_table
+from pipelines.session.tables import POSES, POSES_WITH_COVARIANCE, SKELETON, pose_table, write_table
 
 
 class ParquetExport:

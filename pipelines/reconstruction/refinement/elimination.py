@@ -24,7 +24,7 @@ from pipelines.reconstruction.refinement import kernels, sweeps
 from pipelines.reconstruction.refinement.halves import Half, halved
 from pipelines.reconstruction.refinement.problem import State
 from pipelines.reconstruction.refinement.system import System
-from pipelines.session.side_by_side import Halt, side_by_side
+from pipelines.session.progress import Halt, side_by_side
 
 Int64 = NDArray[np.int64]
 Part = TypeVar("Part")

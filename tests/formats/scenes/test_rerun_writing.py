@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipelines.formats.scenes import rerun_writing
-from pipelines.session import extras
+from pipelines.session import registries
 from pipelines.session.errors import DataError
 from pipelines.session.registries import Export
 from tests.formats.exported import LENS, SIGMA_M, flown, recording, stamps
@@ -95,7 +95,7 @@ def test_without_rerun_one_line_says_what_to_install(tmp_path: Path, monkeypatch
     def absent(name: str) -> None:
         raise ImportError(name)
 
-    monkeypatch.setattr(extras, "import_module", absent)
+    monkeypatch.setattr(registries, "import_module", absent)
     with pytest.raises(DataError) as caught:
         WRITER.write(recording(), tmp_path)
     assert str(caught.value) == 'rerun: is not installed; run `pip install "rerun-sdk>=0.24"`'

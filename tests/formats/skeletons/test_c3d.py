@@ -11,12 +11,11 @@ import pytest
 
 from pipelines.formats.skeletons import c3d
 from pipelines.formats.skeletons.even_frames import at_even_times
-from pipelines.session import extras
+from pipelines.session import registries
 from pipelines.session.errors import DataError
-from pipelines.session.extras import need
 from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion
-from pipelines.session.registries import ChoiceOfAxes, JointFormat
+from pipelines.session.registries import ChoiceOfAxes, JointFormat, need
 from tests.formats.exported import SIGMA_M, Listener, recording, stamps, walking, without
 
 READER: JointFormat = c3d.FORMAT
@@ -162,7 +161,7 @@ def test_without_ezc3d_one_line_says_what_to_install(tmp_path: Path, monkeypatch
     def absent(name: str) -> None:
         raise ImportError(name)
 
-    monkeypatch.setattr(extras, "import_module", absent)
+    monkeypatch.setattr(registries, "import_module", absent)
     for attempt in (lambda: read(path), lambda: WRITER.write(recording(), tmp_path)):
         with pytest.raises(DataError) as caught:
             attempt()

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import quaternion_from_matrix
-from pipelines.session.pose_noise import logged_covariance
+from pipelines.session.camera_poses import logged_covariance
 from pipelines.session.records import Trajectory
 
 

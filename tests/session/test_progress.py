@@ -6,7 +6,7 @@ from threading import Barrier
 
 import pytest
 
-from pipelines.session.side_by_side import Halt, side_by_side
+from pipelines.session.progress import Halt, side_by_side
 
 
 def test_results_come_in_the_order_of_the_parts() -> None:

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from pipelines.session.people import true_joints_at
 from pipelines.session.records import JointMotion
-from pipelines.session.true_joints import true_joints_at
 
 MS = 1_000_000
 Int64 = NDArray[np.int64]

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from pipelines.session.errors import DataError
-from pipelines.session.extras import install_command, need
+from pipelines.session.registries import install_command, need
 
 ROOT = Path(__file__).parents[2]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
