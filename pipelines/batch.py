@@ -32,7 +32,7 @@ from pipelines.session.errors import BusyError, DataError, MocapError
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.registries import need
 from pipelines.session.stages import names_of
-from pipelines.session.storage import as_data_error, read_json, write_json
+from pipelines.session.storage import as_data_error, read_json, write_json, write_whole
 
 STAGES = ("ingest", "reconstruct", "replan-compare", "report")
 
@@ -399,8 +399,8 @@ def _store(folder: Path, rows: Sequence[FlightRow], outcomes: Sequence[Outcome])
         writer.writerow(map(cell_text, cells))
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _write_text(folder / _TABLE, text.getvalue())
-        _write_text(folder / _PAGE, render_flights(rows))
+        write_whole(folder / _TABLE, text.getvalue().encode("utf-8", "replace"))
+        write_whole(folder / _PAGE, render_flights(rows).encode("utf-8", "replace"))
         times = [
             {"flight": row.flight, **{k: asdict(outcome)[k] for k in ("seconds", "peak_memory_mb", "worker")}}
             for row, outcome in zip(rows, outcomes, strict=True)
@@ -408,10 +408,3 @@ def _store(folder: Path, rows: Sequence[FlightRow], outcomes: Sequence[Outcome])
         write_json(folder / _TIMES, {"schema": 1, "flights": times})
     except OSError as error:
         raise as_data_error(error, folder) from error
-
-
-def _write_text(path: Path, text: str) -> None:
-    """Replace a file completely or not at all; characters of names that UTF-8 cannot hold are replaced."""
-    new = path.with_name(f"{path.name}.new")
-    new.write_bytes(text.encode("utf-8", "replace"))
-    new.replace(path)

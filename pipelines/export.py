@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from filelock import FileLock, Timeout
 
 from pipelines.formats.flights.pictures import open_pictures
 from pipelines.formats.skeletons.even_frames import thinned
@@ -21,7 +20,7 @@ from pipelines.reporting.motion import Motion, motion_from_skeleton
 from pipelines.reporting.overlays import FilmedCamera, status_at, views_of
 from pipelines.reporting.placing import estimated_clocks
 from pipelines.session.description import Description, read_description
-from pipelines.session.errors import BusyError, DataError
+from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import Int64, Recording
@@ -30,6 +29,7 @@ from pipelines.session.stage_records import StageRecord
 from pipelines.session.stages import open_session, session_name
 from pipelines.session.storage import as_data_error, read_json, remove_tree, sha256_of, write_json
 from pipelines.session.tables import FRAMES, POSES, SKELETON, motion_from, read_table, trajectory_from
+from pipelines.session.whole_folders import working_folder
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -273,30 +273,19 @@ def _work_in(target: Path) -> Iterator[Path]:
     Raises:
         BusyError: another process uses it.
     """
-    work = target / _WORK
-    work.mkdir(exist_ok=True)
-    try:
-        lock = FileLock(work / "lock").acquire(timeout=0)
-    except Timeout:
-        raise BusyError(f"{target} is being written by another process; wait for it to finish") from None
+    with working_folder(target / _WORK, target) as work:
+        _clear(target, work)
+        try:
+            yield work
+        finally:
+            _clear(target, work)
 
-    def clear() -> None:
-        for left in [path for path in work.iterdir() if path.name != "lock"]:
-            remove_tree(left)
 
-    try:
-        with lock:
-            for killed in target.glob(f"{_WORK}-*"):  # their name in versions without a lock
-                remove_tree(killed)
-            clear()
-            try:
-                yield work
-            finally:
-                clear()
-    finally:
-        with suppress(OSError):
-            (work / "lock").unlink(missing_ok=True)
-            work.rmdir()
+def _clear(target: Path, work: Path) -> None:
+    """Remove what killed exports left behind."""
+    left = [*target.glob(f"{_WORK}-*"), *(path for path in work.iterdir() if path.is_dir())]
+    for path in left:  # the first have the names of versions without a lock
+        remove_tree(path)
 
 
 def _move(made: Mapping[Path, dict[str, Any]], target: Path, overwrite: bool) -> Exported:

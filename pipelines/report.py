@@ -26,7 +26,7 @@ from pipelines.session.maps import load_maps
 from pipelines.session.records import Occupancy
 from pipelines.session.stage_records import Stage, StageRecord, outdated, versions_of
 from pipelines.session.stages import Session, locked, open_session, session_name
-from pipelines.session.storage import as_data_error, hash_of, read_json, sha256_of
+from pipelines.session.storage import as_data_error, hash_of, read_json, sha256_of, write_whole
 from pipelines.session.tables import (
     ACTOR,
     CAMERA_POSES,
@@ -238,16 +238,6 @@ def _named(studies: Sequence[StudyContent]) -> list[dict[str, object]]:
 
 def _labels(resolved: Sequence[Path]) -> list[str]:
     return labels_of([(*place.parts[1:-1], session_name(place)) for place in resolved])
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file completely or leave it as it was."""
-    new = path.with_name(f".{path.name}.new")
-    try:
-        new.write_bytes(content)
-        new.replace(path)
-    finally:
-        new.unlink(missing_ok=True)
 
 
 def _refuse_foreign(page: Path) -> None:

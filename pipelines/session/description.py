@@ -13,9 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from pipelines.geometry.cameras import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import refuse_camera_names
 from pipelines.session.records import Occupancy
-from pipelines.session.storage import hash_of, read_json
+from pipelines.session.storage import hash_of, read_json, refuse_camera_names
 
 SCHEMA = 1
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import difflib
 import math
-import re
-from collections.abc import Collection
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
@@ -19,10 +17,10 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from pipelines.geometry.mounting import RelativeTo
+from pipelines.session.storage import refuse_camera_names
 from pipelines.session.yaml_files import Part, read_yaml_model
 
 SCHEMA = 1
-CAMERA_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 _LATEST_NS = 2**62  # differences of two such times fit int64
 _MOST_FRAMES = 10**9  # a year at 30 Hz
@@ -450,19 +448,6 @@ class Plan(Part):
     def log_of(self, camera: str) -> str:
         """Return the log of a camera's topic."""
         return self.topics[camera].log or self.log or ""
-
-
-def refuse_camera_names(names: Collection[str]) -> None:
-    """Refuse camera names that cannot each name their own folder.
-
-    Raises:
-        ValueError: a name is not allowed, or two names differ in case only.
-    """
-    bad = [name for name in names if not CAMERA_NAME.fullmatch(name)]
-    if bad:
-        raise ValueError(f"camera name {bad[0]!r}: use 1 to 64 of A-Z a-z 0-9 _ -, it names a folder")
-    if len({name.lower() for name in names}) < len(names):
-        raise ValueError("two cameras differ in case only: their folders would be one on some systems")
 
 
 class Flight(Part):

@@ -13,16 +13,13 @@ with locked(folder) as session:
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
-from pipelines.session.errors import BusyError, DataError, MocapError
+from pipelines.session.errors import DataError, MocapError
 from pipelines.session.stage_records import (
     COMMANDS,
     SCHEMA,
@@ -42,11 +39,29 @@ from pipelines.session.storage import (
     read_json,
     remove_tree,
     sha256_of,
-    sync_folder,
+    sync,
     sync_tree,
     write_json,
 )
+from pipelines.session.whole_folders import finished_part, held, remove_if_unused
 
+_AT_ROOT = {
+    "ingest": (
+        "cameras",
+        "actor.parquet",
+        "map",
+        "plan.parquet",
+        "truth.parquet",
+        "truth_poses.parquet",
+        "session.json",
+    )
+}
+"""Names that a stage publishes beside its own folder instead of inside it; only that stage writes them."""
+
+_SHOWN_BY = {"reconstruct": ("overlay",)}
+"""Stages that only show another stage's result; they are removed when that result is replaced."""
+
+_LOCK = ".lock"
 _LEFT_BY_KILLED_INGEST = {".lock", ".lock.pid", ".partial", "ingest.new", "run.json.new"}
 
 
@@ -117,11 +132,11 @@ class WritableSession(Session):
         key = key_of(stage, settings, inputs)
         before = usable_record(self.folder / stage.name / "stage.json")
         if force:
-            remove_partials(self.folder, stage.name)
+            _remove_partials(self.folder, stage.name)
         elif before is not None and before.key == key and self._intact(before):
-            remove_partials(self.folder, stage.name)  # of a --force that was interrupted
+            _remove_partials(self.folder, stage.name)  # of a --force that was interrupted
             return Run(self.folder, stage, key, settings, inputs, before=before, finished=True)
-        new = new_folder(self.folder, stage.name)
+        new = _new_folder(self.folder, stage.name)
         remove_tree(new)
         new.mkdir()
         return Run(self.folder, stage, key, settings, inputs, before=before, finished=False)
@@ -167,7 +182,7 @@ class Run:
         before: StageRecord | None,
         finished: bool,
     ) -> None:
-        self.folder = new_folder(session, stage.name)
+        self.folder = _new_folder(session, stage.name)
         self.finished = finished
         self._session = session
         self._stage = stage
@@ -199,17 +214,7 @@ class Run:
             name: of the part; the parts of a stage are stored by the stage's key.
             produce: writes the part into the empty folder that it gets.
         """
-        finished = self._session / ".partial" / f"{self._stage.name}-{self._key}" / name
-        if finished.is_dir():
-            return finished
-        temporary = finished.with_name(f"{name}.new")
-        remove_tree(temporary)
-        temporary.mkdir(parents=True)
-        produce(temporary)
-        sync_tree(temporary)
-        temporary.rename(finished)
-        sync_folder(finished.parent)
-        return finished
+        return finished_part(self._session / ".partial" / f"{self._stage.name}-{self._key}" / name, produce)
 
     def publish(self, *, counts: Mapping[str, object], warnings: Sequence[str] = ()) -> StageRecord:
         """End the stage: the content of `folder` replaces its earlier files, completely or not at all.
@@ -230,14 +235,14 @@ class Run:
             warnings=jsonable(list(warnings)),
         )
         write_json(self.folder / "stage.json", {"schema": SCHEMA, **asdict(self._record)})
-        sync_folder(self._session)
-        self.outdated = outdated(self._session, self._record)
-        roll_forward(self._session, self._stage.name)
+        sync(self._session)
+        self.outdated = _outdated(self._session, self._record)
+        _roll_forward(self._session, self._stage.name)
         self._stopwatch.note(self._session, self._stage.name)
         return self._record
 
     def _outputs(self) -> dict[str, str]:
-        at_root = AT_ROOT.get(self._stage.name)
+        at_root = _AT_ROOT.get(self._stage.name)
         outputs = {}
         for path in sorted(path for path in self.folder.rglob("*") if path.is_file()):
             name = path.relative_to(self.folder)
@@ -254,6 +259,29 @@ def session_name(folder: Path) -> str:
     return folder.resolve().name.removesuffix(".session")
 
 
+def names_of(paths: Sequence[Path]) -> list[str]:
+    """Return a name for each flight or session, which does not depend on the others.
+
+    The name is that of the file without its ending. Most manifests are called `flight`; these get the name
+    of the folder around them.
+
+    Raises:
+        DataError: two have the same name.
+    """
+    named: dict[str, Path] = {}
+    for path in paths:
+        whole = path.resolve()
+        name = whole.stem if whole.stem != "flight" else whole.parent.name
+        if name in named:
+            raise DataError(
+                path,
+                f"would be called {name}, as {named[name]} is",
+                "leave --output out, or rename one of them",
+            )
+        named[name] = path
+    return list(named)
+
+
 def open_session(folder: Path) -> Session:
     """Open a session for reading; an interrupted publication is completed first.
 
@@ -262,7 +290,7 @@ def open_session(folder: Path) -> Session:
         BusyError: it is being published right now.
     """
     try:
-        if not is_interrupted(folder):
+        if not _is_interrupted(folder):
             _check_session(folder)
             return Session(folder)
     except OSError as error:
@@ -293,18 +321,18 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
         if create:
             _check_target(folder, overwrite=overwrite)
             folder.mkdir(parents=True, exist_ok=True)
-        elif not is_interrupted(folder):
+        elif not _is_interrupted(folder):
             _check_session(folder)
-        with _lock(folder):
+        with held(folder / _LOCK, folder):
             try:
-                repair(folder)
+                _repair(folder)
                 if not create:
                     _check_session(folder)
                 yield WritableSession(folder)
             except BaseException as error:
                 # What cannot be repaired now is repaired when the session is opened next.
                 with suppress(OSError):
-                    repair(folder)
+                    _repair(folder)
                     if is_new and isinstance(error, MocapError):
                         # The user will change an input, so finished parts are useless; after an interrupt
                         # they are useful.
@@ -312,7 +340,7 @@ def locked(folder: Path, *, create: bool = False, overwrite: bool = False) -> It
                 raise
             finally:
                 if is_new and not (folder / "session.json").exists():
-                    _leave_no_trace(folder)
+                    remove_if_unused(folder, _LOCK)
     except OSError as error:
         raise as_data_error(error, folder) from error
 
@@ -351,55 +379,7 @@ def _refuse_newer_session(folder: Path) -> None:
         pass  # missing or damaged: its readers report this, and ingest writes it again
 
 
-@contextmanager
-def _lock(folder: Path) -> Iterator[None]:
-    """Hold a lock of the kernel, which ends with the process, however that ends."""
-    # The holder's process id is in a file of its own: some versions of filelock empty the lock file.
-    holder = folder / ".lock.pid"
-    try:
-        lock = FileLock(folder / ".lock").acquire(timeout=0)
-    except Timeout:
-        raise BusyError(f"{folder} is being written by {_process(holder)}; wait for it to finish") from None
-    with lock:
-        try:
-            holder.write_text(f"{os.getpid()}\n")
-            yield
-        finally:
-            holder.unlink(missing_ok=True)
-
-
-def _process(holder: Path) -> str:
-    try:
-        return f"process {int(holder.read_text())}"
-    except (OSError, ValueError):
-        return "another process"
-
-
-def _leave_no_trace(folder: Path) -> None:
-    with suppress(OSError):
-        (folder / ".lock").unlink()
-        (folder / ".lock.pid").unlink()
-        folder.rmdir()
-
-
-AT_ROOT = {
-    "ingest": (
-        "cameras",
-        "actor.parquet",
-        "map",
-        "plan.parquet",
-        "truth.parquet",
-        "truth_poses.parquet",
-        "session.json",
-    )
-}
-"""Names that a stage publishes beside its own folder instead of inside it; only that stage writes them."""
-
-_SHOWN_BY = {"reconstruct": ("overlay",)}
-"""Stages that only show another stage's result; they are removed when that result is replaced."""
-
-
-def new_folder(folder: Path, stage: str) -> Path:
+def _new_folder(folder: Path, stage: str) -> Path:
     """Return the folder in which a stage writes until it is published."""
     return folder / f"{stage}.new"
 
@@ -409,50 +389,50 @@ def _old(folder: Path, stage: str) -> Path:
     return folder / f".{stage}.old"
 
 
-def is_interrupted(folder: Path) -> bool:
+def _is_interrupted(folder: Path) -> bool:
     """Return True if the publication of a stage was interrupted."""
     return any(
-        (new_folder(folder, stage) / "stage.json").exists() or _old(folder, stage).exists()
+        (_new_folder(folder, stage) / "stage.json").exists() or _old(folder, stage).exists()
         for stage in STAGES
     )
 
 
-def repair(folder: Path) -> None:
+def _repair(folder: Path) -> None:
     """Complete interrupted publications, and remove the folders of stages that did not reach theirs."""
     for stage in STAGES:
-        if usable_record(new_folder(folder, stage) / "stage.json") is not None:
-            roll_forward(folder, stage)
-        remove_tree(new_folder(folder, stage))
+        if usable_record(_new_folder(folder, stage) / "stage.json") is not None:
+            _roll_forward(folder, stage)
+        remove_tree(_new_folder(folder, stage))
         _settle_old(folder, stage)
     remove_tree(folder / "run.json.new")
 
 
-def roll_forward(folder: Path, stage: str) -> None:
+def _roll_forward(folder: Path, stage: str) -> None:
     """Publish a complete `<stage>.new`.
 
     Every step can be repeated, and the stage's folder, with its record, is renamed last. After a kill between
     any two steps, doing all of them again completes the publication.
     """
-    new, old = new_folder(folder, stage), _old(folder, stage)
+    new, old = _new_folder(folder, stage), _old(folder, stage)
     record = read_record(new / "stage.json")
     published = {name.partition("/")[0] for name in record.outputs}
-    remove_partials(folder, stage)
+    _remove_partials(folder, stage)
     old.mkdir(exist_ok=True)
-    for entry in AT_ROOT.get(stage, ()):
+    for entry in _AT_ROOT.get(stage, ()):
         is_in_place = entry in published and not (new / entry).exists()
         if not is_in_place:
             _move(folder / entry, old / entry)
             _move(new / entry, folder / entry)
-    for shown in outdated(folder, record):
+    for shown in _outdated(folder, record):
         _move(folder / shown, old / shown)
     _move(folder / stage, old / stage)
     new.rename(folder / stage)
-    sync_folder(old)
-    sync_folder(folder)
+    sync(old)
+    sync(folder)
     remove_tree(old)
 
 
-def outdated(folder: Path, record: StageRecord) -> list[str]:
+def _outdated(folder: Path, record: StageRecord) -> list[str]:
     """List the stages that show a result other than this one; those of a later version are left alone."""
     gone = []
     for name in _SHOWN_BY.get(record.stage, ()):
@@ -478,40 +458,10 @@ def _move(source: Path, target: Path) -> None:
         source.rename(target)
 
 
-def remove_partials(folder: Path, stage: str) -> None:
+def _remove_partials(folder: Path, stage: str) -> None:
     """Remove the stored finished parts of a stage, which no run needs any more."""
     partial = folder / ".partial"
     for chunks in sorted(partial.glob(f"{stage}-*")):
         remove_tree(chunks)
     if partial.is_dir() and not any(partial.iterdir()):
         partial.rmdir()
-
-
-_USUAL = "flight"
-
-
-def names_of(paths: Sequence[Path]) -> list[str]:
-    """Return a name for each flight or session, which does not depend on the others.
-
-    The name is that of the file without its ending. Most manifests are called `flight`; these get the name
-    of the folder around them.
-
-    Raises:
-        DataError: two have the same name.
-    """
-    named: dict[str, Path] = {}
-    for path in paths:
-        name = _name_of(path)
-        if name in named:
-            raise DataError(
-                path,
-                f"would be called {name}, as {named[name]} is",
-                "leave --output out, or rename one of them",
-            )
-        named[name] = path
-    return list(named)
-
-
-def _name_of(path: Path) -> str:
-    whole = path.resolve()
-    return whole.stem if whole.stem != _USUAL else whole.parent.name

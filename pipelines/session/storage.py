@@ -7,15 +7,18 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import stat
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipelines.session.errors import DataError
+
+CAMERA_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 _REMEDIES = {
     errno.ENOENT: "check the path; those in a flight.yaml are relative to it",
@@ -31,6 +34,19 @@ def as_data_error(error: OSError, path: Path) -> DataError:
     """Make a one-line error of an operating system's error; `path` is used if the error names no file."""
     remedy = _REMEDIES.get(error.errno or 0, "mend that and run the command again")
     return DataError(error.filename or path, error.strerror or str(error), remedy)
+
+
+def refuse_camera_names(names: Collection[str]) -> None:
+    """Refuse camera names that cannot each name their own folder.
+
+    Raises:
+        ValueError: a name is not allowed, or two names differ in case only.
+    """
+    bad = [name for name in names if not CAMERA_NAME.fullmatch(name)]
+    if bad:
+        raise ValueError(f"camera name {bad[0]!r}: use 1 to 64 of A-Z a-z 0-9 _ -, it names a folder")
+    if len({name.lower() for name in names}) < len(names):
+        raise ValueError("two cameras differ in case only: their folders would be one on some systems")
 
 
 def is_special(path: Path) -> bool:
@@ -155,11 +171,19 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
         ValueError: it holds NaN or an infinite number (`jsonable` turns NaN into null).
     """
     text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    write_whole(path, text.encode("utf-8"))
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file; a kill leaves the old file or the new one, complete."""
     temporary = path.with_name(f"{path.name}.new")
-    temporary.write_bytes(text.encode("utf-8"))
-    _sync(temporary)
-    temporary.replace(path)
-    _sync(path.parent)
+    try:
+        temporary.write_bytes(content)
+        sync(temporary)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    sync(path.parent)
 
 
 def read_json(path: Path, remedy: str = "run the stage that wrote it again with --force") -> dict[str, Any]:
@@ -186,15 +210,11 @@ def _refuse_constant(name: str) -> None:
 def sync_tree(folder: Path) -> None:
     """Sync a folder and everything in it to disk, so that it survives a loss of power."""
     for path in [*folder.rglob("*"), folder]:
-        _sync(path)
+        sync(path)
 
 
-def sync_folder(folder: Path) -> None:
-    """Sync a folder to disk, so that renames in it survive a loss of power."""
-    _sync(folder)
-
-
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Sync a file, or a folder so that renames in it survive a loss of power."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

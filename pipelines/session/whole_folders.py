@@ -7,7 +7,8 @@
         making.publish()
 
 Everything is written in a hidden folder beside the target, which is renamed to the target at the end.
-Parts are stored by key, so a run with other settings does not use them.
+Parts are stored by key, so a run with other settings does not use them. Sessions have several such folders in
+them, their stages; they use the lock and the parts of this module, and `stages` publishes them.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from pipelines.session.errors import BusyError, DataError
-from pipelines.session.storage import as_data_error, read_json, remove_tree, sync_folder, sync_tree
+from pipelines.session.storage import as_data_error, read_json, remove_tree, sync, sync_tree
 
 SIMULATION_MARK = "simulation.json"
 """The file that is in every folder of `mocap simulate`."""
@@ -28,7 +29,77 @@ SIMULATION_MARK = "simulation.json"
 STUDY_MARK = "summary.json"
 """The file that is in every folder of `mocap ablate`."""
 
+_LOCK = "lock"
 _OF_SESSIONS = {"session.json": "a session", "stage.json": "a stage of a session"}
+
+
+@contextmanager
+def held(lock: Path, target: Path) -> Iterator[None]:
+    """Hold a lock of the kernel, which ends with the process, however that ends.
+
+    Args:
+        lock: the file of the lock. The holder's process id is in a file of its own beside it, because some
+            versions of filelock empty the lock file.
+        target: the folder that is written meanwhile, for the message.
+
+    Raises:
+        BusyError: another process holds it.
+    """
+    holder = lock.with_name(f"{lock.name}.pid")
+    try:
+        acquired = FileLock(lock).acquire(timeout=0)
+    except Timeout:
+        raise BusyError(f"{target} is being written by {_process(holder)}; wait for it to finish") from None
+    with acquired:
+        try:
+            holder.write_text(f"{os.getpid()}\n")
+            yield
+        finally:
+            holder.unlink(missing_ok=True)
+
+
+def _process(holder: Path) -> str:
+    try:
+        return f"process {int(holder.read_text())}"
+    except (OSError, ValueError):
+        return "another process"
+
+
+def remove_if_unused(folder: Path, lock: str) -> None:
+    """Remove a folder if only its lock is left in it."""
+    with suppress(OSError):
+        if {path.name for path in folder.iterdir()} <= {lock, f"{lock}.pid"}:
+            for left in (lock, f"{lock}.pid"):
+                (folder / left).unlink(missing_ok=True)
+            folder.rmdir()
+
+
+@contextmanager
+def working_folder(work: Path, target: Path) -> Iterator[Path]:
+    """Make and lock the hidden folder in which a target is written; it is removed if it ends up empty.
+
+    Raises:
+        BusyError: another process uses it.
+    """
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+        with held(work / _LOCK, target):
+            yield work
+    finally:
+        remove_if_unused(work, _LOCK)
+
+
+def finished_part(finished: Path, produce: Callable[[Path], None]) -> Path:
+    """Return the folder of a finished part; call `produce` with an empty folder if it does not exist yet."""
+    if not finished.is_dir():
+        temporary = finished.with_name(f"{finished.name}.new")
+        remove_tree(temporary)
+        temporary.mkdir(parents=True)
+        produce(temporary)
+        sync_tree(temporary)
+        temporary.rename(finished)
+        sync(finished.parent)
+    return finished
 
 
 class Making:
@@ -46,15 +117,7 @@ class Making:
 
     def part(self, name: str, produce: Callable[[Path], None]) -> Path:
         """Return the folder of a finished part; call `produce` if no interrupted run finished it."""
-        finished = self._parts / name
-        if not finished.is_dir():
-            temporary = self._parts / f"{name}.new"
-            remove_tree(temporary)
-            temporary.mkdir(parents=True)
-            produce(temporary)
-            sync_tree(temporary)
-            temporary.rename(finished)
-        return finished
+        return finished_part(self._parts / name, produce)
 
     def publish(self) -> None:
         """Replace the target by the folder, and move the old target away."""
@@ -64,7 +127,7 @@ class Making:
         if self._target.exists():
             self._target.rename(old)
         self.folder.rename(self._target)
-        sync_folder(self._target.parent)
+        sync(self._target.parent)
 
 
 @contextmanager
@@ -83,10 +146,8 @@ def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Itera
     """
     target = target.absolute()
     _check(target, mark, overwrite)
-    work = _work_of(target)
     try:
-        work.mkdir(parents=True, exist_ok=True)
-        with _held(work / "lock", target):
+        with working_folder(_work_of(target), target) as work:
             _put_back(work, target)
             for stale in [path for path in work.iterdir() if path.is_dir() and path.name != key]:
                 remove_tree(stale)
@@ -105,8 +166,6 @@ def whole_folder(target: Path, key: str, *, mark: str, overwrite: bool) -> Itera
                     remove_tree(work / "whole")
     except OSError as error:
         raise as_data_error(error, target) from error
-    finally:
-        _tidy(work)
 
 
 def refuse_sessions(target: Path, *, mark: str, option: str) -> None:
@@ -139,26 +198,20 @@ def is_made(target: Path, key: str, *, mark: str) -> bool:
 
     In that case, leftovers of a later attempt that was killed are useless and are removed.
     """
-    made = False
-    with suppress(DataError):
-        made = read_json(target / mark).get("key") == key
-    if made:
-        _clear(_work_of(target.absolute()), target)
+    try:
+        made = bool(read_json(target / mark).get("key") == key)
+    except DataError:
+        return False
+    work = _work_of(target.absolute())
+    if made and work.is_dir():
+        with suppress(OSError, BusyError), working_folder(work, target):
+            for left in [path for path in work.iterdir() if path.is_dir()]:
+                remove_tree(left)
     return made
 
 
 def _work_of(target: Path) -> Path:
     return target.parent / f".{target.name}.making"
-
-
-def _clear(work: Path, target: Path) -> None:
-    """Remove a working folder that no process uses."""
-    with suppress(OSError, BusyError):
-        if work.is_dir():
-            with _held(work / "lock", target):
-                for left in [path for path in work.iterdir() if path.is_dir()]:
-                    remove_tree(left)
-            _tidy(work)
 
 
 def _check(target: Path, mark: str, overwrite: bool) -> None:
@@ -174,27 +227,9 @@ def _check(target: Path, mark: str, overwrite: bool) -> None:
         )
 
 
-@contextmanager
-def _held(path: Path, target: Path) -> Iterator[None]:
-    try:
-        lock = FileLock(path).acquire(timeout=0)
-    except Timeout:
-        raise BusyError(f"{target} is being made by another process; wait for it to finish") from None
-    with lock:
-        yield
-
-
 def _put_back(work: Path, target: Path) -> None:
     """Put the old target back if a kill between two renames left no new one; else remove it."""
     old = work / "old"
     if old.exists() and not target.exists():
         old.rename(target)
     remove_tree(old)
-
-
-def _tidy(work: Path) -> None:
-    """Remove the working folder if only the lock is left in it."""
-    with suppress(OSError):
-        if {path.name for path in work.iterdir()} <= {"lock"}:
-            (work / "lock").unlink(missing_ok=True)
-            work.rmdir()
