@@ -21,15 +21,15 @@ import numpy as np
 from benchmarks.results_page import ARM_COLUMNS, arm_figures, markdown_table
 from pipelines.ingest import ingest
 from pipelines.planning.arm_flights import fly_arm
+from pipelines.planning.arms import PLANNER_ARMS
 from pipelines.planning.comparison import mean_of_trials
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.loading import load_flight
-from pipelines.planning.scene import Rules, Scene, build_scene
+from pipelines.planning.scene import Scene, Settings, build_scene
 from pipelines.planning.scores import score
-from pipelines.replan import Settings, planner_settings, replan
+from pipelines.replan import planner_settings, replan
 from pipelines.session.description import read_description
 from pipelines.session.maps import load_maps
-from pipelines.session.registries import PLANNER_ARMS
 from pipelines.simulate import simulate
 
 SCENARIOS = Path(__file__).parents[1] / "sample_data" / "planning"
@@ -109,9 +109,9 @@ def _print_seeds(sessions: Mapping[str, Path], seeds: int) -> None:
         cells = []
         for kind in kinds:
             values = np.array([each[kind]["mean"] for each in differences if each[kind]])
-            told = mean_of_trials(values, 0)
+            estimate = mean_of_trials(values, 0)
             scale = 100 if kind == "occluded_share" else 1
-            cells.append("-" if told is None else _with_interval(told.as_json(), scale))
+            cells.append("-" if estimate is None else _with_interval(estimate.as_json(), scale))
         largest = [f"{max(each['arms'][arm]['tilt_deg']['max'] for each in flown):.1f}" for arm in ARMS]
         print(f"| {' | '.join([name, *cells, *largest])} |", flush=True)
 
@@ -131,7 +131,7 @@ def _with_interval(estimate: Mapping[str, Any], scale: float) -> str:
 def _scene(session: Path) -> Scene:
     description = read_description(session)
     flight = load_flight(session, description, None, pose_noise=None)
-    return build_scene(flight, load_maps(session), description, Rules(PlannerConfig()))
+    return build_scene(flight, load_maps(session), description, Settings())
 
 
 def _print_weights(scenes: Mapping[str, Scene]) -> None:
@@ -140,7 +140,7 @@ def _print_weights(scenes: Mapping[str, Scene]) -> None:
     for changed in VARIANTS:
         config = replace(PlannerConfig(), **changed)  # type: ignore[arg-type]  # ints and floats by name
         cells = [
-            _figures(replace(scene, rules=replace(scene.rules, config=config)), arm)
+            _figures(replace(scene, settings=replace(scene.settings, planner=config)), arm)
             for scene in scenes.values()
             for arm in ARMS
         ]

@@ -20,7 +20,7 @@ from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField
 from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import formation_slots
-from pipelines.planning.replay import replay
+from pipelines.planning.replay import Start, replay
 from pipelines.planning.scores import score
 from tests.planning.worlds import mound, trees, walker, wall
 
@@ -118,9 +118,8 @@ def print_replays(turns: int) -> list[tuple[str, float, float]]:
                     arm,
                     *walker(seconds),
                     [field],
+                    Start(2, np.pi / 4),
                     config=config,
-                    drones=2,
-                    yaw_rad=np.pi / 4,
                     clock=time.thread_time,
                 )
                 runs_s.append(time.thread_time() - started)
@@ -157,9 +156,7 @@ def print_separations() -> None:
         nearest = np.inf
         cases = itertools.product(worlds, (ADAPTIVE, COVARIANCE, GREEDY), (2, 3, 5), (-90.0, 45.0))
         for field, arm, drones, yaw_deg in cases:
-            result = replay(
-                arm, *walker(25.0), [field], config=config, drones=drones, yaw_rad=np.radians(yaw_deg)
-            )
+            result = replay(arm, *walker(25.0), [field], Start(drones, np.radians(yaw_deg)), config=config)
             for name, count in result.separation.items():
                 counts[name] += count
             for i, j in itertools.combinations(range(drones), 2):

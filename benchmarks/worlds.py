@@ -24,13 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
+from pipelines.planning.arms import PLANNER_ARMS
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, distance_field
 from pipelines.planning.formation import formation_slots, slot_offsets
-from pipelines.planning.replay import replay
+from pipelines.planning.replay import Start, replay
 from pipelines.planning.scores import predicted_errors, score
 from pipelines.session.records import Occupancy
-from pipelines.session.registries import PLANNER_ARMS
 
 Int64 = NDArray[np.int64]
 
@@ -262,9 +262,8 @@ def fly(seed: int, arms: Sequence[str] = ARMS) -> list[dict[str, Any]]:
             world.actor_t_ns,
             world.actor,
             [field],
+            Start(world.drones, world.yaw_rad),
             config=_CONFIG,
-            drones=world.drones,
-            yaw_rad=world.yaw_rad,
         )
         place = _finely(result.position)
         slots_now = world.actor[0] + (result.position[:, 0] - result.actor[0])
@@ -286,7 +285,7 @@ def fly(seed: int, arms: Sequence[str] = ARMS) -> list[dict[str, Any]]:
                 "farthest_m": float(away[:, -1].max()),
                 "limits": sum(broken[key] for key in ("speed", "acceleration", "jerk", "separation")),
                 "tilt_deg": float(np.degrees(result.tilt_rad).mean()),
-                "hidden": float(1.0 - result.visible.mean()),
+                "hidden": figures["occluded_share"],
                 "error_m": float(error.mean()),
                 "safety": getattr(result, "safety", {}),
             }

@@ -21,7 +21,7 @@ from mocap_cli.several import each
 from mocap_cli.terminal import print_table, say, say_warnings, watching
 
 if TYPE_CHECKING:
-    from pipelines.planning.replay import Mode
+    from pipelines.planning.config import Mode
 
 
 @click.command("replan-compare", short_help="Fly other planners against the log, compare.")
@@ -121,7 +121,8 @@ def replan_compare_command(
     The actor's own skeleton is filmed again from each planner's cameras, with simulated errors of detector
     and poses. Every figure of a replay is simulated; `flown` and `planned` are what the log says.
     """
-    from pipelines.replan import Settings, planner_settings, replan
+    from pipelines.planning.scene import Settings
+    from pipelines.replan import planner_settings, replan
 
     stated = {"radius_m": radius, "tilt_deg": tilt, "yaws": yaws, "yaw_frame": yaw_frame}
     settings = Settings(

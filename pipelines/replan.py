@@ -1,7 +1,8 @@
 """Stage `replan`: fly the formation planners again, offline, with the logged actor and the maps.
 
-Load the flown trajectories; fly every arm and film the actor's own skeleton from its cameras; score all arms
-in the same way and compare; store. metrics.json marks what was simulated; run.json has the planning times.
+Load the logged flight; replay every arm and simulate what its cameras measure of the actor's skeleton; score
+all arms in the same way and compare; store. metrics.json marks what was simulated; run.json has the planning
+times.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,24 +23,23 @@ from pipelines.planning.arm_flights import (
     FLOWN,
     LOGGED,
     PLANNED,
-    film_arm,
     flight_from,
     fly_arm,
     logged_arm,
+    measure_arm,
     seen_joints,
     trajectories,
 )
+from pipelines.planning.arms import PLANNER_ARMS
+from pipelines.planning.comparison import ArmResult, compare
 from pipelines.planning.config import PlannerConfig, planner_config
-from pipelines.planning.contest import Entrant, compare
 from pipelines.planning.loading import LoggedFlight, load_flight
-from pipelines.planning.replay import Mode
-from pipelines.planning.scene import Rules, Scene, build_scene
+from pipelines.planning.scene import Scene, Settings, build_scene
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import load_maps
 from pipelines.session.progress import Progress, Silent
 from pipelines.session.records import JointMotion
-from pipelines.session.registries import PLANNER_ARMS
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
@@ -63,22 +63,6 @@ REPLAN_STAGE = Stage("replan", revision=3)
 
 _HEIGHT_M = 1.75  # of the person, for their size in the modelled detector's pictures
 _SKELETON = "reconstruct/skeleton.parquet"
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Settings that determine the result, in addition to the session; None takes the session's value."""
-
-    arms: tuple[str, ...] | None = (
-        None  # adaptive and fixed, flown if cameras moved, planned if commands are logged
-    )
-    drones: int | None = None  # the number of cameras, 2 to 8
-    yaw_deg: float | None = None  # that of the first camera
-    mode: Mode = "closed-loop"
-    trials: int = 20
-    seed: int = 0
-    pose_noise: str | None = None
-    planner: PlannerConfig = field(default_factory=PlannerConfig)
 
 
 @dataclass(frozen=True)
@@ -146,31 +130,29 @@ def replan(
         flight = load_flight(folder, description, reconstructed, pose_noise=settings.pose_noise)
         arms = _arms(folder, settings.arms, flight)
         errors = _detector_errors(session)
-        scene = build_scene(
-            flight, load_maps(folder) if description.map else [], description, _rules(settings)
-        )
+        scene = build_scene(flight, load_maps(folder) if description.map else [], description, settings)
         for note in scene.notes:
             progress.note(note)
         progress.start("Replaying", len(arms))
-        entrants, times = {}, {}
+        results, times = {}, {}
         for arm in arms:
             made = run.chunk(arm, partial(_fly, scene, errors, arm))
-            entrants[arm] = _read_entrant(made)
+            results[arm] = _read_result(made)
             times[arm] = read_json(made / "times.json")
             (run.folder / arm).mkdir()
             for table in made.glob("*.parquet"):
                 shutil.copyfile(table, run.folder / arm / table.name)
             progress.advance()
-        metrics = jsonable(compare(scene, entrants) | {"keypoints": f"modelled after {errors.detector}"})
+        metrics = jsonable(compare(scene, results) | {"keypoints": f"modelled after {errors.detector}"})
         write_table(run.folder / "actor.parquet", _actor_table(scene), ACTOR)
         write_table(run.folder / "cost_map.parquet", _cost_table(scene), COST_MAP)
         write_json(run.folder / "metrics.json", metrics)
         counts = {
             "moments": len(scene.t_ns),
             "pictures": len(scene.t_ns[scene.pictures]),
-            "joint_frames": {name: entrant.joint_frames for name, entrant in entrants.items()},
-            "local_plans": {name: entrant.flown.separation for name, entrant in entrants.items()},
-            "safety": {name: entrant.flown.safety for name, entrant in entrants.items()},
+            "joint_frames": {name: result.joint_frames for name, result in results.items()},
+            "local_plans": {name: result.flight.separation for name, result in results.items()},
+            "safety": {name: result.flight.safety for name, result in results.items()},
         }
         record = run.publish(counts=counts, warnings=metrics["warnings"])
         _note_planning_times(folder, times)
@@ -244,18 +226,6 @@ def _arms(folder: Path, asked: tuple[str, ...] | None, flight: LoggedFlight) -> 
     return list(dict.fromkeys(asked))
 
 
-def _rules(settings: Settings) -> Rules:
-    yaw = settings.yaw_deg
-    return Rules(
-        config=settings.planner,
-        drones=settings.drones,
-        yaw_rad=None if yaw is None else float(np.radians(yaw)),
-        mode=settings.mode,
-        trials=settings.trials,
-        seed=settings.seed,
-    )
-
-
 def _detect(
     pixels: Float,
     free: np.ndarray[Any, np.dtype[np.bool_]],
@@ -276,10 +246,10 @@ def _detect(
 
 
 def _fly(scene: Scene, errors: DetectorErrors, arm: str, folder: Path) -> None:
-    """Fly and film one arm; write everything that the comparison needs to the folder."""
+    """Fly one arm and measure from its cameras; write everything that the comparison needs to the folder."""
     flown = logged_arm(scene, arm) if arm in LOGGED else fly_arm(scene, PLANNER_ARMS.get(arm))
     joints = scene.flight.skeleton.joints if scene.flight.skeleton else ()
-    measured = film_arm(scene, flown, partial(_detect, joints=joints, errors=errors))
+    measured = measure_arm(scene, flown, partial(_detect, joints=joints, errors=errors))
     write_table(folder / "trajectories.parquet", trajectories(scene, flown), REPLAN)
     np.save(folder / "known.npy", flown.known)
     facts: dict[str, object] = {
@@ -298,12 +268,12 @@ def _fly(scene: Scene, errors: DetectorErrors, arm: str, folder: Path) -> None:
     write_json(folder / "times.json", _percentiles({"central": flown.central_s, "local": flown.local_s}))
 
 
-def _read_entrant(folder: Path) -> Entrant:
+def _read_result(folder: Path) -> ArmResult:
     facts = read_json(folder / "facts.json")
     table = read_table(folder / "trajectories.parquet", REPLAN)
     errors = folder / "error_m.npy"
-    return Entrant(
-        flown=flight_from(table, np.load(folder / "known.npy"), facts["separation"], facts["safety"]),
+    return ArmResult(
+        flight=flight_from(table, np.load(folder / "known.npy"), facts["separation"], facts["safety"]),
         error_m=np.load(errors) if errors.exists() else None,
         seen_share=facts["seen_share"],
         joint_frames=facts["joint_frames"],

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from pipelines.formats.flights.pictures import Pictures, open_pictures, refuse_changed_pictures
 from pipelines.geometry.arrays import Picture
-from pipelines.planning.hidden import hidden_shares
 from pipelines.planning.loading import load_flight
+from pipelines.planning.scene import hidden_shares
 from pipelines.reporting.comparison import compare, labels_of
 from pipelines.reporting.comparison_figures import draw_comparison
 from pipelines.reporting.comparison_page import GENERATOR, render_comparison

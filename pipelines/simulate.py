@@ -22,13 +22,14 @@ from pipelines.formats.maps.octomap_writing import write_octomap
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video_writing import join_videos, write_h264
 from pipelines.geometry.arrays import Float, Picture
+from pipelines.planning.arms import PLANNER_ARMS
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import distance_field
-from pipelines.planning.pilot import Pilot
+from pipelines.planning.replay import Pilot, Start
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
 from pipelines.session.records import Occupancy, SkeletalMotion
-from pipelines.session.registries import PLANNER_ARMS, noise_models
+from pipelines.session.registries import noise_models
 from pipelines.session.storage import hash_of, read_json, sha256_of, write_json
 from pipelines.session.whole_folders import SIMULATION_MARK, is_made, whole_folder
 from pipelines.simulation.detector_errors import errors_of
@@ -189,7 +190,7 @@ def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | Non
     def start(world: World) -> Planner:
         spec = scenario.world.map
         field = distance_field(world.occupancy(spec.resolution_m, spec.height_m))
-        pilot = Pilot(arm, config, drones=count, yaw_rad=float(np.radians(formation.yaw_deg)))
+        pilot = Pilot(arm, config, Start(count, float(np.radians(formation.yaw_deg))))
         measured = 0
 
         def slots(known: Known) -> tuple[Float, Float]:
@@ -199,8 +200,9 @@ def _planner(scenario: Scenario, path: Path) -> Callable[[World], Planner] | Non
             measured = len(known.actor_t_s)
             if not measured:  # the actor's position is not known yet: hover
                 return known.position, np.zeros_like(known.position)
-            command = pilot.step(known.t_s, known.position, known.velocity, field)
-            return command.position, command.velocity
+            pilot.replan(known.t_s, known.position, known.velocity, field)
+            position, velocity, _ = pilot.reference(known.t_s)
+            return position, velocity
 
         return slots
 

@@ -1,4 +1,4 @@
-"""One arm of a comparison: its flight, its simulated measurements, and its table rows."""
+"""One arm of a comparison: its flight, replayed or logged, and its rows in the tables."""
 
 from __future__ import annotations
 
@@ -9,18 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float
-from pipelines.geometry.cameras import Intrinsics
-from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.poses import look_at
 from pipelines.planning.arms import Arm
+from pipelines.planning.distance_field import visible
 from pipelines.planning.forecast import ActorFilter
 from pipelines.planning.formation import TILT, YAW, slot_of
 from pipelines.planning.loading import planned_positions
-from pipelines.planning.measuring import Detect, Filming, Measured, film
-from pipelines.planning.replay import replay
+from pipelines.planning.measuring import CameraPaths, Detect, Measured, measure
+from pipelines.planning.replay import Start, replay
 from pipelines.planning.scene import Scene
 from pipelines.planning.scores import predicted_errors
-from pipelines.planning.sight import visible
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -64,41 +62,40 @@ def logged_arm(scene: Scene, name: str) -> ArmFlight:
         names = tuple(camera.name for camera in scene.flight.cameras)
         return ArmFlight(names, position, quaternion, np.full_like(position, np.nan), known, {}, {})
     position, known = planned_positions(scene.flight, scene.t_ns)
-    believed = _estimates(scene)
-    slots = slot_of(position - believed)
+    estimates = _estimates(scene)
+    slots = slot_of(position - estimates)
     slots[..., YAW] = np.unwrap(slots[..., YAW], axis=1)
-    return ArmFlight(tuple(scene.flight.planned), position, look_at(position, believed), slots, known, {}, {})
+    return ArmFlight(
+        tuple(scene.flight.planned), position, look_at(position, estimates), slots, known, {}, {}
+    )
 
 
 def _estimates(scene: Scene) -> Float:
     """Estimate the actor's positions [T, 3] as planners do, from no later measurement."""
     flight, config = scene.flight, scene.config
-    believed = ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m)
+    actor = ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m)
     log_s = (flight.actor_t_ns - flight.actor_t_ns[0]) / 1e9
     until = np.searchsorted(flight.actor_t_ns, scene.t_ns, side="right")
     found, taken = np.empty((len(scene.t_ns), 3)), 0
     for k, t_s in enumerate((scene.t_ns - flight.actor_t_ns[0]) / 1e9):
         for row in range(taken, until[k]):
-            believed.measure(log_s[row], flight.actor[row])
+            actor.measure(log_s[row], flight.actor[row])
         taken = int(until[k])
-        found[k] = believed.forecast(np.array([t_s]))[0]
+        found[k] = actor.forecast(np.array([t_s]))[0]
     return found
 
 
 def fly_arm(scene: Scene, arm: Arm) -> ArmFlight:
     """Fly a scene again."""
-    flight, rules = scene.flight, scene.rules
     done = replay(
         arm,
-        flight.actor_t_ns,
-        flight.actor,
+        scene.flight.actor_t_ns,
+        scene.flight.actor,
         scene.fields,
+        Start(scene.drones, scene.yaw_rad, scene.heading_rad),
         config=scene.config,
-        drones=scene.drones,
-        yaw_rad=scene.yaw_rad,
-        heading_rad=scene.heading_rad,
-        mode=rules.mode,
-        seed=rules.seed,
+        mode=scene.settings.mode,
+        seed=scene.settings.seed,
     )
     return ArmFlight(
         names=tuple(scene.names),
@@ -113,38 +110,32 @@ def fly_arm(scene: Scene, arm: Arm) -> ArmFlight:
     )
 
 
-def film_arm(scene: Scene, flown: ArmFlight, detect: Detect) -> Measured | None:
+def measure_arm(scene: Scene, flown: ArmFlight, detect: Detect) -> Measured | None:
     """Simulate what an arm's cameras measure of the actor's skeleton; None without a skeleton."""
     if scene.joints is None:
         return None
-    lenses, noise = _equipment(scene, flown)
+    cameras = scene.flight.cameras
+    own = {camera.name: camera for camera in cameras}
+    carried = [own.get(name, cameras[k % len(cameras)]) for k, name in enumerate(flown.names)]
     pictures = scene.pictures
-    filming = Filming(
+    paths = CameraPaths(
         t_ns=scene.t_ns[pictures],
         position=flown.position[:, pictures],
         quaternion_xyzw=flown.quaternion_xyzw[:, pictures],
         known=flown.known[:, pictures],
-        intrinsics=lenses,
-        noise=noise,
+        intrinsics=[camera.intrinsics for camera in carried],
+        noise=[camera.noise for camera in carried],
         joints=scene.joints,
         middle=scene.actor[pictures],
     )
-    return film(
-        filming,
+    return measure(
+        paths,
         scene.field,
         detect,
         start_m=scene.config.sight_start_m,
-        trials=scene.rules.trials,
-        seed=scene.rules.seed,
+        trials=scene.settings.trials,
+        seed=scene.settings.seed,
     )
-
-
-def _equipment(scene: Scene, flown: ArmFlight) -> tuple[list[Intrinsics], list[tuple[NoiseModel, ...]]]:
-    """Return lens and pose noise of each camera."""
-    cameras = scene.flight.cameras
-    own = {camera.name: camera for camera in cameras}
-    carried = [own.get(name, cameras[k % len(cameras)]) for k, name in enumerate(flown.names)]
-    return [camera.intrinsics for camera in carried], [camera.noise for camera in carried]
 
 
 def trajectories(scene: Scene, flown: ArmFlight) -> pd.DataFrame:
@@ -176,7 +167,7 @@ def seen_joints(scene: Scene, flown: ArmFlight, measured: Measured) -> pd.DataFr
     import pandas as pd
 
     if scene.joints is None or scene.flight.skeleton is None:
-        raise ValueError("nobody knows a skeleton")
+        raise ValueError("the scene has no skeleton")
     t_s, t_ns = scene.t_s[scene.pictures], scene.t_ns[scene.pictures]
     looks = np.unique(np.searchsorted(t_s, np.arange(0.0, t_s[-1] + 1e-9, _LOOK_EVERY_S) - 1e-9))
     pixels, free = (values[:, looks].swapaxes(0, 1) for values in (measured.pixels, measured.free))

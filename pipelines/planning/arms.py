@@ -13,7 +13,6 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.costs import SlotCosts, cost_map, costs_in_frame, costs_of_slots, error_map
 from pipelines.planning.distance_field import DistanceField
 from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import (
@@ -24,8 +23,21 @@ from pipelines.planning.formation import (
     yaw_set,
 )
 from pipelines.planning.information import log_determinant, ray_information
-from pipelines.planning.search import best_sequence, lattice
-from pipelines.planning.search_kernels import Formations, Lattice, cheapest_slots, turn_the_shorter_way
+from pipelines.planning.search import (
+    Formations,
+    Lattice,
+    SlotCosts,
+    best_sequence,
+    cheapest_slots,
+    cost_map,
+    costs_in_frame,
+    costs_of_slots,
+    error_map,
+    lattice,
+    slot_weights,
+    turn_the_shorter_way,
+)
+from pipelines.session.registries import Registry
 
 _TOO_NEAR = 100.0  # cost of a slot within the separation of another drone's: more than any gain
 
@@ -90,6 +102,7 @@ class _GreedyArm:
         return _Greedy(config, drones, yaw_rad)
 
 
+PLANNER_ARMS: Registry[Arm] = Registry("mocap.planner_arms", "planner arm")
 FIXED: Arm = _FixedArm()
 ADAPTIVE: Arm = _SearchingArm("adaptive", "adaptive formation")
 COVARIANCE: Arm = _SearchingArm("covariance", "adaptive formation, predicted error", predicts_error=True)
@@ -132,7 +145,7 @@ class _Formation:
         self._offsets = slot_offsets(self._slots)
         self._config, self._predicts_error = config, predicts_error
         self._formations = Formations(self._lattice, self._slots, self._offsets)
-        self._weights = config.slot_weights()
+        self._weights = slot_weights(config)
         self._rates = np.array(config.slot_rates)
 
     def plan(self, t_s: float, commanded: Float, actor: Forecast, field: DistanceField) -> FormationPath:

@@ -1,4 +1,4 @@
-"""Comparison of arms: means, differences, and their confidence intervals.
+"""Comparison of arms, as in metrics.json: scores, differences with their intervals, and the verdict.
 
 Intervals are percentiles of bootstrap means (Efron & Tibshirani 1993, 13.3): of the trials for errors, which
 are independent draws, and of stretches of the flight for figures that depend on the flight's course.
@@ -6,13 +6,20 @@ are independent draws, and of stretches of the flight for figures that depend on
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float
+from pipelines.planning.arm_flights import LOGGED, ArmFlight
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.distance_field import visible
+from pipelines.planning.formation import TILT, slot_of
+from pipelines.planning.scene import Scene
+from pipelines.planning.scores import score
 
 Float32 = NDArray[np.float32]
 
@@ -20,6 +27,10 @@ RESAMPLES = 2000
 LEVEL = 0.95
 STRETCH_S = 5.0
 """Length of the pieces in which the flight is resampled, because neighbouring moments are alike, s."""
+REFERENCE = "fixed"
+"""Arm that the others are compared with; the first arm where it is missing."""
+_ALIKE_DEG = 2.0  # smaller differences of tilt are not reported
+_ALIKE_PERCENT = 1.0  # of the joints, likewise
 
 
 @dataclass(frozen=True)
@@ -101,3 +112,241 @@ def _weighted(values: Float, weight: Float, seed: int) -> Estimate | None:
     tail = 50 * (1 - LEVEL)
     low, high = np.percentile(means, [tail, 100 - tail])
     return Estimate(mean, (float(low), float(high)))
+
+
+@dataclass(frozen=True)
+class ArmResult:
+    """Flight of one arm, and what its cameras measured."""
+
+    flight: ArmFlight
+    error_m: Float32 | None  # [trials, P, J] NaN where not measured; None without a skeleton
+    seen_share: float | None  # of joints and cameras
+    joint_frames: int
+
+
+def compare(scene: Scene, results: Mapping[str, ArmResult]) -> dict[str, Any]:
+    """Score every arm and the differences to the reference.
+
+    Errors are compared on common joint-frames: those that all arms measured in a trial, for `mpjpe_mm` and
+    for the differences alike. `coverage` is the share that the arm itself measured.
+    """
+    errors = {name: result.error_m for name, result in results.items() if result.error_m is not None}
+    shared = common_frames(errors) if errors else None
+    arms = {name: _scores(scene, name, result, shared) for name, result in results.items()}
+    reference = REFERENCE if REFERENCE in results else next(iter(results))
+    differences = [
+        {"arm": name, "against": reference, **_difference(scene, result, results[reference], shared)}
+        for name, result in results.items()
+        if name != reference
+    ]
+    settings, flight = scene.settings, scene.flight
+    broken = [line for name, arm in arms.items() if (line := broken_limits(name, arm, scene.config))]
+    return {
+        "schema": 1,
+        "simulated": True,  # replays are, and every reconstruction error
+        "mode": settings.mode,
+        "drones": scene.drones,
+        "yaw_deg": float(np.degrees(scene.yaw_rad)),
+        "duration_s": float(scene.t_s[-1]),
+        "actor": {"planned_with": flight.actor_source, "scored_against": scene.actor_source},
+        "skeleton": flight.skeleton_source,
+        "flown_poses": flight.poses_source,
+        "pose_noise_from": flight.noise_source,
+        "maps": len(scene.fields),
+        "near_obstacle_share": float(scene.near.mean()),
+        "trials": settings.trials,
+        "seed": settings.seed,
+        "intervals": {"level": LEVEL, "errors_over": "trials", "flights_over_stretches_of_s": STRETCH_S},
+        "arms": arms,
+        "differences": differences,
+        "verdict": _verdict(arms, differences, broken),
+        "notes": list(scene.notes),
+        "warnings": [*broken, *scene.warnings, *_warnings(results)],
+    }
+
+
+def _scores(scene: Scene, name: str, result: ArmResult, shared: Bool | None) -> dict[str, Any]:
+    flown = result.flight
+    found = score(scene.t_s, flown.position, scene.actor, scene.field, scene.config, near=scene.near)
+    own, common, covered = _errors(scene, result, shared)
+    return {
+        **found,
+        "mpjpe_mm": None if common is None else common.mean,
+        "simulated": name not in LOGGED,
+        "drones": len(flown.position),
+        "local_plans": flown.separation or None,
+        "safety": flown.safety or None,
+        "reconstruction_error": {
+            "simulated": True,
+            "mpjpe_mm": _json(common),
+            "mpjpe_of_all_it_measured_mm": _json(own),
+            "coverage": _json(covered),
+            "seen_share": result.seen_share,
+            "joint_frames": result.joint_frames,
+        },
+    }
+
+
+def _errors(
+    scene: Scene, result: ArmResult, shared: Bool | None
+) -> tuple[Estimate | None, Estimate | None, Estimate | None]:
+    """Return the mean error of all measured joint-frames and of the common ones, and the coverage."""
+    error, seed = result.error_m, scene.settings.seed
+    if error is None or shared is None:
+        return None, None, None
+    measured = np.isfinite(error)
+    own, common = (mean_of_trials(mpjpe_mm(error, rows), seed) for rows in (measured, shared & measured))
+    return own, common, mean_of_trials(coverage(error, result.joint_frames), seed)
+
+
+def _difference(scene: Scene, one: ArmResult, other: ArmResult, shared: Bool | None) -> dict[str, Any]:
+    """Compute one minus the other, with intervals.
+
+    Both have the same seeds, moments and joint-frames as in the table.
+    """
+    tilt_deg, hidden = (
+        of(scene, one.flight).mean(axis=0) - of(scene, other.flight).mean(axis=0)
+        for of in (_tilt_deg, _hidden)
+    )
+    always, stretch = np.ones(len(scene.t_ns), dtype=np.bool_), stretches(scene.t_s)
+    seed = scene.settings.seed
+    error = cover = None
+    if one.error_m is not None and other.error_m is not None and shared is not None:
+        both = shared & np.isfinite(one.error_m) & np.isfinite(other.error_m)  # one may have measured none
+        error = mean_of_trials(mpjpe_mm(one.error_m, both) - mpjpe_mm(other.error_m, both), seed)
+        cover = mean_of_trials(
+            coverage(one.error_m, one.joint_frames) - coverage(other.error_m, other.joint_frames), seed
+        )
+    return {
+        "tilt_deg": _json(mean_over_time(tilt_deg, always, stretch, seed)),
+        "tilt_near_obstacle_deg": _json(mean_over_time(tilt_deg, scene.near, stretch, seed)),
+        "occluded_share": _json(mean_over_time(hidden, always, stretch, seed)),
+        "mpjpe_mm": _json(error),
+        "coverage": _json(cover),
+        "simulated": True,
+    }
+
+
+def _tilt_deg(scene: Scene, flown: ArmFlight) -> Float:
+    tilt_deg: Float = np.degrees(slot_of(flown.position - scene.actor)[..., TILT])
+    return tilt_deg
+
+
+def _hidden(scene: Scene, flown: ArmFlight) -> Float:
+    seen = visible(scene.field, flown.position, scene.actor, start_m=scene.config.sight_start_m)
+    return np.where(seen, 0.0, 1.0)
+
+
+def _verdict(
+    arms: Mapping[str, Mapping[str, Any]], differences: Sequence[Mapping[str, Any]], broken: Sequence[str]
+) -> str:
+    """Name the violated limits, and then compare the arms."""
+    if differences:
+        wanted = next((each for each in differences if each["arm"] == "adaptive"), differences[0])
+        said = verdict(wanted["arm"], wanted["against"], arms, wanted)
+    else:
+        said = f"{next(iter(arms))} flew alone: there is nothing to compare it with"
+    return ". ".join([*broken, said])
+
+
+def _warnings(results: Mapping[str, ArmResult]) -> list[str]:
+    warnings = []
+    for name, result in results.items():
+        gap_share = float(1.0 - result.flight.known.mean())
+        if gap_share > 0:
+            warnings.append(
+                f"{name}: {100 * gap_share:.1f} % of its poses lie in gaps of the log: straight ways there,"
+                " and no pictures"
+            )
+        if result.error_m is not None and not np.isfinite(result.error_m).any():
+            warnings.append(f"{name}: not a single joint could be measured from its cameras")
+    return warnings
+
+
+def _json(estimate: Estimate | None) -> dict[str, object] | None:
+    return None if estimate is None else estimate.as_json()
+
+
+def verdict(
+    arm: str, against: str, arms: Mapping[str, Mapping[str, Any]], difference: Mapping[str, Any]
+) -> str:
+    """Compare an arm with another in one sentence: tilt, reconstruction error, coverage.
+
+    Args:
+        arm: the arm that is judged.
+        against: the arm that it is compared with.
+        arms: scores by arm, as in metrics.json.
+        difference: of the two, arm minus against, as in metrics.json.
+    """
+    return (
+        f"{_about_tilt(arm, against, arms)}; {_about_error(difference)}{_about_coverage(arm, against, arms)}"
+    )
+
+
+def broken_limits(arm: str, scores: Mapping[str, Any], config: PlannerConfig) -> str | None:
+    """Name every limit that an arm violates, and how often; None if it keeps all of them.
+
+    Args:
+        arm: its name.
+        scores: of the arm, as in metrics.json.
+        config: the limits.
+    """
+    kinds = {
+        "collision": "collides with an obstacle",
+        "clearance": f"comes within {config.drone_radius_m:g} m of an obstacle",
+        "actor": f"comes within {config.actor_distance_m:g} m of the actor",
+        "separation": f"has two drones within {config.separation_m:g} m of each other",
+        "speed": f"flies faster than {config.speed_mps:g} m/s",
+        "acceleration": f"accelerates by more than {config.acceleration_mps2:g} m/s^2",
+        "jerk": f"has a jerk of more than {config.jerk_mps3:g} m/s^3",
+    }
+    counts = scores["limit_violations"]
+    said = [f"{words} ({_times(counts[kind])})" for kind, words in kinds.items() if counts.get(kind)]
+    return f"{arm} {', '.join(said)}" if said else None
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
+
+
+def _about_tilt(arm: str, against: str, arms: Mapping[str, Mapping[str, Any]]) -> str:
+    own, other = (arms[name]["tilt_deg"]["max"] for name in (arm, against))
+    if abs(own - other) < _ALIKE_DEG:
+        return f"{arm} and {against} tilt alike, up to {own:.0f} and {other:.0f} deg"
+    if own < other:
+        return f"{arm} keeps the tilt at {own:.0f} deg where {against} climbs to {other:.0f}"
+    return f"{arm} climbs to a tilt of {own:.0f} deg where {against} keeps it at {other:.0f}"
+
+
+def _about_coverage(arm: str, against: str, arms: Mapping[str, Mapping[str, Any]]) -> str:
+    """Say which arm measured more joints; empty if they are alike.
+
+    Errors are compared on joints that both measured, so the coverage must be reported as well.
+    """
+    found = [arms[name]["reconstruction_error"]["coverage"] for name in (arm, against)]
+    if None in found:
+        return ""
+    own, other = (100 * each["mean"] for each in found)
+    if abs(own - other) < _ALIKE_PERCENT:
+        return ""
+    return f", and it measures {own:.0f} % of the joints where {against} measures {other:.0f} %"
+
+
+def _about_error(difference: Mapping[str, Any]) -> str:
+    found = difference["mpjpe_mm"]
+    if found is None:
+        return "its reconstruction error could not be compared"
+    mean, interval = found["mean"], found["interval"]
+    if interval is None:
+        return f"its reconstruction error differs by {mean:+.0f} mm in the only trial (simulated)"
+    low, high = interval
+    if low <= 0 <= high:
+        return (
+            "no difference in reconstruction error was found"
+            f" ({mean:+.1f} mm [{low:+.1f}, {high:+.1f}], simulated)"
+        )
+    nearest, farthest = sorted((abs(low), abs(high)))
+    which = "smaller" if mean < 0 else "larger"
+    return (
+        f"its reconstruction error is {abs(mean):.1f} mm [{nearest:.1f}, {farthest:.1f}] {which} (simulated)"
+    )

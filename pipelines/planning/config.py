@@ -9,12 +9,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal, get_args
 
-from pipelines.planning.local_kernels import Weights
-from pipelines.planning.search_kernels import SlotWeights
-from pipelines.planning.tracking import Flying
 from pipelines.session.errors import DataError
 
 MOST_DRONES = 16
+Mode = Literal["plan-only", "closed-loop"]  # of a replay
 Frame = Literal["world", "heading"]
 _WORDS: dict[str, tuple[str, ...]] = {"yaw_frame": get_args(Frame)}
 _SIGNED = ("tilt_deg",)
@@ -48,7 +46,7 @@ class PlannerConfig:
     knot_s: float = 1.0
     horizon_knots: int = 10  # T
     yaw_rate_deg_per_s: float = 22.5
-    yaw_frame: Frame = "world"  # or yaws count from the actor's heading (heading.py)
+    yaw_frame: Frame = "world"  # or yaws count from the actor's heading (forecast.YawZero)
     heading_speed_mps: float = 0.5  # a slower actor stands, and keeps the last heading
     tilt_rate_deg_per_s: float = 5.0  # tilt and range are searched by `covariance` and `greedy` alone
     range_rate_mps: float = 1.0
@@ -161,51 +159,15 @@ class PlannerConfig:
                 "those of covariance and greedy keep",
             ),
         )
-        told = []
+        doubts = []
         for name, yaws, seconds, keeps in lattices:
             most_deg = self.yaw_rate_deg_per_s * seconds
             if 1 < yaws < 360 / most_deg * (1 - 1e-9):
-                told.append(
+                doubts.append(
                     f"{name}: {yaws} cells of {360 / yaws:.3g} deg, but formations turn {most_deg:.3g} deg"
                     f" between knots: {keeps} to their yaw, state at least {math.ceil(360 / most_deg - 1e-9)}"
                 )
-        return told
-
-    def flying(self) -> Flying:
-        """Return gains, limits and period of the drones."""
-        return Flying(
-            self.k_position,
-            self.k_velocity,
-            self.k_integral,
-            self.acceleration_mps2,
-            self.jerk_mps3,
-            self.speed_mps,
-            1.0 / self.tracking_hz,
-        )
-
-    def slot_weights(self) -> SlotWeights:
-        """Return the weights of the formation search's kernels."""
-        return SlotWeights(self.w_obs, self.w_occ, self.eps_obs_m, self.sight_start_m)
-
-    def local_weights(self, resolution_m: float) -> Weights:
-        """Return the local planner's weights; sight lines from `radius_m` are sampled every half voxel."""
-        reach_m = max(self.radius_m - self.sight_start_m, resolution_m)
-        return Weights(
-            l_obs=self.l_obs,
-            l_occ=self.l_occ,
-            l_form=self.l_form,
-            l_sep=self.l_sep,
-            a_velocity=self.a_velocity,
-            a_acceleration=self.a_acceleration,
-            a_jerk=self.a_jerk,
-            eps_obs_m=self.eps_obs_m,
-            eps_occ_m=self.eps_occ_m,
-            soft_separation_m=self.soft_separation_m,
-            sight_start_m=self.sight_start_m,
-            speed_floor_mps=self.speed_floor_mps,
-            step_s=self.waypoint_s,
-            samples=max(math.ceil(2 * reach_m / resolution_m), 4),
-        )
+        return doubts
 
 
 def planner_config(values: Mapping[str, object], source: Path | str = "planner settings") -> PlannerConfig:

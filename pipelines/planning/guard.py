@@ -22,13 +22,13 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.distance_field import DistanceField
-from pipelines.planning.field_kernels import Grid, interpolate
+from pipelines.planning.distance_field import DistanceField, Grid, interpolate
 from pipelines.planning.forecast import ActorFilter
 from pipelines.planning.tracking import (
     POSITION,
     VELOCITY,
     Plan,
+    flying_of,
     roll_out,
     stopping_ticks,
 )
@@ -87,7 +87,7 @@ class Guard:
     """
 
     def __init__(self, position: Float, config: PlannerConfig, *, exactly: bool = False) -> None:
-        self._config, self._flying, self._exactly = config, config.flying(), exactly
+        self._config, self._flying, self._exactly = config, flying_of(config), exactly
         self._ticks = math.ceil(config.tracking_hz / config.local_hz - 1e-9)
         rows = self._ticks + stopping_ticks(self._flying) + 1
         self._ticks_ahead = min(round(_ACTOR_AHEAD_S * config.tracking_hz), rows - 1)

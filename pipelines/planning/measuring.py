@@ -18,11 +18,10 @@ from pipelines.geometry.cameras import Intrinsics, project, undistort
 from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import invert, matrix_from_quaternion, rates, transform
 from pipelines.geometry.triangulation import Views, locate
-from pipelines.planning.distance_field import DistanceField
-from pipelines.planning.sight import visible
+from pipelines.planning.distance_field import DistanceField, visible
+from pipelines.session.records import Int64
 
 Float32 = NDArray[np.float32]
-Int64 = NDArray[np.int64]
 
 PIXEL_SIGMA = 3.0
 """Standard deviation of a good keypoint for triangulation, px: the first value in `mocap reconstruct`."""
@@ -55,7 +54,7 @@ class Detect(Protocol):
 
 
 @dataclass(frozen=True)
-class Filming:
+class CameraPaths:
     """Cameras N on their paths at the times T of their pictures, and the filmed person."""
 
     t_ns: Int64  # [T]
@@ -80,40 +79,40 @@ class Measured:
     free: Bool  # [N, T, J] True where nothing stands between camera and joint
 
 
-def film(
-    filming: Filming, field: DistanceField, detect: Detect, *, start_m: float, trials: int, seed: int
+def measure(
+    paths: CameraPaths, field: DistanceField, detect: Detect, *, start_m: float, trials: int, seed: int
 ) -> Measured:
     """Measure a skeleton in several trials.
 
     Args:
-        filming: cameras and person.
+        paths: cameras and person.
         field: the distance field of the obstacles.
         detect: the detector.
         start_m: the end of sight lines next to the joint that is left out: maps contain the person.
         trials: independent draws of all noise.
         seed: of the random numbers. Trial k of camera i has the same numbers for any other path.
     """
-    joints = filming.joints
-    cameras, times, count = len(filming.position), *joints.shape[:2]
-    pixels = np.stack([_pixels(filming, i) for i in range(cameras)])
+    joints = paths.joints
+    cameras, times, count = len(paths.position), *joints.shape[:2]
+    pixels = np.stack([_pixels(paths, i) for i in range(cameras)])
     known = np.isfinite(joints[..., 0])
-    standing_in = np.where(known[..., None], joints, filming.middle[:, None])
-    free = visible(field, filming.position[:, :, None], standing_in, start_m=start_m)
-    sigma = np.stack([_pose_sigma(filming, i) for i in range(cameras)], axis=1)
+    standing_in = np.where(known[..., None], joints, paths.middle[:, None])
+    free = visible(field, paths.position[:, :, None], standing_in, start_m=start_m)
+    sigma = np.stack([_pose_sigma(paths, i) for i in range(cameras)], axis=1)
     error = np.full((trials, times, count), np.nan, dtype=np.float32)
     first = np.full(joints.shape, np.nan)
     for trial in range(trials):
         rays = np.empty((times, count, cameras, 2))
         weight = np.empty((times, count, cameras))
         logged_position, logged_rotation = np.empty((times, cameras, 3)), np.empty((times, cameras, 3, 3))
-        for i, lens in enumerate(filming.intrinsics):
+        for i, lens in enumerate(paths.intrinsics):
             rng = np.random.default_rng([seed, trial, i])
-            path = filming.position[i]
+            path = paths.position[i]
             logged_position[:, i], turned = disturb(
-                filming.noise[i], filming.t_ns, path, filming.quaternion_xyzw[i], rng
+                paths.noise[i], paths.t_ns, path, paths.quaternion_xyzw[i], rng
             )
             logged_rotation[:, i] = matrix_from_quaternion(turned)
-            xy, confidence = detect(pixels[i], free[i], path, filming.middle, _focal(lens), rng)
+            xy, confidence = detect(pixels[i], free[i], path, paths.middle, _focal(lens), rng)
             rays[:, :, i] = undistort(xy, lens)
             weight[:, :, i] = np.where(confidence >= MIN_CONFIDENCE, confidence, 0.0)
         views = Views(
@@ -122,7 +121,7 @@ def film(
             pose_index=np.repeat(np.arange(times), count),
             position=logged_position,
             rotation=logged_rotation,
-            focal=np.array([_focal(lens) for lens in filming.intrinsics]),
+            focal=np.array([_focal(lens) for lens in paths.intrinsics]),
             pixel_sigma=np.full(cameras, PIXEL_SIGMA),
             pose_sigma=sigma,
         )
@@ -137,20 +136,20 @@ def film(
     return Measured(error, first, seen_share, int(known.sum()), pixels, free)
 
 
-def _pixels(filming: Filming, i: int) -> Float:
+def _pixels(paths: CameraPaths, i: int) -> Float:
     """Compute the exact pixels [T, J, 2] of one camera; NaN outside its picture and where it has no pose."""
-    lens = filming.intrinsics[i]
-    camera_from_world = invert(filming.position[i, :, None], filming.quaternion_xyzw[i, :, None])
-    pixels = project(transform(camera_from_world, filming.joints), lens)
+    lens = paths.intrinsics[i]
+    camera_from_world = invert(paths.position[i, :, None], paths.quaternion_xyzw[i, :, None])
+    pixels = project(transform(camera_from_world, paths.joints), lens)
     inside = (pixels >= -0.5) & (pixels <= np.array([lens.width, lens.height]) - 0.5)
-    return np.where(inside.all(axis=-1, keepdims=True) & filming.known[i, :, None, None], pixels, np.nan)
+    return np.where(inside.all(axis=-1, keepdims=True) & paths.known[i, :, None, None], pixels, np.nan)
 
 
-def _pose_sigma(filming: Filming, i: int) -> Float:
+def _pose_sigma(paths: CameraPaths, i: int) -> Float:
     """Compute the sigmas [T, 2] per axis (m, rad) of one camera's poses for triangulation."""
-    path, turned = filming.position[i], filming.quaternion_xyzw[i]
-    elapsed_s = (filming.t_ns - filming.t_ns[0]) / 1e9
-    return sum_sigma(filming.noise[i], elapsed_s, *rates(filming.t_ns, path, turned))
+    path, turned = paths.position[i], paths.quaternion_xyzw[i]
+    elapsed_s = (paths.t_ns - paths.t_ns[0]) / 1e9
+    return sum_sigma(paths.noise[i], elapsed_s, *rates(paths.t_ns, path, turned))
 
 
 def _focal(lens: Intrinsics) -> float:

@@ -1,47 +1,71 @@
-"""Offline replay of an arm, with the logged actor and the maps that were known at each time."""
+"""Replay of an arm: its planner in flight (`Pilot`), offline, against the logged actor and the maps.
+
+Equal arguments give equal replays, but for the measured times. No measurement or map is used before its time.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import look_at
 from pipelines.planning.arms import Arm
-from pipelines.planning.config import PlannerConfig
+from pipelines.planning.config import MOST_DRONES, Mode, PlannerConfig
 from pipelines.planning.distance_field import DistanceField, open_space
-from pipelines.planning.formation import YAW, slot_of
+from pipelines.planning.forecast import ActorFilter, Forecast, YawZero
+from pipelines.planning.formation import (
+    TILT,
+    YAW,
+    FormationPath,
+    formation_slots,
+    slot_of,
+    slot_offsets,
+    turned,
+)
 from pipelines.planning.guard import Flown, Guard
-from pipelines.planning.local import Separation
-from pipelines.planning.pilot import Pilot, PlanningTimes
-from pipelines.planning.sight import visible
+from pipelines.planning.local import LocalPlanner, Separation
+from pipelines.planning.tracking import Plan, tracking_times
+from pipelines.session.records import Int64
 
-Int64 = NDArray[np.int64]
-Mode = Literal["plan-only", "closed-loop"]
+_NOW_S = 1e-6  # times are sums of periods: due this much early is due
+
+
+class Start(NamedTuple):
+    """Formation at the start of a flight."""
+
+    drones: int  # 1 to 16
+    yaw_rad: float = 0.0  # of the first camera, counterclockwise from east
+    heading_rad: float = 0.0  # the actor's before walking, from east, if `yaw_frame` is `heading`
+
+
+@dataclass
+class PlanningTimes:
+    """Measured seconds of every planning call; they differ from run to run."""
+
+    central_s: list[float]
+    local_s: list[float]
 
 
 @dataclass(frozen=True)
-class ReplayResult:
+class Replay:
     """A replayed flight of N cameras at T times, one per tracking step."""
 
-    arm: str
     t_ns: Int64  # [T] on the clock of the actor's log
     position: Float  # [N, T, 3] metres, world
     velocity: Float  # [N, T, 3] m/s
     quaternion_xyzw: Float  # [N, T, 4] world_from_camera, aimed at the estimate
     slots: Float  # [N, T, 3] commanded: yaw (rad from east, continuous), tilt (rad), range (m)
-    tilt_rad: Float  # [N, T] flown, above the logged actor
-    visible: Bool  # [N, T] True where nothing is between camera and logged actor, by the last map
     actor: Float  # [T, 3] the log, interpolated
     estimate: Float  # [T, 3] the planner's estimate of the actor
     separation: dict[str, int]  # local plans by `Separation`
     safety: dict[str, int]  # local plannings by `guard.Flown`
-    times: PlanningTimes  # measured, different from run to run
+    times: PlanningTimes
 
     @property
     def t_s(self) -> Float:
@@ -50,9 +74,127 @@ class ReplayResult:
         return seconds
 
     @property
+    def tilt_rad(self) -> Float:
+        """Tilt [N, T] as flown, above the logged actor."""
+        return slot_of(self.position - self.actor)[..., TILT]
+
+    @property
     def formation_yaw_rad(self) -> Float:
         """Yaw [T] of the first camera's slot, continuous."""
         return self.slots[0, :, YAW]
+
+
+class Pilot:
+    """One arm in flight. Call `measure` at each measurement and `replan` at the tracking rate.
+
+    Central planning, local planning and tracking have the rates of the configuration, counted from the
+    first call. Drones plan one after the other, each with the latest plans of the others.
+
+    Args:
+        arm: the planner of the cameras' slots.
+        config: weights and rates.
+        start: the formation at the start.
+        clock: seconds, for `times`.
+
+    Raises:
+        ValueError: an impossible number of drones.
+    """
+
+    def __init__(
+        self, arm: Arm, config: PlannerConfig, start: Start, *, clock: Callable[[], float] = perf_counter
+    ) -> None:
+        if not 1 <= start.drones <= MOST_DRONES:
+            raise ValueError(f"{start.drones} drones: 1 to {MOST_DRONES} can be planned for")
+        self._config, self._clock = config, clock
+        self._zero = YawZero(config, start.heading_rad)
+        yaw_rad = start.yaw_rad - float(self._zero.at(np.zeros(1))[0])
+        self._formation_planner = arm.start(config, drones=start.drones, yaw_rad=yaw_rad)
+        self._local_planner = LocalPlanner(config)
+        self._filter = ActorFilter(q=config.actor_q, sigma_m=config.actor_sigma_m)
+        slots = formation_slots(
+            np.array([yaw_rad]), start.drones, tilt_rad=config.tilt_rad, range_m=config.radius_m
+        )
+        self._formation = FormationPath(np.zeros(1), slots, np.array(config.slot_rates))
+        self._plans: list[Plan | None] = [None] * start.drones
+        self._next_central_s = self._next_local_s = -np.inf
+        self.guard: Guard | None = None
+        """Filter of the local plans: it decides which motion is flown. Set by a replay; None otherwise."""
+        self.times = PlanningTimes([], [])
+        self.separation: Counter[Separation] = Counter()
+
+    def measure(self, t_s: float, position: Float) -> None:
+        """Take in the actor's position [3] metres, world (the middle of the hips).
+
+        Times must not go back.
+        """
+        self._filter.measure(t_s, position)
+
+    def replan(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
+        """Replan if a plan is due.
+
+        Args:
+            t_s: now; at or after the latest measurement. There must be at least one.
+            position: [N, 3] metres, world, of the drones.
+            velocity: [N, 3] m/s.
+            field: the distance field of the obstacles that are known now.
+        """
+        config = self._config
+        if t_s >= self._next_central_s - _NOW_S:
+            self._next_central_s = max(self._next_central_s, t_s) + 1.0 / config.central_hz
+            self._plan_formation(t_s, field)
+        if t_s >= self._next_local_s - _NOW_S:
+            self._next_local_s = max(self._next_local_s, t_s) + 1.0 / config.local_hz
+            self._plan_locally(t_s, position, velocity, field)
+
+    def wanted(self, t_s: float) -> tuple[Float, Float]:
+        """Return commanded slots [N, 3], yaw from east, and the actor's estimate [3] that cameras aim at."""
+        now = np.array([t_s])
+        return self._slots_at(now)[0], self._filter.forecast(now)[0]
+
+    def reference(self, t_s: float) -> tuple[Float, Float, Float]:
+        """Return position, velocity, acceleration [N, 3] of the latest local plans, after `replan`."""
+        asked = [plan.at(np.array([t_s])) for plan in self._plans if plan is not None]
+        where, speed, change = (np.concatenate(part) for part in zip(*asked, strict=True))
+        return where, speed, change
+
+    def _slots_at(self, t_s: Float) -> Float:
+        """Return commanded slots [T, N, 3], their yaws from east."""
+        slots = self._formation.at(t_s)
+        return turned(slots, self._zero.at(t_s)) if self._config.yaw_frame == "heading" else slots
+
+    def _plan_formation(self, t_s: float, field: DistanceField) -> None:
+        config = self._config
+        started = self._clock()
+        knots = t_s + config.knot_s * np.arange(1, config.horizon_knots + 1, dtype=np.float64)
+        commanded = self._formation.at(np.array([t_s]))[0]
+        if config.yaw_frame == "heading":
+            self._zero.follow(t_s, *self._filter.at(t_s)[1:])
+        actor = Forecast(self._filter.forecast(knots), self._zero.at(knots))
+        self._formation = self._formation_planner.plan(t_s, commanded, actor, field)
+        self.times.central_s.append(self._clock() - started)
+
+    def _plan_locally(self, t_s: float, position: Float, velocity: Float, field: DistanceField) -> None:
+        config = self._config
+        times = t_s + config.waypoint_s * np.arange(1, config.waypoints + 1, dtype=np.float64)
+        actor = self._filter.forecast(times)
+        slots = actor[:, None] + slot_offsets(self._slots_at(times))
+        for i in range(len(self._plans)):
+            started = self._clock()
+            made = self._local_planner.plan(
+                t_s,
+                position[i],
+                velocity[i],
+                slots=slots[:, i],
+                actor=actor,
+                others=[plan for j, plan in enumerate(self._plans) if j != i and plan is not None],
+                field=field,
+                previous=self._plans[i],
+            )
+            self.times.local_s.append(self._clock() - started)
+            self._plans[i] = (
+                made.plan if self.guard is None else self.guard.admit(i, t_s, made.plan, self._filter, field)
+            )
+            self.separation[made.separation] += 1
 
 
 def replay(
@@ -60,52 +202,53 @@ def replay(
     actor_t_ns: Int64,
     actor: Float,
     fields: Sequence[DistanceField],
+    start: Start,
     *,
     config: PlannerConfig,
-    drones: int,
-    yaw_rad: float = 0.0,
-    heading_rad: float = 0.0,
     mode: Mode = "closed-loop",
     seed: int = 0,
     clock: Callable[[], float] = perf_counter,
-) -> ReplayResult:
-    """Fly an arm against a log. Equal arguments give equal results, but for the measured times.
+) -> Replay:
+    """Fly an arm against a log.
 
     The drones start in their slots, at rest, and fly what `guard.Guard` admits. The actor is measured as
-    logged, with `actor_noise_m` added from the seed; no measurement or map is used before its time.
+    logged, with `actor_noise_m` added from the seed.
 
     Args:
         arm: the planner of the cameras' slots.
         actor_t_ns: [A] stamps of the log, ascending, at least two.
         actor: [A, 3] metres, world, the middle of the hips; rows with NaN were not measured.
         fields: the maps by the time from which they hold; before the first one nothing is known.
+        start: the formation at the start.
         config: weights and rates, the same for all arms of a comparison.
-        drones: number of cameras.
-        yaw_rad: of the first camera at the start, counterclockwise from east.
-        heading_rad: the actor's heading before walking, from east, if `yaw_frame` is `heading`.
         mode: `closed-loop` flies point masses with limited acceleration; `plan-only` puts the drones exactly
             on their local plans.
         seed: of the noise.
         clock: seconds, to measure planning times.
 
     Raises:
-        ValueError: times that do not ascend, or fewer than two measurements.
+        ValueError: times that do not ascend, fewer than two measurements, an impossible number of drones.
     """
-    t_ns, measured = _checked(actor_t_ns, actor)
+    rows = np.isfinite(actor).all(axis=1)
+    t_ns, measured = actor_t_ns[rows], actor[rows]
+    if len(t_ns) < 2 or (np.diff(t_ns) <= 0).any():
+        raise ValueError("a replay needs two measurements of the actor or more, their stamps ascending")
     log_s = (t_ns - t_ns[0]) / 1e9
     noise = np.random.default_rng(seed).normal(size=measured.shape)
     noisy = measured + config.actor_noise_m * noise
     maps = sorted(fields, key=lambda field: field.from_ns)
-    replay_ns = replay_times(t_ns, config)
+    replay_ns = tracking_times(t_ns, config)
     map_at = np.searchsorted([field.from_ns for field in maps], replay_ns, side="right")
     known = [open_space(), *maps]
     taken_in = np.searchsorted(t_ns, replay_ns, side="right")
 
-    pilot = Pilot(arm, config, drones=drones, yaw_rad=yaw_rad, heading_rad=heading_rad, clock=clock)
+    pilot = Pilot(arm, config, start, clock=clock)
     pilot.measure(0.0, noisy[0])
-    start = pilot.slots_now(0.0)[1]
-    guard = pilot.guard = Guard(start, config, exactly=mode == "plan-only")
-    shape = (drones, len(replay_ns), 3)
+    first_slots, first_estimate = pilot.wanted(0.0)
+    guard = pilot.guard = Guard(
+        first_estimate + slot_offsets(first_slots), config, exactly=mode == "plan-only"
+    )
+    shape = (start.drones, len(replay_ns), 3)
     position, velocity, slots, estimate = (np.empty(s) for s in (shape, shape, shape, shape[1:]))
     done = 1
     for k, now_ns in enumerate(replay_ns):
@@ -117,36 +260,15 @@ def replay(
         pilot.replan(t_s, position[:, k], velocity[:, k], known[map_at[k]])
         slots[:, k], estimate[k] = pilot.wanted(t_s)
         guard.advance()
-
-    truth = np.stack([np.interp(replay_ns, t_ns, measured[:, axis]) for axis in range(3)], axis=-1)
-    return ReplayResult(
-        arm=arm.name,
+    return Replay(
         t_ns=replay_ns,
         position=position,
         velocity=velocity,
         quaternion_xyzw=look_at(position, estimate),
         slots=slots,
-        tilt_rad=slot_of(position - truth)[..., 1],
-        visible=visible(known[-1], position, truth, start_m=config.sight_start_m),
-        actor=truth,
+        actor=np.stack([np.interp(replay_ns, t_ns, measured[:, axis]) for axis in range(3)], axis=-1),
         estimate=estimate,
         separation={kind.value: pilot.separation[kind] for kind in Separation},
         safety={kind.value: guard.counts[kind] for kind in Flown},
         times=pilot.times,
     )
-
-
-def replay_times(actor_t_ns: Int64, config: PlannerConfig) -> Int64:
-    """Return the times [T] of a replay: every tracking step from the first measurement to the last."""
-    first_ns, last_ns = int(actor_t_ns[0]), int(actor_t_ns[-1])
-    period_ns = round(1e9 / config.tracking_hz)
-    return first_ns + period_ns * np.arange((last_ns - first_ns) // period_ns + 1, dtype=np.int64)
-
-
-def _checked(t_ns: Int64, actor: Float) -> tuple[Int64, Float]:
-    """Return the rows that were measured."""
-    rows = np.isfinite(actor).all(axis=1)
-    t_ns, actor = t_ns[rows], actor[rows]
-    if len(t_ns) < 2 or (np.diff(t_ns) <= 0).any():
-        raise ValueError("a replay needs two measurements of the actor or more, their stamps ascending")
-    return t_ns, actor

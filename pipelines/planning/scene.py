@@ -1,23 +1,31 @@
-"""Data that all arms of a comparison share: the actor, the maps, the cameras and the times."""
+"""Data that all arms of a comparison share: settings, the actor, the maps, the cameras and the times."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float
-from pipelines.planning.comparison import stretches
-from pipelines.planning.config import PlannerConfig
-from pipelines.planning.costs import cost_map, costs_of_slots
-from pipelines.planning.distance_field import DistanceField, Unknown, distance_field, open_space
+from pipelines.planning.config import Mode, PlannerConfig
+from pipelines.planning.distance_field import (
+    OCCUPIED,
+    DistanceField,
+    Grid,
+    Unknown,
+    distance_field,
+    open_space,
+    visible,
+)
+from pipelines.planning.forecast import first_heading
 from pipelines.planning.formation import YAW, formation_slots, slot_of, slot_offsets, yaw_set
-from pipelines.planning.heading import first_heading
-from pipelines.planning.loading import LoggedFlight, SessionCamera, Source, flown_poses, points_at
-from pipelines.planning.replay import Mode, replay_times
+from pipelines.planning.loading import LoggedFlight, Source, flown_poses, points_at
 from pipelines.planning.scores import near_obstacle
+from pipelines.planning.search import cost_map, costs_of_slots
+from pipelines.planning.tracking import tracking_times
 from pipelines.session.description import Description
 from pipelines.session.records import Int64, Occupancy
 
@@ -25,18 +33,23 @@ MOST_DRONES = 8
 PICTURES_HZ = 25.0
 """Rate of the pictures: near enough to the 30 Hz for which the detector's errors are modelled."""
 _COST_MAP_HZ, _COST_MAP_YAWS = 2.0, 72
+_HIDDEN_HZ = 10.0  # rate of the moments of `hidden_shares`
 
 
 @dataclass(frozen=True)
-class Rules:
-    """Rules of a comparison; None takes the session's value."""
+class Settings:
+    """Settings that determine a comparison, in addition to the session; None takes the session's value."""
 
-    config: PlannerConfig
-    drones: int | None = None
-    yaw_rad: float | None = None  # of the first camera at the start, from the zero of yaws
+    arms: tuple[str, ...] | None = (
+        None  # adaptive and fixed, flown if cameras moved, planned if commands are logged
+    )
+    drones: int | None = None  # the number of cameras, 2 to 8
+    yaw_deg: float | None = None  # of the first camera at the start, from the zero of yaws
     mode: Mode = "closed-loop"
     trials: int = 20
     seed: int = 0
+    pose_noise: str | None = None
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
 
 
 @dataclass(frozen=True)
@@ -44,7 +57,7 @@ class Scene:
     """A flight that can be flown again. T times, one per tracking step; C cameras of the session."""
 
     flight: LoggedFlight
-    rules: Rules
+    settings: Settings
     drones: int
     yaw_rad: float  # of the first camera at the start, from east
     heading_rad: float  # of the actor's first way, from east; 0 where yaws count from east
@@ -59,7 +72,7 @@ class Scene:
     @property
     def config(self) -> PlannerConfig:
         """Planner settings."""
-        return self.rules.config
+        return self.settings.planner
 
     @property
     def t_s(self) -> Float:
@@ -73,22 +86,11 @@ class Scene:
         return self.fields[-1] if self.fields else open_space()
 
     @property
-    def cameras(self) -> list[SessionCamera]:
-        """Camera of each drone: the session's cameras, and then the same again."""
-        cameras = self.flight.cameras
-        return [cameras[k % len(cameras)] for k in range(self.drones)]
-
-    @property
     def names(self) -> list[str]:
         """Names of the drones: those of the session's cameras, and then drone1, ... as far as free."""
         own = [camera.name for camera in self.flight.cameras]
         free = [f"drone{k + 1}" for k in range(self.drones + len(own)) if f"drone{k + 1}" not in own]
         return [*own, *free][: self.drones]
-
-    @property
-    def stretch(self) -> Int64:
-        """Stretch [T] of the flight that each moment belongs to."""
-        return stretches(self.t_s)
 
     @property
     def pictures(self) -> slice:
@@ -115,14 +117,9 @@ class Scene:
 
     def start_slots_inside(self) -> int:
         """Count the slots of the start that are within the drones' radius of an obstacle, or in it."""
-        clearance_m = self.field_at_start.sample(self._first_slots()[:, 0])[0]
-        return int((clearance_m < self.config.drone_radius_m).sum())
-
-    @property
-    def field_at_start(self) -> DistanceField:
-        """Distance field that is known when the replay begins."""
         known = [field for field in self.fields if field.from_ns <= self.t_ns[0]]
-        return known[-1] if known else open_space()
+        clearance_m = (known[-1] if known else open_space()).sample(self._first_slots()[:, 0])[0]
+        return int((clearance_m < self.config.drone_radius_m).sum())
 
     def cost_map(self) -> tuple[Int64, Float, Float]:
         """Compute times [M], yaws [D] of the first camera, and the formation's cost [M, D] there."""
@@ -136,10 +133,7 @@ class Scene:
 
 
 def build_scene(
-    flight: LoggedFlight,
-    maps: Sequence[Occupancy],
-    description: Description,
-    rules: Rules,
+    flight: LoggedFlight, maps: Sequence[Occupancy], description: Description, settings: Settings
 ) -> Scene:
     """Prepare a comparison: distance fields, times, the first camera's start, and warnings."""
     notes = []
@@ -150,24 +144,25 @@ def build_scene(
     notes.append(
         f"unknown voxels of the map count as {unknown}" if fields else "no map: open space, nothing is hidden"
     )
-    t_ns = replay_times(flight.actor_t_ns, rules.config)
+    t_ns = tracking_times(flight.actor_t_ns, settings.planner)
     actor, actor_source = flight.scored_actor(t_ns)
     flown = flown_poses(flight, description, t_ns)
-    drones = rules.drones or min(max(len(flight.cameras), 2), MOST_DRONES)
-    if rules.drones is None and drones != len(flight.cameras):
+    drones = settings.drones or min(max(len(flight.cameras), 2), MOST_DRONES)
+    if settings.drones is None and drones != len(flight.cameras):
         notes.append(f"{drones} drones are replayed, the session has {len(flight.cameras)} cameras")
     heading_rad = 0.0
-    if rules.config.yaw_frame == "heading":
+    if settings.planner.yaw_frame == "heading":
         heading_rad = first_heading(flight.actor)
         notes.append(f"yaws count from where the actor heads, {np.degrees(heading_rad):.1f} deg at first")
-    yaw_rad = None if rules.yaw_rad is None else rules.yaw_rad + heading_rad
-    if yaw_rad is None:
+    if settings.yaw_deg is not None:
+        yaw_rad = float(np.radians(settings.yaw_deg)) + heading_rad
+    else:
         yaw_rad = float(slot_of(flown[0][0, 0] - actor[0])[YAW])
         first = flight.cameras[0].name
         notes.append(f"formations start at {np.degrees(yaw_rad):.1f} deg, where {first} was")
     scene = Scene(
         flight=flight,
-        rules=rules,
+        settings=settings,
         drones=drones,
         yaw_rad=yaw_rad,
         heading_rad=heading_rad,
@@ -206,3 +201,50 @@ def _doubts(scene: Scene) -> list[str]:
     if scene.flight.skeleton is None:
         doubts.append("no skeleton to look at, so no reconstruction error: run `mocap reconstruct` first")
     return doubts
+
+
+def hidden_shares(
+    flight: LoggedFlight,
+    description: Description,
+    maps: Sequence[Occupancy],
+    *,
+    start_m: float = PlannerConfig().sight_start_m,
+) -> dict[str, float]:
+    """Compute the share of moments in which an occupied voxel stood between a camera and the actor.
+
+    Ten moments a second, while the camera's pose is known; true poses and hips where they are known. Each
+    map counts from its own time on; unknown voxels are free.
+
+    Args:
+        flight: the poses of the cameras and the actor's positions.
+        description: the session's.
+        maps: in any order, one at least.
+        start_m: the end of the sight line next to the actor is left out, this much of it: maps contain the
+            actor.
+
+    Returns:
+        By camera; those without a pose at any of the moments are left out.
+    """
+    first_ns, last_ns = int(flight.actor_t_ns[0]), int(flight.actor_t_ns[-1])
+    count = max(2, round((last_ns - first_ns) / 1e9 * _HIDDEN_HZ) + 1)
+    t_ns = np.linspace(first_ns, last_ns, count).round().astype(np.int64)
+    actor, _ = flight.scored_actor(t_ns)
+    position, _, known = flown_poses(flight, description, t_ns)
+    hidden = np.zeros(known.shape, dtype=np.bool_)
+    for occupancy in sorted(maps, key=lambda one: one.from_ns):
+        (later,) = np.nonzero(t_ns >= occupancy.from_ns)  # a later map replaces an earlier one
+        field = _occupied_only(occupancy)
+        hidden[:, later] = ~visible(field, position[:, later], actor[later], start_m=start_m)
+    return {
+        camera.name: float(hidden[c, known[c]].mean())
+        for c, camera in enumerate(flight.cameras)
+        if known[c].any()
+    }
+
+
+def _occupied_only(occupancy: Occupancy) -> DistanceField:
+    """Return a field that has only the occupied voxels, no distances: sight lines need no more."""
+    with np.errstate(invalid="ignore"):
+        occupied: NDArray[np.bool_] = occupancy.probability >= OCCUPIED
+    sign = np.where(occupied, np.float32(-1), np.float32(1))
+    return DistanceField(Grid(sign, np.array(occupancy.origin, dtype=np.float64), occupancy.resolution_m))

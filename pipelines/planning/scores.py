@@ -8,10 +8,9 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.distance_field import DistanceField
+from pipelines.planning.distance_field import DistanceField, visible
 from pipelines.planning.formation import RANGE, TILT, YAW, slot_of, wrapped
 from pipelines.planning.information import predicted_error, ray_information
-from pipelines.planning.sight import visible
 
 Scores = dict[str, object]
 

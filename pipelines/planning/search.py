@@ -1,19 +1,262 @@
-"""Cheapest sequence of states through a cost map: dynamic programming over neighbours (Ho et al., Alg. 1).
+"""The formation search: costs of slots, and the cheapest sequence of them by dynamic programming.
 
-As printed, the algorithm adds the index of the best neighbour instead of its value, and leaves out the time
-of the costs. Here V[T] = C[T] and V[t, i] = C[t, i] + min over neighbours j of (V[t + 1, j] + move).
+As printed, Alg. 1 of Ho et al. adds the index of the best neighbour instead of its value, and leaves out the
+time of the costs. Here V[T] = C[T] and V[t, i] = C[t, i] + min over neighbours j of (V[t + 1, j] + move).
+The kernels have no threads and no fastmath: the same numbers give the same bytes.
 """
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
-from pipelines.planning.formation import YAW, wrapped
-from pipelines.planning.search_kernels import REACHED_S, Lattice, cheapest_sequence
+from pipelines.geometry.compilation import cached, helper
+from pipelines.planning.config import PlannerConfig
+from pipelines.planning.distance_field import (
+    DIAGONAL,
+    ROUNDING,
+    DistanceField,
+    Grid,
+    Sight,
+    interpolate,
+    look,
+    nearest,
+    occupied_samples,
+    sampling,
+)
+from pipelines.planning.forecast import Forecast
+from pipelines.planning.formation import YAW, slot_offsets, turned, wrapped
+from pipelines.planning.information import predicted_error, ray_information
+from pipelines.session.records import Int64
 
-Int64 = NDArray[np.int64]
+_REACHED_S = 1e-9  # a cell exactly as far as the rates allow is a neighbour
+
+
+class Lattice(NamedTuple):
+    """States of a formation (or of one drone), and the neighbours that can follow each."""
+
+    states: Float  # [S, 3] yaw, tilt, range
+    rates: Float  # [3] per second
+    knot_s: float
+    w_turn: float
+    neighbours: Int64  # [S, K] nearest first, itself at the front; -1 fills up
+    move: Float  # [S, K] cost of going there
+
+
+class Formations(NamedTuple):
+    """Formations to choose from."""
+
+    lattice: Lattice
+    slots: Float  # [S, n, 3] of each state
+    offsets: Float  # [S, n, 3] m, the same from the actor
+
+
+class SlotWeights(NamedTuple):
+    """Weights of the search, by name; see `PlannerConfig`."""
+
+    w_obs: float
+    w_occ: float
+    eps_obs_m: float
+    sight_start_m: float
+
+
+def slot_weights(config: PlannerConfig) -> SlotWeights:
+    """Return the weights of the search's kernels."""
+    return SlotWeights(config.w_obs, config.w_occ, config.eps_obs_m, config.sight_start_m)
+
+
+@helper
+def _look_at_slots(
+    grid: Grid,
+    sight: Sight,
+    actor: Float,
+    offsets: Float,
+    eps_obs_m: float,
+    start_m: float,
+    obstacle: Float,
+    share: Float,
+) -> None:
+    """Compute the results of `_slot_costs`, into arrays of zeros.
+
+    The distances at the two ends show that most sight lines are free. One look at the actor serves all lines,
+    and the obstacle cost needs the camera's distance anyway.
+    """
+    times, (states, cameras, _) = actor.shape[0], offsets.shape
+    side_m = grid.resolution_m
+    rules, counts = np.zeros((states, cameras, 11)), np.zeros((states, cameras), np.int64)
+    longest_m = 0.0
+    for s in range(states):
+        for i in range(cameras):
+            x, y, z = offsets[s, i]
+            counts[s, i] = sampling(x, y, z, start_m, side_m, rules[s, i])
+            longest_m = max(longest_m, rules[s, i, 10])
+    clear = math.ceil(2.0 * eps_obs_m / side_m + 1.0)  # from this leap on the nearest obstacle costs nothing
+    per_m = 1.0 / side_m
+    for t in range(times):
+        spare_m = nearest(grid, actor[t, 0], actor[t, 1], actor[t, 2]) - DIAGONAL * side_m
+        if spare_m > longest_m + eps_obs_m + (DIAGONAL + ROUNDING) * side_m:
+            continue
+        free_m = spare_m + (0.5 - ROUNDING) * side_m  # about the actor
+        ax = (actor[t, 0] - grid.origin[0]) / side_m
+        ay = (actor[t, 1] - grid.origin[1]) / side_m
+        az = (actor[t, 2] - grid.origin[2]) / side_m
+        # Neighbouring sight lines follow each other, so that their look-ups hit the cache.
+        for i in range(cameras):
+            for s in range(states):
+                rule, count = rules[s, i], counts[s, i]
+                x, y, z = offsets[s, i]
+                is_occupied, leap = look(sight, ax + x * per_m, ay + y * per_m, az + z * per_m)
+                if is_occupied or leap < clear:
+                    distance = interpolate(grid, actor[t, 0] + x, actor[t, 1] + y, actor[t, 2] + z)[0]
+                    obstacle[t, s, i] = min(max(1.0 - distance / eps_obs_m, 0.0), 1.0)
+                first = max(int((free_m - start_m) * rule[9] - 0.5), 0)
+                end = count if is_occupied else count - leap
+                if first < end:
+                    share[t, s, i] = (
+                        occupied_samples(sight, ax, ay, az, rule, float(first), float(end)) / count
+                    )
+
+
+@cached
+def _slot_costs(
+    grid: Grid, sight: Sight, actor: Float, offsets: Float, eps_obs_m: float, start_m: float
+) -> tuple[Float, Float]:
+    """Compute the obstacle cost and the occupied share of the sight line, both [T, S, n].
+
+    Args:
+        grid: the distance field.
+        sight: the same for sight lines.
+        actor: [T, 3] forecast.
+        offsets: [S, n, 3] slots of every state, from the actor.
+        eps_obs_m: the distance from which obstacles count.
+        start_m: distance from the actor at which sight lines begin.
+    """
+    shape = (actor.shape[0], offsets.shape[0], offsets.shape[1])
+    obstacle, share = np.zeros(shape), np.zeros(shape)
+    _look_at_slots(grid, sight, actor, offsets, eps_obs_m, start_m, obstacle, share)
+    return obstacle, share
+
+
+@helper
+def _weigh(obstacle: Float, share: Float, w_obs: float, w_occ: float) -> Float:
+    """Compute the cost map [T, S] from the results of `_slot_costs`.
+
+    Costs are summed over the drones, the first one first.
+    """
+    times, states, cameras = obstacle.shape
+    cost = np.zeros((times, states))
+    for t in range(times):
+        for s in range(states):
+            for i in range(cameras):
+                cost[t, s] += w_obs * obstacle[t, s, i] + w_occ * share[t, s, i]
+    return cost
+
+
+@helper
+def _search(cost: Float, lattice: Lattice, start: Float) -> tuple[Int64, float]:
+    """Find the cheapest sequence; see `best_sequence`."""
+    times, states = cost.shape
+    value = cost.copy()
+    following = np.zeros((times, states), np.int64)
+    for t in range(times - 2, -1, -1):
+        for s in range(states):
+            best = math.inf
+            for k in range(lattice.neighbours.shape[1]):
+                j = lattice.neighbours[s, k]
+                if j >= 0 and value[t + 1, j] + lattice.move[s, k] < best:
+                    best = value[t + 1, j] + lattice.move[s, k]
+                    following[t, s] = j
+            value[t, s] = cost[t, s] + best
+
+    # The first step starts anywhere between the states.
+    reach_s, way_s = np.zeros(states), np.zeros(states)
+    for s in range(states):
+        for axis in range(3):
+            way = abs(lattice.states[s, axis] - start[axis])
+            if axis == YAW:
+                way = abs(_wrapped(way))
+            reach_s[s] = max(reach_s[s], way / lattice.rates[axis])
+            way_s[s] += way / lattice.rates[axis]
+    within_s = max(lattice.knot_s, reach_s.min()) + _REACHED_S
+    sequence = np.zeros(times, np.int64)
+    total = nearest = math.inf
+    for s in range(states):
+        through = value[0, s] + lattice.w_turn / 2.0 * way_s[s]
+        if reach_s[s] <= within_s and (through < total or (through == total and way_s[s] < nearest)):
+            total, nearest = through, way_s[s]
+            sequence[0] = s
+    for t in range(times - 1):
+        sequence[t + 1] = following[t, sequence[t]]
+    return sequence, total
+
+
+@helper
+def _wrapped(angle_rad: float) -> float:
+    return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@helper
+def _turn_the_shorter_way(slots: Float) -> None:
+    """Make the yaws of slots [T, n, 3] continuous, from knot to knot."""
+    for i in range(slots.shape[1]):
+        first, before, turned = slots[0, i, YAW], slots[0, i, YAW], 0.0
+        for t in range(1, slots.shape[0]):
+            yaw = slots[t, i, YAW]
+            turned += _wrapped(yaw - before)
+            slots[t, i, YAW] = first + turned
+            before = yaw
+
+
+@cached
+def _weighed(obstacle: Float, share: Float, w_obs: float, w_occ: float) -> Float:
+    """Compute C [T, S] of costs [T, S, n]; see `cost_map`."""
+    return _weigh(obstacle, share, w_obs, w_occ)
+
+
+@cached
+def _cheapest_sequence(cost: Float, lattice: Lattice, start: Float) -> tuple[Int64, float]:
+    """Find the cheapest sequence; see `best_sequence`."""
+    return _search(cost, lattice, start)
+
+
+@cached
+def turn_the_shorter_way(slots: Float) -> None:
+    """Make the yaws of slots [T, n, 3] continuous, from knot to knot, in place."""
+    _turn_the_shorter_way(slots)
+
+
+@cached
+def cheapest_slots(
+    grid: Grid, sight: Sight, actor: Float, formations: Formations, w: SlotWeights, commanded: Float
+) -> Float:
+    """Plan a formation in one call: look at the slots, weigh, search.
+
+    Args:
+        grid: the distance field.
+        sight: the same for sight lines.
+        actor: [T, 3] forecast.
+        formations: the formations to choose from.
+        w: the weights.
+        commanded: [n, 3] the slots that are commanded now.
+
+    Returns:
+        [T + 1, n, 3] slots at the knots, the first as commanded; yaw is continuous.
+    """
+    shape = (actor.shape[0], formations.slots.shape[0], formations.slots.shape[1])
+    obstacle, share = np.zeros(shape), np.zeros(shape)
+    _look_at_slots(grid, sight, actor, formations.offsets, w.eps_obs_m, w.sight_start_m, obstacle, share)
+    sequence, _ = _search(_weigh(obstacle, share, w.w_obs, w.w_occ), formations.lattice, commanded[0])
+    through = np.empty((shape[0] + 1, shape[2], 3))
+    for i in range(shape[2]):
+        for axis in range(3):
+            through[0, i, axis] = commanded[i, axis]
+            for t in range(shape[0]):
+                through[t + 1, i, axis] = formations.slots[sequence[t], i, axis]
+    _turn_the_shorter_way(through)
+    return through
 
 
 def lattice(states: Float, *, rates: Float, knot_s: float, w_turn: float) -> Lattice:
@@ -27,7 +270,7 @@ def lattice(states: Float, *, rates: Float, knot_s: float, w_turn: float) -> Lat
     """
     time_s = _time_between(states[:, None], states, rates)
     reach, cost = time_s.max(axis=-1), w_turn / 2.0 * time_s.sum(axis=-1)
-    within = reach <= knot_s + REACHED_S
+    within = reach <= knot_s + _REACHED_S
     order = np.argsort(np.where(within, time_s.sum(axis=-1), np.inf), axis=1, kind="stable")
     width = int(within.sum(axis=1).max())
     neighbours = order[:, :width].astype(np.int64)
@@ -56,4 +299,55 @@ def best_sequence(cost: Float, grid: Lattice, start: Float) -> tuple[Int64, floa
         [T] indices of states, and the sum of costs and moves. Ties are broken in favour of the same state, or
         else the nearest one.
     """
-    return cheapest_sequence(np.ascontiguousarray(cost), grid, start)
+    return _cheapest_sequence(np.ascontiguousarray(cost), grid, start)
+
+
+class SlotCosts(NamedTuple):
+    """Costs of every slot of every state at every time, [T, S, n]."""
+
+    obstacle: Float  # O = clip(1 - M/eps_obs, 0, 1)
+    occluded: Float  # share of the sight line that is occupied
+
+
+def costs_of_slots(field: DistanceField, actor: Float, offsets: Float, config: PlannerConfig) -> SlotCosts:
+    """Compute the costs of every slot.
+
+    The integrand of the obstacle cost that Ho et al. print ignores its variable; here it is one minus the
+    signed distance over the local planner's `eps_obs_m`, so that both planners keep the same distance.
+
+    Args:
+        field: the distance field of the obstacles.
+        actor: [T, 3] forecast, metres, world.
+        offsets: [S, n, 3] metres, the slots of each state from the actor.
+        config: `eps_obs_m`, `sight_start_m`.
+    """
+    actor = np.ascontiguousarray(actor)
+    eps_m, start_m = config.eps_obs_m, config.sight_start_m
+    return SlotCosts(*_slot_costs(field.grid, field.sight, actor, offsets, eps_m, start_m))
+
+
+def costs_in_frame(field: DistanceField, actor: Forecast, slots: Float, config: PlannerConfig) -> SlotCosts:
+    """Compute the costs of slots [S, n, 3] whose yaws count from the actor's heading at each time."""
+    looks = [
+        costs_of_slots(
+            field, position[None], slot_offsets(turned(slots, np.full(slots.shape[:-2], heading))), config
+        )
+        for position, heading in zip(*actor, strict=True)
+    ]
+    return SlotCosts(*(np.concatenate(parts) for parts in zip(*looks, strict=True)))
+
+
+def cost_map(costs: SlotCosts, config: PlannerConfig) -> Float:
+    """Compute C [T, S] = w_obs sum O + w_occ sum of occupied shares over the drones."""
+    return _weighed(costs.obstacle, costs.occluded, config.w_obs, config.w_occ)
+
+
+def error_map(costs: SlotCosts, offsets: Float, config: PlannerConfig) -> Float:
+    """Predict the error [T, S] in metres of the views that are free.
+
+    A weak prior limits the error where too few views are free.
+    """
+    information = ray_information(offsets, config)
+    free = (costs.occluded == 0.0).astype(np.float64)
+    total = np.einsum("tsn,snij->tsij", free, information) + np.eye(3) / config.prior_sigma_m**2
+    return predicted_error(total)

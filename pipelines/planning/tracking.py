@@ -19,6 +19,8 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached, helper
+from pipelines.planning.config import PlannerConfig
+from pipelines.session.records import Int64
 
 POSITION, VELOCITY, ACCELERATION, INTEGRAL = range(4)
 """Rows of a drone's state [4, 3]: m, m/s, m/s^2, and the integral of the position error in m s."""
@@ -58,6 +60,26 @@ class Flying(NamedTuple):
     jerk_mps3: float
     speed_mps: float
     period_s: float
+
+
+def flying_of(config: PlannerConfig) -> Flying:
+    """Return gains, limits and period of the drones."""
+    return Flying(
+        config.k_position,
+        config.k_velocity,
+        config.k_integral,
+        config.acceleration_mps2,
+        config.jerk_mps3,
+        config.speed_mps,
+        1.0 / config.tracking_hz,
+    )
+
+
+def tracking_times(actor_t_ns: Int64, config: PlannerConfig) -> Int64:
+    """Return the times [T] of a replay: every tracking step from the first measurement to the last."""
+    first_ns, last_ns = int(actor_t_ns[0]), int(actor_t_ns[-1])
+    period_ns = round(1e9 / config.tracking_hz)
+    return first_ns + period_ns * np.arange((last_ns - first_ns) // period_ns + 1, dtype=np.int64)
 
 
 @helper

@@ -268,25 +268,6 @@ class ChoiceOfAxes(Export, Protocol):
         """The axes (z-up, y-up) that the export can write, the default first."""
 
 
-class Arm(Protocol):
-    """A way to plan formations.
-
-    Its arguments and results are types of `pipelines.planning`, which this layer cannot import.
-    `pipelines.planning.arms` defines the same protocol with these types.
-    """
-
-    @property
-    def name(self) -> str:
-        """The name that the user writes after `--arms`."""
-
-    @property
-    def title(self) -> str:
-        """The name that reports print."""
-
-    def start(self, config: Any, *, drones: int, yaw_rad: float) -> Any:
-        """Make the `FormationPlanner` of a `PlannerConfig`; the first camera starts at the given yaw."""
-
-
 class Registry(Generic[T]):
     """The objects that one group of entry points names, loaded on request."""
 
@@ -322,7 +303,6 @@ FORMATS: Registry[Format] = Registry("mocap.formats", "format")
 EXPORTS: Registry[Export] = Registry("mocap.exports", "export format")
 DETECTORS: Registry[Detector | DetectorFamily] = Registry("mocap.detectors", "detector")
 NOISE_MODELS: Registry[type[NoiseModel]] = Registry("mocap.noise_models", "pose noise model")
-PLANNER_ARMS: Registry[Arm] = Registry("mocap.planner_arms", "planner arm")
 
 F = TypeVar("F")
 

@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 
 from pipelines.planning.arms import ADAPTIVE
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.costs import cost_map, costs_of_slots
 from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import formation_slots, slot_offsets, wrapped, yaw_set
-from pipelines.planning.search import best_sequence, lattice
+from pipelines.planning.search import best_sequence, cost_map, costs_of_slots, lattice
 from tests.planning.worlds import trees
 
 WORLD = trees()

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 from pipelines.planning.comparison import (
+    broken_limits,
     common_frames,
     coverage,
     mean_of_trials,
     mean_over_time,
     mpjpe_mm,
     stretches,
+    verdict,
 )
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.verdict import broken_limits, verdict
 
 
 def test_the_interval_of_a_mean_is_that_of_the_normal_distribution() -> None:

@@ -10,11 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.costs import cost_map, costs_of_slots, error_map
-from pipelines.planning.distance_field import distance_field, open_space
+from pipelines.planning.distance_field import distance_field, occupied_share, open_space
 from pipelines.planning.formation import formation_slots, slot_offsets
 from pipelines.planning.information import log_determinant, predicted_error, ray_information
-from pipelines.planning.sight import occupied_share
+from pipelines.planning.search import cost_map, costs_of_slots, error_map
 from pipelines.session.records import Occupancy
 from tests.planning.worlds import wall
 

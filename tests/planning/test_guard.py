@@ -16,7 +16,7 @@ from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import DistanceField, distance_field, open_space
 from pipelines.planning.forecast import ActorFilter
 from pipelines.planning.guard import Flown, Guard, least_clearance, nearest_free, wanted_clearance_m
-from pipelines.planning.replay import replay
+from pipelines.planning.replay import Start, replay
 from pipelines.planning.scores import score
 from pipelines.planning.tracking import Plan
 from pipelines.session.records import Occupancy
@@ -198,14 +198,14 @@ def test_a_drone_in_the_way_of_somebody_who_walks_gives_way() -> None:
 def test_a_map_that_comes_late_is_left_and_reported() -> None:
     """From 4 s on the map says that both drones are in a block of concrete: the scores say so."""
     stamps, hips = walker(8.0, 0.01)
-    start = replay(FIXED, stamps, hips, [], config=CONFIG, drones=1).position[0, 0]
+    start = replay(FIXED, stamps, hips, [], Start(1), config=CONFIG).position[0, 0]
     side_m = 0.5
     occupied = np.zeros((80, 80, 40), dtype=np.float32)
     origin = np.array([-20.0, -20.0, -2.0])
     low, high = ((start + way - origin) // side_m for way in (-1.5, 1.5))
     occupied[tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))] = 1
     late = distance_field(Occupancy(occupied, origin, side_m, from_ns=4_000_000_000))
-    result = replay(FIXED, stamps, hips, [late], config=CONFIG, drones=1)
+    result = replay(FIXED, stamps, hips, [late], Start(1), config=CONFIG)
     assert result.safety[Flown.LEFT] > 0
     figures = score(result.t_s, result.position, result.actor, late, CONFIG)
     violations = figures["limit_violations"]
@@ -218,7 +218,7 @@ def test_plans_that_are_flown_exactly_do_not_pass_through_walls_either() -> None
     field = slab(0.5, 0.5)
     stamps, hips = walker(20.0, 1.0)
     hips = hips + np.array([-8.0, -7.0, 0.0])
-    result = replay(FIXED, stamps, hips, [field], config=CONFIG, drones=2, mode="plan-only")
+    result = replay(FIXED, stamps, hips, [field], Start(2), config=CONFIG, mode="plan-only")
     assert field.sample(result.position)[0].min() >= CONFIG.drone_radius_m
 
 
@@ -251,5 +251,5 @@ def test_the_adaptive_arm_that_fell_through_a_wall_before_does_not() -> None:
     stamps, hips = walker(25.0, 1.2)
     hips = hips + np.array([-14.0, -8.0, 0.0])
     for arm in (ADAPTIVE, FIXED):
-        result = replay(arm, stamps, hips, [field], config=CONFIG, drones=3, yaw_rad=np.radians(-90))
+        result = replay(arm, stamps, hips, [field], Start(3, np.radians(-90)), config=CONFIG)
         assert field.sample(result.position)[0].min() >= CONFIG.drone_radius_m

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float
 from pipelines.planning.arms import ADAPTIVE, COVARIANCE, FIXED, GREEDY, Arm
 from pipelines.planning.config import PlannerConfig
-from pipelines.planning.costs import cost_map, costs_of_slots
 from pipelines.planning.distance_field import open_space
-from pipelines.planning.forecast import Forecast
+from pipelines.planning.forecast import Forecast, YawZero, first_heading
 from pipelines.planning.formation import YAW, formation_slots, slot_of, slot_offsets, wrapped, yaw_set
-from pipelines.planning.heading import YawZero, first_heading
-from pipelines.planning.replay import replay
+from pipelines.planning.replay import Start, replay
+from pipelines.planning.search import cost_map, costs_of_slots
 from tests.planning.worlds import trees, walker
 
 WORLD_FRAME = PlannerConfig()
@@ -80,7 +79,7 @@ def test_the_first_heading_of_a_log_is_where_the_actor_leaves_to() -> None:
 @pytest.mark.parametrize("arm", [FIXED, ADAPTIVE, COVARIANCE, GREEDY], ids=lambda arm: arm.name)
 def test_who_walks_straight_east_is_filmed_alike_in_both_frames(arm: Arm) -> None:
     flights = [
-        replay(arm, *walker(8.0), [WORLD], config=config, drones=2, yaw_rad=0.7)
+        replay(arm, *walker(8.0), [WORLD], Start(2, 0.7), config=config)
         for config in (WORLD_FRAME, HEADING_FRAME)
     ]
     for name in ("position", "slots"):
@@ -105,9 +104,7 @@ def test_a_formation_in_the_heading_frame_turns_with_the_actor(arm: Arm) -> None
     bandwidth, times sqrt(2) for its damping: 3.6 deg at 0.1 rad/s; as much again is allowed."""
     stamps, hips, heading = on_a_circle(25.0)
     flown = {
-        config.yaw_frame: replay(
-            arm, stamps, hips, [open_space()], config=config, drones=2, yaw_rad=np.pi, heading_rad=np.pi / 2
-        )
+        config.yaw_frame: replay(arm, stamps, hips, [open_space()], Start(2, np.pi, np.pi / 2), config=config)
         for config in (WORLD_FRAME, HEADING_FRAME)
     }
     assert np.ptp(flown["world"].formation_yaw_rad) == 0

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.cameras import Intrinsics
-from pipelines.planning.hidden import hidden_shares
 from pipelines.planning.loading import LoggedFlight, SessionCamera
+from pipelines.planning.scene import hidden_shares
 from pipelines.session.description import Description
 from pipelines.session.records import Occupancy, Trajectory
 

@@ -12,7 +12,7 @@ from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import White
 from pipelines.geometry.poses import look_at
 from pipelines.planning.distance_field import open_space
-from pipelines.planning.measuring import Filming, film
+from pipelines.planning.measuring import CameraPaths, measure
 from tests.planning.worlds import wall
 
 LENS = Intrinsics(1280, 720, 760.0, 760.0, 639.5, 359.5)
@@ -34,13 +34,13 @@ def two_pixels_off(
     return found + rng.normal(0, 2.0, found.shape), confidence
 
 
-def filming(*cameras: tuple[float, float, float]) -> Filming:
+def watching(*cameras: tuple[float, float, float]) -> CameraPaths:
     """Make cameras at rest that look at a person who stands at x = 12, y = 0."""
     middle = np.tile([12.0, 0.0, 1.0], (TIMES, 1))
     joints = middle[:, None] + np.random.default_rng(0).uniform(-0.5, 0.5, (TIMES, JOINTS, 3))
     position = np.repeat(np.array(cameras)[:, None], TIMES, axis=1)
     count = len(cameras)
-    return Filming(
+    return CameraPaths(
         t_ns=np.arange(TIMES) * 40_000_000,
         position=position,
         quaternion_xyzw=look_at(position, middle),
@@ -56,39 +56,39 @@ SOUTH, EAST, BEHIND_THE_WALL = (12.0, -10.0, 3.0), (22.0, 0.0, 3.0), (12.0, 14.0
 
 
 def test_without_errors_the_joints_come_back() -> None:
-    measured = film(filming(SOUTH, EAST), open_space(), exact, start_m=1.5, trials=2, seed=0)
+    measured = measure(watching(SOUTH, EAST), open_space(), exact, start_m=1.5, trials=2, seed=0)
     assert measured.error_m.shape == (2, TIMES, JOINTS)
     assert measured.error_m.max() < 1e-6
-    assert measured.first == pytest.approx(filming(SOUTH).joints, abs=1e-6)
+    assert measured.first == pytest.approx(watching(SOUTH).joints, abs=1e-6)
     assert measured.seen_share == 1.0
     assert measured.joint_frames == TIMES * JOINTS
 
 
 def test_who_stands_behind_a_wall_measures_nothing() -> None:
-    measured = film(filming(SOUTH, BEHIND_THE_WALL), wall(), exact, start_m=1.5, trials=1, seed=0)
+    measured = measure(watching(SOUTH, BEHIND_THE_WALL), wall(), exact, start_m=1.5, trials=1, seed=0)
     assert not np.isfinite(measured.error_m).any()
     assert measured.seen_share == 0.5
-    third = film(filming(SOUTH, EAST, BEHIND_THE_WALL), wall(), exact, start_m=1.5, trials=1, seed=0)
+    third = measure(watching(SOUTH, EAST, BEHIND_THE_WALL), wall(), exact, start_m=1.5, trials=1, seed=0)
     assert third.error_m.max() < 1e-6
 
 
 def test_outside_the_picture_and_without_a_pose_nothing_is_seen() -> None:
-    shot = filming(SOUTH, EAST)
+    shot = watching(SOUTH, EAST)
     away = replace(shot, quaternion_xyzw=look_at(shot.position, shot.position + np.array([0, 0, 1.0])))
-    assert film(away, open_space(), exact, start_m=1.5, trials=1, seed=0).seen_share == 0.0
+    assert measure(away, open_space(), exact, start_m=1.5, trials=1, seed=0).seen_share == 0.0
     known = shot.known.copy()
     known[1, : TIMES // 2] = False
-    gappy = film(replace(shot, known=known), open_space(), exact, start_m=1.5, trials=1, seed=0)
+    gappy = measure(replace(shot, known=known), open_space(), exact, start_m=1.5, trials=1, seed=0)
     measured = np.isfinite(gappy.error_m[0]).all(axis=1)
     assert not measured[: TIMES // 2].any()
     assert measured[TIMES // 2 :].all()
 
 
 def test_joints_that_nobody_knows_are_not_counted() -> None:
-    shot = filming(SOUTH, EAST)
+    shot = watching(SOUTH, EAST)
     joints = shot.joints.copy()
     joints[:10, 0] = np.nan
-    measured = film(replace(shot, joints=joints), open_space(), exact, start_m=1.5, trials=1, seed=0)
+    measured = measure(replace(shot, joints=joints), open_space(), exact, start_m=1.5, trials=1, seed=0)
     assert measured.joint_frames == TIMES * JOINTS - 10
     assert not np.isfinite(measured.error_m[0, :10, 0]).any()
     assert np.isfinite(measured.error_m[0, :, 1:]).all()
@@ -100,17 +100,17 @@ def test_pose_noise_costs_what_it_says() -> None:
     decides (0.1 m each), upwards the mean of both (0.1/sqrt 2). The mean length of such an error lies
     between the Rayleigh mean of two axes, 0.125 m, and the Maxwell mean of three, 0.160 m.
     """
-    shot = filming((12.0, -10.0, 1.0), (22.0, 0.0, 1.0))
+    shot = watching((12.0, -10.0, 1.0), (22.0, 0.0, 1.0))
     noisy = replace(shot, noise=[[White(position_m=0.1)]] * 2)
-    measured = film(noisy, open_space(), exact, start_m=1.5, trials=20, seed=0)
+    measured = measure(noisy, open_space(), exact, start_m=1.5, trials=20, seed=0)
     # 800 independent poses: the mean is known to 0.06 m / sqrt(800) = 2 mm.
     assert 0.125 - 0.008 < measured.error_m.mean() < 0.160 + 0.008
 
 
 def test_the_same_seed_draws_the_same_noise_for_any_path() -> None:
     def errors(place: tuple[float, float, float], seed: int) -> Float:
-        shot = filming(place, EAST)
-        measured = film(shot, open_space(), two_pixels_off, start_m=1.5, trials=3, seed=seed)
+        shot = watching(place, EAST)
+        measured = measure(shot, open_space(), two_pixels_off, start_m=1.5, trials=3, seed=seed)
         return measured.error_m.astype(np.float64)
 
     one, again, other = errors(SOUTH, 4), errors(SOUTH, 4), errors(SOUTH, 5)

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float
 from pipelines.planning.formation import wrapped, yaw_set
-from pipelines.planning.search import best_sequence, lattice
-from pipelines.planning.search_kernels import Lattice
+from pipelines.planning.search import Lattice, best_sequence, lattice
 
 RATES = np.array([np.radians(22.5), np.radians(5.0), 1.0])
 

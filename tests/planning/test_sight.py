@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipelines.planning.distance_field import DistanceField, distance_field
-from pipelines.planning.sight import occupied_share, visible
+from pipelines.planning.distance_field import DistanceField, distance_field, occupied_share, visible
 from pipelines.session.records import Occupancy
 
 RES = 0.5

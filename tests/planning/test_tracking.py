@@ -16,6 +16,7 @@ from pipelines.planning.tracking import (
     VELOCITY,
     Flying,
     Plan,
+    flying_of,
     roll_out,
     stopping_ticks,
 )
@@ -72,7 +73,7 @@ def at_rest() -> Float:
 def test_a_step_is_reached_without_staying_off() -> None:
     """The slowest pole is near k_integral/k_position = 0.083/s: after 60 s less than 1 % is left."""
     for goal in (np.array([2.0, 0, 0]), np.array([0, 0, -1.0])):
-        states = track(still_at(goal), at_rest(), CONFIG.flying(), 60.0)
+        states = track(still_at(goal), at_rest(), flying_of(CONFIG), 60.0)
         assert states[-1, POSITION] == pytest.approx(goal, abs=0.02)
         assert states[-1, VELOCITY] == pytest.approx(np.zeros(3), abs=0.02)
 
@@ -82,7 +83,7 @@ def test_the_acceleration_rises_with_the_largest_jerk_and_keeps_its_limit() -> N
 
     With period h: a_k = min(k, 4) m/s^2 in period k = 1, 2, ...
     """
-    flying = CONFIG.flying()._replace(k_velocity=1e-9, k_integral=0.0)
+    flying = flying_of(CONFIG)._replace(k_velocity=1e-9, k_integral=0.0)
     goal = np.array([300.0, 400.0, 0.0])
     states = track(still_at(goal), at_rest(), flying, 1.0)
     towards = np.array([0.6, 0.8, 0.0])
@@ -108,7 +109,7 @@ def test_a_moving_reference_is_followed_closely() -> None:
     start = at_rest()
     start[POSITION], start[VELOCITY] = circle[0], [0.0, speed, 0.0]
     start[ACCELERATION] = -(w**2) * circle[0]
-    states = track(Plan(0.0, circle, start[VELOCITY], 0.1), start, CONFIG.flying(), 10.0)
+    states = track(Plan(0.0, circle, start[VELOCITY], 0.1), start, flying_of(CONFIG), 10.0)
     t = np.arange(len(states)) / CONFIG.tracking_hz
     truth = radius * np.stack([np.cos(w * t), np.sin(w * t), 0 * t], axis=1)
     assert np.linalg.norm(states[:, POSITION] - truth, axis=1).max() < 0.03
@@ -123,7 +124,7 @@ def test_limits_are_kept_whatever_a_plan_asks_for_and_every_motion_ends_at_rest(
     seed: int, direction: Float, push: Float, spread_m: float
 ) -> None:
     """From any state within the limits, after a plan of random waypoints."""
-    flying = CONFIG.flying()
+    flying = flying_of(CONFIG)
     ticks = 10
     states = np.zeros((ticks + stopping_ticks(flying) + 1, 4, 3))
     states[0, VELOCITY] = direction * 0.95 * flying.speed_mps / np.sqrt(3)
@@ -148,7 +149,7 @@ def test_a_stop_from_full_speed_takes_what_its_law_says() -> None:
     V^2/(2 A) = 8 m in all, but the end: (A/3)^2/(2 A) = 0.222 m of it become (A/3)/3 = 0.444 m; the jerk
     adds V A/(2 J) = 0.32 m at first and at most (A/3) A/(2 J) more; 8.22 to 8.65 m.
     """
-    flying = CONFIG.flying()
+    flying = flying_of(CONFIG)
     states = np.zeros((stopping_ticks(flying) + 1, 4, 3))
     states[0, VELOCITY] = [8.0, 0.0, 0.0]
     roll_out(np.zeros((2, 3)), np.zeros(3), 0.5, 0.0, 0, False, flying, states)
