@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipelines.formats.common.exporting import thinned
 from pipelines.formats.flights.pictures import open_pictures
-from pipelines.formats.skeletons.even_frames import thinned
 from pipelines.geometry.arrays import Picture
 from pipelines.reporting.filmed import read_filmed, refined_poses
 from pipelines.reporting.frame_drawing import caption_of, draw_frame

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from pipelines.formats.common.stated_paths import leads_out
+from pipelines.formats.common.files import leads_out
 from pipelines.formats.flights.flight_reader import FlightReader, span_words
 from pipelines.formats.flights.flight_sources import losses
 from pipelines.formats.flights.source_hashes import (

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.formats.common.yaml_text import read_yaml
+from pipelines.formats.common.files import read_yaml
 from pipelines.geometry.arrays import Float
 from pipelines.planning.arm_flights import (
     FLOWN,

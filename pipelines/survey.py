@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from pipelines.formats.common.yaml_text import read_yaml
+from pipelines.formats.common.files import read_yaml
 from pipelines.planning.config import PlannerConfig, planner_config
 from pipelines.session.description import read_description
 from pipelines.session.errors import DataError

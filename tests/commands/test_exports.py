@@ -14,7 +14,7 @@ from rosbags.highlevel import AnyReader
 
 from pipelines.export import export, load_recording
 from pipelines.formats.skeletons import c3d
-from pipelines.formats.skeletons.even_frames import at_even_times
+from pipelines.formats.skeletons.joint_files import at_even_times
 from pipelines.session.progress import Silent
 from pipelines.session.records import JointMotion
 from tests.commands.runner import content, mocap_process, refusal, refused, succeeds

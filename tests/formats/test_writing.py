@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from pipelines.formats.calibrations import ros_camera_info
-from pipelines.formats.calibrations.camera_info_writing import write_camera_info
+from pipelines.formats.calibrations.ros_camera_info import write_camera_info
 from pipelines.formats.logs import mcap_log
 from pipelines.formats.logs.ros2_recording import Ros2Recording
 from pipelines.formats.videos import video

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import get_types_from_msg
 
 from pipelines.formats.logs.map_topics import OCCUPANCY_GRID, OCTOMAP, POINT_CLOUD
-from pipelines.formats.maps.octomap_writing import write_octomap
+from pipelines.formats.maps.octomap import write_octomap
 from pipelines.geometry.arrays import Float
 from pipelines.session.records import Occupancy
 from tests.synthetic.logged_flights import header

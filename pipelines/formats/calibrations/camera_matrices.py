@@ -14,6 +14,7 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
+from pipelines.session.records import CalibratedCamera
 
 # k1 k2 p1 p2 k3 k4 k5 k6; the further ones of OpenCV (prism, tilt) are rare and mostly zero.
 _MOST_COEFFICIENTS = 8
@@ -124,3 +125,17 @@ def invert_matrix(source: Path, camera: str, rotation: Float, translation: Float
     if not is_rotation:
         raise DataError(source, f"camera {camera}: R is not a rotation matrix")
     return invert_pose(source, camera, Rotation.from_matrix(rotation).as_quat(), translation)
+
+
+def describe_cameras(cameras: dict[str, CalibratedCamera]) -> dict[str, object]:
+    """Describe every camera by name, on one line each."""
+    return {"cameras": len(cameras), **{name: _camera_line(camera) for name, camera in cameras.items()}}
+
+
+def _camera_line(camera: CalibratedCamera) -> str:
+    parts = []
+    if (lens := camera.intrinsics) is not None:
+        parts.append(f"{lens.width} x {lens.height} px, f {lens.fx:.1f} {lens.fy:.1f}, {lens.model}")
+    if camera.position is not None:
+        parts.append("at " + " ".join(f"{value:.3f}" for value in camera.position))
+    return ", ".join(parts)

@@ -16,9 +16,8 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from pipelines.formats.calibrations.camera_matrices import build_intrinsics, invert_pose
-from pipelines.formats.common.summaries import describe_cameras
-from pipelines.formats.common.text_tables import read_text
+from pipelines.formats.calibrations.camera_matrices import build_intrinsics, describe_cameras, invert_pose
+from pipelines.formats.common.files import read_text
 from pipelines.geometry.cameras import DistortionModel, Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera

@@ -7,10 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.calibrations.camera_matrices import intrinsics
-from pipelines.formats.common.summaries import describe_cameras
-from pipelines.formats.common.text_tables import read_head
-from pipelines.formats.common.yaml_text import numbers, read_yaml
+from pipelines.formats.calibrations.camera_matrices import describe_cameras, intrinsics
+from pipelines.formats.common.files import numbers, read_head, read_yaml
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera

@@ -10,9 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.calibrations.camera_matrices import intrinsics, invert_matrix, invert_rodrigues
-from pipelines.formats.common.summaries import describe_cameras
-from pipelines.formats.common.text_tables import read_head, read_text
+from pipelines.formats.calibrations.camera_matrices import (
+    describe_cameras,
+    intrinsics,
+    invert_matrix,
+    invert_rodrigues,
+)
+from pipelines.formats.common.files import read_head, read_text
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera

@@ -1,4 +1,4 @@
-"""ROS camera calibrations: the YAML of camera_info_manager, and the older INI that is also called ost.txt."""
+"""ROS camera calibrations: the YAML of camera_info_manager, read and written, and the older INI (ost.txt)."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.calibrations.camera_matrices import intrinsics
-from pipelines.formats.common.summaries import describe_cameras
-from pipelines.formats.common.text_tables import read_head, read_text
-from pipelines.formats.common.yaml_text import numbers, read_yaml
+from pipelines.formats.calibrations.camera_matrices import describe_cameras, intrinsics
+from pipelines.formats.common.files import numbers, read_head, read_text, read_yaml
 from pipelines.geometry.arrays import Float
+from pipelines.geometry.cameras import Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import CalibratedCamera
 
@@ -139,6 +138,42 @@ def _camera(
         fisheye=model in _FISHEYE,
     )
     return {name: CalibratedCamera(lens)}
+
+
+# --- writing -------------------------------------------------------------------------------------------
+
+
+def write_camera_info(path: Path, name: str, intrinsics: Intrinsics) -> None:
+    """Write one camera; numbers keep their full precision."""
+    model, distortion = ros_distortion(intrinsics)
+    fx, fy, cx, cy = (float(v) for v in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
+    matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    projection = [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
+    lines = [
+        f"image_width: {intrinsics.width}",
+        f"image_height: {intrinsics.height}",
+        f"camera_name: {name}",
+        *_written_matrix("camera_matrix", 3, 3, matrix),
+        f"distortion_model: {model}",
+        *_written_matrix("distortion_coefficients", 1, len(distortion), distortion),
+        *_written_matrix("rectification_matrix", 3, 3, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
+        *_written_matrix("projection_matrix", 3, 4, projection),
+    ]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+
+
+def ros_distortion(intrinsics: Intrinsics) -> tuple[str, list[float]]:
+    """Return the model's name in ROS, and as many coefficients as that model takes there."""
+    coefficients = [float(v) for v in intrinsics.distortion]
+    if intrinsics.model == "fisheye":
+        return "equidistant", coefficients
+    if len(coefficients) > 5:
+        return "rational_polynomial", coefficients
+    return "plumb_bob", [*coefficients, *[0.0] * (5 - len(coefficients))]
+
+
+def _written_matrix(key: str, rows: int, columns: int, data: list[float]) -> list[str]:
+    return [f"{key}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: {data}"]
 
 
 FORMAT = RosCameraInfo()

@@ -23,8 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.summaries import describe_times
-from pipelines.formats.common.text_tables import read_head
+from pipelines.formats.common.files import read_head
+from pipelines.formats.common.rows import describe_times
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
     between_refreshed_angles,

@@ -10,7 +10,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipelines.formats.keypoint_files.keypoint_json import (
+from pipelines.formats.keypoint_files.keypoint_people import (
+    Gathering,
+    choose_skeleton,
+    describe_detections,
     first_entry,
     is_alphapose_entry,
     load_json,
@@ -19,7 +22,6 @@ from pipelines.formats.keypoint_files.keypoint_json import (
     triples,
     whole_number,
 )
-from pipelines.formats.keypoint_files.keypoint_people import Gathering, choose_skeleton, describe_detections
 from pipelines.session.errors import DataError
 from pipelines.session.records import Detections
 

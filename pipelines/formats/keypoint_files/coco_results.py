@@ -14,7 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.keypoint_files.keypoint_json import (
+from pipelines.formats.keypoint_files.keypoint_people import (
+    Gathering,
+    choose_skeleton,
+    describe_detections,
     first_entry,
     is_alphapose_entry,
     load_json,
@@ -23,7 +26,6 @@ from pipelines.formats.keypoint_files.keypoint_json import (
     triples,
     whole_number,
 )
-from pipelines.formats.keypoint_files.keypoint_people import Gathering, choose_skeleton, describe_detections
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import Detections

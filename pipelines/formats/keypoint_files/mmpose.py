@@ -14,14 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.keypoint_files.keypoint_json import (
+from pipelines.formats.keypoint_files.keypoint_people import (
+    Gathering,
+    choose_skeleton,
+    describe_detections,
     first_entry,
     frame_number,
     numbers,
     objects,
     samples,
 )
-from pipelines.formats.keypoint_files.keypoint_people import Gathering, choose_skeleton, describe_detections
 from pipelines.session.errors import DataError
 from pipelines.session.records import Detections
 

@@ -13,14 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.keypoint_files.keypoint_json import (
+from pipelines.formats.keypoint_files.keypoint_people import (
+    Gathering,
+    choose_skeleton,
+    describe_detections,
     frame_number,
     objects,
     samples,
     triples,
     whole_number,
 )
-from pipelines.formats.keypoint_files.keypoint_people import Gathering, choose_skeleton, describe_detections
 from pipelines.geometry.arrays import Float
 from pipelines.session.records import Detections
 from pipelines.session.skeletons import SKELETONS

@@ -22,8 +22,7 @@ from pipelines.formats.logs.map_topics import (
     time_of,
 )
 from pipelines.formats.logs.messages import bytes_of
-from pipelines.formats.maps.placed_grids import Pose
-from pipelines.formats.maps.point_voxels import VoxelSet
+from pipelines.formats.maps.voxel_grids import Pose, VoxelSet
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import transform
 from pipelines.session.errors import DataError

@@ -12,7 +12,7 @@ from pipelines.formats.logs.message_decoders import Decoder, Schema, decoder
 from pipelines.formats.logs.messages import nanoseconds
 from pipelines.formats.logs.recordings import OpenLog
 from pipelines.formats.logs.trajectories import Stamps
-from pipelines.formats.maps.placed_grids import Pose
+from pipelines.formats.maps.voxel_grids import Pose
 from pipelines.geometry.poses import interpolate_poses
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, Message, Occupancy, Trajectory

@@ -29,7 +29,7 @@ from pipelines.formats.logs.map_topics import (
 )
 from pipelines.formats.logs.messages import bytes_of
 from pipelines.formats.maps.octomap import leaves_of, occupancy_from
-from pipelines.formats.maps.placed_grids import Pose, extruded, placed
+from pipelines.formats.maps.voxel_grids import Pose, extruded, placed
 from pipelines.geometry.poses import compose
 from pipelines.session.errors import DataError
 from pipelines.session.maps import MOST_VOXELS, check_resolution

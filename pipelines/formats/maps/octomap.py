@@ -1,4 +1,4 @@
-"""Reader of OctoMap trees: `.bt` (each leaf occupied or free) and `.ot` (each node's log odds).
+"""Reader and writer of OctoMap trees: `.bt` (each leaf occupied or free) and `.ot` (each node's log odds).
 
 Layout (octomap 1.10, OcTreeBaseImpl.hxx and OccupancyOcTreeBase.hxx), little-endian, nodes depth first:
 
@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.formats.common.binary_files import first_bytes, read_bytes, split_header
-from pipelines.geometry.arrays import Bytes
+from pipelines.formats.common.files import first_bytes, read_bytes, split_header
+from pipelines.geometry.arrays import Bytes, Float
 from pipelines.session.errors import DataError
 from pipelines.session.maps import check_resolution, check_size, describe_grid
 from pipelines.session.records import Occupancy
@@ -146,7 +146,7 @@ def occupancy_from(
     Raises:
         DataError: `resolution_m` is no such multiple, or the grid is too large.
     """
-    from pipelines.formats.maps.octree_kernels import fill
+    from pipelines.formats.maps.octree import fill
 
     halvings = _halvings(source, finest_m, resolution_m)
     side_m = finest_m * 2**halvings
@@ -190,7 +190,7 @@ def binary_leaves(source: Path | str, payload: Bytes) -> Leaves:
     Raises:
         DataError: cut off, damaged, or bytes beyond the tree.
     """
-    from pipelines.formats.maps.octree_kernels import walk_binary
+    from pipelines.formats.maps.octree import walk_binary
 
     words = payload[: len(payload) // 2 * 2].view("<u2")
     # The bit pairs 01 and 10 are leaves: those whose bits differ.
@@ -210,7 +210,7 @@ def full_leaves(source: Path | str, payload: Bytes, record_bytes: int) -> Leaves
     Raises:
         DataError: cut off, damaged, bytes beyond the tree, or log odds that are not finite.
     """
-    from pipelines.formats.maps.octree_kernels import walk_full
+    from pipelines.formats.maps.octree import walk_full
 
     records = payload[: len(payload) // record_bytes * record_bytes].reshape(-1, record_bytes)
     children = np.ascontiguousarray(records[:, -1])
@@ -264,7 +264,7 @@ def _is_legacy(content: bytes) -> bool:
 
 
 def _check_walk(source: Path | str, used: int, unit_bytes: int, payload_bytes: int) -> None:
-    from pipelines.formats.maps.octree_kernels import BREAKS_OFF, TOO_DEEP
+    from pipelines.formats.maps.octree import BREAKS_OFF, TOO_DEEP
 
     if used == BREAKS_OFF:
         raise DataError(source, f"its tree breaks off after {payload_bytes} bytes", _COPY_AGAIN)
@@ -301,6 +301,70 @@ def _box(name: str, leaves: Leaves, chosen: NDArray[np.bool_], resolution_m: flo
         f"{name}_box_min_m": [round(v, 4) for v in (low * resolution_m).tolist()],
         f"{name}_box_max_m": [round(v, 4) for v in (high * resolution_m).tolist()],
     }
+
+
+# --- writing -------------------------------------------------------------------------------------------
+
+_OFF_GRID = 1e-4  # of a voxel; origins are sums and products of rounded decimal numbers
+
+_HEADER = """# Octomap OcTree binary file
+# (feel free to add / change comments, but leave the first line as it is!)
+#
+id OcTree
+size {nodes}
+res {resolution_m!r}
+data
+"""
+
+
+def write_octomap(path: Path, occupancy: Occupancy) -> None:
+    """Write a map as a pruned .bt: at least 0.5 is occupied, below is free, NaN is left out.
+
+    Raises:
+        ValueError: the origin is not a multiple of the resolution, or nothing in the map is known.
+        DataError: the map reaches further from the world's origin than an OctoMap of these voxels can
+            (32768 voxels).
+    """
+    from pipelines.formats.maps.octree import FREE, INNER, OCCUPIED, UNKNOWN, nodes_of, write_depth_first
+
+    side_m = float(occupancy.resolution_m)
+    first = _first_key(occupancy.origin, side_m)
+    _check_reach(path, first, occupancy.probability.shape, side_m)
+    states = np.full(occupancy.probability.shape, UNKNOWN, dtype=np.uint8)
+    states[occupancy.probability < 0.5] = FREE
+    states[occupancy.probability >= 0.5] = OCCUPIED
+    if not states.any():
+        raise ValueError("nothing in the map is known")
+    flat, begin, low, shape = nodes_of(states, first)
+    words = np.empty(int((flat == INNER).sum()), dtype="<u2")
+    leaves = write_depth_first(flat, begin, low, shape, words)
+    header = _HEADER.format(nodes=len(words) + leaves, resolution_m=side_m)
+    path.write_bytes(header.encode() + words.tobytes())
+
+
+def _first_key(origin: Float, side_m: float) -> NDArray[np.int64]:
+    """Return the finest voxel's key at the grid's corner, counted from the tree's lower end."""
+    steps = np.asarray(origin, dtype=np.float64) / side_m
+    nearest = np.rint(steps)
+    if not (np.abs(steps - nearest) <= _OFF_GRID).all():
+        raise ValueError(
+            f"the origin {np.asarray(origin).tolist()} is not on OctoMap's grid, "
+            f"the multiples of {side_m:g} m"
+        )
+    key: NDArray[np.int64] = nearest.astype(np.int64) + _CENTRE
+    return key
+
+
+def _check_reach(path: Path, first: NDArray[np.int64], shape: tuple[int, ...], side_m: float) -> None:
+    end = first + np.array(shape)
+    if (first < 0).any() or (end > 2 * _CENTRE).any():
+        reach_m = max(int((_CENTRE - first).max()), int((end - _CENTRE).max())) * side_m
+        raise DataError(
+            path,
+            f"an OctoMap of {side_m:g} m voxels ends {_CENTRE * side_m:g} m from the world's origin, "
+            f"the map reaches {reach_m:g} m",
+            "take larger voxels or a map nearer to the origin",
+        )
 
 
 FORMAT = OctomapFormat()

@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.binary_files import first_bytes, read_bytes, split_header
-from pipelines.formats.maps.point_voxels import (
+from pipelines.formats.common.files import first_bytes, read_bytes, split_header
+from pipelines.formats.maps.voxel_grids import (
     check_count,
     describe_points,
     joined,
@@ -33,6 +35,8 @@ _NUMPY_KIND = {"F": "f", "I": "i", "U": "u"}
 _EXPORT_AGAIN = "export it again"
 _SIZES = struct.Struct("<II")
 _NO_VIEWPOINT = [0, 0, 0, 1, 0, 0, 0]
+MOST_EXPANSION = 88
+"""Largest ratio of output to input (264 bytes for 3); a file that states more is refused."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +166,6 @@ def _is_identity(viewpoint: tuple[str, ...]) -> bool:
 
 
 def _decompressed(path: Path, body: Bytes, header: _Header) -> Bytes:
-    from pipelines.formats.maps.lzf import MOST_EXPANSION, decompress
 
     if len(body) < _SIZES.size:
         check_count(path, header.points, 0)
@@ -180,6 +183,56 @@ def _decompressed(path: Path, body: Bytes, header: _Header) -> Bytes:
     if decompress(packed, values) != size:
         raise DataError(path, "its compressed points are damaged", "copy it again or export it again")
     return values
+
+
+@cache
+def _compiled() -> Callable[[Bytes, Bytes], int]:
+    from pipelines.geometry.compilation import cached
+
+    return cached(_unpack_lzf)
+
+
+def decompress(packed: Bytes, target: Bytes) -> int:
+    """Fill `target` from an LZF stream, compiled.
+
+    The stream (liblzf by Marc Lehmann, lzf_d.c) is a sequence of instructions, each with a byte c first:
+
+    - c < 32: copy the c + 1 bytes that follow;
+    - else: repeat (c >> 5) + 2 bytes of the output (if c >> 5 is 7, a byte to add to the length follows) from
+      ((c & 31) << 8) + next byte + 1 bytes back; the two may overlap.
+
+    Returns:
+        The bytes written, or -1 if the stream is cut off, too long or points outside.
+    """
+    return _compiled()(packed, target)
+
+
+def _unpack_lzf(packed: Bytes, target: Bytes) -> int:
+    read, written = 0, 0
+    while read < len(packed):
+        control = int(packed[read])
+        read += 1
+        if control < 32:
+            length = control + 1
+            if read + length > len(packed) or written + length > len(target):
+                return -1
+            target[written : written + length] = packed[read : read + length]
+            read += length
+        else:
+            length = (control >> 5) + 2
+            if length == 9 and read < len(packed):
+                length += int(packed[read])
+                read += 1
+            if read >= len(packed):
+                return -1
+            source = written - ((control & 31) << 8) - int(packed[read]) - 1
+            read += 1
+            if source < 0 or written + length > len(target):
+                return -1
+            for k in range(length):  # one by one, because the two ranges may overlap
+                target[written + k] = target[source + k]
+        written += length
+    return written
 
 
 FORMAT = PcdFormat()

@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pipelines.formats.common.binary_files import first_bytes, read_bytes, split_header
-from pipelines.formats.maps.point_voxels import (
+from pipelines.formats.common.files import first_bytes, read_bytes, split_header
+from pipelines.formats.maps.voxel_grids import (
     check_count,
     describe_points,
     occupancy_of,

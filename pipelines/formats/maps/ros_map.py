@@ -20,10 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.formats.common.binary_files import first_bytes, read_bytes
-from pipelines.formats.common.stated_paths import leads_out
-from pipelines.formats.common.text_tables import read_head
-from pipelines.formats.common.yaml_text import numbers, read_yaml
+from pipelines.formats.common.files import first_bytes, leads_out, numbers, read_bytes, read_head, read_yaml
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.maps import check_resolution, check_size, describe_grid

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.stamps import cell_name, parse_stamps, stamp_column
-from pipelines.formats.common.summaries import describe_trajectory
-from pipelines.formats.common.text_tables import TextTable, parse_table, read_head, read_text
-from pipelines.formats.poses.pose_rows import clean_poses
+from pipelines.formats.common.files import read_head, read_text
+from pipelines.formats.common.rows import TextTable, cell_name, parse_stamps, parse_table, stamp_column
+from pipelines.formats.poses.pose_rows import clean_poses, describe_trajectory
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import Trajectory

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.formats.common.rows import bounding_box, describe_times
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, Trajectory
@@ -121,3 +122,14 @@ def _drop(keep: Bool, bad: Bool, cause: str, dropped: dict[str, int]) -> None:
     if count:
         dropped[cause] = count
         keep &= ~bad
+
+
+def describe_trajectory(trajectory: Trajectory) -> dict[str, object]:
+    """Return rows, times, bounding box of the positions, and the rows dropped, by cause."""
+    return {
+        "rows": len(trajectory.t_ns),
+        **describe_times(trajectory.t_ns),
+        **bounding_box(trajectory.position),
+        "covariance": "yes" if trajectory.covariance is not None else "no",
+        **{f"dropped: {cause}": count for cause, count in trajectory.dropped.items()},
+    }

@@ -11,12 +11,18 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.export_names import safe_file_name, tracks_of
-from pipelines.formats.common.stamps import SECONDS, cell_name, format_seconds, parse_stamps, stamp_column
-from pipelines.formats.common.summaries import describe_trajectory
-from pipelines.formats.common.text_tables import parse_table, read_head, read_text
+from pipelines.formats.common.exporting import safe_file_name, tracks_of
+from pipelines.formats.common.files import read_head, read_text
+from pipelines.formats.common.rows import (
+    SECONDS,
+    cell_name,
+    format_seconds,
+    parse_stamps,
+    parse_table,
+    stamp_column,
+)
 from pipelines.formats.poses.pose_csv import find_header, pose_column
-from pipelines.formats.poses.pose_rows import clean_poses
+from pipelines.formats.poses.pose_rows import clean_poses, describe_trajectory
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording, Trajectory
 

@@ -26,13 +26,9 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.formats.calibrations.camera_info_writing import ros_distortion
-from pipelines.formats.common.export_names import safe_file_name
+from pipelines.formats.calibrations.ros_camera_info import ros_distortion
+from pipelines.formats.common.exporting import as_jpeg, ellipsoids_95, safe_file_name, surface_of, thinned
 from pipelines.formats.logs.ros2_recording import Ros2Recording
-from pipelines.formats.maps.map_surfaces import surface_of
-from pipelines.formats.scenes.jpegs import as_jpeg
-from pipelines.formats.scenes.uncertainty import ellipsoids_95
-from pipelines.formats.skeletons.even_frames import thinned
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.session.errors import DataError

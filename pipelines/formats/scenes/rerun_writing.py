@@ -20,11 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.formats.common.export_names import safe_file_name
-from pipelines.formats.maps.map_surfaces import surface_of
-from pipelines.formats.scenes.jpegs import as_jpeg
-from pipelines.formats.scenes.uncertainty import ellipsoids_95
-from pipelines.formats.skeletons.even_frames import thinned
+from pipelines.formats.common.exporting import as_jpeg, ellipsoids_95, safe_file_name, surface_of, thinned
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, JointMotion, Recording, Trajectory

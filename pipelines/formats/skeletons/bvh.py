@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.text_tables import read_head, read_text
+from pipelines.formats.common.files import read_head, read_text
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import multiply, rotate
 from pipelines.session.errors import DataError

@@ -20,11 +20,18 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.formats.common.export_names import people_of
-from pipelines.formats.common.summaries import describe_motion
-from pipelines.formats.skeletons.even_frames import EvenMotion, at_even_times
-from pipelines.formats.skeletons.joint_axes import METRES, to_metres_z_up, to_y_up
-from pipelines.formats.skeletons.trc import joint_names, marker_name, metric_unit
+from pipelines.formats.common.exporting import people_of
+from pipelines.formats.skeletons.joint_files import (
+    METRES,
+    EvenMotion,
+    at_even_times,
+    describe_motion,
+    joint_names,
+    marker_name,
+    metric_unit,
+    to_metres_z_up,
+    to_y_up,
+)
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, JointMotion, Recording

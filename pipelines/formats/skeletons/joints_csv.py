@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.formats.common.export_names import write_tables
-from pipelines.formats.common.stamps import cell_name, parse_stamps, stamp_column
-from pipelines.formats.common.summaries import describe_motion
-from pipelines.formats.common.text_tables import parse_table, read_head, read_text
+from pipelines.formats.common.exporting import write_tables
+from pipelines.formats.common.files import read_head, read_text
+from pipelines.formats.common.rows import cell_name, parse_stamps, parse_table, stamp_column
 from pipelines.formats.poses import pose_csv
-from pipelines.formats.skeletons.joint_axes import to_metres_z_up
+from pipelines.formats.skeletons.joint_files import describe_motion, to_metres_z_up
 from pipelines.session.errors import DataError
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Int64, JointMotion, Recording
 

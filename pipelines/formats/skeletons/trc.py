@@ -15,58 +15,23 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.export_names import people_of
-from pipelines.formats.common.stamps import format_seconds, parse_stamps
-from pipelines.formats.common.summaries import describe_motion, median_step_ns
-from pipelines.formats.common.text_tables import read_head, read_text
-from pipelines.formats.skeletons.joint_axes import METRES, to_metres_z_up, to_y_up
+from pipelines.formats.common.exporting import people_of
+from pipelines.formats.common.files import read_head, read_text
+from pipelines.formats.common.rows import format_seconds, median_step_ns, parse_stamps
+from pipelines.formats.skeletons.joint_files import (
+    METRES,
+    describe_motion,
+    joint_names,
+    marker_name,
+    metric_unit,
+    to_metres_z_up,
+    to_y_up,
+)
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording
-from pipelines.session.skeletons import SKELETONS
 
-_UNITS = {
-    "m": "m",
-    "meters": "m",
-    "metres": "m",
-    "cm": "cm",
-    "centimeters": "cm",
-    "mm": "mm",
-    "millimeters": "mm",
-}
 _DECIMALS = 7  # of a metre: far below any measurement error, and rows stay readable
-
-
-def metric_unit(stated: str) -> str:
-    """Return m, cm or mm for a unit's name in files; any other name as it is."""
-    return _UNITS.get(stated.lower(), stated)
-
-
-def marker_name(joint: str) -> str:
-    """Return Pose2Sim's and OpenSim's name of our joint: right_big_toe is RBigToe, nose is Nose.
-
-    Names that are in no skeleton of ours stay as they are.
-    """
-    return _MARKERS.get(joint, joint)
-
-
-def _camel_case(joint: str) -> str:
-    words = joint.split("_")
-    if words[0] in {"left", "right"}:
-        words[0] = words[0][0]
-    return "".join(word[0].upper() + word[1:] for word in words)
-
-
-_MARKERS = {joint: _camel_case(joint) for skeleton in SKELETONS.values() for joint in skeleton.joints}
-_JOINTS = {
-    **{marker: joint for joint, marker in _MARKERS.items()},
-    **{joint.title().replace("_", ""): joint for joint in _MARKERS},  # RightBigToe
-    "CHip": "hip",
-    "MidHip": "hip",
-    "HipCenter": "hip",
-    "LFootIndex": "left_big_toe",
-    "RFootIndex": "right_big_toe",
-}
 
 
 @dataclass(frozen=True)
@@ -164,15 +129,6 @@ def _numbers(path: Path, lines: list[str], markers: int, first_line: int) -> tup
     if not times:
         raise DataError(path, "holds no frames", "export it again")
     return times, np.array(values).reshape(len(times), markers, 3)
-
-
-def joint_names(markers: tuple[str, ...]) -> tuple[str, ...]:
-    """Return our names of known markers; if two markers mean one joint, only the first gets its name."""
-    names: list[str] = []
-    for marker in markers:
-        joint = _JOINTS.get(marker, marker)
-        names.append(marker if joint in names else joint)
-    return tuple(names)
 
 
 class TrcExport:

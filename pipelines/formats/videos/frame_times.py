@@ -8,9 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.stamps import cell_name, format_seconds, parse_stamps, stamp_column
-from pipelines.formats.common.summaries import describe_times
-from pipelines.formats.common.text_tables import parse_table, read_head, read_text
+from pipelines.formats.common.files import read_head, read_text
+from pipelines.formats.common.rows import (
+    cell_name,
+    describe_times,
+    format_seconds,
+    parse_stamps,
+    parse_table,
+    stamp_column,
+)
 from pipelines.formats.drone_logs.dji_srt import parse_subtitles, read_subtitles
 from pipelines.geometry.arrays import Bool
 from pipelines.session.errors import DataError

@@ -22,7 +22,7 @@ from pipelines.formats.logs import maps as log_maps
 from pipelines.formats.logs.clouds import cloud_points
 from pipelines.formats.logs.map_topics import evenly
 from pipelines.formats.maps import octomap
-from pipelines.formats.maps.point_voxels import occupancy_of
+from pipelines.formats.maps.voxel_grids import occupancy_of
 from pipelines.geometry.poses import enu_from_ned
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight, Log, Map, WorldFromLog

@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from pipelines.formats.maps import octomap
-from pipelines.formats.maps.octomap_writing import write_octomap
+from pipelines.formats.maps.octomap import write_octomap
 from pipelines.session.errors import DataError
 from pipelines.session.records import Occupancy
 

@@ -13,8 +13,8 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from pipelines.formats.common.exporting import CHI2_95
 from pipelines.formats.scenes import mcap_writing
-from pipelines.formats.scenes.uncertainty import CHI2_95
 from pipelines.session.errors import DataError
 from pipelines.session.records import Recording
 from pipelines.session.registries import Export

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.formats.skeletons import bvh_writing
 from pipelines.formats.skeletons.bvh import read_motion
-from pipelines.formats.skeletons.bvh_rig import fit_rig, joint_positions
+from pipelines.formats.skeletons.bvh_writing import fit_rig, joint_positions
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.errors import DataError

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipelines.formats.skeletons import c3d
-from pipelines.formats.skeletons.even_frames import at_even_times
+from pipelines.formats.skeletons.joint_files import at_even_times
 from pipelines.session import registries
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Silent

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 from hypothesis import given
 
-from pipelines.formats.skeletons import trc
+from pipelines.formats.skeletons import joint_files, trc
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording
 from pipelines.session.registries import Export, JointFormat
@@ -111,10 +111,10 @@ def test_what_is_wrong_is_said(tmp_path: Path, text: str, problem: str) -> None:
 
 
 def test_marker_names() -> None:
-    assert trc.marker_name("right_hip") == "RHip"
-    assert trc.marker_name("left_small_toe") == "LSmallToe"
-    assert trc.marker_name("nose") == "Nose"
-    assert trc.marker_name("C7") == "C7"
+    assert joint_files.marker_name("right_hip") == "RHip"
+    assert joint_files.marker_name("left_small_toe") == "LSmallToe"
+    assert joint_files.marker_name("nose") == "Nose"
+    assert joint_files.marker_name("C7") == "C7"
 
 
 def test_of_two_names_for_one_joint_the_second_is_kept(tmp_path: Path) -> None:
@@ -252,7 +252,7 @@ def test_another_reader_finds_the_same(tmp_path: Path) -> None:
     assert motion is not None
     (path,) = WRITER.write(replace(walked, unit="mm", axes="z-up"), tmp_path)
     names, table = as_pose2sim_reads(path)
-    assert names == [trc.marker_name(joint) for joint in motion.joints]
+    assert names == [joint_files.marker_name(joint) for joint in motion.joints]
     assert path.read_text().split("\n")[2].split("\t")[4] == "mm"
     values = table.to_numpy()[:, 2:].reshape(60, -1, 3)
     # Four decimals of a millimetre.

@@ -15,8 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.formats.videos import video
-from pipelines.formats.videos.containers import is_shown
-from pipelines.formats.videos.video import VideoReader, created_ns, frames, index_video
+from pipelines.formats.videos.video import VideoReader, created_ns, frames, index_video, is_shown
 from pipelines.geometry.arrays import Picture
 from pipelines.session.errors import DataError
 from pipelines.session.registries import FORMATS, VideoFormat

@@ -1,21 +1,61 @@
-"""Resampling of motion to a constant rate, for formats that number their frames and store no times."""
+"""Files of joints: their unit and axes, the names of their markers, and a constant rate."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
+from pipelines.formats.common.rows import bounding_box, describe_times
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import interpolate_points
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress
 from pipelines.session.records import Int64, JointMotion
+from pipelines.session.skeletons import SKELETONS
 
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+AXES = ("z-up", "y-up")
 _KEPT_NS = 500_000  # a sample this near to its frame keeps its position: 1 mm of a hand at 2 m/s
 _LONGEST_STEP = 1.5  # in frame steps: nothing is interpolated between times further apart
 _MOST_FRAMES = 10_000_000
 _MOST_EMPTY = 100  # frames per sample
+_UNITS = {
+    "m": "m",
+    "meters": "m",
+    "metres": "m",
+    "cm": "cm",
+    "centimeters": "cm",
+    "mm": "mm",
+    "millimeters": "mm",
+}
+
+
+def to_metres_z_up(source: Path, position: Float, unit: str, axes: str) -> Float:
+    """Convert positions [..., 3]; a point with a coordinate that is not finite is missing (all NaN).
+
+    y-up files (OpenSim, TRC) turn into world = (z, x, y), a rotation: x forward becomes y, y up becomes z.
+
+    Raises:
+        DataError: an unknown unit or unknown axes.
+    """
+    if unit not in METRES:
+        raise DataError(
+            source, f"the unit {unit!r} is none of {', '.join(METRES)}", "state `unit: mm` or alike"
+        )
+    if axes not in AXES:
+        raise DataError(
+            source, f"the axes {axes!r} are none of {', '.join(AXES)}", "state `axes: y-up` or z-up"
+        )
+    seen = np.isfinite(position).all(axis=-1, keepdims=True)
+    turned = position[..., [2, 0, 1]] if axes == "y-up" else position
+    return np.where(seen, turned * METRES[unit], np.nan)
+
+
+def to_y_up(position: Float) -> Float:
+    """Convert world positions [..., 3] to OpenSim's axes, y up: (y, z, x) of the world."""
+    return position[..., [1, 2, 0]]
 
 
 @dataclass(frozen=True)
@@ -103,9 +143,56 @@ def _rows(values: Float, row: Int64) -> Float:
     return taken
 
 
-def thinned(t_ns: Int64, rate_hz: float) -> Int64:
-    """Choose rows of sorted times: the first of every 1 / rate_hz seconds; none for a rate of 0."""
-    if not rate_hz or not len(t_ns):
-        return np.zeros(0, np.int64)
-    period = np.floor((t_ns - t_ns[0]) * (rate_hz / 1e9) + 1e-6)
-    return np.flatnonzero(np.diff(period, prepend=-1.0)).astype(np.int64)
+def describe_motion(motion: JointMotion) -> dict[str, object]:
+    """Return joints, people, times, share of missing joints, bounding box of the positions."""
+    return {
+        "rows": len(motion.t_ns),
+        "people": motion.position.shape[1],
+        "joints": list(motion.joints),
+        **describe_times(motion.t_ns),
+        "missing_share": round(float(np.isnan(motion.position).any(axis=-1).mean()), 4),
+        **bounding_box(motion.position.reshape(-1, 3)),
+    }
+
+
+def metric_unit(stated: str) -> str:
+    """Return m, cm or mm for a unit's name in files; any other name as it is."""
+    return _UNITS.get(stated.lower(), stated)
+
+
+def marker_name(joint: str) -> str:
+    """Return Pose2Sim's and OpenSim's name of our joint: right_big_toe is RBigToe, nose is Nose.
+
+    Names that are in no skeleton of ours stay as they are.
+    """
+    return _MARKERS.get(joint, joint)
+
+
+def _camel_case(joint: str) -> str:
+    words = joint.split("_")
+    if words[0] in {"left", "right"}:
+        words[0] = words[0][0]
+    return "".join(word[0].upper() + word[1:] for word in words)
+
+
+_MARKERS = {joint: _camel_case(joint) for skeleton in SKELETONS.values() for joint in skeleton.joints}
+
+
+_JOINTS = {
+    **{marker: joint for joint, marker in _MARKERS.items()},
+    **{joint.title().replace("_", ""): joint for joint in _MARKERS},  # RightBigToe
+    "CHip": "hip",
+    "MidHip": "hip",
+    "HipCenter": "hip",
+    "LFootIndex": "left_big_toe",
+    "RFootIndex": "right_big_toe",
+}
+
+
+def joint_names(markers: tuple[str, ...]) -> tuple[str, ...]:
+    """Return our names of known markers; if two markers mean one joint, only the first gets its name."""
+    names: list[str] = []
+    for marker in markers:
+        joint = _JOINTS.get(marker, marker)
+        names.append(marker if joint in names else joint)
+    return tuple(names)

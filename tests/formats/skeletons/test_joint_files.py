@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.formats.skeletons.even_frames import at_even_times, thinned
+from pipelines.formats.common.exporting import thinned
+from pipelines.formats.skeletons.joint_files import at_even_times
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion
 from tests.formats.exported import START_NS, Listener

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.formats.common.stamps import (
+from pipelines.formats.common.rows import (
     MILLISECONDS,
     NANOSECONDS,
     SECONDS,

@@ -1,0 +1,162 @@
+"""What exports share: names of files, tables, chosen times, and what viewers show of maps and covariances."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.cameras import Intrinsics, rescaled
+from pipelines.geometry.poses import quaternion_from_matrix
+from pipelines.session.errors import DataError
+from pipelines.session.records import Int64, JointMotion, Occupancy, Recording, Trajectory
+
+_WIDEST_PX = 960
+_QUALITY = 85
+
+CHI2_95 = 7.815
+"""95 % of a Gaussian in three dimensions lie within {x : x' S^-1 x = 7.815} (chi-square)."""
+
+MOST_CUBES = 1_000_000
+_SLAB = 16  # layers that are searched together
+
+
+def safe_file_name(name: str) -> str:
+    """Turn a free-text name into part of a file name: letters, digits, dot, dash, underscore."""
+    return re.sub(r"[^\w.-]+", "_", name).strip("._")[:80] or "recording"
+
+
+def people_of(recording: Recording, folder: Path, suffix: str) -> tuple[JointMotion, dict[int, Path]]:
+    """Return a recording's motion, and a file for each person with at least one known joint.
+
+    The file is `<name>.trc`, or `<name>_person<k>.trc` if there are several people (for the suffix `.trc`).
+
+    Raises:
+        DataError: no joint of any person is known.
+    """
+    motion = recording.motion
+    if motion is None or np.isnan(motion.position).all():
+        raise DataError(recording.name, "holds no joints to export", "run `mocap reconstruct` first")
+    people = motion.position.shape[1]
+    known = [person for person in range(people) if not np.isnan(motion.position[:, person]).all()]
+    which = {person: f"_person{person}" if people > 1 else "" for person in known}
+    name = safe_file_name(recording.name)
+    return motion, {person: folder / f"{name}{which[person]}{suffix}" for person in known}
+
+
+def tracks_of(recording: Recording) -> dict[str, Trajectory]:
+    """Return the cameras' poses by file name: `<camera>` as logged, `<camera>_refined` as corrected."""
+    tracks = dict(recording.cameras)
+    tracks |= {f"{camera}_refined": track for camera, track in recording.refined.items()}
+    return {name: track for name, track in tracks.items() if len(track.t_ns)}
+
+
+def write_tables(
+    recording: Recording,
+    folder: Path,
+    suffix: str,
+    write_joints: Callable[[Path, JointMotion], None],
+    write_poses: Callable[[Path, Trajectory], None],
+) -> list[Path]:
+    """Write a recording's tables: `<name>` with the joints, `<name>_<camera>` with a camera's poses.
+
+    Raises:
+        DataError: it has neither joints nor camera poses.
+    """
+    name = safe_file_name(recording.name)
+    paths: list[Path] = []
+    if recording.motion is not None and recording.motion.position.size:
+        paths.append(folder / f"{name}{suffix}")
+        write_joints(paths[-1], recording.motion)
+    for camera, trajectory in tracks_of(recording).items():
+        paths.append(folder / f"{name}_{safe_file_name(camera)}{suffix}")
+        write_poses(paths[-1], trajectory)
+    if not paths:
+        raise DataError(recording.name, "holds neither joints nor camera poses", "reconstruct it first")
+    return sorted(paths)
+
+
+def as_jpeg(camera: str, picture: NDArray[np.uint8], lens: Intrinsics) -> tuple[Intrinsics, bytes]:
+    """Shrink a BGR picture [height, width, 3] to at most 960 px in width; return its intrinsics and JPEG.
+
+    Raises:
+        DataError: the picture cannot be encoded.
+    """
+    import cv2
+
+    height, width = picture.shape[:2]
+    if width > _WIDEST_PX:
+        size = (_WIDEST_PX, round(height * _WIDEST_PX / width))
+        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    done, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    if not done:
+        raise DataError(camera, "has a picture that cannot be encoded as JPEG", "add --pictures-hz 0")
+    return rescaled(lens, picture.shape[1], picture.shape[0]), jpeg.tobytes()
+
+
+def ellipsoids_95(covariance: Float) -> tuple[Float, Float]:
+    """Compute half axes [..., 3] in m and world_from_axes quaternions [..., 4] of 95 % ellipsoids.
+
+    Args:
+        covariance: [..., 6] m^2, upper triangle: xx, xy, xz, yy, yz, zz; NaN gives NaN.
+    """
+    full = covariance[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*covariance.shape[:-1], 3, 3)
+    known = np.isfinite(full).all(axis=(-2, -1))
+    half = np.full((*known.shape, 3), np.nan)
+    turn = np.full((*known.shape, 4), np.nan)
+    values, vectors = np.linalg.eigh(full[known])
+    vectors[..., 0] *= np.sign(np.linalg.det(vectors))[..., None]  # a rotation, not a reflection
+    half[known] = np.sqrt(CHI2_95 * np.maximum(values, 0.0))
+    turn[known] = quaternion_from_matrix(vectors)
+    return half, turn
+
+
+@dataclass(frozen=True)
+class MapSurface:
+    """N cubes that cover the surface."""
+
+    middle: Float  # [N, 3] m, world
+    cube_m: float  # their side
+    voxels: int  # of the map's surface
+
+
+def surface_of(occupancy: Occupancy, most: int = MOST_CUBES) -> MapSurface:
+    """Find the surface of a map, in cubes of as few whole voxels as give at most `most` cubes.
+
+    Voxels beyond the map's box and unknown voxels count as not occupied.
+    """
+    layers = occupancy.probability.shape[0]
+    found: list[Int64] = []
+    for first in range(0, layers, _SLAB):
+        last = min(first + _SLAB, layers)
+        low, high = max(first - 1, 0), min(last + 1, layers)
+        with np.errstate(invalid="ignore"):
+            part = occupancy.probability[low:high] >= 0.5
+        padding = ((int(first == 0), int(last == layers)), (1, 1), (1, 1))
+        part = np.pad(part, padding)
+        inner = part[1:-1, 1:-1, 1:-1].copy()
+        for axis in range(3):
+            for side in (slice(None, -2), slice(2, None)):
+                inner &= part[tuple(side if a == axis else slice(1, -1) for a in range(3))]
+        here = np.argwhere(part[1:-1, 1:-1, 1:-1] & ~inner)
+        found.append(here.astype(np.int64) + np.array([first, 0, 0]))
+    voxels = np.concatenate(found)
+    gathered, cubes = 1, voxels
+    while len(cubes) > most:
+        gathered += 1
+        cubes = np.unique(voxels // gathered, axis=0)
+    cube_m = occupancy.resolution_m * gathered
+    return MapSurface(occupancy.origin + cube_m * (cubes + 0.5), cube_m, len(voxels))
+
+
+def thinned(t_ns: Int64, rate_hz: float) -> Int64:
+    """Choose rows of sorted times: the first of every 1 / rate_hz seconds; none for a rate of 0."""
+    if not rate_hz or not len(t_ns):
+        return np.zeros(0, np.int64)
+    period = np.floor((t_ns - t_ns[0]) * (rate_hz / 1e9) + 1e-6)
+    return np.flatnonzero(np.diff(period, prepend=-1.0)).astype(np.int64)

@@ -1,0 +1,134 @@
+"""Reading of whole files as bytes, text or YAML, and of their beginnings, by which formats are recognised."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.geometry.arrays import Bytes, Float
+from pipelines.session.errors import DataError
+from pipelines.session.storage import as_data_error, is_special, refuse_special
+from pipelines.session.yaml_files import plain_yaml
+
+HEAD_BYTES = 64 * 1024
+"""Bytes that `recognises` reads: enough for any header, few enough to be instant."""
+
+_LARGEST_YAML = 1 << 20  # characters; the parser is slow, and calibrations are far smaller
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read the whole file.
+
+    Raises:
+        DataError: missing or unreadable.
+    """
+    refuse_special(path)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise as_data_error(error, path) from error
+
+
+def first_bytes(path: Path, count: int = HEAD_BYTES) -> bytes:
+    """Read the beginning of a file, to recognise it; empty if the file cannot be read. Never raises."""
+    if is_special(path):
+        return b""
+    try:
+        with path.open("rb") as file:
+            return file.read(count)
+    except OSError:
+        return b""
+
+
+def split_header(path: Path, content: bytes, last: str) -> tuple[list[list[str]], Bytes]:
+    """Split a file into the words of each header line and the bytes below the header.
+
+    Args:
+        path: the file, for messages.
+        content: all of it.
+        last: the first word of the header's last line.
+
+    Raises:
+        DataError: no such line within the first 64 KiB.
+    """
+    lines: list[list[str]] = []
+    start = 0
+    while start < min(len(content), HEAD_BYTES):
+        end = content.find(b"\n", start, HEAD_BYTES)
+        end = end if end >= 0 else min(len(content), HEAD_BYTES)
+        words = content[start:end].decode("ascii", "replace").split()
+        if words:
+            lines.append(words)
+        start = end + 1
+        if words and words[0] == last:
+            return lines, np.frombuffer(content, np.uint8)[start:]
+    raise DataError(path, f"its header has no line {last!r}", "export the file again")
+
+
+def read_yaml(path: Path) -> dict[str, object]:
+    """Read the mapping at the top of a YAML file, built of plain types only.
+
+    The first line `%YAML:1.0` of old OpenCV and Kalibr files, which is no YAML, is skipped.
+
+    Raises:
+        DataError: unreadable, larger than a megabyte, no valid YAML, or no mapping of names.
+    """
+    text = read_text(path)
+    if len(text) > _LARGEST_YAML:
+        raise DataError(path, f"has {len(text)} characters", f"a calibration has less than {_LARGEST_YAML}")
+    if text.startswith("%YAML:"):
+        text = "#" + text
+    value = plain_yaml(path, text)
+    if not isinstance(value, dict):
+        raise DataError(path, "is no YAML mapping of names to values", "write it again")
+    return {str(key): item for key, item in value.items()}
+
+
+def numbers(source: Path, name: str, value: object) -> Float:
+    """Return a list of numbers as an array [N]; `name` is for the message if it is none.
+
+    Raises:
+        DataError: not a list, or an element is not a number.
+    """
+    if not isinstance(value, list) or not all(
+        isinstance(cell, int | float) and not isinstance(cell, bool) for cell in value
+    ):
+        raise DataError(source, f"{name} is no list of numbers", "write it again")
+    return np.array(value, dtype=np.float64)
+
+
+def leads_out(stated: str) -> bool:
+    """Return True if a relative path leads out of its folder; links may, as a file cannot bring any."""
+    return Path(os.path.normpath(stated)).parts[:1] == (os.pardir,)
+
+
+def read_text(path: Path) -> str:
+    r"""Read the whole file as UTF-8 without a byte order mark, lines ending in "\n".
+
+    Raises:
+        DataError: missing, unreadable, or not text.
+    """
+    refuse_special(path)
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise DataError(
+            path, f"cannot be read ({error.strerror})", "check the path and its permissions"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise DataError(path, f"is not UTF-8 text (byte {error.start})", "save it as plain text") from error
+
+
+def read_head(path: Path) -> str:
+    """Read the first lines of a file, to recognise it; empty if the file cannot be read. Never raises."""
+    if is_special(path):
+        return ""
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+    except OSError:
+        return ""
+    text = head.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
+    return text if len(head) < HEAD_BYTES else text.rpartition("\n")[0]

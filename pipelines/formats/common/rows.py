@@ -1,0 +1,301 @@
+"""Rows of text tables and logs: numbers, time stamps, and the rows that are dropped."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import ROUND_HALF_UP, Decimal, InvalidOperation
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines.geometry.arrays import Bool, Float
+from pipelines.session.errors import DataError
+from pipelines.session.records import Int64
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+SECONDS, MILLISECONDS, MICROSECONDS, NANOSECONDS = 9, 6, 3, 0
+"""Units of time, each as the power of ten by which it exceeds a nanosecond."""
+
+_UNITS = {"s": SECONDS, "sec": SECONDS, "ms": MILLISECONDS, "us": MICROSECONDS, "ns": NANOSECONDS}
+_STAMP_NAMES = {"t", "time", "timestamp", "stamp"}
+_LARGEST = 2**63 - 1
+
+GAP_STEPS = 5
+"""A gap is a step of more than this many median steps."""
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """Columns of a text file: numbers as float64 with NaN for blank cells, the rest as text."""
+
+    text: dict[str, pa.ChunkedArray]
+    numbers: dict[str, Float]
+    truncated: int  # 1 if the last line was incomplete and was left out
+
+    def stack(self, names: Sequence[str]) -> Float:
+        """Return some number columns side by side, [N, len(names)]."""
+        return np.stack([self.numbers[name] for name in names], axis=-1)
+
+
+def parse_table(
+    path: Path,
+    body: str,
+    *,
+    delimiter: str,
+    columns: int,
+    text: dict[str, int],
+    numbers: dict[str, int],
+    first_line: int,
+) -> TextTable:
+    """Read delimited rows.
+
+    If the last line does not parse, its writing was probably interrupted: it is left out and counted in
+    `truncated`. Blank lines and lines that begin with # are skipped.
+
+    Args:
+        path: the file, for messages.
+        body: its text below the header.
+        delimiter: one character.
+        columns: number of cells in every row.
+        text: columns to keep as text, name to index.
+        numbers: columns to read as numbers, name to index. Blank, "nan" and the like become NaN.
+        first_line: the number of the body's first line in the file, for messages.
+
+    Raises:
+        DataError: another line has the wrong number of cells, or a cell that is not a number.
+    """
+    import pyarrow as pa
+
+    body = re.sub(r"\n[ \t]*#[^\n]*", "\n", "\n" + body)[1:]
+    wanted = {**text, **numbers}
+    for truncated in (0, 1):
+        try:
+            table = _parse_csv(body, delimiter, columns, text, numbers)
+        except pa.ArrowInvalid as error:
+            lines = body.rstrip().split("\n")
+            bad = _first_bad_line(lines, delimiter, columns, numbers)
+            if truncated or bad is None or bad[0] < len(lines) - 1:
+                where, what = bad or (0, str(error).splitlines()[0])
+                raise DataError(
+                    path, f"line {first_line + where}: {what}", "correct or delete that line"
+                ) from error
+            body = "\n".join(lines[:-1])
+        else:
+            return TextTable(
+                text={name: table.column(str(wanted[name])) for name in text},
+                numbers={
+                    name: np.asarray(table.column(str(wanted[name])).to_numpy(), dtype=np.float64)
+                    for name in numbers
+                },
+                truncated=truncated,
+            )
+    raise AssertionError("both attempts either return or raise")
+
+
+def _parse_csv(
+    body: str, delimiter: str, columns: int, text: dict[str, int], numbers: dict[str, int]
+) -> pa.Table:
+    """Parse rows into an Arrow table whose columns are named by their index."""
+    import pyarrow as pa
+    import pyarrow.csv
+
+    types = {str(index): pa.string() for index in text.values()}
+    types |= {str(index): pa.float64() for index in numbers.values()}
+    if not body.strip():
+        return pa.table({name: pa.array([], type=kind) for name, kind in types.items()})
+    return pyarrow.csv.read_csv(
+        pa.BufferReader(body.encode()),
+        read_options=pyarrow.csv.ReadOptions(column_names=[str(i) for i in range(columns)]),
+        parse_options=pyarrow.csv.ParseOptions(delimiter=delimiter),
+        convert_options=pyarrow.csv.ConvertOptions(column_types=types, include_columns=list(types)),
+    )
+
+
+def _first_bad_line(
+    lines: Sequence[str], delimiter: str, columns: int, numbers: dict[str, int]
+) -> tuple[int, str] | None:
+    """Return the index of the first line that is no valid row, and its problem; None if all are valid."""
+    for index, line in enumerate(lines):
+        if not line.strip():
+            continue
+        try:
+            cells = next(csv.reader([line], delimiter=delimiter), [])
+        except csv.Error as error:  # most often a cell of more than 131072 characters
+            return index, str(error)
+        if len(cells) != columns:
+            return index, f"{len(cells)} columns instead of {columns}"
+        for name, column in numbers.items():
+            if not _is_number(cells[column]):
+                return index, f"{cells[column][:40]!r} is not a number ({name})"
+    return None
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell or "nan")
+    except ValueError:
+        return False
+    return True
+
+
+def parse_stamps(
+    source: Path | str, texts: Sequence[str] | pa.ChunkedArray, unit: int = SECONDS
+) -> tuple[Int64, Bool]:
+    """Parse stamps as nanoseconds, rounded to the nearest (halves away from zero), without any float between.
+
+    A float64 holds 1700000000.123456789 s only to 0.2 us.
+
+    Args:
+        source: the file, for messages.
+        texts: [N] decimal numbers, with an exponent or without.
+        unit: SECONDS, MILLISECONDS, MICROSECONDS or NANOSECONDS.
+
+    Returns:
+        [N] nanoseconds (0 if the text is unusable), and [N] True if the text is a finite number that
+        int64 nanoseconds can hold.
+
+    Raises:
+        DataError: most stamps are too large for the unit (after the year 2262), so the unit is wrong.
+    """
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    column = texts if isinstance(texts, pa.ChunkedArray) else pa.chunked_array([pa.array(texts, pa.string())])
+    column = pc.utf8_trim_whitespace(pc.fill_null(column, ""))
+    t_ns, readable = _parse_plain(column, unit)
+    too_large: list[Decimal] = []
+    for index in np.flatnonzero(~readable):
+        value = _decimal(column[int(index)].as_py())
+        if value is None:
+            continue
+        exact = value.scaleb(unit)
+        if abs(exact) > _LARGEST:
+            too_large.append(abs(value))
+            continue
+        t_ns[index] = int(exact.to_integral_value(ROUND_HALF_UP))
+        readable[index] = True
+    if len(too_large) > np.count_nonzero(readable):
+        raise _wrong_unit(source, sorted(too_large)[len(too_large) // 2])
+    return t_ns, readable
+
+
+def _parse_plain(column: pa.ChunkedArray, unit: int) -> tuple[Int64, Bool]:
+    """Parse the stamps without an exponent, vectorised: sign, digits, dot, digits."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    parts = pc.extract_regex(column, r"^(?P<sign>[+-]?)(?P<whole>\d*)\.?(?P<fraction>\d*)$")
+    sign, whole, fraction = (pc.fill_null(pc.struct_field(parts, [k]), "") for k in range(3))
+    digits = pc.add(pc.utf8_length(whole), pc.utf8_length(fraction))
+    # Below 10 ** (18 - unit) whole units nothing overflows; 10 digits suffice for today's seconds.
+    safe_whole = pc.less_equal(pc.utf8_length(whole), 18 - unit if unit < SECONDS else 10)
+    plain = np.asarray(pc.and_(pc.greater(digits, 0), safe_whole).to_numpy(), dtype=np.bool_)
+
+    def integers(text: pa.ChunkedArray) -> Int64:
+        held = pc.if_else(pa.chunked_array([pa.array(plain)]), text, "0")
+        return np.asarray(pc.cast(held, pa.int64()).to_numpy(), dtype=np.int64)
+
+    one_more = pc.utf8_slice_codeunits(pc.utf8_rpad(fraction, unit + 1, "0"), 0, unit + 1)
+    units = integers(pc.if_else(pc.equal(whole, ""), "0", whole))
+    plain &= units < _LARGEST // 10**unit
+    magnitude = np.where(plain, units, 0) * 10**unit + (integers(one_more) + 5) // 10
+    negative = np.asarray(pc.equal(sign, "-").to_numpy(), dtype=np.bool_)
+    return np.where(plain, np.where(negative, -magnitude, magnitude), 0), plain
+
+
+def _decimal(text: str) -> Decimal | None:
+    try:
+        value = Decimal(text)
+    except InvalidOperation:
+        return None
+    # An exponent of billions would make an integer of as many digits.
+    return value if value.is_finite() and abs(value.adjusted()) < 40 else None
+
+
+def _wrong_unit(source: Path | str, typical: Decimal) -> DataError:
+    unit = "nanoseconds" if typical > 10**17 else "microseconds" if typical > 10**14 else "milliseconds"
+    return DataError(
+        source,
+        f"time stamps of about {typical:.3g} are too large for their unit; they look like {unit}",
+        "convert them, or save a CSV whose column is named t_ns, t_us or t_ms",
+    )
+
+
+def format_seconds(t_ns: Int64) -> list[str]:
+    """Format stamps as seconds with nine decimals, exactly."""
+    return [f"{'-' * (t < 0)}{abs(t) // 10**9}.{abs(t) % 10**9:09d}" for t in t_ns.tolist()]
+
+
+def cell_name(cell: str) -> tuple[str, str]:
+    """Split a column heading into lower-case name and unit: "#timestamp [ns]" is ("timestamp", "ns")."""
+    match = re.fullmatch(
+        r"#?\s*[\"']?([^\[(\"']*?)\s*(?:[\[(]([^\])]*)[\])])?\s*[\"']?", cell.strip().lower()
+    )
+    if match is None:
+        return cell.strip().lower(), ""
+    return re.sub(r"[./\s]+", "_", match[1]).strip("_"), (match[2] or "").strip()
+
+
+def stamp_column(header: Sequence[str]) -> tuple[int, int] | None:
+    """Find the time column and its unit: t, time, timestamp or stamp, with _ns or [ns] and so on.
+
+    A heading without a unit means seconds. If there are several columns, the finest unit is taken.
+    """
+    found: dict[int, int] = {}
+    for index, cell in enumerate(header):
+        name, unit = cell_name(cell)
+        base, _, suffix = name.rpartition("_")
+        if base in _STAMP_NAMES and suffix in _UNITS:
+            found.setdefault(_UNITS[suffix], index)
+        elif name in _STAMP_NAMES and (unit or "s") in _UNITS:
+            found.setdefault(_UNITS[unit or "s"], index)
+    if not found:
+        return None
+    finest = min(found)
+    return found[finest], finest
+
+
+def median_step_ns(t_ns: Int64) -> float | None:
+    """Return the median time between rows; None for fewer than two rows."""
+    return float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else None
+
+
+def describe_times(t_ns: Int64) -> dict[str, object]:
+    """Return first and last stamp, span, rate, and the number and the longest of the gaps.
+
+    Args:
+        t_ns: [N] strictly increasing.
+    """
+    if not len(t_ns):
+        return {}
+    step = median_step_ns(t_ns)
+    summary: dict[str, object] = {
+        "first_ns": int(t_ns[0]),
+        "last_ns": int(t_ns[-1]),
+        "span_s": round((int(t_ns[-1]) - int(t_ns[0])) / 1e9, 6),
+    }
+    if step is not None:
+        steps = np.diff(t_ns)
+        gaps = steps[steps > GAP_STEPS * step]
+        summary["rate_hz"] = round(1e9 / step, 3)
+        summary["gaps"] = len(gaps)
+        if len(gaps):
+            summary["longest_gap_s"] = round(float(gaps.max()) / 1e9, 3)
+    return summary
+
+
+def bounding_box(position: Float) -> dict[str, object]:
+    """Return the smallest and largest coordinates of the finite points [N, 3]."""
+    finite = position[np.isfinite(position).all(axis=1)]
+    if not len(finite):
+        return {}
+    return {
+        "box_min_m": [round(v, 4) for v in finite.min(axis=0).tolist()],
+        "box_max_m": [round(v, 4) for v in finite.max(axis=0).tolist()],
+    }
