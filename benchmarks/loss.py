@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipelines.geometry.triangulation import estimate_noise, triangulate
-from pipelines.reconstruction.reweighting import triangulate_heavy_tailed
+from pipelines.reconstruction.solving import triangulate_heavy_tailed
 from tests.geometry.rings import ring, with_pixel_noise, with_pose_noise
 
 DRAWS = 200

@@ -15,8 +15,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.noise import Bias, Drift, GaussMarkov, NoiseModel, White
-from pipelines.reconstruction.refinement.problem import pose_errors
+from pipelines.geometry.noise import Bias, Drift, GaussMarkov, NoiseModel, White, pose_errors
 from pipelines.reconstruction.refinement.refine import Refined, refine
 from tests.reconstruction.formations import BONES, Formation, formation, mean_mm
 

@@ -31,11 +31,10 @@ import numpy as np
 from benchmarks.refine import MODELS, refined_of, rooted
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import aligned_distances
-from pipelines.geometry.noise import NoiseModel
-from pipelines.reconstruction.refinement.building import build
+from pipelines.geometry.noise import NoiseModel, pose_errors
 from pipelines.reconstruction.refinement.elimination import eliminate, samples
 from pipelines.reconstruction.refinement.estimate import BOUND, initial_state
-from pipelines.reconstruction.refinement.problem import Knowledge, lay_out, pose_errors
+from pipelines.reconstruction.refinement.problem import Knowledge, build, lay_out
 from pipelines.reconstruction.refinement.system import System
 from tests.reconstruction.formations import BONES, FPS, STATED_PX, Formation, formation
 

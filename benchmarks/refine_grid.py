@@ -25,8 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.refine import MODELS, mean_nees, rooted
-from pipelines.geometry.noise import Bias, NoiseModel, White
-from pipelines.reconstruction.refinement.problem import pose_errors
+from pipelines.geometry.noise import Bias, NoiseModel, White, pose_errors
 from pipelines.reconstruction.refinement.refine import refine
 from tests.reconstruction.formations import BONES, formation, mean_mm
 

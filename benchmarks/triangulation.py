@@ -19,8 +19,14 @@ import numpy as np
 import pycolmap
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.picture_gate import triangulate_pictures
-from pipelines.geometry.triangulation import Method, Views, estimate_noise, locate, triangulate
+from pipelines.geometry.triangulation import (
+    Method,
+    Views,
+    estimate_noise,
+    locate,
+    triangulate,
+    triangulate_pictures,
+)
 from tests.geometry.rings import FOCAL, LEVELS, ring, with_outliers, with_pixel_noise, with_pose_noise
 
 GATE_PX = 15.0  # usual choice of users of pycolmap and Pose2Sim

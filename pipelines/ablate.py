@@ -18,11 +18,10 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import PCK_THRESHOLD_M, common, measure
 from pipelines.geometry.noise import NoiseModel
-from pipelines.geometry.picture_gate import triangulate_pictures
-from pipelines.geometry.triangulation import Views, estimate_noise, locate
+from pipelines.geometry.triangulation import Views, estimate_noise, locate, triangulate_pictures
 from pipelines.keypoints.alone import FollowedAlone
 from pipelines.keypoints.hints import project_actor
-from pipelines.reconstruction.refining_views import refined_points
+from pipelines.reconstruction.refining import refined_points
 from pipelines.reporting.ablation import Row, draw, estimates, results_csv
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side

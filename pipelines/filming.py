@@ -21,8 +21,7 @@ from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.arrays import Float, Picture
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel
-from pipelines.geometry.picture_gate import triangulate_pictures
-from pipelines.geometry.triangulation import Views, estimate_noise
+from pipelines.geometry.triangulation import Views, estimate_noise, triangulate_pictures
 from pipelines.keypoints.actor_hints import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD
 from pipelines.keypoints.alone import FollowedAlone
 from pipelines.keypoints.hints import project_actor

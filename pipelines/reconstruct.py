@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.detect import detect, hints_from, hints_of
 from pipelines.formats.flights.pictures import open_pictures, refuse_changed_pictures
-from pipelines.geometry.arrays import Float, Picture
+from pipelines.geometry.arrays import Bool, Float, Int64, Picture
 from pipelines.geometry.triangulation import (
     STATUS,
     Method,
@@ -48,8 +47,7 @@ from pipelines.reconstruction.observations import (
     readout_of,
     time_base,
 )
-from pipelines.reconstruction.quality import assess
-from pipelines.reconstruction.refining import RefinedFlight, RobustFlight, refine_flight
+from pipelines.reconstruction.results import assess, camera_poses_table, skeleton_table
 from pipelines.reconstruction.smoothing import smoother
 from pipelines.reconstruction.solving import (
     UNKNOWN_SIGMA,
@@ -59,13 +57,12 @@ from pipelines.reconstruction.solving import (
     solver_for,
     views_with_noise,
 )
-from pipelines.reconstruction.tables import camera_poses_table, skeleton_table
 from pipelines.reconstruction.trials import disturbances, disturbed, told_together
 from pipelines.session.description import Description, Interpolation, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.people import LoggedActor, logged_actor, true_joints_at
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Int64, JointMotion
+from pipelines.session.records import JointMotion
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
@@ -73,6 +70,8 @@ from pipelines.session.tables import CAMERA_POSES, SKELETON, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from pipelines.reconstruction.refining import RefinedFlight
 
 RECONSTRUCT = Stage("reconstruct", revision=14)
 
@@ -400,7 +399,7 @@ class _Seen:
     observations: Observations  # at the skeleton's times, on these sides
     sides: Int64  # [T, P, J, C], see `on_sides`
     between_views: dict[str, int]  # counts of left-right swaps, see `swaps_across_views`
-    anybody: NDArray[np.bool_]  # [T] True if any person was detected
+    anybody: Bool  # [T] True if any person was detected
 
 
 def _observe(flight: _Flight, cameras: list[Camera], settings: Settings) -> _Seen:
@@ -589,6 +588,8 @@ def _refine(
     settings: Settings,
     workers: int,
 ) -> RefinedFlight:
+    from pipelines.reconstruction.refining import RobustFlight, refine_flight
+
     return refine_flight(
         RobustFlight(
             cameras,

@@ -12,11 +12,9 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 
-Int64 = NDArray[np.int64]
 Series = tuple[Float, Float]
 """Sums [T] and weights [T] of a figure at every moment: the figure is the ratio of their totals."""
 

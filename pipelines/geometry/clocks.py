@@ -1,18 +1,23 @@
-"""Offset and drift between two clocks, from stamps of the same events."""
+"""Clocks: offset and drift between two of them from stamps of the same events, and the start of a video.
+
+The start is found from the motion of points in the pictures and the logged motion of the camera. Between two
+pictures, a point moves along a line that the camera's motion determines (epipolar geometry, Hartley and
+Zisserman 2004, section 9.1). Only its place on the line depends on its depth. So a start can be judged
+without knowing the scene: by the distance of points from the segment of that line between infinite depth and
+the nearest possible depth. If the camera only rotates, the segment is a point.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
-
-Int64 = NDArray[np.int64]
+from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.poses import conjugate, interpolate_poses, matrix_from_quaternion, multiply, rotate
 
 _MOST_PAIRS = 400  # events whose pairs give the slopes: 80,000 pairs
-_CLEAR = 4.0  # standard deviations from which a drift counts as significant
+_CLEAR = 4.0  # standard deviations from which a drift, or a difference of log-likelihoods, is significant
 _LARGEST_DRIFT_PPM = 1000.0  # quartz is off by 100 at most; more is a jump or a wrong unit
 _CORRELATED_S = 10.0  # correlation time of the delays of one link
 
@@ -79,7 +84,7 @@ def fit_clock(this_ns: Int64, other_ns: Int64) -> ClockFit | None:
     )
 
 
-def _inside(residual_s: Float) -> tuple[NDArray[np.bool_], float]:
+def _inside(residual_s: Float) -> tuple[Bool, float]:
     """Mark the events near the line, and compute their scatter about it."""
     centred = residual_s - np.median(residual_s)
     scatter = 1.4826 * float(np.median(np.abs(centred)))
@@ -96,3 +101,298 @@ def _median_slope(t_s: Float, lead_s: Float) -> float:
     # Pairs far apart determine the drift; the slopes of close ones are dominated by delays.
     far = step > np.ptp(t_s) / 4
     return float(np.median(rise[far] / step[far])) if far.any() else 0.0
+
+
+# --- start of a video ----------------------------------------------------------------------------------
+
+
+_STEP_S = 0.02
+_SMOOTHED_S = 0.1  # standard deviation of the window: a log's poses are noisy from row to row
+_LEAST_WEIGHT = 0.9  # known share of a window: next to gaps and ends its mean is biased
+_NEAREST_M = 2.0  # smallest distance from the drone to anything that it films
+_LEAST_DEPTH = 0.1  # of a direction, as a share of its length: no picture shows points beside the camera
+_SCATTER = 2e-3  # rad: 0.4 px of pictures 320 px wide; error of tracking and of the poses between pictures
+_SEARCHED_S = 0.08  # step between the starts that are tried
+_SEARCHED_SHARE = 0.25  # scatter during the search, as a share of the motion of points
+_MOST_SEARCHED = 500  # points that are used while all starts are tried
+_LEAST_COVERED = 0.5  # share of the stretches that the log must cover
+_ELSEWHERE_S = 0.5  # a start this far from the best counts as another one
+_MOST_STEPS = 30  # of Newton's method: if every other one is halved, they end shorter than 1e-5 s
+_REFINED_S = 0.01  # step of the finite differences that refine a start
+_BLOCK_S = 1.0  # errors within a second may correlate
+_LARGEST_SIGMA_S = 0.1
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Points tracked through stretches of a video, in normalised coordinates (x/z, y/z)."""
+
+    begin_ns: Int64  # [S] of the video's own stamps, rising
+    end_ns: Int64  # [S]
+    stretch: Int64  # [P] index of a point's stretch, rising
+    begin: Float  # [P, 2]
+    end: Float  # [P, 2]
+
+
+@dataclass(frozen=True)
+class StartFit:
+    """The start time of a video: the time at which its stamps are 0."""
+
+    start_ns: int
+    sigma_s: float
+    moved: float  # median motion of points in a stretch, rad
+    beside: float  # median distance of points from where the poses allow them, rad
+
+
+@dataclass(frozen=True)
+class _Path:
+    """A camera's poses on a grid, smoothed."""
+
+    position: Float  # [G, 3]
+    quaternion: Float  # [G, 4]
+    known: Bool  # [G]
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Starts on a grid, and the log-likelihood gain of each over a camera that stands still."""
+
+    path: _Path
+    followed: Followed
+    moved: float  # median motion of points in a stretch, rad
+    scatter: float  # rad: expected residual of the best start of the grid
+    starts_s: Float  # [K] after the first pose
+    gain: Float  # [K]; -inf where the log covers too little
+
+    def likeliest(self, among: Bool) -> tuple[float, float]:
+        """Find the likeliest start among those marked [K]; return it and its standard deviation, in s."""
+        best = np.argmax(np.where(among, self.gain, -np.inf))
+        return _refined(self.path, self.followed, float(self.starts_s[best]), self.scatter)
+
+    def explained(self, start_s: float) -> Float:
+        """Compute the log-likelihood gain of a start for each stretch [S]; 0 where the log has no poses."""
+        still = _still(self.followed, _SCATTER)
+        return np.nan_to_num(still - _misfits(self.path, self.followed, start_s, _SCATTER))
+
+
+def fit_start(
+    t_ns: Int64,
+    position: Float,
+    quaternion_xyzw: Float,
+    followed: Followed,
+    *,
+    max_gap_ns: int,
+    near_ns: int | None = None,
+    within_s: float = 1.0,
+) -> StartFit:
+    """Find the time at which the video's stamps are 0, such that the points move as the poses predict.
+
+    All starts on a grid are compared with a camera that stands still, by the likelihood of the points'
+    distances (Cauchy's, so that the filmed person and lost points have little weight). The best start must be
+    better than a still camera, and than the best start elsewhere, by four standard deviations of the
+    difference (Vuong 1989, with independent stretches). It is refined by Newton's method. Its standard
+    deviation allows any correlation of errors within a second (sums over blocks: Liang and Zeger 1986).
+
+    Args:
+        t_ns: [N] strictly increasing stamps of the poses.
+        position: [N, 3] m, of the camera in the world.
+        quaternion_xyzw: [N, 4] world_from_camera.
+        followed: the points.
+        max_gap_ns: there is no interpolation between poses further apart than this.
+        near_ns: the approximate start; None for any time that the poses cover.
+        within_s: the largest distance of the start from `near_ns`.
+
+    Raises:
+        ValueError: points and poses agree at no time or at several times; the message explains the reason.
+    """
+    if not len(followed.stretch):
+        raise ValueError("nothing in them can be followed")
+    search = _search(_path(t_ns, position, quaternion_xyzw, max_gap_ns), followed)
+    if not np.isfinite(search.gain).any():
+        raise ValueError("the poses cover less than half of them")
+    near_s = None if near_ns is None else (near_ns - int(t_ns[0])) / 1e9
+    possible = np.isfinite(search.gain) & (near_s is None or np.abs(search.starts_s - near_s) <= within_s)
+    if not possible.any():
+        raise ValueError(f"the poses cover less than half of them within {within_s:g} s of the stated start")
+
+    start_s, sigma_s = search.likeliest(possible)
+    explained = search.explained(start_s)
+    if near_s is not None:
+        likeliest_s, _ = search.likeliest(np.ones(len(possible), np.bool_))
+        apart_s = likeliest_s - near_s
+        if abs(apart_s) > within_s and _is_clear(search.explained(likeliest_s) - explained):
+            raise ValueError(
+                f"they move as the poses do {apart_s:+.2f} s from the stated start, which must be right to"
+                f" {within_s:g} s"
+            )
+    if not _is_clear(explained):
+        raise ValueError("they do not move as the poses do")
+    elsewhere = possible & (np.abs(search.starts_s - start_s) > _ELSEWHERE_S)
+    if elsewhere.any():
+        other_s, _ = search.likeliest(elsewhere)
+        apart_s = abs(other_s - start_s)
+        if apart_s > _ELSEWHERE_S / 2 and not _is_clear(explained - search.explained(other_s)):
+            raise ValueError(
+                f"they move as the poses do at several times, {apart_s:.2f} s apart: too little, too evenly,"
+                " or again and again"
+            )
+    if not np.isfinite(sigma_s):
+        raise ValueError("no start explains their motion better than those shortly before and after it")
+    if sigma_s > _LARGEST_SIGMA_S:
+        raise ValueError(f"their motion says when to {sigma_s:.2g} s only, not to {_LARGEST_SIGMA_S:g} s")
+    return StartFit(
+        start_ns=int(t_ns[0]) + round(start_s * 1e9),
+        sigma_s=sigma_s,
+        moved=search.moved,
+        beside=float(np.nanmedian(_distances(search.path, followed, start_s))),
+    )
+
+
+def _path(t_ns: Int64, position: Float, quaternion_xyzw: Float, max_gap_ns: int) -> _Path:
+    from scipy.ndimage import gaussian_filter1d
+
+    at_ns = t_ns[0] + np.arange(0, int(t_ns[-1] - t_ns[0]) + 1, round(_STEP_S * 1e9))
+    moved, turned = interpolate_poses(
+        t_ns, position, quaternion_xyzw, at_ns, max_gap_ns=max_gap_ns, max_extrapolation_ns=0
+    )
+    there: Bool = np.asarray(np.isfinite(moved).all(axis=1))
+    width = _SMOOTHED_S / _STEP_S
+    weight = gaussian_filter1d(there.astype(np.float64), width, mode="constant")
+
+    def smoothed(values: Float) -> Float:
+        held = np.where(there[:, None], values, 0.0)
+        return gaussian_filter1d(held, width, axis=0, mode="constant") / np.maximum(weight, 1e-9)[:, None]
+
+    centre = np.where(there[:, None], moved, 0.0).sum(axis=0) / max(int(there.sum()), 1)
+    quaternion = smoothed(turned)
+    norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    return _Path(
+        position=smoothed(moved - centre),
+        quaternion=quaternion / np.maximum(norm, 1e-9),
+        known=there & np.asarray(weight > _LEAST_WEIGHT),
+    )
+
+
+def _search(path: _Path, followed: Followed) -> _Search:
+    """Try all starts at which the video overlaps the log."""
+    last_s, length_s = float(followed.end_ns[-1]) / 1e9, _STEP_S * (len(path.known) - 1)
+    starts_s = np.arange(-last_s, length_s, _SEARCHED_S)
+    moved = float(np.median(np.linalg.norm(followed.end - followed.begin, axis=1)))
+    scatter = max(_SCATTER, _SEARCHED_SHARE * moved)
+    gain = _gains(path, _thinned(followed), starts_s, scatter)
+    return _Search(path, followed, moved, scatter, starts_s, gain)
+
+
+def _thinned(followed: Followed) -> Followed:
+    """Keep every n-th point, so that many starts can be tried."""
+    every = slice(None, None, max(1, len(followed.stretch) // _MOST_SEARCHED))
+    return Followed(
+        followed.begin_ns,
+        followed.end_ns,
+        followed.stretch[every],
+        followed.begin[every],
+        followed.end[every],
+    )
+
+
+def _gains(path: _Path, followed: Followed, starts_s: Float, scatter: float) -> Float:
+    """Compute each start's log-likelihood gain over a still camera; -inf where the log covers too little."""
+    still = _still(followed, scatter)
+    gain = np.full(len(starts_s), -np.inf)
+    for k, start_s in enumerate(starts_s.tolist()):
+        better = still - _misfits(path, followed, start_s, scatter)
+        known = np.isfinite(better)
+        if known.mean() >= _LEAST_COVERED:
+            gain[k] = better[known].sum()
+    return gain
+
+
+def _still(followed: Followed, scatter: float) -> Float:
+    """Compute the misfits [S] of a camera that stands still."""
+    return _summed(followed, np.linalg.norm(followed.end - followed.begin, axis=1), scatter)
+
+
+def _misfits(path: _Path, followed: Followed, start_s: float, scatter: float) -> Float:
+    """Compute the misfits [S] of a start, in s after the first pose; NaN where the log has no poses."""
+    return _summed(followed, _distances(path, followed, start_s), scatter)
+
+
+def _summed(followed: Followed, distance: Float, scatter: float) -> Float:
+    """Sum the negative log-likelihoods of the points of each stretch, up to a constant."""
+    each = np.log1p((distance / scatter) ** 2)
+    return np.bincount(followed.stretch, each, len(followed.begin_ns)).astype(np.float64)
+
+
+def _distances(path: _Path, followed: Followed, start_s: float) -> Float:
+    """Compute the distances [P] of points from where a start allows them; NaN where the log has no poses."""
+    from_position, from_quaternion = _at(path, start_s + followed.begin_ns / 1e9)
+    to_position, to_quaternion = _at(path, start_s + followed.end_ns / 1e9)
+    turn = matrix_from_quaternion(multiply(conjugate(to_quaternion), from_quaternion))
+    shift = rotate(conjugate(to_quaternion), from_position - to_position) / _NEAREST_M
+    ray = np.einsum(
+        "pij,pj->pi", turn[followed.stretch], np.column_stack([followed.begin, np.ones(len(followed.begin))])
+    )
+    infinite, nearest = _in_picture(ray), _in_picture(ray + shift[followed.stretch])
+    line, beside = nearest - infinite, followed.end - infinite
+    length2 = np.maximum((line**2).sum(axis=1), 1e-18)
+    along = np.clip((beside * line).sum(axis=1) / length2, 0.0, 1.0)
+    return np.asarray(np.linalg.norm(beside - along[:, None] * line, axis=1))
+
+
+def _in_picture(ray: Float) -> Float:
+    return ray[:, :2] / np.maximum(ray[:, 2:], _LEAST_DEPTH)
+
+
+def _at(path: _Path, at_s: Float) -> tuple[Float, Float]:
+    """Interpolate positions [S, 3] and quaternions [S, 4] at times after the first pose; NaN if not known."""
+    place = at_s / _STEP_S
+    before = np.clip(np.floor(place).astype(np.int64), 0, max(len(path.known) - 2, 0))
+    after = np.minimum(before + 1, len(path.known) - 1)
+    share = (place - before)[:, None]
+    inside = (place >= 0) & (place <= len(path.known) - 1) & path.known[before] & path.known[after]
+    position = (1 - share) * path.position[before] + share * path.position[after]
+    quaternion = (1 - share) * path.quaternion[before] + share * path.quaternion[after]
+    quaternion /= np.maximum(np.linalg.norm(quaternion, axis=1, keepdims=True), 1e-9)
+    return np.where(inside[:, None], position, np.nan), np.where(inside[:, None], quaternion, np.nan)
+
+
+def _is_clear(differences: Float) -> bool:
+    """Test if a sum of differences of log-likelihoods is significantly above zero."""
+    known = differences[np.isfinite(differences)]
+    sigma = float(np.std(known, ddof=1)) * np.sqrt(len(known)) if len(known) > 1 else np.inf
+    return float(known.sum()) > max(_CLEAR * sigma, _CLEAR**2 / 2)
+
+
+def _refined(path: _Path, followed: Followed, start_s: float, scatter: float) -> tuple[float, float]:
+    """Refine a start to a fraction of a step, with smaller and smaller scatter; return also its sigma in s.
+
+    The limit on Newton's steps is halved each time they change direction. If points scatter little, their
+    likelihood has a sharp peak, and full steps would jump from side to side of it. Beside the peak its
+    curvature has the other sign; there a step goes downhill in misfit. The standard deviation is infinite if
+    the likelihood has no peak near the start.
+    """
+    block = (followed.begin_ns / 1e9 / _BLOCK_S).astype(np.int64)
+    sigma_s = np.inf
+    while True:
+        longest_s, before_s = _SEARCHED_S, 0.0
+        for _ in range(_MOST_STEPS):
+            less, here, more = (
+                _misfits(path, followed, start_s + k * _REFINED_S, scatter) for k in (-1, 0, 1)
+            )
+            slope = np.nan_to_num((more - less) / (2 * _REFINED_S))
+            bend = float(np.nansum(more - 2 * here + less)) / _REFINED_S**2
+            spread = float(np.sqrt((np.bincount(block, slope) ** 2).sum()))
+            sigma_s = spread / bend if bend > 0 else np.inf
+            downhill = -float(slope.sum())
+            if bend <= 0 and not downhill:
+                break  # the log has no poses here
+            step_s = downhill / bend if bend > 0 else float(np.copysign(longest_s, downhill))
+            if step_s * before_s < 0:
+                longest_s /= 2
+            step_s = float(np.clip(step_s, -longest_s, longest_s))
+            start_s, before_s = start_s + step_s, step_s
+            if abs(step_s) < 1e-5:
+                break
+        if scatter <= _SCATTER:
+            return start_s, sigma_s
+        scatter = max(scatter / 2, _SCATTER)

@@ -6,6 +6,7 @@ on the right: noisy world_from_camera = (p + translation, q * exp(rotation)). Si
 errors of several models add up.
 
 Models are registered under `mocap.noise_models`; `build` takes the classes by their registered names.
+`PoseErrors` is the prior that such models are for the estimate of poses.
 """
 
 from __future__ import annotations
@@ -18,9 +19,8 @@ from dataclasses import MISSING, dataclass, fields
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import (
     conjugate,
     interpolate_poses,
@@ -32,7 +32,6 @@ from pipelines.geometry.poses import (
 
 _LARGEST = 1e6  # of any parameter: larger ones make no sense, and their squares may overflow
 
-Int64 = NDArray[np.int64]
 Frame = Literal["world", "body"]
 
 
@@ -77,7 +76,7 @@ class NoiseModel(ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Process(NoiseModel):
+class _RandomProcess(NoiseModel):
     """One random process in time for six independent axes; the camera's motion has no influence."""
 
     frame: Frame = "world"
@@ -119,7 +118,7 @@ class _Process(NoiseModel):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Stationary(_Process):
+class _Stationary(_RandomProcess):
     """A process whose standard deviation is the same at any time."""
 
     position_m: float = 0.0
@@ -172,7 +171,7 @@ class GaussMarkov(_Stationary):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drift(_Process):
+class Drift(_RandomProcess):
     """A random walk that starts at zero with the first pose."""
 
     position_m_per_sqrt_s: float = 0.0
@@ -262,6 +261,136 @@ def disturb(
         error += model.errors(t_ns, position, quaternion_xyzw, rng)
     turned = multiply(quaternion_xyzw, quaternion_from_rotation_vector(error[:, 3:]))
     return position + error[:, :3], turned
+
+
+# --- priors of pose errors -------------------------------------------------------------------------------
+
+SHIFT_IN_WORLD, ROTATION, SHIFT_IN_CAMERA = 0, 3, 6
+"""First index of each part of the corrections of a picture's pose (see `refinement.kernels`)."""
+
+EXACT = 1e-5
+"""Constant error (m and rad) that stands for none, so that the equations stay well posed."""
+
+WHITE_SHARE = 0.5
+"""White share of a logged variance; a log gives the size of errors, not their correlation over time."""
+
+
+@dataclass(frozen=True)
+class Process:
+    """Pose error of one kind over time, the same on three axes: sigma0 at the start, then a random walk.
+
+    With a correlation time it is a Gauss-Markov process whose standard deviation is always sigma0.
+    """
+
+    number: int  # SHIFT_IN_WORLD, ROTATION or SHIFT_IN_CAMERA
+    sigma0: float  # m or rad
+    rate: float = 0.0  # m or rad per sqrt(s)
+    correlation_s: float = np.inf
+
+    @property
+    def constant(self) -> bool:
+        """True if it never changes."""
+        return self.rate == 0 and not np.isfinite(self.correlation_s)
+
+    def stray(self, elapsed_s: float) -> float:
+        """Compute the mean variance about the straight line between two values `elapsed_s` apart.
+
+        That of a Brownian bridge, rate^2 s (T - s) / T, over its length; a Gauss-Markov process is
+        a walk of rate sigma sqrt(2 / correlation time) over short times.
+        """
+        rate2 = self.rate**2
+        if np.isfinite(self.correlation_s):
+            rate2 += 2 * self.sigma0**2 / self.correlation_s
+        return min(rate2 * elapsed_s / 6, max(self.sigma0, self.rate) ** 2)
+
+    def step(self, elapsed_s: float) -> tuple[float, float]:
+        """Compute the share that is left after some time, and the added variance."""
+        if np.isfinite(self.correlation_s):
+            kept = float(np.exp(-elapsed_s / self.correlation_s))
+            return kept, self.sigma0**2 * (1 - kept**2)
+        return 1.0, self.rate**2 * elapsed_s
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Prior of one camera's pose errors."""
+
+    white: tuple[float, float]  # m, rad per axis; 0, 0 for none
+    processes: tuple[Process, ...]
+    logged: bool = False
+    """True if white errors have the logged covariance of each pose; `white` is then its level."""
+
+    def white_with_stray(self, knot_s: float) -> Float:
+        """Compute the standard deviation [2] (m, rad) of white errors, with slow errors between knots."""
+        variance = np.square(self.white)
+        for process in self.processes:
+            variance[1 if process.number == ROTATION else 0] += process.stray(knot_s)
+        if variance.any():
+            variance = np.maximum(variance, EXACT**2)
+        return np.sqrt(variance)
+
+
+def pose_errors(models: Sequence[NoiseModel]) -> PoseErrors:
+    """Convert stated noise models to a prior.
+
+    Latency is left to the clock: a delayed log and a clock offset differ only where cameras accelerate.
+
+    Raises:
+        ValueError: a model is not one of flight.yaml's.
+    """
+    white = np.zeros(2)
+    merged: dict[int, tuple[float, float]] = {}
+    processes = []
+
+    def add(number: int, sigma0: float, rate: float) -> None:
+        old = merged.get(number, (0.0, 0.0))
+        merged[number] = (float(np.hypot(old[0], sigma0)), float(np.hypot(old[1], rate)))
+
+    for model in models:
+        match model:
+            case White():
+                white += np.square([model.position_m, np.radians(model.rotation_deg)])
+            case Bias():
+                add(_shift(model.frame), model.position_m, 0.0)
+                add(ROTATION, float(np.radians(model.rotation_deg)), 0.0)
+            case Drift():
+                add(_shift(model.frame), 0.0, model.position_m_per_sqrt_s)
+                add(ROTATION, 0.0, float(np.radians(model.rotation_deg_per_sqrt_s)))
+            case GaussMarkov():
+                sizes = ((_shift(model.frame), model.position_m), (ROTATION, np.radians(model.rotation_deg)))
+                processes += [
+                    Process(number, float(size), correlation_s=model.correlation_s)
+                    for number, size in sizes
+                    if size > 0
+                ]
+            case Latency():
+                pass
+            case _:
+                raise ValueError(f"{type(model).__name__} cannot be a prior of the refinement")
+    processes += [
+        Process(number, max(sigma0, EXACT), rate)
+        for number, (sigma0, rate) in sorted(merged.items())
+        if sigma0 > 0 or rate > 0
+    ]
+    # A position without noise beside a rotation with noise (or the reverse) is a very small noise.
+    known = np.sqrt(white)
+    if known.any():
+        known = np.maximum(known, EXACT)
+    return PoseErrors((float(known[0]), float(known[1])), tuple(processes))
+
+
+def _shift(frame: str) -> int:
+    return SHIFT_IN_WORLD if frame == "world" else SHIFT_IN_CAMERA
+
+
+def errors_of_level(level: Float) -> PoseErrors:
+    """Build pose errors from their level [2] (m, rad) alone: half of the variance white, half constant."""
+    white, constant = np.sqrt(WHITE_SHARE) * level, np.sqrt(1 - WHITE_SHARE) * level
+    processes = (Process(SHIFT_IN_WORLD, float(constant[0])), Process(ROTATION, float(constant[1])))
+    return PoseErrors((float(white[0]), float(white[1])), processes)
+
+
+# --- models as users write them --------------------------------------------------------------------------
 
 
 def build(

@@ -12,12 +12,9 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import compose, interpolate_poses, invert
-
-Int64 = NDArray[np.int64]
 
 
 class Link(NamedTuple):

@@ -1,9 +1,7 @@
 """Compiled kernels of triangulation; `triangulation` is their only user and explains the methods.
 
-All kernels are in this one module: numba's cache watches the file of the outermost function only, so a
-helper in another file could change without the cached code noticing. For the same reason only
-`triangulate_range` is cached; its helpers are compiled into it. There is no fastmath and no thread here:
-a joint-frame's result depends only on its own numbers, so any division of the work gives the same bytes.
+There is no fastmath and no thread here: a joint-frame's result depends only on its own numbers, so any
+division of the work gives the same bytes.
 
 Symmetric 3x3 matrices are passed as the six numbers xx, xy, xz, yy, yz, zz. All calculations use a world
 moved to the mean camera centre, so that an origin kilometres away costs no precision.
@@ -14,13 +12,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.arrays import Bool, Float, Int8, Int64
 from pipelines.geometry.compilation import cached, helper
 
-Int64 = NDArray[np.int64]
-Int8 = NDArray[np.int8]
 Vector = tuple[float, float, float]
 Symmetric = tuple[float, float, float, float, float, float]
 
@@ -774,3 +769,90 @@ def triangulate_range(
             else:
                 covariance[n, :, :] = math.nan
             count[n] = total
+
+
+# --- the common motion of a picture's joints -----------------------------------------------------------
+
+
+@helper
+def _median(values: Float, count: int) -> float:
+    """Compute the median of the first `count` values, which are sorted in place."""
+    for i in range(1, count):
+        value = values[i]
+        k = i
+        while k > 0 and values[k - 1] > value:
+            values[k] = values[k - 1]
+            k -= 1
+        values[k] = value
+    half = count // 2
+    if count % 2 == 1:
+        middle: float = values[half]
+        return middle
+    mean: float = 0.5 * (values[half - 1] + values[half])
+    return mean
+
+
+@helper
+def _seen(xy: Float, weight: Float, n: int, c: int) -> bool:
+    return weight[n, c] > 0.0 and math.isfinite(weight[n, c] + xy[n, c, 0] + xy[n, c, 1])
+
+
+@cached
+def move_pictures(
+    order: Int64,
+    starts: Int64,
+    fewest: int,
+    points: Float,
+    xy: Float,
+    weight: Float,
+    pose_index: Int64,
+    position: Float,
+    rotation: Float,
+    moved: Float,
+    judged: Bool,
+) -> None:
+    """Move the views of each picture by the median residual of its joints, and mark those that were.
+
+    Rows order[starts[p]] ... of `points` are those of picture p in every camera. A view without a point in
+    front of its camera has no residual and is moved with the others. Pictures with fewer than `fewest`
+    residuals stay as they are.
+
+    `order` [N], `starts` [P + 1]; `points` [N, 3] m in the world, NaN where there is none; `xy` [N, C, 2]
+    normalised, NaN or of weight 0 where unseen; `weight` [N, C]; `pose_index` [N] into `position` [F, C, 3] m
+    and `rotation` [F, C, 3, 3] world_from_camera, NaN without a pose. Written: `moved` [N, C, 2], which
+    starts as a copy of `xy`, and `judged` [N, C], which starts as False.
+    """
+    most = 0
+    for p in range(len(starts) - 1):
+        most = max(most, starts[p + 1] - starts[p])
+    u = np.empty(most)
+    v = np.empty(most)
+    for p in range(len(starts) - 1):
+        for c in range(weight.shape[1]):
+            count = 0
+            for k in range(starts[p], starts[p + 1]):
+                n = order[k]
+                if not _seen(xy, weight, n, c):
+                    continue
+                at = pose_index[n]
+                dx = points[n, 0] - position[at, c, 0]
+                dy = points[n, 1] - position[at, c, 1]
+                dz = points[n, 2] - position[at, c, 2]
+                depth = rotation[at, c, 0, 2] * dx + rotation[at, c, 1, 2] * dy + rotation[at, c, 2, 2] * dz
+                if not depth > 0.0:
+                    continue
+                right = rotation[at, c, 0, 0] * dx + rotation[at, c, 1, 0] * dy + rotation[at, c, 2, 0] * dz
+                down = rotation[at, c, 0, 1] * dx + rotation[at, c, 1, 1] * dy + rotation[at, c, 2, 1] * dz
+                u[count] = right / depth - xy[n, c, 0]
+                v[count] = down / depth - xy[n, c, 1]
+                count += 1
+            if count < fewest:
+                continue
+            shift_u = _median(u, count)
+            shift_v = _median(v, count)
+            for k in range(starts[p], starts[p + 1]):
+                n = order[k]
+                if _seen(xy, weight, n, c):
+                    moved[n, c, 0] = xy[n, c, 0] + shift_u
+                    moved[n, c, 1] = xy[n, c, 1] + shift_v
+                    judged[n, c] = True

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.reconstruction.observations import Camera
-from pipelines.session.records import Int64
 
 UInt8 = NDArray[np.uint8]
 
@@ -112,7 +111,7 @@ def _flow(before: UInt8, after: UInt8, points: NDArray[Any]) -> tuple[NDArray[An
     return np.asarray(there), np.asarray(found)
 
 
-def _free(xy: NDArray[np.float32], boxes: Float, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _free(xy: NDArray[np.float32], boxes: Float, shape: tuple[int, ...]) -> Bool:
     """Mark the points [N] that are inside the picture and on no person."""
     size = np.array([shape[1], shape[0]])
     free = ((xy > _EDGE_PX) & (xy < size - _EDGE_PX)).all(axis=1)

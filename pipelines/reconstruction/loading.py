@@ -10,15 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
-from pipelines.reconstruction.observations import Camera
-from pipelines.reconstruction.refinement.problem import (
-    NEW_SHARE,
-    ROTATION,
-    SHIFT_IN_WORLD,
+from pipelines.geometry.noise import (
     PoseErrors,
-    Process,
+    errors_of_level,
     pose_errors,
 )
+from pipelines.reconstruction.observations import Camera
 from pipelines.session.camera_poses import stated_models, stated_noise
 from pipelines.session.description import CameraEntry, Description
 from pipelines.session.errors import DataError
@@ -176,13 +173,6 @@ def load_pose_errors(
             stated.append(PoseErrors((0.0, 0.0), ()) if camera.static else None)
     known = [errors for errors in stated if errors is not None]
     return known if len(known) == len(stated) else None
-
-
-def errors_of_level(level: Float) -> PoseErrors:
-    """Build pose errors from their level [2] (m, rad) alone: half of the variance white, half constant."""
-    new, lasting = np.sqrt(NEW_SHARE) * level, np.sqrt(1 - NEW_SHARE) * level
-    processes = (Process(SHIFT_IN_WORLD, float(lasting[0])), Process(ROTATION, float(lasting[1])))
-    return PoseErrors((float(new[0]), float(new[1])), processes)
 
 
 def load_clock_sigma(description: Description, cameras: Sequence[Camera]) -> Float:

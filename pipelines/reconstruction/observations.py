@@ -16,13 +16,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.cameras import Intrinsics, row_delay_s, undistort
+from pipelines.geometry.noise import PoseErrors
 from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion, velocities
-from pipelines.reconstruction.refinement.problem import PoseErrors
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import Interpolation
-from pipelines.session.records import Detections, Int64, Trajectory
+from pipelines.session.records import Detections, Trajectory
 
 _FRAME_GAP_NS = 500_000_000  # consecutive frames further apart than this, and than usual, are not bridged
 _USUAL = 1.5  # times the median frame period
@@ -42,7 +42,7 @@ class Camera:
     intrinsics: Intrinsics
     frame_number: Int64  # [F] as the pictures count them
     frame_t_ns: Int64  # [F]
-    follows: NDArray[np.bool_]  # [F] True if the frame is the next picture after the row before
+    follows: Bool  # [F] True if the frame is the next picture after the row before
     trajectory: Trajectory
     static: bool
     sigma: Float | None  # [N, 2]
@@ -72,7 +72,7 @@ class Camera:
         return dense
 
     @cached_property
-    def bridged(self) -> NDArray[np.bool_]:
+    def bridged(self) -> Bool:
         """[F - 1] True for frames after the first that may be interpolated to from the frame before."""
         step_ns = np.diff(self.frame_t_ns)
         return np.asarray(self.follows[1:] & (step_ns <= self.largest_gap_ns))

@@ -6,24 +6,25 @@ are inliers and which joints are reconstructed. Positions and covariances are th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.picture_gate import triangulate_pictures
+from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.noise import WHITE_SHARE, NoiseModel, PoseErrors, pose_errors
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.geometry.triangulation import (
     STATUS,
     Triangulation,
     Views,
     estimate_noise,
+    locate,
     reprojection_px,
     triangulate,
+    triangulate_pictures,
 )
-from pipelines.reconstruction.clock_search import begun_offsets_s
 from pipelines.reconstruction.observations import (
     Camera,
     Candidates,
@@ -32,12 +33,10 @@ from pipelines.reconstruction.observations import (
     on_sides,
     sightings_of,
 )
-from pipelines.reconstruction.refinement.building import Sighting
-from pipelines.reconstruction.refinement.problem import NEW_SHARE, PoseErrors
+from pipelines.reconstruction.refinement.problem import Sighting
 from pipelines.reconstruction.refinement.refine import SETTLED_S, Refined, corrected, refine
 from pipelines.reconstruction.solving import pictures_of
 from pipelines.session.description import Interpolation
-from pipelines.session.records import Int64
 from pipelines.session.skeletons import bones_of
 
 if TYPE_CHECKING:
@@ -269,7 +268,7 @@ def _sighting(flight: RobustFlight, c: int, camera: Camera) -> Sighting:
 def white_covariance(camera: Camera, prior: PoseErrors) -> Float | None:
     """Return covariances [F, 6, 6] of the white error of each picture's pose; None if not in the log."""
     logged = camera.covariance_at(camera.frame_t_ns) if prior.logged else None
-    return None if logged is None else NEW_SHARE * logged
+    return None if logged is None else WHITE_SHARE * logged
 
 
 def rigid_pairs(joints: tuple[str, ...], people: int) -> Int64:
@@ -326,3 +325,122 @@ def _camera_table(flight: RobustFlight, refined: Refined, offset_s: Float) -> pd
         table[["qx", "qy", "qz", "qw"]] = quaternion_from_matrix(true_rotation)
         parts.append(table)
     return pd.concat(parts, ignore_index=True)
+
+
+# --- initial clock offsets -----------------------------------------------------------------------------
+
+_STEP_S = 1 / 15  # limbs swing for longer than that
+_REACH = 2.0  # standard deviations of the stated clock offset
+_CLEARER = 0.8  # share of the disagreement without a shift that the best shift must go below
+_LIMBS = 75.0  # percentile: half of the joints swing too little, and some views are wrong
+
+
+def begun_offsets_s(views_at: Callable[[float], Views], instants: int, clock_sigma_s: Float) -> Float:
+    """Find an initial offset [C] s of every clock, to about two pictures; 0 for known clocks.
+
+    Views agree at the right offset. Pose errors move all joints of a view together and must not count: the
+    disagreement is measured after subtracting the median of each view.
+
+    Args:
+        views_at: function that returns the views with all unknown clocks moved forward by a number of
+            seconds; joint-frames are grouped by time, the same number at each time.
+        instants: number of these times.
+        clock_sigma_s: [C] prior standard deviation of each offset, 0 for a known clock. Without a known
+            clock all offsets are 0.
+    """
+    begun = np.zeros(len(clock_sigma_s))
+    unknown = np.flatnonzero(clock_sigma_s > 0)
+    if not len(unknown) or len(unknown) == len(begun):
+        return begun
+    steps = int(_REACH * clock_sigma_s.max() / _STEP_S)
+    shifts_s = _STEP_S * np.arange(-steps, steps + 1)
+    disagreement = np.full((len(shifts_s), len(begun)), np.inf)
+    for row, shift_s in enumerate(shifts_s):
+        views = views_at(float(shift_s))
+        for camera in unknown[np.abs(shift_s) <= _REACH * clock_sigma_s[unknown]]:
+            disagreement[row, camera] = _disagreement(views, instants, clock_sigma_s == 0, camera)
+    for camera in unknown:
+        best = int(np.argmin(disagreement[:, camera]))
+        if disagreement[best, camera] < _CLEARER * disagreement[steps, camera]:
+            begun[camera] = shifts_s[best]
+    return begun
+
+
+def _disagreement(views: Views, instants: int, known: Bool, camera: int) -> float:
+    """Compute the disagreement of a camera with those of known clocks, beside the median of each view."""
+    chosen = np.append(np.flatnonzero(known), camera)
+    views = replace(
+        views,
+        xy=views.xy[:, chosen],
+        weight=views.weight[:, chosen],
+        position=views.position[:, chosen],
+        rotation=views.rotation[:, chosen],
+        focal=views.focal[chosen],
+        pixel_sigma=views.pixel_sigma[chosen],
+        pose_sigma=views.pose_sigma[:, chosen],
+    )
+    points = locate(views, method="dlt").points
+    away = points[:, None] - views.position[views.pose_index]
+    seen = np.einsum("ncij,nci->ncj", views.rotation[views.pose_index], away)
+    depth = np.where(seen[..., 2] > 0, seen[..., 2], np.nan)
+    missed = seen[..., :2] / depth[..., None] - views.xy
+    missed[views.weight == 0] = np.nan
+    missed = missed.reshape(instants, -1, len(chosen), 2)
+    there = np.isfinite(missed[..., -1, 0])
+    if not there.any():
+        return np.inf
+    missed = missed[there.any(axis=1)]
+    unseen = np.isnan(missed).all(axis=1, keepdims=True)  # by one of the others
+    of_view = np.nanmedian(np.where(unseen, 0.0, missed), axis=1, keepdims=True)
+    own = np.linalg.norm(missed - of_view, axis=-1)
+    return float(np.nanpercentile(own, _LIMBS))
+
+
+# --- cameras that share their times --------------------------------------------------------------------
+
+
+def refined_points(
+    views: Views, t_s: Float, joints: tuple[str, ...], models: Sequence[NoiseModel]
+) -> tuple[Float, str | None]:
+    """Compute the points of one person by `refined`, and the reason of a fallback to `robust`, if any.
+
+    Args:
+        views: N = T * J joint-frames, joints fastest; one row of poses for each of the T times. The pose
+            noise in them is for `robust`.
+        t_s: [T] strictly increasing.
+        joints: the J names.
+        models: pose noise, the same for every camera; an empty list for exact poses.
+
+    Returns:
+        Points [N, 3] m, NaN for none, and the reason of the fallback, None without one.
+    """
+    times, cameras = views.position.shape[:2]
+    told = replace(views, pixel_sigma=estimate_noise(views))
+    start = triangulate_pictures(told, picture=views.pose_index, pixel_sigma=views.pixel_sigma).points
+    sightings = [
+        Sighting(
+            t_s=t_s,
+            xy=views.xy[:, c].reshape(times, -1, 2),
+            confidence=views.weight[:, c].reshape(times, -1),
+            position=views.position[:, c],
+            rotation=views.rotation[:, c],
+            focal_px=float(views.focal[c]),
+            pixel_sigma=float(views.pixel_sigma[c]),
+        )
+        for c in range(cameras)
+    ]
+    prior = [pose_errors(models)] * cameras
+    shape = (times, len(joints), 3)
+    found = refine(t_s, sightings, start.reshape(shape), rigid_pairs(joints, 1), prior, np.zeros(cameras))
+    if found.fallback is not None:
+        return start, found.fallback
+    position, rotation = views.position.copy(), views.rotation.copy()
+    for c, (when_s, numbers) in enumerate(found.corrections):
+        if len(when_s):
+            there = np.stack([np.interp(t_s, when_s, column) for column in numbers.T], axis=1)
+            position[:, c], rotation[:, c] = corrected(position[:, c], rotation[:, c], there)
+    moved = replace(views, position=position, rotation=rotation, pose_sigma=np.zeros_like(views.pose_sigma))
+    gated = triangulate(replace(moved, pixel_sigma=estimate_noise(moved)), method="robust")
+    refined = found.position.reshape(-1, 3)
+    ok = (gated.status == STATUS.index("ok")) & np.isfinite(refined[:, 0])
+    return np.where(ok[:, None], refined, gated.points), None

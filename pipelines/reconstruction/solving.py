@@ -1,4 +1,15 @@
-"""Inputs of the solvers of joint-frames: rays, noise, and the choice of the solver."""
+"""Solvers of joint-frames: their noise, the choice between them, and two ways to weigh inliers again.
+
+- By the full logged 6x6 pose covariances. Triangulation uses one standard deviation for a position and one
+  for a rotation; its gates and its choice of views need no more. Logs contain more: satellite positioning
+  errs more upwards, a compass more than a level, and a lever arm correlates position and rotation. With each
+  view's own 2x2 covariance the inliers are weighted again: a few Gauss-Newton steps on the reprojection.
+- By a heavy-tailed loss, for static, calibrated cameras. Noisy poses move all joints of a view together and
+  by a normal amount: least squares is right for them, and weighting views by their own residuals costs 11 %
+  at five cameras. With calibrated poses and no stated noise, a view that disagrees shows a wrong joint, and
+  the size of its residual has no meaning: its weight should fall with its residual
+  (docs/decisions/0002-loss-of-still-cameras.md).
+"""
 
 from __future__ import annotations
 
@@ -8,23 +19,20 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.picture_gate import triangulate_pictures
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.triangulation import (
     STATUS,
     Method,
     Triangulation,
     Views,
     estimate_noise,
+    reprojection_px,
     triangulate,
+    triangulate_pictures,
 )
 from pipelines.reconstruction.observations import Camera, Observations
-from pipelines.reconstruction.pose_weighting import triangulate_weighted
-from pipelines.reconstruction.reweighting import triangulate_heavy_tailed
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64
 
 UNKNOWN_SIGMA = (0.3, np.radians(1.0))
 """Camera pose noise (m, rad) for associating people if none is stated: the studies' medium level."""
@@ -119,9 +127,7 @@ def pictures_of(observations: Observations) -> Int64:
     return np.repeat(np.arange(times * people), joints)
 
 
-def refused_people(
-    result: Triangulation, observations: Observations, seen: NDArray[np.bool_]
-) -> Triangulation:
+def refused_people(result: Triangulation, observations: Observations, seen: Bool) -> Triangulation:
     """Mark joints of a person without any chosen view as rejected, at times when `seen` [T] is True."""
     shape = observations.confidence.shape[:3]
     status = result.status.reshape(shape)
@@ -137,3 +143,110 @@ def said_noise(views: Views) -> str:
     pixels = float(np.median(views.pixel_sigma))
     rotation_deg = np.degrees(rotation_rad)
     return f"noise taken for poses {position_m:.3g} m and {rotation_deg:.3g} deg, pixels {pixels:.3g}"
+
+
+# --- full pose covariances -----------------------------------------------------------------------------
+
+_REFITS = 4  # the last moves the median joint by less than a thousandth of its standard deviation
+_REFITTED = 8192  # joint-frames at once: memory
+
+
+def triangulate_weighted(
+    views: Views, *, solve: Callable[[Views], Triangulation], pose_covariance: Float
+) -> Triangulation:
+    """Triangulate with `robust`, then weigh its inliers by their poses' full covariances.
+
+    Args:
+        views: the views; `pose_sigma` holds the level of the same covariances.
+        solve: `robust` with the options for these views.
+        pose_covariance: [F, C, 6, 6] position in the world (m^2), then rotation vector in the camera (rad^2).
+    """
+    first = solve(views)
+    points, covariance = first.points.copy(), first.covariance.copy()
+    (ok,) = np.nonzero(first.status == STATUS.index("ok"))
+    for start in range(0, len(ok), _REFITTED):
+        rows = ok[start : start + _REFITTED]
+        refit = _refit(views, first, pose_covariance, rows)
+        good = np.isfinite(refit[0]).all(axis=1) & np.isfinite(refit[1]).all(axis=(1, 2))
+        points[rows[good]], covariance[rows[good]] = refit[0][good], refit[1][good]
+    measured = np.isfinite(points[:, 0])
+    residual_px = np.where(measured[:, None], reprojection_px(views, points), first.residual_px)
+    return replace(first, points=points, covariance=covariance, residual_px=residual_px)
+
+
+def _refit(views: Views, first: Triangulation, pose_covariance: Float, rows: Int64) -> tuple[Float, Float]:
+    """Refit these joint-frames: points [N, 3] and covariances [N, 3, 3]."""
+    pose = views.pose_index[rows]
+    rotation, centre = views.rotation[pose], views.position[pose]
+    inlier = first.inlier[rows]
+    weight = np.where(inlier, views.weight[rows], 1.0)
+    pixel = (views.pixel_sigma / views.focal / weight) ** 2
+    seen = np.where(inlier[..., None], views.xy[rows], 0.0)
+    covariance = pose_covariance[pose]
+    points = first.points[rows].copy()
+    normal = np.empty((len(rows), 3, 3))
+    for _ in range(_REFITS):
+        away = np.einsum("ncji,ncj->nci", rotation, points[:, None] - centre)
+        away[~inlier] = [0.0, 0.0, 1.0]
+        u, v, z = np.moveaxis(away, -1, 0)
+        u, v = u / z, v / z
+        project = np.zeros((*u.shape, 2, 3))
+        project[..., 0, 0] = project[..., 1, 1] = 1 / z
+        project[..., 0, 2], project[..., 1, 2] = -u / z, -v / z
+        by_point = np.einsum("ncij,nckj->ncik", project, rotation)
+        # A camera that stands e further, and is turned by w about its axes, sees the point at
+        # exp(-w) R' (X - p - e): by e as by -X, by w as by the cross product with the point.
+        by_turn = project @ _cross_matrix(away)
+        by_pose = np.concatenate([-by_point, by_turn], axis=-1)
+        spread = by_pose @ covariance @ np.swapaxes(by_pose, -1, -2)
+        spread[..., 0, 0] += pixel
+        spread[..., 1, 1] += pixel
+        information = np.where(inlier[..., None, None], np.linalg.inv(spread), 0.0)
+        residual = seen - np.stack([u, v], axis=-1)
+        weighted = np.swapaxes(by_point, -1, -2) @ information
+        normal = (weighted @ by_point).sum(axis=1)
+        right = np.einsum("ncij,ncj->ni", weighted, residual)
+        points = points + np.linalg.solve(normal, right[..., None])[..., 0]
+    return points, np.asarray(np.linalg.inv(normal), dtype=np.float64)
+
+
+def _cross_matrix(vector: Float) -> Float:
+    """Return the cross-product matrix [..., 3, 3] of v: (v x) u."""
+    x, y, z = np.moveaxis(vector, -1, 0)
+    o = np.zeros_like(x)
+    rows = [[o, -z, y], [z, o, -x], [-y, x, o]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+# --- heavy-tailed loss ---------------------------------------------------------------------------------
+
+_ROUNDS = 12  # the effect of more rounds: docs/decisions/0002-loss-of-still-cameras.md
+
+
+def triangulate_heavy_tailed(views: Views, *, threads: int) -> Triangulation:
+    """Triangulate with `robust`, then weigh its inliers by Cauchy's loss (iteratively reweighted).
+
+    A view of whitened residual r gets the weight 1 / (1 + r^2) (Holland and Welsch 1977, table 1, with
+    the scale `views.pixel_sigma` instead of their tuning constant). `robust` decides which views are
+    inliers; the covariance is that of the weights in the last round.
+
+    Args:
+        views: the views; `pixel_sigma` from `estimate_noise`.
+        threads: see `triangulate`.
+    """
+    first = triangulate(views, method="robust", threads=threads)
+    inliers = np.where(first.inlier, views.weight, 0.0)
+    result = first
+    for _ in range(_ROUNDS):
+        whitened = inliers * result.residual_px / views.pixel_sigma
+        # Without a residual (not reconstructed, behind the camera) there is nothing to weight by.
+        loss = np.where(np.isfinite(whitened), np.nan_to_num(whitened) ** 2, 0.0)
+        weighted = replace(views, weight=inliers / np.sqrt(1.0 + loss))
+        result = triangulate(weighted, method="robust", threads=threads)
+    lost = first.points[:, :1] * result.points[:, :1]  # NaN where either has no point
+    return replace(
+        result,
+        inlier=first.inlier & result.inlier,
+        residual_px=np.where(np.isnan(lost), first.residual_px, reprojection_px(views, result.points)),
+        status=np.where(np.isnan(first.points[:, 0]), first.status, result.status),
+    )

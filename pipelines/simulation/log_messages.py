@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.pose_covariance import pose_covariance_in_body
-from pipelines.geometry.poses import conjugate
+from pipelines.geometry.poses import conjugate, pose_covariance_in_body
 from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, SimulatedPerson
 
 _RECEIVED_NS = 2_000_000  # after a message's own stamp, by the recorder on board

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.noise import GaussMarkov, NoiseModel, disturb, sum_sigma
-from pipelines.geometry.pose_covariance import mounted_covariance
 from pipelines.geometry.poses import (
     compose,
     conjugate,
     interpolate_points,
     interpolate_poses,
     invert,
+    mounted_covariance,
     multiply,
     rates,
     rotate,

@@ -11,6 +11,7 @@ import pytest
 
 from pipelines.formats.videos.video import VideoReader
 from pipelines.geometry.cameras import Intrinsics, undistort
+from pipelines.geometry.noise import pose_errors
 from pipelines.geometry.poses import (
     conjugate,
     interpolate_poses,
@@ -19,10 +20,8 @@ from pipelines.geometry.poses import (
     quaternion_from_matrix,
     rotation_vector_from_quaternion,
 )
-from pipelines.reconstruction.background import prior_of
-from pipelines.reconstruction.background_poses import adjust
+from pipelines.reconstruction.background import adjust, prior_of
 from pipelines.reconstruction.background_tracks import follow
-from pipelines.reconstruction.refinement.problem import pose_errors
 from pipelines.session.description import read_description
 from pipelines.session.registries import noise_models
 from tests.commands.runner import refused, succeeds

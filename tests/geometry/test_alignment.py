@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from pipelines.geometry.alignment import align, align_each
 from pipelines.geometry.arrays import Float
+from pipelines.geometry.metrics import align, align_each
 
 
 def cloud(count: int = 17, seed: int = 0) -> Float:

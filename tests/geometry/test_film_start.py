@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.film_start import Followed, StartFit, fit_start
+from pipelines.geometry.clocks import Followed, StartFit, fit_start
 
 Motion = Callable[[Float], tuple[Float, Rotation]]
 """Positions m [N, 3] and attitudes [N] of a camera at times s [N]."""

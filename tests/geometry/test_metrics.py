@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.metrics import Int64, bone_lengths, common, measure, measure_shape
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.metrics import bone_lengths, common, measure, measure_shape
 
 JOINTS = ("left_hip", "right_hip", "left_knee", "right_knee", "nose")
 STANCE = np.array([[0.0, 0.1, 1.0], [0, -0.1, 1.0], [0.02, 0.12, 0.5], [-0.02, -0.12, 0.5], [0.05, 0, 1.7]])

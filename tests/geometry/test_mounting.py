@@ -24,13 +24,14 @@ from pipelines.geometry.mounting import (
     compose_mount,
     flu_body_from_frd,
 )
-from pipelines.geometry.pose_covariance import mounted_covariance, pose_covariance_in_body
 from pipelines.geometry.poses import (
     conjugate,
     enu_from_ned,
     invert,
     matrix_from_quaternion,
+    mounted_covariance,
     multiply,
+    pose_covariance_in_body,
     quaternion_from_rotation_vector,
     rotate,
     transform,

@@ -10,12 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.noise import (
     Bias,
     Drift,
     GaussMarkov,
-    Int64,
     Latency,
     NoiseModel,
     White,

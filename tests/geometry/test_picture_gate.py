@@ -7,16 +7,15 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.picture_gate import triangulate_pictures
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.triangulation import (
     STATUS,
-    Int64,
     Triangulation,
     Views,
     estimate_noise,
     reprojection_px,
     triangulate,
+    triangulate_pictures,
 )
 from tests.geometry.rings import FOCAL, LEVELS, ring, with_outliers, with_pixel_noise, with_pose_noise
 

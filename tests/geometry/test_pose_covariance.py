@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.pose_covariance import carried_covariance, mounted_covariance, pose_covariance_in_body
+from pipelines.geometry.poses import carried_covariance, mounted_covariance, pose_covariance_in_body
 
 SAMPLES = 40_000
 # A sampled covariance has a standard error of at most sqrt(2 / N) sqrt(S_ii S_jj) = 0.7 %: five of them. What

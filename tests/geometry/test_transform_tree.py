@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.poses import Int64, compose, invert, matrix_from_quaternion
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.poses import compose, invert, matrix_from_quaternion
 from pipelines.geometry.transform_tree import Link, chain, find_route
 
 S = 1_000_000_000

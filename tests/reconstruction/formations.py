@@ -9,10 +9,9 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import NoiseModel, disturb
-from pipelines.geometry.picture_gate import triangulate_pictures
 from pipelines.geometry.poses import matrix_from_quaternion
-from pipelines.geometry.triangulation import Views, estimate_noise
-from pipelines.reconstruction.refinement.building import Sighting
+from pipelines.geometry.triangulation import Views, estimate_noise, triangulate_pictures
+from pipelines.reconstruction.refinement.problem import Sighting
 from pipelines.session.skeletons import bones_of
 from pipelines.simulation.drone_paths import orbit
 from pipelines.simulation.walk import COCO17, route, walk

@@ -11,18 +11,24 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, row_delay_s
+from pipelines.geometry.noise import ROTATION, SHIFT_IN_WORLD, PoseErrors, Process
 from pipelines.geometry.poses import (
     matrix_from_quaternion,
     quaternion_from_matrix,
     quaternion_from_rotation_vector,
     rotation_vector_from_quaternion,
 )
-from pipelines.reconstruction import background_poses
-from pipelines.reconstruction.background import Followed, prior_of, refine_cameras
-from pipelines.reconstruction.background_poses import Adjusted, PosePrior, adjust
+from pipelines.reconstruction import background
+from pipelines.reconstruction.background import (
+    Adjusted,
+    Followed,
+    PosePrior,
+    adjust,
+    prior_of,
+    refine_cameras,
+)
 from pipelines.reconstruction.background_tracks import Tracks, follow
 from pipelines.reconstruction.observations import Camera
-from pipelines.reconstruction.refinement.problem import ROTATION, SHIFT_IN_WORLD, PoseErrors, Process
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Detections, Trajectory
 
@@ -150,7 +156,7 @@ def test_a_log_that_the_pictures_contradict_is_kept_and_named() -> None:
 def test_a_few_pictures_more_than_a_stretch_cost_nothing(
     pictures: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(background_poses, "STRETCH", 40)
+    monkeypatch.setattr(background, "STRETCH", 40)
     rng = np.random.default_rng(6)
     position, rotation = flown(pictures, 0.3 * pictures)
     picture, point, xy = sighted(position, rotation, rng)

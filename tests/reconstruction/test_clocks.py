@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.reconstruction.refinement.building import Sighting
-from pipelines.reconstruction.refinement.problem import pose_errors
+from pipelines.geometry.noise import pose_errors
+from pipelines.reconstruction.refinement.problem import Sighting
 from pipelines.reconstruction.refinement.refine import Refined, refine
 from tests.reconstruction.formations import BONES, FOCAL_PX, formation
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.triangulation import STATUS
-from pipelines.reconstruction.filling import fill_gaps
+from pipelines.reconstruction.finishing import fill_gaps
 
 Int64 = NDArray[np.int64]
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float
-from pipelines.reconstruction.refinement.levels import limber
+from pipelines.reconstruction.refinement.estimate import limber
 
 
 def covariance(seed: int, joints: int) -> Float:

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipelines.geometry.arrays import Float
-from pipelines.reconstruction.refinement.problem import PoseErrors
+from pipelines.geometry.noise import PoseErrors
 from pipelines.reconstruction.refinement.refine import Refined, refine
 from tests.reconstruction.formations import BONES, Formation, formation, mean_mm, triangulated
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.reconstruction.refinement.memory import lasting
+from pipelines.reconstruction.refinement.estimate import lasting
 
 FRAMES, FLIGHTS = 1000, 2000
 

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.arrays import Float
+from pipelines.geometry.noise import ROTATION, errors_of_level
 from pipelines.geometry.triangulation import STATUS, Views, triangulate
-from pipelines.reconstruction.loading import errors_of_level
-from pipelines.reconstruction.pose_weighting import triangulate_weighted
-from pipelines.reconstruction.refinement.problem import ROTATION
+from pipelines.reconstruction.solving import triangulate_weighted
 from tests.geometry.rings import ring, turned, with_pixel_noise
 
 OK = STATUS.index("ok")

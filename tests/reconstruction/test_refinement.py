@@ -12,27 +12,24 @@ import pytest
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import aligned_distances
-from pipelines.geometry.noise import Bias, Drift, NoiseModel, White
-from pipelines.reconstruction.refinement import elimination, kernels
-from pipelines.reconstruction.refinement.building import build
-from pipelines.reconstruction.refinement.elimination import covariances, eliminate, moments, step
-from pipelines.reconstruction.refinement.estimate import initial_state, solve
-from pipelines.reconstruction.refinement.halves import parted
-from pipelines.reconstruction.refinement.levels import shrunk
-from pipelines.reconstruction.refinement.problem import (
+from pipelines.geometry.noise import (
     ROTATION,
     SHIFT_IN_CAMERA,
     SHIFT_IN_WORLD,
-    Knowledge,
-    Pictures,
+    Bias,
+    Drift,
+    NoiseModel,
     PoseErrors,
     Process,
-    State,
-    lay_out,
+    White,
     pose_errors,
 )
+from pipelines.reconstruction.refinement import elimination, kernels
+from pipelines.reconstruction.refinement.elimination import covariances, eliminate, moments, step
+from pipelines.reconstruction.refinement.estimate import initial_state, shrunk, solve
+from pipelines.reconstruction.refinement.problem import Knowledge, Pictures, State, build, lay_out
 from pipelines.reconstruction.refinement.refine import corrected, refine
-from pipelines.reconstruction.refinement.system import System, misfit, prior_cost
+from pipelines.reconstruction.refinement.system import System, misfit, parted, prior_cost
 from tests.reconstruction.formations import BONES, STATED_PX, Formation, formation, mean_mm
 
 WHITE = White(position_m=0.3, rotation_deg=1.0)

@@ -10,8 +10,15 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
-from pipelines.reconstruction.rauch_tung_striebel import STATES, UNKNOWN, find_density, smooth_positions
-from pipelines.reconstruction.smoothing import Butterworth, RauchTungStriebel, smoother
+from pipelines.reconstruction.smoothing import (
+    STATES,
+    UNKNOWN,
+    Butterworth,
+    RauchTungStriebel,
+    find_density,
+    smooth_positions,
+    smoother,
+)
 from pipelines.session.errors import DataError
 
 Int64 = NDArray[np.int64]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.reconstruction.tables import camera_poses_table
+from pipelines.reconstruction.results import camera_poses_table
 from pipelines.session.description import Interpolation
 from pipelines.session.records import Trajectory
 from tests.reconstruction.test_trials import camera

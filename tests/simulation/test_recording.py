@@ -9,8 +9,7 @@ import pytest
 
 from pipelines.geometry.mounting import body_from_camera, compose_gimbal
 from pipelines.geometry.noise import Bias, GaussMarkov, Latency, NoiseModel, White
-from pipelines.geometry.pose_covariance import mounted_covariance
-from pipelines.geometry.poses import conjugate, multiply, rotation_vector_from_quaternion
+from pipelines.geometry.poses import conjugate, mounted_covariance, multiply, rotation_vector_from_quaternion
 from pipelines.simulation.flying import LEVER_ARM, DronePaths, fly, moments, ring_slots
 from pipelines.simulation.recording import (
     ACTOR_CORRELATION_S,

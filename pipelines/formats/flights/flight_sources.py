@@ -29,7 +29,7 @@ from pipelines.geometry.mounting import (
     compose_gimbal,
     compose_mount,
 )
-from pipelines.geometry.pose_covariance import mounted_covariance
+from pipelines.geometry.poses import mounted_covariance
 from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import (

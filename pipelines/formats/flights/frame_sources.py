@@ -17,7 +17,7 @@ from pipelines.formats.videos.frame_times import read_frame_times, times_of_fram
 from pipelines.formats.videos.picture_motion import followed_points
 from pipelines.formats.videos.video import created_ns
 from pipelines.geometry.cameras import Intrinsics
-from pipelines.geometry.film_start import fit_start
+from pipelines.geometry.clocks import fit_start
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Camera, FrameTimes
 from pipelines.session.records import Detections, Int64, Trajectory, VideoIndex

@@ -10,8 +10,8 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.geodesy import Place
 from pipelines.geometry.mounting import flu_body_from_frd
-from pipelines.geometry.pose_covariance import carried_covariance
 from pipelines.geometry.poses import (
+    carried_covariance,
     compose,
     enu_from_ned,
     matrix_from_quaternion,

@@ -19,7 +19,7 @@ from pipelines.formats.poses.pose_rows import clean_poses
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.mounting import attitude_from_angles
-from pipelines.geometry.pose_covariance import pose_covariance_in_body
+from pipelines.geometry.poses import pose_covariance_in_body
 from pipelines.geometry.transform_tree import Link, chain, find_route
 from pipelines.session.errors import DataError
 from pipelines.session.records import AngleSample, Int64, PoseSample, Sample, Trajectory

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipelines.formats.videos.video import VideoReader
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, rescaled, undistort
-from pipelines.geometry.film_start import Followed
+from pipelines.geometry.clocks import Followed
 from pipelines.session.records import Int64
 
 _WIDTH_PX = 320  # width to which pictures are reduced: motion is still visible

@@ -17,16 +17,13 @@ from dataclasses import dataclass, fields
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.refinement import kernels, sweeps
-from pipelines.reconstruction.refinement.halves import Half, halved
 from pipelines.reconstruction.refinement.problem import State
-from pipelines.reconstruction.refinement.system import System
+from pipelines.reconstruction.refinement.system import Half, System, halved
 from pipelines.session.progress import Halt, side_by_side
 
-Int64 = NDArray[np.int64]
 Part = TypeVar("Part")
 Result = TypeVar("Result")
 

@@ -1,25 +1,31 @@
-"""Estimate: Gauss-Newton on all unknowns together, with a prior learned from stretches of the flight."""
+"""Estimate: Gauss-Newton on all unknowns together, with a prior learned from stretches of the flight.
+
+The prior's levels (standard deviations of errors and motion) are learned from the data. A variance becomes
+the sum of the estimates' squares over the number of them that the data determine, sum of 1 - posterior /
+prior variance (MacKay, "Bayesian interpolation", 1992). Its fixed points are those of expectation
+maximisation (Dempster, Laird & Rubin 1977), which was measured to be too slow here: if pictures carry little
+information on a level, eight rounds left it near its start. All levels are estimated together: fitting a
+constant error alone to a drifting log was measured to be ten times worse than trusting the log.
+
+Keypoint errors have a memory. A detector is wrong for the same reasons in neighbouring pictures, so they
+carry less information than independent pictures: the mean of a stationary error falls as if only one in tau =
+1 + 2 sum of its autocorrelations had been taken. An estimate that ignores this treats keypoint errors as slow
+pose errors. A pose error moves all joints of a camera together. The memory is therefore measured on each
+joint's residual relative to the other joints. Residuals show only a part of the error, see `memory_of`.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pipelines.geometry.arrays import Float
-from pipelines.reconstruction.refinement.elimination import (
-    Eliminated,
-    eliminate,
-    step,
-)
-from pipelines.reconstruction.refinement.levels import reestimated
-from pipelines.reconstruction.refinement.memory import lasting, memory_of
-from pipelines.reconstruction.refinement.problem import (
-    Knowledge,
-    Problem,
-    State,
-    lay_out,
-)
+from pipelines.geometry.noise import ROTATION, PoseErrors, Process
+from pipelines.reconstruction.refinement.elimination import Eliminated, Moments, eliminate, moments, step
+from pipelines.reconstruction.refinement.problem import Knowledge, Problem, State, lay_out
 from pipelines.reconstruction.refinement.system import System, misfit, prior_cost
 
 BOUND = 3.5
@@ -168,3 +174,253 @@ def initial_state(problem: Problem, known: Knowledge, position: Float) -> State:
         shared,
         np.zeros((len(problem.pictures.first), 6)),
     )
+
+
+# --- levels --------------------------------------------------------------------------------------------
+
+_GAP = 3.0  # usual steps: between stretches of a flight
+_EVERY = 3  # pictures of every third time are enough to estimate image noise and white errors
+_BODY_ACCELERATION, _BODY_COUNT = 1.5, 3.0  # m/s^2, weight of this prior; the simulated walk's is 1.1
+_LEAST_ACCELERATION = 0.1  # m/s^2, along any combination of joints
+_LEAST_BONE_M = 0.001
+_STRIDE = 1.5  # overshoot of a step over its goal, on a logarithmic scale
+_LEAST_TOLD = 0.03  # least share of a level determined by data: levels without data stay unchanged
+_CHANGES = (0.04, 6.0)  # bounds of the change of a variance in one round
+_MOST_OF_CONSTANT = 1.6
+"""Upper bound for constant errors: they are only a few numbers, and can diverge with the scale."""
+_LEAST_WHITE = (1e-4, 1e-5)  # m, rad
+_LEAST_CONSTANT = (1e-3, 1e-4)
+_LEAST_RATE = (1e-4, 1e-5)
+
+
+def reestimated(system: System, state: State, at: Eliminated, *, poses: bool, motion: bool) -> Knowledge:
+    """Estimate the prior's parameters again from the posterior at `state`.
+
+    Args:
+        system: the problem with the parameters so far.
+        state: the estimate with them.
+        at: the equations that it solves.
+        poses: True to estimate the levels of pose errors, pooled over the cameras.
+        motion: True to estimate those of motion, bones and keypoints.
+    """
+    known = system.knowledge
+    found = moments(system, state, at, every=_EVERY)
+    if poses:
+        known = replace(known, poses=_poses(system, found))
+    if not motion:
+        return known
+    grown = system.grown(state)
+    before = known.bone_sigma_m * grown
+    bones = before * (np.sqrt(found.bones / found.times) / before) ** _STRIDE
+    squares, told = found.image.sum(axis=0)
+    scale = known.pixel_scale * float(np.sqrt(squares / max(told, 1.0)))
+    return replace(
+        known,
+        acceleration=_acceleration(known.acceleration * grown**2, found, _bodies(system.problem)),
+        bone_sigma_m=np.maximum(bones, _LEAST_BONE_M),
+        size_m=known.size_m * grown,
+        pixel_scale=scale,
+    )
+
+
+def shrunk(acceleration: Float, t_s: Float, position: Float) -> Float:
+    """Shrink the correlations of a covariance of accelerations [J, J] according to the flight's length.
+
+    Limbs repeat their motion, so a short flight has few independent accelerations, and some combination of
+    joints seems to stay at rest by chance. With that prior, posterior covariances were a third
+    too small. Correlations are multiplied by 1 - sum var(r) / sum r^2 (Schafer & Strimmer, "A shrinkage
+    approach to large-scale covariance matrix estimation", 2005), where var(r) is (1 - r^2)^2 / (N - 1) and N
+    the number of accelerations over 1 + 2 sum rho^2 of their autocorrelation (Bartlett 1946).
+
+    Args:
+        acceleration: [J, J] (m/s^2)^2, as estimated.
+        t_s: [T] times (s).
+        position: [T, J, 3] m, the estimate from which it was computed.
+    """
+    joints = len(acceleration)
+    if joints < 2:
+        return acceleration
+    steps = np.diff(t_s)
+    velocity = np.diff(position, axis=0) / steps[:, None, None]
+    whole = np.maximum(steps[1:], steps[:-1]) < _GAP * np.median(steps)
+    change = (np.diff(velocity, axis=0) / (0.5 * (steps[1:] + steps[:-1]))[:, None, None])[whole]
+    unit = change / np.sqrt(np.maximum(np.mean(change**2, axis=(0, 2)), 1e-12))[:, None]
+    lags = range(1, len(unit) // 4)
+    repeated = 1 + 2 * sum(float(np.mean(unit[lag:] * unit[:-lag])) ** 2 for lag in lags)
+    independent = 3 * len(unit) / repeated
+    deviation = np.sqrt(np.diagonal(acceleration))
+    correlation2 = (acceleration / np.outer(deviation, deviation))[~np.eye(joints, dtype=bool)] ** 2
+    chance = float(np.sum((1 - correlation2) ** 2)) / max(independent - 1, 1.0)
+    share = min(chance / max(float(correlation2.sum()), 1e-12), 1.0)
+    return (1 - share) * acceleration + share * np.diag(deviation**2)
+
+
+def limber(acceleration: Float, spread: float) -> Float:
+    """Enlarge accelerations relative to the body's for the estimate of joints, if views are imprecise.
+
+    The accelerations of limbs repeat in a gait and are not white as in the prior. With imprecise views,
+    joints are averaged over longer times, and more of their swings would be lost. Standard deviations
+    relative to the body grow with those of triangulated points. The body is the best-determined mean under
+    A: that of all joints with weights A^-1 1, whose variance stays 1 / (1' A^-1 1).
+
+    Args:
+        acceleration: [J, J] (m/s^2)^2, A, as estimated.
+        spread: standard deviation of a triangulated point over that of its rays; no change below 1.
+    """
+    body = np.full_like(acceleration, 1 / np.linalg.inv(acceleration).sum())
+    return body + max(spread, 1.0) ** 2 * (acceleration - body)
+
+
+def _acceleration(before: Float, found: Moments, bodies: Float) -> Float:
+    """Estimate the covariance of accelerations, in coordinates where the previous one is the identity.
+
+    With noisy poses, a flight of 2 s determines less than one acceleration of a body as a whole (`bodies`
+    [J, P], 1 for its joints). The acceleration of walking bodies is added as a prior with the weight of
+    `_BODY_COUNT` accelerations.
+    """
+    values, vectors = np.linalg.eigh(before)
+    root, inverse = (vectors * values**power @ vectors.T for power in (0.5, -0.5))
+    squares, variance = (inverse @ part @ inverse / found.times for part in found.acceleration)
+    shares, axes = np.linalg.eigh(np.eye(len(before)) - (variance + variance.T) / 2)
+    known = np.maximum(shares, _LEAST_TOLD)
+    estimate = axes.T @ (squares - variance) @ axes + np.diag(known - shares)
+    for body in bodies.T:
+        along = axes.T @ inverse @ body
+        precision = float(along @ along)
+        shared = np.outer(along, along) / precision * _BODY_COUNT / found.times
+        estimate = estimate + shared * _BODY_ACCELERATION**2 * precision
+        known = known + np.diagonal(shared)
+    goal = estimate / np.sqrt(known[:, None] * known)
+    changes, turned = np.linalg.eigh((goal + goal.T) / 2)
+    changes = np.clip(np.maximum(changes, _CHANGES[0]) ** _STRIDE, *_CHANGES)
+    turned = axes @ turned
+    further = root @ (turned * changes @ turned.T) @ root
+    values, vectors = np.linalg.eigh((further + further.T) / 2)
+    floored: Float = vectors * np.maximum(values, _LEAST_ACCELERATION**2) @ vectors.T
+    return floored
+
+
+def _bodies(problem: Problem) -> Float:
+    """Mark the joints of each body, the joints that bones connect: [J, P], 1 for its joints."""
+    joints = problem.joints
+    ends = problem.bones
+    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(joints, joints))
+    count, label = connected_components(graph, directed=False)
+    return np.eye(count)[label]
+
+
+def _change(squares: float, told: float, count: float) -> float:
+    """Compute the factor on a variance from the mean square of estimates and the share the data determine."""
+    known = max(told / count, _LEAST_TOLD)
+    goal = (squares / count + known - told / count) / known
+    return float(np.clip(max(goal, 1e-9) ** _STRIDE, *_CHANGES))
+
+
+def _poses(system: System, found: Moments) -> tuple[PoseErrors, ...]:
+    """Estimate the levels of pose errors, the same for all cameras."""
+    known, layout = system.knowledge, system.layout
+    knot_s = float(layout.knot_t_s[1] - layout.knot_t_s[0])
+    before = known.poses[0].white_with_stray(knot_s)
+    stray2 = before**2 - np.square(known.poses[0].white)
+    white = []
+    for part in range(2):
+        squares, count, told = found.white[part]
+        if count == 0:
+            white.append(0.0)
+            continue
+        variance = before[part] ** 2
+        estimates = squares / variance - (count - told)
+        wanted = variance * _change(estimates, told, count) - stray2[part]
+        white.append(max(float(np.sqrt(max(wanted, 0.0))), _LEAST_WHITE[part]))
+    by_place: dict[int, list[tuple[bool, int]]] = {}
+    for (camera, process), place in zip(layout.processes, layout.place, strict=True):
+        by_place.setdefault(known.poses[camera].processes.index(process), []).append(place)
+    processes = [
+        _process(process, by_place[index], found, layout.knot_count)
+        for index, process in enumerate(known.poses[0].processes)
+    ]
+    return (PoseErrors((white[0], white[1]), tuple(processes)),) * len(known.poses)
+
+
+def _process(process: Process, places: list[tuple[bool, int]], found: Moments, knot_count: int) -> Process:
+    part = 1 if process.number == ROTATION else 0
+    columns = np.concatenate([np.arange(3) + column for _, column in places])
+    at_knots = places[0][0]
+    starting = found.starting[columns if at_knots else columns + knot_count]
+    variance = process.sigma0**2
+    told = float(np.sum(1 - starting[:, 1] / variance))
+    estimates = float(np.sum(starting[:, 0] - starting[:, 1])) / variance
+    sigma0 = process.sigma0 * np.sqrt(min(_change(estimates, told, len(columns)), _MOST_OF_CONSTANT))
+    rate = 0.0
+    if process.rate > 0:
+        squares, count, spread = found.walked[columns].sum(axis=0)
+        told = count - spread / process.rate**2
+        estimates = (squares - spread) / process.rate**2
+        rate = max(process.rate * float(np.sqrt(_change(estimates, told, count))), _LEAST_RATE[part])
+    return replace(process, sigma0=max(float(sigma0), _LEAST_CONSTANT[part]), rate=rate)
+
+
+# --- memory of keypoint errors -------------------------------------------------------------------------
+
+_LONGEST_S = 2.0  # lags up to here
+_STOPS = 0.02  # an autocorrelation below this is chance; the sum stops there
+_MOST = 30.0
+
+
+def memory_of(system: System, state: State) -> float:
+    """Estimate tau, the number of neighbouring residuals that count as one independent one, from 1 to 30."""
+    problem = system.problem
+    pictures = problem.pictures
+    _, residual, _ = misfit(system, state)
+    far = (residual**2).sum(axis=-1) > system.bound2
+    residual = np.where(far[..., None], np.nan, residual)
+    cameras = np.unique(pictures.camera)
+    # A picture without any inlier joint contributes nothing.
+    own = residual - np.nansum(residual, axis=1, keepdims=True) / np.maximum(
+        np.sum(~np.isnan(residual), axis=1, keepdims=True), 1
+    )
+    lags = max(int(_LONGEST_S / system.usual_step_s), 1)
+    products, counts = np.zeros(lags + 1), np.zeros(lags + 1)
+    for camera in cameras:
+        (mine,) = np.nonzero(pictures.camera == camera)
+        order = mine[np.argsort(pictures.when_s[mine], kind="stable")]
+        step_s = float(np.median(np.diff(pictures.when_s[order]))) if len(order) > 1 else 1.0
+        values = _evenly(pictures.when_s[order], own[order], step_s)
+        for lag in range(min(lags, len(values) - 1) + 1):
+            product = values[: len(values) - lag] * values[lag:]
+            products[lag] += np.nansum(product)
+            counts[lag] += np.isfinite(product).sum()
+    if counts[0] == 0:
+        return 1.0
+    # Of the 2 C numbers that C cameras see of a slow error, the joint's position absorbs three.
+    shown = (2 * len(cameras) - 3) / (2 * len(cameras))
+    correlation = products / np.maximum(counts, 1) / (products[0] / counts[0])
+    tau = 1.0
+    for value in correlation[1:]:
+        if value < _STOPS:
+            break
+        tau += 2 * float(value) / shown
+    return min(tau, _MOST)
+
+
+def lasting(memory: float, pixel_scale: float) -> float:
+    """Compute the memory of image points if part of their error does not show in residuals.
+
+    The error of a single point is known beforehand: for a detector, the measured one. Residuals show only
+    the share `pixel_scale` of it if the rest is correlated for so long that joints and cameras follow it. The
+    mean of N points has (s^2 + (1 - s^2) tau) / N times the stated variance, where s^2 / N was counted. For
+    errors without correlation, a small scale means that the points are better than stated.
+
+    Args:
+        memory: tau from `memory_of`.
+        pixel_scale: s, standard deviation of the residuals, as a share of the stated one.
+    """
+    return max(memory, 1.0 + (pixel_scale**-2 - 1.0) * memory)
+
+
+def _evenly(when_s: Float, values: Float, step_s: float) -> Float:
+    """Put values [F, ...] at their places in an even sequence; NaN where there is none."""
+    place = np.round((when_s - when_s[0]) / step_s).astype(np.int64)
+    even = np.full((int(place[-1]) + 1, *values.shape[1:]), np.nan)
+    even[place] = values
+    return even

@@ -10,12 +10,9 @@ Interpolation is quadratic over three times of the skeleton.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.compilation import cached, helper
-
-Int64 = NDArray[np.int64]
 
 NUMBERS = 10  # of a picture: shift in the world, rotation, shift in the camera, clock
 WHITE = 6  # the first of them have a white part

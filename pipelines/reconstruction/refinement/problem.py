@@ -1,4 +1,4 @@
-"""Input of the refinement: pictures, the skeleton's times, and the priors of errors."""
+"""Refinement problem: pictures, the skeleton's times, the priors of errors, and their construction."""
 
 from __future__ import annotations
 
@@ -8,19 +8,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
-from pipelines.geometry.noise import Bias, Drift, GaussMarkov, Latency, NoiseModel, White
+from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.noise import PoseErrors, Process
 
-Int64 = NDArray[np.int64]
-
-SHIFT_IN_WORLD, ROTATION, SHIFT_IN_CAMERA, CLOCK = 0, 3, 6, 9
-"""First index of each part of a picture's ten numbers (see `kernels`)."""
-
-EXACT = 1e-5
-"""Constant error (m and rad) that stands for none, so that the equations stay well posed."""
-
-NEW_SHARE = 0.5
-"""White share of a logged variance; a log gives the size of errors, not their correlation over time."""
+CLOCK = 9
+"""Index of the clock offset among a picture's ten numbers (see `kernels`)."""
 
 
 @dataclass(frozen=True)
@@ -45,114 +37,6 @@ class Pictures:
 
 
 @dataclass(frozen=True)
-class Process:
-    """Pose error of one kind over time, the same on three axes: sigma0 at the start, then a random walk.
-
-    With a correlation time it is a Gauss-Markov process whose standard deviation is always sigma0.
-    """
-
-    number: int  # SHIFT_IN_WORLD, ROTATION or SHIFT_IN_CAMERA
-    sigma0: float  # m or rad
-    rate: float = 0.0  # m or rad per sqrt(s)
-    correlation_s: float = np.inf
-
-    @property
-    def constant(self) -> bool:
-        """True if it never changes."""
-        return self.rate == 0 and not np.isfinite(self.correlation_s)
-
-    def stray(self, elapsed_s: float) -> float:
-        """Compute the mean variance about the straight line between two values `elapsed_s` apart.
-
-        That of a Brownian bridge, rate^2 s (T - s) / T, over its length; a Gauss-Markov process is
-        a walk of rate sigma sqrt(2 / correlation time) over short times.
-        """
-        rate2 = self.rate**2
-        if np.isfinite(self.correlation_s):
-            rate2 += 2 * self.sigma0**2 / self.correlation_s
-        return min(rate2 * elapsed_s / 6, max(self.sigma0, self.rate) ** 2)
-
-    def step(self, elapsed_s: float) -> tuple[float, float]:
-        """Compute the share that is left after some time, and the added variance."""
-        if np.isfinite(self.correlation_s):
-            kept = float(np.exp(-elapsed_s / self.correlation_s))
-            return kept, self.sigma0**2 * (1 - kept**2)
-        return 1.0, self.rate**2 * elapsed_s
-
-
-@dataclass(frozen=True)
-class PoseErrors:
-    """Prior of one camera's pose errors."""
-
-    white: tuple[float, float]  # m, rad per axis; 0, 0 for none
-    processes: tuple[Process, ...]
-    logged: bool = False
-    """True if white errors have the logged covariance of each pose; `white` is then its level."""
-
-    def white_with_stray(self, knot_s: float) -> Float:
-        """Compute the standard deviation [2] (m, rad) of white errors, with slow errors between knots."""
-        variance = np.square(self.white)
-        for process in self.processes:
-            variance[1 if process.number == ROTATION else 0] += process.stray(knot_s)
-        if variance.any():
-            variance = np.maximum(variance, EXACT**2)
-        return np.sqrt(variance)
-
-
-def pose_errors(models: Sequence[NoiseModel]) -> PoseErrors:
-    """Convert stated noise models to a prior.
-
-    Latency is left to the clock: a delayed log and a clock offset differ only where cameras accelerate.
-
-    Raises:
-        ValueError: a model is not one of flight.yaml's.
-    """
-    white = np.zeros(2)
-    merged: dict[int, tuple[float, float]] = {}
-    processes = []
-
-    def add(number: int, sigma0: float, rate: float) -> None:
-        old = merged.get(number, (0.0, 0.0))
-        merged[number] = (float(np.hypot(old[0], sigma0)), float(np.hypot(old[1], rate)))
-
-    for model in models:
-        match model:
-            case White():
-                white += np.square([model.position_m, np.radians(model.rotation_deg)])
-            case Bias():
-                add(_shift(model.frame), model.position_m, 0.0)
-                add(ROTATION, float(np.radians(model.rotation_deg)), 0.0)
-            case Drift():
-                add(_shift(model.frame), 0.0, model.position_m_per_sqrt_s)
-                add(ROTATION, 0.0, float(np.radians(model.rotation_deg_per_sqrt_s)))
-            case GaussMarkov():
-                sizes = ((_shift(model.frame), model.position_m), (ROTATION, np.radians(model.rotation_deg)))
-                processes += [
-                    Process(number, float(size), correlation_s=model.correlation_s)
-                    for number, size in sizes
-                    if size > 0
-                ]
-            case Latency():
-                pass
-            case _:
-                raise ValueError(f"{type(model).__name__} cannot be a prior of the refinement")
-    processes += [
-        Process(number, max(sigma0, EXACT), rate)
-        for number, (sigma0, rate) in sorted(merged.items())
-        if sigma0 > 0 or rate > 0
-    ]
-    # A position without noise beside a rotation with noise (or the reverse) is a very small noise.
-    known = np.sqrt(white)
-    if known.any():
-        known = np.maximum(known, EXACT)
-    return PoseErrors((float(known[0]), float(known[1])), tuple(processes))
-
-
-def _shift(frame: str) -> int:
-    return SHIFT_IN_WORLD if frame == "world" else SHIFT_IN_CAMERA
-
-
-@dataclass(frozen=True)
 class Layout:
     """Places of the unknowns other than joints: at knots in time, or shared by all times.
 
@@ -164,7 +48,7 @@ class Layout:
     place: tuple[tuple[bool, int], ...]  # of each process: at knots?, first column
     entry_start: Int64  # [C + 1]
     entry_number: Int64
-    entry_knot: NDArray[np.bool_]
+    entry_knot: Bool
     entry_column: Int64
     clock_column: Int64  # [C], -1 for a known clock
     clock_sigma_s: Float  # [C]
@@ -277,3 +161,112 @@ class State:
             shared=self.shared + share * step.shared,
             white=self.white + share * step.white,
         )
+
+
+# --- construction --------------------------------------------------------------------------------------
+
+
+KNOT_S = 0.5
+"""Distance of the knots between which slow pose errors are linear; deviations from that count as white."""
+
+_NEAR = 0.75  # steps of the skeleton: a picture further from its nearest time is not used
+_RATE_S = 0.25  # to both sides
+_GAP = 3.5  # usual steps: no interpolation if three consecutive times span more than this
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Keypoints of one camera in its F pictures, with its logged poses."""
+
+    t_s: Float  # [F] strictly increasing, on the skeleton's clock
+    xy: Float  # [F, J, 2] normalised, undistorted; NaN where nothing was seen
+    confidence: Float  # [F, J]
+    position: Float  # [F, 3] m, logged world_from_camera; NaN without a pose
+    rotation: Float  # [F, 3, 3]
+    focal_px: float
+    pixel_sigma: float  # px per axis of a view of confidence 1
+    pose_covariance: Float | None = None  # [F, 6, 6] of white pose errors, see `Problem`
+
+    @property
+    def range_of(self) -> Bool:
+        """True for pictures [F] with a pose and a keypoint."""
+        return ~np.isnan(self.position[:, 0]) & ~np.isnan(self.xy[..., 0]).all(axis=1)
+
+
+def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64, *, threads: int = 1) -> Problem:
+    """Build the problem: sort pictures by the skeleton's times around them; leave out those near none.
+
+    Args:
+        t_s: [T] strictly increasing times of the skeleton, at least three.
+        sightings: keypoints and poses of each camera.
+        bones: [B, 2] joints with a nearly constant distance.
+        threads: see `Problem`.
+    """
+    parts, covariances, logged = [], [np.empty((0, 6, 6))], 0
+    for camera, sighting in enumerate(sightings):
+        parts.append(_pictures(t_s, sighting, camera, logged))
+        if sighting.pose_covariance is not None:
+            covariances.append(sighting.pose_covariance)
+            logged += len(sighting.t_s)
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    order = np.lexsort((columns[2], columns[1], columns[0]))
+    pictures = Pictures(*(np.ascontiguousarray(column[order]) for column in columns))
+    knots = max(int(np.ceil((t_s[-1] - t_s[0]) / KNOT_S)) + 1, 2)
+    knot_t_s = np.linspace(t_s[0], t_s[-1], knots)
+    return Problem(t_s, pictures, bones, knot_t_s, np.concatenate(covariances), threads)
+
+
+def _pictures(t_s: Float, sighting: Sighting, camera: int, logged: int) -> tuple[NDArray[np.generic], ...]:
+    step = float(np.median(np.diff(t_s)))
+    first, near = _first_of_three(t_s, sighting.t_s, step)
+    (kept,) = np.nonzero(near & sighting.range_of)
+    speed, turn = _rates(sighting)
+    seen = ~np.isnan(sighting.xy[kept, :, 0]) & (sighting.confidence[kept] > 0)
+    sharpness = np.where(seen, sighting.confidence[kept], 0.0) * sighting.focal_px / sighting.pixel_sigma
+    xy = np.where(seen[..., None], sighting.xy[kept], np.nan)
+    return (
+        first[kept],
+        np.full(len(kept), camera, dtype=np.int64),
+        np.full(len(kept), -1) if sighting.pose_covariance is None else logged + kept,
+        sighting.t_s[kept],
+        xy,
+        sharpness,
+        seen.astype(np.float64),
+        sighting.position[kept],
+        sighting.rotation[kept],
+        speed[kept],
+        turn[kept],
+    )
+
+
+def _first_of_three(t_s: Float, at_s: Float, step: float) -> tuple[Int64, Bool]:
+    """Find the first of three consecutive times of the skeleton around each time; mark if they exist."""
+    after = np.clip(np.searchsorted(t_s, at_s), 1, len(t_s) - 1)
+    nearest = np.where(at_s - t_s[after - 1] <= t_s[after] - at_s, after - 1, after)
+    span = np.full(len(t_s) + 2, np.inf)  # of the three times that begin at index - 2
+    span[2:-2] = t_s[2:] - t_s[:-2]
+    choices = np.stack([nearest - 1, nearest - 2, nearest], axis=1)
+    fits = span[np.clip(choices, -2, len(t_s) - 1) + 2] < _GAP * step
+    first = np.take_along_axis(choices, fits.argmax(axis=1)[:, None], axis=1)[:, 0]
+    near = fits.any(axis=1) & (np.abs(t_s[nearest] - at_s) <= _NEAR * step)
+    return first.astype(np.int64), near
+
+
+def _rates(sighting: Sighting) -> tuple[Float, Float]:
+    """Compute speed [F, 3] (m/s) in the world and turn rate [F, 3] (rad/s) in the camera; 0 where unknown.
+
+    Rates are taken over half a second. From picture to picture, noisy poses would give rates larger than
+    people's motion, and estimated clock offsets would be too small.
+    """
+    count = len(sighting.t_s)
+    if count < 3:
+        return np.zeros((count, 3)), np.zeros((count, 3))
+    reach = max(round(_RATE_S / float(np.median(np.diff(sighting.t_s)))), 1)
+    before, after = np.arange(count) - reach, np.arange(count) + reach
+    before, after = np.maximum(before, 0), np.minimum(after, count - 1)
+    elapsed_s = (sighting.t_s[after] - sighting.t_s[before])[:, None]
+    speed = (sighting.position[after] - sighting.position[before]) / elapsed_s
+    turned = np.einsum("tji,tjk->tik", sighting.rotation[before], sighting.rotation[after])
+    antisymmetric = (turned - np.swapaxes(turned, 1, 2)) / 2
+    axes = [antisymmetric[:, 2, 1], antisymmetric[:, 0, 2], antisymmetric[:, 1, 0]]
+    return np.nan_to_num(speed), np.nan_to_num(np.stack(axes, axis=1) / elapsed_s)

@@ -6,10 +6,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
-from pipelines.reconstruction.refinement.building import Sighting, build
+from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.noise import ROTATION, SHIFT_IN_CAMERA, SHIFT_IN_WORLD, PoseErrors, Process
 from pipelines.reconstruction.refinement.elimination import (
     Eliminated,
     covariances,
@@ -21,24 +20,13 @@ from pipelines.reconstruction.refinement.estimate import (
     evidence,
     initial_state,
     learn,
+    limber,
+    shrunk,
     solve,
 )
 from pipelines.reconstruction.refinement.kernels import turned
-from pipelines.reconstruction.refinement.levels import limber, shrunk
-from pipelines.reconstruction.refinement.problem import (
-    ROTATION,
-    SHIFT_IN_CAMERA,
-    SHIFT_IN_WORLD,
-    Knowledge,
-    Pictures,
-    PoseErrors,
-    Problem,
-    Process,
-    State,
-)
+from pipelines.reconstruction.refinement.problem import Knowledge, Pictures, Problem, Sighting, State, build
 from pipelines.reconstruction.refinement.system import System, misfit
-
-Int64 = NDArray[np.int64]
 
 _WINDOWS, _WINDOW = 3, 100  # stretches of the flight, in times, from which the prior is found
 _LEARNING_ROUNDS, _FEWER_ROUNDS = 8, 3
@@ -152,7 +140,7 @@ class _Prior:
     expected_m: float  # largest allowed move of the skeleton
 
 
-def _refined(problem: Problem, start: Float, part: NDArray[np.bool_], begun: Float, prior: _Prior) -> Refined:
+def _refined(problem: Problem, start: Float, part: Bool, begun: Float, prior: _Prior) -> Refined:
     """Estimate under a prior, and check the result; `fallback` gives the reason if a check fails.
 
     Raises:
@@ -282,17 +270,17 @@ def corrected(position: Float, rotation: Float, numbers: Float) -> tuple[Float, 
 # --- joints and bones ----------------------------------------------------------------------------------
 
 
-def _participating(start: Float) -> NDArray[np.bool_]:
+def _participating(start: Float) -> Bool:
     """Choose the joints [J] that were triangulated often enough to be refined."""
-    part: NDArray[np.bool_] = (~np.isnan(start[..., 0])).sum(axis=0) >= _FEWEST_TIMES
+    part: Bool = (~np.isnan(start[..., 0])).sum(axis=0) >= _FEWEST_TIMES
     return part
 
 
-def _take(sighting: Sighting, part: NDArray[np.bool_]) -> Sighting:
+def _take(sighting: Sighting, part: Bool) -> Sighting:
     return replace(sighting, xy=sighting.xy[:, part], confidence=sighting.confidence[:, part])
 
 
-def _renumbered(bones: Int64, part: NDArray[np.bool_]) -> Int64:
+def _renumbered(bones: Int64, part: Bool) -> Int64:
     number = np.cumsum(part) - 1
     there = part[bones].all(axis=1)
     renumbered: Int64 = number[bones[there]].astype(np.int64).reshape(-1, 2)

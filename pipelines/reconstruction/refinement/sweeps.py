@@ -8,9 +8,8 @@ front as x = R' (y - W' z), with R the inverse of the Cholesky factor of their o
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.compilation import cached, helper
 from pipelines.reconstruction.refinement.kernels import (
     NUMBERS,
@@ -20,8 +19,6 @@ from pipelines.reconstruction.refinement.kernels import (
     assemble,
     posterior_of_picture,
 )
-
-Int64 = NDArray[np.int64]
 
 _STRIP = 48  # rows; with fewer, products are too small to be fast
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from pipelines.formats.videos.picture_motion import followed_points
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
-from pipelines.geometry.film_start import fit_start
+from pipelines.geometry.clocks import fit_start
 from pipelines.geometry.poses import look_at
 from pipelines.ingest import ingest
 from pipelines.session.storage import read_json

@@ -1,6 +1,7 @@
-"""Quality of a reconstruction: errors against the truth if known, and internal consistency.
+"""Stored results of a reconstruction: rows of the session's tables, and the figures of metrics.json.
 
-Everything here is JSON-able, with null for figures that could not be measured.
+Figures are errors against the truth if known, and internal consistency. They are JSON-able, with null for
+figures that could not be measured.
 """
 
 from __future__ import annotations
@@ -8,18 +9,22 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int8, Int64
 from pipelines.geometry.bootstrap import LEVEL, RESAMPLES, Series, intervals, stretch_samples
 from pipelines.geometry.metrics import JointErrors, error_series, measure, measure_shape
+from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.geometry.triangulation import STATUS, Triangulation, Views, reprojection_px
-from pipelines.reconstruction.observations import Observations
-from pipelines.session.records import Int64
+from pipelines.reconstruction.observations import Camera, Observations
+from pipelines.session.description import Interpolation
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS
 from pipelines.session.skeletons import bones_of
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _OK, _FILLED = STATUS.index("ok"), STATUS.index("filled")
 _PER_JOINT = (
@@ -98,7 +103,7 @@ def assess(
 def _intervals(
     position: Float,
     own: Float | None,
-    status: NDArray[np.int8],
+    status: Int8,
     residual: Float,
     joints: tuple[str, ...],
     t_ns: Int64,
@@ -129,7 +134,7 @@ def _intervals(
     }
 
 
-def _share(status: NDArray[np.int8]) -> Series:
+def _share(status: Int8) -> Series:
     """Count measured joint-frames and all joint-frames at each time."""
     measured = (status == _OK).sum(axis=(1, 2), dtype=np.float64)
     return measured, np.full(len(status), float(status[0].size))
@@ -147,7 +152,7 @@ def _mean_mm(error_m: Float) -> float | None:
     return 1e3 * float(there.mean()) if there.size else None
 
 
-def _figures(status: NDArray[np.int8], residual: Float) -> dict[str, Any]:
+def _figures(status: Int8, residual: Float) -> dict[str, Any]:
     counts = Counter({STATUS[code]: int((status == code).sum()) for code in np.unique(status)})
     return {
         "reconstructed_share": counts["ok"] / max(status.size, 1),
@@ -200,3 +205,52 @@ def _leave_one_out(
         points = solve(replace(views, weight=weight)).points
         figures[name] = _spread(reprojection_px(views, points)[:, c])
     return figures
+
+
+# --- tables --------------------------------------------------------------------------------------------
+
+
+def skeleton_table(observations: Observations, result: Triangulation) -> pd.DataFrame:
+    """Build the rows of `tables.SKELETON`: every joint of every person at every time."""
+    import pandas as pd
+
+    times, people, joints, _ = observations.confidence.shape
+    used = np.where(result.inlier, result.residual_px, np.nan)
+    table = pd.DataFrame(
+        {
+            "t_ns": np.repeat(observations.t_ns, people * joints),
+            "person": np.tile(np.repeat(np.arange(people), joints), times),
+            "joint": np.tile(np.array(observations.joints, dtype=object), times * people),
+        }
+    )
+    table[["x", "y", "z"]] = result.points
+    table[list(POINT_COVARIANCE_COLUMNS)] = result.covariance[:, *np.triu_indices(3)]
+    table["views"] = result.views
+    table["reprojection_px"] = _row_mean(used)
+    table["status"] = np.array(STATUS, dtype=object)[result.status]
+    return table
+
+
+def camera_poses_table(cameras: Sequence[Camera], between: Interpolation) -> pd.DataFrame:
+    """Build the rows of `tables.CAMERA_POSES`: the poses of cameras at their pictures.
+
+    Pictures without a pose, for example in a pause of the log, have no row.
+    """
+    import pandas as pd
+
+    parts = []
+    for camera in cameras:
+        position, rotation = camera.poses_at(camera.frame_t_ns, between)
+        (posed,) = np.nonzero(np.isfinite(position[:, 0]))
+        table = pd.DataFrame({"t_ns": camera.frame_t_ns[posed], "camera": camera.name})
+        table[["x", "y", "z"]] = position[posed]
+        table[["qx", "qy", "qz", "qw"]] = quaternion_from_matrix(rotation[posed])
+        parts.append(table)
+    return pd.concat(parts, ignore_index=True)
+
+
+def _row_mean(values: Float) -> Float:
+    """Compute the mean of each row without its NaN; NaN for a row of only NaN."""
+    count = (~np.isnan(values)).sum(axis=1)
+    mean: Float = np.where(count > 0, np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)
+    return mean
