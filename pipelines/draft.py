@@ -19,17 +19,20 @@ from pipelines.drafting.found import (
     FrameTimes,
     Joints,
     Keypoints,
+    LeftOut,
     Lens,
     Map,
     Poses,
     Recording,
+    Search,
     Span,
+    Thing,
     TopicFound,
     Video,
+    kind_of_format,
 )
 from pipelines.drafting.manifest_text import write_manifest
 from pipelines.drafting.matching import match
-from pipelines.drafting.searching import LeftOut, Search, Thing, kind_of_format
 from pipelines.formats.common.rows import median_step_ns
 from pipelines.formats.drone_logs.dji_srt import read_subtitles
 from pipelines.formats.logs.messages import kind_of, samples
@@ -165,17 +168,7 @@ def _read_all(things: Sequence[Thing], home: Path, progress: Progress) -> tuple[
         if not known:
             unread.append(LeftOut(path, problem))
         progress.advance()
-    return Findings(
-        keypoints=[thing for thing in found if isinstance(thing, Keypoints)],
-        poses=[thing for thing in found if isinstance(thing, Poses)],
-        calibrations=[thing for thing in found if isinstance(thing, Calibration)],
-        joints=[thing for thing in found if isinstance(thing, Joints)],
-        frame_times=[thing for thing in found if isinstance(thing, FrameTimes)],
-        videos=[thing for thing in found if isinstance(thing, Video)],
-        maps=[thing for thing in found if isinstance(thing, Map)],
-        recordings=[thing for thing in found if isinstance(thing, Recording)],
-        drone_logs=[thing for thing in found if isinstance(thing, DroneLog)],
-    ), unread
+    return Findings(found), unread
 
 
 def _read(path: Path, formats: Sequence[Format], home: Path) -> tuple[list[Found], str]:

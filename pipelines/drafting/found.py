@@ -1,12 +1,33 @@
-"""Records of found files, with what a draft needs: names, kinds, times, topics; no arrays."""
+"""Search of files and folders for everything that a format recognises, and records of what was found.
+
+A record has what a draft needs: names, kinds, times, topics; no arrays.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
-from pipelines.session.telemetry import Height
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import read_flight
+from pipelines.session.registries import (
+    FORMATS,
+    CalibrationFormat,
+    Format,
+    JointFormat,
+    KeypointFormat,
+    LogFormat,
+    MapFormat,
+    TrajectoryFormat,
+    VideoFormat,
+    why_not,
+)
+from pipelines.session.telemetry import Height, TelemetryFormat
+
+F = TypeVar("F", bound="Found")
 
 Place = tuple[str, ...]
 """Names of a thing: folders below the common one, then the file's name without its suffix."""
@@ -158,30 +179,160 @@ class Recording(Found):
     drivers: tuple[Driver, ...] = ()
 
 
+_KINDS = (Video, Keypoints, Recording, DroneLog, Poses, Calibration, FrameTimes, Joints, Map)
+
+
 @dataclass(frozen=True)
 class Findings:
     """Everything that was found, each kind in the order of its paths."""
 
-    keypoints: list[Keypoints] = field(default_factory=list)
-    poses: list[Poses] = field(default_factory=list)
-    calibrations: list[Calibration] = field(default_factory=list)
-    joints: list[Joints] = field(default_factory=list)
-    frame_times: list[FrameTimes] = field(default_factory=list)
-    videos: list[Video] = field(default_factory=list)
-    maps: list[Map] = field(default_factory=list)
-    recordings: list[Recording] = field(default_factory=list)
-    drone_logs: list[DroneLog] = field(default_factory=list)
+    found: Sequence[Found]
+
+    def of(self, kind: type[F]) -> list[F]:
+        """List those of a kind."""
+        return [found for found in self.found if isinstance(found, kind)]
 
     def all(self) -> list[Found]:
         """List all of them, kind by kind."""
-        return [
-            *self.videos,
-            *self.keypoints,
-            *self.recordings,
-            *self.drone_logs,
-            *self.poses,
-            *self.calibrations,
-            *self.frame_times,
-            *self.joints,
-            *self.maps,
-        ]
+        return [found for kind in _KINDS for found in self.of(kind)]
+
+
+_FILES_ASKED = 16  # of a folder of keypoints, for their format
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A path that was looked at but is not used."""
+
+    path: Path
+    reason: str
+
+
+Thing = tuple[Path, list[Format]]
+"""A file or folder, and the formats that recognise it."""
+
+
+class Search:
+    """A search through files and folders, which notes what it had to leave out."""
+
+    def __init__(self) -> None:
+        self.left_out: list[LeftOut] = []
+        self._formats = FORMATS.all()
+        self._seen: set[Path] = set()
+
+    def look(self, paths: Sequence[Path]) -> tuple[list[Thing], Path]:
+        """Find everything that is recognised, each thing once, and the folder that all paths share.
+
+        Raises:
+            DataError: a path does not exist.
+        """
+        things: list[Thing] = []
+        bases: list[Path] = []
+        for path in paths:
+            if not path.exists():
+                raise DataError(path, "does not exist", "check the path")
+            found = list(self._under(path))
+            alone = not path.is_dir() or [thing for thing, _ in found] == [path]
+            bases.append(path.parent if alone else path)
+            things += found
+        return sorted(things, key=lambda thing: thing[0]), Path(os.path.commonpath(bases))
+
+    def _under(self, path: Path) -> Iterator[Thing]:
+        """Yield the things at a path and below it."""
+        if path.resolve() in self._seen:  # named twice, or a link that leads back
+            return
+        self._seen.add(path.resolve())
+        if not _is_text(path):
+            self.left_out.append(LeftOut(path, "its name is no text that a manifest could state, left out"))
+        elif path.is_dir():
+            yield from self._under_folder(path)
+        elif formats := self._recognising(path):
+            yield path, formats
+        else:
+            self.left_out.append(LeftOut(path, _why_left_out(path)))
+
+    def _under_folder(self, folder: Path) -> Iterator[Thing]:
+        """Yield the folder itself if it is one thing, and things in it that are not part of that."""
+        children = self._children(folder)
+        formats = [f for f in self._recognising(folder) if self._is_whole(folder, children, f)]
+        if not formats:
+            for child in children:
+                yield from self._under(child)
+            return
+        yield folder, formats
+        kinds = {kind_of_format(format_) for format_ in formats}
+        for child in children:
+            if child.is_dir():
+                yield from self._under(child)
+            elif KeypointFormat not in kinds or child.suffix.lower() != ".json":
+                others = [f for f in self._recognising(child) if kind_of_format(f) not in kinds]
+                if others:
+                    yield child, others
+
+    def _is_whole(self, folder: Path, children: Sequence[Path], format_: Format) -> bool:
+        """Test if a folder that a format recognises is one thing, not a folder with several such things.
+
+        A folder is also recognised if it holds keypoint files, one for each camera, or a single log, or the
+        files of a bag beside the videos of its flight.
+        """
+        if isinstance(format_, LogFormat):
+            inside = [kind_of_format(f) for child in children for f in self._recognising(child)]
+            alone = len(inside) == 1 and not (folder / "metadata.yaml").exists()
+            return not alone and all(kind is LogFormat for kind in inside)
+        if not isinstance(format_, KeypointFormat):
+            return True
+        files = [child for child in children if child.suffix.lower() == ".json"]
+        asked = files[:: max(1, len(files) // _FILES_ASKED)]
+        if len(files) < 2 or any(f is not format_ for file in asked for f in self._recognising(file)):
+            return False
+        try:
+            format_.read_keypoints(folder, skeleton=None, first_frame=0)
+        except DataError:  # two files of one frame: they are of several cameras
+            return False
+        return True
+
+    def _children(self, folder: Path) -> list[Path]:
+        try:
+            children = sorted(folder.iterdir())
+        except OSError as error:
+            self.left_out.append(LeftOut(folder, f"cannot be read ({error.strerror}), left out"))
+            return []
+        return [c for c in children if not c.name.startswith(".") and c.suffix != ".session" and c.exists()]
+
+    def _recognising(self, path: Path) -> list[Format]:
+        return [format_ for format_ in self._formats if format_.recognises(path)]
+
+
+def kind_of_format(format_: Format) -> type | None:
+    """Return the protocol of a format; None if it has none of these."""
+    kinds = (
+        KeypointFormat,
+        TrajectoryFormat,
+        CalibrationFormat,
+        JointFormat,
+        LogFormat,
+        VideoFormat,
+        MapFormat,
+        TelemetryFormat,
+    )
+    return next((kind for kind in kinds if isinstance(format_, kind)), None)
+
+
+def _is_text(path: Path) -> bool:
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _why_left_out(path: Path) -> str:
+    """Explain why a file is left out that no format recognises."""
+    if path.suffix.lower() in {".yaml", ".yml"}:
+        try:
+            read_flight(path)
+        except DataError:
+            pass
+        else:
+            return "is a flight manifest already (run `mocap ingest` on it), left out"
+    return f"not recognised{why_not(path)}, left out"

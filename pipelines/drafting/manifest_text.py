@@ -1,16 +1,447 @@
-"""Text of a drafted flight.yaml: what was found, with comments on what only the user can know."""
+"""Text of a drafted flight.yaml: what was found, with comments on what only the user can know.
+
+Names come from file systems and logs, and may hold any character. A value is always read back as the same,
+and a comment always ends at the end of its line.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from decimal import Decimal
+from io import StringIO
 from pathlib import Path
+from typing import Any
 
-from pipelines.drafting.camera_text import CameraText, Remarks, flowing, spanned, stated, told
-from pipelines.drafting.found import Found, Joints, Recording, Span
-from pipelines.drafting.matching import Draft
-from pipelines.drafting.yaml_text import commented, entry, one_line, scalar
+from ruamel.yaml import YAML
+from ruamel.yaml.representer import RoundTripRepresenter
+
+from pipelines.drafting.found import (
+    Calibration,
+    DroneLog,
+    Found,
+    FrameTimes,
+    Joints,
+    Keypoints,
+    Poses,
+    Recording,
+    Span,
+    Video,
+)
+from pipelines.drafting.matching import CameraDraft, Candidate, Draft
 from pipelines.session.manifest import SCHEMA
+
+# Texts that every reader of YAML, old or new, reads as text without quotes.
+_PLAIN = re.compile(r"(?:\.\.?/)*[A-Za-z_/][A-Za-z0-9_./-]*(?: [A-Za-z0-9_./-]+)*")
+_WORDS_OF_YAML = frozenset(["null", "true", "false", "yes", "no", "on", "off", "y", "n"])
+
+
+class _Representer(RoundTripRepresenter):
+    """Writes times with all their digits, and quotes texts that a reader may take for another type."""
+
+    def represent_str(self, data: str) -> Any:
+        plain = _PLAIN.fullmatch(data) and data.lower() not in _WORDS_OF_YAML
+        return self.represent_scalar("tag:yaml.org,2002:str", data, style=None if plain else '"')
+
+    def represent_decimal(self, data: Decimal) -> Any:
+        text = format(data, "f")
+        return self.represent_scalar(f"tag:yaml.org,2002:{'float' if '.' in text else 'int'}", text)
+
+
+_Representer.add_representer(str, _Representer.represent_str)
+_Representer.add_representer(Decimal, _Representer.represent_decimal)
+
+
+def flow(value: object) -> str:
+    """Write texts, numbers, mappings and lists as YAML on one line."""
+    yaml = YAML()
+    yaml.Representer = _Representer
+    yaml.default_flow_style = True
+    yaml.brace_single_entry_mapping_in_flow_sequence = True
+    yaml.width = sys.maxsize
+    text = StringIO()
+    yaml.dump([value], text)  # a document cannot be a bare text without a line "..." after it
+    return text.getvalue().strip()[1:-1]
+
+
+def entry(key: str, value: object, comment: str = "") -> str:
+    """Write a line `key: value  # comment`, without indentation."""
+    return commented(f"{flow(key)}: {flow(value)}", comment)
+
+
+def commented(line: str, comment: str) -> str:
+    """Append a comment to a line, if there is one."""
+    return f"{line}  # {one_line(comment)}" if comment else line
+
+
+def one_line(text: str) -> str:
+    """Replace all characters that end a line or control a terminal."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
+
+
+ASSUMED_FPS = 30
+_BRIDGED_NS = 500_000_000  # ingest's default for the longest gap between two poses
+_MOST_OTHERS = 8  # candidates that are listed after the chosen one
+
+
+@dataclass
+class Remarks:
+    """Short remarks on the whole manifest: each with the cameras that it concerns."""
+
+    missing: dict[str, list[str]] = field(default_factory=dict)  # ingest is not possible without it
+    assumed: dict[str, list[str]] = field(default_factory=dict)  # the result depends on it
+
+
+class CameraText:
+    """Writer of one camera, key by key.
+
+    Args:
+        camera: the camera with its candidates.
+        draft: the flight of the camera.
+        relative: converts a path to the form in the manifest.
+        remarks: missing and assumed things are added here.
+    """
+
+    def __init__(
+        self, camera: CameraDraft, draft: Draft, relative: Callable[[Path], str], remarks: Remarks
+    ) -> None:
+        self._camera = camera
+        self._draft = draft
+        self._relative = relative
+        self._remarks = remarks
+
+    def lines(self) -> list[str]:
+        """Write the lines below the camera's name, without indentation."""
+        return [
+            *self._video(),
+            *self._keypoints(),
+            *self._frame_times(),
+            *self._clock(),
+            *self._pose(),
+            *self._mount(),
+            *self._intrinsics(),
+            *self._noise(),
+        ]
+
+    # --- pictures --------------------------------------------------------------------------------------
+
+    def _video(self) -> list[str]:
+        videos = self._camera.videos
+        if not videos and self._camera.keypoints:
+            return []
+        if not videos:
+            self._miss("a video or keypoints")
+            return [
+                f"# video: {self._camera.name}.mp4  # missing: or {{log, topic}} of pictures, or keypoints"
+            ]
+        remark = told(videos[0])
+        if self._camera.paired:
+            remark += "; assumed: of the same camera as the keypoints"
+            self._assume("that video and keypoints are of one camera")
+        return self._said("video", videos, remark)
+
+    def _keypoints(self) -> list[str]:
+        if not self._camera.keypoints:
+            return []
+        taken, *others = self._camera.keypoints
+        found = taken.found
+        settings = dict(taken.settings)
+        remarks = [told(taken)]
+        if isinstance(found, Keypoints) and found.ambiguous:
+            settings["format"] = found.format
+            remarks.append("assumed: other formats recognise it too")
+            self._assume(f"keypoints: that they are {found.format}'s")
+        if isinstance(found, Keypoints) and (first := _first_frame(found, self._film)):
+            settings["first_frame"] = first
+            remarks.append(f"assumed: frame {first} of it is the first")
+            self._assume(f"keypoints: first_frame {first}")
+        return self._said("keypoints", [replace(taken, settings=settings), *others], "; ".join(remarks))
+
+    @property
+    def _film(self) -> Video | None:
+        """The video file, if its pictures are in one."""
+        found = self._camera.videos[0].found if self._camera.videos else None
+        return found if isinstance(found, Video) else None
+
+    # --- time ------------------------------------------------------------------------------------------
+
+    def _frame_times(self) -> list[str]:
+        choice = self._camera.frame_times
+        if choice:
+            return self._said("frame_times", choice.all, told(choice.taken))
+        if self._camera.videos and self._film is None:
+            return []  # the log's own stamps
+        if coarse := self._coarse_start():
+            return coarse
+        start, reason = self._start()
+        if self._film:
+            if start is None:
+                return ["# frame_times: {start: SECONDS}  # when the first frame was taken, if not at 0"]
+            self._assume("frame_times: start, when the first frame was taken")
+            return [entry("frame_times", {"start": start}, f"assumed: the first frame {reason}")]
+        if not self._camera.keypoints:
+            return []
+        fps = {"fps": ASSUMED_FPS}
+        if start is None:
+            self._assume(f"frame_times: fps {ASSUMED_FPS}, the first frame at 0 s")
+            return [entry("frame_times", fps, f"assumed: {ASSUMED_FPS} frames a second, the first at 0 s")]
+        self._assume(f"frame_times: fps {ASSUMED_FPS}; start, when the first frame was taken")
+        remark = f"assumed: {ASSUMED_FPS} frames a second, the first {reason}"
+        return [entry("frame_times", {"start": start, **fps}, remark)]
+
+    def _coarse_start(self) -> list[str]:
+        """Write the video's start from subtitles that show whole seconds."""
+        found = self._camera.poses.taken.found if self._camera.poses else None
+        if not isinstance(found, DroneLog) or found.video_start_ns is None or not self._film:
+            return []
+        self._assume("frame_times: start by the subtitles' clock, to a second")
+        start = Decimal(found.video_start_ns) / 10**9
+        remark = "assumed: by the subtitles' clock, whole seconds of local time taken as UTC"
+        return [entry("frame_times", {"start": start.normalize()}, remark)]
+
+    def _start(self) -> tuple[Decimal | None, str]:
+        """Assume the first frame's time in seconds: when poses and truth have begun; None for 0."""
+        poses = self._camera.poses.taken.span if self._camera.poses else None
+        truth = next((joints.span for joints in self._draft.true_joints), None)
+        known = {"its poses": poses, "the truth": truth}
+        spans = {what: span for what, span in known.items() if span}
+        if poses and truth and poses.overlap_ns(truth) < 0:
+            spans = {"its poses": poses}  # the truth has another zero of time
+        filmed = Span(0, self._length_ns())
+        if not spans or all(filmed.overlap_ns(span) >= 0 for span in spans.values()):
+            return None, ""
+        first_ns = max(span.first_ns for span in spans.values())
+        return Decimal(-(-first_ns // 10**6)) / 1000, f"when {' and '.join(spans)} begin"
+
+    def _length_ns(self) -> int:
+        if self._film:
+            return self._film.length_ns
+        frames = (c.found.frames for c in self._camera.keypoints[:1] if isinstance(c.found, Keypoints))
+        return next(frames, 0) * 10**9 // ASSUMED_FPS
+
+    def _clock(self) -> list[str]:
+        if self._camera.videos and self._film is None:
+            return []
+        if self._coarse_start():
+            settings = {"offset_s": 0, "sigma_s": 1}
+            return [entry("clock", settings, "the subtitles' clock shows whole seconds")]
+        return ["# clock: {offset_s: 0, sigma_s: 0.2}  # if its clock is off against the poses', or unsure"]
+
+    # --- poses -----------------------------------------------------------------------------------------
+
+    def _pose(self) -> list[str]:
+        choice = self._camera.poses
+        if choice is None:
+            self._miss("pose: nothing of that name has poses")
+            loose = self._loose(Poses, DroneLog, Recording, Calibration)
+            return [
+                f"# pose: {{tum: {self._camera.name}.tum}}  # missing: nothing of that name has poses{loose}",
+                "#   or {csv: FILE}, {static: CALIBRATION}, {log: LOG, topic: TOPIC}, {log, parent, child},",
+                "#   {dji: SRT}, {ulog: FILE}, {ardupilot: FILE}, {log: LOG, preset: dji_osdk or mavros}",
+            ]
+        taken = choice.taken
+        remarks = [told(taken)]
+        if not choice.named:
+            remarks.append("assumed: they are its own")
+            self._assume("pose: that these poses are its own")
+        if taken.is_true:
+            remarks.append("assumed: these poses, called the truth, for there are no others")
+            self._assume("pose: what is called the truth, for there is nothing else")
+        filmed = self._camera.filmed
+        if filmed and taken.span and filmed.overlap_ns(taken.span) < 0:
+            remarks.append(f"missing: it was filmed at other times, {spanned(filmed)}")
+            self._miss("pose: there are no poses of the time when it filmed")
+        if isinstance(taken.found, Poses):
+            remarks.append("if of the body, not the camera: add of: body, and a mount")
+        if isinstance(taken.found, DroneLog):
+            remarks += self._about_drone(taken.found)
+        if taken.ned_hint:
+            remarks.append(f"{flow(taken.ned_hint)} sounds like north-east-down: then add axes: ned")
+            self._assume("pose: axes enu, although a name sounds like ned")
+        return self._said("pose", choice.all, "; ".join(remarks), self._pose_settings)
+
+    def _about_drone(self, found: DroneLog) -> list[str]:
+        """List remarks on what a drone's own log does not determine."""
+        remarks = []
+        if found.height == "stated":
+            self._miss("pose: altitude, for its log states no height")
+            remarks.append("missing: altitude: METRES above the take-off")
+        elif found.key == "dji" and found.height == "unknown":
+            self._assume("pose: absolute heights from a barometer, which differ between drones by metres")
+            remarks.append("assumed: absolute heights (altitude: relative takes the other)")
+        elif found.key == "dji":
+            self._assume("pose: heights above the take-off, which was level for all")
+            remarks.append("assumed: heights above the take-off (altitude: absolute takes the other)")
+        if found.step_ns > _BRIDGED_NS:
+            step_s = found.step_ns / 1e9
+            remarks.append(f"a position every {step_s:.3g} s: ingest with --max-pose-gap {1.5 * step_s:.3g}")
+        return remarks
+
+    def _pose_settings(self, candidate: Candidate) -> object:
+        if isinstance(candidate.found, Calibration):
+            return {"static": self._of_calibration(candidate)}
+        if "log" in candidate.settings and "preset" not in candidate.settings:
+            return {**candidate.settings, "of": "body" if candidate.of_body else "camera"}
+        return candidate.settings
+
+    def _mount(self) -> list[str]:
+        if self._camera.poses is None:
+            return []
+        taken = self._camera.poses.taken
+        if taken.unturned and self._camera.gimbal is None:
+            self._miss("gimbal: how the camera was turned, for its log does not say it")
+            return [
+                "# gimbal: {fixed: {yaw_deg: 90, pitch_deg: -30}}  # missing: from north to east, and up; or"
+                " {log: LOG, topic: TOPIC, relative_to: world}"
+            ]
+        if not taken.of_body and (isinstance(taken.found, DroneLog) or "preset" in taken.settings):
+            return ["# mount: {looks: forward, translation: [0, 0, 0]}  # the lever arm to the gimbal, m"]
+        if not (taken.of_body or taken.unturned):
+            return []
+        choice = self._camera.gimbal
+        if choice is None:
+            self._assume("mount: the camera looks forward, level, from the body's origin")
+            settings = {"looks": "forward", "down_deg": 0, "translation": [0, 0, 0]}
+            return [entry("mount", settings, "assumed: along the body's x axis, level, no lever arm (m)")]
+        self._miss("gimbal: relative_to, what its angles are relative to")
+        lines = ["gimbal:", *(f"  {entry(key, value)}" for key, value in choice.taken.settings.items())]
+        lines.append(
+            "  # relative_to: world  # missing: world (DJI: it replaces the body's turn), body or heading"
+        )
+        if choice.taken.topic and "Quaternion" not in choice.taken.topic.type:
+            lines.append("  # order: ypr  # assumed: yaw, pitch, roll as they stand in the message; or rpy")
+            lines.append("  # units: deg  # assumed; or rad")
+            self._assume("gimbal: order ypr, units deg")
+        lines.append("# mount: {looks: forward, translation: [0, 0, 0]}  # the lever arm to the gimbal, m")
+        return [*lines, *self._others("gimbal", choice.others)]
+
+    def _noise(self) -> list[str]:
+        if self._camera.poses is None or self._camera.poses.taken.span is None:
+            return []
+        if self._camera.poses.taken.by_gps:
+            return [
+                "# pose_noise: {gauss-markov: {position_m: 1.5, rotation_deg: 1, correlation_s: 100},"
+                " white: {position_m: 0.1, rotation_deg: 0.3}}",
+                "#   what GPS alone is good for: 1 to 2 m across, twice that in height, for minutes alike",
+            ]
+        return ["# pose_noise: {white: {position_m: 0.1, rotation_deg: 0.5}}  # how good they are, if known"]
+
+    # --- intrinsics ------------------------------------------------------------------------------------
+
+    def _intrinsics(self) -> list[str]:
+        choice = self._camera.intrinsics
+        if choice is None:
+            self._miss("intrinsics: nothing of that name has them")
+            return [
+                "# intrinsics: {width: 1920, height: 1080, fx: 1400, fy: 1400, cx: 959.5, cy: 539.5}"
+                f"  # missing: nothing of that name has them{self._loose(Calibration)}",
+                "#   or a calibration file, or {log: LOG, topic: TOPIC}",
+            ]
+        remark = told(choice.taken)
+        if not choice.named:
+            remark += "; assumed: it holds for this camera"
+            self._assume("intrinsics: that one calibration holds for them")
+        return self._said("intrinsics", choice.all, remark, self._of_calibration)
+
+    def _of_calibration(self, candidate: Candidate) -> object:
+        """Write only the path if the camera is clear: it has the same name, or it is the only one."""
+        if candidate.settings.get("camera") in {None, self._camera.name} and "path" in candidate.settings:
+            return candidate.found.path
+        return candidate.settings
+
+    # --- sentences -------------------------------------------------------------------------------------
+
+    def _said(
+        self,
+        key: str,
+        candidates: Sequence[Candidate],
+        remark: str,
+        settings: Callable[[Candidate], object] = lambda candidate: candidate.settings,
+    ) -> list[str]:
+        """Write the first candidate, and the others as comments below."""
+        line = entry(key, stated(settings(candidates[0]), self._relative), remark)
+        return [line, *self._others(key, candidates[1:], settings)]
+
+    def _others(
+        self,
+        key: str,
+        candidates: Sequence[Candidate],
+        settings: Callable[[Candidate], object] = lambda candidate: candidate.settings,
+    ) -> list[str]:
+        lines = [
+            f"# or {entry(key, stated(settings(candidate), self._relative), told(candidate))}"
+            for candidate in candidates[:_MOST_OTHERS]
+        ]
+        more = len(candidates) - len(lines)
+        return [*lines, f"#   and {more} more"] if more else lines
+
+    def _loose(self, *kinds: type[Found]) -> str:
+        """List found things of some kinds that are not used."""
+        paths = [self._relative(found.path) for found in self._draft.unused if isinstance(found, kinds)]
+        return f"; there is {', '.join(map(flow, paths[:_MOST_OTHERS]))}" if paths else ""
+
+    def _assume(self, what: str) -> None:
+        self._remarks.assumed.setdefault(what, []).append(self._camera.name)
+
+    def _miss(self, what: str) -> None:
+        self._remarks.missing.setdefault(what, []).append(self._camera.name)
+
+
+def stated(settings: object, relative: Callable[[Path], str]) -> object:
+    """Convert settings to the form in the manifest: relative paths, no None, a lone path without its key."""
+    if isinstance(settings, Path):
+        return relative(settings)
+    if not isinstance(settings, dict):
+        return settings
+    said = {key: stated(value, relative) for key, value in settings.items() if value is not None}
+    return said["path"] if said.keys() == {"path"} else said
+
+
+def told(candidate: Candidate) -> str:
+    """Describe a candidate in a few words."""
+    found, topic = candidate.found, candidate.topic
+    if topic:
+        type_ = topic.type.rpartition("/")[2]
+        return f"{topic.count} {type_}, {spanned(topic.span)}"
+    match found:
+        case Video():
+            return f"{found.frames} frames, {found.length_ns / 1e9:.6g} s"
+        case Keypoints():
+            return f"{found.title}, {found.frames} frames"
+        case FrameTimes():
+            return f"{found.rows} times" + (", local time taken as UTC" if found.key == "srt" else "")
+        case Poses():
+            return f"{found.title}, {spanned(found.span)}"
+        case DroneLog():
+            has = "with gimbal angles" if found.gimbal else "no gimbal angles"
+            return f"{found.title}, {found.positions} positions, {has}, {spanned(found.span)}"
+        case Recording() if "preset" in candidate.settings:
+            turned = "" if candidate.of_body or candidate.unturned else " with gimbal angles"
+            return f"usual topics{turned}" + (f", {spanned(candidate.span)}" if candidate.span else "")
+        case Recording():
+            return "transforms" + (f", {spanned(candidate.span)}" if candidate.span else "")
+    return found.title
+
+
+def spanned(span: Span) -> str:
+    """Write the length and the start of a span."""
+    return f"{(span.last_ns - span.first_ns) / 1e9:.6g} s from {span.first_ns / 1e9:.3f}"
+
+
+def _first_frame(found: Keypoints, video: Video | None) -> int:
+    """Return the first frame's number if the numbers cannot count from 0; else 0."""
+    if video is None:
+        return found.first_frame if found.first_frame > found.frames else 0
+    fits = found.last_frame - found.first_frame < video.frames
+    return found.first_frame if found.last_frame >= video.frames and fits else 0
+
+
+def flowing(settings: object, relative: Callable[[Path], str]) -> str:
+    """Write settings in one line of YAML."""
+    return flow(stated(settings, relative))
+
 
 _HEAD = """\
 # A flight for `mocap ingest`, drafted by `mocap init` from what the files say.
@@ -100,7 +531,7 @@ def _cameras(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) ->
         return [_NO_CAMERA]
     lines = ["", "cameras:"]
     for camera in draft.cameras:
-        lines.append(f"  {scalar(camera.name)}:")
+        lines.append(f"  {flow(camera.name)}:")
         lines += [f"    {line}" for line in CameraText(camera, draft, relative, remarks).lines()]
     return lines
 
@@ -136,7 +567,7 @@ def _truth(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
         why = "" if meets else ", when there are no poses"
         lines.append(
             commented(
-                f"# or truth: {{joints: {scalar(relative(joints.path))}}}",
+                f"# or truth: {{joints: {flow(relative(joints.path))}}}",
                 f"{joints.title}, {spanned(joints.span)}{why}",
             )
         )
@@ -156,7 +587,7 @@ def _unused(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
     lines = ["", "# Recognised, but not used:"]
     for found in draft.unused:
         hint = "; if known to be true: truth: {joints: FILE}" if isinstance(found, Joints) else ""
-        lines.append(f"#   {scalar(relative(found.path))}  ({one_line(found.title)}{hint or _held(found)})")
+        lines.append(f"#   {flow(relative(found.path))}  ({one_line(found.title)}{hint or _held(found)})")
     return lines
 
 

@@ -1,21 +1,41 @@
 """Matching of pictures, poses, calibrations and truth to cameras.
 
-A camera is anything with pictures: a video, keypoints, a topic with pictures. Every other thing goes to the
-camera with the same name. If there are several for a camera, the one that overlaps in time with its film is
-taken, then the one of the likelier kind. The others are kept and listed as alternatives.
+A camera is anything with pictures: a video, keypoints, a topic with pictures. Every other thing that a
+manifest can state is a candidate, and goes to the camera with the same name. If there are several for a
+camera, the one that overlaps in time with its film is taken, then the one of the likelier kind. The others
+are kept and listed as alternatives.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
-from pipelines.drafting import candidates as of
-from pipelines.drafting.candidates import Candidate
-from pipelines.drafting.found import Findings, Found, Joints, Recording, Span
+from pipelines.drafting.found import (
+    Calibration,
+    DroneLog,
+    Findings,
+    Found,
+    FrameTimes,
+    Joints,
+    Keypoints,
+    Map,
+    Poses,
+    Recording,
+    Span,
+    TopicFound,
+    TopicKind,
+    Video,
+)
 from pipelines.drafting.labels import (
+    ACTOR,
+    COMMANDED,
     EQUAL,
+    NO_PICTURES,
     NUMBER,
+    OPTICAL,
     OTHER,
     PART,
     TRUTH_WORDS,
@@ -23,12 +43,187 @@ from pipelines.drafting.labels import (
     Label,
     affinity,
     camera_names,
+    chains,
     fitting,
+    hints_at_ned,
     is_called,
+    joined,
+    label_of,
+    label_of_place,
+    label_of_recording,
+    label_of_topic,
     order,
     unique,
 )
-from pipelines.drafting.recordings import joined, label_of_recording
+from pipelines.session.manifest import PoseSource
+
+_POSE_TYPES = ("Odometry", "PoseWithCovarianceStamped", "PoseStamped", "PoseInFrame", "TransformStamped")
+"""Types of pose messages, the preferred first: odometry states its uncertainty. All others come last."""
+_GIMBAL = frozenset({"gimbal", "mount", "pan", "tilt", "ptz", "camera", "cam"})
+_MANY_CAMERAS = 200  # of one calibration file: more are the pictures of one moving camera
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Something that a manifest can state, with its labels and its rank among candidates of its kind."""
+
+    settings: dict[str, object]  # for the manifest; paths are Path objects
+    labels: tuple[Label, ...]  # the labels of its names, one or more
+    found: Found
+    rank: tuple[object, ...] = ()  # the smallest is the likeliest among those with equal names
+    span: Span | None = None
+    topic: TopicFound | None = None
+    of_body: bool = False  # poses of the body; else of the camera
+    by_gps: bool = False  # poses whose position is that of a satellite receiver
+    unturned: bool = False  # positions only, without attitudes of drone or gimbal
+    is_true: bool = False  # its name says that it is ground truth
+    ned_hint: str = ""  # a name that sounds like north-east-down
+
+    def affinity(self, label: Label) -> int:
+        """Rate how well it matches a camera's label."""
+        return max(affinity(own, label) for own in self.labels)
+
+
+def _moving_poses(findings: Findings, logs: Mapping[str, Recording]) -> list[Candidate]:
+    """List trajectories, topics and chains of transforms; not those named after truth, commands or actor."""
+    files = [_of_trajectory(found) for found in _trajectories(findings) if not _is_true(found)]
+    drones = [_of_drone(found) for found in findings.of(DroneLog)]
+    topics = [c for c in _pose_topics(logs) if not is_called(_topic_of(c), TRUTH_WORDS | ACTOR | COMMANDED)]
+    return [*files, *drones, *_of_drivers(logs), *topics, *_of_transforms(logs)]
+
+
+def _trajectories(findings: Findings) -> list[Poses]:
+    """List trajectory files for whose format manifests have a key."""
+    return [found for found in findings.of(Poses) if found.format in PoseSource.one_of]
+
+
+def _calibrated(findings: Findings, part: Literal["intrinsics", "pose"]) -> list[Candidate]:
+    """List cameras of calibrations with a part: their intrinsics, or their pose if they stand still."""
+    return [
+        _of_calibration(found, name)
+        for found in findings.of(Calibration)
+        if len(found.cameras) <= _MANY_CAMERAS
+        for name, lens in found.cameras.items()
+        if getattr(lens, part)
+    ]
+
+
+def _near(candidate: Candidate, pictures: str) -> int:
+    """Count the leading name parts that a camera info shares with a topic of pictures; 0 for other kinds."""
+    if candidate.topic is None or candidate.topic.kind != "intrinsics":
+        return 0
+    ours, theirs = (name.strip("/").split("/") for name in (candidate.topic.name, pictures))
+    shared = 0
+    while shared < min(len(ours), len(theirs)) and ours[shared] == theirs[shared] != "":
+        shared += 1
+    return shared
+
+
+def _of_file(found: Found, key: str = "path", span: Span | None = None) -> Candidate:
+    return Candidate({key: found.path}, (label_of_place(found.place),), found, (0, found.place), span)
+
+
+def _of_trajectory(found: Poses) -> Candidate:
+    return replace(_of_file(found, found.format, found.span), rank=(0, 0, found.place))
+
+
+def _of_drone(found: DroneLog) -> Candidate:
+    """Make a candidate of a drone's own log; with gimbal angles, it has the poses of the camera."""
+    return replace(
+        _of_file(found, found.key, found.span),
+        rank=(0, int(not found.gimbal), found.place),
+        of_body=found.body and not found.gimbal,
+        by_gps=found.by_gps,
+        unturned=not (found.body or found.gimbal),
+    )
+
+
+def _of_drivers(logs: Mapping[str, Recording]) -> Iterator[Candidate]:
+    """Yield candidates of drivers: the usual topics of a driver together hold more than each topic alone."""
+    for log, recording in logs.items():
+        for driver in recording.drivers:
+            namespace = driver.namespace or ""
+            settings = {"log": log, "preset": driver.preset, "namespace": driver.namespace}
+            yield Candidate(
+                dict(settings),
+                (label_of_topic(recording, namespace),),
+                recording,
+                (1, 1 - int(driver.gimbal) + int(not driver.body), -1, -driver.count, namespace),
+                driver.span,
+                of_body=driver.body and not driver.gimbal,
+                by_gps=driver.by_gps,
+                unturned=not (driver.body or driver.gimbal),
+            )
+
+
+def _is_true(found: Found) -> bool:
+    return is_called(found.place[-1], TRUTH_WORDS)
+
+
+def _of_calibration(found: Calibration, camera: str) -> Candidate:
+    """Make a candidate of one camera of a calibration; an only camera is not named in the settings."""
+    of_file, own = label_of_place(found.place), label_of(camera)
+    alone = len(found.cameras) == 1
+    both = tuple({word.key: word for word in (*of_file, *own)}.values())
+    labels = [of_file, own] if alone else [own, both]
+    return Candidate(
+        {"path": found.path, "camera": None if alone else camera},
+        tuple(label for label in labels if label) or ((),),
+        found,
+        (0, found.place, camera),
+    )
+
+
+def _topics(logs: Mapping[str, Recording], kind: TopicKind) -> list[Candidate]:
+    return [
+        Candidate(
+            {"log": log, "topic": topic.name},
+            (label_of_topic(recording, topic.name),),
+            recording,
+            (1, -topic.count, topic.name),
+            topic.span,
+            topic,
+        )
+        for log, recording in logs.items()
+        for topic in recording.topics
+        if topic.kind == kind and topic.count
+    ]
+
+
+def _pose_topics(logs: Mapping[str, Recording]) -> list[Candidate]:
+    return [_of_pose_topic(c, c.topic) for c in _topics(logs, "poses") if c.topic]
+
+
+def _of_pose_topic(candidate: Candidate, topic: TopicFound) -> Candidate:
+    type_ = topic.type.rpartition("/")[2].rpartition(".")[2]
+    likelihood = _POSE_TYPES.index(type_) if type_ in _POSE_TYPES else len(_POSE_TYPES)
+    of_body = not is_called(topic.source or topic.name, OPTICAL)
+    return replace(
+        candidate,
+        rank=(1, int(of_body), likelihood, -topic.count, topic.name),
+        of_body=of_body,
+        ned_hint=hints_at_ned(topic.target, topic.source, topic.name),
+    )
+
+
+def _topic_of(candidate: Candidate) -> str:
+    return candidate.topic.name if candidate.topic else ""
+
+
+def _of_transforms(logs: Mapping[str, Recording]) -> Iterator[Candidate]:
+    for log, recording in logs.items():
+        spans = [topic.span for topic in recording.topics if topic.kind == "transforms" and topic.count]
+        for parent, child in chains(recording):
+            of_body = not is_called(child, OPTICAL)
+            yield Candidate(
+                {"log": log, "parent": parent, "child": child},
+                (label_of_topic(recording, child),),
+                recording,
+                (1, int(of_body), len(_POSE_TYPES) + 1, 0, child),
+                Span(min(s.first_ns for s in spans), max(s.last_ns for s in spans)) if spans else None,
+                of_body=of_body,
+                ned_hint=hints_at_ned(parent, child),
+            )
 
 
 @dataclass(frozen=True)
@@ -85,18 +280,24 @@ class Draft:
 
 def match(findings: Findings) -> Draft:
     """Find the cameras, and what belongs to each."""
-    logs = _log_names(joined(findings.recordings))
+    logs = _log_names(joined(findings.of(Recording)))
     cameras = _cameras(findings, logs)
-    moving, still = of.moving_poses(findings, logs), of.still_poses(findings)
-    truth = of.true_poses(findings)
-    called_true = (joints for joints in findings.joints if is_called(joints.place[-1], TRUTH_WORDS))
-    true_joints = sorted(called_true, key=lambda j: (-_shared([j.span], _spans(moving)), j.place))
-    lenses, gimbals, stamps = of.lenses(findings, logs), of.gimbals(logs), of.frame_times(findings)
-    anchors = [*moving, *of.joints(findings)]
+    moving, still = _moving_poses(findings, logs), _calibrated(findings, "pose")
+    truth = [replace(_of_trajectory(f), is_true=True) for f in _trajectories(findings) if _is_true(f)]
+    pose_topics = _pose_topics(logs)
+    true_topics = [replace(c, is_true=True) for c in pose_topics if is_called(_topic_of(c), TRUTH_WORDS)]
+    true_joints = sorted(
+        filter(_is_true, findings.of(Joints)), key=lambda j: (-_shared([j.span], _spans(moving)), j.place)
+    )
+    lenses = [*_calibrated(findings, "intrinsics"), *_topics(logs, "intrinsics")]
+    # Angles of other names are magnetic fields, velocities, attitudes.
+    gimbals = [c for c in _topics(logs, "angles") if is_called(_topic_of(c), _GIMBAL)]
+    stamps = [_of_file(found, found.key, found.span) for found in findings.of(FrameTimes)]
+    anchors = [*moving, *(_of_file(found, span=found.span) for found in findings.of(Joints))]
 
     for camera in cameras:
         choose = _Chooser(camera, cameras, anchors)
-        camera.poses = _beside(choose(moving), choose(still)) or choose(truth) or choose(of.true_topics(logs))
+        camera.poses = _beside(choose(moving), choose(still)) or choose(truth) or choose(true_topics)
         if camera.poses and not camera.poses.taken.is_true:
             camera.true_poses = choose(truth)
         camera.intrinsics = choose(lenses, shared=True)
@@ -104,16 +305,16 @@ def match(findings: Findings) -> Draft:
         if camera.poses and (camera.poses.taken.of_body or camera.poses.taken.unturned):
             camera.gimbal = choose(gimbals)
 
-    actors = of.actors(logs)
+    actors = [c for c in pose_topics if is_called(_topic_of(c), ACTOR)]
     mentioned = [*(c for camera in cameras for c in camera.mentioned()), *actors]
     used = {candidate.found.path for candidate in mentioned}
-    used |= {thing.path for thing in (*true_joints, *findings.maps)}
+    used |= {thing.path for thing in (*true_joints, *findings.of(Map))}
     return Draft(
         logs={name: log for name, log in logs.items() if log.path in used},
         cameras=cameras,
         true_joints=true_joints,
         actors=actors,
-        maps=list(findings.maps),
+        maps=findings.of(Map),
         unused=[
             found
             for found in findings.all()
@@ -142,15 +343,22 @@ def _log_names(recordings: Sequence[Recording]) -> dict[str, Recording]:
 def _cameras(findings: Findings, logs: dict[str, Recording]) -> list[CameraDraft]:
     """Make a camera for everything that has pictures; if nothing has, one for each source of poses."""
     cameras: list[CameraDraft] = []
-    for video in sorted(of.videos(findings), key=_by_name):
+    together = Counter(found.path.parent for found in findings.of(Keypoints))
+    pictures = _topics(logs, "pictures")
+    coloured = [c for c in pictures if not is_called(_topic_of(c), NO_PICTURES)]
+    for video in sorted(map(_of_file, findings.of(Video)), key=_by_name):
         _home(cameras, video, lambda camera: camera.videos).videos.append(video)
-    for topic in sorted(of.picture_topics(logs), key=_by_name):
+    for topic in sorted(coloured or pictures, key=_by_name):
         _home(cameras, topic, lambda camera: [c for c in camera.videos if c.topic]).videos.append(topic)
-    for keypoints in sorted(of.keypoints(findings), key=_by_name):
+    detected = [  # those of the folder with the most of them rank first
+        replace(_of_file(found), rank=(-together[found.path.parent], found.place))
+        for found in findings.of(Keypoints)
+    ]
+    for keypoints in sorted(detected, key=_by_name):
         _home(cameras, keypoints, lambda camera: camera.keypoints).keypoints.append(keypoints)
     _pair_the_last(cameras)
     if not cameras:
-        for poses in sorted(of.moving_poses(findings, logs), key=_by_name):
+        for poses in sorted(_moving_poses(findings, logs), key=_by_name):
             if not any(_same(camera.label, poses) for camera in cameras):
                 cameras.append(CameraDraft(poses.labels[0]))
     cameras.sort(key=lambda camera: order(camera.label))
@@ -237,7 +445,7 @@ class _Chooser:
         def key(rival: Candidate) -> tuple[object, ...]:
             # A log that began a second earlier is as good as another; one of another flight is not.
             elsewhere = 2 * times[id(rival)] < max(times.values())
-            return elsewhere, -self._likeness(rival), -of.near(rival, self._topic), rival.rank
+            return elsewhere, -self._likeness(rival), -_near(rival, self._topic), rival.rank
 
         taken, *others = sorted(rivals, key=key)
         likeness = self._likeness(taken)

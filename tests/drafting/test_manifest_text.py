@@ -64,30 +64,28 @@ def test_first_frame_is_stated_where_the_numbers_cannot_count_from_0(
     listed: tuple[int, int], frames: int | None, expected: int | None
 ) -> None:
     videos = [] if frames is None else [video(frames)]
-    text, stated = written(Findings(keypoints=[keypoints(*listed)], videos=videos))
+    text, stated = written(Findings([keypoints(*listed), *videos]))
     said = stated["cameras"]["drone1"]["keypoints"]
     assert (said["first_frame"] if isinstance(said, dict) else None) == expected
     assert any("first_frame" in remark for remark in text.assumed) == (expected is not None)
 
 
 def test_a_video_that_the_poses_outlast_needs_no_start() -> None:
-    text, stated = written(Findings(videos=[video(300)], poses=[poses(-SECOND, 20 * SECOND)]))
+    text, stated = written(Findings([video(300), poses(-SECOND, 20 * SECOND)]))
     assert "frame_times" not in stated["cameras"]["drone1"]
     assert not text.assumed
 
 
 def test_a_video_that_counts_from_elsewhere_starts_with_the_first_pose_rounded_up() -> None:
     first_ns = EPOCH_NS + 123_456_789
-    text, stated = written(Findings(videos=[video(300)], poses=[poses(first_ns, first_ns + 20 * SECOND)]))
+    text, stated = written(Findings([video(300), poses(first_ns, first_ns + 20 * SECOND)]))
     assert stated["cameras"]["drone1"]["frame_times"] == {"start": 1700000000.124}
     assert text.assumed == ["drone1: frame_times: start, when the first frame was taken"]
 
 
 def test_truth_of_another_time_is_told_but_not_stated() -> None:
     truth = Joints(*about("truth.csv"), Span(0, 10 * SECOND))
-    findings = Findings(
-        keypoints=[keypoints(0, 9)], poses=[poses(EPOCH_NS, EPOCH_NS + SECOND)], joints=[truth]
-    )
+    findings = Findings([keypoints(0, 9), poses(EPOCH_NS, EPOCH_NS + SECOND), truth])
     text, stated = written(findings)
     assert "truth" not in stated
     assert "# or truth: {joints: truth.csv}" in text.text
@@ -96,9 +94,7 @@ def test_truth_of_another_time_is_told_but_not_stated() -> None:
 
 def test_a_camera_of_a_calibration_is_named_where_its_name_is_another() -> None:
     calibration = Calibration(*about("calib.toml"), {"cam_1": Lens(True, True), "cam_2": Lens(True, True)})
-    findings = Findings(
-        keypoints=[keypoints(0, 9), keypoints(0, 9, "cam_2.json")], calibrations=[calibration]
-    )
+    findings = Findings([keypoints(0, 9), keypoints(0, 9, "cam_2.json"), calibration])
     _, stated = written(findings)
     assert stated["cameras"]["drone1"]["pose"] == {"static": {"path": "calib.toml", "camera": "cam_1"}}
     assert stated["cameras"]["cam_2"]["intrinsics"] == "calib.toml"
@@ -106,7 +102,7 @@ def test_a_camera_of_a_calibration_is_named_where_its_name_is_another() -> None:
 
 def test_keypoints_of_several_formats_state_one() -> None:
     two = Keypoints(*about("drone1.json", "coco"), 10, 0, 9, ambiguous=True)
-    text, stated = written(Findings(keypoints=[two]))
+    text, stated = written(Findings([two]))
     assert stated["cameras"]["drone1"]["keypoints"] == {"path": "drone1.json", "format": "coco"}
     assert "drone1: keypoints: that they are coco's" in text.assumed
 
@@ -120,18 +116,18 @@ def test_poses_logged_at_another_time_than_the_pictures_are_missing() -> None:
         (Path("/flight/d1.mcap"),),
         (topic("/drone1/image", "pictures", 0), topic("/drone1/odometry", "poses", 100)),
     )
-    text, _ = written(Findings(recordings=[log]))
+    text, _ = written(Findings([log]))
     assert "drone1: pose: there are no poses of the time when it filmed" in text.missing
 
 
 def test_one_map_is_stated_and_the_others_are_told() -> None:
-    text, stated = written(Findings(videos=[video(9)], maps=[Map(*about("a.bt")), Map(*about("b.pcd"))]))
+    text, stated = written(Findings([video(9), Map(*about("a.bt")), Map(*about("b.pcd"))]))
     assert stated["map"] == "a.bt"
     assert "# or map: b.pcd  # title of x" in text.text
 
 
 def test_without_a_camera_a_template_stands_in_a_comment() -> None:
-    text, stated = written(Findings(maps=[Map(*about("a.bt"))]))
+    text, stated = written(Findings([Map(*about("a.bt"))]))
     assert "cameras" not in stated
     assert text.missing == ["cameras: nothing was found that has pictures, keypoints or poses of a drone"]
     assert "#     pose: {tum: drone1.tum}" in text.text
@@ -141,10 +137,10 @@ def test_topics_of_a_log_that_has_no_place_are_named() -> None:
     truth = TopicFound("/ground_truth", "nav_msgs/msg/Odometry", "poses", 5, Span(0, SECOND))
     empty = TopicFound("/odometry", "nav_msgs/msg/Odometry", "poses", 0, Span(0, 0))
     log = Recording(*about("site.bag"), (Path("/flight/site.bag"),), (truth, empty))
-    text, _ = written(Findings(recordings=[log]))
+    text, _ = written(Findings([log]))
     assert "#   site.bag  (title of x with /ground_truth)" in text.text
 
 
 def test_many_cameras_are_told_in_short() -> None:
-    text, _ = written(Findings(keypoints=[keypoints(0, 9, f"cam{k}.json") for k in range(9)]))
+    text, _ = written(Findings([*[keypoints(0, 9, f"cam{k}.json") for k in range(9)]]))
     assert "cam0, cam1, cam2, cam3, cam4, ...: pose: nothing of that name has poses" in text.missing

@@ -20,8 +20,8 @@ from pipelines.drafting.found import (
     TopicKind,
     Video,
 )
+from pipelines.drafting.labels import chains, joined
 from pipelines.drafting.matching import CameraDraft, Choice, Draft, match
-from pipelines.drafting.recordings import chains, joined
 
 SECOND = 10**9
 
@@ -91,10 +91,17 @@ def others(choice: Choice | None) -> list[str]:
 def test_video_keypoints_poses_and_truth_meet_by_the_name_of_the_drone() -> None:
     draft = match(
         Findings(
-            videos=[video("drone2.mp4"), video("drone1.mp4")],
-            keypoints=[keypoints("kp/drone1_alphapose.json"), keypoints("kp/drone_02.json")],
-            poses=[poses("drone1_poses.tum"), poses("drone1_true.tum"), poses("drone2/odometry.tum")],
-            calibrations=[calibration("drone1.yaml", "narrow"), calibration("drone2.yaml", "wide")],
+            [
+                video("drone2.mp4"),
+                video("drone1.mp4"),
+                keypoints("kp/drone1_alphapose.json"),
+                keypoints("kp/drone_02.json"),
+                poses("drone1_poses.tum"),
+                poses("drone1_true.tum"),
+                poses("drone2/odometry.tum"),
+                calibration("drone1.yaml", "narrow"),
+                calibration("drone2.yaml", "wide"),
+            ]
         )
     )
     assert [c.name for c in draft.cameras] == ["drone1", "drone2"]
@@ -110,14 +117,12 @@ def test_video_keypoints_poses_and_truth_meet_by_the_name_of_the_drone() -> None
 
 
 def test_ten_drones_are_listed_in_the_order_of_their_numbers() -> None:
-    draft = match(Findings(videos=[video(f"drone{k}.mp4") for k in range(10, 0, -1)]))
+    draft = match(Findings([*[video(f"drone{k}.mp4") for k in range(10, 0, -1)]]))
     assert [c.name for c in draft.cameras] == [f"drone{k}" for k in range(1, 11)]
 
 
 def test_of_two_sets_of_keypoints_the_one_for_most_cameras_is_taken() -> None:
-    draft = match(
-        Findings(keypoints=[keypoints("a/cam01.json"), keypoints("b/cam01.json"), keypoints("b/cam02.json")])
-    )
+    draft = match(Findings([keypoints("a/cam01.json"), keypoints("b/cam01.json"), keypoints("b/cam02.json")]))
     assert [[str(k.found.path.parent.name) for k in c.keypoints] for c in draft.cameras] == [
         ["b", "a"],
         ["b"],
@@ -125,14 +130,14 @@ def test_of_two_sets_of_keypoints_the_one_for_most_cameras_is_taken() -> None:
 
 
 def test_the_last_video_and_the_last_keypoints_are_a_pair_unless_they_are_counted() -> None:
-    draft = match(Findings(videos=[video("DJI_0001.mp4")], keypoints=[keypoints("walk.json")]))
+    draft = match(Findings([video("DJI_0001.mp4"), keypoints("walk.json")]))
     assert [c.paired for c in draft.cameras] == [True]
-    counted = match(Findings(videos=[video("drone1.mp4")], keypoints=[keypoints("drone2.json")]))
+    counted = match(Findings([video("drone1.mp4"), keypoints("drone2.json")]))
     assert [c.name for c in counted.cameras] == ["drone1", "drone2"]
 
 
 def test_files_of_one_name_in_numbered_folders_are_several_cameras() -> None:
-    draft = match(Findings(videos=[video("drone1/DJI_0001.mp4"), video("drone2/DJI_0001.mp4")]))
+    draft = match(Findings([video("drone1/DJI_0001.mp4"), video("drone2/DJI_0001.mp4")]))
     assert [c.name for c in draft.cameras] == ["drone1", "drone2"]
 
 
@@ -145,7 +150,7 @@ def test_two_cameras_of_one_drone_share_its_poses() -> None:
         topic("/drone1/back/camera_info", "intrinsics"),
         topic("/drone1/odometry", "poses"),
     )
-    draft = match(Findings(recordings=[log]))
+    draft = match(Findings([log]))
     assert sorted(c.name for c in draft.cameras) == ["back", "front"]
     assert {taken(c.poses) for c in draft.cameras} == {"/drone1/odometry"}
     assert taken(camera(draft, "back").intrinsics) == "/drone1/back/camera_info"
@@ -153,7 +158,7 @@ def test_two_cameras_of_one_drone_share_its_poses() -> None:
 
 def test_without_pictures_whatever_has_poses_is_a_camera() -> None:
     log = recording("flight.mcap", topic("/uav1/odometry", "poses"), topic("/uav2/odometry", "poses"))
-    draft = match(Findings(recordings=[log]))
+    draft = match(Findings([log]))
     assert [c.name for c in draft.cameras] == ["uav1", "uav2"]
     assert not any(c.videos or c.keypoints for c in draft.cameras)
 
@@ -164,7 +169,7 @@ def test_depth_is_no_picture() -> None:
         topic("/drone1/depth/image_raw", "pictures"),
         topic("/drone1/color/image_raw", "pictures"),
     )
-    draft = match(Findings(recordings=[log]))
+    draft = match(Findings([log]))
     assert [c.name for c in draft.cameras] == ["drone1"]
     assert [v.settings["topic"] for v in draft.cameras[0].videos] == ["/drone1/color/image_raw"]
 
@@ -177,7 +182,7 @@ def test_topics_without_a_prefix_are_called_after_their_log() -> None:
         recording(f"{name}.bag", topic("/odometry", "poses"), topic("/camera/image_raw", "pictures"))
         for name in ("red", "blue")
     ]
-    draft = match(Findings(recordings=logs))
+    draft = match(Findings([*logs]))
     assert {c.name: c.poses.taken.settings["log"] for c in draft.cameras if c.poses} == {
         "red": "red",
         "blue": "blue",
@@ -186,9 +191,7 @@ def test_topics_without_a_prefix_are_called_after_their_log() -> None:
 
 def test_time_decides_between_two_flights_of_one_drone() -> None:
     flown = recording("cameras.mcap", topic("/drone1/image_raw", "pictures", times=span(100, 160)))
-    draft = match(
-        Findings(recordings=[flown], poses=[poses("a/drone1.tum", 0, 60), poses("b/drone1.tum", 90, 170)])
-    )
+    draft = match(Findings([flown, poses("a/drone1.tum", 0, 60), poses("b/drone1.tum", 90, 170)]))
     assert draft.cameras[0].poses
     assert draft.cameras[0].poses.taken.found.path.parent.name == "b"
     assert len(draft.cameras[0].poses.others) == 1
@@ -197,12 +200,13 @@ def test_time_decides_between_two_flights_of_one_drone() -> None:
 def test_time_shared_with_the_other_drones_decides_where_pictures_have_no_stamps() -> None:
     draft = match(
         Findings(
-            videos=[video("drone1.mp4"), video("drone2.mp4")],
-            poses=[
+            [
+                video("drone1.mp4"),
+                video("drone2.mp4"),
                 poses("a/drone1.tum", 0, 60),
                 poses("b/drone1.tum", 205, 250),
                 poses("drone2.tum", 200, 250),
-            ],
+            ]
         )
     )
     choice = camera(draft, "drone1").poses
@@ -220,7 +224,7 @@ def test_a_second_more_of_a_lesser_kind_does_not_beat_odometry() -> None:
         topic("/drone1/ground_truth/odom", "poses", times=span(0, 60)),
         topic("/person/odom", "poses", times=span(0, 60)),
     )
-    draft = match(Findings(recordings=[log]))
+    draft = match(Findings([log]))
     assert taken(draft.cameras[0].poses) == "/drone1/odometry"
     assert others(draft.cameras[0].poses) == ["/drone1/mocap/pose"]
     assert [actor.settings["topic"] for actor in draft.actors] == ["/person/odom"]
@@ -240,7 +244,7 @@ def test_poses_of_a_camera_come_before_those_of_a_body() -> None:
         ),
     )
     assert chains(log) == [("map", "drone1/camera_optical_frame"), ("map", "drone1/base_link")]
-    choice = match(Findings(recordings=[log])).cameras[0].poses
+    choice = match(Findings([log])).cameras[0].poses
     assert choice
     assert choice.taken.settings == {"log": "flight", "parent": "map", "child": "drone1/camera_optical_frame"}
     assert not choice.taken.of_body
@@ -253,19 +257,13 @@ def test_a_loop_of_transforms_ends() -> None:
 
 
 def test_nothing_named_like_it_is_not_guessed_among_several_cameras() -> None:
-    draft = match(Findings(videos=[video("drone1.mp4"), video("drone2.mp4")], poses=[poses("drone1.tum")]))
+    draft = match(Findings([video("drone1.mp4"), video("drone2.mp4"), poses("drone1.tum")]))
     assert taken(camera(draft, "drone1").poses) == "drone1.tum"
     assert camera(draft, "drone2").poses is None
 
 
 def test_a_lone_camera_takes_what_lies_beside_it_whatever_its_name() -> None:
-    draft = match(
-        Findings(
-            videos=[video("DJI_0001.mp4")],
-            poses=[poses("walk.tum")],
-            calibrations=[calibration("mavic.yaml", "x")],
-        )
-    )
+    draft = match(Findings([video("DJI_0001.mp4"), poses("walk.tum"), calibration("mavic.yaml", "x")]))
     assert taken(draft.cameras[0].poses) == "walk.tum"
     assert taken(draft.cameras[0].intrinsics) == "mavic.yaml"
     assert draft.cameras[0].poses
@@ -275,9 +273,7 @@ def test_a_lone_camera_takes_what_lies_beside_it_whatever_its_name() -> None:
 def test_static_poses_serve_where_no_log_has_any() -> None:
     files = [keypoints("cam1.json"), keypoints("cam2.json")]
     shared = calibration("calibration.toml", "cam1", "cam2", pose=True)
-    draft = match(
-        Findings(keypoints=files, calibrations=[shared], poses=[poses("cam1.tum"), poses("cam2_true.tum")])
-    )
+    draft = match(Findings([*files, shared, poses("cam1.tum"), poses("cam2_true.tum")]))
     assert taken(camera(draft, "cam1").poses) == "cam1.tum"
     assert others(camera(draft, "cam1").poses) == ["calibration.toml"]
     assert taken(camera(draft, "cam2").poses) == "calibration.toml"
@@ -285,7 +281,7 @@ def test_static_poses_serve_where_no_log_has_any() -> None:
 
 
 def test_truth_is_used_as_poses_only_where_there_is_nothing_else() -> None:
-    draft = match(Findings(videos=[video("drone1.mp4")], poses=[poses("drone1_gt.tum")]))
+    draft = match(Findings([video("drone1.mp4"), poses("drone1_gt.tum")]))
     assert taken(draft.cameras[0].poses) == "drone1_gt.tum"
     assert draft.cameras[0].true_poses is None
 
@@ -294,9 +290,7 @@ def test_truth_is_used_as_poses_only_where_there_is_nothing_else() -> None:
 
 
 def test_one_calibration_without_a_name_serves_all_and_says_so() -> None:
-    draft = match(
-        Findings(videos=[video("a.mp4"), video("b.mp4")], calibrations=[calibration("gopro.yaml", "camera")])
-    )
+    draft = match(Findings([video("a.mp4"), video("b.mp4"), calibration("gopro.yaml", "camera")]))
     choices = [c.intrinsics for c in draft.cameras]
     assert [taken(choice) for choice in choices] == ["gopro.yaml", "gopro.yaml"]
     assert not any(choice.named for choice in choices if choice)
@@ -305,8 +299,13 @@ def test_one_calibration_without_a_name_serves_all_and_says_so() -> None:
 def test_the_calibration_of_another_drone_is_not_taken() -> None:
     draft = match(
         Findings(
-            videos=[video("drone1.mp4"), video("drone2.mp4"), video("drone3.mp4")],
-            calibrations=[calibration("drone1.yaml", "camera"), calibration("drone2.yaml", "camera")],
+            [
+                video("drone1.mp4"),
+                video("drone2.mp4"),
+                video("drone3.mp4"),
+                calibration("drone1.yaml", "camera"),
+                calibration("drone2.yaml", "camera"),
+            ]
         )
     )
     assert [taken(c.intrinsics) for c in draft.cameras] == ["drone1.yaml", "drone2.yaml", ""]
@@ -319,7 +318,7 @@ def test_camera_info_beside_the_pictures_is_taken() -> None:
         topic("/drone1/ir/camera_info", "intrinsics"),
         topic("/drone1/rgb/camera_info", "intrinsics"),
     )
-    draft = match(Findings(recordings=[log]))
+    draft = match(Findings([log]))
     assert taken(draft.cameras[0].intrinsics) == "/drone1/rgb/camera_info"
 
 
@@ -331,8 +330,8 @@ def test_angles_are_a_gimbal_only_by_name_and_for_poses_of_a_body() -> None:
         topic("/drone1/imu/mag", "angles"),
         topic("/drone1/gimbal_angles", "angles"),
     )
-    assert taken(match(Findings(recordings=[log])).cameras[0].gimbal) == "/drone1/gimbal_angles"
-    of_camera = match(Findings(recordings=[log], poses=[poses("drone1.tum")]))
+    assert taken(match(Findings([log])).cameras[0].gimbal) == "/drone1/gimbal_angles"
+    of_camera = match(Findings([log, poses("drone1.tum")]))
     assert of_camera.cameras[0].gimbal is None
 
 
@@ -341,13 +340,13 @@ def test_frame_times_go_to_the_video_of_their_name() -> None:
         FrameTimes(*place(f"DJI_000{k}.SRT"), "frame_times", "frame times", "srt", 300, span(0, 10))
         for k in (1, 2)
     ]
-    draft = match(Findings(videos=[video("DJI_0001.mp4"), video("DJI_0002.mp4")], frame_times=stamps))
+    draft = match(Findings([video("DJI_0001.mp4"), video("DJI_0002.mp4"), *stamps]))
     assert [taken(c.frame_times) for c in draft.cameras] == ["DJI_0001.SRT", "DJI_0002.SRT"]
 
 
 def test_joints_are_true_only_by_name() -> None:
     joints = [Joints(*place(name), "trc", "TRC", span(0, 10)) for name in ("result.trc", "truth.trc")]
-    draft = match(Findings(videos=[video("a.mp4")], joints=joints))
+    draft = match(Findings([video("a.mp4"), *joints]))
     assert [found.path.name for found in draft.true_joints] == ["truth.trc"]
     assert [found.path.name for found in draft.unused] == ["result.trc"]
 
@@ -374,6 +373,6 @@ def test_only_logs_that_are_named_stand_in_the_manifest() -> None:
         recording("d1.mcap", topic("/drone1/image", "pictures"), topic("/drone1/odom", "poses")),
         recording("other.mcap"),
     ]
-    draft = match(Findings(recordings=logs))
+    draft = match(Findings([*logs]))
     assert list(draft.logs) == ["d1"]
     assert [found.path.name for found in draft.unused] == ["other.mcap"]
