@@ -38,7 +38,7 @@ from benchmarks.results_page import (
     Numbers,
     render,
 )
-from pipelines.reporting.ablation import METRICS
+from pipelines.reporting.studies import METRICS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from textwrap import wrap
 from typing import Any
 
-from pipelines.reporting.ablation import METRICS, tables
+from pipelines.reporting.studies import METRICS, tables
 
 Numbers = dict[str, Any]
 

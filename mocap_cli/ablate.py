@@ -173,7 +173,7 @@ def _run(study: Study, varied: Mapping[str, Any], shared: Mapping[str, Any]) -> 
 
 
 def _print(summary: Mapping[str, Any]) -> None:
-    from pipelines.reporting.ablation import tables
+    from pipelines.reporting.studies import tables
 
     settings = summary["settings"]
     say(

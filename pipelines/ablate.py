@@ -22,7 +22,7 @@ from pipelines.geometry.triangulation import Views, estimate_noise, locate, tria
 from pipelines.keypoints.alone import FollowedAlone
 from pipelines.keypoints.hints import project_actor
 from pipelines.reconstruction.refining import refined_points
-from pipelines.reporting.ablation import Row, draw, estimates, results_csv
+from pipelines.reporting.studies import Row, draw, estimates, results_csv
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
 from pipelines.session.registries import Detector, find_detector, hashes_of_models

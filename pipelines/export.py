@@ -14,11 +14,10 @@ import numpy as np
 from pipelines.formats.common.exporting import thinned
 from pipelines.formats.flights.pictures import open_pictures
 from pipelines.geometry.arrays import Picture
-from pipelines.reporting.filmed import read_filmed, refined_poses
+from pipelines.reporting.content import estimated_clocks
 from pipelines.reporting.frame_drawing import caption_of, draw_frame
 from pipelines.reporting.motion import Motion, motion_from_skeleton
-from pipelines.reporting.overlays import FilmedCamera, status_at, views_of
-from pipelines.reporting.placing import estimated_clocks
+from pipelines.reporting.overlays import FilmedCamera, read_filmed, refined_poses, status_at, views_of
 from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map

@@ -18,10 +18,9 @@ import numpy as np
 from pipelines.formats.flights.pictures import open_pictures, refuse_changed_pictures
 from pipelines.formats.videos.video_writing import TICK_S, join_videos, write_h264
 from pipelines.geometry.arrays import Picture
-from pipelines.reporting.filmed import read_filmed
 from pipelines.reporting.frame_drawing import blank_frame, caption_of, draw_frame, padded_to_even
 from pipelines.reporting.motion import Motion, motion_from_skeleton
-from pipelines.reporting.overlays import FilmedCamera, status_at, views_of
+from pipelines.reporting.overlays import FilmedCamera, read_filmed, status_at, views_of
 from pipelines.session.description import Description, MediaEntry, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side

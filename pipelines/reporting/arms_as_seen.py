@@ -8,9 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
-from pipelines.reporting.plates import LINE_STYLES, Plate, stacked, table
+from pipelines.reporting.plates import (
+    CAMERAS,
+    GRID,
+    LINE_STYLES,
+    MUTED,
+    PAPER,
+    STATUS_COLOURS,
+    WIDTH_IN,
+    Plate,
+    page_style,
+    stacked,
+    table,
+)
 from pipelines.reporting.replanned import Arm, Replan, Seen
-from pipelines.reporting.svg import CAMERAS, GRID, MUTED, PAPER, STATUS_COLOURS, WIDTH_IN, page_style
 from pipelines.reporting.wording import listing, plural, quantity, shortened
 from pipelines.session.records import Int64
 from pipelines.session.skeletons import bones_of

@@ -22,10 +22,11 @@ from pipelines.geometry.bootstrap import Series, interval_of, intervals, resampl
 from pipelines.geometry.metrics import aligned_distances, bone_lengths, root_relative_distances
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.motion import Motion
-from pipelines.reporting.placing import camera_positions
 from pipelines.reporting.summary import Summary, summarise
+from pipelines.session.camera_poses import poses_at
 from pipelines.session.records import Int64
 from pipelines.session.skeletons import bones_of
+from pipelines.session.tables import trajectory_from
 
 _PCK_M = 0.15
 _LEAST_SHARED = 0.5
@@ -266,6 +267,20 @@ def _tilt(content: SessionContent, summary: Summary, motion: Motion) -> Values:
     away = camera_positions(content, summary, motion.t_ns) - actor
     tilt = np.degrees(np.arctan2(away[..., 2], np.linalg.norm(away[..., :2], axis=-1)))
     return Values(("formation",), tilt.mean(axis=0)[:, None])
+
+
+def camera_positions(content: SessionContent, summary: Summary, t_ns: Int64) -> Float:
+    """Interpolate positions [C, T, 3] m of the cameras that have poses; NaN at times without one."""
+    between = summary.description.pose_interpolation
+    poses = content.poses | content.refined
+    positions = []
+    for camera in summary.cameras:
+        if camera.name not in poses:
+            continue
+        track = trajectory_from(poses[camera.name])
+        position, _ = poses_at(track, t_ns, between, static=camera.entry.poses.static)
+        positions.append(position)
+    return np.stack(positions) if positions else np.full((1, len(t_ns), 3), np.nan)
 
 
 def _middle(motion: Motion) -> Float:

@@ -11,9 +11,20 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.reporting.comparison import MEASURES, Comparison, Judged, Measure, Pair
-from pipelines.reporting.over_time import percentiles, time_bins
-from pipelines.reporting.plates import LINE_STYLES, Plate, quiet, stacked, table, tabled
-from pipelines.reporting.svg import CAMERAS, MUTED, WIDTH_IN, page_style
+from pipelines.reporting.plates import (
+    CAMERAS,
+    LINE_STYLES,
+    MUTED,
+    WIDTH_IN,
+    Plate,
+    page_style,
+    percentiles,
+    quiet,
+    stacked,
+    table,
+    tabled,
+    time_bins,
+)
 from pipelines.reporting.wording import fixed, joint_label, listing, quantity, shortened
 
 if TYPE_CHECKING:

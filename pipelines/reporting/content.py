@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from pipelines.session.description import Description
@@ -78,3 +78,27 @@ def text(mapping: Mapping[str, object], key: str) -> str:
     """Return the text under a key; empty when it is absent or something else."""
     value = mapping.get(key)
     return value if isinstance(value, str) else ""
+
+
+def estimated_clocks(metrics: Mapping[str, object]) -> dict[str, int]:
+    """Read the estimated clock offsets, ns: the amounts to add to the cameras' ingested frame times.
+
+    Args:
+        metrics: reconstruct/metrics.json.
+    """
+    offsets = section(metrics, "clock_offsets_s")
+    return {name: round((number(offsets, name) or 0.0) * 1e9) for name in offsets}
+
+
+def as_reconstructed(content: SessionContent) -> SessionContent:
+    """Return the session with the poses and the clocks that its skeleton was measured with.
+
+    Refined poses replace the logged ones, and frames have the times of the estimated clocks. Only then are
+    residuals those of the reconstruction.
+    """
+    offset_ns = estimated_clocks(content.metrics or {})
+    frames = {
+        name: table.assign(t_ns=table["t_ns"] + offset_ns.get(name, 0))
+        for name, table in content.frames.items()
+    }
+    return replace(content, poses=content.poses | content.refined, frames=frames)

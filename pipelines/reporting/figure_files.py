@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.reporting.content import SessionContent
-from pipelines.reporting.plates import Plate
-from pipelines.reporting.svg import WIDTH_IN, page_style, settled
+from pipelines.reporting.plates import WIDTH_IN, Plate, page_style, settled
 from pipelines.reporting.wording import cell_text
 from pipelines.session.errors import DataError
 from pipelines.session.storage import read_json, write_json

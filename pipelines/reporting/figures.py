@@ -1,4 +1,4 @@
-"""The figures of a session's page: those of its cameras, joints and bones, and the list of all.
+"""The figures of a session's page: cameras, errors over time, joints, body and bones; the list of all.
 
 Each function draws one figure from the summary and describes the picture in words.
 Long recordings are drawn with at most `MOST_POINTS` points a path and `MOST_BINS` stretches of time;
@@ -12,27 +12,30 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.reporting.over_time import draw_over_time
-from pipelines.reporting.paths_from_above import draw_paths
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.triangulation import STATUS
+from pipelines.reporting.from_above import draw_paths
+from pipelines.reporting.motion import Motion, side_of
 from pipelines.reporting.plates import (
-    Plate,
-    quiet,
-    table,
-    tabled,
-)
-from pipelines.reporting.snapshots import draw_snapshots
-from pipelines.reporting.summary import CameraRow, Summary
-from pipelines.reporting.svg import (
     CAMERAS,
     LEFT,
     MIDDLE,
+    MUTED,
     PAPER,
     RIGHT,
     STATUS_COLOURS,
     WIDTH_IN,
+    Plate,
     page_style,
+    percentiles,
+    quiet,
+    table,
+    tabled,
+    time_bins,
 )
+from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.wording import (
+    STATUS_LABELS,
     fixed,
     joint_label,
     listing,
@@ -41,9 +44,11 @@ from pipelines.reporting.wording import (
     quantity,
     shortened,
 )
+from pipelines.session.skeletons import bones_of, with_derived
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.axes import Axes
 
 
 def draw_all(summary: Summary, poses: Mapping[str, pd.DataFrame]) -> dict[str, Plate]:
@@ -177,3 +182,186 @@ def _bone_lengths(summary: Summary) -> Plate:
         relative_spread=[b.spread for b in bones],
     )
     return Plate("bones", title, caption, f"Median and relative spread: {told}.", figure, {"": numbers})
+
+
+# --- over time -----------------------------------------------------------------------------------------
+
+
+def draw_over_time(summary: Summary, motion: Motion) -> Plate:
+    """Draw errors, and the share of measured joints; distances from truth where that is known."""
+    from matplotlib.figure import Figure
+
+    seconds = (motion.t_ns - summary.origin_ns) / 1e9
+    values = motion.reprojection_px if summary.errors_mm is None else summary.errors_mm
+    unit = "px" if summary.errors_mm is None else "mm"
+    what = "reprojection error" if summary.errors_mm is None else "distance from truth"
+    bins = time_bins(seconds)
+    centres, shares = _status_shares(seconds, motion, bins)
+    shown = {word: 100 * shares[STATUS.index(word)] for word in summary.statuses}
+    middle, low, high = percentiles(np.where(motion.measured, values, np.nan), seconds, bins)
+    with page_style():
+        figure = Figure((WIDTH_IN, 3.5), layout="constrained")
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
+        _draw_errors(upper, centres, middle, low, high)
+        upper.set_ylabel(f"{what} ({unit})")
+        _draw_percentages(lower, bins, shown)
+        lower.set_xlabel("time (s)")
+        figure.legend(loc="outside upper left", ncols=len(STATUS))
+        title = f"{what.capitalize()} over time, and what became of the joints"
+        worst = int(np.nanargmax(middle)) if np.isfinite(middle).any() else None
+        told = (
+            "No joint was measured."
+            if worst is None
+            else f"The median over joints lies between {quantity(float(np.nanmin(middle)), unit)} and "
+            f"{quantity(float(middle[worst]), unit)}, the largest at {quantity(float(centres[worst]), 's')}."
+        )
+    caption = (
+        f"Above: {what} of the measured joints, median and the range from the 10th to the 90th percentile. "
+        "Below: the share of joints measured, and why the others were not."
+    )
+    if len(centres) < len(motion.t_ns):
+        caption += f" Each point stands for {bins[1] - bins[0]:.2g} s."
+    numbers = table(
+        t_s=centres,
+        **{f"median_{unit}": middle, f"p10_{unit}": low, f"p90_{unit}": high},
+        **{f"{word}_percent": share for word, share in shown.items()},
+    )
+    return Plate("time", title, caption, told, figure, {"": numbers})
+
+
+def _draw_errors(axes: Axes, centres: Float, middle: Float, low: Float, high: Float) -> None:
+    """Draw a line on its range, from zero."""
+    axes.grid(visible=True, axis="y")
+    axes.fill_between(centres, low, high, color=STATUS_COLOURS["ok"], alpha=0.22, linewidth=0)
+    axes.plot(centres, middle, color=STATUS_COLOURS["ok"])
+    axes.set_ylim(0, 1.08 * np.nanmax(high, initial=0.0) or 1.0)
+    quiet(axes, grid=False)
+
+
+def _draw_percentages(axes: Axes, bins: Float, shown: Mapping[str, Float]) -> None:
+    """Draw the share of joints by status, one on top of the other."""
+    base = np.zeros(len(bins) - 1)
+    for word, share in shown.items():
+        top = base + share
+        axes.fill_between(
+            *_steps(bins, base, top), color=STATUS_COLOURS[word], linewidth=0, label=STATUS_LABELS[word]
+        )
+        base = top
+    axes.set_ylim(0, 100)
+    axes.set_xlim(bins[0], bins[-1])
+    axes.set_ylabel("joints (%)")
+    quiet(axes)
+
+
+def _status_shares(seconds: Float, motion: Motion, bins: Float) -> tuple[Float, Float]:
+    """Return the bins' centres, and the share of every status in each, [S, bins]; 0 without rows."""
+    edges = np.searchsorted(seconds, bins)
+    per_time = np.stack([(motion.status == s).sum(axis=(1, 2)) for s in range(len(STATUS))])
+    running = np.concatenate([np.zeros((len(STATUS), 1)), np.cumsum(per_time, axis=1)], axis=1)
+    counts = np.diff(running[:, edges], axis=1)
+    return (bins[:-1] + bins[1:]) / 2, counts / np.maximum(counts.sum(axis=0), 1)
+
+
+def _steps(bins: Float, low: Float, high: Float) -> tuple[Float, Float, Float]:
+    """Return the corners of a step line: a share holds for the whole of its bin."""
+    corners = np.repeat(bins, 2)[1:-1]
+    return corners, np.repeat(low, 2), np.repeat(high, 2)
+
+
+# --- the body ------------------------------------------------------------------------------------------
+
+
+SNAPSHOTS = 7
+_STRIDE_M = 1.3  # between two snapshots of the body
+# Above a raised hand, and below the ground by more than errors explain: points beyond are cut off.
+_TALLEST_M, _DEEPEST_M = 2.6, 0.5
+
+
+def draw_snapshots(summary: Summary, motion: Motion) -> Plate:
+    """Draw the first person's fullest skeletons, side by side.
+
+    At least one joint must have been measured.
+    """
+    from matplotlib.figure import Figure
+
+    chosen = _fullest_times(motion)
+    joints, position = with_derived(motion.joints, motion.measured_position[chosen, 0])
+    # The median over the snapshots: a joint far below the ground must not lift every body.
+    ground = float(np.median(np.nanmin(position[..., 2], axis=1)))
+    top = float(np.clip(np.nanmax(position[..., 2]) - ground + 0.1, 1.0, _TALLEST_M))
+    bottom = float(np.clip(np.nanmin(position[..., 2]) - ground, -_DEEPEST_M, 0.0)) - 0.05
+    width = _STRIDE_M * SNAPSHOTS
+    with page_style():
+        figure = Figure((WIDTH_IN, 0.5 + (WIDTH_IN - 0.6) * (top - bottom) / width), layout="constrained")
+        axes = figure.subplots()
+        seconds = [(int(motion.t_ns[k]) - summary.origin_ns) / 1e9 for k in chosen]
+        labels = [f"{fixed(t_s)} s" for t_s in seconds]
+        drawn = []
+        for k, body in enumerate(position):
+            aside, up = _three_quarter_view(body, joints)
+            _draw_body(axes, aside + _STRIDE_M * k, up - ground, joints)
+            drawn.append(np.stack([aside, up - ground], axis=-1))
+        axes.set_xlim(-_STRIDE_M / 2, width - _STRIDE_M / 2)
+        axes.set_ylim(bottom, top)
+        axes.set_yticks(np.arange(0.0, top, 0.5))
+        axes.set_aspect("equal")
+        axes.set_xticks(_STRIDE_M * np.arange(len(chosen)), labels)
+        axes.set_ylabel("height (m)")
+        axes.grid(visible=True, axis="y")
+        quiet(axes, grid=False)
+        axes.spines["bottom"].set_visible(False)
+        axes.tick_params(axis="x", length=0)
+        title = "The body at a few moments"
+        told = f"{plural(len(chosen), 'snapshot')} at {listing(labels)}."
+    whose = "" if motion.position.shape[1] == 1 else " of the first person"
+    caption = (
+        f"The fullest skeleton{whose} in each stretch of time, facing right and seen from its right, "
+        "half from the front; left limbs in blue, right limbs in orange. "
+        "Heights count from where the feet stand."
+    )
+    places = np.concatenate(drawn)
+    numbers = table(
+        t_s=np.repeat(seconds, len(joints)),
+        joint=list(joints) * len(chosen),
+        right_m=places[:, 0],
+        above_ground_m=places[:, 1],
+    )
+    return Plate("body", title, caption, told, figure, {"": numbers})
+
+
+def _fullest_times(motion: Motion) -> list[int]:
+    """Choose in each of `SNAPSHOTS` equal stretches the time with most joints, nearest its middle."""
+    count = motion.measured[:, 0].sum(axis=1)
+    chosen = []
+    for rows in np.array_split(np.arange(len(count)), min(SNAPSHOTS, len(count))):
+        best = rows[count[rows] == count[rows].max()]
+        middle = best[np.argmin(np.abs(best - rows.mean()))]
+        if count[middle] >= 2:
+            chosen.append(int(middle))
+    return chosen or [int(np.argmax(count))]
+
+
+def _three_quarter_view(body: Float, joints: tuple[str, ...]) -> tuple[Float, Float]:
+    """Compute horizontal and vertical picture coordinates in metres of one body [J, 3].
+
+    The picture's right is where the body faces, turned 35 degrees towards its left, so that both sides show.
+    """
+    facing = np.array([1.0, 0.0])
+    for left, right in (("left_hip", "right_hip"), ("left_shoulder", "right_shoulder")):
+        if left in joints and right in joints:
+            across = (body[joints.index(left)] - body[joints.index(right)])[:2]
+            if np.isfinite(across).all() and np.linalg.norm(across) > 0:
+                facing = np.array([across[1], -across[0]]) / np.linalg.norm(across)
+                break
+    leftward = np.array([-facing[1], facing[0]])
+    right_of_picture = np.cos(np.radians(35)) * facing + np.sin(np.radians(35)) * leftward
+    ground = body[:, :2] - np.nanmedian(body[:, :2], axis=0)
+    return ground @ right_of_picture, body[:, 2]
+
+
+def _draw_body(axes: Axes, aside: Float, up: Float, joints: tuple[str, ...]) -> None:
+    place = {name: (aside[j], up[j]) for j, name in enumerate(joints)}
+    for start, end in bones_of(joints):
+        colour, order = {"left": (LEFT, 2), "right": (RIGHT, 4), "": (MIDDLE, 3)}[side_of(start, end)]
+        axes.plot(*zip(place[start], place[end], strict=True), color=colour, linewidth=1.7, zorder=order)
+    axes.plot(aside, up, "o", color=MUTED, markersize=1.6, zorder=5)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from urllib.parse import quote
 
 from pipelines.reporting import wording
-from pipelines.reporting.templating import environment
+from pipelines.reporting.wording import environment
 
 COLUMNS = (
     "flight",

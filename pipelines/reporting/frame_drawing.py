@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Picture
 from pipelines.geometry.triangulation import STATUS
-from pipelines.reporting.bones import side_of
+from pipelines.reporting.motion import side_of
 from pipelines.reporting.overlays import View
 from pipelines.session.skeletons import bones_of
 

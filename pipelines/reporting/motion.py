@@ -1,4 +1,4 @@
-"""The skeleton's long table as dense arrays, and its distance from truth."""
+"""The skeleton's long table as dense arrays: its errors, and the lengths of its bones."""
 
 from __future__ import annotations
 
@@ -9,15 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
+from pipelines.geometry.metrics import bone_lengths
 from pipelines.geometry.triangulation import STATUS
-from pipelines.session.people import true_joints_at
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Int64
-from pipelines.session.tables import motion_from
 
 if TYPE_CHECKING:
     import pandas as pd
-
-_NEVER_TOGETHER_M = 1e9  # distance of people without a common time: they are matched last
 
 
 @dataclass(frozen=True)
@@ -78,32 +75,6 @@ def motion_from_skeleton(table: pd.DataFrame) -> Motion:
     )
 
 
-def truth_at(truth: pd.DataFrame, motion: Motion) -> Float:
-    """Return the true positions at the motion's times and joints, [T, P, J, 3].
-
-    Each person is compared with the nearest true one, by `true_joints_at`; NaN also for joints and people
-    that are not in the truth.
-    """
-    known = motion_from(truth, motion.joints)
-    return _own_truth(motion.measured_position, true_joints_at(known, motion.t_ns))
-
-
-def _own_truth(position: Float, truth: Float) -> Float:
-    """Match each measured person of [T, P, J, 3] to the nearest true one on average, each taken once."""
-    from scipy.optimize import linear_sum_assignment
-
-    distance = np.linalg.norm(position[:, :, None] - truth[:, None], axis=-1)
-    shared = np.isfinite(distance)
-    count = shared.sum(axis=(0, 3))
-    total = np.where(shared, distance, 0.0).sum(axis=(0, 3))
-    person, match = linear_sum_assignment(
-        np.where(count > 0, total / np.maximum(count, 1), _NEVER_TOGETHER_M)
-    )
-    own: Float = np.full(position.shape, np.nan)
-    own[:, person] = truth[:, match]
-    return own
-
-
 def errors_mm(motion: Motion, truth: Float) -> Float:
     """Compute the distance of every measured joint from truth in mm, [T, P, J]; NaN if either is missing."""
     distance: Float = 1000 * np.linalg.norm(motion.measured_position - truth, axis=-1)
@@ -126,3 +97,58 @@ def share_inside_95(motion: Motion, truth: Float) -> float | None:
     weighted = np.linalg.solve(covariance[positive], e[:, :, np.newaxis])[:, :, 0]
     squared = (e * weighted).sum(axis=1)
     return float(np.mean(squared < 7.815))
+
+
+# --- bones ---------------------------------------------------------------------------------------------
+
+
+_LIMBS = {
+    "upper arm": ("shoulder", "elbow"),
+    "forearm": ("elbow", "wrist"),
+    "trunk side": ("shoulder", "hip"),
+    "thigh": ("hip", "knee"),
+    "shank": ("knee", "ankle"),
+}
+_WATCHED = (
+    *(
+        (name, side, f"{side}_{start}", f"{side}_{end}")
+        for name, (start, end) in _LIMBS.items()
+        for side in ("left", "right")
+    ),
+    ("shoulders", "", "left_shoulder", "right_shoulder"),
+    ("hips", "", "left_hip", "right_hip"),
+)
+
+
+def side_of(*joints: str) -> str:
+    """Return `left` or `right` if all joints lie on that side of the body, else an empty word."""
+    sides = {joint.partition("_")[0] for joint in joints}
+    return side if len(sides) == 1 and (side := sides.pop()) in {"left", "right"} else ""
+
+
+@dataclass(frozen=True)
+class Bone:
+    """The length of one bone over a recording, in metres."""
+
+    name: str
+    side: str  # left, right, or empty for a bone across
+    median_m: float
+    low_m: float  # 10th percentile
+    high_m: float  # 90th percentile
+    spread: float  # half the central 68 % of the lengths, relative to the median: 0 for a rigid bone
+
+
+def watched_bones(motion: Motion) -> list[Bone]:
+    """Measure the bones with both ends measured at some time, limb by limb, left before right."""
+    there = [bone for bone in _WATCHED if set(bone[2:]) <= set(motion.joints)]
+    lengths = bone_lengths(
+        motion.measured_position, motion.joints, [(start, end) for *_, start, end in there]
+    )
+    bones = []
+    for b, (name, side, *_) in enumerate(there):
+        measured = lengths[..., b][np.isfinite(lengths[..., b])]
+        if measured.size:
+            low, p16, median, p84, high = (float(p) for p in np.percentile(measured, [10, 16, 50, 84, 90]))
+            spread = (p84 - p16) / 2 / median if median > 0 else 0.0
+            bones.append(Bone(name, side, median, low, high, spread))
+    return bones

@@ -13,20 +13,17 @@ from markupsafe import Markup
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting import wording
 from pipelines.reporting.arm_figures import draw_arms
-from pipelines.reporting.content import SessionContent, number, section, text
+from pipelines.reporting.content import SessionContent, as_reconstructed, number, section, text
 from pipelines.reporting.figures import draw_all
-from pipelines.reporting.overlay_figures import draw_overlays
 from pipelines.reporting.overlays import Moment, ReadFrame, collect_moments
-from pipelines.reporting.panels import draw_panel, picture_width
-from pipelines.reporting.placing import as_reconstructed
+from pipelines.reporting.panels import draw_overlays, draw_panel, picture_width
 from pipelines.reporting.plates import Plate
-from pipelines.reporting.quality import quality
 from pipelines.reporting.replanned import Replan, summarise_replan
 from pipelines.reporting.studies import draw_studies, summarise_studies
-from pipelines.reporting.summary import Summary, errors_per_camera, measures, summarise
-from pipelines.reporting.templating import environment
+from pipelines.reporting.summary import Summary, errors_per_camera, measures, quality, summarise
 from pipelines.reporting.verdict import give_verdict
 from pipelines.reporting.viewer import make_scene
+from pipelines.reporting.wording import environment
 
 
 @dataclass(frozen=True)

@@ -1,22 +1,43 @@
-"""A camera's view as inline SVG: detections and the reprojected skeleton over the picture.
+"""The skeleton over a camera's picture: as inline SVG for the page, and as a figure for a publication.
 
-A square is cut out around the people, so that a distance of a few pixels can be seen; a small map in its
-corner shows where in the picture it lies. Lengths in a drawing are pixels of the picture; sizes of marks are
-in the drawing's own unit, 1/320 of the panel's width.
+A square is cut out around the people, so that a distance of a few pixels can be seen. The page's panels
+have a small map in their corner that shows where in the picture the square lies. Lengths in a panel are
+pixels of the picture; sizes of marks are in the panel's own unit, 1/320 of its width.
 """
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Picture
-from pipelines.reporting.bones import side_of
-from pipelines.reporting.overlays import View
+from pipelines.reporting.motion import side_of
+from pipelines.reporting.overlays import Moment, View
+from pipelines.reporting.plates import (
+    GRID,
+    INK,
+    LEFT,
+    MIDDLE,
+    MUTED,
+    RIGHT,
+    STATUS_COLOURS,
+    WIDTH_IN,
+    Plate,
+    page_style,
+    quiet,
+    stacked,
+    table,
+)
+from pipelines.reporting.wording import listing, quantity, shortened
 from pipelines.session.skeletons import bones_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+
 
 _MARGIN = 1.3  # size of a panel, relative to its contents
 _LEAST_PX = 96.0
@@ -60,7 +81,7 @@ def draw_panel(view: View, width_px: int) -> str:
     kept = np.isfinite(view.found[..., 0]) & ~view.rejected & ~view.unmeasured
     marks = [
         *_bones(view, unit),
-        _lines(
+        _segments(
             "residual", unit, zip(view.found[compared], view.reprojected[:, :joints][compared], strict=True)
         ),
         *_circles("joint", 1.7 * unit, view.reprojected[:, :joints].reshape(-1, 2)),
@@ -75,9 +96,9 @@ def draw_panel(view: View, width_px: int) -> str:
     ]
     kind = "overlay on-picture" if view.picture is not None else "overlay"
     return (
-        f'<svg class="{kind}" viewBox="{_numbers(*window)}" aria-hidden="true">'
+        f'<svg class="{kind}" viewBox="{_joined(*window)}" aria-hidden="true">'
         + "".join(background + marks)
-        + (_map(view, size, window) if window.width < _WHOLE * size[0] else "")
+        + (_overview(view, size, window) if window.width < _WHOLE * size[0] else "")
         + "</svg>"
     )
 
@@ -116,16 +137,16 @@ def _bones(view: View, unit: float) -> list[str]:
         for body in view.reprojected
         for a, b in bones_of(view.joints)
     ]
-    casing = _lines("casing", unit, ((a, b) for a, b, _ in bones))
+    casing = _segments("casing", unit, ((a, b) for a, b, _ in bones))
     return [casing] + [
-        _lines(f"bone {side or 'middle'}", unit, ((a, b) for a, b, of in bones if of == side))
+        _segments(f"bone {side or 'middle'}", unit, ((a, b) for a, b, of in bones if of == side))
         for side in ("", "left", "right")
     ]
 
 
-def _lines(kind: str, unit: float, segments: Iterable[tuple[Float, Float]]) -> str:
+def _segments(kind: str, unit: float, segments: Iterable[tuple[Float, Float]]) -> str:
     """Draw all segments as one path; those with a missing end are left out."""
-    steps = [f"M{_numbers(*a)}L{_numbers(*b)}" for a, b in segments if np.isfinite([a, b]).all()]
+    steps = [f"M{_joined(*a)}L{_joined(*b)}" for a, b in segments if np.isfinite([a, b]).all()]
     if not steps:
         return ""
     width = _WIDTHS[kind.partition(" ")[0]] * unit
@@ -146,7 +167,7 @@ def _circles(kind: str, radius: float, points: Float) -> list[str]:
 def _crosses(kind: str, unit: float, points: Float) -> str:
     arms = 3.6 * unit * np.array([[[-1, -1], [1, 1]], [[-1, 1], [1, -1]]])
     strokes = [(point + start, point + end) for point in points for start, end in arms]
-    return _lines("casing", unit, strokes) + _lines(kind, unit, strokes)
+    return _segments("casing", unit, strokes) + _segments(kind, unit, strokes)
 
 
 def _rectangle(kind: str, window: Window, unit: float) -> str:
@@ -157,14 +178,14 @@ def _rectangle(kind: str, window: Window, unit: float) -> str:
     )
 
 
-def _numbers(*values: float) -> str:
+def _joined(*values: float) -> str:
     return " ".join(f"{value:.1f}" for value in values)
 
 
 # --- pictures ------------------------------------------------------------------------------------------
 
 
-def _map(view: View, size: tuple[int, int], window: Window) -> str:
+def _overview(view: View, size: tuple[int, int], window: Window) -> str:
     """Draw the whole picture in the upper left corner, with the panel's frame, and other people."""
     everything = Window(-0.5, -0.5, *size)
     width = _MAP * window.width
@@ -172,7 +193,7 @@ def _map(view: View, size: tuple[int, int], window: Window) -> str:
     gap = 0.02 * window.width
     return (
         f'<svg class="map" x="{window.left + gap:.1f}" y="{window.top + gap:.1f}" width="{width:.1f}" '
-        f'height="{width * size[1] / size[0]:.1f}" viewBox="{_numbers(*everything)}">'
+        f'height="{width * size[1] / size[0]:.1f}" viewBox="{_joined(*everything)}">'
         + _rectangle("ground", everything, unit)
         + (_picture(view.picture, size, everything, _MAP_WIDTH_PX) if view.picture is not None else "")
         + "".join(_circles("other", 2 * unit, np.nanmedian(view.others, axis=1)))
@@ -220,3 +241,96 @@ def cut_out(
     low, high = np.clip(np.round(corners * scale), 0, picture.shape[1::-1]).astype(int)
     (left, top), (right, bottom) = low / scale - 0.5, high / scale - 0.5
     return picture[low[1] : high[1], low[0] : high[0]], (float(left), float(right), float(bottom), float(top))
+
+
+# --- figures -------------------------------------------------------------------------------------------
+
+
+_MOST_COLUMNS = 4
+_RING = "#ff8ee0"  # seen on grass, clothes and sky alike
+_CASING = "#ffffff"
+
+
+def draw_overlays(moments: Sequence[Moment]) -> dict[str, Plate]:
+    """Draw a figure for every moment at which any camera has a frame, by its key."""
+    plates = [_moment(k, moment) for k, moment in enumerate(moments, start=1) if moment.views]
+    return {plate.key: plate for plate in plates}
+
+
+def _moment(k: int, moment: Moment) -> Plate:
+    from matplotlib.figure import Figure
+
+    columns = min(len(moment.views), _MOST_COLUMNS)
+    rows = -(-len(moment.views) // columns)
+    with page_style():
+        figure = Figure((WIDTH_IN, rows * (WIDTH_IN / columns + 0.2)), layout="constrained")
+        panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+        for axes in panels:
+            axes.set_visible(False)
+        for axes, view in zip(panels, moment.views, strict=False):
+            _draw_view(axes, view)
+    title = f"The skeleton in the pictures at {quantity(moment.t_s, 's', 2)}"
+    caption = (
+        "Lines: the skeleton reprojected, left limbs in blue, right limbs in orange. Rings: what the "
+        "detector found; crosses: found, but not reconstructed, in red where the views disagreed."
+    )
+    if moment.worst and moment.error_mm is not None:
+        caption += (
+            f" The moment of the largest error of a joint: {quantity(moment.error_mm, 'mm', 0)} from truth."
+        )
+    elif moment.worst:
+        caption += " The moment with the largest reprojection error."
+    told = listing(f"{view.camera} {quantity(view.median_px, 'px')}" for view in moment.views)
+    numbers = {"": stacked([_numbers_of_view(view) for view in moment.views])}
+    return Plate(f"overlay-{k}", title, caption, f"Median reprojection error: {told}.", figure, numbers)
+
+
+def _draw_view(axes: Axes, view: View) -> None:
+    size = (view.intrinsics.width, view.intrinsics.height)
+    window = window_of(view, size)
+    axes.set_visible(True)
+    if view.picture is not None:
+        import cv2
+
+        part, edges = cut_out(view.picture, size, window)
+        axes.imshow(cv2.cvtColor(part, cv2.COLOR_BGR2RGB), extent=edges, interpolation="antialiased")
+    axes.set_xlim(window.left, window.left + window.width)
+    axes.set_ylim(window.top + window.height, window.top)
+    axes.set_aspect("equal")
+    axes.set_facecolor(GRID)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    quiet(axes, grid=False)
+    axes.spines["bottom"].set_visible(False)
+    place = {name: j for j, name in enumerate(view.joints)}
+    for body in view.reprojected:
+        for a, b in bones_of(view.joints):
+            colour = {"left": LEFT, "right": RIGHT, "": MIDDLE}[side_of(a, b)]
+            ends = body[[place[a], place[b]]].T
+            axes.plot(*ends, color=_CASING, linewidth=2.6, alpha=0.75, zorder=2)
+            axes.plot(*ends, color=colour, linewidth=1.3, zorder=3)
+    lost = view.rejected | view.unmeasured
+    axes.plot(*view.found[~lost].T, "o", mec=_RING, mfc="none", mew=0.7, markersize=4.5, zorder=4)
+    axes.plot(*view.found[view.rejected].T, "x", color=STATUS_COLOURS["rejected"], markersize=5, zorder=5)
+    axes.plot(*view.found[view.unmeasured].T, "x", color=MUTED, markersize=4, zorder=5)
+    words = f"{shortened(view.camera)}, frame {view.frame}, {quantity(view.median_px, 'px')}"
+    axes.set_title(words, fontsize=7.2, color=INK, loc="left")
+
+
+def _numbers_of_view(view: View) -> pd.DataFrame:
+    """Tabulate every joint in the picture; empty where it was not found or not reconstructed."""
+    people, joints = view.found.shape[:2]
+    reprojected = view.reprojected[:, :joints].reshape(-1, 2)
+    found = view.found.reshape(-1, 2)
+    return table(
+        camera=view.camera,
+        frame=view.frame,
+        t_s=view.t_s,
+        person=np.repeat(np.arange(people), joints),
+        joint=list(view.joints[:joints]) * people,
+        found_x_px=found[:, 0],
+        found_y_px=found[:, 1],
+        reprojected_x_px=reprojected[:, 0],
+        reprojected_y_px=reprojected[:, 1],
+        rejected=view.rejected.ravel().astype(int),
+    )

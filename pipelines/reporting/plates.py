@@ -1,24 +1,189 @@
-"""A figure with its words and its numbers, and helpers that all figures share."""
+"""A figure with its words and its numbers, in the page's style, and as inline SVG.
+
+The SVG takes its colours and fonts from the page: each colour of the palette is replaced by a CSS variable,
+so that one drawing serves light and dark mode and paper, and text stays text. The same figure gives the same
+bytes, and its ids carry a prefix of their own, so that the figures of one page do not clash.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import io
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
+from xml.sax.saxutils import escape
 
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.reporting.svg import GRID, inline_svg
 from pipelines.reporting.wording import fixed
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.typing import RcKeyType
 
-MOST_POINTS = 600
+
+INK, MUTED, GRID, PAPER = "#22262a", "#666d74", "#dddcd6", "#fefdfb"
+LEFT, RIGHT, MIDDLE = "#1f78b5", "#c8561b", "#4a4f55"
+CAMERAS = ("#0072b2", "#d55e00", "#009e73", "#b0528f", "#a87900", "#4f8fc4")
+"""Colours of cameras, after Okabe and Ito's for all kinds of colour vision, darkened for thin lines."""
+LEVELS = ("#9db8c9", "#5f97bd", "#1f6da5", "#123f66")
+"""Colours of ordered values, from the least to the most: light to dark, on dark paper dark to light."""
+STATUS_COLOURS = {
+    "ok": "#2f6f92",
+    "filled": "#9fc6d8",
+    "few_views": "#edca6e",
+    "low_parallax": "#e08f43",
+    "rejected": "#b3422a",
+    "not_detected": "#cbcbc6",
+    "no_pose": "#74777b",
+}
+PALETTE = {
+    INK: "--ink",
+    MUTED: "--muted",
+    GRID: "--grid",
+    PAPER: "--paper",
+    LEFT: "--left",
+    RIGHT: "--right",
+    MIDDLE: "--middle",
+    **{colour: f"--camera-{k}" for k, colour in enumerate(CAMERAS)},
+    **{colour: f"--level-{k}" for k, colour in enumerate(LEVELS)},
+    **{colour: f"--status-{word.replace('_', '-')}" for word, colour in STATUS_COLOURS.items()},
+}
+
+WIDTH_IN = 9.0
+"""Width of a figure as wide as the page; CSS scales it to the window."""
+
+_PAGE_STYLE: dict[RcKeyType, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "mocap",
+    "text.parse_math": False,  # a name may hold a dollar sign
+    "font.size": 7.6,
+    "text.color": INK,
+    "axes.edgecolor": MUTED,
+    "axes.labelcolor": MUTED,
+    "axes.linewidth": 0.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.formatter.useoffset": False,
+    "axes.axisbelow": True,
+    "axes.labelsize": 7.6,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.major.width": 0.5,
+    "ytick.major.width": 0.5,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "xtick.labelsize": 7.2,
+    "ytick.labelsize": 7.2,
+    "grid.color": GRID,
+    "grid.linewidth": 0.5,
+    "legend.frameon": False,
+    "legend.fontsize": 7.2,
+    "legend.handlelength": 1.4,
+    "legend.borderpad": 0.0,
+    "lines.linewidth": 1.1,
+    "lines.solid_capstyle": "round",
+}
+
+
+@contextmanager
+def page_style() -> Iterator[None]:
+    """Make figures in the page's style, independent of matplotlibrc.
+
+    Names in any script raise no warning.
+    """
+    import matplotlib as mpl
+
+    with mpl.rc_context(), warnings.catch_warnings():
+        # The page's own fonts show the text; matplotlib's are used for measuring it alone.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        mpl.rcdefaults()
+        mpl.rcParams.update(_PAGE_STYLE)
+        yield
+
+
+@contextmanager
+def settled(figure: Figure, scale: float = 1.0) -> Iterator[None]:
+    """Lay a figure out at a scale of its size and hold that layout; call it within `page_style`.
+
+    The layout's solver leaves the last bits of coordinates open; rounded, the same figure gives the same
+    bytes.
+    """
+    size_in = figure.get_size_inches()
+    figure.set_size_inches(*(scale * size_in))
+    for axes in figure.axes:  # undo the positions of an earlier layout
+        if (place := axes.get_subplotspec()) is not None:
+            axes.set_position(place.get_position(figure))
+        axes.set_in_layout(True)
+    figure.set_layout_engine("constrained")
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for axes in figure.axes:
+        left, bottom, width, height = (round(float(edge), 5) for edge in axes.get_position(True).bounds)
+        axes.set_position((left, bottom, width, height))
+    try:
+        yield
+    finally:
+        figure.set_size_inches(*size_in)
+
+
+def inline_svg(figure: Figure, key: str, title: str, description: str) -> str:
+    """Return the figure as an `<svg>` element for the inside of a page.
+
+    Args:
+        figure: the figure.
+        key: prefix of every id, one of its own for each figure of a page.
+        title: its subject, for readers who cannot see it.
+        description: the picture in words, with its numbers.
+    """
+    buffer = io.StringIO()
+    with page_style(), settled(figure):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    drawing = buffer.getvalue()
+    view = re.search(r'viewBox="([^"]+)"', drawing)
+    if view is None:
+        raise ValueError("matplotlib wrote an SVG without a viewBox")
+    body = drawing[drawing.index("</metadata>") + len("</metadata>") :]
+    body = re.sub(r"<defs>\s*<style[^>]*>[^<]*</style>\s*</defs>", "", body, count=1)
+    # Matplotlib's own ids are hashes of coordinates whose last bits the layout's solver leaves open.
+    tags = "".join(re.findall(r"<[^<>]+>", body))
+    found = dict.fromkeys(re.findall(r'(?:url\(#|href="#)([^")]+)', tags))
+    referenced = {name: f"{key}-{k}" for k, name in enumerate(found)}
+    # Names stand between tags and are escaped there, so that a tag is whatever lies between < and >.
+    body = re.sub(r"<[^<>]+>", lambda tag: _page_tag(tag.group(), referenced), body)
+    body = re.sub(r">\s+<", "><", body)
+    return (
+        f'<svg viewBox="{view.group(1)}" role="img" aria-labelledby="{key}-title" '
+        f'aria-describedby="{key}-desc"><title id="{key}-title">{escape(title)}</title>'
+        f'<desc id="{key}-desc">{escape(description)}</desc>{body.strip()}'
+    )
+
+
+def _page_tag(tag: str, referenced: Mapping[str, str]) -> str:
+    tag = re.sub(
+        r' id="([^"]+)"', lambda m: f' id="{referenced[m.group(1)]}"' if m.group(1) in referenced else "", tag
+    )
+    tag = re.sub(r'(url\(#|href="#)([^")]+)', lambda m: m.group(1) + referenced[m.group(2)], tag)
+    tag = tag.replace("xlink:href=", "href=")
+    tag = re.sub(r" font-family: [^;\"]+;?", "", tag)
+    tag = re.sub(r' transform="rotate\(-0 [^"]*"', "", tag)
+    tag = re.sub(r"\d+\.\d{3,}", lambda m: f"{float(m.group()):.2f}".rstrip("0").rstrip("."), tag)
+    tag = re.sub(r"#[0-9a-f]{6}\b", lambda m: _page_colour(m.group()), tag)
+    return re.sub(r"\s*\n\s*", " ", tag)
+
+
+def _page_colour(colour: str) -> str:
+    return f"var({PALETTE[colour]})" if colour in PALETTE else colour
+
+
+MOST_POINTS, MOST_BINS = 600, 300
 LINE_STYLES: tuple[Literal["-"] | tuple[int, tuple[float, ...]], ...] = (
     "-",
     (0, (4.0, 1.5)),
@@ -87,3 +252,23 @@ def quiet(axes: Axes, *, grid: bool = True) -> None:
     axes.tick_params(axis="y", length=0)
     if grid:
         axes.grid(visible=True, axis="x", color=GRID)
+
+
+def time_bins(seconds: Float, most: int = MOST_BINS) -> Float:
+    """Return the edges of at most so many bins; one per stamp if there are fewer stamps."""
+    count = min(len(seconds), most)
+    step = (seconds[-1] - seconds[0]) / max(len(seconds) - 1, 1) or 1.0
+    edges: Float = np.linspace(seconds[0] - step / 2, seconds[-1] + step / 2, count + 1)
+    return edges
+
+
+def percentiles(values: Float, seconds: Float, bins: Float) -> tuple[Float, Float, Float]:
+    """Compute median, 10th and 90th percentile of the finite values in each bin; NaN in an empty one."""
+    edges = np.searchsorted(seconds, bins)
+    result = np.full((3, len(bins) - 1), np.nan)
+    for k in range(len(bins) - 1):
+        inside = values[edges[k] : edges[k + 1]]
+        finite = inside[np.isfinite(inside)]
+        if finite.size:
+            result[:, k] = np.percentile(finite, [50, 10, 90])
+    return result[0], result[1], result[2]

@@ -1,17 +1,389 @@
-"""Studies on a session's page: their result in a sentence, a table of their errors, and their figure."""
+"""Results of studies: means with their intervals, tables, the figure, and their part of a session's page.
+
+Rows are plain: `tilt_deg`, `drones`, `noise`, `noise_model`, `method`, `trial`, and the measured figures.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any
 
-from pipelines.reporting.ablation import METRICS, Table, drawing, setting, tables
-from pipelines.reporting.ablation_figure import draw_study
+import numpy as np
+
+from pipelines.geometry.arrays import Float
 from pipelines.reporting.content import StudyContent
-from pipelines.reporting.plates import Plate, tabled
-from pipelines.reporting.svg import WIDTH_IN
+from pipelines.reporting.plates import CAMERAS, GRID, INK, LEVELS, MUTED, WIDTH_IN, Plate, page_style, tabled
 from pipelines.reporting.wording import fixed, quantity
+from pipelines.session.records import Int64
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+Row = dict[str, Any]
+
+METRICS = {
+    "mpjpe_mm": "MPJPE, mm",
+    "root_mpjpe_mm": "Root-relative MPJPE, mm",
+    "pa_mpjpe_mm": "PA-MPJPE, mm",
+    "own_mpjpe_mm": "MPJPE of everything that the method itself reconstructed, mm",
+    "pck150": "PCK@150 mm, missing joints counted as wrong, %",
+    "reconstructed_share": "Reconstructed, %",
+    "fell_back": "Trials in which refined fell back to robust, %",
+}
+"""Titles of the metrics in the tables; the first three are on the joint-frames that every method has."""
+
+_SHARES = {"pck150", "reconstructed_share", "fell_back"}  # in percent there
+_DRAWN = ("mpjpe_mm", "root_mpjpe_mm")
+_CONDITION = ("tilt_deg", "drones", "noise", "noise_model", "method")
+_VARIED = {"tilt": "tilt_deg", "robots": "drones"}
+_RESAMPLES = 2000
+_TAIL_PERCENT = 2.5
+_NOTHING_MM = 1e-3  # errors below are none: no ratio is taken to them
+
+
+def estimates(rows: Sequence[Row], study: str, *, seed: int) -> list[dict[str, Any]]:
+    """Compute the means over trials of every condition and method.
+
+    Intervals hold 95 % of the means of resampled trials (Efron & Tibshirani 1993, 13.3).
+
+    Args:
+        rows: of every trial.
+        study: tilt, robots or noise: the condition that the ratio compares.
+        seed: of the resampling.
+
+    Returns:
+        In the order of the rows, each with the condition and method, and with
+        - `metrics`: by name `mean`, `interval` (None where all trials are alike) and the number of `trials`
+          that had the figure; None where none had it;
+        - `ratio`: of `mpjpe_mm` to the first tilt or number of drones, or for `noise` to the first method,
+          trials paired; None where that mean is zero;
+        - `per_joint`: means.
+    """
+    by_condition: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        by_condition.setdefault(tuple(row[name] for name in _CONDITION), []).append(row)
+    varied = _CONDITION.index(_VARIED.get(study, "method"))
+    first = next(iter(by_condition))[varied]
+    told = []
+    for condition, own in by_condition.items():
+        others = by_condition[(*condition[:varied], first, *condition[varied + 1 :])]
+        told.append(
+            {
+                **dict(zip(_CONDITION, condition, strict=True)),
+                "metrics": {name: _mean(own, name, seed) for name in own[0] if _is_measured(name)},
+                "ratio": _ratio(own, others, seed),
+                "per_joint": _per_joint(own),
+            }
+        )
+    return told
+
+
+def _is_measured(name: str) -> bool:
+    return name not in {*_CONDITION, "trial", "per_joint"}
+
+
+def _resampled(trials: int, seed: int) -> Int64:
+    """Draw rows of trials [B, K] with replacement."""
+    return np.random.default_rng([seed, trials]).integers(trials, size=(_RESAMPLES, trials))
+
+
+def _mean(rows: Sequence[Row], name: str, seed: int) -> dict[str, Any] | None:
+    values = np.array([row[name] for row in rows if row[name] is not None], dtype=np.float64)
+    if not values.size:
+        return None
+    return _estimate(float(values.mean()), values[_resampled(len(values), seed)].mean(axis=1), len(values))
+
+
+def _ratio(rows: Sequence[Row], others: Sequence[Row], seed: int) -> dict[str, Any] | None:
+    """Compute the mean error as a multiple of another condition's; trials share random numbers in both."""
+    pairs = np.array(
+        [
+            (row["mpjpe_mm"], other["mpjpe_mm"])
+            for row, other in zip(rows, others, strict=True)
+            if None not in (row["mpjpe_mm"], other["mpjpe_mm"])
+        ],
+        dtype=np.float64,
+    ).reshape(-1, 2)
+    if not len(pairs) or pairs[:, 1].min() < _NOTHING_MM:
+        return None
+    own, other = pairs.mean(axis=0)
+    drawn = pairs[_resampled(len(pairs), seed)].mean(axis=1)
+    return _estimate(float(own / other), drawn[:, 0] / drawn[:, 1], len(pairs))
+
+
+def _estimate(mean: float, drawn: Float, trials: int) -> dict[str, Any]:
+    interval = None
+    if drawn.min() < drawn.max():  # trials without chance (exact poses, pictures filmed once) have none
+        low, high = np.percentile(drawn, [_TAIL_PERCENT, 100 - _TAIL_PERCENT])
+        interval = [float(low), float(high)]
+    return {"mean": mean, "interval": interval, "trials": trials}
+
+
+def _per_joint(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
+    told: dict[str, dict[str, float | None]] = {}
+    for joint, errors in rows[0]["per_joint"].items():
+        told[joint] = {}
+        for name in errors:
+            values = [row["per_joint"][joint][name] for row in rows]
+            there = [value for value in values if value is not None]
+            told[joint][name] = float(np.mean(there)) if there else None
+    return told
+
+
+def results_csv(rows: Sequence[Row]) -> str:
+    """Write one line for every condition, trial and method; empty where nothing could be measured."""
+    text = io.StringIO()
+    columns = [name for name in rows[0] if name != "per_joint"]
+    writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+# --- tables --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Table:
+    """One figure of a study; the varied condition is in columns."""
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+
+
+def tables(summary: Mapping[str, Any]) -> list[Table]:
+    """Make the tables for readers, as text; `-` where nothing could be measured."""
+    head, columns = _heads(summary)
+    first = summary["settings"]["methods"][0] if summary["study"] == "noise" else columns[0]
+    told = []
+    for name, title in [*METRICS.items(), ("ratio", f"MPJPE relative to {first}, on common joint-frames")]:
+        lines = _lines(summary)
+        if name == "fell_back":  # only refined can fall back
+            lines = [(label, cells) for label, cells in lines if label[-1] == "refined"]
+            if not lines:
+                continue
+        rows = [[*label, *(_text(cell, name) for cell in cells)] for label, cells in lines]
+        told.append(Table(title, [*head, *columns], rows))
+    return told
+
+
+def _heads(summary: Mapping[str, Any]) -> tuple[list[str], list[str]]:
+    """Return the headers of the line names, and of their figures."""
+    settings = summary["settings"]
+    match summary["study"]:
+        case "tilt":
+            return ["noise", "method"], [f"{tilt:g} deg" for tilt in settings["tilts_deg"]]
+        case "robots":
+            return ["noise", "method"], [f"{drones} drones" for drones in settings["drones"]]
+    return ["method"], list(settings["noise"])
+
+
+def _lines(summary: Mapping[str, Any]) -> list[tuple[tuple[str, ...], list[Mapping[str, Any]]]]:
+    """Group the cells by line, in the order of the varied condition."""
+    names = ("method",) if summary["study"] == "noise" else ("noise", "method")
+    lines: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
+    for cell in summary["cells"]:
+        lines.setdefault(tuple(cell[name] for name in names), []).append(cell)
+    return list(lines.items())
+
+
+def _text(cell: Mapping[str, Any], name: str) -> str:
+    estimate = cell["ratio"] if name == "ratio" else cell["metrics"][name]
+    if estimate is None:
+        return "-"
+    if name in _SHARES:
+        return f"{100 * estimate['mean']:.1f}"
+    digits = 2 if name == "ratio" else 1
+    text = f"{estimate['mean']:.{digits}f}"
+    if estimate["interval"] is None:
+        return text
+    low, high = estimate["interval"]
+    return f"{text} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+# --- the figure ----------------------------------------------------------------------------------------
+
+
+def draw(folder: Path, summary: Mapping[str, Any]) -> None:
+    """Write the study's figure as SVG, PNG and PDF."""
+    save_study(folder, drawing(summary), f"Simulated: {setting(summary)}")
+
+
+def setting(summary: Mapping[str, Any]) -> str:
+    """Describe the filmed scene and the number of trials."""
+    settings = summary["settings"]
+    drones, tilt = f"{settings['drones'][0]} drones", f"tilt {settings['tilts_deg'][0]:g} deg"
+    fixed = {"tilt": drones, "robots": tilt}.get(summary["study"], f"{drones}, {tilt}")
+    return (
+        f"{fixed}, {settings['seconds']:g} s of walking, keypoints: {summary['keypoints']};"
+        f" mean and 95 % interval, trials: {settings['trials']}"
+    )
+
+
+def drawing(summary: Mapping[str, Any]) -> StudyDrawing:
+    """Make the study's figure: a row for each of the first two metrics."""
+    study, settings = summary["study"], summary["settings"]
+    lines = _lines(summary)
+    rows = []
+    for name in _DRAWN:
+        if study == "noise":
+            panels = [Panel("", [_curve(label[0], cells, name) for label, cells in lines])]
+        else:
+            panels = [
+                Panel(method, [_curve(noise, cells, name) for (noise, of), cells in lines if of == method])
+                for method in settings["methods"]
+            ]
+        rows.append((METRICS[name], panels))
+    match study:
+        case "tilt":
+            return StudyDrawing(rows, settings["tilts_deg"], "tilt of the formation, deg", "pose noise", True)
+        case "robots":
+            return StudyDrawing(rows, settings["drones"], "drones", "pose noise", True)
+    return StudyDrawing(rows, list(settings["noise"]), "pose noise", "method", False)
+
+
+def _curve(label: str, cells: Sequence[Mapping[str, Any]], name: str) -> Curve:
+    found = [cell["metrics"][name] for cell in cells]
+    return Curve(
+        label,
+        [None if each is None else each["mean"] for each in found],
+        [None if each is None or each["interval"] is None else tuple(each["interval"]) for each in found],
+    )
+
+
+_PANEL_IN, _ROW_IN, _SMALLEST_IN = 2.7, 2.0, 5.4
+_MARKERS = "osD^vPX*"
+_BESIDE = 0.012  # of the axis, between the error bars of neighbouring curves if the axis has words
+_LETTERS_PER_IN = 16  # of the title
+_HEADROOM, _LEAST_TOP = 1.04, 1.0  # above the highest marker; least top of the axis
+_DPI = 160
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line of a panel; None where nothing could be measured."""
+
+    label: str
+    mean: Sequence[float | None]
+    interval: Sequence[tuple[float, float] | None]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes."""
+
+    title: str
+    curves: Sequence[Curve]
+
+
+@dataclass(frozen=True)
+class StudyDrawing:
+    """Contents of a study's figure."""
+
+    rows: Sequence[tuple[str, Sequence[Panel]]]
+    """Name of each measured figure, and its panels, the same number in every row."""
+    at: Sequence[float] | Sequence[str]
+    """The values along the horizontal axis; words are put side by side."""
+    axis: str
+    """Title of the horizontal axis."""
+    legend: str
+    """Title of the legend of curves."""
+    ordered: bool
+    """True if the curves have an order, which their colours then show."""
+
+
+def save_study(folder: Path, drawing: StudyDrawing, title: str) -> None:
+    """Write `figure.svg`, `.png` and `.pdf`; equal arguments give equal bytes."""
+    width_in = max(0.6 + _PANEL_IN * len(drawing.rows[0][1]), _SMALLEST_IN)
+    figure = draw_study(drawing, width_in, title)
+    with page_style():
+        # Neither dates nor versions: the same study gives the same files.
+        figure.savefig(folder / "figure.svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(folder / "figure.png", dpi=_DPI, metadata={"Software": None})
+        figure.savefig(
+            folder / "figure.pdf", metadata={"CreationDate": None, "Creator": None, "Producer": None}
+        )
+
+
+def draw_study(drawing: StudyDrawing, width_in: float, title: str = "") -> Figure:
+    """Draw a study, with a title above everything if there is one."""
+    from matplotlib.figure import Figure
+
+    rows, at = drawing.rows, drawing.at
+    columns = len(rows[0][1])
+    with page_style():
+        figure = Figure((width_in, 0.9 + _ROW_IN * len(rows)), layout="constrained")
+        grid = figure.subplots(len(rows), columns, sharex=True, sharey="row", squeeze=False)
+        for (measured, panels), line in zip(rows, grid, strict=True):
+            for panel, axes in zip(panels, line, strict=True):
+                _draw_panel(axes, panel, at, ordered=drawing.ordered)
+            line[0].set_ylabel(measured)
+            line[0].set_ylim(0, _HEADROOM * max(line[0].get_ylim()[1], _LEAST_TOP))
+        for panel, axes in zip(rows[0][1], grid[0], strict=True):
+            axes.set_title(panel.title, color=INK, fontsize=8.4)
+        for axes in grid[-1]:
+            axes.set_xlabel(drawing.axis)
+        handles, labels = grid[0][0].get_legend_handles_labels()
+        below = min(len(labels), 3 * columns)
+        figure.legend(handles, labels, title=drawing.legend, loc="outside lower center", ncols=below)
+        if title:
+            lines = wrap(title, int(_LETTERS_PER_IN * width_in))
+            figure.suptitle("\n".join(lines), color=MUTED, fontsize=8.0)
+    return figure
+
+
+def _draw_panel(axes: Axes, panel: Panel, at: Sequence[float] | Sequence[str], *, ordered: bool) -> None:
+    numbers = [float(value) if isinstance(value, int | float) else k for k, value in enumerate(at)]
+    words = any(isinstance(value, str) for value in at)
+    step = _BESIDE * (len(at) - 1 or 1) if words else 0.0
+    for k, curve in enumerate(panel.curves):
+        shift = (k - (len(panel.curves) - 1) / 2) * step
+        there = [
+            (x + shift, y, interval or (y, y))
+            for x, y, interval in zip(numbers, curve.mean, curve.interval, strict=True)
+            if y is not None
+        ]
+        below, above = ([abs(y - interval[end]) for _, y, interval in there] for end in (0, 1))
+        axes.errorbar(
+            [x for x, *_ in there],
+            [y for _, y, _ in there],
+            [below, above],
+            label=curve.label,
+            color=_colour(k, len(panel.curves), ordered),
+            marker=_MARKERS[k % len(_MARKERS)],
+            markersize=3.2,
+            linestyle="none" if words else "-",
+            capsize=2.0,
+            elinewidth=0.8,
+        )
+    axes.set_xticks(numbers, [_label(value, len(at)) for value in at])
+    axes.grid(axis="y", color=GRID)
+    axes.tick_params(length=0)
+
+
+def _colour(k: int, count: int, ordered: bool) -> Any:
+    if ordered and count <= len(LEVELS):
+        return LEVELS[k + len(LEVELS) - count]
+    return CAMERAS[k % len(CAMERAS)]
+
+
+def _label(value: float | str, count: int) -> str:
+    """Format a tick label: words are wrapped in lines that leave room for those beside them."""
+    if not isinstance(value, str):
+        return f"{value:g}"
+    return "\n".join(wrap(value.replace(",", ", "), max(int(_LETTERS_PER_IN * _SMALLEST_IN / count) - 1, 1)))
+
+
+# --- on a session's page -------------------------------------------------------------------------------
+
 
 _TITLES = {
     "tilt": "Error against tilt",
@@ -61,7 +433,7 @@ def summarise_studies(contents: Sequence[StudyContent]) -> tuple[Study, ...]:
             command=each.command,
             digest=each.digest,
             tables=tuple(
-                _table(table, 1 if each.summary["study"] == "noise" else 2)
+                _study_table(table, 1 if each.summary["study"] == "noise" else 2)
                 for table in tables(each.summary)
                 if table.title in _SHOWN
             ),
@@ -79,7 +451,7 @@ def _key(k: int) -> str:
     return f"study-{k + 1}"
 
 
-def _table(table: Table, names: int) -> StudyTable:
+def _study_table(table: Table, names: int) -> StudyTable:
     rows = []
     for row in table.rows:
         figures = [text.rstrip("]").partition(" [") for text in row[names:]]

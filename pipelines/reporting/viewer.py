@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.reporting.bones import side_of
-from pipelines.reporting.motion import Motion
+from pipelines.reporting.motion import Motion, side_of
 from pipelines.reporting.replanned import Arm, Replan
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.terrain import Surface, surface

@@ -1,10 +1,15 @@
-"""Numbers and words as the page prints them."""
+"""Numbers and words as the pages print them, and the templates that use them."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
 
 THIN = "\u202f"  # narrow no-break space: between a number and its unit, and between thousands
 ABSENT = "–"
@@ -147,3 +152,24 @@ def plain(value: object) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{key}: {plain(inner)}" for key, inner in value.items()) or "none"
     return str(value)
+
+
+def environment() -> Environment:
+    """Make the templates' environment: all inputs are escaped, and a missing one is an error."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    made = Environment(
+        loader=PackageLoader("pipelines.reporting"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    made.filters.update(
+        fixed=fixed,
+        whole=whole,
+        percent=percent,
+        joint=joint_label,
+    )
+    return made

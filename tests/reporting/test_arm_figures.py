@@ -9,9 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.reporting.arm_figures import draw_arms
-from pipelines.reporting.arms_from_above import KEYFRAMES
-from pipelines.reporting.arms_over_time import hidden_spans
+from pipelines.reporting.arm_figures import draw_arms, hidden_spans
+from pipelines.reporting.from_above import KEYFRAMES
 from pipelines.reporting.plates import Plate
 from pipelines.reporting.replanned import Replan, summarise_replan
 

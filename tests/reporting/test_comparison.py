@@ -10,8 +10,7 @@ import pytest
 
 from pipelines.geometry.bootstrap import RESAMPLES, STRETCH_S
 from pipelines.reporting.comparison import compare, labels_of
-from pipelines.reporting.comparison_page import GENERATOR, render_comparison
-from pipelines.reporting.comparison_verdict import judge
+from pipelines.reporting.comparison_page import GENERATOR, judge, render_comparison
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.wording import THIN
 

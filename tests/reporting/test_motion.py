@@ -7,7 +7,8 @@ import pandas as pd
 import pytest
 
 from pipelines.geometry.triangulation import STATUS
-from pipelines.reporting.motion import errors_mm, motion_from_skeleton, share_inside_95, truth_at
+from pipelines.reporting.motion import errors_mm, motion_from_skeleton, share_inside_95
+from pipelines.reporting.summary import truth_at
 
 from .conftest import FRAMES, JOINTS, OFFSET_M, make_skeleton, make_truth, statuses
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.overlays import MOMENTS
 from pipelines.reporting.page import render_page
-from pipelines.reporting.svg import PALETTE
+from pipelines.reporting.plates import PALETTE
 from pipelines.reporting.wording import THIN
 
 from .comparisons import make_comparison

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.reporting.content import SessionContent
 from pipelines.reporting.page import render_page
-from pipelines.reporting.quality import QualityRow, quality
-from pipelines.reporting.summary import summarise
+from pipelines.reporting.summary import QualityRow, quality, summarise
 from pipelines.reporting.wording import THIN
 from pipelines.session.tables import COVARIANCE_COLUMNS
 

@@ -6,9 +6,8 @@ from typing import Any
 
 import pytest
 
-from pipelines.reporting.ablation import METRICS
 from pipelines.reporting.content import StudyContent
-from pipelines.reporting.studies import draw_studies, summarise_studies, what_it_shows
+from pipelines.reporting.studies import METRICS, draw_studies, summarise_studies, what_it_shows
 from pipelines.simulation.study.settings import command_of, settings_for
 
 
