@@ -1,4 +1,4 @@
-"""Paths of the real recordings that some tests use; a clone without them skips those tests."""
+"""Real recordings and networks that some tests use; where they cannot be had, those tests are skipped."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import os
 from pathlib import Path
 
 import pytest
+
+from pipelines.session.registries import find_detector
+from tests.commands.runner import mocap_process
 
 _ROOT = Path(__file__).resolve().parent.parent
 
@@ -17,3 +20,11 @@ def real_data(relative: str) -> Path:
     if not path.exists():
         pytest.skip(f"real recordings are not here ({relative}); set MOCAP_REAL_DATA to their folder")
     return path
+
+
+def fetch_networks(detector: str) -> None:
+    """Fetch a detector's networks if they are absent; skip the calling test if that fails."""
+    if None in find_detector(detector).models().values():
+        fetched = mocap_process("models", "fetch", detector, timeout=300)
+        if fetched.returncode:
+            pytest.skip(f"the networks of {detector} cannot be fetched here: {fetched.stderr.strip()}")

@@ -11,10 +11,10 @@ import pytest
 
 from pipelines.keypoints.calibration import measured_for
 from pipelines.session.people import true_joints_at
-from pipelines.session.registries import find_detector
 from pipelines.session.storage import read_json, sha256_of
 from pipelines.session.tables import SKELETON, TRUTH, motion_from, read_table
-from tests.commands.runner import mocap, mocap_process, succeeds
+from tests.commands.runner import mocap, succeeds
+from tests.real_data import fetch_networks
 
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "mound_walk"
 LEGS = ("left_knee", "right_knee", "left_ankle", "right_ankle")
@@ -63,10 +63,7 @@ def test_no_leg_is_taken_for_the_other(tmp_path: Path) -> None:
 
 def reconstructed(folder: Path, detector: str, *options: str) -> tuple[Path, str]:
     """Ingest the sample with its true poses, and reconstruct it; return the session and the output."""
-    if None in find_detector(detector).models().values():
-        fetched = mocap_process("models", "fetch", detector, timeout=300)
-        if fetched.returncode:
-            pytest.skip(f"the detector's networks cannot be fetched here: {fetched.stderr.strip()}")
+    fetch_networks(detector)
     session = folder / "true_poses.session"
     succeeds("ingest", SAMPLE / "true_poses.yaml", "-o", session)
     done = mocap("reconstruct", session, "--detector", detector, *options, "--workers", "2")
