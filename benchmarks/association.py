@@ -20,9 +20,10 @@ from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.geometry.triangulation import Views, triangulate
 from pipelines.keypoints.association import associate
 from pipelines.session.records import Int64
-from pipelines.simulation.drone_paths import orbit
-from pipelines.simulation.observe import KeypointNoise, detect, see
-from pipelines.simulation.walk import walk
+from pipelines.simulation.detector_errors import see
+from pipelines.simulation.flying import orbit
+from tests.synthetic.keypoints import KeypointNoise, detect
+from tests.synthetic.walk import walk
 
 CAMERAS = PEOPLE = 5
 FOCAL, PIXEL_PX, RATE_HZ = 1000.0, 3.0, 30

@@ -46,9 +46,8 @@ from pipelines.session.skeletons import get_skeleton
 from pipelines.session.stages import locked
 from pipelines.session.tables import detections_from, keypoints_table
 from pipelines.simulate import simulate
-from pipelines.simulation.detector_errors import ANY_JOINT, COLUMNS, MODELLED, errors_of, view_of
+from pipelines.simulation.detector_errors import ANY_JOINT, COLUMNS, MODELLED, errors_of, see, view_of
 from pipelines.simulation.flight import fly_scenario, visible_joints
-from pipelines.simulation.observe import see
 from pipelines.simulation.scenario import BITS_PER_PIXEL, DISTORTION, read_scenario
 
 TILTS_DEG = (0, 15, 30, 45, 60)

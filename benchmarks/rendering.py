@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.poses import quaternion_from_matrix
-from pipelines.simulation.rendering import Renderer
+from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.surfaces import Surface, joined
-from pipelines.simulation.walk import COCO17, walk
+from tests.synthetic.walk import COCO17, walk
 
 UP = np.array([0.0, 0.0, 1.0])
 SUN = np.array([0.45, -0.35, 0.82])

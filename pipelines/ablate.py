@@ -31,7 +31,8 @@ from pipelines.session.whole_folders import STUDY_MARK, is_made, refuse_sessions
 from pipelines.simulation.detector_errors import errors_of
 from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.scenario import World
-from pipelines.simulation.study.filming import (
+from pipelines.simulation.study.settings import Noise, Settings, StudyMethod
+from pipelines.simulation.study.sightings import (
     IMITATED,
     Formation,
     Sightings,
@@ -42,7 +43,6 @@ from pipelines.simulation.study.filming import (
     views_of,
     walk,
 )
-from pipelines.simulation.study.settings import Noise, Settings, StudyMethod
 from pipelines.simulation.world.scene import build_world
 
 _REVISION = 3

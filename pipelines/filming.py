@@ -18,7 +18,7 @@ import numpy as np
 from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.videos.video import VideoReader
 from pipelines.formats.videos.video_writing import write_h264
-from pipelines.geometry.arrays import Float, Picture
+from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.triangulation import Views, estimate_noise, triangulate_pictures
@@ -33,7 +33,7 @@ from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.people import LoggedActor, logged_actor
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Int64, JointMotion
+from pipelines.session.records import JointMotion
 from pipelines.session.registries import Detector, advice_on, find_detector, hashes_of_models
 from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import locked
@@ -41,13 +41,19 @@ from pipelines.session.storage import hash_of, jsonable, read_json, sha256_of, w
 from pipelines.session.tables import REPLAN, TRUTH, motion_table, read_table, write_table
 from pipelines.session.whole_folders import SIMULATION_MARK
 from pipelines.simulation.body import Person
+from pipelines.simulation.detector_errors import see
 from pipelines.simulation.flight import Set, build_set
-from pipelines.simulation.observe import see
 from pipelines.simulation.rendering.renderer import Renderer
 from pipelines.simulation.rig import BodyMotion
 from pipelines.simulation.scenario import Scenario, read_scenario
-from pipelines.simulation.study.filming import Formation, Sightings, Walk, views_of
-from pipelines.simulation.study.measuring import errors_in_common, measure_arm
+from pipelines.simulation.study.sightings import (
+    Formation,
+    Sightings,
+    Walk,
+    errors_in_common,
+    measure_arm,
+    views_of,
+)
 
 FILM = Stage("film", revision=2)
 

@@ -34,13 +34,11 @@ from pipelines.session.storage import hash_of, read_json, sha256_of, write_json
 from pipelines.session.whole_folders import SIMULATION_MARK, is_made, whole_folder
 from pipelines.simulation.detector_errors import errors_of
 from pipelines.simulation.flight import SimulatedDrone, SimulatedFlight, fly_scenario
+from pipelines.simulation.flight_files import logged_messages, manifest_text, write_keypoints, write_truth
 from pipelines.simulation.flying import Known, Planner
-from pipelines.simulation.log_messages import logged_messages
-from pipelines.simulation.manifest_text import manifest_text
+from pipelines.simulation.rendering.camera import exposed_moments
 from pipelines.simulation.rendering.renderer import Moment, Renderer
-from pipelines.simulation.rendering.shutter import exposed_moments
 from pipelines.simulation.scenario import Scenario, read_scenario
-from pipelines.simulation.truth_files import write_keypoints, write_truth
 from pipelines.simulation.world.scene import World
 
 _REVISION = 5

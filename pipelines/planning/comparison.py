@@ -13,15 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.arrays import Bool, Float, Float32
 from pipelines.planning.arm_flights import LOGGED, ArmFlight
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import visible
 from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.scene import Scene
 from pipelines.planning.scores import score
-
-Float32 = NDArray[np.float32]
 
 RESAMPLES = 2000
 LEVEL = 0.95

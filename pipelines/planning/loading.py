@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel, White
 from pipelines.geometry.poses import gaps, interpolate_points
@@ -17,7 +17,7 @@ from pipelines.session.camera_poses import COMMAND_LINE, known_variances, poses_
 from pipelines.session.description import CameraEntry, Description, Interpolation
 from pipelines.session.errors import DataError
 from pipelines.session.people import logged_actor
-from pipelines.session.records import Int64, JointMotion, Trajectory
+from pipelines.session.records import JointMotion, Trajectory
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.tables import (
     CAMERA_POSES,

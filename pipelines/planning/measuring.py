@@ -11,17 +11,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.arrays import Bool, Float, Float32, Int64
 from pipelines.geometry.cameras import Intrinsics, project, undistort
 from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import invert, matrix_from_quaternion, rates, transform
 from pipelines.geometry.triangulation import Views, locate
 from pipelines.planning.distance_field import DistanceField, visible
-from pipelines.session.records import Int64
-
-Float32 = NDArray[np.float32]
 
 PIXEL_SIGMA = 3.0
 """Standard deviation of a good keypoint for triangulation, px: the first value in `mocap reconstruct`."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import look_at
 from pipelines.planning.arms import Arm
 from pipelines.planning.config import MOST_DRONES, Mode, PlannerConfig
@@ -31,7 +31,6 @@ from pipelines.planning.formation import (
 from pipelines.planning.guard import Flown, Guard
 from pipelines.planning.local import LocalPlanner, Separation
 from pipelines.planning.tracking import Plan, tracking_times
-from pipelines.session.records import Int64
 
 _NOW_S = 1e-6  # times are sums of periods: due this much early is due
 

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.planning.config import Mode, PlannerConfig
 from pipelines.planning.distance_field import (
     OCCUPIED,
@@ -27,7 +27,7 @@ from pipelines.planning.scores import near_obstacle
 from pipelines.planning.search import cost_map, costs_of_slots
 from pipelines.planning.tracking import tracking_times
 from pipelines.session.description import Description
-from pipelines.session.records import Int64, Occupancy
+from pipelines.session.records import Occupancy
 
 MOST_DRONES = 8
 PICTURES_HZ = 25.0

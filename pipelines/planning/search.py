@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.compilation import cached, helper
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import (
@@ -30,7 +30,6 @@ from pipelines.planning.distance_field import (
 from pipelines.planning.forecast import Forecast
 from pipelines.planning.formation import YAW, slot_offsets, turned, wrapped
 from pipelines.planning.information import predicted_error, ray_information
-from pipelines.session.records import Int64
 
 _REACHED_S = 1e-9  # a cell exactly as far as the rates allow is a neighbour
 

@@ -17,10 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.compilation import cached, helper
 from pipelines.planning.config import PlannerConfig
-from pipelines.session.records import Int64
 
 POSITION, VELOCITY, ACCELERATION, INTEGRAL = range(4)
 """Rows of a drone's state [4, 3]: m, m/s, m/s^2, and the integral of the position error in m s."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import difflib
 import math
-from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Literal
@@ -18,11 +17,10 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from pipelines.geometry.mounting import RelativeTo
 from pipelines.session.storage import refuse_camera_names
-from pipelines.session.yaml_files import Part, read_yaml_model
+from pipelines.session.yaml_files import Part, SecondsAsNs, nanoseconds, read_yaml_model
 
 SCHEMA = 1
 
-_LATEST_NS = 2**62  # differences of two such times fit int64
 _MOST_FRAMES = 10**9  # a year at 30 Hz
 
 Axes = Literal["enu", "ned"]
@@ -52,25 +50,12 @@ def _fps(value: object) -> Fraction:
     return fps
 
 
-def _nanoseconds(value: object) -> int:
-    try:
-        nanoseconds = Decimal(str(value)) * 1_000_000_000
-        is_near = abs(nanoseconds) <= _LATEST_NS  # before it becomes an integer of as many digits
-    except ArithmeticError:
-        raise ValueError("is no time in seconds") from None
-    if not is_near:
-        raise ValueError("is no time in seconds: it lies beyond the year 2116 (are these ms or ns?)")
-    return int(nanoseconds.to_integral_value())
-
-
 def _seconds(value: float) -> float:
-    _nanoseconds(value)
+    nanoseconds(value)
     return value
 
 
 Fps = Annotated[Fraction, BeforeValidator(_fps)]
-SecondsAsNs = Annotated[int, BeforeValidator(_nanoseconds)]
-"""Seconds in the file (number or text), exact nanoseconds in the program."""
 Seconds = Annotated[float, AfterValidator(_seconds)]
 """Seconds that can be added to any time."""
 

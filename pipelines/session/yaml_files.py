@@ -4,15 +4,33 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
+from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
 
 from pipelines.session.errors import DataError
 from pipelines.session.storage import refuse_special
 
 _LARGEST_FILE = 1_000_000  # bytes; a real one has a few thousand
+_LATEST_NS = 2**62  # differences of two such times fit int64
+
+
+def nanoseconds(value: object) -> int:
+    """Convert seconds, a number or text, to exact nanoseconds; ValueError for no time before 2116."""
+    try:
+        exact = Decimal(str(value)) * 1_000_000_000
+        is_near = abs(exact) <= _LATEST_NS  # before it becomes an integer of as many digits
+    except ArithmeticError:
+        raise ValueError("is no time in seconds") from None
+    if not is_near:
+        raise ValueError("is no time in seconds: it lies beyond the year 2116 (are these ms or ns?)")
+    return int(exact.to_integral_value())
+
+
+SecondsAsNs = Annotated[int, BeforeValidator(nanoseconds)]
+"""Seconds in the file (number or text), exact nanoseconds in the program."""
 
 
 class Part(BaseModel):

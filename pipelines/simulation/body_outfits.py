@@ -1,4 +1,4 @@
-"""Clothes, shoes and hair of a body, as layers that lie over each other, and the skin that shows.
+"""Neutral pose of a body, and its clothes, shoes and hair: layers over each other, and the skin that shows.
 
 Garments are cut from a suit of tights that lies on the skin (MakeHuman's), each with vertices of its own
 and its own distance from the skin, so that a shirt hangs over trousers and trousers over shoes.
@@ -11,10 +11,164 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Index
+from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
 from pipelines.simulation.body_asset import PARTS
-from pipelines.simulation.body_patches import Patch, cut, normals, pick, together, triangles
-from pipelines.simulation.rig import BONE, SIDES
+from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES
+
+
+def neutral_turns(rest_joint: Float, lean_rad: float) -> Float:
+    """Compute the turn of each bone from rest to neutral: [22, 4] quaternions xyzw.
+
+    Trunk and head stay. Legs come down straight, arms straight with the hands forward of the elbows'
+    bend, so that a knee or elbow bends about the axis from side to side; feet point ahead, soles level.
+
+    Args:
+        rest_joint: [22, 3] m, x forward, y left, z up.
+        lean_rad: angle of the arms from the vertical, outward, to clear the hips.
+    """
+    turns = np.tile(np.eye(3), (len(BONES), 1, 1))
+    for sign, side in zip((1.0, -1.0), SIDES, strict=True):
+
+        def bone(name: str, side: str = side) -> int:
+            return BONE[f"{side}_{name}"]
+
+        def along(upper: str, lower: str, side: str = side) -> Float:
+            way: Float = rest_joint[BONE[f"{side}_{lower}"]] - rest_joint[BONE[f"{side}_{upper}"]]
+            return way
+
+        down = np.array([0.0, sign * np.sin(lean_rad), -np.cos(lean_rad)])
+        axis = np.array([0.0, -np.cos(lean_rad), -sign * np.sin(lean_rad)])
+        upper, lower = along("upper_arm", "forearm"), along("forearm", "hand")
+        rest_axis = np.cross(upper, lower)
+        turns[bone("upper_arm")] = _turn((upper, rest_axis), (down, axis))
+        turns[bone("forearm")] = turns[bone("hand")] = _turn((lower, rest_axis), (down, axis))
+
+        left, straight = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0])
+        turns[bone("thigh")] = _turn((along("thigh", "shank"), left), (straight, left))
+        turns[bone("shank")] = _turn((along("shank", "foot"), left), (straight, left))
+        ahead = along("foot", "toes") * [1.0, 1.0, 0.0]
+        up = np.array([0.0, 0.0, 1.0])
+        turns[bone("foot")] = turns[bone("toes")] = _turn((ahead, up), (np.array([1.0, 0.0, 0.0]), up))
+    return quaternion_from_matrix(turns)
+
+
+def neutral_offsets(rest_joint: Float, turns: Float) -> Float:
+    """Compute each joint's place relative to its parent's, neutral pose: [22, 3] m, the root's row zero.
+
+    Parts that must be zero, sideways in the trunk and in a hanging leg, are exactly zero.
+    """
+    matrix = matrix_from_quaternion(turns)
+    offset = np.zeros((len(BONES), 3))
+    for name, parent in PARENT.items():
+        if parent is not None:
+            along = rest_joint[BONE[name]] - rest_joint[BONE[parent]]
+            offset[BONE[name]] = np.einsum("ij,j->i", matrix[BONE[parent]], along)
+    offset[np.abs(offset) < 1e-12] = 0.0
+    return offset
+
+
+def _turn(source: tuple[Float, Float], target: tuple[Float, Float]) -> Float:
+    """Return the rotation that takes the first source direction to the first target direction.
+
+    It takes the plane of both source directions to the plane of both target directions.
+    """
+    turn: Float = np.einsum("ik,jk->ij", _frame(*target), _frame(*source))
+    return turn
+
+
+def _frame(first: Float, second: Float) -> Float:
+    """Return axes in columns: along the first, across both, and the third."""
+    x = first / np.linalg.norm(first)
+    z = np.cross(x, second)
+    z /= np.linalg.norm(z)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+@dataclass(frozen=True)
+class Patch:
+    """Triangles [F, 3] and values [V, ...] of their vertices, by name."""
+
+    values: dict[str, Float]
+    faces: Index
+
+    def replaced(self, **values: Float) -> Patch:
+        """Return the same patch with other or additional values."""
+        return Patch(self.values | values, self.faces)
+
+
+def triangles(quads: Index) -> Index:
+    """Split quads [Q, 4] into triangles [2 Q, 3]."""
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+def normals(vertices: Float, faces: Index) -> Float:
+    """Compute outward unit normals [V, 3], means over the triangles around by area; zero where none are."""
+    across = np.cross(
+        vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
+    )
+    total = np.zeros_like(vertices)
+    for corner in faces.T:
+        np.add.at(total, corner, across)
+    unit: Float = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+    return unit
+
+
+def cut(patch: Patch, keep: Float) -> Patch:
+    """Return the part of a patch where `keep` [V], linear in each triangle, is not negative.
+
+    Along the cut, vertices are added whose values are linear between the ends of the edge that was cut.
+    """
+    inside = keep[patch.faces] >= 0
+    count = inside.sum(axis=1)
+    one = _odd_first(patch.faces[count == 1], inside[count == 1])
+    two = _odd_first(patch.faces[count == 2], ~inside[count == 2])
+    crossed = np.concatenate([one[:, [0, 1]], one[:, [0, 2]], two[:, [0, 1]], two[:, [0, 2]]])
+    edges, which = np.unique(np.sort(crossed, axis=1), axis=0, return_inverse=True)
+    one_b, one_c, two_b, two_c = np.split(
+        which.ravel() + len(keep), np.cumsum([len(one), len(one), len(two)])
+    )
+    faces = np.concatenate(
+        [
+            patch.faces[count == 3],
+            np.stack([one[:, 0], one_b, one_c], axis=1),
+            np.stack([two_b, two[:, 1], two[:, 2]], axis=1),
+            np.stack([two_b, two[:, 2], two_c], axis=1),
+        ]
+    )
+    first, second = edges.T
+    share = keep[first] / (keep[first] - keep[second])
+
+    def extended(value: Float) -> Float:
+        part = share.reshape(-1, *(1,) * (value.ndim - 1))
+        return np.concatenate([value, value[first] + part * (value[second] - value[first])])
+
+    return _compact({name: extended(value) for name, value in patch.values.items()}, faces)
+
+
+def pick(patch: Patch, wanted: NDArray[np.bool_]) -> Patch:
+    """Return some triangles [F] of a patch, whole."""
+    return _compact(patch.values, patch.faces[wanted])
+
+
+def together(patches: list[Patch], names: tuple[str, ...]) -> Patch:
+    """Join several patches side by side, with the values named."""
+    counts = [len(patch.values[names[0]]) for patch in patches]
+    first = np.cumsum([0, *counts[:-1]])
+    faces = np.concatenate([patch.faces + k for patch, k in zip(patches, first, strict=True)])
+    return Patch({name: np.concatenate([patch.values[name] for patch in patches]) for name in names}, faces)
+
+
+def _odd_first(faces: Index, odd: NDArray[np.bool_]) -> Index:
+    """Rotate each triangle's corners, in their order, until the one that differs comes first."""
+    turn = (np.argmax(odd, axis=1)[:, None] + np.arange(3)) % 3
+    return np.take_along_axis(faces, turn, axis=1)
+
+
+def _compact(values: dict[str, Float], faces: Index) -> Patch:
+    used, corners = np.unique(faces, return_inverse=True)
+    return Patch({name: value[used] for name, value in values.items()}, corners.reshape(faces.shape))
+
 
 Colour = tuple[float, float, float]
 

@@ -16,6 +16,8 @@ from typing import get_args
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.cameras import Intrinsics, project
+from pipelines.geometry.poses import invert, transform
 from pipelines.session.errors import DataError
 from pipelines.session.skeletons import mirrored
 from pipelines.simulation.scenario import DetectorErrors, ModelledDetector
@@ -125,6 +127,27 @@ def _numbers(path: Path, row: list[str]) -> list[float]:
 
 
 # --- the detector --------------------------------------------------------------------------------------
+
+
+def see(joints: Float, position: Float, quaternion_xyzw: Float, intrinsics: Intrinsics) -> Float:
+    """Compute the exact pixels of joints; nothing hides anything.
+
+    Args:
+        joints: [T, J, 3] metres, world.
+        position: [T, 3] metres, world_from_camera; or [T, J, 3] of each joint (or [T, 1, 3]).
+        quaternion_xyzw: [T, 4] unit, or as many as positions.
+        intrinsics: the camera.
+
+    Returns:
+        [T, J, 2] px; NaN behind the camera and outside the picture, whose corner pixels have their
+        centres at (0, 0) and (width - 1, height - 1).
+    """
+    if position.ndim == 2:
+        position, quaternion_xyzw = position[:, None], quaternion_xyzw[:, None]
+    camera_from_world = invert(position, quaternion_xyzw)
+    pixels = project(transform(camera_from_world, joints), intrinsics)
+    inside = (pixels >= -0.5) & (pixels <= np.array([intrinsics.width, intrinsics.height]) - 0.5)
+    return np.where(inside.all(axis=-1, keepdims=True), pixels, np.nan)
 
 
 def view_of(camera: Float, target: Float, *, height_m: float, focal_px: float) -> tuple[Float, Float]:

@@ -6,20 +6,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.cameras import Intrinsics, project, row_delay_s, undistort
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.poses import invert, transform
 from pipelines.session.errors import DataError
 from pipelines.session.records import SkeletalMotion
 from pipelines.simulation.body import Person, make_body
-from pipelines.simulation.detector_errors import detect_keypoints, view_of
+from pipelines.simulation.detector_errors import detect_keypoints, see, view_of
 from pipelines.simulation.flying import DronePaths, Planner, fly, fly_with, moments, ring_slots
 from pipelines.simulation.motion.retarget import retarget
 from pipelines.simulation.motion.script import perform
-from pipelines.simulation.observe import see
 from pipelines.simulation.recording import (
     DronePoses,
     PoseLog,
@@ -30,12 +28,11 @@ from pipelines.simulation.recording import (
     sample_log,
 )
 from pipelines.simulation.rig import BodyMotion
-from pipelines.simulation.scenario import Actor, Lens, Scenario
+from pipelines.simulation.scenario import Actor, Scenario
 from pipelines.simulation.surfaces import Surface, hidden_by
 from pipelines.simulation.world.scene import World, build_world
-from pipelines.simulation.world.terrain import raise_mounds
+from pipelines.simulation.world.solids import raise_mounds
 
-Int64 = NDArray[np.int64]
 Moving = Callable[[Float], BodyMotion]
 
 LEAD_S = 0.2
@@ -164,7 +161,7 @@ def fly_scenario(
     estimates = [_estimated(each, k, scenario, t_s) for k, each in enumerate(set_up.people)]
     actor_ns, actor = estimates[0]
     paths = _paths(scenario, t_s, followed.moving(t_s).root, actor_ns / 1e9, actor, world, planner)
-    lens = _usable(intrinsics_of(scenario.lens))
+    lens = _usable(scenario.lens.intrinsics())
     drones = [_drone(scenario, lens, paths, index, noise, span_s) for index in range(scenario.drones.count)]
 
     t_ns = np.unique(np.concatenate([drone.at_frames.t_ns for drone in drones]))
@@ -285,26 +282,6 @@ def keypoints_of(
             [scenario.seed, _KEYPOINTS, flight.drones.index(drone), *_of_others(flight.people.index(person))]
         ),
         joints=person.person.joints,
-    )
-
-
-def intrinsics_of(lens: Lens) -> Intrinsics:
-    """Return the intrinsics of a camera that looks straight ahead.
-
-    The principal point is the middle of the picture. It is (width - 1) / 2, because pixel centres are whole
-    numbers. `hfov_deg` gives the focal length as without distortion.
-    """
-    focal = lens.width / 2 / float(np.tan(np.radians(lens.hfov_deg / 2)))
-    return Intrinsics(
-        lens.width,
-        lens.height,
-        focal,
-        focal,
-        (lens.width - 1) / 2,
-        (lens.height - 1) / 2,
-        "radtan" if lens.distortion else "none",
-        tuple(lens.distortion or ()),
-        (lens.readout_ms or 0.0) / 1e3,
     )
 
 

@@ -1,21 +1,31 @@
-"""Files of a simulated flight, in the formats that a real one has.
+"""Files of a simulated flight, in the formats that a real one has: manifest, log messages, keypoints, truth.
 
-Numbers are written with enough digits that reading them back costs less than 0.01 mm at 10 m.
+Numbers are written with enough digits that reading them back costs less than 0.01 mm at 10 m. Messages are
+those of ROS 2, their fields plain numbers by name; a stamp is nanoseconds since the epoch, and fields that
+are zero may be left out. Axes are the world's, east-north-up.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
-
-Int64 = NDArray[np.int64]
+from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.poses import conjugate, pose_covariance_in_body
+from pipelines.session.storage import write_json
+from pipelines.simulation.flight import (
+    SimulatedDrone,
+    SimulatedFlight,
+    SimulatedPerson,
+    keypoints_of,
+    picture_stamps,
+    visible_joints,
+)
+from pipelines.simulation.flying import LEVER_ARM
 
 _BOX_MARGIN = 0.15  # of the keypoints' extent, as a person detector's box is larger than the joints
 
@@ -95,3 +105,241 @@ def _alphapose_entry(frame: int, person: Sighting) -> dict[str, object]:
 def write_lines(path: Path, lines: list[str]) -> None:
     """Write lines of text that end as on Linux, on every system."""
     path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+
+
+def write_truth(folder: Path, flight: SimulatedFlight) -> None:
+    """Write the truth at the times of pictures and logs."""
+    start_ns = flight.scenario.start_ns
+    truth = folder / "truth"
+    truth.mkdir()
+    stamps, joint_names = flight.t_ns + start_ns, flight.people[0].person.joints
+    if flight.scenario.actors is None:
+        write_joints(truth / "joints.csv", stamps, joint_names, flight.people[0].joints)
+    else:
+        write_people(truth / "joints.csv", stamps, joint_names, [each.joints for each in flight.people])
+        write_json(truth / "people.json", {"people": [each.name for each in flight.people]})
+    for drone in flight.drones:
+        poses = drone.at_log
+        write_tum(
+            truth / f"{drone.name}.tum",
+            poses.t_ns + start_ns,
+            poses.camera_position,
+            poses.camera_quaternion_xyzw,
+        )
+        write_lines(truth / f"{drone.name}_visible.csv", _visible_lines(flight, drone))
+    offsets = {drone.name: drone.clock_offset_s for drone in flight.drones}
+    write_json(truth / "clocks.json", {"clock_offsets_s": offsets})
+
+
+def _visible_lines(flight: SimulatedFlight, drone: SimulatedDrone) -> list[str]:
+    """Lines of CSV: frame, person where the scenario has `actors`, and 1 or 0 for each joint."""
+    visible = [visible_joints(flight, drone, person)[1].astype(int).astype(str) for person in flight.people]
+    numbered = flight.scenario.actors is not None
+    lines = [",".join(["frame", *(["person"] if numbered else []), *flight.people[0].person.joints])]
+    for frame in range(len(drone.at_frames.t_ns)):
+        for number, rows in enumerate(visible):
+            lines.append(",".join([str(frame), *([str(number)] if numbered else []), *rows[frame]]))
+    return lines
+
+
+def write_keypoints(folder: Path, flight: SimulatedFlight, drone: SimulatedDrone) -> None:
+    """What a detector would have found, as AlphaPose writes it, and when the pictures were taken."""
+    people = [Sighting(1 + k, *keypoints_of(flight, drone, person)) for k, person in enumerate(flight.people)]
+    write_alphapose(folder / f"{drone.name}_keypoints.json", people)
+    stamps = picture_stamps(flight, drone)
+    lines = ["frame,t_ns", *(f"{frame},{stamp}" for frame, stamp in enumerate(stamps.tolist()))]
+    write_lines(folder / f"{drone.name}_frames.csv", lines)
+
+
+_UNKNOWN_CLOCK_SIGMA_S = 0.3
+
+
+def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = False) -> str:
+    """Write the manifest, which ties the files together.
+
+    Args:
+        flight: the flight.
+        video: True for videos; False for keypoints in their place.
+        true_poses: take the true poses for logged ones. Otherwise the manifest states only what a user would
+            know; the truth is only under `truth`.
+    """
+    scenario = flight.scenario
+    lines = [
+        "# Simulated by `mocap simulate` from scenario.yaml; simulation.json says how.",
+        *([] if video else [f"# The keypoints have the measured errors of {scenario.keypoints.detector}."]),
+        *_shot(flight),
+        "schema: 1",
+        f"name: {_quoted(scenario.name)}",
+        "simulated: true",
+        "world: {frame: enu}",
+        "logs:",
+        *(f"  {drone.name}: {{path: {drone.name}.mcap}}" for drone in flight.drones),
+        "cameras:",
+    ]
+    for drone in flight.drones:
+        lines += [*_pictures(flight, drone, video), *_poses(flight, drone, true_poses)]
+    poses = ", ".join(f"{drone.name}: truth/{drone.name}.tum" for drone in flight.drones)
+    lines += [
+        f"actor: {{log: drone1, topic: {flight.people[0].topic}, point: hip}}",
+        "map: site.bt",
+        "truth:",
+        "  joints: truth/joints.csv",
+        f"  poses: {{{poses}}}",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _shot(flight: SimulatedFlight) -> list[str]:
+    """Write a comment on exposure, readout and bit rate; none where all are off."""
+    lens = flight.scenario.lens
+    said = [
+        f"exposure {lens.exposure_ms:g} ms" if lens.exposure_ms else "",
+        f"readout {lens.readout_ms:g} ms" if lens.readout_ms else "",
+        f"{lens.bitrate_mbps:g} Mbit/s" if lens.bitrate_mbps else "",
+    ]
+    if not any(said):
+        return []
+    stamps = "a picture's time is the middle of the exposure of its middle row"
+    return [f"# Pictures: {', '.join(part for part in said if part)}; {stamps}."]
+
+
+def _quoted(text: str) -> str:
+    """Return any text as a scalar of YAML on one line."""
+    plain = text.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in plain) + '"'
+
+
+def _pictures(flight: SimulatedFlight, drone: SimulatedDrone, video: bool) -> list[str]:
+    name = drone.name
+    known = not any(other.clock_offset_s for other in flight.drones)
+    start_ns = int(picture_stamps(flight, drone)[0])
+    whole, fraction = divmod(start_ns, 10**9)
+    if video:
+        pictures = [f"    video: {name}.mp4", f"    frame_times: {{start: {whole}.{fraction:09d}}}"]
+    else:
+        pictures = [
+            f"    frame_times: {{csv: {name}_frames.csv}}",
+            f"    keypoints: {{path: {name}_keypoints.json, format: alphapose, skeleton: coco17}}",
+        ]
+    sigma_s = 0 if known else _UNKNOWN_CLOCK_SIGMA_S
+    intrinsics, readout_s = f"{name}_camera.yaml", drone.intrinsics.readout_s
+    if readout_s:
+        intrinsics = f"{{path: {intrinsics}, readout_s: {readout_s:g}}}"
+    return [
+        f"  {name}:",
+        *pictures,
+        f"    clock: {{offset_s: 0, sigma_s: {sigma_s}}}",
+        f"    intrinsics: {intrinsics}",
+    ]
+
+
+def _poses(flight: SimulatedFlight, drone: SimulatedDrone, true_poses: bool) -> list[str]:
+    name, drones = drone.name, flight.scenario.drones
+    if true_poses:
+        return [f"    pose: {{tum: truth/{name}.tum}}"]
+    arm = ", ".join(f"{v:g}" for v in LEVER_ARM)
+    lines = [
+        f"    pose: {{log: {name}, topic: /{name}/odometry, of: body}}",
+        f"    mount: {{looks: forward, translation: [{arm}]}}",
+        f"    gimbal: {{log: {name}, topic: /{name}/gimbal, relative_to: world}}",
+    ]
+    if drones.pose_noise and drones.state_pose_noise:
+        lines.append("    pose_noise:")
+        for model, parameters in drones.pose_noise.items():
+            stated = ", ".join(f"{key}: {value}" for key, value in parameters.items())
+            lines.append(f"      {model}: {{{stated}}}")
+    return lines
+
+
+_RECEIVED_NS = 2_000_000  # after a message's own stamp, by the recorder on board
+_CAMERA_INFO_NS = 1_000_000_000
+
+
+class LoggedMessage(NamedTuple):
+    """One message, as received."""
+
+    received_ns: int
+    topic: str
+    type: str
+    fields: dict[str, Any]
+
+
+def logged_messages(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[LoggedMessage]:
+    """The messages of one drone in the order of receipt; the first drone hears of the actors, too."""
+    messages = [*_odometry(flight, drone), *_gimbal(flight, drone), *_camera_infos(flight, drone)]
+    if drone is flight.drones[0]:
+        for person in flight.people:
+            messages += _actor(flight, person)
+    for stamp_ns, topic, type_, fields in sorted(messages, key=lambda message: message[:2]):
+        yield LoggedMessage(stamp_ns + _RECEIVED_NS, topic, type_, fields)
+
+
+_Stamped = tuple[int, str, str, dict[str, Any]]
+
+
+def _odometry(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_Stamped]:
+    body = drone.log.body
+    covariance = np.zeros((len(body.t_ns), 6, 6))
+    if body.covariance is not None:  # ROS turns about fixed axes
+        covariance = pose_covariance_in_body(body.covariance, conjugate(body.quaternion_xyzw))
+    for k, stamp_ns in enumerate((body.t_ns + flight.scenario.start_ns).tolist()):
+        pose = {"position": _xyz(body.position[k]), "orientation": _xyzw(body.quaternion_xyzw[k])}
+        fields = {
+            "header": {"stamp": stamp_ns, "frame_id": "world"},
+            "child_frame_id": f"{drone.name}/body",
+            "pose": {"pose": pose, "covariance": covariance[k]},
+        }
+        yield stamp_ns, f"/{drone.name}/odometry", "nav_msgs/msg/Odometry", fields
+
+
+def _gimbal(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_Stamped]:
+    stamps = (drone.log.body.t_ns + flight.scenario.start_ns).tolist()
+    for stamp_ns, attitude in zip(stamps, drone.log.gimbal_xyzw, strict=True):
+        header = {"stamp": stamp_ns, "frame_id": "world"}
+        fields = {"header": header, "quaternion": _xyzw(attitude)}
+        yield stamp_ns, f"/{drone.name}/gimbal", "geometry_msgs/msg/QuaternionStamped", fields
+
+
+def _camera_infos(flight: SimulatedFlight, drone: SimulatedDrone) -> Iterator[_Stamped]:
+    lens = drone.intrinsics
+    fields = {
+        "width": lens.width,
+        "height": lens.height,
+        "distortion_model": "rational_polynomial" if len(lens.distortion) > 5 else "plumb_bob",
+        "d": [*lens.distortion, *[0.0] * (5 - len(lens.distortion))],
+        "k": [lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0],
+        "r": np.eye(3),
+        "p": [lens.fx, 0.0, lens.cx, 0.0, 0.0, lens.fy, lens.cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+    }
+    first, last = drone.log.body.t_ns[[0, -1]] + flight.scenario.start_ns
+    for stamp_ns in range(int(first), int(last), _CAMERA_INFO_NS):
+        header = {"stamp": stamp_ns, "frame_id": f"{drone.name}/camera"}
+        yield (
+            stamp_ns,
+            f"/{drone.name}/camera/camera_info",
+            "sensor_msgs/msg/CameraInfo",
+            {"header": header, **fields},
+        )
+
+
+def _actor(flight: SimulatedFlight, person: SimulatedPerson) -> Iterator[_Stamped]:
+    sigma = person.look.estimate_sigma_m
+    covariance = np.diag([sigma**2] * 3 + [0.0] * 3)
+    for stamp_ns, place in zip(
+        (person.estimate_ns + flight.scenario.start_ns).tolist(), person.estimate, strict=True
+    ):
+        pose = {"position": _xyz(place), "orientation": {"w": 1.0}}
+        fields = {
+            "header": {"stamp": stamp_ns, "frame_id": "world"},
+            "pose": {"pose": pose, "covariance": covariance},
+        }
+        yield stamp_ns, person.topic, "geometry_msgs/msg/PoseWithCovarianceStamped", fields
+
+
+def _xyz(vector: np.ndarray[Any, Any]) -> dict[str, float]:
+    return dict(zip("xyz", vector.tolist(), strict=True))
+
+
+def _xyzw(quaternion: np.ndarray[Any, Any]) -> dict[str, float]:
+    return dict(zip("xyzw", quaternion.tolist(), strict=True))

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.mounting import body_from_camera
 from pipelines.geometry.noise import GaussMarkov, NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import (
@@ -25,8 +24,6 @@ from pipelines.geometry.poses import (
 from pipelines.session.records import Trajectory
 from pipelines.simulation.flying import LEVER_ARM, DronePaths
 from pipelines.simulation.scenario import Lens
-
-Int64 = NDArray[np.int64]
 
 JITTER_SHARE = 0.02  # sigma of a log's stamps, of the time between them; at most ten times that
 _LARGEST_JITTER = 0.2

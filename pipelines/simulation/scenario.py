@@ -11,6 +11,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import (
     AfterValidator,
     Field,
@@ -20,9 +21,8 @@ from pydantic import (
     model_validator,
 )
 
-from pipelines.geometry.cameras import COEFFICIENT_COUNTS
-from pipelines.session.manifest import SecondsAsNs
-from pipelines.session.yaml_files import Part, read_yaml_model
+from pipelines.geometry.cameras import COEFFICIENT_COUNTS, Intrinsics
+from pipelines.session.yaml_files import Part, SecondsAsNs, read_yaml_model
 
 SCHEMA = 2
 _MOST_VOXELS = 20_000_000
@@ -302,6 +302,25 @@ class Lens(Part):
                     f"{name}: {getattr(self, name):g} ms do not fit between pictures {period_ms:.3g} ms apart"
                 )
         return self
+
+    def intrinsics(self) -> Intrinsics:
+        """Return the intrinsics of a camera that looks straight ahead.
+
+        The principal point is the middle of the picture. It is (width - 1) / 2, because pixel centres are
+        whole numbers. `hfov_deg` gives the focal length as without distortion.
+        """
+        focal = self.width / 2 / float(np.tan(np.radians(self.hfov_deg / 2)))
+        return Intrinsics(
+            self.width,
+            self.height,
+            focal,
+            focal,
+            (self.width - 1) / 2,
+            (self.height - 1) / 2,
+            "radtan" if self.distortion else "none",
+            tuple(self.distortion or ()),
+            (self.readout_ms or 0.0) / 1e3,
+        )
 
     @model_serializer(mode="wrap")
     def _as_stated(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from pipelines.keypoints.tracking import TrackedPerson
 from pipelines.session.registries import Person, Region
 from pipelines.session.skeletons import get_skeleton
 from pipelines.simulation.study import settings
-from pipelines.simulation.study.filming import RANGE_M, exact_keypoints, formation, views_of, walk
+from pipelines.simulation.study.sightings import RANGE_M, exact_keypoints, formation, views_of, walk
 from tests.commands.runner import content
 
 TRUSTING = ("--methods", "dlt,midpoint,robust")  # refined takes longer than all of them

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.session.records import JointMotion, Occupancy, Recording, Trajectory
-from pipelines.simulation.walk import COCO17, walk
+from tests.synthetic.walk import COCO17, walk
 
 START_NS = 1_700_000_000_000_000_000
 FPS = 30

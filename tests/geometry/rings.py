@@ -6,7 +6,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.triangulation import Views
-from pipelines.simulation.walk import walk
+from tests.synthetic.walk import walk
 
 FOCAL = 1500.0
 LEVELS = {"a": (0.1, 0.5), "b": (0.3, 1.0), "c": (0.5, 2.0)}  # m, deg per axis: METHODS 1.3

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.poses import look_at
+from pipelines.simulation.detector_errors import see
 from pipelines.simulation.flight_files import write_tum
-from pipelines.simulation.observe import see
 from tests.keypoints.onnx_graphs import constant_model, heatmap_model, spots
 
 START_S, FPS = 1_700_000_000, 30

@@ -8,9 +8,9 @@ import pytest
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import look_at
 from pipelines.keypoints.swaps import exchange, mirrored_pairs, undo_swaps
-from pipelines.simulation.observe import see
-from pipelines.simulation.walk import COCO17, walk
+from pipelines.simulation.detector_errors import see
 from tests.synthetic.flights import LENS
+from tests.synthetic.walk import COCO17, walk
 
 FPS, SECONDS, NOISE_PX = 30, 20, 2.0
 PAIRS = mirrored_pairs(COCO17)

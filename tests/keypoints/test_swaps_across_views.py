@@ -11,9 +11,9 @@ from pipelines.geometry.poses import look_at, matrix_from_quaternion
 from pipelines.keypoints.swaps import Pair, mirrored_pairs
 from pipelines.keypoints.swaps_across_views import swaps_across_views
 from pipelines.reconstruction.observations import on_sides
-from pipelines.simulation.observe import see
-from pipelines.simulation.walk import COCO17, walk
+from pipelines.simulation.detector_errors import see
 from tests.synthetic.flights import LENS
+from tests.synthetic.walk import COCO17, walk
 
 NOISE_PX = 2.0
 T_S = np.arange(150) / 15

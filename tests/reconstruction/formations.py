@@ -13,8 +13,8 @@ from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.geometry.triangulation import Views, estimate_noise, triangulate_pictures
 from pipelines.reconstruction.refinement.problem import Sighting
 from pipelines.session.skeletons import bones_of
-from pipelines.simulation.drone_paths import orbit
-from pipelines.simulation.walk import COCO17, route, walk
+from pipelines.simulation.flying import orbit
+from tests.synthetic.walk import COCO17, route, walk
 
 FPS = 30.0
 FOCAL_PX = 1500.0

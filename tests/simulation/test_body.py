@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import multiply, quaternion_from_rotation_vector, rotate
-from pipelines.simulation.body import Person, make_body
-from pipelines.simulation.body_skinning import moving_weights
+from pipelines.simulation.body import Person, make_body, moving_weights
 from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES, BodyMotion, joint_centres, sole_points
 from pipelines.simulation.scenario import Body
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float
-from pipelines.simulation.body_patches import Patch, cut, normals, pick, together, triangles
+from pipelines.simulation.body_outfits import Patch, cut, normals, pick, together, triangles
 
 
 def sheet(n: int = 6) -> Patch:

@@ -29,7 +29,7 @@ from pipelines.simulation.detector_errors import (
     view_of,
 )
 from pipelines.simulation.scenario import DetectorErrors
-from pipelines.simulation.walk import COCO17
+from tests.synthetic.walk import COCO17
 
 # Of a prototype's measurement, the same for all joints; what comes along is measured again now and then.
 EXAMPLE = read_errors(Path(__file__).parent / "example_detector_errors.csv")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pipelines.geometry.poses import look_at, matrix_from_quaternion
-from pipelines.simulation.drone_paths import orbit
-from pipelines.simulation.observe import see
-from pipelines.simulation.walk import COCO17, walk
+from pipelines.simulation.detector_errors import see
+from pipelines.simulation.flying import orbit
 from tests.synthetic.flights import LENS
+from tests.synthetic.walk import COCO17, walk
 
 T_S = np.linspace(0, 20, 41)
 TARGET = np.stack([1.2 * T_S, 3.0 + 0 * T_S, 1.0 + 0 * T_S], axis=1)

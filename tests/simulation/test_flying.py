@@ -9,7 +9,6 @@ import pytest
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion
-from pipelines.simulation.drone_paths import orbit
 from pipelines.simulation.flying import (
     ATTITUDE_LAG_S,
     GIMBAL_LAG_S,
@@ -24,6 +23,7 @@ from pipelines.simulation.flying import (
     fly,
     fly_with,
     moments,
+    orbit,
     ring_slots,
 )
 from pipelines.simulation.scenario import Formation, Limits

@@ -8,10 +8,11 @@ import pytest
 
 from pipelines.geometry.cameras import camera_matrix
 from pipelines.geometry.poses import invert, look_at, rotation_vector_from_quaternion
-from pipelines.simulation.drone_paths import orbit
-from pipelines.simulation.observe import KeypointNoise, detect, see
-from pipelines.simulation.walk import walk
+from pipelines.simulation.detector_errors import see
+from pipelines.simulation.flying import orbit
 from tests.synthetic.flights import LENS
+from tests.synthetic.keypoints import KeypointNoise, detect
+from tests.synthetic.walk import walk
 
 T_S = np.linspace(0, 5, 7)
 TARGET = np.stack([1.2 * T_S, 0 * T_S, 1.0 + 0 * T_S], axis=1)

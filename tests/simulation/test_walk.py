@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float
 from pipelines.session.skeletons import mirrored
-from pipelines.simulation.walk import COCO17, route, stride_m, walk
+from tests.synthetic.walk import COCO17, route, stride_m, walk
 
 LIMBS = {  # fractions of the body's height, Drillis & Contini
     ("hip", "knee"): 0.530 - 0.285,

@@ -17,10 +17,11 @@ from pipelines.geometry.cameras import Intrinsics, camera_matrix
 from pipelines.geometry.noise import disturb
 from pipelines.geometry.poses import invert, look_at, rotation_vector_from_quaternion
 from pipelines.session.registries import noise_models
-from pipelines.simulation.drone_paths import orbit
+from pipelines.simulation.detector_errors import see
 from pipelines.simulation.flight_files import Sighting, write_alphapose, write_joints, write_tum
-from pipelines.simulation.observe import KeypointNoise, detect, see
-from pipelines.simulation.walk import COCO17, route, walk
+from pipelines.simulation.flying import orbit
+from tests.synthetic.keypoints import KeypointNoise, detect
+from tests.synthetic.walk import COCO17, route, walk
 
 Int64 = NDArray[np.int64]
 

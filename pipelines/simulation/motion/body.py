@@ -10,12 +10,16 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import multiply, rotate
 from pipelines.simulation.motion import gait
-from pipelines.simulation.motion.feet import Foot, foot_over_time, sole_of
-from pipelines.simulation.motion.keys import Keys
-from pipelines.simulation.motion.legs import leg_rotations, pelvis_height, two_bones
-from pipelines.simulation.motion.plan import Plan
-from pipelines.simulation.motion.turns import about, partly
-from pipelines.simulation.rig import BONE, BONES, SIDES, BodyMotion, Rig
+from pipelines.simulation.motion.legs import (
+    Foot,
+    foot_over_time,
+    leg_rotations,
+    pelvis_height,
+    sole_of,
+    two_bones,
+)
+from pipelines.simulation.motion.plan import Keys, Plan
+from pipelines.simulation.rig import BONE, BONES, SIDES, BodyMotion, Rig, about, partly
 
 Heights = Callable[[Float], Float]
 

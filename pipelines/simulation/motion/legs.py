@@ -1,16 +1,221 @@
-"""Limbs of two bones that reach a point, and the height of a pelvis whose legs reach the ground."""
+"""Feet over time, and the legs that reach them.
+
+A foot is planted, rolls over heel, ball and tip while it carries, and then swings to the next place. A
+planted foot turns about the point of it that touches the ground: the heel from the strike until the
+sole is flat, then, once the heel rises, the joint of the toes, which stay flat behind until they have bent
+as far as they go and the foot tips over their end.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import conjugate, multiply, rotate
-from pipelines.simulation.motion.feet import Foot
-from pipelines.simulation.motion.turns import about, from_axes, unit
-from pipelines.simulation.rig import BONE, SIDES, Rig
+from pipelines.simulation.motion.gait import Roll, roll
+from pipelines.simulation.motion.plan import Footstep, Keys
+from pipelines.simulation.rig import BONE, SIDES, Rig, about, from_axes, unit
+
+Heights = Callable[[Float], Float]
+
+_FULL_SWING_M = 1.3  # of a leg of 0.93 m
+_TOES_BEND = np.radians(42.0)
+_SOFTNESS_M = (0.0003, 0.02)  # range over which the point changes that a foot turns about: planted, swung
+_LONGEST_ROLL_S = 0.8  # in a longer stance the foot is flat for the rest
+_STILL_SHARE = 0.05  # of the swing at either end; there the foot goes only up or down
+_SET_DOWN = 0.65  # share of the stance that belongs to the strike, the rest to the lift
+_HALF_WIDTH_M = 0.04
+
+
+@dataclass(frozen=True)
+class Foot:
+    """One foot over time."""
+
+    ankle: Float  # [T, 3] m
+    rotation: Float  # [T, 4] world_from_foot
+    toes: Float  # [T, 4]
+    carries: Float  # [T] 1 while it is planted, 0 in the middle of a swing
+    kicks: Float  # [T] 1 while it swings as a kick, not as a step
+    least_knee: Float  # [T] rad, least flexion of its knee
+
+
+def foot_over_time(
+    rig: Rig, side: int, t_s: Float, steps: Sequence[Footstep], extra: Keys, ground: Heights
+) -> Foot:
+    """Compute the place and the attitude of a foot over time.
+
+    Args:
+        rig: the person's bones.
+        side: 0 is left.
+        t_s: [T]
+        steps: in the order of time; the first only gives the foot's place at the beginning.
+        extra: curves beside the steps: `heel_deg`, the angle by which both heels are raised, `left_kick`,
+            `right_kick`.
+        ground: heights of places [N, 2].
+    """
+    keys = _keys_of_steps(steps, leg_m=rig.length_of_leg)
+    curve = {name: keys.at(name, t_s) for name in ("x", "y", "yaw", "clear", "soft", "bent", "carries")}
+    joint, heel, tip = _sole(rig, side)
+    place = np.stack([curve["x"], curve["y"]], axis=1)
+    base, tilt, rise = _on_ground(place, curve["yaw"], heel[0], tip[0], ground)
+    pitch = np.radians(keys.at("pitch_deg", t_s) - extra.at("heel_deg", t_s))
+    # Uphill the heel behind rises as much more as the ground is steep.
+    pitch -= keys.at("leaves", t_s) * np.arctan((rise + np.hypot(rise, 0.02)) / 2)
+
+    bend = curve["bent"] * _bent_toes(pitch)
+    ankle_xz = _rolled(joint, heel, tip, pitch, bend, curve["soft"])
+    ankle_xz[:, 1] += curve["clear"]
+
+    frame = multiply(about(2, curve["yaw"]), tilt)
+    flat = np.array([0.0, 0.0, -heel[1]])
+    moved = np.stack([ankle_xz[:, 0], np.zeros(len(t_s)), ankle_xz[:, 1]], axis=1)
+    rotation = multiply(frame, about(1, -pitch))
+    return Foot(
+        ankle=base + rotate(frame, flat + moved),
+        rotation=rotation,
+        toes=multiply(rotation, about(1, -bend)),
+        carries=curve["carries"],
+        kicks=extra.at(f"{SIDES[side]}_kick", t_s),
+        least_knee=np.radians(keys.at("knee_deg", t_s)),
+    )
+
+
+def sole_of(rig: Rig, side: int, foot: Foot) -> tuple[Float, Float]:
+    """Compute heel and tip of a foot, [T, 3] m, world."""
+    joint = rig.offset[BONE[f"{SIDES[side]}_toes"]]
+    heel, _, tip = rig.sole[side]
+    at_tip = rotate(foot.rotation, joint) + rotate(foot.toes, tip - joint)
+    return foot.ankle + rotate(foot.rotation, heel), foot.ankle + at_tip
+
+
+def _sole(rig: Rig, side: int) -> tuple[Float, Float, Float]:
+    """Return the joint of the toes, heel and tip from the ankle, forward and up, [2] m each."""
+    joint = rig.offset[BONE[f"{SIDES[side]}_toes"]]
+    heel, _, tip = rig.sole[side]
+    return joint[[0, 2]], heel[[0, 2]], np.array([tip[0], heel[2]])
+
+
+def _keys_of_steps(steps: Sequence[Footstep], leg_m: float) -> Keys:
+    """Write the curves of one foot: the place of its flat sole, its pitch, its height in swing."""
+    keys = Keys()
+    extents = [_extent(a, b, leg_m) for a, b in pairwise(steps)]
+    runs = [(a.run + b.run) / 2 for a, b in pairwise(steps)]
+    for i, step in enumerate(steps):
+        came, goes = (extents[i - 1] if i else 0.0), (extents[i] if i < len(extents) else 0.0)
+        lift_s = steps[i + 1].lift_s if i < len(extents) else None
+        rolled = roll(step.run, came, goes)
+        for name, value in (("x", float(step.place[0])), ("y", float(step.place[1])), ("yaw", step.yaw)):
+            early_s = _STILL_SHARE * (step.strike_s - step.lift_s)
+            keys.add(name, (step.strike_s - early_s, value), (step.strike_s, value))
+            if lift_s is not None:
+                late_s = _STILL_SHARE * (steps[i + 1].strike_s - lift_s)
+                keys.add(name, (lift_s, value), (lift_s + late_s, value))
+        _stance(keys, step.strike_s, lift_s, rolled)
+        if lift_s is not None:
+            swung = roll(runs[i], goes, goes)
+            _onward(keys, lift_s, step, steps[i + 1], swung)
+            _swing(keys, lift_s, steps[i + 1].strike_s, swung)
+    return keys
+
+
+def _extent(before: Footstep, after: Footstep, leg_m: float) -> float:
+    """Compute the length of a swing, as a share of a full stride of walking."""
+    moved = float(np.hypot(*(after.place - before.place))) + 0.15 * abs(after.yaw - before.yaw)
+    return moved * 0.93 / (leg_m * _FULL_SWING_M)
+
+
+def _stance(keys: Keys, strike_s: float, lift_s: float | None, rolled: Roll) -> None:
+    """Write the keys from the strike until the foot is flat, and, if it lifts, from heel rise to lift."""
+    lasting = _LONGEST_ROLL_S if lift_s is None else min(lift_s - strike_s, _LONGEST_ROLL_S)
+    for name, value in (("pitch_deg", rolled.strike_deg), ("clear", 0.0), ("soft", _SOFTNESS_M[0])):
+        keys.add(name, (strike_s, value))
+    keys.add("bent", (strike_s, 1.0))
+    keys.add("carries", (strike_s, 1.0))
+    for name, curve in (("pitch_deg", rolled.stance_deg), ("knee_deg", rolled.knee_deg)):
+        down = [(share, value) for share, value in curve if share <= _SET_DOWN]
+        keys.add(name, *((strike_s + share * lasting, value) for share, value in down))
+        if lift_s is not None:
+            up = [down[-1], *curve[len(down) :]]
+            keys.add(name, *((lift_s - (1 - share) * lasting, value) for share, value in up))
+    if lift_s is None:
+        return
+    keys.add("pitch_deg", (lift_s, rolled.lift_deg))
+    for name, value in (("clear", 0.0), ("soft", _SOFTNESS_M[0]), ("bent", 1.0), ("carries", 1.0)):
+        keys.add(name, (lift_s, value))
+    keys.add("leaves", (lift_s - 0.5 * lasting, 0.0), (lift_s - 0.18 * lasting, 0.9), (lift_s, 1.0))
+
+
+def _onward(keys: Keys, lift_s: float, before: Footstep, after: Footstep, rolled: Roll) -> None:
+    """Write the keys from one place on the ground to the next, without these two."""
+    for name, start, end in (
+        ("x", before.place[0], after.place[0]),
+        ("y", before.place[1], after.place[1]),
+        ("yaw", before.yaw, after.yaw),
+    ):
+        for share, there in rolled.onward:
+            keys.add(name, (lift_s + share * (after.strike_s - lift_s), float(start + there * (end - start))))
+
+
+def _swing(keys: Keys, lift_s: float, strike_s: float, rolled: Roll) -> None:
+    """Write the keys from the lift to the strike, without these two."""
+    for name, curve in (
+        ("pitch_deg", rolled.swing_deg),
+        ("clear", rolled.clearance_m),
+        ("soft", ((0.25, _SOFTNESS_M[1]), (0.75, _SOFTNESS_M[1]))),
+        ("bent", ((0.35, rolled.toes), (0.9, rolled.toes))),
+        ("leaves", ((0.5, 0.0),)),
+        ("carries", ((0.2, 0.0), (0.6, 0.0), (rolled.carries, 1.0))),
+    ):
+        keys.add(name, *((lift_s + share * (strike_s - lift_s), value) for share, value in curve))
+
+
+def _bent_toes(pitch: Float) -> Float:
+    """Compute the bend of toes that lie on the ground, [T] rad: all of the pitch, up to a limit."""
+    raised = np.maximum(-pitch, 0.0)
+    # x / (1 + x^8)^(1/8): as good as x below three quarters of the limit.
+    part = raised / _TOES_BEND
+    return np.asarray(raised / (1 + part**8) ** 0.125, dtype=np.float64)
+
+
+def _turned(point: Float, pitch: Float) -> Float:
+    """Turn a point of the foot, pitched toes up by [T] rad: [T, 2] forward and up."""
+    cosine, sine = np.cos(pitch), np.sin(pitch)
+    return np.stack([cosine * point[0] - sine * point[1], sine * point[0] + cosine * point[1]], axis=1)
+
+
+def _rolled(joint: Float, heel: Float, tip: Float, pitch: Float, bend: Float, softness_m: Float) -> Float:
+    """Compute the ankle's shift from its place with a flat sole, [T, 2] m, if one point stays put.
+
+    The point is the lower one of heel and tip; where both are as low, the change from one to the other is
+    spread over `softness_m` of the difference of their heights.
+    """
+    heel_now = _turned(heel, pitch)
+    tip_now = _turned(joint, pitch) + _turned(tip - joint, pitch + bend)
+    lower = np.clip((tip_now[:, 1] - heel_now[:, 1]) / softness_m, -500.0, 500.0)
+    on_heel = (1 / (1 + np.exp(-lower)))[:, None]
+    return on_heel * (heel - heel_now) + (1 - on_heel) * (tip - tip_now)
+
+
+def _on_ground(
+    place: Float, yaw: Float, heel_m: float, tip_m: float, ground: Heights
+) -> tuple[Float, Float, Float]:
+    """Find the place of a flat sole: [T, 3] m below the ankle, the ground's tilt [T, 4], its slope [T]."""
+    ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    at_heel, at_tip = ground(place + heel_m * ahead), ground(place + tip_m * ahead)
+    rise = (at_tip - at_heel) / (tip_m - heel_m)
+    middle = place + 0.5 * (heel_m + tip_m) * ahead
+    across = (ground(middle + _HALF_WIDTH_M * left) - ground(middle - _HALF_WIDTH_M * left)) / (
+        2 * _HALF_WIDTH_M
+    )
+    base = np.concatenate([place, (at_heel - heel_m * rise)[:, None]], axis=1)
+    tilt = multiply(about(1, -np.arctan(rise)), about(0, np.arctan(across * np.cos(np.arctan(rise)))))
+    return base, tilt, rise
+
 
 _HANGS_FREE_M = 0.02  # allowed height of the pelvis above the reach of a leg that does not carry
 _STRETCHED_M = 0.002  # near a straight limb, its reach is softened over about this length

@@ -5,16 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Bytes, Float, Float32, Int32
 from pipelines.geometry.compilation import cached
-from pipelines.simulation.rendering.meshes import GROUND, SMOOTH, Mesh
-from pipelines.simulation.rendering.raster import NOTHING, SHIFTS_PX, SUBROWS, Band
-
-Float32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
-UInt8 = NDArray[np.uint8]
+from pipelines.simulation.rendering.raster import GROUND, NOTHING, SHIFTS_PX, SMOOTH, SUBROWS, Band, Mesh
 
 
 class View(NamedTuple):
@@ -31,7 +25,7 @@ class Fragments(NamedTuple):
 
     pixel: Int32  # [N] of the band, row by row
     share: Float32  # [N] of the pixel's samples
-    on_ground: UInt8  # [N] 0, or 1 + the pixel's place in a pattern of 4 x 4 for the texture
+    on_ground: Bytes  # [N] 0, or 1 + the pixel's place in a pattern of 4 x 4 for the texture
     point: Float32  # [N, 3] m, world
     normal: Float32  # [N, 3] unit, towards the camera's side of the face
     colour: Float32  # [N, 3] RGB reflectance
@@ -102,10 +96,10 @@ def _gather(
     faces: Int32,
     normals: Float32,
     colours: Float32,
-    kind: UInt8,
+    kind: Bytes,
     pixel: Int32,
     share: Float32,
-    on_ground: UInt8,
+    on_ground: Bytes,
     point: Float32,
     normal: Float32,
     colour: Float32,

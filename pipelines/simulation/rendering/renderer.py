@@ -6,33 +6,30 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.arrays import Bool, Bytes, Float, Float32
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.poses import matrix_from_quaternion
+from pipelines.simulation.rendering.camera import DistortingLens, developed
 from pipelines.simulation.rendering.fragments import View, gather, room_for
-from pipelines.simulation.rendering.ground import ground_texture, paint
-from pipelines.simulation.rendering.lens import DistortingLens
-from pipelines.simulation.rendering.meshes import GROUND, Mesh, mesh_of, stacked
 from pipelines.simulation.rendering.raster import (
     CENTRES_PX,
+    GROUND,
     NOTHING,
     SHIFTS_PX,
     SUBROWS,
     Band,
+    Mesh,
     bands,
     draw,
     empty_band,
+    mesh_of,
     projected,
+    stacked,
 )
-from pipelines.simulation.rendering.sensor import developed
-from pipelines.simulation.rendering.shading import shade
+from pipelines.simulation.rendering.shading import ground_texture, paint, shade
 from pipelines.simulation.rendering.shadows import ShadowMap, shadow_map, sun_axes, sunlight
 from pipelines.simulation.surfaces import Surface
-
-Float32 = NDArray[np.float32]
-UInt8 = NDArray[np.uint8]
 
 _BAND_ROWS = 16  # pixel rows whose samples fit a processor's cache
 _STATIC_TEXEL_M, _STATIC_TEXELS = 0.02, 2048
@@ -81,7 +78,7 @@ class Renderer:
 
     def picture(
         self, position: Float, quaternion_xyzw: Float, people: Sequence[Surface], frame: int
-    ) -> UInt8:
+    ) -> Bytes:
         """Render the camera's picture.
 
         Args:
@@ -95,7 +92,7 @@ class Renderer:
         """
         return self.exposed([Moment(position, quaternion_xyzw, people)], np.ones((1, self._size[0])), frame)
 
-    def exposed(self, moments: Sequence[Moment], weights: Float, frame: int) -> UInt8:
+    def exposed(self, moments: Sequence[Moment], weights: Float, frame: int) -> Bytes:
         """Render what the camera sees while its rows are exposed.
 
         Args:

@@ -6,16 +6,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Bytes, Float, Float32
 from pipelines.geometry.compilation import cached
 from pipelines.simulation.rendering.fragments import Fragments
-from pipelines.simulation.rendering.meshes import Mesh
-from pipelines.simulation.rendering.raster import CENTRES_PX, Projected, draw, empty_band
-
-Float32 = NDArray[np.float32]
-UInt8 = NDArray[np.uint8]
+from pipelines.simulation.rendering.raster import CENTRES_PX, Mesh, Projected, draw, empty_band
 
 _MARGIN = 4  # texels around the region
 _STEP = 6.0  # texels of height between neighbours: more than on slopes that the sun lights well
@@ -25,7 +20,7 @@ class ShadowMap(NamedTuple):
     """Height of the topmost surface above each cell of a plane across the sun's rays."""
 
     height: Float32  # [H, W] m towards the sun, -inf where the sun hits nothing
-    edge: UInt8  # [H, W] 1 where a filtered look-up may find lit and shaded texels side by side
+    edge: Bytes  # [H, W] 1 where a filtered look-up may find lit and shaded texels side by side
     corner: Float  # [2] m, corner of the first texel, along the axes of `sun_axes`
     texel_m: float
 
@@ -85,7 +80,7 @@ def _face_sun(normal: Float32, towards: Float, sun: Float32) -> None:
 @cached
 def _cast(
     height: Float32,
-    edge: UInt8,
+    edge: Bytes,
     corner: Float,
     texel_m: float,
     axes: Float,
@@ -138,7 +133,7 @@ def _cast(
 
 
 @cached
-def _edges(height: Float32, step: float) -> UInt8:
+def _edges(height: Float32, step: float) -> Bytes:
     """Mark texels where heights within the 4 x 4 texels of a look-up differ by more than a step."""
     rows, width = height.shape
     lowest, highest = np.empty((rows, width), np.float32), np.empty((rows, width), np.float32)

@@ -1,1 +1,1 @@
-"""Studies of the causes of reconstruction error: their settings, and the filmed scenes."""
+"""Studies of the causes of reconstruction error: their settings, and what their cameras see."""

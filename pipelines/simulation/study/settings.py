@@ -12,7 +12,6 @@ from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.triangulation import Method
 from pipelines.session.errors import DataError
 from pipelines.session.registries import find_detector, parsed_noise_models
-from pipelines.simulation.study.filming import LONGEST_S
 
 Study = Literal["tilt", "robots", "noise"]
 Keypoints = Literal["model", "exact"]
@@ -23,6 +22,7 @@ LEVELS = {"none": (0.0, 0.0), "low": (0.1, 0.5), "medium": (0.3, 1.0), "high": (
 StudyMethod = Method | Literal["refined"]
 METHODS: tuple[StudyMethod, ...] = (*get_args(Method), "refined")
 
+_LONGEST_S = 600.0  # of a walk
 _CORRELATION_S = 10.0  # of gauss-markov
 _FEWEST_REFINED = 20  # pictures: below, it would always be robust
 _DRONES, _TILT_DEG, _STEEPEST_DEG = (2, 8), 15.0, 85.0
@@ -111,7 +111,7 @@ def settings_for(
     _check_names("--levels", levels, tuple(LEVELS))
     _check_range("--tilts", tilts_deg, -10.0, _STEEPEST_DEG)
     _check_range("--robots", drones, *_DRONES)
-    _check_range("--seconds", [seconds], 0.1, LONGEST_S)
+    _check_range("--seconds", [seconds], 0.1, _LONGEST_S)
     _check_range("--rate", [rate_hz], 0.1, 240.0)
     _check_range("--trials", [trials], 1, 10_000)
     for name, values in (("--tilts", tilts_deg), ("--robots", drones), ("--noise", noise)):

@@ -22,12 +22,15 @@ from pipelines.geometry.poses import (
     transform,
 )
 from pipelines.simulation.body import make_body
-from pipelines.simulation.rendering import Renderer
-from pipelines.simulation.rendering.ground import FULL_SCALE, TILE_TEXELS, ground_texture
-from pipelines.simulation.rendering.renderer import Moment
-from pipelines.simulation.rendering.sensor import EXPOSURE, NOISE
-from pipelines.simulation.rendering.shading import HAZE_M, HORIZON_RGB
-from pipelines.simulation.rendering.shutter import STEP_S, exposed_moments
+from pipelines.simulation.rendering.camera import EXPOSURE, NOISE, STEP_S, exposed_moments
+from pipelines.simulation.rendering.renderer import Moment, Renderer
+from pipelines.simulation.rendering.shading import (
+    FULL_SCALE,
+    HAZE_M,
+    HORIZON_RGB,
+    TILE_TEXELS,
+    ground_texture,
+)
 from pipelines.simulation.rig import BONES
 from pipelines.simulation.scenario import Body
 from pipelines.simulation.surfaces import Surface, hidden_by

@@ -1,39 +1,35 @@
-"""Scene of the formation studies: a long walk on level ground, filmed from ideal positions.
+"""A walking person as the cameras of a formation see them, and the measures of what was seen.
 
 No drone flies in a study: the cameras are exactly in their slots about the walking person at every moment and
 look at the person, as in the simulated experiments of Ho et al., "3D Human Reconstruction in the Wild with
 Collaborative Aerial Cameras". Only the keypoints and the logged poses have errors, of known size. Trial k of
 camera i has the same random numbers in every formation and for every size of the errors, so that differences
-between formations are not due to chance.
+between formations are not due to chance. Stage `film` measures the arms of a comparison in the same way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.cameras import Intrinsics, undistort
+from pipelines.geometry.metrics import common, measure
 from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import matrix_from_quaternion, rates
-from pipelines.geometry.triangulation import Views
-from pipelines.session.records import Int64
+from pipelines.geometry.triangulation import Views, reprojection_px
 from pipelines.simulation.body import Person, make_body
-from pipelines.simulation.detector_errors import detect_keypoints, view_of
-from pipelines.simulation.drone_paths import orbit
-from pipelines.simulation.flight import intrinsics_of
+from pipelines.simulation.detector_errors import detect_keypoints, see, view_of
+from pipelines.simulation.flying import orbit
 from pipelines.simulation.motion.script import perform
-from pipelines.simulation.observe import see
 from pipelines.simulation.rig import BodyMotion
 from pipelines.simulation.scenario import Body, DetectorErrors, Lens, Step, Travel
 
 RANGE_M = 10.0
 """Distance from the person to every camera, m."""
-
-LONGEST_S = 600.0
-"""Longest duration of a walk, s."""
 
 CIRCLE_M = 15.0
 """Radius of the way: the person is seen from all sides."""
@@ -87,7 +83,7 @@ def walk(seconds: float, rate_hz: float, seed: int) -> Walk:
     """Return a person who walks on a circle at an even pace.
 
     Args:
-        seconds: duration, at most `LONGEST_S`.
+        seconds: duration.
         rate_hz: of the pictures.
         seed: of the person's way of walking.
     """
@@ -143,7 +139,7 @@ def formation(of: Walk, *, cameras: int, tilt_deg: float) -> Formation:
         tilt_deg=tilt_deg,
         yaw_rate_deg_per_s=0.0,
     )
-    return Formation(position, quaternion, intrinsics_of(Lens()))
+    return Formation(position, quaternion, Lens().intrinsics())
 
 
 def exact_keypoints(of: Walk, seen_by: Formation) -> Sightings:
@@ -226,3 +222,81 @@ def views_of(
         pixel_sigma=np.full(cameras, PIXEL_SIGMA),
         pose_sigma=sigma,
     )
+
+
+NEAR_SHARE = 0.1
+"""Largest error of a right keypoint, as a share of the height in pixels of a person at that place."""
+
+_NEAR_TILT_DEG = 5.0
+_ERRORS = ("reconstructed_share", "mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm", "pck150")
+
+
+def measure_arm(
+    of: Walk,
+    seen_by: Formation,
+    sightings: Sightings,
+    views: Views,
+    points: Float,
+    *,
+    tilt_deg: Float,
+    range_m: Float,
+    desired_tilt_deg: float,
+) -> dict[str, Any]:
+    """Measure an arm: figures by their names in film/metrics.json.
+
+    Shares are of pictures, of joints in them, or of moments.
+
+    Args:
+        of: the filmed person.
+        seen_by: N cameras at T moments.
+        sightings: the keypoints found in their pictures.
+        views: the input of triangulation, one row for each joint-frame.
+        points: [T, J, 3] m, the triangulated joints, NaN where there is none.
+        tilt_deg: [N, T] of the cameras above the person.
+        range_m: [N, T] distances of the cameras from the person.
+        desired_tilt_deg: the planners' desired tilt.
+    """
+    exact = exact_keypoints(of, seen_by).xy
+    inside = np.isfinite(exact[..., 0])
+    off_px = np.linalg.norm(sightings.xy - exact, axis=-1)
+    near = off_px <= NEAR_SHARE * (seen_by.lens.fx * of.height_m / range_m)[..., None]
+    measured = off_px[np.isfinite(off_px)]
+    errors = measure(points[:, None], of.joints[:, None], of.person.joints, of.t_ns)
+    return {
+        "pictures": int(np.prod(inside.shape[:2])),
+        "in_view_share": float(inside.all(axis=-1).mean()),
+        "tilt_deg": {
+            "mean": float(tilt_deg.mean()),
+            "max": float(tilt_deg.max()),
+            "within_5_share": float((np.abs(tilt_deg - desired_tilt_deg) <= _NEAR_TILT_DEG).mean()),
+        },
+        "detected_share": float((sightings.confidence > 0).any(axis=-1).mean()),
+        "keypoint_pck": float(near[inside].mean()) if inside.any() else None,
+        "keypoint_median_px": float(np.median(measured)) if measured.size else None,
+        "reprojection_px": _reprojection_px(views, points),
+        **{name: errors[name] for name in _ERRORS},
+    }
+
+
+def errors_in_common(
+    points: Mapping[str, Float], true_joints: Mapping[str, Float]
+) -> dict[str, float | None]:
+    """Compute each arm's MPJPE (mm) on the joint-frames that all arms reconstructed; None if there are none.
+
+    Args:
+        points: [T, J, 3] m of every arm, NaN for joints that were not reconstructed.
+        true_joints: [T, J, 3] m of every arm.
+    """
+    shared = common(*(own[:, None] for own in points.values()))[:, 0]
+    found: dict[str, float | None] = {}
+    for name, own in points.items():
+        error_m = np.linalg.norm(own - true_joints[name], axis=-1)[shared]
+        found[name] = 1e3 * float(error_m.mean()) if error_m.size else None
+    return found
+
+
+def _reprojection_px(views: Views, points: Float) -> dict[str, float] | None:
+    """Compute the error between used keypoints and the skeleton, by the poses that the log would have."""
+    off_px = reprojection_px(views, points.reshape(-1, 3))
+    used = off_px[np.isfinite(off_px)]
+    return {"mean": float(used.mean()), "median": float(np.median(used))} if used.size else None

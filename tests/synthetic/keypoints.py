@@ -1,4 +1,4 @@
-"""Detector noise on true keypoints; noise on logged poses is in `geometry.noise`."""
+"""Keypoints of a simple detector on exact pixels: white noise, missed joints, gross outliers."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.cameras import Intrinsics, project
-from pipelines.geometry.poses import invert, transform
 
 _OUTLIER_PX = (30.0, 150.0)  # distance of a gross outlier from the truth
 
@@ -20,27 +18,6 @@ class KeypointNoise:
     pixel_px: float = 3.0  # sigma of each coordinate
     missed_share: float = 0.0
     outlier_share: float = 0.0  # of the joints that are not missed
-
-
-def see(joints: Float, position: Float, quaternion_xyzw: Float, intrinsics: Intrinsics) -> Float:
-    """Compute the exact pixels of joints; nothing hides anything.
-
-    Args:
-        joints: [T, J, 3] metres, world.
-        position: [T, 3] metres, world_from_camera; or [T, J, 3] of each joint (or [T, 1, 3]).
-        quaternion_xyzw: [T, 4] unit, or as many as positions.
-        intrinsics: the camera.
-
-    Returns:
-        [T, J, 2] px; NaN behind the camera and outside the picture, whose corner pixels have their
-        centres at (0, 0) and (width - 1, height - 1).
-    """
-    if position.ndim == 2:
-        position, quaternion_xyzw = position[:, None], quaternion_xyzw[:, None]
-    camera_from_world = invert(position, quaternion_xyzw)
-    pixels = project(transform(camera_from_world, joints), intrinsics)
-    inside = (pixels >= -0.5) & (pixels <= np.array([intrinsics.width, intrinsics.height]) - 0.5)
-    return np.where(inside.all(axis=-1, keepdims=True), pixels, np.nan)
 
 
 def detect(pixels: Float, noise: KeypointNoise, rng: np.random.Generator) -> tuple[Float, Float]:

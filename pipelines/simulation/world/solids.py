@@ -1,0 +1,461 @@
+"""The ground with its mounds, trees and walls: exact solids, their places, and their visible surfaces."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry.arrays import Float, Int32, Int64
+from pipelines.session.errors import DataError
+from pipelines.simulation import scenario
+from pipelines.simulation.surfaces import Surface, joined
+from pipelines.simulation.world import kernels
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Mounds over z = 0: height = sum of h exp(-(a^2 + b^2) / 2).
+
+    a and b are the distances from a mound's centre along its yawed axes, in its sigmas.
+    """
+
+    mounds: Float  # [M, 7] as `kernels` explains
+
+    def height(self, xy: Float) -> Float:
+        """Compute the ground's height, m, [...] at points [..., 2]; NaN at NaN where there are mounds."""
+        points = _rows(xy, 2)
+        out = np.empty(len(points))
+        kernels.heights(self.mounds, points, out)
+        return out.reshape(np.shape(xy)[:-1])
+
+    def normal(self, xy: Float) -> Float:
+        """Compute unit normals of the ground [..., 3], pointing up, at points [..., 2]."""
+        points = _rows(xy, 2)
+        slope = np.zeros((len(points), 2))
+        kernels.gradients(self.mounds, points, slope)
+        upward = np.concatenate([-slope, np.ones((len(points), 1))], axis=1)
+        unit: Float = upward / np.sqrt((upward**2).sum(axis=1, keepdims=True))
+        return unit.reshape(*np.shape(xy)[:-1], 3)
+
+    @property
+    def slope(self) -> float:
+        """Upper bound of the ground's slope: a Gaussian is steepest one sigma out, h / sigma exp(-1/2)."""
+        return float((self.mounds[:, 6] / self.mounds[:, 4:6].min(axis=1)).sum() * math.exp(-0.5))
+
+    @property
+    def curvature(self) -> float:
+        """Upper bound of second derivatives, any direction, 1/m: a Gaussian's is h / sigma^2, at its top."""
+        return float((self.mounds[:, 6] / self.mounds[:, 4:6].min(axis=1) ** 2).sum())
+
+    def curvature_within(self, centre: Float, radius_m: float) -> Float:
+        """Compute an upper bound like `curvature`, within circles about points [N, 2].
+
+        r sigmas out, |r^2 - 1| exp(-r^2 / 2) and exp(-r^2 / 2) times h / sigma^2 are the principal second
+        derivatives of a round mound; for an oval one they are at most those with its smaller sigma.
+        """
+        total = np.zeros(len(centre))
+        for x, y, _, _, along, across, height in self.mounds:
+            away = np.hypot(centre[:, 0] - x, centre[:, 1] - y) - radius_m
+            squared = np.maximum(away / max(along, across), 0) ** 2
+            total += height / min(along, across) ** 2 * np.minimum(1, (1 + squared) * np.exp(-squared / 2))
+        return total
+
+
+def raise_mounds(mounds: Sequence[scenario.Mound]) -> Terrain:
+    """Return the ground that a scenario describes."""
+    rows = [
+        (
+            *m.centre,
+            math.cos(math.radians(m.yaw_deg)),
+            math.sin(math.radians(m.yaw_deg)),
+            *m.sigma_m,
+            m.height_m,
+        )
+        for m in mounds
+    ]
+    return Terrain(np.array(rows, dtype=np.float64).reshape(-1, 7))
+
+
+def _rows(points: Float, columns: int) -> Float:
+    """Return points as [N, columns] for the kernels."""
+    return np.ascontiguousarray(points, dtype=np.float64).reshape(-1, columns)
+
+
+_FAR_M = 2000.0  # beyond, the horizon is less than two pixels away for a drone at 5 m
+_CELLS = 16  # along the ground's square, at least
+_GROWTH = 0.5  # cells outside are at most half as wide as their distance from it
+_FLATNESS_M = 0.02  # largest distance of triangles from the ground
+_FINEST = 17  # halvings of the whole: cells of 3 to 6 cm, however steep a mound
+_GRASS = (0.115, 0.15, 0.055)  # mean reflectance of a meadow; the texture of the ground varies it
+
+
+def ground_surface(ground: scenario.Ground, terrain: Terrain) -> Surface:
+    """Triangulate the corners of a quadtree, whose cells are halved until the ground in them is flat.
+
+    A linear triangle within a circle of radius r errs by at most curvature r^2 / 2 (r = side / sqrt 2).
+    """
+    from scipy.spatial import Delaunay
+
+    cell_m = ground.size_m / _CELLS
+    whole_m = cell_m * 2 ** math.ceil(math.log2(2 * max(_FAR_M, 3 * ground.size_m) / cell_m))
+    corners, finest_m = _corners(ground, terrain, whole_m)
+    local = corners * finest_m - whole_m / 2
+    faces = Delaunay(local).simplices.astype(np.int32)  # counterclockwise in the plane
+    xy = local + np.array(ground.centre)
+    a, b, c = xy[faces[:, 0]], xy[faces[:, 1]], xy[faces[:, 2]]
+    turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    faces[turn < 0] = faces[turn < 0][:, ::-1]
+    vertices = np.concatenate([xy, terrain.height(xy)[:, None]], axis=1)
+    colour = np.tile(np.array(_GRASS, np.float32), (len(vertices), 1))
+    return Surface(vertices, faces, colour, smooth=True, ground=True)
+
+
+def _corners(ground: scenario.Ground, terrain: Terrain, whole_m: float) -> tuple[Int64, float]:
+    """Return the cells' corners [V, 2], in units of the finest cell's side, and that side in metres."""
+    finest_m = whole_m / 2**_FINEST
+    cells, side = np.zeros((1, 2), dtype=np.int64), 2**_FINEST
+    found = []
+    while len(cells):
+        centre = (cells + side / 2) * finest_m - whole_m / 2
+        split = _too_wide(centre, side * finest_m, ground, terrain) & (side > 1)
+        steps = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
+        found.append((cells[~split][:, None] + steps * side).reshape(-1, 2))
+        side //= 2
+        cells = (cells[split][:, None] + steps * side).reshape(-1, 2)
+    return np.unique(np.concatenate(found), axis=0), finest_m
+
+
+def _too_wide(centre: Float, side_m: float, ground: scenario.Ground, terrain: Terrain) -> NDArray[np.bool_]:
+    """Find the cells [N] to be halved; centres [N, 2] are relative to the ground's middle."""
+    outside = np.abs(centre).max(axis=1) - side_m / 2 - ground.size_m / 2
+    allowed = np.maximum(1.001 * ground.size_m / _CELLS, _GROWTH * outside)
+    # Triangles join corners of neighbouring cells, too: look a cell further.
+    curvature = terrain.curvature_within(centre + np.array(ground.centre), side_m * 1.5)
+    wide: NDArray[np.bool_] = (side_m > allowed) | (curvature * side_m**2 / 4 > _FLATNESS_M)
+    return wide
+
+
+_TRIES = 200  # places tried for each tree
+_APART = 0.9  # crown radii between the trunks of two trees: crowns may mingle, trees do not coincide
+_HEIGHT_SPREAD = 0.25  # a tree is up to this share lower or higher than the wood
+_SLENDER, _STOUT = 0.21, 0.31  # crown radius of the tree's height
+
+
+def plant(
+    wood: scenario.Wood,
+    rng: np.random.Generator,
+    *,
+    keep_clear: Float,
+    standing: Sequence[scenario.Tree],
+    walls: Sequence[scenario.Wall],
+) -> list[scenario.Tree]:
+    """Place a wood's trees at random, evenly over its circle.
+
+    Args:
+        wood: number and place of the trees.
+        rng: decides the places and the sizes.
+        keep_clear: [K, 2] m, points of the actor's way; no trunk's axis is nearer to one than `clear_m`.
+        standing: trees that are there already; new ones keep apart from them and from each other.
+        walls: new trees keep their trunks out of them.
+
+    Raises:
+        DataError: they do not fit.
+    """
+    trees = list(standing)
+    for planted in range(wood.count):
+        for _ in range(_TRIES):
+            tree = _seedling(wood, rng)
+            if _has_room(tree, wood.clear_m, keep_clear, trees, walls):
+                trees.append(tree)
+                break
+        else:
+            raise DataError(
+                "world.wood",
+                f"found room for {planted} of {wood.count} trees within {wood.radius_m:g} m of "
+                f"{wood.centre} and {wood.clear_m:g} m off the actor's way",
+                "take fewer or smaller trees, a larger radius_m or a smaller clear_m",
+            )
+    return trees[len(standing) :]
+
+
+def _seedling(wood: scenario.Wood, rng: np.random.Generator) -> scenario.Tree:
+    """Draw a tree anywhere in the wood's circle."""
+    bearing, share, size, girth = rng.uniform(size=4).tolist()
+    away = wood.radius_m * math.sqrt(share)  # as many trees on every square metre
+    height = wood.height_m * (1 + _HEIGHT_SPREAD * (2 * size - 1))
+    place = [
+        wood.centre[0] + away * math.cos(2 * math.pi * bearing),
+        wood.centre[1] + away * math.sin(2 * math.pi * bearing),
+    ]
+    radius = height * (_SLENDER + (_STOUT - _SLENDER) * girth)
+    return scenario.Tree.model_construct(position=place, height_m=height, crown_radius_m=radius)
+
+
+def _has_room(
+    tree: scenario.Tree,
+    clear_m: float,
+    keep_clear: Float,
+    trees: Sequence[scenario.Tree],
+    walls: Sequence[scenario.Wall],
+) -> bool:
+    x, y = tree.position
+    return (
+        all(
+            math.hypot(x - other.position[0], y - other.position[1])
+            >= _APART * max(tree.crown_radius_m, other.crown_radius_m)
+            for other in trees
+        )
+        and all(_away_from(wall, x, y) >= wall.thickness_m / 2 + 0.1 * tree.height_m for wall in walls)
+        and bool((np.hypot(keep_clear[:, 0] - x, keep_clear[:, 1] - y) >= clear_m).all())
+    )
+
+
+def _away_from(wall: scenario.Wall, x: float, y: float) -> float:
+    """Compute the distance from a place to a wall's line."""
+    (ax, ay), (bx, by) = wall.start, wall.end
+    square = (bx - ax) ** 2 + (by - ay) ** 2
+    share = min(max(((x - ax) * (bx - ax) + (y - ay) * (by - ay)) / square, 0), 1) if square else 0.0
+    return math.hypot(x - ax - share * (bx - ax), y - ay - share * (by - ay))
+
+
+_CROWN_SHARE = 0.62  # of a tree's height
+_TRUNK_SHARE = 0.03  # its radius, of the tree's height
+_MOST_BURIED_M = 50.0
+
+
+@dataclass(frozen=True)
+class Obstacles:
+    """Solids on the ground, as rows of numbers that `kernels` explains. Tree k has trunk and crown k."""
+
+    trunks: Float  # [T, 5]
+    crowns: Float  # [T, 5]
+    slabs: Float  # [W, 8]
+
+
+def erect(terrain: Terrain, trees: Sequence[scenario.Tree], walls: Sequence[scenario.Wall]) -> Obstacles:
+    """Stand trees and walls on the ground.
+
+    A tree's crown is the upper 62 % of its height; its trunk, 3 % of the height in radius, ends in the
+    crown's middle. A wall is level on top, `height_m` above the highest ground under its line, so that it
+    is nowhere lower. Both reach below the lowest ground that they stand on.
+
+    Raises:
+        DataError: a wall begins where it ends.
+    """
+    return Obstacles(
+        np.array([_trunk(terrain, tree) for tree in trees]).reshape(-1, 5),
+        np.array([_crown(terrain, tree) for tree in trees]).reshape(-1, 5),
+        np.array([_slab(terrain, k, wall) for k, wall in enumerate(walls)]).reshape(-1, 8),
+    )
+
+
+def _foot(terrain: Terrain, tree: scenario.Tree) -> float:
+    return float(terrain.height(np.array(tree.position)))
+
+
+def _trunk(terrain: Terrain, tree: scenario.Tree) -> tuple[float, ...]:
+    foot, radius = _foot(terrain, tree), min(_TRUNK_SHARE * tree.height_m, tree.crown_radius_m)
+    buried = min(0.1 + radius * terrain.slope, _MOST_BURIED_M)
+    return (*tree.position, foot - buried, foot + (1 - _CROWN_SHARE / 2) * tree.height_m, radius)
+
+
+def _crown(terrain: Terrain, tree: scenario.Tree) -> tuple[float, ...]:
+    upright = _CROWN_SHARE / 2 * tree.height_m
+    centre = _foot(terrain, tree) + tree.height_m - upright
+    return (*tree.position, centre, tree.crown_radius_m, upright)
+
+
+def _slab(terrain: Terrain, k: int, wall: scenario.Wall) -> tuple[float, ...]:
+    start, end = np.array(wall.start), np.array(wall.end)
+    length = math.hypot(*(end - start))
+    if length == 0:
+        raise DataError(f"world.walls[{k}]", f"begins where it ends, at {wall.start}", "give it a length")
+    along = (end - start) / length
+    across = np.array([-along[1], along[0]]) * wall.thickness_m / 2
+    steps = min(2 + math.ceil(length / 0.1), 20_000)
+    line = start + np.linspace(0, length, steps)[:, None] * along
+    under = terrain.height(line[:, None] + np.array([[-1.0], [0.0], [1.0]]) * across)
+    # Between samples the ground falls by no more than its slope allows.
+    unseen = terrain.slope * math.hypot(length / (steps - 1) / 2, wall.thickness_m / 4)
+    low = under.min() - 0.1 - min(unseen, _MOST_BURIED_M)
+    middle = (start + end) / 2
+    return (*middle, *along, length / 2, wall.thickness_m / 2, low, under[:, 1].max() + wall.height_m)
+
+
+_SIDES = 10  # of a trunk
+_RINGS = 5
+_CLUSTERS = 16  # of leaves in a crown
+_HEART = 0.8  # radius of the part that is always filled with leaves: no line of sight slips through
+_OUTLINE = 12
+_RAGGED = 0.04  # deviation of leaves from their cluster, of the crown's radius (sigma)
+_MANY_TREES = 40  # more are drawn with fewer triangles each
+_BARK = (0.16, 0.115, 0.08)
+_GREENS = ((0.10, 0.19, 0.045), (0.13, 0.22, 0.05), (0.075, 0.155, 0.05), (0.165, 0.22, 0.06))
+_STONE = (0.36, 0.33, 0.29)
+_BLOCK_M = (0.6, 0.3)  # length and height of a wall's stones
+_MOST_BLOCKS = (120, 20)  # along and up a wall; longer walls have larger stones
+
+
+def tree_surfaces(obstacles: Obstacles, seed: int) -> list[Surface]:
+    """Draw all trunks as one surface and all crowns as another; nothing without trees."""
+    if not len(obstacles.trunks):
+        return []
+    sphere = _sphere(3 if len(obstacles.trunks) <= _MANY_TREES else 2)
+    trunks, crowns = [], []
+    for k, (trunk, crown) in enumerate(zip(obstacles.trunks, obstacles.crowns, strict=True)):
+        rng = np.random.default_rng([seed, _LOOKS, k])
+        trunks.append(_drawn_trunk(trunk, rng))
+        crowns.append(_drawn_crown(crown, sphere, rng))
+    return [joined(*trunks), joined(*crowns)]
+
+
+def wall_surfaces(obstacles: Obstacles, seed: int) -> list[Surface]:
+    """Draw all walls as one surface, stone by stone; nothing without walls."""
+    if not len(obstacles.slabs):
+        return []
+    walls = [
+        _drawn_wall(slab, np.random.default_rng([seed, _LOOKS + 1, k]))
+        for k, slab in enumerate(obstacles.slabs)
+    ]
+    return [joined(*walls)]
+
+
+def _drawn_trunk(trunk: Float, rng: np.random.Generator) -> Surface:
+    """Draw a prism of the trunk's cross-section, its bark mottled."""
+    x, y, low, high, radius = trunk
+    bearing = np.arange(_SIDES) * (2 * np.pi / _SIDES)
+    # The polygon has the circle's area: sides (1/2) R^2 sin(2 pi / sides) = pi r^2.
+    outer = radius * math.sqrt(2 * np.pi / _SIDES / math.sin(2 * np.pi / _SIDES))
+    ring = np.stack([x + outer * np.cos(bearing), y + outer * np.sin(bearing)], axis=1)
+    levels = np.linspace(low, high, _RINGS)
+    vertices = np.concatenate([np.column_stack([ring, np.full(_SIDES, z)]) for z in levels])
+    this = np.arange(_SIDES)
+    following = (this + 1) % _SIDES
+    quads = np.concatenate(
+        [
+            np.stack([this, following, following + _SIDES, this + _SIDES], axis=1) + k * _SIDES
+            for k in range(_RINGS - 1)
+        ]
+    )
+    tone = rng.uniform(0.7, 1.3, len(vertices))
+    return Surface(vertices, _split(quads), _colours(np.array(_BARK), tone), smooth=True)
+
+
+def _drawn_crown(crown: Float, sphere: tuple[Float, Int32], rng: np.random.Generator) -> Surface:
+    """Draw clusters of leaves around the middle: the outermost of some balls in every direction.
+
+    An outline shows the outermost leaves. A high mean of the radius over all directions is therefore scaled
+    to 1, so that outlines are as large as the ellipsoid's.
+    """
+    direction, faces = sphere
+    middle = _spread(_CLUSTERS, rng) * rng.uniform(0.58, 0.66, _CLUSTERS)[:, None]
+    size = rng.uniform(0.38, 0.46, _CLUSTERS)
+    toward = np.einsum("vk,ck->vc", direction, middle)
+    inside = size**2 - (middle**2).sum(axis=1) + toward**2
+    reach = np.where(inside > 0, toward + np.sqrt(np.maximum(inside, 0)), 0)
+    nearest = reach.argmax(axis=1)
+    radius = np.maximum(reach.max(axis=1), _HEART)
+    depth = np.clip((radius - _HEART) / (1.05 - _HEART), 0, 1)
+    radius = np.clip(radius + rng.normal(0, _RAGGED, len(radius)), 0.7, 1.2)
+    radius /= (radius**_OUTLINE).mean() ** (1 / _OUTLINE)
+    green = np.array(_GREENS)[rng.integers(len(_GREENS))] * rng.uniform(0.85, 1.15)
+    tone = rng.uniform(0.75, 1.25, _CLUSTERS)[nearest] * (0.5 + 0.5 * depth)  # dark between the clusters
+    tone *= rng.uniform(0.75, 1.25, len(radius))
+    vertices = crown[:3] + direction * radius[:, None] * crown[[3, 3, 4]]
+    return Surface(vertices, faces, _colours(green, tone), smooth=False)
+
+
+def _drawn_wall(slab: Float, rng: np.random.Generator) -> Surface:
+    """Draw four sides and the top, of stones that differ in tone."""
+    x, y, cos, sin, length, thickness, low, high = slab
+    along, across = np.array([cos, sin, 0.0]), np.array([-sin, cos, 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    base = np.array([x, y, low])
+    length, thickness, tall = 2 * length * along, 2 * thickness * across, (high - low) * up
+    corner = base - length / 2 - thickness / 2
+    sides = [
+        (corner, length, tall),
+        (corner + length + thickness, -length, tall),
+        (corner + length, thickness, tall),
+        (corner + thickness, -thickness, tall),
+        (corner + tall, length, thickness),
+    ]
+    return joined(*(_stones(*side, rng) for side in sides))
+
+
+def _stones(corner: Float, along: Float, up: Float, rng: np.random.Generator) -> Surface:
+    """Draw a rectangle of stones, each with four corners of its own; seen from `along` x `up`."""
+    columns, rows = (
+        min(max(1, round(float(np.sqrt((edge**2).sum())) / size)), most)
+        for edge, size, most in zip((along, up), _BLOCK_M, _MOST_BLOCKS, strict=True)
+    )
+    u, v = (part.ravel() for part in np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"))
+    steps = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    s, t = (u[:, None] + steps[:, 0]) / columns, (v[:, None] + steps[:, 1]) / rows
+    vertices = (corner + s[..., None] * along + t[..., None] * up).reshape(-1, 3)
+    tone = np.repeat(rng.uniform(0.75, 1.2, len(u)), 4) * rng.uniform(0.92, 1.08, 4 * len(u))
+    quads = np.arange(4 * len(u)).reshape(-1, 4)
+    return Surface(vertices, _split(quads), _colours(np.array(_STONE), tone), smooth=False)
+
+
+def _split(quads: NDArray[np.int64]) -> Int32:
+    """Split each quadrangle [Q, 4] into two triangles [2 Q, 3]."""
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.int32)
+
+
+def _colours(colour: Float, tone: Float) -> NDArray[np.float32]:
+    return np.clip(colour * tone[:, None], 0, 1).astype(np.float32)
+
+
+def _spread(count: int, rng: np.random.Generator) -> Float:
+    """Draw unit vectors [count, 3], evenly about the sphere (a Fibonacci spiral).
+
+    They are turned and shaken at random.
+    """
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    bearing = k * (np.pi * (1 + math.sqrt(5))) + rng.uniform(0, 2 * np.pi)
+    flat = np.sqrt(1 - z**2)
+    points = np.stack([flat * np.cos(bearing), flat * np.sin(bearing), z], axis=1)
+    points += rng.normal(0, 0.18, points.shape)
+    unit: Float = points / np.sqrt((points**2).sum(axis=1, keepdims=True))
+    return unit
+
+
+def _sphere(halvings: int) -> tuple[Float, Int32]:
+    """Return directions and triangles of an icosahedron whose edges were halved some times.
+
+    There are 20 * 4^halvings triangles.
+    """
+    g = (1 + math.sqrt(5)) / 2
+    # Three golden rectangles; every triangle joins three corners that are mutually 2 apart.
+    corners = np.array([np.roll((0.0, a, b * g), k) for k in range(3) for a in (-1, 1) for b in (-1, 1)])
+    apart = ((corners[:, None] - corners) ** 2).sum(axis=-1)
+    near = np.isclose(apart, 4)
+    faces = np.array(
+        [
+            (a, b, c)
+            for a in range(12)
+            for b in range(a)
+            for c in range(b)
+            if near[a, b] and near[b, c] and near[a, c]
+        ]
+    )
+    inward = np.linalg.det(corners[faces]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    for _ in range(halvings):
+        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        unique, which = np.unique(edges, axis=0, return_inverse=True)
+        middle = which.reshape(-1, 3) + len(corners)
+        corners = np.concatenate([corners, corners[unique].sum(axis=1) / 2])
+        (a, b, c), (ab, bc, ca) = faces.T, middle.T
+        triangles = [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
+        faces = np.concatenate([np.stack(triangle, axis=1) for triangle in triangles])
+    return corners / np.sqrt((corners**2).sum(axis=1, keepdims=True)), faces.astype(np.int32)
+
+
+_LOOKS = 2  # keeps these random numbers apart from the wood's
