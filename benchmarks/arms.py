@@ -50,7 +50,7 @@ VARIANTS: tuple[Mapping[str, float], ...] = (
 
 
 def main() -> None:
-    """Print the tables of docs/planner.md."""
+    """Print the tables of docs/measurements-planner.md."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trials", type=int, default=20, help="draws of noise (default 20)")
     parser.add_argument("--weights", action="store_true", help="other weights instead (minutes)")

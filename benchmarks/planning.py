@@ -40,7 +40,7 @@ GROWTH = (
 
 
 def main() -> None:
-    """Print the tables of docs/planner.md, and which aims are met."""
+    """Print the tables of docs/measurements-planner.md, and which aims are met."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=200, help="central plans per figure (default 200)")
     parser.add_argument("--turns", type=int, default=5, help="of all plans and replays (default 5)")

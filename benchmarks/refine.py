@@ -1,4 +1,4 @@
-"""Accuracy of `refined` compared with `robust`, and its speed, given in docs/decisions/0004-refined.md.
+"""Accuracy of `refined` compared with `robust`, and its speed, given in docs/measurements-refined.md.
 
 python -m benchmarks.refine [--seeds N] [--times T] [--cameras N ...] [--long T]
 

@@ -39,7 +39,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--sigma", type=float, default=0.2, help="s, what the manifest says of the clock")
     arguments = parser.parse_args()
-    print("| cameras, poses | true offset ms | error ms | stated sigma ms | robust mm | refined mm | CPU s |")
+    print(
+        "| cameras, poses | true offset ms | error ms | posterior sigma ms | robust mm | refined mm | CPU s |"
+    )
     print("|" + " --- |" * 7)
     for name in arguments.poses:
         for offset_s in arguments.offsets:

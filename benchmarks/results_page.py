@@ -129,8 +129,9 @@ def _head(numbers: Numbers) -> list[str]:
         *_words(
             f"It takes about {numbers['cpu_minutes']} minutes of processor time and runs the commands above "
             "each table, in quick versions: shorter walks and fewer trials than [studies](studies.md) and "
-            "[the planner](planner.md) have. Processors round differently, and closed loops of planners make "
-            "that larger: on another one figures of the arms moved, those of filmed ones by up to 8 %."
+            "[the planner's measurements](measurements-planner.md). Processors round differently, and closed "
+            "loops of planners amplify that: on another processor the figures of the arms changed, those of "
+            "filmed ones by up to 8 %."
         ),
         *_words(
             "**Everything here is simulated**: body, flights, logs and pictures are made by "
@@ -236,7 +237,7 @@ def _filming(numbers: Numbers) -> list[str]:
             "cameras would have seen them, BlazePose looks at the pictures, and `robust` reconstructs from "
             "poses with one draw of 0.02 m and 0.2 deg. In E2 somebody walks towards a mound that the fixed "
             "formation climbs; in E3 they jog a slalom with a dead stop, and play soccer. Clips of 5 s; "
-            "[the planner](planner.md) says what the columns mean."
+            "[measurements](measurements-planner.md#filmed-with-the-real-detector) explains the columns."
         ),
         *_code([command for own in FILMED.values() for command in own]),
         *markdown_table([*header, "root-relative mm"], rows),

@@ -33,7 +33,7 @@ _MOST = {
 
 @dataclass(frozen=True)
 class PlannerConfig:
-    """Settings of every arm; the defaults are those that docs/planner.md measures.
+    """Settings of every arm; docs/measurements-planner.md measures the defaults.
 
     Raises:
         ValueError: an impossible value; the message names it.

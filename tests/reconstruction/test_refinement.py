@@ -296,7 +296,7 @@ def test_white_noise_is_averaged_over_time(told: bool) -> None:
 def test_covariances_of_white_noise_are_calibrated() -> None:
     """Test 24 flights of 2 s: NEES is 3 +- 0.19, since a flight's mean has a standard deviation of 0.95.
 
-    400 flights have this deviation around their mean of 3.01 (docs/decisions/0004-refined.md). The share of
+    400 flights have this deviation around their mean of 3.01 (docs/measurements-refined.md). The share of
     95 % ellipsoids varies by 7 % from flight to flight there, so by 1.4 % in the mean. Tolerances are four
     of these.
     """
