@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mocap_cli.options import (
-    Command,
     FiniteRange,
+    Shown,
     any_path,
     force_option,
-    json_option,
-    level,
+    grouped,
+    output_options,
     overwrite_option,
     seed_option,
-    verbosity_options,
     workers_option,
 )
 from mocap_cli.terminal import print_json, print_table, say, watching
@@ -34,71 +33,65 @@ def ablate_command() -> None:
     """
 
 
-def _shared_options(command: Command) -> Command:
-    """Add the options that every study has."""
-    for option in reversed(
-        [
-            click.option("-o", "--output", type=any_path, required=True, help="Folder of the results."),
-            click.option(
-                "--levels",
-                metavar="NAME,...",
-                help="Pose noise: none, low (0.1 m, 0.5 deg), medium (0.3, 1), high (0.5, 2), per axis"
-                " [default: all; for noise: medium].",
-            ),
-            click.option(
-                "--noise",
-                metavar="MODEL",
-                multiple=True,
-                help='Pose noise instead of levels, such as "bias:position_m=0.3,rotation_deg=1"; repeat'
-                " it for several.",
-            ),
-            click.option(
-                "--methods",
-                metavar="NAME,...",
-                default="dlt,midpoint,robust,refined",
-                show_default=True,
-                help="Compared side by side. refined takes most of the time.",
-            ),
-            click.option(
-                "--keypoints",
-                type=click.Choice(["model", "exact"]),
-                help="With the measured errors of a detector, or without any [default: model].",
-            ),
-            click.option(
-                "--detector",
-                metavar="NAME",
-                help="Render pictures and let this detector look at them (`mocap models`).",
-            ),
-            click.option(
-                "--seconds",
-                type=FiniteRange(0.1, 600),
-                default=75.0,
-                show_default=True,
-                help="Length of the walk.",
-            ),
-            click.option(
-                "--rate",
-                type=FiniteRange(0.1, 240),
-                metavar="HZ",
-                help="Of the pictures [default: 30; 1 with --detector].",
-            ),
-            click.option(
-                "--trials",
-                type=click.IntRange(1, 10_000),
-                default=10,
-                show_default=True,
-                help="Draws of all noise.",
-            ),
-            seed_option("Of all noise."),
-            workers_option("Conditions worked on at once; the results do not depend on them."),
-            overwrite_option,
-            force_option,
-            json_option,
-            verbosity_options,
-        ]
-    ):
-        command = option(command)
-    return command
+_study_options = grouped(
+    "study",
+    dict,
+    click.option("-o", "--output", type=any_path, required=True, help="Folder of the results."),
+    click.option(
+        "--levels",
+        metavar="NAME,...",
+        help="Pose noise: none, low (0.1 m, 0.5 deg), medium (0.3, 1), high (0.5, 2), per axis"
+        " [default: all; for noise: medium].",
+    ),
+    click.option(
+        "--noise",
+        metavar="MODEL",
+        multiple=True,
+        help='Pose noise instead of levels, such as "bias:position_m=0.3,rotation_deg=1"; repeat'
+        " it for several.",
+    ),
+    click.option(
+        "--methods",
+        metavar="NAME,...",
+        default="dlt,midpoint,robust,refined",
+        show_default=True,
+        help="Compared side by side. refined takes most of the time.",
+    ),
+    click.option(
+        "--keypoints",
+        type=click.Choice(["model", "exact"]),
+        help="With the measured errors of a detector, or without any [default: model].",
+    ),
+    click.option(
+        "--detector",
+        metavar="NAME",
+        help="Render pictures and let this detector look at them (`mocap models`).",
+    ),
+    click.option(
+        "--seconds",
+        type=FiniteRange(0.1, 600),
+        default=75.0,
+        show_default=True,
+        help="Length of the walk.",
+    ),
+    click.option(
+        "--rate",
+        type=FiniteRange(0.1, 240),
+        metavar="HZ",
+        help="Of the pictures [default: 30; 1 with --detector].",
+    ),
+    click.option(
+        "--trials",
+        type=click.IntRange(1, 10_000),
+        default=10,
+        show_default=True,
+        help="Draws of all noise.",
+    ),
+    seed_option("Of all noise."),
+    workers_option("Conditions worked on at once; the results do not depend on them."),
+    overwrite_option,
+    force_option,
+)
 
 
 _drones_option = click.option(
@@ -112,62 +105,54 @@ _tilt_option = click.option(
 @ablate_command.command("tilt", short_help="Error against the tilt of the formation.")
 @click.option("--tilts", metavar="DEG,...", default="0,15,30,45,60", show_default=True, help="Of the slots.")
 @_drones_option
-@_shared_options
-def tilt_command(tilts: str, drones: int, **shared: Any) -> None:
+@_study_options
+@output_options
+def tilt_command(tilts: str, drones: int, study: dict[str, Any], shown: Shown) -> None:
     """Error against tilt, for every level of pose noise and every method."""
-    _run("tilt", {"tilts_deg": _numbers("--tilts", tilts, float), "drones": [drones]}, shared)
+    _run("tilt", {"tilts_deg": _numbers("--tilts", tilts, float), "drones": [drones]}, study, shown)
 
 
 @ablate_command.command("robots", short_help="Error against the number of drones.")
 @click.option("--robots", metavar="N,...", default="2,3,4,5", show_default=True, help="How many film.")
 @_tilt_option
-@_shared_options
-def robots_command(robots: str, tilt: float, **shared: Any) -> None:
+@_study_options
+@output_options
+def robots_command(robots: str, tilt: float, study: dict[str, Any], shown: Shown) -> None:
     """Error against the number of drones, for every level of pose noise and every method."""
-    _run("robots", {"tilts_deg": [tilt], "drones": _numbers("--robots", robots, int)}, shared)
+    _run("robots", {"tilts_deg": [tilt], "drones": _numbers("--robots", robots, int)}, study, shown)
 
 
 @ablate_command.command("noise", short_help="Error against the kind of pose noise.")
 @_drones_option
 @_tilt_option
-@_shared_options
-def noise_command(drones: int, tilt: float, **shared: Any) -> None:
+@_study_options
+@output_options
+def noise_command(drones: int, tilt: float, study: dict[str, Any], shown: Shown) -> None:
     """Error against the kind of pose noise, equally large on the average, for every method."""
-    _run("noise", {"tilts_deg": [tilt], "drones": [drones]}, shared)
+    _run("noise", {"tilts_deg": [tilt], "drones": [drones]}, study, shown)
 
 
-def _run(study: Study, varied: Mapping[str, Any], shared: Mapping[str, Any]) -> None:
+def _run(name: Study, varied: Mapping[str, Any], study: dict[str, Any], shown: Shown) -> None:
     from pipelines.ablate import ablate
     from pipelines.simulation.study.settings import settings_for
 
-    levels = shared["levels"]
+    levels, methods, rate_hz = study.pop("levels"), study.pop("methods"), study.pop("rate")
+    run = {key: study.pop(key) for key in ("workers", "overwrite", "force")}
+    output = study.pop("output")
     settings = settings_for(
-        study,
+        name,
         **varied,
+        **study,
         levels=None if levels is None else _words(levels),
-        noise=shared["noise"],
-        methods=_words(shared["methods"]),
-        keypoints=shared["keypoints"],
-        detector=shared["detector"],
-        seconds=shared["seconds"],
-        rate_hz=shared["rate"],
-        trials=shared["trials"],
-        seed=shared["seed"],
+        methods=_words(methods),
+        rate_hz=rate_hz,
     )
-    quiet = shared["quiet"]
-    with watching(level(quiet, shared["verbose"])) as progress:
-        result = ablate(
-            settings,
-            shared["output"],
-            workers=shared["workers"],
-            overwrite=shared["overwrite"],
-            force=shared["force"],
-            progress=progress,
-        )
-    if shared["as_json"]:
+    with watching(shown.level) as progress:
+        result = ablate(settings, output, progress=progress, **run)
+    if shown.as_json:
         print_json(result.summary)
         return
-    if not quiet:
+    if not shown.quiet:
         _print(result.summary)
     say(f"{'unchanged' if result.skipped else 'written'}: {result.folder}")
 

@@ -3,26 +3,56 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from mocap_cli.options import (
+    Shown,
     any_path,
     every_option,
     force_option,
-    json_option,
-    level,
+    grouped,
+    output_options,
     overwrite_option,
     provider_option,
-    verbosity_options,
     with_provider,
 )
 from mocap_cli.several import expanded
 from mocap_cli.terminal import one_line, print_json, say, watching
 
 if TYPE_CHECKING:
-    from pipelines.geometry.triangulation import Method
+    from pipelines.batch import Settings
+
+
+def _settings(stages: str, detector: str, provider: str | None, **others: Any) -> Settings:
+    from pipelines.batch import Settings
+
+    names = tuple(name.strip() for name in stages.split(",") if name.strip())
+    return Settings(stages=names, detector=with_provider(detector, provider), **others)
+
+
+_settings_options = grouped(
+    "settings",
+    _settings,
+    click.option(
+        "--stages",
+        default="ingest,reconstruct,replan-compare,report",
+        show_default=True,
+        metavar="NAME,...",
+        help="Which of them.",
+    ),
+    click.option(
+        "--method",
+        type=click.Choice(["dlt", "midpoint", "robust", "refined"]),
+        default="robust",
+        show_default=True,
+        help="Of `mocap reconstruct`, as the next three are.",
+    ),
+    click.option("--detector", default="blazepose", show_default=True, help="For flights without keypoints."),
+    provider_option,
+    every_option,
+)
 
 
 @click.command("batch", short_help="All of it over many flights, on Dask.")
@@ -46,27 +76,10 @@ if TYPE_CHECKING:
     metavar="tcp://HOST:PORT",
     help="Use the Dask cluster there, whose machines see the same folders under the same paths.",
 )
-@click.option(
-    "--stages",
-    default="ingest,reconstruct,replan-compare,report",
-    show_default=True,
-    metavar="NAME,...",
-    help="Which of them.",
-)
-@click.option(
-    "--method",
-    type=click.Choice(["dlt", "midpoint", "robust", "refined"]),
-    default="robust",
-    show_default=True,
-    help="Of `mocap reconstruct`, as the next three are.",
-)
-@click.option("--detector", default="blazepose", show_default=True, help="For flights without keypoints.")
-@provider_option
-@every_option
+@_settings_options
 @force_option
 @overwrite_option
-@json_option
-@verbosity_options
+@output_options
 @click.pass_context
 def batch_command(
     context: click.Context,
@@ -74,16 +87,10 @@ def batch_command(
     output: Path | None,
     workers: int | None,
     scheduler: str | None,
-    stages: str,
-    method: Method | Literal["refined"],
-    detector: str,
-    provider: str | None,
-    every: int,
+    settings: Settings,
     force: bool,
     overwrite: bool,
-    as_json: bool,
-    quiet: bool,
-    verbose: int,
+    shown: Shown,
 ) -> None:
     """Ingest, reconstruct, replan and report many flights, and sum them up in a table.
 
@@ -92,15 +99,9 @@ def batch_command(
     """
     if workers is not None and scheduler is not None:
         raise click.UsageError("--workers are those of this machine: leave them out with --scheduler.")
-    from pipelines.batch import Settings, batch
+    from pipelines.batch import batch
 
-    settings = Settings(
-        stages=tuple(name.strip() for name in stages.split(",") if name.strip()),
-        method=method,
-        detector=with_provider(detector, provider),
-        every=every,
-    )
-    with watching(level(quiet, verbose)) as progress:
+    with watching(shown.level) as progress:
         result = batch(
             expanded(flights),
             output,
@@ -112,10 +113,10 @@ def batch_command(
             progress=progress,
         )
     failures = [row for row in result.rows if row.error is not None]
-    if quiet:  # else they were printed when they happened
+    if shown.quiet:  # else they were printed when they happened
         for row in failures:
             say(f"failed: {one_line(str(row.error))}", err=True)
-    if as_json:
+    if shown.as_json:
         print_json(
             {
                 "flights": len(result.rows),
@@ -127,7 +128,7 @@ def batch_command(
         )
     else:
         done = len(result.rows) - len(failures)
-        if not quiet:
+        if not shown.quiet:
             say(f"{done} of {len(result.rows)} flights done, {result.unchanged} of them unchanged")
         say(f"written: {result.table}")
         say(f"written: {result.page}")

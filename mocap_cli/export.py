@@ -10,11 +10,10 @@ import click
 
 from mocap_cli.options import (
     FiniteRange,
+    Shown,
     any_path,
-    json_option,
-    level,
+    output_options,
     overwrite_option,
-    verbosity_options,
 )
 from mocap_cli.several import each
 from mocap_cli.terminal import say, watching
@@ -62,8 +61,7 @@ class _ListsFormats(click.Command):
     help="Pictures per camera and second in mcap and rerun; 0 is none. [default: 2]",
 )
 @overwrite_option
-@json_option
-@verbosity_options
+@output_options
 def export_command(
     session: Path,
     formats: str,
@@ -72,9 +70,7 @@ def export_command(
     axes: str | None,
     pictures_hz: float | None,
     overwrite: bool,
-    as_json: bool,
-    quiet: bool,
-    verbose: int,
+    shown: Shown,
 ) -> dict[str, Any] | None:
     """Write the skeleton and the cameras in the formats of other programs.
 
@@ -86,7 +82,7 @@ def export_command(
     names = [name.strip() for name in formats.split(",") if name.strip()]
     if not names:
         raise click.BadParameter("names no format", param_hint="--to")
-    with watching(level(quiet, verbose)) as progress:
+    with watching(shown.level) as progress:
         result = export(
             session,
             names,
@@ -97,7 +93,7 @@ def export_command(
             overwrite=overwrite,
             progress=progress,
         )
-    if as_json:
+    if shown.as_json:
         return {
             "written": [str(path) for path in result.written],
             "unchanged": [str(path) for path in result.unchanged],

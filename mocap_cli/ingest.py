@@ -9,12 +9,11 @@ import click
 
 from mocap_cli.options import (
     FiniteRange,
+    Shown,
     any_path,
     force_option,
-    json_option,
-    level,
+    output_options,
     overwrite_option,
-    verbosity_options,
 )
 from mocap_cli.several import each
 from mocap_cli.terminal import one_line, print_table, say, say_warnings, watching
@@ -51,8 +50,7 @@ if TYPE_CHECKING:
 @click.option("--strict", is_flag=True, help="Refuse a flight of which anything is lost or damaged.")
 @overwrite_option
 @force_option
-@json_option
-@verbosity_options
+@output_options
 def ingest_command(
     flight: Path,
     output: Path | None,
@@ -61,14 +59,12 @@ def ingest_command(
     strict: bool,
     overwrite: bool,
     force: bool,
-    as_json: bool,
-    quiet: bool,
-    verbose: int,
+    shown: Shown,
 ) -> dict[str, Any] | None:
     """Read logs, keypoints, calibration and truth of each flight into a session."""
     from pipelines.ingest import ingest
 
-    with watching(level(quiet, verbose)) as progress:
+    with watching(shown.level) as progress:
         result = ingest(
             flight,
             output,
@@ -79,10 +75,10 @@ def ingest_command(
             force=force,
             progress=progress,
         )
-    say_warnings(result.description.warnings, quiet)
-    if as_json:
+    say_warnings(result.description.warnings, shown.quiet)
+    if shown.as_json:
         return result.description.model_dump(mode="json", by_alias=True)
-    if not quiet:
+    if not shown.quiet:
         _print(result)
         _print_stamps(result)
         _print_origin(result)

@@ -8,7 +8,12 @@ from pathlib import Path
 
 import click
 
-from mocap_cli.options import any_path, json_option, level, overwrite_option, verbosity_options
+from mocap_cli.options import (
+    Shown,
+    any_path,
+    output_options,
+    overwrite_option,
+)
 from mocap_cli.terminal import one_line, print_json, say, watching
 
 _MANY = 5  # most files of one kind in one folder that are listed one by one
@@ -23,11 +28,8 @@ _MANY = 5  # most files of one kind in one folder that are listed one by one
     help="Manifest to write [default: flight.yaml in the folder that all PATHS have in common].",
 )
 @overwrite_option
-@json_option
-@verbosity_options
-def init_command(
-    paths: tuple[Path, ...], output: Path | None, overwrite: bool, as_json: bool, quiet: bool, verbose: int
-) -> None:
+@output_options
+def init_command(paths: tuple[Path, ...], output: Path | None, overwrite: bool, shown: Shown) -> None:
     """Look into logs, videos, keypoints, calibrations and maps, and draft the flight.yaml that names them.
 
     PATHS are files and folders; folders are looked through. What belongs to which camera is told by names
@@ -38,15 +40,15 @@ def init_command(
     from pipelines.draft import draft
     from pipelines.session.storage import jsonable
 
-    with watching(level(quiet, verbose)) as progress:
+    with watching(shown.level) as progress:
         result = draft(paths, output, overwrite=overwrite, progress=progress)
-    if not quiet:
+    if not shown.quiet:
         for line in _left_out(result.left_out):
             say(line, err=True)
         for word, remarks in (("missing", result.missing), ("assumed", result.assumed)):
             for remark in remarks:
                 say(f"{word}: {one_line(remark)}", err=True)
-    if as_json:
+    if shown.as_json:
         summary = {
             "flight": str(result.path),
             "cameras": result.cameras,

@@ -4,33 +4,25 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib import import_module
 from typing import Any
 
 import click
 
-from mocap_cli.ablate import ablate_command
-from mocap_cli.batch import batch_command
-from mocap_cli.export import export_command
-from mocap_cli.info import info_command
-from mocap_cli.ingest import ingest_command
-from mocap_cli.init import init_command
-from mocap_cli.models import models_command
-from mocap_cli.reconstruct import reconstruct_command
-from mocap_cli.replan_compare import replan_compare_command
-from mocap_cli.report import report_command
-from mocap_cli.simulate import simulate_command
 from mocap_cli.terminal import one_line, say
 from pipelines.session.errors import MocapError
+
+COMMANDS = (
+    *("init", "ingest", "reconstruct", "replan-compare", "report", "batch", "export", "simulate", "ablate"),
+    *("info", "models"),
+)
+"""The commands in the order of their use. Each is `NAME_command` in the module `mocap_cli.NAME`."""
 
 _INTERRUPTED = 130  # the exit status that shells expect after Ctrl-C
 
 
 class Mocap(click.Group):
-    """Group that lists commands in the order of their use and prints errors in one line."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  # click calls it so
-        """List the commands in the order of their use."""
-        return list(self.commands)
+    """Group that prints errors in one line."""
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; an error that the user can correct is one line on stderr and exit status 1."""
@@ -49,7 +41,22 @@ class Mocap(click.Group):
             ctx.exit(_INTERRUPTED)
 
 
-@click.group(cls=Mocap, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+class _Lazy(Mocap):
+    """Group of `COMMANDS` that imports a command when it is asked for, so that none waits for the others."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  # click calls it so
+        """List the commands in the order of their use."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import a command; for an unknown name all of them, from which click suggests the nearest."""
+        for name in (cmd_name,) if cmd_name in COMMANDS else COMMANDS:
+            module = name.replace("-", "_")
+            self.add_command(getattr(import_module(f"mocap_cli.{module}"), f"{module}_command"))
+        return super().get_command(ctx, cmd_name)
+
+
+@click.group(cls=_Lazy, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(package_name="mocap-pipeline", prog_name="mocap")
 def mocap() -> None:
     """From the flight logs and keypoints of a drone team to the 3D motion of the person it filmed.
@@ -58,22 +65,6 @@ def mocap() -> None:
     it into a session, a folder of plain tables; `reconstruct` measures the skeleton; `report` shows how far
     it can be trusted; `export` carries on.
     """
-
-
-for command in (
-    init_command,
-    ingest_command,
-    reconstruct_command,
-    replan_compare_command,
-    report_command,
-    batch_command,
-    export_command,
-    simulate_command,
-    ablate_command,
-    info_command,
-    models_command,
-):
-    mocap.add_command(command)
 
 
 def run() -> None:

@@ -2,14 +2,44 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
 Command = TypeVar("Command", bound=Callable[..., Any])
+
+Option = Callable[[Any], Any]
+"""A decorator that adds one or several options to a command."""
+
+
+def grouped(name: str, make: Callable[..., Any], *options: Option) -> Callable[[Command], Command]:
+    """Add options to a command that takes their values together.
+
+    Args:
+        name: of the command's argument.
+        make: called with the values by the names of the options' parameters; a dataclass, or a function.
+        options: in the order of the help text.
+    """
+
+    def decorated(command: Command) -> Command:
+        @functools.wraps(command)
+        def run(*arguments: Any, **values: Any) -> Any:
+            own = {parameter.name: values.pop(parameter.name) for parameter in added}
+            return command(*arguments, **{name: make(**own)}, **values)
+
+        before = len(getattr(run, "__click_params__", ()))
+        for option in reversed(options):
+            option(run)
+        added = tuple(run.__click_params__[before:])  # type: ignore[attr-defined]
+        return run  # type: ignore[return-value]
+
+    return decorated
+
 
 any_path = click.Path(path_type=Path)
 """A path that click does not check: the function that reads it reports a missing path or a wrong kind."""
@@ -82,13 +112,25 @@ class FiniteRange(click.FloatRange):
         return number
 
 
-def verbosity_options(command: Command) -> Command:
-    """Add -q and -v; the command takes `quiet: bool` and `verbose: int`."""
-    quiet = click.option("-q", "--quiet", is_flag=True, help="Say only where the result is, and errors.")
-    verbose = click.option("-v", "--verbose", count=True, help="Say more.")
-    return quiet(verbose(command))
+@dataclass(frozen=True)
+class Shown:
+    """The values of the options on what a command prints."""
+
+    as_json: bool
+    quiet: bool
+    verbose: int
+
+    @property
+    def level(self) -> int:
+        """Both of -q and -v: -1 is quiet, 0 is normal, 1 and above is more."""
+        return -1 if self.quiet else self.verbose
 
 
-def level(quiet: bool, verbose: int) -> int:
-    """Combine both to one number: -1 is quiet, 0 is normal, 1 and above is more."""
-    return -1 if quiet else verbose
+output_options = grouped(
+    "shown",
+    Shown,
+    json_option,
+    click.option("-q", "--quiet", is_flag=True, help="Say only where the result is, and errors."),
+    click.option("-v", "--verbose", count=True, help="Say more."),
+)
+"""--json, -q and -v; the command takes `shown: Shown`."""

@@ -5,118 +5,151 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from mocap_cli.options import (
     FiniteRange,
+    Shown,
     every_option,
     force_option,
-    json_option,
-    level,
+    grouped,
+    output_options,
     provider_option,
     seed_option,
-    verbosity_options,
     with_provider,
 )
 from mocap_cli.several import each
 from mocap_cli.terminal import print_table, say, say_warnings, watching
 
 if TYPE_CHECKING:
-    from pipelines.geometry.triangulation import Method
-    from pipelines.reconstruct import Reconstructed
+    from pipelines.reconstruct import Reconstructed, Settings
+
+
+def _settings(
+    start_s: float | None, end_s: float | None, detector: str, provider: str | None, **others: Any
+) -> Settings:
+    from pipelines.reconstruct import Settings
+
+    if start_s is not None and end_s is not None and start_s >= end_s:
+        raise click.BadParameter(f"{end_s:g} is not after --start {start_s:g}", param_hint="--end")
+    return Settings(detector=with_provider(detector, provider), start_s=start_s, end_s=end_s, **others)
+
+
+_settings_options = grouped(
+    "settings",
+    _settings,
+    click.option(
+        "--method",
+        type=click.Choice(["dlt", "midpoint", "robust", "refined"]),
+        default="robust",
+        show_default=True,
+        help="dlt: linear triangulation; midpoint: the point closest to the rays; robust: outlier views"
+        " rejected, then least squares on the reprojection; refined: robust, then skeleton, camera poses and"
+        " clocks estimated together.",
+    ),
+    click.option(
+        "--rate",
+        "rate_hz",
+        type=FiniteRange(0, 10_000, min_open=True),
+        metavar="HZ",
+        help="Rate of the skeleton [default: the frames of the camera with the most].",
+    ),
+    click.option(
+        "--persons",
+        "people",
+        type=click.IntRange(1, 20),
+        default=1,
+        show_default=True,
+        help="How many people.",
+    ),
+    click.option(
+        "--min-confidence",
+        type=FiniteRange(0, 1),
+        default=0.3,
+        show_default=True,
+        help="Keypoints below this are not used.",
+    ),
+    click.option(
+        "--pixel-noise",
+        "pixel_sigma",
+        type=FiniteRange(0.01, 10_000),
+        default=3.0,
+        show_default=True,
+        metavar="PX",
+        help="Standard deviation of a good keypoint; more is found from the data.",
+    ),
+    click.option(
+        "--pose-noise",
+        metavar="MODEL",
+        help="What is known of the camera poses' errors, instead of what flight.yaml says; for example"
+        ' "white:position_m=0.3,rotation_deg=1 + drift:position_m_per_sqrt_s=0.05".',
+    ),
+    click.option(
+        "--refine-cameras",
+        type=click.Choice(["background"]),
+        help="Correct the attitudes of moving cameras first, by how the still background passes through their"
+        " pictures.",
+    ),
+    click.option(
+        "--disturb-poses",
+        metavar="MODEL",
+        help="Add such errors to every logged pose first, to see what they do. Methods are not told of them:"
+        " --pose-noise does that.",
+    ),
+    click.option(
+        "--trials",
+        type=click.IntRange(1, 1000),
+        default=1,
+        show_default=True,
+        metavar="N",
+        help="Draws of --disturb-poses. metrics.json has the figures of each, their mean, spread and"
+        " interval; the skeleton is that of the first.",
+    ),
+    seed_option("Of --disturb-poses."),
+    click.option(
+        "--fill",
+        "fill_s",
+        type=FiniteRange(0, min_open=True),
+        metavar="SECONDS",
+        help="Interpolate a joint across gaps of at most this length; their status is `filled`. Without it"
+        " gaps stay open.",
+    ),
+    click.option(
+        "--smooth",
+        metavar="FILTER",
+        help='"butterworth:cutoff_hz=6,order=4" (forwards and backwards, no lag) or "rts" (Kalman smoother'
+        ' that weighs covariances; "rts:model=jerk"). Never across gaps.',
+    ),
+    click.option(
+        "--detector",
+        default="blazepose",
+        show_default=True,
+        help="Runs on the pictures of cameras that came without keypoints (see `mocap models`).",
+    ),
+    provider_option,
+    every_option,
+    click.option(
+        "--start",
+        "start_s",
+        type=FiniteRange(0, 1e9),
+        metavar="SECONDS",
+        help="Let the detector look at pictures from then on, since the flight's first.",
+    ),
+    click.option(
+        "--end",
+        "end_s",
+        type=FiniteRange(0, 1e9),
+        metavar="SECONDS",
+        help="And at pictures before then only.",
+    ),
+)
 
 
 @click.command("reconstruct", short_help="Detect, triangulate, measure the errors.")
 @each("session", "SESSION")
-@click.option(
-    "--method",
-    type=click.Choice(["dlt", "midpoint", "robust", "refined"]),
-    default="robust",
-    show_default=True,
-    help="dlt: linear triangulation; midpoint: the point closest to the rays; robust: outlier views"
-    " rejected, then least squares on the reprojection; refined: robust, then skeleton, camera poses and"
-    " clocks estimated together.",
-)
-@click.option(
-    "--rate",
-    type=FiniteRange(0, 10_000, min_open=True),
-    metavar="HZ",
-    help="Rate of the skeleton [default: the frames of the camera with the most].",
-)
-@click.option("--persons", type=click.IntRange(1, 20), default=1, show_default=True, help="How many people.")
-@click.option(
-    "--min-confidence",
-    type=FiniteRange(0, 1),
-    default=0.3,
-    show_default=True,
-    help="Keypoints below this are not used.",
-)
-@click.option(
-    "--pixel-noise",
-    type=FiniteRange(0.01, 10_000),
-    default=3.0,
-    show_default=True,
-    metavar="PX",
-    help="Standard deviation of a good keypoint; more is found from the data.",
-)
-@click.option(
-    "--pose-noise",
-    metavar="MODEL",
-    help="What is known of the camera poses' errors, instead of what flight.yaml says; for example"
-    ' "white:position_m=0.3,rotation_deg=1 + drift:position_m_per_sqrt_s=0.05".',
-)
-@click.option(
-    "--refine-cameras",
-    type=click.Choice(["background"]),
-    help="Correct the attitudes of moving cameras first, by how the still background passes through their"
-    " pictures.",
-)
-@click.option(
-    "--disturb-poses",
-    metavar="MODEL",
-    help="Add such errors to every logged pose first, to see what they do. Methods are not told of them:"
-    " --pose-noise does that.",
-)
-@click.option(
-    "--trials",
-    type=click.IntRange(1, 1000),
-    default=1,
-    show_default=True,
-    metavar="N",
-    help="Draws of --disturb-poses. metrics.json has the figures of each, their mean, spread and interval;"
-    " the skeleton is that of the first.",
-)
-@seed_option("Of --disturb-poses.")
-@click.option(
-    "--fill",
-    type=FiniteRange(0, min_open=True),
-    metavar="SECONDS",
-    help="Interpolate a joint across gaps of at most this length; their status is `filled`. Without it gaps"
-    " stay open.",
-)
-@click.option(
-    "--smooth",
-    metavar="FILTER",
-    help='"butterworth:cutoff_hz=6,order=4" (forwards and backwards, no lag) or "rts" (Kalman smoother that'
-    ' weighs covariances; "rts:model=jerk"). Never across gaps.',
-)
-@click.option(
-    "--detector",
-    default="blazepose",
-    show_default=True,
-    help="Runs on the pictures of cameras that came without keypoints (see `mocap models`).",
-)
-@provider_option
-@every_option
-@click.option(
-    "--start",
-    type=FiniteRange(0, 1e9),
-    metavar="SECONDS",
-    help="Let the detector look at pictures from then on, since the flight's first.",
-)
-@click.option("--end", type=FiniteRange(0, 1e9), metavar="SECONDS", help="And at pictures before then only.")
+@_settings_options
 @click.option(
     "--overlay",
     is_flag=True,
@@ -130,68 +163,29 @@ if TYPE_CHECKING:
     help="Threads; the result does not depend on them.",
 )
 @force_option
-@json_option
-@verbosity_options
+@output_options
 def reconstruct_command(
     session: Path,
-    method: Method | Literal["refined"],
-    rate: float | None,
-    persons: int,
-    min_confidence: float,
-    pixel_noise: float,
-    pose_noise: str | None,
-    refine_cameras: Literal["background"] | None,
-    disturb_poses: str | None,
-    trials: int,
-    seed: int,
-    fill: float | None,
-    smooth: str | None,
-    detector: str,
-    provider: str | None,
-    every: int,
-    start: float | None,
-    end: float | None,
+    settings: Settings,
     overlay: bool,
     workers: int,
     force: bool,
-    as_json: bool,
-    quiet: bool,
-    verbose: int,
+    shown: Shown,
 ) -> dict[str, Any] | None:
     """Find the actor's joints in the pictures, triangulate them, and measure the errors."""
     from pipelines.overlay import refuse_overlays, write_overlays
-    from pipelines.reconstruct import Settings, reconstruct
+    from pipelines.reconstruct import reconstruct
 
-    if start is not None and end is not None and start >= end:
-        raise click.BadParameter(f"{end:g} is not after --start {start:g}", param_hint="--end")
-    settings = Settings(
-        method=method,
-        rate_hz=rate,
-        people=persons,
-        min_confidence=min_confidence,
-        pixel_sigma=pixel_noise,
-        pose_noise=pose_noise,
-        detector=with_provider(detector, provider),
-        every=every,
-        start_s=start,
-        end_s=end,
-        fill_s=fill,
-        smooth=smooth,
-        refine_cameras=refine_cameras,
-        disturb_poses=disturb_poses,
-        trials=trials,
-        seed=seed,
-    )
     if overlay:
         refuse_overlays(session, force=force)
-    with watching(level(quiet, verbose)) as progress:
+    with watching(shown.level) as progress:
         result = reconstruct(session, settings, workers=workers, force=force, progress=progress)
         videos = write_overlays(session, workers=workers, force=force, progress=progress) if overlay else []
-    say_warnings(result.record.warnings, quiet)
-    if as_json:
+    say_warnings(result.record.warnings, shown.quiet)
+    if shown.as_json:
         return result.metrics
-    if not quiet:
-        _print(result, every_joint=verbose > 0)
+    if not shown.quiet:
+        _print(result, every_joint=shown.verbose > 0)
     say(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'reconstruct'}")
     for video in videos:
         say(f"written: {video}")

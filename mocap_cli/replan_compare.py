@@ -10,142 +10,140 @@ import click
 from mocap_cli.filming import Rendering, film_arms, print_filmed, render_options
 from mocap_cli.options import (
     FiniteRange,
+    Shown,
     any_path,
     force_option,
-    json_option,
-    level,
+    grouped,
+    output_options,
     seed_option,
-    verbosity_options,
 )
 from mocap_cli.several import each
 from mocap_cli.terminal import print_table, say, say_warnings, watching
 
 if TYPE_CHECKING:
-    from pipelines.planning.config import Mode
+    from pipelines.planning.scene import Settings
+
+
+def _settings(arms: str | None, config: Path | None, horizon_s: float | None, **others: Any) -> Settings:
+    from pipelines.planning.scene import Settings
+    from pipelines.replan import planner_settings
+
+    stated = {name: others.pop(name) for name in ("radius_m", "tilt_deg", "yaws", "yaw_frame")}
+    changes = {name: value for name, value in stated.items() if value is not None}
+    return Settings(
+        arms=None if arms is None else tuple(name.strip() for name in arms.split(",")),
+        planner=planner_settings(config, changes, horizon_s=horizon_s),
+        **others,
+    )
+
+
+_settings_options = grouped(
+    "settings",
+    _settings,
+    click.option(
+        "--arms",
+        metavar="NAME,...",
+        help="What is compared: adaptive, fixed, covariance, greedy; flown and planned, what the log says was"
+        " flown and commanded [default: adaptive, fixed, flown where cameras moved, planned where logged].",
+    ),
+    click.option(
+        "--drones", type=click.IntRange(2, 8), help="How many [default: the session's cameras, at least 2]."
+    ),
+    click.option(
+        "--radius",
+        "radius_m",
+        type=FiniteRange(0.5, 500),
+        metavar="M",
+        help="From the actor to the slots (`covariance` and `greedy` only start there).",
+    ),
+    click.option(
+        "--tilt",
+        "tilt_deg",
+        type=FiniteRange(-10, 85),
+        metavar="DEG",
+        help="Of the slots above the actor (likewise).",
+    ),
+    click.option("--yaws", type=click.IntRange(1, 360), help="Cells of a full turn that are searched."),
+    click.option(
+        "--horizon",
+        "horizon_s",
+        type=FiniteRange(0.1, 600),
+        metavar="S",
+        help="How far the search looks ahead, at most 60 knots.",
+    ),
+    click.option(
+        "--yaw",
+        "yaw_deg",
+        type=FiniteRange(-360, 360),
+        metavar="DEG",
+        help="Of the first camera at the start, counterclockwise from east, or from --yaw-frame"
+        " [default: where it was].",
+    ),
+    click.option(
+        "--yaw-frame",
+        type=click.Choice(["world", "heading"]),
+        help="What yaws count from: east, or where the actor heads, so that formations turn with them"
+        " [default: world].",
+    ),
+    click.option(
+        "--config",
+        type=any_path,
+        metavar="PLANNER.yaml",
+        help="Planner settings (docs/planner.md); the options above win over it.",
+    ),
+    click.option(
+        "--mode",
+        type=click.Choice(["closed-loop", "plan-only"]),
+        default="closed-loop",
+        show_default=True,
+        help="Fly the plans as point masses, or be exactly where they are.",
+    ),
+    click.option(
+        "--trials",
+        type=click.IntRange(1, 10_000),
+        default=20,
+        show_default=True,
+        help="Draws of detector and pose noise for the reconstruction error.",
+    ),
+    seed_option("Of all noise."),
+    click.option(
+        "--pose-noise",
+        metavar="MODEL",
+        help="Errors of the cameras' poses, instead of what the session says; for example"
+        ' "white:position_m=0.3,rotation_deg=1".',
+    ),
+)
 
 
 @click.command("replan-compare", short_help="Fly other planners against the log, compare.")
 @each("session", "SESSION")
-@click.option(
-    "--arms",
-    metavar="NAME,...",
-    help="What is compared: adaptive, fixed, covariance, greedy; flown and planned, what the log says was"
-    " flown and commanded [default: adaptive, fixed, flown where cameras moved, planned where logged].",
-)
-@click.option(
-    "--drones", type=click.IntRange(2, 8), help="How many [default: the session's cameras, at least 2]."
-)
-@click.option(
-    "--radius",
-    type=FiniteRange(0.5, 500),
-    metavar="M",
-    help="From the actor to the slots (`covariance` and `greedy` only start there).",
-)
-@click.option(
-    "--tilt", type=FiniteRange(-10, 85), metavar="DEG", help="Of the slots above the actor (likewise)."
-)
-@click.option("--yaws", type=click.IntRange(1, 360), help="Cells of a full turn that are searched.")
-@click.option(
-    "--horizon",
-    type=FiniteRange(0.1, 600),
-    metavar="S",
-    help="How far the search looks ahead, at most 60 knots.",
-)
-@click.option(
-    "--yaw",
-    type=FiniteRange(-360, 360),
-    metavar="DEG",
-    help="Of the first camera at the start, counterclockwise from east, or from --yaw-frame"
-    " [default: where it was].",
-)
-@click.option(
-    "--yaw-frame",
-    type=click.Choice(["world", "heading"]),
-    help="What yaws count from: east, or where the actor heads, so that formations turn with them"
-    " [default: world].",
-)
-@click.option(
-    "--config",
-    type=any_path,
-    metavar="PLANNER.yaml",
-    help="Planner settings (docs/planner.md); the options above win over it.",
-)
-@click.option(
-    "--mode",
-    type=click.Choice(["closed-loop", "plan-only"]),
-    default="closed-loop",
-    show_default=True,
-    help="Fly the plans as point masses, or be exactly where they are.",
-)
-@click.option(
-    "--trials",
-    type=click.IntRange(1, 10_000),
-    default=20,
-    show_default=True,
-    help="Draws of detector and pose noise for the reconstruction error.",
-)
-@seed_option("Of all noise.")
-@click.option(
-    "--pose-noise",
-    metavar="MODEL",
-    help="Errors of the cameras' poses, instead of what the session says; for example"
-    ' "white:position_m=0.3,rotation_deg=1".',
-)
+@_settings_options
 @render_options
 @force_option
-@json_option
-@verbosity_options
+@output_options
 def replan_compare_command(
     session: Path,
-    arms: str | None,
-    drones: int | None,
-    radius: float | None,
-    tilt: float | None,
-    yaws: int | None,
-    horizon: float | None,
-    yaw: float | None,
-    yaw_frame: str | None,
-    config: Path | None,
-    mode: Mode,
-    trials: int,
-    seed: int,
-    pose_noise: str | None,
+    settings: Settings,
     rendering: Rendering | None,
     force: bool,
-    as_json: bool,
-    quiet: bool,
-    verbose: int,
+    shown: Shown,
 ) -> dict[str, Any] | None:
     """Replay formation planners against the logged actor and map, and compare them in numbers.
 
     The actor's own skeleton is filmed again from each planner's cameras, with simulated errors of detector
     and poses. Every figure of a replay is simulated; `flown` and `planned` are what the log says.
     """
-    from pipelines.planning.scene import Settings
-    from pipelines.replan import planner_settings, replan
+    from pipelines.replan import replan
 
-    stated = {"radius_m": radius, "tilt_deg": tilt, "yaws": yaws, "yaw_frame": yaw_frame}
-    settings = Settings(
-        arms=None if arms is None else tuple(name.strip() for name in arms.split(",")),
-        drones=drones,
-        yaw_deg=yaw,
-        mode=mode,
-        trials=trials,
-        seed=seed,
-        pose_noise=pose_noise,
-        planner=planner_settings(
-            config, {name: value for name, value in stated.items() if value is not None}, horizon_s=horizon
-        ),
-    )
-    with watching(level(quiet, verbose)) as progress:
+    with watching(shown.level) as progress:
         result = replan(session, settings, force=force, progress=progress)
         filmed = None
         if rendering is not None:
             filmed = film_arms(session, rendering, force=force, progress=progress)
-    say_warnings(result.record.warnings, quiet)
-    if as_json:
+    say_warnings(result.record.warnings, shown.quiet)
+    if shown.as_json:
         return result.metrics if filmed is None else result.metrics | {"filmed": filmed}
-    if not quiet:
+    if not shown.quiet:
         _print(result.metrics)
         if filmed is not None:
             print_filmed(filmed)

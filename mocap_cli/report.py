@@ -7,12 +7,11 @@ from pathlib import Path
 import click
 
 from mocap_cli.options import (
+    Shown,
     any_path,
     force_option,
-    json_option,
-    level,
+    output_options,
     overwrite_option,
-    verbosity_options,
 )
 from mocap_cli.several import end, expanded, tell
 from mocap_cli.terminal import print_json, say, say_warnings, watching
@@ -44,8 +43,7 @@ from pipelines.session.errors import MocapError
 )
 @force_option
 @overwrite_option
-@json_option
-@verbosity_options
+@output_options
 def report_command(
     sessions: tuple[Path, ...],
     output: Path | None,
@@ -53,9 +51,7 @@ def report_command(
     figures: Path | None,
     force: bool,
     overwrite: bool,
-    as_json: bool,
-    quiet: bool,
-    verbose: int,
+    shown: Shown,
 ) -> None:
     """Write one self-contained HTML page for each session: how good, how sure, what is doubtful.
 
@@ -70,7 +66,7 @@ def report_command(
     compared = drawn = None
     results = []
     failed: dict[str, str] = {}
-    with watching(level(quiet, verbose)) as progress:
+    with watching(shown.level) as progress:
         progress.start("Writing pages", len(ones) + (len(ones) > 1) + (figures is not None))
         for session in ones:
             try:
@@ -87,8 +83,8 @@ def report_command(
             drawn = write_figures_of(ones, figures, studies=studies, overwrite=overwrite, force=force)
             progress.advance()
     for result in results:
-        say_warnings(result.record.warnings, quiet)
-    if as_json:
+        say_warnings(result.record.warnings, shown.quiet)
+    if shown.as_json:
         print_json(
             {
                 "pages": [str(result.page) for result in results],

@@ -7,12 +7,11 @@ from pathlib import Path
 import click
 
 from mocap_cli.options import (
+    Shown,
     any_path,
     force_option,
-    json_option,
-    level,
+    output_options,
     overwrite_option,
-    verbosity_options,
     workers_option,
 )
 from mocap_cli.terminal import print_json, print_table, say, watching
@@ -29,8 +28,7 @@ from mocap_cli.terminal import print_json, print_table, say, watching
 @workers_option("Pictures rendered at once; the flight does not depend on them.")
 @overwrite_option
 @force_option
-@json_option
-@verbosity_options
+@output_options
 def simulate_command(
     scenario: Path,
     output: Path,
@@ -38,14 +36,12 @@ def simulate_command(
     workers: int,
     overwrite: bool,
     force: bool,
-    as_json: bool,
-    quiet: bool,
-    verbose: int,
+    shown: Shown,
 ) -> None:
     """Make the files that a flight would bring home: logs, videos, calibration, map - and the truth."""
     from pipelines.simulate import simulate
 
-    with watching(level(quiet, verbose)) as progress:
+    with watching(shown.level) as progress:
         result = simulate(
             scenario,
             output,
@@ -55,10 +51,10 @@ def simulate_command(
             force=force,
             progress=progress,
         )
-    if as_json:
+    if shown.as_json:
         print_json(result.summary)
         return
-    if not quiet:
+    if not shown.quiet:
         summary = result.summary
         rows = [(name, count, summary["poses"][name]) for name, count in summary["frames"].items()]
         say(f"{summary['name']}: {summary['duration_s']:g} s, simulated, {summary['pictures']}")
