@@ -15,7 +15,7 @@ from rosbags.highlevel import AnyReader
 from pipelines.formats.calibrations import ros_camera_info
 from pipelines.formats.calibrations.ros_camera_info import write_camera_info
 from pipelines.formats.logs import mcap_log
-from pipelines.formats.logs.ros2_recording import Ros2Recording
+from pipelines.formats.logs.ros2_writing import Ros2Recording
 from pipelines.formats.videos import video
 from pipelines.formats.videos.video_writing import TICK_S, join_videos, write_h264
 from pipelines.geometry.cameras import Intrinsics, project

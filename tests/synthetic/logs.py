@@ -25,7 +25,7 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
-from pipelines.formats.logs.ros_messages import build
+from pipelines.formats.logs.ros2_writing import build
 from tests.formats.foxglove_protobuf import protobuf
 
 ROS1 = get_typestore(Stores.ROS1_NOETIC)

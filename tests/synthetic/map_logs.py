@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import get_types_from_msg
 
-from pipelines.formats.logs.map_topics import OCCUPANCY_GRID, OCTOMAP, POINT_CLOUD
+from pipelines.formats.logs.maps import OCCUPANCY_GRID, POINT_CLOUD
+from pipelines.formats.logs.message_decoders import OCTOMAP
 from pipelines.formats.maps.octomap import write_octomap
 from pipelines.geometry.arrays import Float
 from pipelines.session.records import Occupancy

@@ -15,31 +15,34 @@ from typing import Literal, Self
 
 from pipelines.formats.flights.log_times import doubts_of_stamps, world_times
 from pipelines.formats.flights.open_logs import OpenLogs
-from pipelines.formats.flights.picture_encodings import decode
-from pipelines.formats.flights.pictures import later_times, picture_samples, picture_stamps
 from pipelines.formats.logs.commands import COMMAND_TYPES, read_commands
-from pipelines.formats.logs.fixed_layouts import poses_at_once
-from pipelines.formats.logs.frames import frames_of_poses, place_of_frame, transforms_in
-from pipelines.formats.logs.map_topics import (
+from pipelines.formats.logs.maps import (
     MAP_TYPES,
     OCCUPANCY_GRID,
     LoggedMaps,
     Losses,
     MapTopic,
     frame_of,
-    map_messages,
+    read_maps,
 )
-from pipelines.formats.logs.maps import read_maps
 from pipelines.formats.logs.messages import Kind, all_samples, kind_of
+from pipelines.formats.logs.pictures import (
+    TRIGGER_TYPES,
+    decode,
+    later_times,
+    picture_stamps,
+    read_triggers,
+)
 from pipelines.formats.logs.presets import NAV_SAT_FIX, read_pair, read_positions, read_preset
 from pipelines.formats.logs.trajectories import (
     Gathered,
     attitudes_of,
     chained,
-    trajectory_of,
-    trajectory_of_arrays,
+    frames_of_poses,
+    place_of_frame,
+    poses_of,
+    transforms_in,
 )
-from pipelines.formats.logs.triggers import TRIGGER_TYPES, read_triggers
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight, PoseSource
 from pipelines.session.manifest import Log as LogSource
@@ -55,9 +58,6 @@ from pipelines.session.records import (
 )
 from pipelines.session.registries import Log
 from pipelines.session.telemetry import PositionTrack, Telemetry, TelemetryChoice
-
-_MAY_DISAGREE_S = 0.5  # header and receive stamps: transport and decoding take less
-_MAY_JUMP_S = 1.0  # from one message to the next, in addition to the time that passed
 
 _Wanted = Kind | Literal["maps"]
 
@@ -127,7 +127,7 @@ class FlightLogs:
                 gathered = self._chained(log, recording, source, topic, parent, child, max_gap_ns)
             else:
                 name = self._choose(recording, source, "poses", topic)
-                gathered = self._poses(log, recording, source, name)
+                gathered = poses_of(recording, name, source, self.settings(log).stamps)
             lost = dict(recording.dropped)
             started_ns = _start_ns(recording)
         return self._at_world_times(log, source, gathered, lost, started_ns)
@@ -204,8 +204,6 @@ class FlightLogs:
                 stamps=self.settings(log).stamps,
                 order=order,
                 units=units,
-                may_disagree_s=_MAY_DISAGREE_S,
-                may_jump_s=_MAY_JUMP_S,
             )
             lost = dict(recording.dropped)
             started_ns = _start_ns(recording)
@@ -261,7 +259,7 @@ class FlightLogs:
         """
         with self._open(log) as (recording, source):
             name = self._choose(recording, source, "pictures", topic)
-            for sample in picture_samples(recording, name, source):
+            for sample in all_samples(recording.messages([name]), source):
                 if not isinstance(sample, PictureSample):
                     continue  # `frames` refuses it
                 if sample.width and sample.height:
@@ -288,7 +286,7 @@ class FlightLogs:
         with self._open(log) as (recording, source):
             topic = self._choose(recording, source, "maps", stated.topic)
             type_ = next(each.type for each in recording.topics if each.name == topic)
-            first = next(map_messages(recording, topic), None)
+            first = next(recording.messages([topic]), None)
             if first is None:
                 raise Losses(f"{source} {topic}", recording.dropped).nothing_usable()
             if stated.height_m is not None and type_ != OCCUPANCY_GRID:
@@ -311,7 +309,7 @@ class FlightLogs:
 
         def read() -> Iterator[Message]:
             with self._open(log) as (recording, _):
-                yield from map_messages(recording, topic)
+                yield from recording.messages([topic])
                 lost.update(recording.dropped)
 
         about = MapTopic(
@@ -368,19 +366,6 @@ class FlightLogs:
         self._note(f"{source}: took {_NOUNS[kind]} from {only}, the only candidate")
         return only
 
-    def _poses(self, log: str, recording: Log, source: str, topic: str) -> Gathered:
-        """Read the poses of a topic: all at once if its messages have one layout, else one by one."""
-        place, stamps = f"{source} {topic}", self.settings(log).stamps
-        arrays = poses_at_once(recording, topic)
-        if arrays is not None:
-            return trajectory_of_arrays(
-                arrays, place, stamps=stamps, may_disagree_s=_MAY_DISAGREE_S, may_jump_s=_MAY_JUMP_S
-            )
-        samples = all_samples(recording.messages([topic]), source)
-        return trajectory_of(
-            samples, place, stamps=stamps, may_disagree_s=_MAY_DISAGREE_S, may_jump_s=_MAY_JUMP_S
-        )
-
     def _chained(
         self,
         log: str,
@@ -399,8 +384,6 @@ class FlightLogs:
             child=child,
             stamps=self.settings(log).stamps,
             max_gap_ns=max_gap_ns,
-            may_disagree_s=_MAY_DISAGREE_S,
-            may_jump_s=_MAY_JUMP_S,
         )
 
     def _at_world_times(

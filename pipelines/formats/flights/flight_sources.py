@@ -19,7 +19,7 @@ from pipelines.formats.flights.frame_sources import CameraFrames, FrameSources
 from pipelines.formats.flights.gimbal_angles import attitudes_at, stated_angles
 from pipelines.formats.flights.telemetry_poses import Origin, TelemetryPoses
 from pipelines.formats.flights.world_axes import body_in_enu, in_enu, in_world, refuse_projected
-from pipelines.formats.logs.map_topics import LoggedMaps
+from pipelines.formats.logs.maps import LoggedMaps
 from pipelines.formats.maps.ros_map import FORMAT as ROS_MAP
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple, Protocol, Self, TypeVar
+from typing import Protocol, Self
 
-import numpy as np
-
-from pipelines.formats.flights.picture_encodings import KNOWN, decode, is_known
 from pipelines.formats.logs.messages import all_samples
-from pipelines.formats.logs.picture_layouts import HEAD_LENGTH, picture_decoder, read_stamps
-from pipelines.formats.logs.recordings import OpenLog, messages_alike
+from pipelines.formats.logs.pictures import KNOWN, decode, is_known, later_pictures
 from pipelines.formats.videos.video import VideoReader
 from pipelines.geometry.arrays import Picture
 from pipelines.session.description import Description, MediaEntry
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64, PictureSample, Sample
+from pipelines.session.records import PictureSample
 from pipelines.session.registries import Log, LogFormat, recognise
 from pipelines.session.stage_records import noted_stamps
 from pipelines.session.storage import file_stamp, sha256_of
-
-_MAY_LEAP_NS = 1_000_000_000  # transport and decoding take less time
 
 
 class Pictures(Protocol):
@@ -38,26 +31,6 @@ class Pictures(Protocol):
 
     def __exit__(self, *exception: object) -> None:
         """Close the files."""
-
-
-class Stamped(Protocol):
-    """Stamps of a picture, without its pixels."""
-
-    @property
-    def stamp_ns(self) -> int:
-        """Stamp of its header; 0 without one."""
-
-    @property
-    def receive_ns(self) -> int:
-        """Stamp of its receipt."""
-
-
-class _Stamps(NamedTuple):
-    stamp_ns: int
-    receive_ns: int
-
-
-_Stamped = TypeVar("_Stamped", bound=Stamped)
 
 
 @contextmanager
@@ -181,95 +154,6 @@ class LoggedPictures:
             )
 
     def _begin(self) -> Iterator[PictureSample]:
-        samples = picture_samples(self._log, self._topic, self._source)
+        samples = all_samples(self._log.messages([self._topic]), self._source)
         pictures = (sample for sample in samples if isinstance(sample, PictureSample))
         return later_pictures(pictures, self._stamps)
-
-
-def picture_samples(recording: Log, topic: str, source: Path | str) -> Iterator[Sample]:
-    """Yield the samples of a topic of pictures, in the order of receipt; see `all_samples`.
-
-    Args:
-        recording: an open log.
-        topic: its name.
-        source: the log, for messages to the user.
-    """
-    if isinstance(recording, OpenLog):
-        return all_samples(recording.messages([topic], picture_decoder), source)
-    return all_samples(recording.messages([topic]), source)
-
-
-def picture_stamps(recording: Log, topic: str, source: Path | str) -> tuple[Int64, Int64]:
-    """Return header stamps [N] (0 without one) and stamps of receipt [N] of a topic's pictures.
-
-    The order is that of receipt.
-
-    The pictures are the same as those of `picture_samples`. If their messages have one layout, only the
-    beginning of each is read.
-
-    Raises:
-        DataError: the topic holds something else.
-    """
-    if (at_once := _stamps_at_once(recording, topic)) is not None:
-        return at_once
-    header_ns, receive_ns = array("q"), array("q")
-    for sample in picture_samples(recording, topic, source):
-        if not isinstance(sample, PictureSample):
-            raise DataError(source, f"{topic} holds no pictures", "name another topic")
-        header_ns.append(sample.stamp_ns)
-        receive_ns.append(sample.receive_ns)
-    return np.array(header_ns, np.int64), np.array(receive_ns, np.int64)
-
-
-def _stamps_at_once(recording: Log, topic: str) -> tuple[Int64, Int64] | None:
-    alike = messages_alike(recording, topic)
-    if alike is None:
-        return None
-    return read_stamps(alike.schema, alike.log.heads(alike.topic, HEAD_LENGTH))
-
-
-def later_pictures(pictures: Iterator[_Stamped], stamps: str) -> Iterator[_Stamped]:
-    """Yield the pictures whose stamp is above all before: frame k of a topic is the k-th of these."""
-    newest: _Stamped | None = None
-    leapt: _Stamped | None = None
-    for picture in pictures:
-        if newest is not None:
-            if stamp_of(picture, stamps) <= stamp_of(newest, stamps):
-                continue
-            # One damaged stamp far ahead must not cost all the pictures after it. If the clock was really set
-            # forward, the next picture shows the same jump.
-            if _leap_ns(newest, picture) > _MAY_LEAP_NS and (
-                leapt is None or abs(_leap_ns(leapt, picture)) > _MAY_LEAP_NS
-            ):
-                leapt = picture
-                continue
-        newest, leapt = picture, None
-        yield picture
-
-
-def later_times(header_ns: Int64, receive_ns: Int64, stamps: str) -> Int64:
-    """Return the stamps of the `later_pictures`, [n], strictly increasing.
-
-    Args:
-        header_ns: [N] stamps of the headers of all pictures, in the order of receipt; 0 without one.
-        receive_ns: [N] of receipt.
-        stamps: which of them order the pictures: header or receive.
-    """
-    times = np.where((header_ns != 0) & (stamps == "header"), header_ns, receive_ns)
-    leaps = np.where((header_ns[1:] != 0) & (header_ns[:-1] != 0), np.diff(header_ns - receive_ns), 0)
-    if (np.diff(times) > 0).all() and (leaps <= _MAY_LEAP_NS).all():
-        return times  # the usual case
-    pictures = map(_Stamps, header_ns.tolist(), receive_ns.tolist())
-    return np.array([stamp_of(picture, stamps) for picture in later_pictures(pictures, stamps)], np.int64)
-
-
-def _leap_ns(before: Stamped, after: Stamped) -> int:
-    """Return by how much the header clock advanced more than the receipt clock between two pictures, ns."""
-    if not before.stamp_ns or not after.stamp_ns:
-        return 0
-    return (after.stamp_ns - before.stamp_ns) - (after.receive_ns - before.receive_ns)
-
-
-def stamp_of(picture: Stamped, stamps: str) -> int:
-    """Return the header stamp if it exists and is wanted, else the stamp of receipt."""
-    return picture.stamp_ns if stamps == "header" and picture.stamp_ns else picture.receive_ns

@@ -8,7 +8,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from pipelines.formats.flights.flight_sources import source_files
-from pipelines.formats.logs.mcap_checksums import OTHER_CHECKSUM, CheckedHash, stated_checksum
+from pipelines.formats.logs.mcap_log import OTHER_CHECKSUM, CheckedHash, stated_checksum
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight
 from pipelines.session.progress import Progress

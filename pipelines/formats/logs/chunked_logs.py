@@ -18,7 +18,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.formats.logs.inflation import inflate
+from pipelines.formats.logs.message_decoders import inflate
 from pipelines.formats.logs.recordings import (
     DAMAGED,
     MISPLACED,

@@ -12,11 +12,11 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from pipelines.formats.logs.messages import FAULTS, nanoseconds, unreadable
+from pipelines.formats.logs.messages import FAULTS, Stamps, nanoseconds, unreadable
 from pipelines.formats.poses.pose_rows import clean_poses
 from pipelines.session.errors import DataError
 from pipelines.session.records import Message, Trajectory
@@ -56,9 +56,7 @@ class _Way:
         return clean_poses(source, np.frombuffer(self._t_ns, dtype=np.int64), readable, position, level)
 
 
-def read_commands(
-    recording: Log, source: str, topic: str, stamps: Literal["header", "receive"]
-) -> Trajectory:
+def read_commands(recording: Log, source: str, topic: str, stamps: Stamps) -> Trajectory:
     """Read the positions that a topic of one of `COMMAND_TYPES` commanded, in the axes of the log.
 
     Setpoints without a position or relative to the body are dropped and counted, and so are empty

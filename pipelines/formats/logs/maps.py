@@ -1,46 +1,86 @@
-"""Maps in logs: octomap_msgs/Octomap, nav_msgs/OccupancyGrid, and by `clouds` sensor_msgs/PointCloud2.
+"""Maps in logs: octomap_msgs/Octomap, nav_msgs/OccupancyGrid and sensor_msgs/PointCloud2.
 
-Consecutive maps of a topic replace each other, as they did in flight. So every change is a map of its own,
-with the stamp from which it is valid. A log of any length needs the memory of its largest map only; its
-messages are read twice if there is more than one map.
+Consecutive octomaps and floor plans of a topic replace each other, as they did in flight. So every change is
+a map of its own, with the stamp from which it is valid. A log of any length needs the memory of its largest
+map only; its messages are read twice if there is more than one map.
+
+Point clouds become maps that grow: a voxel is occupied from the time of its first point on, and each map
+holds all points up to one of a few times of the flight. Moving things, above all the actor, leave a trace of
+occupied voxels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from typing import Any
 
 import numpy as np
 
-from pipelines.formats.logs.clouds import accumulated
-from pipelines.formats.logs.map_topics import (
-    OCTOMAP,
-    PLACELESS,
-    POINT_CLOUD,
-    RECORD_AGAIN,
-    LoggedMaps,
-    Losses,
-    MapTopic,
-    evenly,
-    place_at,
-    time_of,
-)
-from pipelines.formats.logs.messages import bytes_of
+from pipelines.formats.logs.message_decoders import OCTOMAP
+from pipelines.formats.logs.messages import Stamps, bytes_of, nanoseconds
 from pipelines.formats.maps.octomap import leaves_of, occupancy_from
-from pipelines.formats.maps.voxel_grids import Pose, extruded, placed
-from pipelines.geometry.poses import compose
+from pipelines.formats.maps.voxel_grids import Pose, VoxelSet, extruded, placed
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.poses import compose, interpolate_poses, transform
 from pipelines.session.errors import DataError
 from pipelines.session.maps import MOST_VOXELS, check_resolution
-from pipelines.session.records import Message, Occupancy
+from pipelines.session.records import Int64, Message, Occupancy, Trajectory
+
+OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+MAP_TYPES = (OCTOMAP, OCCUPANCY_GRID, POINT_CLOUD)
 
 MOST_MAPS = 100
 """Limit of the maps kept; a replay computes the distance field of each, which takes seconds if large."""
 
+MOST_CLOUD_MAPS = 10
+"""Largest number of times at which the points so far become a map."""
+
+_DAMAGED = "map messages that cannot be used"
+_PLACELESS = "map messages at whose time no transform is known"
 _EMPTY = "empty maps"
 _LATE = "maps without a later stamp"
 _NOT_KEPT = "maps between those that are kept"
+_RECORD_AGAIN = "check what wrote the log"
+
+# Types that coordinates can have, by the numbers of sensor_msgs/PointField.
+_FLOAT_TYPES = {7: "f4", 8: "f8"}
+
+
+@dataclass(frozen=True)
+class MapTopic:
+    """Settings to read the messages of a topic of maps.
+
+    Args:
+        source: log and topic, for messages.
+        frame: of all its messages.
+        stamps: the stamps in use: header or receive.
+        world_from_frame: poses of that frame; a single row always holds.
+        max_gap_ns: the longest gap between two of its rows that is interpolated.
+        resolution_m: side of the voxels, if it is stated.
+        height_m: height of the cells of a floor plan.
+    """
+
+    source: str
+    frame: str
+    stamps: Stamps
+    world_from_frame: Trajectory
+    max_gap_ns: int
+    resolution_m: float | None
+    height_m: float
+
+
+@dataclass(frozen=True)
+class LoggedMaps:
+    """Maps of a topic in the order of their times, with losses and notes."""
+
+    maps: Iterator[Occupancy]  # made one at a time
+    from_ns: Int64  # [K] of each, strictly increasing
+    dropped: dict[str, int]  # by cause
+    notes: list[str] = field(default_factory=list)
 
 
 class _EmptyMapError(Exception):
@@ -68,8 +108,98 @@ def read_maps(read: Callable[[], Iterator[Message]], type_: str, about: MapTopic
         DataError: no map is usable, or one is too large.
     """
     if type_ == POINT_CLOUD:
-        return accumulated(read(), about)
+        return _accumulated(read(), about)
     return _changing(read, about)
+
+
+def frame_of(message: Message, source: str) -> str:
+    """Return the frame of a map, without the leading slash of ROS 1.
+
+    Raises:
+        DataError: the message has no readable frame.
+    """
+    try:
+        return str(message.value.header.frame_id).lstrip("/")
+    except AttributeError as error:
+        raise DataError(source, f"its messages lack the field {error.name!r}", _RECORD_AGAIN) from error
+
+
+class Losses:
+    """Messages of a topic that could not be used.
+
+    Attributes:
+        counts: number of messages by cause.
+    """
+
+    def __init__(self, source: str, counts: Mapping[str, int] | None = None) -> None:
+        self.counts: Counter[str] = Counter(counts)
+        self._source = source
+        self._first: DataError | None = None
+
+    def damaged(self, fault: DataError) -> None:
+        """Count a message that cannot be read; keep the first fault for the note."""
+        self.counts[_DAMAGED] += 1
+        self._first = self._first or fault
+
+    def notes(self) -> list[str]:
+        """Return a note about the messages that cannot be read; empty if all can."""
+        if self._first is None:
+            return []
+        return [f"{self._source}: {self._first.problem} ({self.counts[_DAMAGED]} such messages)"]
+
+    def nothing_usable(self) -> DataError:
+        """Return the error for a topic without a usable map: the first fault, else the losses."""
+        if self._first is not None:
+            return self._first
+        causes = ", ".join(f"{count} {cause}" for cause, count in (+self.counts).items())
+        return DataError(
+            self._source,
+            f"holds no map ({causes or 'it is empty'})",
+            "name another topic, or leave `map:` out",
+        )
+
+
+def evenly(count: int, most: int) -> list[int]:
+    """Return at most `most` of `count` rows, evenly spaced, always with the last one."""
+    if count <= most:
+        return list(range(count))
+    rows: list[int] = np.linspace(count - 1, 0, most).round().astype(int)[::-1].tolist()
+    return rows
+
+
+def _time_of(message: Message, about: MapTopic) -> int:
+    """Return the stamp to use.
+
+    Raises:
+        DataError: the message lies in another frame than those before it.
+    """
+    if (frame := frame_of(message, about.source)) != about.frame:
+        raise DataError(
+            about.source, f"lies in frame {frame!r}, the messages before in {about.frame!r}", _RECORD_AGAIN
+        )
+    stamp_ns = nanoseconds(message.value.header.stamp) if about.stamps == "header" else 0
+    return stamp_ns or message.receive_ns
+
+
+def _place_at(t_ns: int, about: MapTopic) -> Pose | None:
+    """Return the pose of a topic's frame in the world; None if no transform gives it."""
+    poses = about.world_from_frame
+    if len(poses.t_ns) == 1:
+        return poses.position[0], poses.quaternion_xyzw[0]
+    after = int(np.searchsorted(poses.t_ns, t_ns))
+    around = slice(max(after - 1, 0), after + 1)
+    position, quaternion = interpolate_poses(
+        poses.t_ns[around],
+        poses.position[around],
+        poses.quaternion_xyzw[around],
+        np.array([t_ns], np.int64),
+        max_gap_ns=about.max_gap_ns,
+        max_extrapolation_ns=0,
+    )
+    return None if np.isnan(position[0, 0]) else (position[0], quaternion[0])
+
+
+# --- maps that replace each other ---------------------------------------------------------------------------
 
 
 def _changing(read: Callable[[], Iterator[Message]], about: MapTopic) -> LoggedMaps:
@@ -87,7 +217,7 @@ def _changing(read: Callable[[], Iterator[Message]], about: MapTopic) -> LoggedM
             lost.damaged(fault)
             continue
         if made is None:
-            lost.counts[PLACELESS] += 1
+            lost.counts[_PLACELESS] += 1
             continue
         digest = _digest(made)
         if digest == last:
@@ -123,16 +253,16 @@ def _changing(read: Callable[[], Iterator[Message]], about: MapTopic) -> LoggedM
 def _made(message: Message, about: MapTopic) -> Occupancy | None:
     """Make the map of one message; None if the pose of its frame is unknown."""
     try:
-        t_ns = time_of(message, about)
-        pose = place_at(t_ns, about)
+        t_ns = _time_of(message, about)
+        pose = _place_at(t_ns, about)
         if pose is None:
             return None
         make = _octomap if message.topic.type == OCTOMAP else _plan
         return replace(make(message.value, about, pose), from_ns=t_ns)
     except AttributeError as error:
-        raise DataError(about.source, f"lacks the field {error.name!r}", RECORD_AGAIN) from error
+        raise DataError(about.source, f"lacks the field {error.name!r}", _RECORD_AGAIN) from error
     except (TypeError, ValueError, OverflowError) as error:
-        raise DataError(about.source, f"cannot be read ({str(error)[:100]})", RECORD_AGAIN) from error
+        raise DataError(about.source, f"cannot be read ({str(error)[:100]})", _RECORD_AGAIN) from error
 
 
 def _made_again(
@@ -177,7 +307,7 @@ def _plan(value: Any, about: MapTopic, pose: Pose) -> Occupancy:
     width, height = int(info.width), int(info.height)
     cells = bytes_of(value.data).view(np.int8)
     if len(cells) != width * height:
-        raise DataError(source, f"holds {len(cells)} of {width} x {height} cells", RECORD_AGAIN)
+        raise DataError(source, f"holds {len(cells)} of {width} x {height} cells", _RECORD_AGAIN)
     if ((cells < -1) | (cells > 100)).any():
         worst = int(cells[(cells < -1) | (cells > 100)][0])
         raise DataError(source, f"holds a cell of {worst}", "-1 is unknown, else 0 to 100 percent")
@@ -205,5 +335,93 @@ def _origin(stated: Any, source: str) -> Pose:
     if norm == 0:
         return position, np.array([0.0, 0.0, 0.0, 1.0])
     if not np.isfinite(position).all() or not abs(norm - 1) < 0.1:
-        raise DataError(source, f"its origin is no pose ({[*position, *quaternion]})", RECORD_AGAIN)
+        raise DataError(source, f"its origin is no pose ({[*position, *quaternion]})", _RECORD_AGAIN)
     return position, quaternion / norm
+
+
+# --- clouds that accumulate ---------------------------------------------------------------------------------
+
+
+def _accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:
+    """Accumulate the clouds of a topic to maps, in the world's axes and by the log's times.
+
+    Raises:
+        DataError: no point is usable, or their box is too large.
+    """
+    lost = Losses(about.source)
+    voxels = VoxelSet(about.source, about.resolution_m)
+    clouds = 0
+    for message in messages:
+        try:
+            t_ns = _time_of(message, about)
+            pose = _place_at(t_ns, about)
+            points = cloud_points(message.value, about.source)
+        except (AttributeError, TypeError, ValueError, OverflowError) as error:
+            lost.damaged(
+                DataError(about.source, f"a cloud cannot be read ({str(error)[:100]})", _RECORD_AGAIN)
+            )
+            continue
+        except DataError as fault:
+            lost.damaged(fault)
+            continue
+        if pose is None:
+            lost.counts[_PLACELESS] += 1
+            continue
+        with np.errstate(invalid="ignore", over="ignore"):  # NaN and infinity stay, and are counted
+            voxels.add(points if _is_the_world(pose) else transform(pose, points), t_ns)
+        clouds += 1
+    lost.counts.update(voxels.dropped)
+    grew_ns = voxels.grew_ns
+    if not len(grew_ns):
+        raise lost.nothing_usable()
+    most = max(1, min(MOST_CLOUD_MAPS, MOST_VOXELS // int(np.prod(voxels.shape))))
+    from_ns = grew_ns[evenly(len(grew_ns), most)]
+    notes = lost.notes()
+    notes.append(
+        f"{about.source}: {clouds} clouds make {len(from_ns)} maps, each of what had been seen by then;"
+        " what moved, like the actor, stays in them"
+    )
+    return LoggedMaps((voxels.occupancy(int(t_ns)) for t_ns in from_ns), from_ns, dict(+lost.counts), notes)
+
+
+def cloud_points(value: Any, source: str) -> Float:
+    """Return the points [N, 3] of a PointCloud2 in its own frame; NaN stays NaN.
+
+    Raises:
+        DataError: no x, y, z of float32 or float64, or fewer bytes than the message states.
+    """
+    width, height, stride = int(value.width), int(value.height), int(value.point_step)
+    order = ">" if value.is_bigendian else "<"
+    fields = {str(each.name): each for each in value.fields}
+    columns: dict[str, tuple[str, int]] = {}
+    for name in ("x", "y", "z"):
+        kind = _FLOAT_TYPES.get(int(fields[name].datatype)) if name in fields else None
+        if kind is None:
+            stated = f"of type {int(fields[name].datatype)}" if name in fields else "not there"
+            raise DataError(source, f"its field {name} is {stated}", "x, y, z of float32 or float64 are read")
+        offset = int(fields[name].offset)
+        if offset < 0 or offset + int(kind[1]) > stride:
+            raise DataError(
+                source, f"its field {name} lies beyond the {stride} bytes of a point", _RECORD_AGAIN
+            )
+        columns[name] = order + kind, offset
+    row_bytes = int(value.row_step) or width * stride
+    data = bytes_of(value.data)
+    if row_bytes < width * stride or len(data) < row_bytes * height:
+        raise DataError(
+            source, f"a cloud breaks off: {len(data)} bytes for {width} x {height} points", _RECORD_AGAIN
+        )
+    # Rows may be padded, and values may be unaligned, so they are copied.
+    rows = np.ascontiguousarray(data[: row_bytes * height].reshape(height, row_bytes)[:, : width * stride])
+    records = rows.reshape(-1, stride) if width * height else rows.reshape(0, stride)
+    points = np.empty((len(records), 3))
+    with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN warns
+        for axis, (kind, offset) in enumerate(columns.values()):
+            values = np.ascontiguousarray(records[:, offset : offset + np.dtype(kind).itemsize])
+            points[:, axis] = values.view(kind)[:, 0] if len(values) else 0
+    return points
+
+
+def _is_the_world(pose: Pose) -> bool:
+    """Return True for the identity pose: points of the world's own frame then keep every bit."""
+    return not pose[0].any() and pose[1].tolist() == [0.0, 0.0, 0.0, 1.0]

@@ -1,4 +1,4 @@
-"""MCAP files (mcap.dev/spec), whole or cut off, chunked or not, with any profile.
+"""MCAP files (mcap.dev/spec), whole or cut off, chunked or not, with any profile, and their checksums.
 
 The mcap library parses the records. But its readers stop at the first damage, and the one for files
 without an index ignores checksums and size limits. So this module walks the file itself.
@@ -6,8 +6,11 @@ without an index ignores checksums and size limits. So this module walks the fil
 
 from __future__ import annotations
 
+import hashlib
 import struct
+import zlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 
@@ -18,12 +21,13 @@ from mcap.exceptions import McapError
 from numpy.typing import NDArray
 
 from pipelines.formats.logs.chunked_logs import CHUNK_LIMIT, Chunk, ChunkedPart, Content, RecordShape
-from pipelines.formats.logs.mcap_checksums import OTHER_CHECKSUM, checksum_is_right
 from pipelines.formats.logs.message_decoders import Schema, ros2_name
 from pipelines.formats.logs.recordings import Channel, OpenLog, describe_log, open_file, open_parts
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64
 from pipelines.session.storage import is_special
+
+OTHER_CHECKSUM = "data section that differs from its checksum"
 
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _STATISTICS = 2, 3, 4, 5, 6, 7, 11
@@ -35,13 +39,18 @@ _INDEX_ROW = np.dtype([("stamp", "<u8"), ("place", "<u8")])
 _NO_SCHEMA = records.Schema(id=0, data=b"", encoding="", name="")
 _RUN = 1 << 20  # bytes of messages outside chunks that are read at once
 _STAMP_LIMIT = 1 << 63  # our stamps are int64
+_BLOCK = 1 << 20  # bytes of a file that are read at once for its checksum
+_DATA_END = 15
+_FOOTER_RECORD = struct.Struct("<BQQQI8s")  # kind, length, start of summary, of its offsets, checksum, magic
+_DATA_END_RECORD = struct.Struct("<BQI")  # kind, length; checksum
+_FOOTER_LENGTH, _DATA_END_LENGTH = 20, 4  # of the records, without kind and length
 
 
 class McapLog:
     """Reader of MCAP files with messages in ros1, cdr, json or protobuf.
 
     Checksums of chunks are verified here. That of the whole data section is verified when the file is
-    hashed or described (`mcap_checksums`).
+    hashed or described.
     """
 
     name = "mcap"
@@ -223,6 +232,88 @@ def _message_row(content: memoryview | bytes, position: int) -> tuple[int, int, 
     if stamp >= _STAMP_LIMIT:
         raise ValueError("a stamp after the year 2262")
     return channel, stamp, position
+
+
+# --- the checksum of the data section ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StatedChecksum:
+    """Checksum that a file states of its own data section."""
+
+    crc: int
+    size: int  # of the data section: bytes from the beginning of the file
+
+
+class CheckedHash:
+    """Hash for `hashlib.file_digest` that also computes the checksum of the first bytes."""
+
+    def __init__(self, stated: StatedChecksum | None) -> None:
+        self._sha256 = hashlib.sha256()
+        self._stated = stated
+        self._left = stated.size if stated else 0
+        self._crc = 0
+
+    @property
+    def differs(self) -> bool:
+        """True if the file states a checksum and its bytes have another one."""
+        return self._stated is not None and self._crc != self._stated.crc
+
+    def update(self, data: memoryview) -> None:
+        """Add some more bytes."""
+        self._sha256.update(data)
+        if self._left:
+            begin = data[: self._left]
+            self._crc = zlib.crc32(begin, self._crc)
+            self._left -= len(begin)
+
+    def digest(self) -> bytes:
+        """Return the SHA-256 of all bytes."""
+        return self._sha256.digest()
+
+
+def checksum_is_right(path: Path) -> bool | None:
+    """Return True if the data section has the stated checksum; reads it all. None if none is stated.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    stated = stated_checksum(path)
+    if stated is None:
+        return None
+    crc, left = 0, stated.size
+    with path.open("rb") as file:
+        while left and (data := file.read(min(left, _BLOCK))):
+            crc = zlib.crc32(data, crc)
+            left -= len(data)
+    return crc == stated.crc
+
+
+def stated_checksum(path: Path) -> StatedChecksum | None:
+    """Return the checksum that a file states; None if it has none, is no MCAP, or has lost its end.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    with path.open("rb") as file:
+        if file.read(len(_MAGIC)) != _MAGIC:
+            return None
+        size = file.seek(0, 2)
+        if size < len(_MAGIC) + _DATA_END_RECORD.size + _FOOTER_RECORD.size:
+            return None
+        footer_at = file.seek(size - _FOOTER_RECORD.size)
+        kind, length, summary_at, _, _, magic = _FOOTER_RECORD.unpack(file.read(_FOOTER_RECORD.size))
+        if (kind, length, magic) != (_FOOTER, _FOOTER_LENGTH, _MAGIC):
+            return None
+        # The summary follows the end of the data. Without a summary the footer does.
+        end = (summary_at or footer_at) - _DATA_END_RECORD.size
+        if not len(_MAGIC) <= end <= footer_at - _DATA_END_RECORD.size:
+            return None
+        file.seek(end)
+        kind, length, crc = _DATA_END_RECORD.unpack(file.read(_DATA_END_RECORD.size))
+    if (kind, length) != (_DATA_END, _DATA_END_LENGTH) or not crc:
+        return None
+    return StatedChecksum(crc, end)
 
 
 FORMAT = McapLog()

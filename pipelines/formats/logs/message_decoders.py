@@ -10,9 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
-
-from pipelines.formats.logs.inflation import ZSTD_MAGIC, inflate
+from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     from google.protobuf.descriptor_pb2 import FileDescriptorProto
@@ -24,7 +22,11 @@ Decoder = Callable[[memoryview | bytes], Any]
 MESSAGE_LIMIT = 1 << 28  # bytes of a message that is compressed by itself
 ARRAY_LIMIT = 1 << 20  # entries of a fixed array; rosbags unrolls arrays of messages into code
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)+", re.ASCII)
+OCTOMAP = "octomap_msgs/msg/Octomap"
+# rosbags does not know this type, and logs of ROS 2 up to Humble carry no definitions.
+_OCTOMAP_DEFINITION = "std_msgs/Header header\nbool binary\nstring id\nfloat64 resolution\nint8[] data\n"
 _BASE64 = "base64"
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
 @dataclass(frozen=True)
@@ -64,36 +66,14 @@ def decoder(schema: Schema) -> Decoder:
     raise ValueError(f"messages in encoding {schema.encoding or 'none'!r} are not read")
 
 
-@lru_cache(maxsize=256)
-def is_standard(schema: Schema) -> bool:
-    """Return True if the log defines a ROS type, with all its nested types, exactly as ROS does."""
-    from rosbags.typesys import Stores, get_typestore
-
-    ours = get_typestore(Stores.ROS1_NOETIC if schema.encoding == "ros1" else Stores.LATEST)
-    try:
-        theirs = _typestore(schema)
-        return _same_type(theirs, ours, schema.type)
-    except (ValueError, KeyError):
-        return False
-
-
-def _same_type(theirs: Typestore, ours: Typestore, type_: str) -> bool:
-    from rosbags.interfaces import Nodetype
-
-    fields, expected = theirs.fielddefs[type_][1], ours.fielddefs[type_][1]
-    return fields == expected and all(
-        _same_type(theirs, ours, str(kind[1])) for _, kind in fields if kind[0] == Nodetype.NAME
-    )
-
-
 def _ros_decoder(schema: Schema) -> Decoder:
     from rosbags.serde import SerdeError
 
-    store = _typestore(schema)
+    store = typestore(schema)
     deserialize = store.deserialize_ros1 if schema.encoding == "ros1" else store.deserialize_cdr
 
     def decode(data: memoryview | bytes) -> Any:
-        if data[:4] == ZSTD_MAGIC and schema.encoding == "cdr":
+        if data[:4] == _ZSTD_MAGIC and schema.encoding == "cdr":
             data = _inflate_message(data)
         try:
             return deserialize(data, schema.type)
@@ -110,9 +90,14 @@ def _inflate_message(data: memoryview | bytes) -> memoryview | bytes:
     return content
 
 
-def _typestore(schema: Schema) -> Typestore:
-    """Return a store that knows the type of a channel and all its nested types."""
-    from rosbags.typesys import Stores, TypesysError, get_typestore
+@lru_cache(maxsize=256)
+def typestore(schema: Schema) -> Typestore:
+    """Return a store that knows the type of a channel and all its nested types.
+
+    Raises:
+        ValueError: the type is unknown, or its definition cannot be used.
+    """
+    from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
     if not _TYPE_NAME.fullmatch(schema.type):
         raise ValueError(f"{schema.type!r} is no type of ROS")
@@ -125,6 +110,8 @@ def _typestore(schema: Schema) -> Typestore:
             types = _ros_types(schema)
             _check_arrays(types)
             store.register(types)
+        elif schema.type == OCTOMAP:
+            store.register(get_types_from_msg(_OCTOMAP_DEFINITION, OCTOMAP))
         store.get_msgdef(schema.type)
     except KeyError as error:
         raise ValueError(f"the log does not define {error}") from error
@@ -252,3 +239,49 @@ def _by_dependency(files: Any) -> list[FileDescriptorProto]:
     for name in list(waiting):
         add(name)
     return ordered
+
+
+# --- compression -----------------------------------------------------------------------------------------
+
+
+class _Decompressor(Protocol):
+    def decompress(self, data: memoryview | bytes, max_length: int) -> bytes: ...
+
+
+def inflate(data: memoryview | bytes, compression: str, size: int) -> tuple[memoryview | bytes, bool]:
+    """Decompress at most `size` bytes; also return True if that was all, neither cut off nor longer.
+
+    Args:
+        data: one compressed frame, perhaps cut off.
+        compression: none (or empty), bz2, lz4 or zstd.
+        size: largest length of the result.
+
+    Raises:
+        ValueError: an unknown compression, or bytes that are not in this compression.
+    """
+    if compression in {"", "none"}:
+        return data[:size], len(data) <= size
+    if compression == "bz2":
+        from bz2 import BZ2Decompressor
+
+        return _bounded(BZ2Decompressor(), data, size, OSError)
+    if compression == "lz4":
+        from lz4.frame import LZ4FrameDecompressor
+
+        return _bounded(LZ4FrameDecompressor(), data, size, RuntimeError)
+    if compression == "zstd":
+        from backports.zstd import ZstdDecompressor, ZstdError
+
+        return _bounded(ZstdDecompressor(), data, size, ZstdError)
+    raise ValueError(f"compression {compression!r} is not read")
+
+
+def _bounded(
+    decompressor: _Decompressor, data: memoryview | bytes, size: int, failure: type[Exception]
+) -> tuple[bytes, bool]:
+    try:
+        # One byte more than allowed shows if the data goes on.
+        content = decompressor.decompress(data, max_length=size + 1)
+    except (failure, EOFError) as error:
+        raise ValueError(str(error)) from error
+    return content[:size], len(content) <= size and bool(getattr(decompressor, "eof", True))

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.calibrations.camera_matrices import intrinsics
-from pipelines.formats.logs.picture_layouts import PictureFields
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.session.errors import DataError
@@ -33,10 +32,11 @@ from pipelines.session.records import (
 )
 
 Kind = Literal["poses", "transforms", "angles", "intrinsics", "pictures"]
+Stamps = Literal["header", "receive"]
 Source = Path | str
 
 # Larger stamps (after the year 2116) are no times, and their differences would not fit int64.
-_LARGEST_STAMP_NS = 2**62
+LATEST_NS = 2**62
 
 _FISHEYE_MODELS = {"equidistant", "fisheye"}
 _RADTAN_MODELS = {"plumb_bob", "rational_polynomial", "radtan"}
@@ -96,7 +96,7 @@ def all_samples(messages: Iterable[Message], source: Source) -> Iterator[Sample]
             yield from samples(message, source)
             continue
         for sample in samples(message, source):
-            if sample.stamp_ns > newest.get(message.topic.name, -_LARGEST_STAMP_NS):
+            if sample.stamp_ns > newest.get(message.topic.name, -LATEST_NS):
                 newest[message.topic.name] = sample.stamp_ns
                 yield sample
 
@@ -299,16 +299,10 @@ def _of_the_picture(full: Intrinsics, value: Any) -> Intrinsics:
 
 
 def _compressed_image(message: Message, _: Source) -> Iterator[Sample]:
-    if isinstance(message.value, PictureFields):
-        yield _laid_out_picture(message.value, message.receive_ns)
-        return
     yield _encoded_picture(message.value.header.stamp, message)
 
 
 def _image(message: Message, _: Source) -> Iterator[Sample]:
-    if isinstance(message.value, PictureFields):
-        yield _laid_out_picture(message.value, message.receive_ns)
-        return
     yield _raw_picture(message.value.header.stamp, message)
 
 
@@ -318,12 +312,6 @@ def _foxglove_compressed_image(message: Message, _: Source) -> Iterator[Sample]:
 
 def _foxglove_raw_image(message: Message, _: Source) -> Iterator[Sample]:
     yield _raw_picture(message.value.timestamp, message)
-
-
-def _laid_out_picture(fields: PictureFields, receive_ns: int) -> PictureSample:
-    stamp_ns, stated, width, height, step, data = fields
-    encoding = _codec(data, stated) if width is None else stated
-    return PictureSample(stamp_ns, receive_ns, encoding, width, height, step, data)
 
 
 def _encoded_picture(stamp: Any, message: Message) -> PictureSample:
@@ -376,7 +364,7 @@ def nanoseconds(stamp: Any) -> int:
 
 
 def _checked(stamp_ns: int) -> int:
-    if abs(stamp_ns) >= _LARGEST_STAMP_NS:
+    if abs(stamp_ns) >= LATEST_NS:
         raise ValueError(f"its stamp of {stamp_ns // 1_000_000_000} s is no time")
     return stamp_ns
 

@@ -30,7 +30,7 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     whatever_from,
     world_from_heading,
 )
-from pipelines.formats.logs.messages import FAULTS, nanoseconds, unreadable
+from pipelines.formats.logs.messages import FAULTS, Stamps, nanoseconds, unreadable
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.clocks import fit_clock
 from pipelines.geometry.mounting import attitude_in_enu
@@ -47,7 +47,6 @@ from pipelines.session.telemetry import (
 )
 
 Preset = Literal["dji_osdk", "mavros"]
-Stamps = Literal["header", "receive"]
 Position = Literal["local", "global", "gps"]
 
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"

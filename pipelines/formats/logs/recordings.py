@@ -18,7 +18,7 @@ from typing import IO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.formats.logs.message_decoders import Decoder, Schema, decoder
+from pipelines.formats.logs.message_decoders import Schema, decoder
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, Message, Topic
 from pipelines.session.registries import Log
@@ -180,16 +180,9 @@ class OpenLog:
         for part in self.parts:
             part.forget()
 
-    def messages(
-        self, topics: Collection[str], decoder_of: Callable[[Schema], Decoder] = decoder
-    ) -> Iterator[Message]:
-        """Yield the messages of some topics in the order of receipt; others are neither read nor decoded.
-
-        Args:
-            topics: their names.
-            decoder_of: makes the function that decodes messages of a schema, as `decoder` does.
-        """
-        streams = [self._of_part(part, frozenset(topics), decoder_of) for part in self.parts]
+    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """Yield the messages of some topics in the order of receipt; others are neither read nor decoded."""
+        streams = [self._of_part(part, frozenset(topics)) for part in self.parts]
         return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=attrgetter("receive_ns"))
 
     def arrays(self, topic: Topic) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
@@ -255,14 +248,12 @@ class OpenLog:
                     return str(error)
         return ""
 
-    def _of_part(
-        self, part: LogPart, topics: frozenset[str], decoder_of: Callable[[Schema], Decoder]
-    ) -> Iterator[Message]:
+    def _of_part(self, part: LogPart, topics: frozenset[str]) -> Iterator[Message]:
         decoders = {}
         for number, channel in part.channels.items():
             if channel.topic in topics:
                 try:
-                    decoders[number] = decoder_of(channel.schema), self._topics[_key(channel)]
+                    decoders[number] = decoder(channel.schema), self._topics[_key(channel)]
                 except ValueError:
                     part.lose(part.rows_of([number]), UNDEFINED)
         rows = part.rows_of(decoders)

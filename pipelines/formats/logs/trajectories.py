@@ -1,20 +1,22 @@
-"""Conversion of a log's samples to trajectories: of poses, of a chain of transforms, of a gimbal.
+"""Conversion of a log's messages to trajectories: of poses, of a chain of transforms, of a gimbal.
 
-Samples are read one at a time into flat arrays (72 bytes a pose, 288 more with a covariance), so a log
-of any length streams through.
+Numbers are gathered into flat arrays (72 bytes a pose, 288 more with a covariance), so a log of any length
+streams through.
 """
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from pipelines.formats.logs.fixed_layouts import PoseArrays
+from pipelines.formats.logs.layouts import Layout, find_layout
+from pipelines.formats.logs.messages import LATEST_NS, Stamps, all_samples, kind_of
+from pipelines.formats.logs.recordings import UnlikeError, messages_alike
 from pipelines.formats.poses.pose_rows import clean_poses
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.clocks import ClockFit, fit_clock
@@ -23,11 +25,31 @@ from pipelines.geometry.poses import pose_covariance_in_body
 from pipelines.geometry.transform_tree import Link, chain, find_route
 from pipelines.session.errors import DataError
 from pipelines.session.records import AngleSample, Int64, PoseSample, Sample, Trajectory
+from pipelines.session.registries import Log
 
-Stamps = Literal["header", "receive"]
 Source = Path | str
 Edge = tuple[str, str]
 """Target and source of a transform."""
+
+_MAY_DISAGREE_S = 0.5  # header and receive stamps: transport and decoding take less
+_MAY_JUMP_S = 1.0  # from one message to the next, in addition to the time that passed
+_FIXED_FRAMES = ("world", "map", "odom", "earth")  # names of fixed frames in REP 105
+
+_THE_WORLD = Trajectory(np.zeros(1, np.int64), np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]))
+"""Identity pose, for a frame that is the log's world."""
+
+_XYZ, _XYZW = ("x", "y", "z"), ("x", "y", "z", "w")
+_POSE = tuple([f"pose.position.{axis}" for axis in _XYZ] + [f"pose.orientation.{axis}" for axis in _XYZW])
+_LINK = tuple(
+    [f"transform.translation.{axis}" for axis in _XYZ] + [f"transform.rotation.{axis}" for axis in _XYZW]
+)
+_LAID_OUT: dict[str, tuple[str, ...]] = {
+    "geometry_msgs/msg/PoseStamped": _POSE,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": (*(f"pose.{path}" for path in _POSE), "pose.covariance"),
+    "geometry_msgs/msg/TransformStamped": _LINK,
+    "nav_msgs/msg/Odometry": (*(f"pose.{path}" for path in _POSE), "pose.covariance"),
+}
+"""Fields of types that can be read many at a time: position, quaternion, covariance if there is one."""
 
 
 @dataclass(frozen=True)
@@ -61,14 +83,70 @@ class Gathered:
 
 
 @dataclass(frozen=True)
+class LoggedRows:
+    """Numbers of one body as logged, in the order of receipt, with both stamps of each row."""
+
+    header_ns: Int64  # [N]; 0 without one
+    receive_ns: Int64  # [N]
+    values: Float  # [N, W]; of poses position, then quaternion xyzw
+    covariance: Float | None = None  # [N, 36], for poses that have one
+    frames: Edge = ("", "")  # as the log names them; empty if it names none
+
+    def times(self, stamps: Stamps) -> Int64:
+        """Return the stamps asked for [N]; without a header stamp, that of receipt."""
+        if stamps == "receive":
+            return self.receive_ns
+        return np.where(self.header_ns == 0, self.receive_ns, self.header_ns)
+
+    def trajectory(self, source: Source, stamps: Stamps) -> Trajectory:
+        """Return the poses, cleaned, with covariances whose rotation is in the body's axes.
+
+        Raises:
+            DataError: none is usable.
+        """
+        covariance = self.covariance
+        if covariance is not None and not covariance.any():
+            covariance = None  # zero throughout means unknown
+        poses = clean_poses(
+            source,
+            self.times(stamps),
+            np.ones(len(self.header_ns), dtype=np.bool_),
+            self.values[:, :3],
+            self.values[:, 3:],
+            None if covariance is None else covariance.reshape(-1, 6, 6),
+        )
+        if poses.covariance is None:
+            return poses
+        return replace(poses, covariance=pose_covariance_in_body(poses.covariance, poses.quaternion_xyzw))
+
+    def check(self) -> StampCheck:
+        """Compare the stamps of header and receipt."""
+        (stamped,) = np.nonzero(self.header_ns)
+        header_ns, receive_ns = self.header_ns[stamped], self.receive_ns[stamped]
+        lead_ns = header_ns - receive_ns
+        jump_ns = np.diff(lead_ns)
+        return StampCheck(
+            count=len(self.header_ns),
+            without_header=len(self.header_ns) - len(stamped),
+            disagreeing=int(np.count_nonzero(np.abs(lead_ns) > _MAY_DISAGREE_S * 1e9)),
+            largest_disagreement_s=float(lead_ns[np.argmax(np.abs(lead_ns))]) / 1e9 if len(stamped) else 0.0,
+            jumps=tuple(
+                ClockJump(int(stamped[k + 1]), int(header_ns[k + 1]), float(jump_ns[k]) / 1e9)
+                for k in np.flatnonzero(np.abs(jump_ns) > _MAY_JUMP_S * 1e9)
+            ),
+            drift=fit_clock(receive_ns, header_ns) if lead_ns.any() else None,
+        )
+
+
+@dataclass(frozen=True)
 class TransformLog:
     """All transforms of a log, by target and source."""
 
-    moving: Mapping[Edge, SampleRows]
-    static: Mapping[Edge, SampleRows]
+    moving: Mapping[Edge, LoggedRows]
+    static: Mapping[Edge, LoggedRows]
 
 
-class SampleRows:
+class _Samples:
     """Samples of one body, gathered into flat arrays."""
 
     def __init__(self) -> None:
@@ -76,9 +154,6 @@ class SampleRows:
         self._receive_ns = array("q")
         self._values = array("d")
         self._covariances = array("d")
-
-    def __len__(self) -> int:
-        return len(self._header_ns)
 
     def add(self, sample: PoseSample | AngleSample, values: Iterable[float]) -> None:
         """Add one sample; the number of values must always be the same."""
@@ -92,55 +167,52 @@ class SampleRows:
         if pose.covariance is not None:
             self._covariances.frombytes(pose.covariance.tobytes())
 
-    def values(self, width: int) -> Float:
-        """Return the values [N, width]."""
-        return np.frombuffer(self._values, dtype=np.float64).reshape(-1, width)
-
-    def times(self, stamps: Stamps) -> Int64:
-        """Return the stamps asked for [N]; without a header stamp, that of receipt."""
-        return _times(*self._stamps(), stamps)
-
-    def trajectory(self, source: Source, stamps: Stamps) -> Trajectory:
-        """Return the poses, cleaned.
-
-        Raises:
-            DataError: none is usable.
-        """
-        covariance = np.frombuffer(self._covariances, dtype=np.float64).reshape(-1, 36)
-        return _cleaned(source, self.times(stamps), self.values(7), covariance)
-
-    def check(self, may_disagree_s: float, may_jump_s: float) -> StampCheck:
-        """Compare the stamps of header and receipt."""
-        return _compared(*self._stamps(), may_disagree_s, may_jump_s)
-
-    def _stamps(self) -> tuple[Int64, Int64]:
-        return np.frombuffer(self._header_ns, dtype=np.int64), np.frombuffer(self._receive_ns, dtype=np.int64)
+    def rows(self, width: int) -> LoggedRows:
+        """Return the rows, with `width` values each."""
+        return LoggedRows(
+            header_ns=np.frombuffer(self._header_ns, dtype=np.int64),
+            receive_ns=np.frombuffer(self._receive_ns, dtype=np.int64),
+            values=np.frombuffer(self._values, dtype=np.float64).reshape(-1, width),
+            covariance=np.frombuffer(self._covariances, dtype=np.float64).reshape(-1, 36),
+        )
 
 
-def trajectory_of(
-    samples: Iterable[Sample],
-    source: Source,
-    *,
-    stamps: Stamps,
-    may_disagree_s: float = 0.5,
-    may_jump_s: float = 1.0,
-) -> Gathered:
-    """Build the trajectory of one body, in the axes of the log; covariances in ours (rotation in the body).
+# --- poses -----------------------------------------------------------------------------------------------
 
-    Rows are cleaned by `clean_poses`, every loss counted. A covariance that is zero throughout is unknown
-    and left out.
+
+def poses_of(recording: Log, topic: str, source: Source, stamps: Stamps) -> Gathered:
+    """Read the trajectory of one body, in the axes of the log; covariances in ours (rotation in the body).
+
+    Messages of one layout are read many at a time, others one by one, with the same result. Rows are cleaned
+    by `clean_poses`, every loss counted. A covariance that is zero throughout is unknown and left out.
+
+    Args:
+        recording: the log.
+        topic: of poses.
+        source: the log, for messages.
+        stamps: which stamp is the time of a pose. A pose without a header stamp (0) takes that of receipt.
+
+    Raises:
+        DataError: no usable pose, messages that are no poses, or poses of several bodies.
+    """
+    place = f"{source} {topic}"
+    rows = poses_at_once(recording, topic)
+    if rows is None:
+        rows = poses_one_by_one(all_samples(recording.messages([topic]), source), place)
+    return Gathered(rows.trajectory(place, stamps), rows.check(), rows.frames)
+
+
+def poses_one_by_one(samples: Iterable[Sample], source: Source) -> LoggedRows:
+    """Gather the poses of one body.
 
     Args:
         samples: poses in the order of receipt.
         source: the log and topic, for messages.
-        stamps: which stamp is the time of a pose. A pose without a header stamp (0) takes that of receipt.
-        may_disagree_s: largest allowed difference of header and receipt, for delayed transmission.
-        may_jump_s: largest allowed change of that difference from one sample to the next.
 
     Raises:
-        DataError: no usable pose, samples that are no poses, or poses of several bodies.
+        DataError: samples that are no poses, or poses of several bodies.
     """
-    rows = SampleRows()
+    gathered = _Samples()
     frames: Edge | None = None
     for sample in samples:
         if not isinstance(sample, PoseSample):
@@ -149,28 +221,48 @@ def trajectory_of(
         if frames is not None and edge != frames:
             raise DataError(
                 source,
-                f"holds poses of several frames ({_said(frames)}, {_said(edge)})",
+                f"holds poses of several frames ({_named(frames)}, {_named(edge)})",
                 "say which with `parent` and `child`",
             )
         frames = edge
-        rows.add_pose(sample)
-    trajectory = rows.trajectory(source, stamps)
-    return Gathered(trajectory, rows.check(may_disagree_s, may_jump_s), frames or ("", ""))
+        gathered.add_pose(sample)
+    return replace(gathered.rows(7), frames=frames or ("", ""))
 
 
-def trajectory_of_arrays(
-    poses: PoseArrays,
-    source: Source,
-    *,
-    stamps: Stamps,
-    may_disagree_s: float = 0.5,
-    may_jump_s: float = 1.0,
-) -> Gathered:
-    """Build the trajectory of poses that were read at once; arguments like those of `trajectory_of`."""
-    t_ns = _times(poses.header_ns, poses.receive_ns, stamps)
-    trajectory = _cleaned(source, t_ns, poses.pose, poses.covariance)
-    check = _compared(poses.header_ns, poses.receive_ns, may_disagree_s, may_jump_s)
-    return Gathered(trajectory, check, poses.frames)
+def poses_at_once(recording: Log, topic: str) -> LoggedRows | None:
+    """Gather the poses like `poses_one_by_one`; None unless our own reader finds all of one known layout."""
+    alike = messages_alike(recording, topic)
+    if alike is None or alike.schema.type not in _LAID_OUT:
+        return None
+    paths = _LAID_OUT[alike.schema.type]
+    # These grow in place: joining parts would need the memory of a long log twice.
+    header, received, numbers = array("q"), array("q"), array("d")
+    layout: Layout | None = None
+    try:
+        for receive_ns, raw in alike.log.arrays(alike.topic):
+            layout = layout or find_layout(alike.schema, raw[0].tobytes())
+            if layout is None or not layout.fits(raw, np.full(len(raw), raw.shape[1])):
+                return None
+            received.frombytes(receive_ns.tobytes())
+            header.frombytes(layout.stamps_ns(raw).tobytes())
+            numbers.frombytes(layout.column(raw, *paths).astype(np.float64, copy=False).tobytes())
+    except (UnlikeError, KeyError):  # KeyError: a type of a known name with other fields
+        return None
+    if layout is None:
+        return None
+    rows = LoggedRows(
+        np.frombuffer(header, np.int64),
+        np.frombuffer(received, np.int64),
+        np.frombuffer(numbers, np.float64).reshape(len(header), -1),
+    )
+    if np.abs(rows.receive_ns).max() >= LATEST_NS:
+        return None
+    if (np.diff(rows.receive_ns) < 0).any():
+        order = np.argsort(rows.receive_ns, kind="stable")
+        rows = LoggedRows(rows.header_ns[order], rows.receive_ns[order], rows.values[order])
+    covariance = rows.values[:, 7:] if len(paths) > 7 else None
+    frames = layout.texts["header.frame_id"], layout.texts.get("child_frame_id", "")
+    return replace(rows, values=rows.values[:, :7], covariance=covariance, frames=frames)
 
 
 def attitudes_of(
@@ -180,42 +272,55 @@ def attitudes_of(
     stamps: Stamps,
     order: Literal["ypr", "rpy", "pry"] = "ypr",
     units: Literal["deg", "rad"] = "deg",
-    may_disagree_s: float = 0.5,
-    may_jump_s: float = 1.0,
 ) -> Gathered:
     """Build a gimbal's attitude over time, in the axes of the log, about its own pivot (positions are 0).
 
     Args:
         samples: angles or quaternions in the order of receipt.
         source: the log and topic, for messages.
-        stamps: as in `trajectory_of`, like the last two.
+        stamps: as in `poses_of`.
         order: order of the angles in the log (`attitude_from_angles`); ignored for quaternions.
         units: of the angles.
-        may_disagree_s: see there.
-        may_jump_s: see there.
 
     Raises:
         DataError: no usable attitude, or samples that are no angles.
     """
-    rows, of_angles = SampleRows(), False
+    gathered, of_angles = _Samples(), False
     for sample in samples:
         if not isinstance(sample, AngleSample):
             raise DataError(source, "holds no gimbal angles", "name a topic of angles or quaternions")
         of_angles = sample.angles is not None
-        rows.add(sample, sample.angles or sample.quaternion_xyzw or ())
+        gathered.add(sample, sample.angles or sample.quaternion_xyzw or ())
+    rows = gathered.rows(3 if of_angles else 4)
+    quaternion = rows.values
     if of_angles:
         with np.errstate(invalid="ignore"):  # an infinite angle becomes NaN and is dropped
-            quaternion = attitude_from_angles(rows.values(3), order=order, units=units)
-    else:
-        quaternion = rows.values(4)
+            quaternion = attitude_from_angles(rows.values, order=order, units=units)
+    count = len(rows.header_ns)
     trajectory = clean_poses(
-        source,
-        rows.times(stamps),
-        np.ones(len(rows), dtype=np.bool_),
-        np.zeros((len(rows), 3)),
-        quaternion,
+        source, rows.times(stamps), np.ones(count, dtype=np.bool_), np.zeros((count, 3)), quaternion
     )
-    return Gathered(trajectory, rows.check(may_disagree_s, may_jump_s), ("", ""))
+    return Gathered(trajectory, rows.check(), ("", ""))
+
+
+# --- transforms ------------------------------------------------------------------------------------------
+
+
+def transforms_in(recording: Log, source: str, topic: str | None = None) -> TransformLog:
+    """Read every transform of a log, or of one topic; those of topics named `...static` always hold.
+
+    Raises:
+        DataError: messages that cannot be read, or are no transforms.
+    """
+    every = [candidate.name for candidate in recording.topics if kind_of(candidate) == "transforms"]
+    names = every if topic is None else [topic]
+    static = [name for name in names if name.endswith("static")]
+    moving = [name for name in names if name not in static]
+    return transforms_of(
+        all_samples(recording.messages(moving), source),
+        source,
+        static=all_samples(recording.messages(static), source),
+    )
 
 
 def transforms_of(
@@ -242,8 +347,6 @@ def chained(
     child: str,
     stamps: Stamps,
     max_gap_ns: int,
-    may_disagree_s: float = 0.5,
-    may_jump_s: float = 1.0,
 ) -> Gathered:
     """Compute the pose of one frame in another over time, through the log's tree of transforms.
 
@@ -256,10 +359,8 @@ def chained(
         source: the log, for messages.
         parent: the frame in which the poses are wanted; a leading slash is ignored.
         child: the frame whose poses are wanted.
-        stamps: as in `trajectory_of`, like the last two.
+        stamps: as in `poses_of`.
         max_gap_ns: a moving transform is unknown between stamps further apart than this.
-        may_disagree_s: see there.
-        may_jump_s: see there.
 
     Raises:
         DataError: an unknown frame, frames that nothing connects, or no time at which all the
@@ -276,12 +377,12 @@ def chained(
     checks = []
     for edge in route.edges:
         rows = every[edge]
-        poses = rows.trajectory(f"{source}: {_said(edge)}", stamps)
-        is_static = edge not in transforms.moving or len(rows) == 1
+        poses = rows.trajectory(f"{source}: {_named(edge)}", stamps)
+        is_static = edge not in transforms.moving or len(rows.header_ns) == 1
         links[edge] = Link(poses.t_ns, poses.position, poses.quaternion_xyzw, is_static)
         if not is_static:
-            checks.append(rows.check(may_disagree_s, may_jump_s))
-            dropped |= {f"{cause} ({_said(edge)})": count for cause, count in poses.dropped.items()}
+            checks.append(rows.check())
+            dropped |= {f"{cause} ({_named(edge)})": count for cause, count in poses.dropped.items()}
     found = chain(links, parent, child, max_gap_ns=max_gap_ns)
     known = ~np.isnan(found.position[:, 0])
     if not known.any():
@@ -298,55 +399,100 @@ def chained(
     return Gathered(trajectory, _together(checks), (parent, child))
 
 
-def _times(header_ns: Int64, receive_ns: Int64, stamps: Stamps) -> Int64:
-    """Return the stamps asked for [N]; without a header stamp, that of receipt."""
-    return receive_ns if stamps == "receive" else np.where(header_ns == 0, receive_ns, header_ns)
+def frames_of_poses(recording: Log, source: str, taken: Iterable[tuple[str | None, str | None]]) -> list[str]:
+    """Return the frames of a log's poses, each once, without the leading slash of ROS 1.
+
+    Args:
+        recording: the log.
+        source: its name, for messages.
+        taken: topic and parent of each; a parent names the frame itself, and a missing topic means the
+            only one. Entries that do not fit the log are ignored; reading the poses reports them.
+    """
+    topics = [topic.name for topic in recording.topics if kind_of(topic) == "poses"]
+    frames: list[str] = []
+    for stated, parent in taken:
+        topic = topics[0] if stated is None and len(topics) == 1 else stated
+        if parent is not None:
+            frames.append(parent.lstrip("/"))
+        elif topic in topics:
+            first = next(all_samples(recording.messages([topic]), source), None)
+            if isinstance(first, PoseSample):
+                frames.append(first.target.lstrip("/"))
+    return [frame for frame in dict.fromkeys(frames) if frame]
 
 
-def _cleaned(source: Source, t_ns: Int64, pose: Float, covariance: Float | None) -> Trajectory:
-    """Clean logged poses [N, 7] and covariances [N, 36]; turn rotation errors to the body's axes."""
-    if covariance is not None and not covariance.any():
-        covariance = None  # zero throughout means unknown
-    poses = clean_poses(
-        source,
-        t_ns,
-        np.ones(len(t_ns), dtype=np.bool_),
-        pose[:, :3],
-        pose[:, 3:],
-        None if covariance is None else covariance.reshape(-1, 6, 6),
+def place_of_frame(
+    recording: Log,
+    source: str,
+    place: str,
+    frame: str,
+    *,
+    parent: str | None,
+    poses_in: Sequence[str],
+    stamps: Stamps,
+    max_gap_ns: int,
+    note: Callable[[str], None],
+) -> Trajectory:
+    """Return the pose of a frame in the log's world; one row if it is that world or never moves in it.
+
+    The log's world is the stated frame, else the frame of the poses that are taken from this log, else
+    one with the name of a fixed frame. If a map lies in such a fixed frame and no transforms connect it with
+    the frame of the poses, both are taken for one frame, and a note says so.
+
+    Args:
+        recording: the log.
+        source: its name, for messages.
+        place: log and topic, for messages.
+        frame: the frame to find; an empty name means the world.
+        parent: the world's frame, if it is stated.
+        poses_in: the frames of the poses.
+        stamps: which stamps of the transforms are used.
+        max_gap_ns: the longest gap between two transforms that is interpolated.
+        note: receives the result in words.
+
+    Raises:
+        DataError: nothing connects the frame with the log's world.
+    """
+    known = [parent.lstrip("/")] if parent is not None else [*poses_in] or list(_FIXED_FRAMES)
+    if not frame or frame in known:
+        return _THE_WORLD
+    transforms = transforms_in(recording, source)
+    for world in known:
+        if _are_connected(transforms, world, frame):
+            note(f"{place}: lies in {frame!r}, which the log's transforms place in {world!r}")
+            return chained(
+                transforms, source, parent=world, child=frame, stamps=stamps, max_gap_ns=max_gap_ns
+            ).trajectory
+    if parent is None and frame in _FIXED_FRAMES:
+        note(
+            f"{place}: lies in {frame!r}, poses in {', '.join(map(repr, poses_in))};"
+            " nothing in the log connects them, they are taken for one"
+        )
+        return _THE_WORLD
+    raise DataError(
+        place,
+        f"lies in {frame!r}, which no transforms of the log connect with {' or '.join(map(repr, known))}",
+        f"say which frame is the log's world with `parent:` ({frame!r} itself if it does not move)",
     )
-    if poses.covariance is None:
-        return poses
-    return replace(poses, covariance=pose_covariance_in_body(poses.covariance, poses.quaternion_xyzw))
 
 
-def _compared(header_ns: Int64, receive_ns: Int64, may_disagree_s: float, may_jump_s: float) -> StampCheck:
-    (stamped,) = np.nonzero(header_ns)
-    lead_ns = (header_ns - receive_ns)[stamped]
-    drift = fit_clock(receive_ns[stamped], header_ns[stamped]) if lead_ns.any() else None
-    jump_ns = np.diff(lead_ns)
-    return StampCheck(
-        count=len(header_ns),
-        without_header=len(header_ns) - len(stamped),
-        disagreeing=int(np.count_nonzero(np.abs(lead_ns) > may_disagree_s * 1e9)),
-        largest_disagreement_s=float(lead_ns[np.argmax(np.abs(lead_ns))]) / 1e9 if len(stamped) else 0.0,
-        jumps=tuple(
-            ClockJump(int(stamped[k + 1]), int(header_ns[stamped[k + 1]]), float(jump_ns[k]) / 1e9)
-            for k in np.flatnonzero(np.abs(jump_ns) > may_jump_s * 1e9)
-        ),
-        drift=drift,
-    )
+def _are_connected(transforms: TransformLog, parent: str, child: str) -> bool:
+    try:
+        find_route({**transforms.static, **transforms.moving}, parent, child)
+    except ValueError:
+        return False
+    return True
 
 
-def _by_edge(samples: Iterable[Sample], source: Source) -> dict[Edge, SampleRows]:
-    by_edge: dict[Edge, SampleRows] = {}
+def _by_edge(samples: Iterable[Sample], source: Source) -> dict[Edge, LoggedRows]:
+    by_edge: dict[Edge, _Samples] = {}
     for sample in samples:
         if not isinstance(sample, PoseSample):
             raise DataError(source, "holds no transforms", "name a topic of transforms")
         # ROS 1 wrote frames with and without a leading slash.
         edge = (sample.target.lstrip("/"), sample.source.lstrip("/"))
-        by_edge.setdefault(edge, SampleRows()).add_pose(sample)
-    return by_edge
+        by_edge.setdefault(edge, _Samples()).add_pose(sample)
+    return {edge: gathered.rows(7) for edge, gathered in by_edge.items()}
 
 
 def _together(checks: Sequence[StampCheck]) -> StampCheck:
@@ -360,6 +506,6 @@ def _together(checks: Sequence[StampCheck]) -> StampCheck:
     )
 
 
-def _said(edge: Edge) -> str:
+def _named(edge: Edge) -> str:
     target, source = edge
     return f"{source!r} in {target!r}"

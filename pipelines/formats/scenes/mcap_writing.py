@@ -28,7 +28,7 @@ import numpy as np
 
 from pipelines.formats.calibrations.ros_camera_info import ros_distortion
 from pipelines.formats.common.exporting import as_jpeg, ellipsoids_95, safe_file_name, surface_of, thinned
-from pipelines.formats.logs.ros2_recording import Ros2Recording
+from pipelines.formats.logs.ros2_writing import Ros2Recording
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.session.errors import DataError

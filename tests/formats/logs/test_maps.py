@@ -17,10 +17,8 @@ from numpy.typing import NDArray
 
 from pipelines.formats.flights.flight_logs import FlightLogs
 from pipelines.formats.flights.world_axes import in_world
-from pipelines.formats.logs import clouds as log_clouds
 from pipelines.formats.logs import maps as log_maps
-from pipelines.formats.logs.clouds import cloud_points
-from pipelines.formats.logs.map_topics import evenly
+from pipelines.formats.logs.maps import cloud_points, evenly
 from pipelines.formats.maps import octomap
 from pipelines.formats.maps.voxel_grids import occupancy_of
 from pipelines.geometry.poses import enu_from_ned
@@ -492,7 +490,7 @@ def test_clouds_add_up_and_nothing_is_known_before_it_was_seen(
         seen = np.full(whole.probability.shape, np.nan, np.float32)
         seen[*index.T] = 1
         np.testing.assert_array_equal(one.probability, seen)
-    monkeypatch.setattr(log_clouds, "MOST_CLOUD_MAPS", 3)
+    monkeypatch.setattr(log_maps, "MOST_CLOUD_MAPS", 3)
     few = Read(tmp_path, entries)
     assert [(one.from_ns - T0) // SECOND for one in few.maps] == [0, 3, 6]
     same(few.maps[1], found.maps[3])

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from pipelines.formats.logs.mcap_checksums import CheckedHash, stated_checksum
+from pipelines.formats.logs.mcap_log import CheckedHash, stated_checksum
 
 
 def write(path: Path, *, checked: bool = True, chunked: bool = True, summary: bool = True) -> Path:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -14,22 +14,29 @@ from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from pipelines.formats.logs.messages import all_samples
+from pipelines.formats.logs.messages import Stamps, all_samples
 from pipelines.formats.logs.trajectories import (
     ClockJump,
+    Gathered,
+    Source,
     attitudes_of,
     chained,
-    trajectory_of,
+    poses_one_by_one,
     transforms_of,
 )
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.errors import DataError
-from pipelines.session.records import AngleSample, Message, PoseSample, Topic
+from pipelines.session.records import AngleSample, Message, PoseSample, Sample, Topic
 from tests.real_data import real_data
 
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S
 LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+
+def trajectory_of(samples: Iterable[Sample], source: Source, *, stamps: Stamps) -> Gathered:
+    rows = poses_one_by_one(samples, source)
+    return Gathered(rows.trajectory(source, stamps), rows.check(), rows.frames)
 
 
 def flown(
@@ -86,8 +93,8 @@ def test_leads_and_jumps_as_a_loop_would_find_them(leads: list[int]) -> None:
         PoseSample(EPOCH + k * S + lead, EPOCH + k * S, "w", "b", (0.0, 0.0, 0.0), LEVEL)
         for k, lead in enumerate(leads)
     ]
-    check = trajectory_of(stated, "d1", stamps="receive", may_disagree_s=2, may_jump_s=1).stamps
-    assert check.disagreeing == sum(abs(lead) > 2 * S for lead in leads)
+    check = trajectory_of(stated, "d1", stamps="receive").stamps
+    assert check.disagreeing == sum(abs(lead) > S / 2 for lead in leads)
     assert abs(check.largest_disagreement_s) == max(abs(lead) for lead in leads) / S
     jumps = [b - a for a, b in pairwise(leads)]
     assert [round(jump.jump_s * S) for jump in check.jumps] == [jump for jump in jumps if abs(jump) > S]

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.formats.flights.picture_encodings import KNOWN, decode
 from pipelines.formats.flights.pictures import LoggedPictures
+from pipelines.formats.logs.pictures import KNOWN, decode
 from pipelines.geometry.arrays import Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import PictureSample

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.formats.logs.fixed_layouts import PoseArrays, poses_at_once
 from pipelines.formats.logs.messages import all_samples
-from pipelines.formats.logs.trajectories import trajectory_of, trajectory_of_arrays
+from pipelines.formats.logs.trajectories import LoggedRows, poses_at_once, poses_one_by_one
 from pipelines.session.registries import LogFormat, recognise
 from tests.synthetic.logs import CONTAINERS, Container, Entry, write_log
 
@@ -45,7 +44,7 @@ def entry(type_: str, k: int, rng: np.random.Generator, *, frame: str = "odom", 
     return Entry(TOPIC, type_, START_NS + 10_000_000 * k + 3_000_000, fields)
 
 
-def at_once(path: Path) -> PoseArrays | None:
+def at_once(path: Path) -> LoggedRows | None:
     with recognise(path, LogFormat, "log").open_log([path]) as log:
         return poses_at_once(log, TOPIC)
 
@@ -63,14 +62,12 @@ def test_the_same_as_one_by_one(tmp_path: Path, container: Container, type_: str
     assert read.frames == (samples[0].target, samples[0].source)  # type: ignore[union-attr]
     assert read.header_ns.tolist() == [sample.stamp_ns for sample in samples]
     assert read.receive_ns.tolist() == [sample.receive_ns for sample in samples]
-    expected = trajectory_of(iter(samples), "log", stamps="header")
-    found = trajectory_of_arrays(read, "log", stamps="header")
-    assert found.stamps == expected.stamps
+    one_by_one = poses_one_by_one(iter(samples), "log")
+    assert read.check() == one_by_one.check()
+    expected, found = one_by_one.trajectory("log", "header"), read.trajectory("log", "header")
     for name in ("t_ns", "position", "quaternion_xyzw", "covariance"):
-        np.testing.assert_array_equal(
-            getattr(found.trajectory, name), getattr(expected.trajectory, name), strict=True
-        )
-    assert found.trajectory.dropped == expected.trajectory.dropped == {"zero quaternion": 4}
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), strict=True)
+    assert found.dropped == expected.dropped == {"zero quaternion": 4}
 
 
 @pytest.mark.parametrize("container", CONTAINERS)
@@ -93,7 +90,7 @@ def test_many_more_than_one_batch(tmp_path: Path) -> None:
     entries = [entry("nav_msgs/msg/Odometry", k, rng) for k in range(9000)]
     read = at_once(write_log(tmp_path, "log", "mcap-cdr", entries))
     assert read is not None
-    assert read.pose[8999].tolist() == [
+    assert read.values[8999].tolist() == [
         *entries[8999].fields["pose"]["pose"]["position"].values(),
         *entries[8999].fields["pose"]["pose"]["orientation"].values(),
     ]
@@ -124,9 +121,9 @@ def test_a_long_log_is_not_copied_over_and_over() -> None:
     turned = rng.standard_normal((count, 4))
     turned /= np.linalg.norm(turned, axis=1)[:, None]
     pose = np.hstack([rng.standard_normal((count, 3)), turned])
-    poses = PoseArrays(("odom", "base"), t_ns, t_ns, pose, rng.standard_normal((count, 36)))
+    poses = LoggedRows(t_ns, t_ns, pose, rng.standard_normal((count, 36)), ("odom", "base"))
     tracemalloc.start()
-    found = trajectory_of_arrays(poses, "log", stamps="header").trajectory
+    found = poses.trajectory("log", "header")
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert found.covariance is not None

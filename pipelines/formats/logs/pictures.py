@@ -1,0 +1,242 @@
+"""Pictures in logs: the times at which they were taken or triggered, and their pixels.
+
+Names and layouts of raw pixels are those of ROS' sensor_msgs/image_encodings.hpp, which Foxglove's RawImage
+also uses.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple, Protocol, TypeVar
+
+import numpy as np
+
+from pipelines.formats.logs.layouts import Layout, find_layout
+from pipelines.formats.logs.messages import FAULTS, LATEST_NS, all_samples, nanoseconds, unreadable
+from pipelines.formats.logs.recordings import messages_alike
+from pipelines.geometry.arrays import Picture
+from pipelines.session.errors import DataError
+from pipelines.session.records import Int64, PictureSample
+from pipelines.session.registries import Log
+
+_LAID_OUT = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
+
+HEAD_LENGTH = 256
+"""Bytes at the start of a picture message that hold all fields before the picture, unless names are long."""
+
+_MAY_LEAP_NS = 1_000_000_000  # transport and decoding take less time
+
+TRIGGER_TYPES = (
+    "std_msgs/msg/Header",
+    "sensor_msgs/msg/TimeReference",
+    "mavros_msgs/msg/CameraImageCaptured",
+    "mavros_msgs/msg/CamIMUStamp",
+)
+
+_PIXELS: dict[str, tuple[int, str | None]] = {
+    "mono8": (1, "GRAY2BGR"),
+    "8uc1": (1, "GRAY2BGR"),
+    "bgr8": (3, None),
+    "8uc3": (3, None),
+    "rgb8": (3, "RGB2BGR"),
+    "bgra8": (4, "BGRA2BGR"),
+    "rgba8": (4, "RGBA2BGR"),
+    "bayer_rggb8": (1, "BayerRGGB2BGR"),
+    "bayer_bggr8": (1, "BayerBGGR2BGR"),
+    "bayer_gbrg8": (1, "BayerGBRG2BGR"),
+    "bayer_grbg8": (1, "BayerGRBG2BGR"),
+    "yuv422": (2, "YUV2BGR_UYVY"),
+    "uyvy": (2, "YUV2BGR_UYVY"),
+    "yuv422_yuy2": (2, "YUV2BGR_YUY2"),
+    "yuyv": (2, "YUV2BGR_YUY2"),
+}
+"""Bytes of a pixel and the name of OpenCV's conversion (None if none is needed), by encoding."""
+
+KNOWN = tuple(_PIXELS)
+"""Encodings of raw pictures that can be decoded."""
+
+
+class Stamped(Protocol):
+    """Stamps of a picture, without its pixels."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of its header; 0 without one."""
+
+    @property
+    def receive_ns(self) -> int:
+        """Stamp of its receipt."""
+
+
+class _Stamps(NamedTuple):
+    stamp_ns: int
+    receive_ns: int
+
+
+_Stamped = TypeVar("_Stamped", bound=Stamped)
+
+
+# --- times -----------------------------------------------------------------------------------------------
+
+
+def picture_stamps(recording: Log, topic: str, source: Path | str) -> tuple[Int64, Int64]:
+    """Return header stamps [N] (0 without one) and stamps of receipt [N] of a topic's pictures.
+
+    The order is that of receipt. If the messages have one layout, only the beginning of each is read.
+
+    Args:
+        recording: an open log.
+        topic: its name.
+        source: the log, for messages to the user.
+
+    Raises:
+        DataError: the topic holds something else.
+    """
+    if (at_once := stamps_at_once(recording, topic)) is not None:
+        return at_once
+    header_ns, receive_ns = array("q"), array("q")
+    for sample in all_samples(recording.messages([topic]), source):
+        if not isinstance(sample, PictureSample):
+            raise DataError(source, f"{topic} holds no pictures", "name another topic")
+        header_ns.append(sample.stamp_ns)
+        receive_ns.append(sample.receive_ns)
+    return np.array(header_ns, np.int64), np.array(receive_ns, np.int64)
+
+
+def stamps_at_once(recording: Log, topic: str) -> tuple[Int64, Int64] | None:
+    """Return stamps like `picture_stamps`; None if the messages must be decoded one by one."""
+    alike = messages_alike(recording, topic)
+    if alike is None or alike.schema.type not in _LAID_OUT:
+        return None
+    header_ns: list[Int64] = [np.zeros(0, np.int64)]
+    receive_ns: list[Int64] = [np.zeros(0, np.int64)]
+    layout: Layout | None = None
+    for received, sizes, heads in alike.log.heads(alike.topic, HEAD_LENGTH):
+        layout = layout or find_layout(alike.schema, heads[0].tobytes())
+        if layout is None or not layout.fits(heads, sizes) or np.abs(received).max() >= LATEST_NS:
+            return None
+        header_ns.append(layout.stamps_ns(heads))
+        receive_ns.append(received)
+    every = np.concatenate(receive_ns)
+    order = np.argsort(every, kind="stable")
+    return np.concatenate(header_ns)[order], every[order]
+
+
+def later_pictures(pictures: Iterator[_Stamped], stamps: str) -> Iterator[_Stamped]:
+    """Yield the pictures whose stamp is above all before: frame k of a topic is the k-th of these."""
+    newest: _Stamped | None = None
+    leapt: _Stamped | None = None
+    for picture in pictures:
+        if newest is not None:
+            if stamp_of(picture, stamps) <= stamp_of(newest, stamps):
+                continue
+            # One damaged stamp far ahead must not cost all the pictures after it. If the clock was really set
+            # forward, the next picture shows the same jump.
+            if _leap_ns(newest, picture) > _MAY_LEAP_NS and (
+                leapt is None or abs(_leap_ns(leapt, picture)) > _MAY_LEAP_NS
+            ):
+                leapt = picture
+                continue
+        newest, leapt = picture, None
+        yield picture
+
+
+def later_times(header_ns: Int64, receive_ns: Int64, stamps: str) -> Int64:
+    """Return the stamps of the `later_pictures`, [n], strictly increasing.
+
+    Args:
+        header_ns: [N] stamps of the headers of all pictures, in the order of receipt; 0 without one.
+        receive_ns: [N] of receipt.
+        stamps: which of them order the pictures: header or receive.
+    """
+    times = np.where((header_ns != 0) & (stamps == "header"), header_ns, receive_ns)
+    leaps = np.where((header_ns[1:] != 0) & (header_ns[:-1] != 0), np.diff(header_ns - receive_ns), 0)
+    if (np.diff(times) > 0).all() and (leaps <= _MAY_LEAP_NS).all():
+        return times  # the usual case
+    pictures = map(_Stamps, header_ns.tolist(), receive_ns.tolist())
+    return np.array([stamp_of(picture, stamps) for picture in later_pictures(pictures, stamps)], np.int64)
+
+
+def _leap_ns(before: Stamped, after: Stamped) -> int:
+    """Return by how much the header clock advanced more than the receipt clock between two pictures, ns."""
+    if not before.stamp_ns or not after.stamp_ns:
+        return 0
+    return (after.stamp_ns - before.stamp_ns) - (after.receive_ns - before.receive_ns)
+
+
+def stamp_of(picture: Stamped, stamps: str) -> int:
+    """Return the header stamp if it exists and is wanted, else the stamp of receipt."""
+    return picture.stamp_ns if stamps == "header" and picture.stamp_ns else picture.receive_ns
+
+
+def read_triggers(recording: Log, source: str, topic: str) -> tuple[Int64, int]:
+    """Read the times at which pictures were triggered, increasing, and count messages without a new time.
+
+    The time is the message's own stamp: that of its header, or CamIMUStamp's frame_stamp.
+
+    Raises:
+        DataError: a message cannot be read, or none states a time.
+    """
+    stated = array("q")
+    messages = 0
+    for message in recording.messages([topic]):
+        value = message.value
+        messages += 1
+        try:
+            holder = getattr(value, "header", value)
+            stamp = getattr(value, "frame_stamp", None) or holder.stamp
+            stated.append(nanoseconds(stamp))
+        except FAULTS as error:
+            raise unreadable(message, source, error) from error
+    t_ns = np.unique(np.frombuffer(stated, dtype=np.int64))
+    t_ns = t_ns[t_ns > 0]
+    if not len(t_ns):
+        raise DataError(source, f"{topic} states no time", "name another topic")
+    return t_ns, messages - len(t_ns)
+
+
+# --- pixels ----------------------------------------------------------------------------------------------
+
+
+def is_known(sample: PictureSample) -> bool:
+    """Return True if pictures like this one can be decoded; compressed ones must be tried (True)."""
+    return sample.width is None or sample.encoding.lower() in _PIXELS
+
+
+def decode(sample: PictureSample) -> Picture | None:
+    """Decode a logged picture to BGR [H, W, 3]; None if its bytes are damaged or its encoding is unknown."""
+    import cv2
+
+    try:
+        decoded = _compressed(sample) if sample.width is None or sample.height is None else _raw(sample)
+    except cv2.error:
+        return None
+    return decoded
+
+
+def _compressed(sample: PictureSample) -> Picture | None:
+    import cv2
+
+    if not len(sample.data):
+        return None
+    decoded = cv2.imdecode(np.asarray(sample.data, np.uint8), cv2.IMREAD_COLOR)
+    return None if decoded is None else np.asarray(decoded, np.uint8)
+
+
+def _raw(sample: PictureSample) -> Picture | None:
+    import cv2
+
+    width, height = sample.width or 0, sample.height or 0
+    if not is_known(sample):
+        return None
+    pixel, conversion = _PIXELS[sample.encoding.lower()]
+    step = sample.step or width * pixel
+    if not width or not height or step < width * pixel or len(sample.data) < step * height:
+        return None
+    rows = sample.data[: step * height].reshape(height, step)
+    pixels = np.ascontiguousarray(rows[:, : width * pixel]).reshape(height, width, pixel)
+    if conversion is None:
+        return pixels
+    return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}")), np.uint8)
