@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -167,8 +168,9 @@ def test_a_span_begins_at_its_own_first_picture(session: Path) -> None:
     wanted = (STEPS_NS >= 100_000_000) & (STEPS_NS < 250_000_000)
     expected = STEPS_NS[wanted] - STEPS_NS[wanted][0]
     assert np.abs(index_video(video).pts_ns - expected).max() <= 12_000  # one tick of 1/90000 s
-    with pytest.raises(DataError, match="no picture in that span"):
+    with pytest.raises(DataError, match="span") as error:
         write_overlays(session, start_s=100.0)
+    assert error.value.source == session
     assert video.exists()
 
 
@@ -184,7 +186,7 @@ def test_unchanged_videos_are_not_made_again_and_another_skeleton_replaces_them(
     assert summary(session)["method"] == "robust"
     replacing = Watcher()
     reconstruct(session, Settings(method="dlt"), progress=replacing)
-    assert "removed overlay/: it showed the reconstruction before" in replacing.notes
+    assert [note for note in replacing.notes if "overlay/" in note]
     assert not (session / "overlay").exists()
     write_overlays(session)
     assert summary(session)["method"] == "dlt"
@@ -238,7 +240,7 @@ def test_pictures_that_cannot_be_decoded_are_grey_and_counted(
     watcher = Watcher()
     (video,) = write_overlays(session, cameras=["drone1"], progress=watcher)
     assert summary(session)["cameras"]["drone1"]["undecoded"] == 2
-    assert any("drone1: 2 of 12 pictures cannot be decoded" in note for note in watcher.notes)
+    assert any(re.match(rf"drone1: 2\b.*\b{FRAMES}\b", note) for note in watcher.notes)
     corner = [picture[-50:, -50:].mean() for picture in decoded(video)]
     blank = [level < (BLANK + GREY) / 2 for level in corner]
     assert blank == [number in {0, 4} for number in range(FRAMES)]
@@ -263,8 +265,9 @@ def test_a_video_that_is_gone_costs_its_own_overlay(session: Path) -> None:
     again = Watcher()
     write_overlays(session, progress=again)
     assert again.total == 0
-    with pytest.raises(DataError, match=r"drone1\.mp4: the pictures of drone1 are not there any more; put"):
+    with pytest.raises(DataError, match=r"pictures.*\bdrone1\b") as error:
         write_overlays(session, cameras=["drone1"])
+    assert error.value.source == gone
     (session.parent / "drone2.mp4").unlink()
     shutil.rmtree(session / "overlay")
     with pytest.raises(DataError, match=r"drone1\.mp4"):
@@ -289,41 +292,47 @@ def test_a_damaged_video_is_named(session: Path) -> None:
 def test_what_has_no_pictures_or_no_skeleton_says_so(tmp_path: Path) -> None:
     flight = write_flight(tmp_path, seconds=0.3)
     session = session_of(flight)
-    with pytest.raises(DataError, match="has no pictures to draw on"):
+    with pytest.raises(DataError, match=r"\bvideo\b") as error:
         write_overlays(session)
-    with pytest.raises(DataError, match="drone1: has no pictures"):
+    assert error.value.source == session
+    with pytest.raises(DataError, match=r"\bvideo\b") as error:
         write_overlays(session, cameras=["drone1"])
-    with pytest.raises(DataError, match="drone9: no such camera; there are drone1, drone2"):
+    assert error.value.source == "drone1"
+    with pytest.raises(DataError, match=r"\bdrone1, drone2\b") as error:
         write_overlays(session, cameras=["drone9"])
+    assert error.value.source == "drone9"
     shutil.rmtree(session / "reconstruct")
-    with pytest.raises(DataError, match="mocap reconstruct"):
+    with pytest.raises(DataError, match="`mocap reconstruct`") as error:
         write_overlays(session)
+    assert error.value.source == session
 
 
 def test_the_command_refuses_before_it_reconstructs(session: Path, tmp_path: Path) -> None:
     flight = write_flight(tmp_path / "keypoints", seconds=0.3)
     succeeds("ingest", flight.manifest)
     unseen = flight.manifest.with_suffix(".session")
-    assert "has no pictures to draw on; state" in refused("reconstruct", unseen, "--overlay")
+    assert re.search(rf"{unseen.name}: .*pictures.*flight\.yaml", refused("reconstruct", unseen, "--overlay"))
     assert not (unseen / "reconstruct").exists()
     shutil.rmtree(session / "reconstruct")
     (session / "overlay").mkdir()
-    assert "overlay: is in the way" in refused("reconstruct", session, "--overlay")
+    assert re.search(r"\boverlay: .*--force", refused("reconstruct", session, "--overlay"))
     (session / "overlay").rmdir()
     for name in ("drone1", "drone2"):
         (session.parent / f"{name}.mp4").unlink()
-    assert "drone1.mp4: the pictures of drone1 are not" in refused("reconstruct", session, "--overlay")
+    assert re.search(r"drone1\.mp4: .*pictures.*\bdrone1\b", refused("reconstruct", session, "--overlay"))
     assert not (session / "reconstruct").exists()
 
 
 def test_somebody_elses_folder_is_not_replaced(session: Path) -> None:
     (session / "overlay").mkdir()
-    (session / "overlay" / "mine.txt").write_text("mine")
-    with pytest.raises(DataError, match="in the way"):
+    mine = session / "overlay" / "mine.txt"
+    mine.write_text("mine")
+    with pytest.raises(DataError, match="--force") as error:
         write_overlays(session)
-    assert (session / "overlay" / "mine.txt").exists()
+    assert error.value.source == session / "overlay"
+    assert mine.exists()
     write_overlays(session, force=True)
-    assert not (session / "overlay" / "mine.txt").exists()
+    assert not mine.exists()
 
 
 def test_the_stages_of_a_session_do_not_mind_its_videos(session: Path) -> None:

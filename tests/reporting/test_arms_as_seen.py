@@ -14,6 +14,7 @@ from pipelines.reporting.replanned import Replan, summarise_replan
 
 from .comparisons import DRONES, HIDDEN_S, make_comparison
 from .conftest import START_NS
+from .reading import numbers
 
 JOINTS = {"left_shoulder": (40, 0), "right_shoulder": (0, 0), "left_hip": (40, 100), "right_hip": (0, 100)}
 LOOKS_S = np.arange(11)
@@ -50,20 +51,21 @@ def test_moments_are_the_worst_of_each_quarter(compared: Replan) -> None:
 
 def test_the_figure_says_what_is_lost(compared: Replan) -> None:
     plate = draw_arms(compared)["arms-seen"]
-    said = plate.description.replace("\u202f", " ")
-    assert "adaptive: of 88 in 11 looks, 88 joints seen, 0 joints hidden and 0 joints outside." in said
-    assert "fixed: of 88 in 11 looks, 80 joints seen, 8 joints hidden and 0 joints outside." in said
-    assert "flown: of 88 in 11 looks, 66 joints seen, 0 joints hidden and 22 joints outside." in said
+    said = dict(sentence.split(":") for sentence in plate.description.rstrip(".").split(". "))
+    # Joints and looks; then seen, hidden and outside.
+    assert numbers(said["adaptive"]) == [88, 11, 88, 0, 0]
+    assert numbers(said["fixed"]) == [88, 11, 80, 8, 0]
+    assert numbers(said["flown"]) == [88, 11, 66, 0, 22]
     # Two of the four moments, at drone1 of `fixed`; every panel of `flown` lacks a hip.
     assert plate.svg.count(">0 of 4<") == 2
     assert plate.svg.count(">3 of 4<") == 8
     assert ">drone1, 17\u202fdeg<" in plate.svg  # fixed at 2 s: 15 + 2
-    numbers = plate.numbers[""]
-    assert len(numbers) == 3 * 88
-    hidden = numbers[numbers["status"] == "hidden"]
+    table = plate.numbers[""]
+    assert len(table) == 3 * 88
+    hidden = table[table["status"] == "hidden"]
     assert set(hidden["arm"]) == {"fixed"}
     assert sorted(set(hidden["t_s"])) == [2, 3]
-    assert numbers.loc[numbers["status"] == "outside", "x_px"].isna().all()
+    assert table.loc[table["status"] == "outside", "x_px"].isna().all()
 
 
 def test_without_a_skeleton_there_is_none(compared: Replan) -> None:

@@ -12,10 +12,11 @@ from pipelines.geometry.bootstrap import RESAMPLES, STRETCH_S
 from pipelines.reporting.comparison import compare, labels_of
 from pipelines.reporting.comparison_page import GENERATOR, judge, render_comparison
 from pipelines.reporting.content import SessionContent
-from pipelines.reporting.wording import THIN
+from pipelines.reporting.verdict import Verdict
 
 from .conftest import JOINTS, OFFSET_M, make_skeleton, make_truth
-from .test_page import HOSTILE, _named, _Outline
+from .reading import Outline, numbers, one, plain
+from .test_page import HOSTILE, _named
 
 OFF_MM = 1000 * float(np.linalg.norm(OFFSET_M))
 NORMAL_95 = 1.959964
@@ -50,11 +51,8 @@ def _wandering(content: SessionContent, distance_mm: np.ndarray) -> SessionConte
     return replace(content, skeleton=skeleton, truth=truth, metrics={"method": "robust"})
 
 
-def _told(contents: dict[str, SessionContent]) -> str:
-    """Return every sentence of the verdict."""
-    found = judge(compare(contents))
-    sentences = [found.lead, *found.quality, *found.certainty, *found.doubts]
-    return " ".join(sentences).replace(THIN, " ")
+def _verdict(contents: dict[str, SessionContent]) -> Verdict:
+    return judge(compare(contents))
 
 
 def test_the_same_motion_is_compared_moment_by_moment(content: SessionContent) -> None:
@@ -98,10 +96,7 @@ def test_other_times_are_compared_joint_by_joint(content: SessionContent) -> Non
     found = pair.differences["mpjpe"]
     assert found.estimate.value == pytest.approx(OFF_MM, abs=1e-6)
     assert (found.pairs, found.lower) == (len(JOINTS), 0)
-    assert (
-        f"each joint’s mean in one with its mean in the other; “b” has the smaller one for 0 of {len(JOINTS)}"
-        in (_told({"a": content, "b": other}))
-    )
+    assert numbers(_verdict({"a": content, "b": other}).certainty[0]) == [0, len(JOINTS)]
 
 
 def test_another_motion_at_the_same_times_is_compared_joint_by_joint(content: SessionContent) -> None:
@@ -140,18 +135,19 @@ def test_intervals_are_those_of_known_variances(content: SessionContent, apart: 
 
 
 def test_verdict_names_the_better_one_and_by_how_much(content: SessionContent) -> None:
-    text = _told({"near": content, "far": _moved(content, 2)})
-    assert "“near” has the better skeleton: its joints lie 22.4 mm from the truth on average" in text
-    assert "those of “far” 44.7 mm. That is 22.4 mm or 50.0 % less (95 % interval 22.4 to 22.4 mm)" in text
+    lead = _verdict({"near": content, "far": _moved(content, 2)}).lead
+    assert lead.startswith("“near”")  # the better one is named first
+    # The errors of both in mm, their difference in mm and percent, and its 95 % interval.
+    assert numbers(lead) == [22.4, 44.7, 22.4, 50.0, 95, 22.4, 22.4]
     # In the other order the sentence is the same.
-    assert "“near” has the better skeleton" in _told({"far": _moved(content, 2), "near": content})
+    assert _verdict({"far": _moved(content, 2), "near": content}).lead == lead
 
 
 def test_verdict_says_that_a_difference_is_noise(content: SessionContent) -> None:
     even = np.where(np.arange(600) % 3 == 0, 1.0, -1.0)
     first = _wandering(content, 50 + even)
     second = _wandering(content, 50 + np.roll(even, 1))
-    assert "The difference between “a” and “b” is within noise" in _told({"a": first, "b": second})
+    assert "within noise" in _verdict({"a": first, "b": second}).lead
 
 
 def test_verdict_without_truth_is_about_the_pictures(content: SessionContent) -> None:
@@ -160,33 +156,35 @@ def test_verdict_without_truth_is_about_the_pictures(content: SessionContent) ->
     other = replace(
         blind, skeleton=content.skeleton.assign(reprojection_px=content.skeleton["reprojection_px"] * 3)
     )
-    text = _told({"a": blind, "b": other})
-    assert "“a” has the better skeleton" in text
-    assert "px from the keypoints in the pictures on average" in text
-    assert "the verdict is about distances in the pictures" in text
-    assert "MPJPE" not in text
+    verdict = _verdict({"a": blind, "b": other})
+    assert verdict.lead.startswith("“a”")
+    assert "px" in verdict.lead
+    assert "mm" not in verdict.lead
+    assert one(verdict.doubts, "truth", "“a”", "“b”")
+    assert "MPJPE" not in " ".join(verdict.quality)
 
 
 def test_sessions_that_cannot_be_compared_are_said(content: SessionContent) -> None:
     bare = replace(content, skeleton=None, metrics=None, truth=None)
-    text = _told({"a": content, "b": bare})
-    assert "“a” and “b” cannot be compared: “b” holds no reconstructed joint." in text
+    lead = _verdict({"a": content, "b": bare}).lead
+    assert (lead.count("“a”"), lead.count("“b”")) == (1, 2)  # it is b that lacks something
+    assert numbers(lead) == []
     short = replace(content, skeleton=make_skeleton(5), truth=make_truth(5))
-    assert "cannot be told: there are too few moments" in _told({"a": short, "b": short})
+    assert "too few moments" in _verdict({"a": short, "b": short}).lead
     assert content.skeleton is not None
     markers = content.skeleton.assign(
         joint=content.skeleton["joint"].map({n: f"M{k}" for k, n in enumerate(JOINTS)})
     )
     foreign = replace(content, skeleton=markers, truth=None)
-    assert "they have no joint in common" in _told({"a": content, "b": foreign})
+    assert "no joint in common" in _verdict({"a": content, "b": foreign}).lead
 
 
 def test_unlike_sessions_are_doubted(content: SessionContent) -> None:
     simulated = content.session.model_copy(update={"simulated": True})
     other = replace(content, session=simulated, metrics={"method": "dlt"})
-    text = _told({"a": content, "b": other})
-    assert "The sessions were reconstructed by different methods: “a” robust and “b” dlt." in text
-    assert "The sessions are not all simulated: “a” real and “b” simulated." in text
+    doubts = _verdict({"a": content, "b": other}).doubts
+    assert one(doubts, "“a” robust", "“b” dlt")
+    assert one(doubts, "“a” real", "“b” simulated")
 
 
 def _three(content: SessionContent) -> dict[str, SessionContent]:
@@ -202,27 +200,30 @@ def page(content: SessionContent) -> str:
     return render_comparison(_three(content))[0]
 
 
-def test_three_sessions_are_set_against_the_first(page: str) -> None:
-    outline = _Outline(page)
-    first = "Of 3 sessions, “c” has the smallest mean distance of its joints from the truth: 22.4 mm"
-    assert first in outline.text
+def test_three_sessions_are_set_against_the_first(content: SessionContent, page: str) -> None:
+    outline = Outline(page)
+    lead = judge(compare(_three(content))).lead
+    assert "“c”" in lead
+    assert numbers(lead)[:2] == [3, 22.4]
+    assert plain(lead) in outline.text
     assert "“b” less “a”" in outline.text
     assert "“c” less “a”" in outline.text
     assert outline.count("figure") == 3
     # 67.1 mm and 44.7 mm are three and two times sqrt(500) mm; every joint of the second is nearer.
-    assert "MPJPE, mm 67.1 44.7 −22.4 −22.4 to −22.4" in outline.text
-    assert "17 of 17 better" in outline.text
+    row = next(row for row in outline.rows("MPJPE, mm") if len(row) > 5)
+    assert row[1:4] == ["67.1", "44.7", "−22.4 −22.4 to −22.4"]
+    assert row[5:] == [f"{len(JOINTS)} of {len(JOINTS)}", "better"]
 
 
 def test_settings_that_differ_are_listed(page: str) -> None:
-    text = _Outline(page).text
+    text = Outline(page).text
     assert "reconstruct: gates.pixel_sigma_px 3.0 3.0 2.0" in text
     assert f"reconstruct: key {'b2' * 32} {'b2' * 32} {'c3' * 32}" in text
     assert "reconstruct: method" not in text
 
 
 def test_page_needs_nothing_and_is_the_same_every_time(content: SessionContent, page: str) -> None:
-    outline = _Outline(page)
+    outline = Outline(page)
     assert render_comparison(_three(content))[0] == page
     assert GENERATOR in page[:2048]
     assert all(link.startswith("#") for link in outline.links)
@@ -239,9 +240,9 @@ def test_names_from_files_stay_text(content: SessionContent, page: str) -> None:
     for name in HOSTILE:
         stages: dict[str, dict[str, object]] = {"reconstruct": {"key": name, "settings": {name: name}}}
         contents[name] = replace(_named(content, name), stages=stages)
-    outline = _Outline(render_comparison(contents)[0])
+    outline = Outline(render_comparison(contents)[0])
     # No kind of element or attribute that a page with harmless names does not have.
-    assert set(outline.elements) <= set(_Outline(page).elements)
+    assert set(outline.elements) <= set(Outline(page).elements)
     assert outline.scripts == []
     assert all(link.startswith("#") for link in outline.links)
     text = outline.text.replace("\x00", "\ufffd")

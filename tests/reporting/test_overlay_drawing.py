@@ -121,7 +121,7 @@ def test_points_anywhere_leave_the_given_picture_alone(values: list[float]) -> N
     anywhere = View(
         "drone1", lens, JOINTS, 0, 0.0, points, points, nobody, nobody, points, has_pose=True, picture=None
     )
-    assert draw_frame(small, anywhere, ("too small for words",)).shape == small.shape
+    assert draw_frame(small, anywhere, ("words",)).shape == small.shape
     assert (small == GREY).all()
 
 
@@ -148,7 +148,7 @@ def test_captions_fit_their_ground(view: View, size: tuple[int, int]) -> None:
 def test_no_words_where_nobody_could_read_them(view: View) -> None:
     tiny = np.full((9, 16, 3), GREY, np.uint8)
     assert not changed(draw_frame(tiny, replace(view, reprojected=MISSING), ("drone1", "robust"))).any()
-    assert not changed(blank_frame(16, 9, "frame 3 cannot be decoded")).any()
+    assert not changed(blank_frame(16, 9, "undecoded")).any()
 
 
 def test_a_blank_frame_says_why_in_its_middle() -> None:
@@ -164,8 +164,9 @@ def test_what_a_caption_says(view: View) -> None:
     status[0, 1] = STATUS.index("rejected")
     assert caption_of(view, status, "robust") == ("drone1   frame 3   0.100 s", "robust: 3 ok, 1 rejected")
     nothing = np.full((1, 4), -1, np.int8)
-    lines = caption_of(replace(view, has_pose=False), nothing, "refined")
-    assert lines[1] == "refined: no skeleton at this time, no camera pose at this time"
+    _, said = caption_of(replace(view, has_pose=False), nothing, "refined")
+    missing = said.removeprefix("refined: ").split(", ")
+    assert [word in part for word, part in zip(("skeleton", "pose"), missing, strict=True)] == [True, True]
 
 
 @given(st.integers(1, 9), st.integers(1, 9))

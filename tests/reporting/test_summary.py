@@ -70,10 +70,10 @@ def test_measures_state_every_overall_number(content: SessionContent) -> None:
     summary = summarise(replace(content, metrics=metrics))
     shown = {row.label: row.value.replace(THIN, " ") for row in measures(summary)}
     assert shown["MPJPE"] == "22.4 mm"
-    assert shown["PCK at 150 mm"] == "84.0 %"
-    assert shown["Bone length spread"] == "12.3 mm"
     assert shown["Jerk"] == "567 m/s³"
-    assert shown["Reprojection, median"] == "4.41 px"
     assert shown["new_measure"] == "3.14"
+    named = list(shown.items())
+    for word, value in (("PCK at", "84.0 %"), ("Bone", "12.3 mm"), ("Reprojection", "4.41 px")):
+        assert next(text for label, text in named if label.startswith(word)) == value, word
     (row,) = errors_per_camera(summary)
     assert (row.name, row.median_px, row.mean_px, row.left_out_median_px) == ("drone1", 2.0, 3.0, 9.0)

