@@ -70,10 +70,10 @@ def render_options(command: Command) -> Command:
 
 def film_arms(session: Path, asked: Rendering, *, force: bool, progress: Progress) -> dict[str, Any]:
     """Film the session's arms and return their figures."""
-    from pipelines.filming import Shooting, film
+    from pipelines.film import Settings, film
 
-    shooting = Shooting(asked.rate_hz, asked.start_s, asked.end_s, asked.detector)
-    return film(session, shooting, scenario=asked.scenario, force=force, progress=progress).metrics
+    settings = Settings(asked.rate_hz, asked.start_s, asked.end_s, asked.detector)
+    return film(session, settings, scenario=asked.scenario, force=force, progress=progress).metrics
 
 
 def print_filmed(metrics: dict[str, Any]) -> None:

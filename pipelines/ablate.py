@@ -8,7 +8,7 @@ intervals. Everything here is simulated.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import PCK_THRESHOLD_M, common, measure
 from pipelines.geometry.noise import NoiseModel
-from pipelines.geometry.triangulation import Views, estimate_noise, locate, triangulate_pictures
+from pipelines.geometry.triangulation import Views, locate
 from pipelines.keypoints.alone import FollowedAlone
 from pipelines.keypoints.hints import project_actor
 from pipelines.reconstruction.refining import refined_points
@@ -40,6 +40,7 @@ from pipelines.simulation.study.sightings import (
     exact_keypoints,
     formation,
     model_keypoints,
+    triangulate_robustly,
     views_of,
     walk,
 )
@@ -196,8 +197,8 @@ def _measure_cell(
             points[method], doubt = reconstructed(method, views, filmed, models)
             fell_back[method] = float(doubt is not None)
         for method, errors in compared(points, filmed).items():
-            told = {"trial": trial, "method": method, **errors, "fell_back": fell_back[method]}
-            rows.append({**_condition(cell), **told})
+            fallback = {"fell_back": fell_back[method]}
+            rows.append({**_condition(cell), "trial": trial, "method": method, **errors, **fallback})
         progress.advance()
     write_json(folder / "rows.json", {"rows": rows})
 
@@ -223,10 +224,7 @@ def reconstructed(
         elapsed_s = (filmed.t_ns - filmed.t_ns[0]) / 1e9
         return refined_points(views, elapsed_s, tuple(filmed.person.joints), models)
     if method == "robust":
-        told = replace(views, pixel_sigma=estimate_noise(views))
-        return triangulate_pictures(
-            told, picture=views.pose_index, pixel_sigma=views.pixel_sigma
-        ).points, None
+        return triangulate_robustly(views)[1], None
     return locate(views, method=method).points, None
 
 
@@ -258,7 +256,7 @@ def compared(points: Mapping[StudyMethod, Float], filmed: Walk) -> dict[StudyMet
         errors["pck150_auc"] = float(near.sum()) / distance.size
         of_joints: Any = errors["per_joint"]
         errors["per_joint"] = {
-            joint: {name: told[name] for name in _PER_JOINT} for joint, told in of_joints.items()
+            joint: {name: own[name] for name in _PER_JOINT} for joint, own in of_joints.items()
         }
         rows[method] = errors
     return rows

@@ -241,10 +241,10 @@ def _verdict(
     """Name the violated limits, and then compare the arms."""
     if differences:
         wanted = next((each for each in differences if each["arm"] == "adaptive"), differences[0])
-        said = verdict(wanted["arm"], wanted["against"], arms, wanted)
+        conclusion = verdict(wanted["arm"], wanted["against"], arms, wanted)
     else:
-        said = f"{next(iter(arms))} flew alone: there is nothing to compare it with"
-    return ". ".join([*broken, said])
+        conclusion = f"{next(iter(arms))} flew alone: there is nothing to compare it with"
+    return ". ".join([*broken, conclusion])
 
 
 def _warnings(results: Mapping[str, ArmResult]) -> list[str]:
@@ -299,8 +299,8 @@ def broken_limits(arm: str, scores: Mapping[str, Any], config: PlannerConfig) ->
         "jerk": f"has a jerk of more than {config.jerk_mps3:g} m/s^3",
     }
     counts = scores["limit_violations"]
-    said = [f"{words} ({_times(counts[kind])})" for kind, words in kinds.items() if counts.get(kind)]
-    return f"{arm} {', '.join(said)}" if said else None
+    violations = [f"{words} ({_times(counts[kind])})" for kind, words in kinds.items() if counts.get(kind)]
+    return f"{arm} {', '.join(violations)}" if violations else None
 
 
 def _times(count: int) -> str:

@@ -257,12 +257,12 @@ def _swapped(frames: int, joints: tuple[str, ...], share: float, rng: np.random.
     shortest, longest = SWAP_FRAMES
     length = (shortest + longest) / 2
     begins = rng.random(frames) < share / (share + length * (1 - share))
-    lasts, which = rng.integers(shortest, longest + 1, frames), rng.integers(len(limbs), size=frames)
+    counts, which = rng.integers(shortest, longest + 1, frames), rng.integers(len(limbs), size=frames)
     swapped = np.zeros((frames, len(joints)), dtype=np.bool_)
     free_from = 0
     for frame in np.flatnonzero(begins).tolist():
         if frame >= free_from:
-            free_from = frame + int(lasts[frame])
+            free_from = frame + int(counts[frame])
             swapped[frame:free_from] = limbs[which[frame]]
     return swapped
 

@@ -193,15 +193,15 @@ def manifest_text(flight: SimulatedFlight, *, video: bool, true_poses: bool = Fa
 def _shot(flight: SimulatedFlight) -> list[str]:
     """Write a comment on exposure, readout and bit rate; none where all are off."""
     lens = flight.scenario.lens
-    said = [
+    parts = [
         f"exposure {lens.exposure_ms:g} ms" if lens.exposure_ms else "",
         f"readout {lens.readout_ms:g} ms" if lens.readout_ms else "",
         f"{lens.bitrate_mbps:g} Mbit/s" if lens.bitrate_mbps else "",
     ]
-    if not any(said):
+    if not any(parts):
         return []
     stamps = "a picture's time is the middle of the exposure of its middle row"
-    return [f"# Pictures: {', '.join(part for part in said if part)}; {stamps}."]
+    return [f"# Pictures: {', '.join(part for part in parts if part)}; {stamps}."]
 
 
 def _quoted(text: str) -> str:

@@ -14,7 +14,7 @@ import pytest
 
 import pipelines.formats.flights.pictures
 from pipelines.export import export, load_recording
-from pipelines.filming import film
+from pipelines.film import film
 from pipelines.formats.videos.video import VideoReader
 from pipelines.ingest import ingest
 from pipelines.reconstruct import Settings, reconstruct

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipelines.filming import Shooting, film
+from pipelines.film import Settings, film
 from pipelines.formats.videos.video import index_video
 from pipelines.ingest import ingest
 from pipelines.reconstruct import reconstruct
@@ -58,7 +58,7 @@ def test_arms_are_filmed_and_a_detector_looks_at_them(tmp_path: Path) -> None:
     assert "filmed (simulated) at 4 Hz, keypoints by " in again.stdout
     assert "unchanged: " in again.stdout
     assert read_json(session / "replan" / "stage.json") == replanned
-    assert film(session, Shooting(rate_hz=4.0, end_s=1.0)).skipped
+    assert film(session, Settings(rate_hz=4.0, end_s=1.0)).skipped
 
     other = tmp_path / "other.yaml"
     other.write_text(SHORT.replace("distance_m: 5", "distance_m: 5, turn_deg: 90"), encoding="utf-8")
@@ -84,7 +84,7 @@ def test_another_motion_file_is_another_film(tmp_path: Path, monkeypatch: pytest
     for text in ("one", "another", "one"):
         motion.write_text(text, encoding="utf-8")
         with pytest.raises(BegunError) as caught:
-            film(session, Shooting(detector=spot_detector(tmp_path)), scenario=scenario)
+            film(session, Settings(detector=spot_detector(tmp_path)), scenario=scenario)
         inputs.append(caught.value.args[0])
     assert inputs[0] == inputs[2]
     assert inputs[0] != inputs[1]
@@ -118,7 +118,7 @@ def test_everybody_of_the_scenario_is_filmed_again(tmp_path: Path, monkeypatch: 
         return np.zeros((360, 640, 3), np.uint8)
 
     monkeypatch.setattr(Renderer, "picture", picture)
-    film(session, Shooting(rate_hz=4.0, end_s=0.6, detector=spot_detector(tmp_path)))
+    film(session, Settings(rate_hz=4.0, end_s=0.6, detector=spot_detector(tmp_path)))
     truth = pd.read_parquet(session / "truth.parquet").groupby("person")[["x", "y", "z"]].mean()
     assert len(rendered) == 6
     # A walk begins with a stand: within half a second nobody gets further than a step from their mean.

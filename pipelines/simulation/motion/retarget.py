@@ -298,11 +298,12 @@ def _sampled(source: SkeletalMotion, bones: list[int], laid: Float, t_s: Float, 
     rotation = multiply(world[:, bones], laid)
     heading = [_heading(rotation[i, BONE["pelvis"]]) for i in (0, -1)]
     root, first = source.root, source.root[0]
-    lasts = float(source.t_s[-1])
-    since = np.clip(t_s, 0.0, lasts)
+    duration_s = float(source.t_s[-1])
+    since = np.clip(t_s, 0.0, duration_s)
     rounds = np.zeros(len(t_s), dtype=np.int64)
-    if repeat and lasts > 0:
-        seam = np.clip((source.t_s - (lasts - min(_SEAM_S, lasts / 2))) / min(_SEAM_S, lasts / 2), 0.0, 1.0)
+    if repeat and duration_s > 0:
+        seam_s = min(_SEAM_S, duration_s / 2)
+        seam = np.clip((source.t_s - (duration_s - seam_s)) / seam_s, 0.0, 1.0)
         share = seam * seam * (3 - 2 * seam)
         again = multiply(about(2, np.array([heading[1] - heading[0]])), rotation[0])
         rotation = np.stack(
@@ -314,8 +315,8 @@ def _sampled(source: SkeletalMotion, bones: list[int], laid: Float, t_s: Float, 
         )
         root = root.copy()
         root[:, 2] += share * (root[0, 2] - root[-1, 2])
-        rounds = np.floor(np.maximum(t_s, 0.0) / lasts).astype(np.int64)
-        since = np.maximum(t_s, 0.0) - rounds * lasts
+        rounds = np.floor(np.maximum(t_s, 0.0) / duration_s).astype(np.int64)
+        since = np.maximum(t_s, 0.0) - rounds * duration_s
     after = np.clip(np.searchsorted(source.t_s, since, side="right"), 1, max(len(source.t_s) - 1, 1))
     after = np.minimum(after, len(source.t_s) - 1)
     before = np.maximum(after - 1, 0)

@@ -156,24 +156,24 @@ def command_of(settings: Mapping[str, Any], output: str) -> str:
     study, drones, tilts = settings["study"], settings["drones"], settings["tilts_deg"]
     seconds, detector, noise = settings["seconds"], settings["detector"], settings["noise"]
     plain = settings_for(study, methods=METHODS[:1], seconds=seconds)
-    said: list[str] = []
+    words: list[str] = []
     if tilts != list(plain.tilts_deg):
-        said += ["--tilts" if study == "tilt" else "--tilt", ",".join(map(_written, tilts))]
+        words += ["--tilts" if study == "tilt" else "--tilt", ",".join(map(_written, tilts))]
     if drones != list(plain.drones):
-        said += ["--robots" if study == "robots" else "--drones", ",".join(map(str, drones))]
+        words += ["--robots" if study == "robots" else "--drones", ",".join(map(str, drones))]
     if noise != {each.label: each.model for each in plain.noise}:
-        said += _noise_words(study, noise, seconds)
+        words += _noise_words(study, noise, seconds)
     if settings["methods"] != list(METHODS):
-        said += ["--methods", ",".join(settings["methods"])]
+        words += ["--methods", ",".join(settings["methods"])]
     if detector is not None:
-        said += ["--detector", detector]
+        words += ["--detector", detector]
     elif settings["keypoints"] != "model":
-        said += ["--keypoints", settings["keypoints"]]
+        words += ["--keypoints", settings["keypoints"]]
     numbers = {"seconds": 75.0, "rate_hz": 30.0 if detector is None else 1.0, "trials": 10, "seed": 0}
     for name, default in numbers.items():
         if settings[name] != default:
-            said += [f"--{name.removesuffix('_hz')}", _written(settings[name])]
-    return shlex.join(["mocap", "ablate", study, *said, "-o", output])
+            words += [f"--{name.removesuffix('_hz')}", _written(settings[name])]
+    return shlex.join(["mocap", "ablate", study, *words, "-o", output])
 
 
 def _written(number: float) -> str:
@@ -221,8 +221,8 @@ def _levels(study: Study, levels: Sequence[str], seconds: float) -> list[Noise]:
 def _check_names(option: str, given: Sequence[str], known: Sequence[str]) -> None:
     unknown = [name for name in given if name not in known]
     if unknown or not given:
-        said = f"no such name: {', '.join(unknown)}" if unknown else "names nothing"
-        raise DataError(option, said, f"there are {', '.join(known)}")
+        problem = f"no such name: {', '.join(unknown)}" if unknown else "names nothing"
+        raise DataError(option, problem, f"there are {', '.join(known)}")
     _check_once(option, given)
 
 

@@ -10,7 +10,7 @@ between formations are not due to chance. Stage `film` measures the arms of a co
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from pipelines.geometry.cameras import Intrinsics, undistort
 from pipelines.geometry.metrics import common, measure
 from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.geometry.poses import matrix_from_quaternion, rates
-from pipelines.geometry.triangulation import Views, reprojection_px
+from pipelines.geometry.triangulation import Views, estimate_noise, reprojection_px, triangulate_pictures
 from pipelines.simulation.body import Person, make_body
 from pipelines.simulation.detector_errors import detect_keypoints, see, view_of
 from pipelines.simulation.flying import orbit
@@ -229,6 +229,13 @@ NEAR_SHARE = 0.1
 
 _NEAR_TILT_DEG = 5.0
 _ERRORS = ("reconstructed_share", "mpjpe_mm", "root_mpjpe_mm", "pa_mpjpe_mm", "pck150")
+
+
+def triangulate_robustly(views: Views) -> tuple[Views, Float]:
+    """Triangulate as `robust` does: the views with the estimated noise of keypoints, and points [N, 3] m."""
+    weighed = replace(views, pixel_sigma=estimate_noise(views))
+    found = triangulate_pictures(weighed, picture=views.pose_index, pixel_sigma=views.pixel_sigma)
+    return weighed, found.points
 
 
 def measure_arm(

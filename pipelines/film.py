@@ -8,7 +8,7 @@ are simulated, the detector is real. `replan` is only read.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel
-from pipelines.geometry.triangulation import Views, estimate_noise, triangulate_pictures
 from pipelines.keypoints.actor_hints import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD
 from pipelines.keypoints.alone import FollowedAlone
 from pipelines.keypoints.hints import project_actor
@@ -52,6 +51,7 @@ from pipelines.simulation.study.sightings import (
     Walk,
     errors_in_common,
     measure_arm,
+    triangulate_robustly,
     views_of,
 )
 
@@ -64,8 +64,8 @@ _INLET_HEIGHTS = 1.3  # of the person
 
 
 @dataclass(frozen=True)
-class Shooting:
-    """Settings of filming: rate, span and detector."""
+class Settings:
+    """Settings that determine a film: rate, span and detector."""
 
     rate_hz: float = 5.0
     start_s: float | None = None  # since the replay's first moment, which is the default
@@ -85,7 +85,7 @@ class Filmed:
 
 def film(
     folder: Path,
-    shooting: Shooting | None = None,
+    settings: Settings | None = None,
     *,
     scenario: Path | None = None,
     force: bool = False,
@@ -95,7 +95,7 @@ def film(
 
     Args:
         folder: the session; `replan` has run.
-        shooting: the settings that determine the result.
+        settings: the settings that determine the result.
         scenario: of the simulated flight; by default it is searched beside its pictures and the session.
         force: run it again even if nothing changed.
         progress: receives the progress.
@@ -106,7 +106,7 @@ def film(
             detector's files are missing.
         BusyError: another process writes the session.
     """
-    shooting = shooting or Shooting()
+    settings = settings or Settings()
     progress = progress or Silent()
     with locked(folder) as session:
         session.intact_record("ingest")
@@ -117,14 +117,14 @@ def film(
         if not description.simulated:
             raise DataError(folder, "was really flown: only simulated flights can be filmed again")
         path = scenario or _scenario_of(folder, description)
-        detector = find_detector(shooting.detector)
+        detector = find_detector(settings.detector)
         detector.load(threads=1)  # raises an error at once if a file is missing
         plan = read_scenario(path)
         inputs = {"replan": compared.key, "scenario": hash_of(plan.identity())}
         if hashes := {name: sha256_of(file) for name, (file, _) in plan.motion_files(path.parent).items()}:
             inputs["bvh"] = hash_of(hashes) if plan.actors else hashes["actor"]
         inputs |= {f"model {name}": digest for name, digest in hashes_of_models(detector).items()}
-        run = session.begin(FILM, settings=asdict(shooting), inputs=inputs, force=force)
+        run = session.begin(FILM, settings=asdict(settings), inputs=inputs, force=force)
         if run.finished:
             return Filmed(folder, run.record, read_json(folder / "film" / "metrics.json"), skipped=True)
 
@@ -137,7 +137,7 @@ def film(
         setting = _set(plan, path, flight)
         actor = logged_actor(folder, description)
         arms = {
-            arm: _arm(folder, actor, flight, plan, setting, arm, shooting)
+            arm: _arm(folder, actor, flight, plan, setting, arm, settings)
             for arm in read_json(folder / "replan" / "metrics.json")["arms"]
         }
         progress.start(
@@ -153,32 +153,44 @@ def film(
         desired_deg = float(compared.settings["planner.tilt_deg"])
         for name, arm in arms.items():
             parts = [
-                run.chunk(f"{name}-{camera}", partial(_shoot, arm, k, renderer, detector, progress))
+                run.chunk(f"{name}-{camera}", partial(_film_camera, arm, k, renderer, detector, progress))
                 for k, camera in enumerate(arm.names)
             ]
             sightings = _read_sightings(parts)
-            views, points = _triangulated(arm, sightings, compared.settings["seed"])
-            reconstructed[name] = points
-            metrics[name] = _measured(arm, sightings, views, points, desired_tilt_deg=desired_deg)
+            seed = compared.settings["seed"]  # one draw of the comparison's pose noise
+            views = views_of(arm.of, arm.seen_by, sightings, arm.noise, seed=seed, trial=0)
+            views, found = triangulate_robustly(views)
+            points = reconstructed[name] = found.reshape(arm.of.joints.shape)
+            slots = slot_of(arm.seen_by.position - arm.of.motion.root)
+            metrics[name] = measure_arm(
+                arm.of,
+                arm.seen_by,
+                sightings,
+                views,
+                points,
+                tilt_deg=np.degrees(slots[..., TILT]),
+                range_m=slots[..., 2],
+                desired_tilt_deg=desired_deg,
+            )
             _write_arm(run.folder / name, arm, sightings, points, parts)
         true_joints = {name: arm.of.joints for name, arm in arms.items()}
         for name, error_mm in errors_in_common(reconstructed, true_joints).items():
             metrics[name]["common_mpjpe_mm"] = error_mm
-        told = jsonable(
+        figures = jsonable(
             {
                 "schema": 1,
                 "simulated": True,
                 "detector": detector.title,
-                "rate_hz": shooting.rate_hz,
+                "rate_hz": settings.rate_hz,
                 "arms": metrics,
             }
         )
-        write_json(run.folder / "metrics.json", told)
+        write_json(run.folder / "metrics.json", figures)
         counts = {name: len(arm.of.t_ns) for name, arm in arms.items()}
         record = run.publish(counts={"moments": counts, "detector": detector.title})
         for note in advice_on(detector):
             progress.note(note)
-    return Filmed(folder, record, told, skipped=False)
+    return Filmed(folder, record, figures, skipped=False)
 
 
 # --- what is filmed ------------------------------------------------------------------------------------
@@ -220,7 +232,7 @@ def _set(plan: Scenario, path: Path, flight: LoggedFlight) -> Set:
     }
     setting = build_set(plan, bvh=bvh)
     if flight.hips is None:
-        raise DataError(path, "cannot be told to be this flight's", "ingest the flight with its truth")
+        raise DataError(path, "cannot be recognised as this flight's", "ingest the flight with its truth")
     followed = setting.people[0]
     joints = followed.person.keypoints(followed.moving((flight.hips.t_ns - plan.start_ns) / 1e9))
     hips = joints[:, [followed.person.joints.index(name) for name in _HIPS]].mean(axis=1)
@@ -241,12 +253,12 @@ def _arm(
     plan: Scenario,
     setting: Set,
     name: str,
-    shooting: Shooting,
+    settings: Settings,
 ) -> _Arm:
     table = read_table(folder / "replan" / name / "trajectories.parquet", REPLAN)
     cameras = tuple(dict.fromkeys(table["camera"]))
     t_ns = table["t_ns"].to_numpy(np.int64)[:: len(cameras)]
-    rows = _rows(t_ns, shooting)
+    rows = _rows(t_ns, settings)
     if len(rows) < 2:
         raise DataError(folder, f"{len(rows)} pictures lie in the span that is to be filmed", "widen it")
 
@@ -266,12 +278,12 @@ def _arm(
     return _Arm(cameras, walked, beside, seen_by, hips, flight.cameras[0].noise)
 
 
-def _rows(t_ns: Int64, shooting: Shooting) -> Int64:
+def _rows(t_ns: Int64, settings: Settings) -> Int64:
     """Find the rows of the moments [T] nearest to evenly spaced ones at the wanted rate, each once."""
     since_s = (t_ns - t_ns[0]) / 1e9
-    first = shooting.start_s or 0.0
-    behind = since_s[-1] + 1e-9 if shooting.end_s is None else shooting.end_s
-    wanted = np.arange(first, min(behind, since_s[-1] + 1e-9), 1 / shooting.rate_hz)
+    first = settings.start_s or 0.0
+    behind = since_s[-1] + 1e-9 if settings.end_s is None else settings.end_s
+    wanted = np.arange(first, min(behind, since_s[-1] + 1e-9), 1 / settings.rate_hz)
     return np.unique(
         np.clip(np.rint(np.interp(wanted, since_s, np.arange(len(t_ns)))), 0, None).astype(np.int64)
     )
@@ -280,7 +292,7 @@ def _rows(t_ns: Int64, shooting: Shooting) -> Int64:
 # --- pictures ------------------------------------------------------------------------------------------
 
 
-def _shoot(
+def _film_camera(
     arm: _Arm, camera: int, renderer: Renderer, detector: Detector, progress: Progress, folder: Path
 ) -> None:
     """Write one camera's pictures and the detector's keypoints: xy [T, J, 2], confidence [T, J]."""
@@ -321,33 +333,6 @@ def _read_sightings(parts: Sequence[Path]) -> Sightings:
             xy.append(stored["xy"])
             confidence.append(stored["confidence"])
     return Sightings(np.stack(xy), np.stack(confidence))
-
-
-# --- measuring -----------------------------------------------------------------------------------------
-
-
-def _triangulated(arm: _Arm, sightings: Sightings, seed: int) -> tuple[Views, Float]:
-    """Triangulate one draw of the comparison's pose noise; return the views and the points [T, J, 3]."""
-    views = views_of(arm.of, arm.seen_by, sightings, arm.noise, seed=seed, trial=0)
-    told = replace(views, pixel_sigma=estimate_noise(views))
-    found = triangulate_pictures(told, picture=views.pose_index, pixel_sigma=views.pixel_sigma)
-    return told, found.points.reshape(arm.of.joints.shape)
-
-
-def _measured(
-    arm: _Arm, sightings: Sightings, views: Views, points: Float, *, desired_tilt_deg: float
-) -> dict[str, Any]:
-    slots = slot_of(arm.seen_by.position - arm.of.motion.root)
-    return measure_arm(
-        arm.of,
-        arm.seen_by,
-        sightings,
-        views,
-        points,
-        tilt_deg=np.degrees(slots[..., TILT]),
-        range_m=slots[..., 2],
-        desired_tilt_deg=desired_tilt_deg,
-    )
 
 
 # --- drawing -------------------------------------------------------------------------------------------
@@ -393,10 +378,12 @@ def _draw(arm: _Arm, camera: int, sightings: Sightings, points: Float, pictures:
                     picture=None,
                 )
                 error = np.linalg.norm(points[k] - of.joints[k], axis=-1)
-                said = f"{1e3 * np.nanmean(error):.0f} mm off" if known.any() else "nothing reconstructed"
+                error_text = (
+                    f"{1e3 * np.nanmean(error):.0f} mm off" if known.any() else "nothing reconstructed"
+                )
                 caption = (
                     f"{name}   {view.t_s:.2f} s   tilt {np.degrees(slots[k, TILT]):.0f} deg",
-                    f"{int(seen.sum())} joints found, {int(known.sum())} reconstructed, {said}",
+                    f"{int(seen.sum())} joints found, {int(known.sum())} reconstructed, {error_text}",
                 )
                 side_px = _INLET_HEIGHTS * lens.fx * of.height_m / float(slots[k, 2])
                 yield with_inlet(draw_frame(picture, view, caption), middle_px[k], side_px)
