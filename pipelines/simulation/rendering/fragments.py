@@ -41,6 +41,7 @@ def room_for(count: int) -> Fragments:
     return Fragments(pixel, share, on_ground, point, normal, colour, distance, slant)
 
 
+@cached
 def gather(band: Band, first_row: int, view: View, mesh: Mesh, fragments: Fragments, sky: Float32) -> int:
     """Find the fragments of a band's pixels.
 
@@ -58,55 +59,10 @@ def gather(band: Band, first_row: int, view: View, mesh: Mesh, fragments: Fragme
     Returns:
         The number of fragments.
     """
-    return _gather(
-        band.nearness,
-        band.source,
-        first_row,
-        view.position,
-        view.world_from_camera,
-        view.pinhole,
-        view.land,
-        mesh.vertices,
-        mesh.faces,
-        mesh.normals,
-        mesh.colour,
-        mesh.kind,
-        fragments.pixel,
-        fragments.share,
-        fragments.on_ground,
-        fragments.point,
-        fragments.normal,
-        fragments.colour,
-        fragments.distance,
-        fragments.slant,
-        sky,
-    )
-
-
-@cached
-def _gather(
-    nearness: Float32,
-    source: Int32,
-    first_row: int,
-    position: Float,
-    turn: Float,
-    pinhole: Float,
-    land: Float,
-    vertices: Float,
-    faces: Int32,
-    normals: Float32,
-    colours: Float32,
-    kind: Bytes,
-    pixel: Int32,
-    share: Float32,
-    on_ground: Bytes,
-    point: Float32,
-    normal: Float32,
-    colour: Float32,
-    distance: Float32,
-    slant: Float32,
-    sky: Float32,
-) -> int:
+    nearness, source = band
+    position, turn, pinhole, land = view
+    vertices, faces, normals, colours, kind = mesh
+    pixel, share, on_ground, point, normal, colour, distance, slant = fragments
     width = nearness.shape[1]
     weight, per_fx, per_fy = 1.0 / SUBROWS, 1.0 / pinhole[0], 1.0 / pinhole[1]
     (ax, bx, cx), (ay, by, cy), (az, bz, cz) = turn

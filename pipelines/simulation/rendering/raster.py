@@ -142,6 +142,7 @@ def empty_band(sample_rows: int, width: int) -> Band:
     return Band(nearness, np.full((sample_rows, width), NOTHING, np.int32))
 
 
+@cached
 def draw(triangles: Projected, chosen: Int32, shifts_px: Float, first_sample_row: int, band: Band) -> None:
     """Draw triangles into a band: every sample keeps the nearest; the first of equals.
 
@@ -154,15 +155,63 @@ def draw(triangles: Projected, chosen: Int32, shifts_px: Float, first_sample_row
         first_sample_row: the picture's sample row that is the band's first.
         band: changed in place.
     """
-    _draw(
-        triangles.corners,
-        triangles.source,
-        chosen,
-        shifts_px,
-        first_sample_row,
-        band.nearness,
-        band.source,
-    )
+    corners, source = triangles
+    nearness, seen = band
+    rows, width = nearness.shape
+    per_pixel = len(shifts_px)
+    last_sample_row = first_sample_row + rows - 1
+    slack = 1e-9  # px; beyond rounding, below anything visible
+    for t in chosen:
+        x0, y0, n0 = corners[t, 0]
+        x1, y1, n1 = corners[t, 1]
+        x2, y2, n2 = corners[t, 2]
+        area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+        if abs(area) < 1e-12:  # seen from the edge
+            continue
+        # Nearness is linear in the picture (and so is height in a shadow map).
+        per_x = ((n1 - n0) * (y2 - y0) - (n2 - n0) * (y1 - y0)) / area
+        per_y = ((n2 - n0) * (x1 - x0) - (n1 - n0) * (x2 - x0)) / area
+        # Sample row s lies at y = (s + 0.5) / per_pixel - 0.5.
+        top = (min(y0, y1, y2) - slack + 0.5) * per_pixel - 0.5
+        bottom = (max(y0, y1, y2) + slack + 0.5) * per_pixel - 0.5
+        first = int(np.ceil(max(top, float(first_sample_row))))
+        last = int(np.floor(min(bottom, float(last_sample_row))))
+        if first > last:
+            continue
+        slope01 = (x1 - x0) / (y1 - y0) if y1 != y0 else 0.0
+        slope12 = (x2 - x1) / (y2 - y1) if y2 != y1 else 0.0
+        slope20 = (x0 - x2) / (y0 - y2) if y0 != y2 else 0.0
+        face = source[t]
+        for s in range(first, last + 1):
+            y = (s + 0.5) / per_pixel - 0.5
+            shift = shifts_px[s % per_pixel]
+            left, right = np.inf, -np.inf
+            if min(y0, y1) - slack <= y <= max(y0, y1) + slack:
+                a = min(max(x0 + (y - y0) * slope01, min(x0, x1)), max(x0, x1))
+                b = a if y0 != y1 else x1
+                left, right = min(left, a, b), max(right, a, b)
+            if min(y1, y2) - slack <= y <= max(y1, y2) + slack:
+                a = min(max(x1 + (y - y1) * slope12, min(x1, x2)), max(x1, x2))
+                b = a if y1 != y2 else x2
+                left, right = min(left, a, b), max(right, a, b)
+            if min(y2, y0) - slack <= y <= max(y2, y0) + slack:
+                a = min(max(x2 + (y - y2) * slope20, min(x2, x0)), max(x2, x0))
+                b = a if y2 != y0 else x0
+                left, right = min(left, a, b), max(right, a, b)
+            begin = max(left - shift - slack, 0.0)
+            end = min(right - shift + slack, width - 1.0)
+            if begin > end:
+                continue
+            i0, i1 = int(np.ceil(begin)), int(np.floor(end))
+            start = np.float32(n0 + per_x * (i0 + shift - x0) + per_y * (y - y0))
+            step = np.float32(per_x)
+            # Unsigned indices need no look for negative ones, so the loop compiles to vector code.
+            row, column = np.uint64(s - first_sample_row), np.uint64(i0)
+            for k in range(np.uint32(i1 + 1 - i0)):
+                value = start + step * np.float32(np.int32(k))
+                if value > nearness[row, column + np.uint64(k)]:
+                    nearness[row, column + np.uint64(k)] = value
+                    seen[row, column + np.uint64(k)] = face
 
 
 @cached
@@ -242,70 +291,3 @@ def _sorted_into_bands(corners: Float, height: int, rows: int) -> tuple[Int32, N
             chosen[filled[band]] = t
             filled[band] += 1
     return chosen, start
-
-
-@cached
-def _draw(
-    corners: Float,
-    source: Int32,
-    chosen: Int32,
-    shifts_px: Float,
-    first_sample_row: int,
-    nearness: Float32,
-    seen: Int32,
-) -> None:
-    rows, width = nearness.shape
-    per_pixel = len(shifts_px)
-    last_sample_row = first_sample_row + rows - 1
-    slack = 1e-9  # px; beyond rounding, below anything visible
-    for t in chosen:
-        x0, y0, n0 = corners[t, 0]
-        x1, y1, n1 = corners[t, 1]
-        x2, y2, n2 = corners[t, 2]
-        area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
-        if abs(area) < 1e-12:  # seen from the edge
-            continue
-        # Nearness is linear in the picture (and so is height in a shadow map).
-        per_x = ((n1 - n0) * (y2 - y0) - (n2 - n0) * (y1 - y0)) / area
-        per_y = ((n2 - n0) * (x1 - x0) - (n1 - n0) * (x2 - x0)) / area
-        # Sample row s lies at y = (s + 0.5) / per_pixel - 0.5.
-        top = (min(y0, y1, y2) - slack + 0.5) * per_pixel - 0.5
-        bottom = (max(y0, y1, y2) + slack + 0.5) * per_pixel - 0.5
-        first = int(np.ceil(max(top, float(first_sample_row))))
-        last = int(np.floor(min(bottom, float(last_sample_row))))
-        if first > last:
-            continue
-        slope01 = (x1 - x0) / (y1 - y0) if y1 != y0 else 0.0
-        slope12 = (x2 - x1) / (y2 - y1) if y2 != y1 else 0.0
-        slope20 = (x0 - x2) / (y0 - y2) if y0 != y2 else 0.0
-        face = source[t]
-        for s in range(first, last + 1):
-            y = (s + 0.5) / per_pixel - 0.5
-            shift = shifts_px[s % per_pixel]
-            left, right = np.inf, -np.inf
-            if min(y0, y1) - slack <= y <= max(y0, y1) + slack:
-                a = min(max(x0 + (y - y0) * slope01, min(x0, x1)), max(x0, x1))
-                b = a if y0 != y1 else x1
-                left, right = min(left, a, b), max(right, a, b)
-            if min(y1, y2) - slack <= y <= max(y1, y2) + slack:
-                a = min(max(x1 + (y - y1) * slope12, min(x1, x2)), max(x1, x2))
-                b = a if y1 != y2 else x2
-                left, right = min(left, a, b), max(right, a, b)
-            if min(y2, y0) - slack <= y <= max(y2, y0) + slack:
-                a = min(max(x2 + (y - y2) * slope20, min(x2, x0)), max(x2, x0))
-                b = a if y2 != y0 else x0
-                left, right = min(left, a, b), max(right, a, b)
-            begin = max(left - shift - slack, 0.0)
-            end = min(right - shift + slack, width - 1.0)
-            if begin > end:
-                continue
-            i0, i1 = int(np.ceil(begin)), int(np.floor(end))
-            start = np.float32(n0 + per_x * (i0 + shift - x0) + per_y * (y - y0))
-            step = np.float32(per_x)
-            # Unsigned indices need no look for negative ones, so the loop compiles to vector code.
-            row, column = np.uint64(s - first_sample_row), np.uint64(i0)
-            for k in range(np.uint32(i1 + 1 - i0)):
-                value = start + step * np.float32(np.int32(k))
-                if value > nearness[row, column + np.uint64(k)]:
-                    nearness[row, column + np.uint64(k)] = value
-                    seen[row, column + np.uint64(k)] = face
