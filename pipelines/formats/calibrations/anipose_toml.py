@@ -33,9 +33,7 @@ class AniposeToml:
 
     def recognises(self, path: Path) -> bool:
         """Return True if a TOML file has the keys `matrix` and `distortions`."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        head = read_head(path)
+        head = read_head(path, self.suffixes)
         return all(re.search(rf"(?m)^\s*{key}\s*=", head) for key in ("matrix", "distortions"))
 
     def describe(self, path: Path) -> dict[str, object]:

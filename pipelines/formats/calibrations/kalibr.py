@@ -31,9 +31,7 @@ class KalibrFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file has a cam0, cam1, ... at the top and a camera_model."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        head = read_head(path)
+        head = read_head(path, self.suffixes)
         return bool(re.search(r"(?m)^cam\d+\s*:", head) and re.search(r"(?m)^\s+camera_model\s*:", head))
 
     def describe(self, path: Path) -> dict[str, object]:

@@ -42,9 +42,7 @@ class OpencvStorage:
 
     def recognises(self, path: Path) -> bool:
         """Return True if FileStorage wrote the file and it names a camera matrix."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        head = read_head(path)
+        head = read_head(path, self.suffixes)
         stored = "!!opencv-matrix" in head or "<opencv_storage>" in head
         return stored and re.search(rf"(?m)^\s*<?(?:{'|'.join(_MATRIX)})\b", head) is not None
 

@@ -35,9 +35,7 @@ class RosCameraInfo:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file has the keys of a camera_info and OpenCV's FileStorage did not write it."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        head = read_head(path)
+        head = read_head(path, self.suffixes)
         if path.suffix.lower() not in _YAML:
             return bool(re.search(r"(?m)^\[image\]", head) and re.search(r"(?m)^camera matrix\s*$", head))
         keys = ("image_width", "image_height", "camera_matrix")

@@ -125,6 +125,17 @@ class MapSurface:
     voxels: int  # of the map's surface
 
 
+def shown_surface(recording: Recording, occupancy: Occupancy, export: str) -> MapSurface:
+    """Find the surface of a map of the recording; note if its voxels are gathered in larger cubes."""
+    surface = surface_of(occupancy)
+    if surface.cube_m > occupancy.resolution_m * 1.001:
+        recording.progress.note(
+            f"{export}: the map's {surface.voxels} surface voxels are gathered in cubes of "
+            f"{surface.cube_m:g} m, {len(surface.middle)} of them"
+        )
+    return surface
+
+
 def surface_of(occupancy: Occupancy, most: int = MOST_CUBES) -> MapSurface:
     """Find the surface of a map, in cubes of as few whole voxels as give at most `most` cubes.
 

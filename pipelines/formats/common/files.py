@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -31,14 +32,20 @@ def read_bytes(path: Path) -> bytes:
         raise as_data_error(error, path) from error
 
 
-def first_bytes(path: Path, count: int = HEAD_BYTES) -> bytes:
-    """Read the beginning of a file, to recognise it; empty if the file cannot be read. Never raises."""
-    if is_special(path):
+def first_bytes(path: Path, count: int = HEAD_BYTES, *, suffixes: Collection[str] = ()) -> bytes:
+    """Read the beginning of a file, to recognise it; empty for what cannot be read. Never raises.
+
+    Args:
+        path: the file.
+        count: number of bytes.
+        suffixes: in lower case; the result is empty for any other suffix. Without suffixes, any will do.
+    """
+    if (suffixes and path.suffix.lower() not in suffixes) or is_special(path):
         return b""
     try:
         with path.open("rb") as file:
             return file.read(count)
-    except OSError:
+    except (OSError, ValueError):  # ValueError: an impossible name
         return b""
 
 
@@ -121,14 +128,8 @@ def read_text(path: Path) -> str:
         raise DataError(path, f"is not UTF-8 text (byte {error.start})", "save it as plain text") from error
 
 
-def read_head(path: Path) -> str:
-    """Read the first lines of a file, to recognise it; empty if the file cannot be read. Never raises."""
-    if is_special(path):
-        return ""
-    try:
-        with path.open("rb") as file:
-            head = file.read(HEAD_BYTES)
-    except OSError:
-        return ""
+def read_head(path: Path, suffixes: Collection[str] = ()) -> str:
+    """Read the first lines of a text file, to recognise it; like `first_bytes`."""
+    head = first_bytes(path, suffixes=suffixes)
     text = head.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\r", "\n")
     return text if len(head) < HEAD_BYTES else text.rpartition("\n")[0]

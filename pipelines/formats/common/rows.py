@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from bisect import bisect_left
+from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Decimal, InvalidOperation
 from pathlib import Path
@@ -259,6 +260,62 @@ def stamp_column(header: Sequence[str]) -> tuple[int, int] | None:
         return None
     finest = min(found)
     return found[finest], finest
+
+
+def drop_rows(keep: Bool, bad: Bool, cause: str, dropped: MutableMapping[str, int]) -> None:
+    """Remove the bad rows from `keep`, in place, and count those that were still in it."""
+    count = int(np.count_nonzero(keep & bad))
+    if count:
+        dropped[cause] = count
+        keep[bad] = False
+
+
+def kept_rows(
+    t_ns: Int64, causes: Mapping[str, Bool], dropped: MutableMapping[str, int], prefix: str = ""
+) -> Bool:
+    """Mark the usable rows [N]; count the others in `dropped` under the first cause that applies.
+
+    After `causes` come "duplicate stamp" and "stamp out of order" (behind `prefix`): of the other rows, the
+    longest chain of rising stamps is kept, so that one wrong stamp costs one row. Of equal stamps the first
+    stays.
+    """
+    keep = np.ones(len(t_ns), dtype=np.bool_)
+    for cause, bad in causes.items():
+        drop_rows(keep, bad, cause, dropped)
+    rows = np.flatnonzero(keep)
+    if len(rows) > 1:
+        stamps = t_ns[rows]
+        duplicate, late = np.zeros((2, len(t_ns)), dtype=np.bool_)
+        duplicate[rows[1:][stamps[1:] == stamps[:-1]]] = True
+        late[rows[~longest_rising(stamps)]] = True
+        drop_rows(keep, duplicate, f"{prefix}duplicate stamp", dropped)
+        drop_rows(keep, late, f"{prefix}stamp out of order", dropped)
+    return keep
+
+
+def longest_rising(stamps: Int64) -> Bool:
+    """Mark the longest strictly rising chain of stamps, so that one wrong stamp costs one row only.
+
+    Patience sorting (Fredman 1975). Of equally long chains, the one with the smallest last stamp is taken.
+    """
+    if (np.diff(stamps) > 0).all():
+        return np.ones(len(stamps), dtype=np.bool_)
+    tails: list[int] = []  # smallest last stamp of a chain of each length
+    places: list[int] = []  # and the row of that stamp
+    before = np.full(len(stamps), -1, dtype=np.int64)
+    for place, stamp in enumerate(stamps.tolist()):
+        length = bisect_left(tails, stamp)
+        if length < len(tails) and tails[length] == stamp:
+            continue  # of equal stamps the first stays
+        before[place] = places[length - 1] if length else -1
+        tails[length : length + 1] = [stamp]
+        places[length : length + 1] = [place]
+    chain = np.zeros(len(stamps), dtype=np.bool_)
+    place = places[-1]
+    while place >= 0:
+        chain[place] = True
+        place = int(before[place])
+    return chain
 
 
 def median_step_ns(t_ns: Int64) -> float | None:

@@ -17,11 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.formats.common.files import first_bytes
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
+    damaged,
+    fixes_track,
     of_angles,
     on_gps_time,
     on_one_clock,
+    pictures_on_gps_time,
     position_track,
     said_of_fit,
     turned_as_stated,
@@ -130,13 +134,7 @@ class ArduPilotFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file begins with the FMT message that defines FMT itself."""
-        if not path.is_file():
-            return False
-        try:
-            with path.open("rb") as file:
-                head = file.read(11)
-        except OSError:
-            return False
+        head = first_bytes(path, 11)
         return head.startswith(_START) and head[5:9].rstrip(b"\0") == b"FMT"
 
     def describe(self, path: Path) -> dict[str, object]:
@@ -184,9 +182,7 @@ class ArduPilotFormat:
         for name in ("CAM", "TRIG"):
             rows = log.first([name], choice.instance or 0, "I")
             if rows is not None:
-                t_ns = np.unique(rows.t_ns())
-                fit = on_gps_time(path, _gps_time(log), choice.time, [])
-                return t_ns if fit is None else np.unique(fit.other_ns(t_ns))
+                return pictures_on_gps_time(path, rows.t_ns(), _gps_time(log), choice)
         raise DataError(path, "holds no CAM or TRIG message", "take the times of frames otherwise")
 
 
@@ -229,16 +225,7 @@ def _position(
         return position_track(log.path, rows.name, rows.t_ns(), enu, dropped, on_earth=False, origin=origin)
     values = rows.numbers("Lat", "Lng", "Alt")
     fixed = rows.numbers("Status") >= _3D_FIX if kind == "gps" else np.ones(len(rows), dtype=np.bool_)
-    track = position_track(
-        log.path,
-        rows.name,
-        rows.t_ns(),
-        values,
-        dropped,
-        on_earth=True,
-        height="sea level",
-        unusable={"no 3D fix": np.asarray(~fixed)},
-    )
+    track = fixes_track(log.path, rows.name, rows.t_ns(), values, np.asarray(fixed), dropped)
     accuracy = log.first(["GPA"], instance, "I") if kind == "gps" else None
     if accuracy is None:
         return track
@@ -371,27 +358,18 @@ def _index(path: Path) -> Any:
             if file.read(len(_START)) != _START:
                 raise DataError(path, "is no ArduPilot log", "give the .bin that the autopilot wrote")
     except OSError as error:
-        raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
+        raise damaged(path, error) from error
     kind = need("pymavlink.DFReader", "drones").DFReader_binary
     reader = kind.__new__(kind)  # first without the file, which a failing __init__ leaves open
     try:
         with _silence():
             reader.__init__(str(path), zero_time_base=True)
-    except OSError as error:
-        _close(reader)
-        raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
     except Exception as error:  # damaged files raise many kinds of errors in this parser
-        _close(reader)
-        problem = " ".join(str(error).split())[:100] or type(error).__name__
-        raise DataError(path, f"is damaged ({problem})", "download it from the autopilot again") from error
-    _close(reader)
+        raise damaged(path, error) from error
+    finally:
+        if opened := getattr(reader, "filehandle", None):
+            opened.close()  # its memory map is freed with the last reference to it
     return reader
-
-
-def _close(reader: Any) -> None:
-    """Close the file; its memory map is freed with the last reference to it."""
-    if file := getattr(reader, "filehandle", None):
-        file.close()
 
 
 @contextmanager

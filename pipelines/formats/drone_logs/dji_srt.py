@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.files import read_head
-from pipelines.formats.common.rows import describe_times
+from pipelines.formats.common.rows import describe_times, longest_rising
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
     between_refreshed_angles,
@@ -34,7 +34,6 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     turned_as_stated,
     whatever_from,
 )
-from pipelines.formats.poses.pose_rows import longest_rising
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64
@@ -118,9 +117,9 @@ class DjiSrtFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if there are subtitles and one of the first holds a position."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        return bool(np.isfinite(_columns(parse_subtitles(read_head(path)).texts)["latitude"]).any())
+        return bool(
+            np.isfinite(_columns(parse_subtitles(read_head(path, self.suffixes)).texts)["latitude"]).any()
+        )
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe subtitles, times, ranges of the positions, heights and angles."""

@@ -9,7 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.formats.poses.pose_rows import NORM_TOLERANCE, longest_rising
+from pipelines.formats.common.rows import kept_rows
+from pipelines.formats.poses.pose_rows import NORM_TOLERANCE
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place, enu_from_geodetic, place_at
@@ -21,7 +22,7 @@ from pipelines.geometry.poses import (
 )
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64
-from pipelines.session.telemetry import AttitudeTrack, Height, PositionTrack, Telemetry
+from pipelines.session.telemetry import AttitudeTrack, Height, PositionTrack, Telemetry, TelemetryChoice
 
 _HELD_NS = 1_000_000_000  # receivers on drones report at least once a second
 _LEAST_REFRESHES = 4  # intervals between changes that are needed to judge their regularity
@@ -54,7 +55,7 @@ def position_track(
             causes["not on Earth"] = (np.abs(values[:, 0]) > 90) | (np.abs(values[:, 1]) > 360)
             causes["no fix (0, 0)"] = np.asarray((values[:, :2] == 0).all(axis=1))
     found: dict[str, int] = {}
-    keep = _kept(t_ns, causes, found)
+    keep = kept_rows(t_ns, causes, found)
     if not keep.any():
         counts = ", ".join(f"{count} {cause}" for cause, count in found.items()) or "it is empty"
         raise DataError(source, f"{name} holds no usable position ({counts})", "name another log")
@@ -96,7 +97,7 @@ def attitude_track(
             "attitude not a unit quaternion": np.abs(norm - 1) > NORM_TOLERANCE,
         }
     found: dict[str, int] = {}
-    keep = _kept(t_ns, causes, found, prefix="attitude ")
+    keep = kept_rows(t_ns, causes, found, prefix="attitude ")
     if not keep.any():
         return None
     for cause, count in found.items():
@@ -119,6 +120,22 @@ def of_angles(yaw_pitch_roll_deg: Float) -> Float:
 def whatever_from(attitude: Float) -> Mapping[RelativeTo, Float]:
     """Return the same angles for every reference, because the log does not name one and the user may."""
     return {"world": attitude, "body": attitude, "heading": attitude}
+
+
+def fixes_track(
+    source: Path, name: str, t_ns: Int64, values: Float, fixed: Bool, dropped: MutableMapping[str, int]
+) -> PositionTrack:
+    """Apply `position_track` to latitude, longitude and height above the sea [N, 3] with 3D fixes [N]."""
+    unusable = {"no 3D fix": ~fixed}
+    return position_track(
+        source, name, t_ns, values, dropped, on_earth=True, height="sea level", unusable=unusable
+    )
+
+
+def pictures_on_gps_time(source: Path, t_ns: Int64, fit: ClockFit | None, choice: TelemetryChoice) -> Int64:
+    """Return the times of pictures, sorted and each once, in UTC as in `on_gps_time`."""
+    fit = on_gps_time(source, fit, choice.time, [])
+    return np.unique(t_ns) if fit is None else np.unique(fit.other_ns(np.unique(t_ns)))
 
 
 def placed_by(track: PositionTrack, fixes: PositionTrack) -> tuple[PositionTrack, str]:
@@ -215,6 +232,14 @@ def on_gps_time(
     return fit
 
 
+def damaged(path: Path, error: Exception) -> DataError:
+    """Make the error of a log that its parser cannot read, by any kind of exception."""
+    if isinstance(error, OSError):
+        return DataError(path, f"cannot be read ({error.strerror})", "check the path")
+    problem = " ".join(str(error).split())[:100] or type(error).__name__
+    return DataError(path, f"is damaged ({problem})", "download it from the autopilot again")
+
+
 def said_of_fit(fit: ClockFit) -> str:
     """Describe clock offset and drift between a log's own clock and GPS time, in words."""
     return (
@@ -281,25 +306,3 @@ def _between_changes(t_ns: Int64, values: Float, most_rows: int) -> Float:
     measured[[0, *changes.tolist()]] = True
     measured |= (t_ns[last] - t_ns >= _HELD_NS) | (last - rows >= most_rows) | (next_change == len(changes))
     return interpolate_points(t_ns[measured], values[measured], t_ns, max_gap_ns=int(np.ptp(t_ns)) + 1)
-
-
-def _kept(t_ns: Int64, causes: dict[str, Bool], dropped: dict[str, int], prefix: str = "") -> Bool:
-    keep = np.ones(len(t_ns), dtype=np.bool_)
-
-    def drop(cause: str, bad: Bool) -> None:
-        if count := int(np.count_nonzero(keep & bad)):
-            dropped[cause] = count
-            keep[bad] = False
-
-    for cause, bad in causes.items():
-        drop(cause, bad)
-    rows = np.flatnonzero(keep)
-    if len(rows) > 1:
-        stamps = t_ns[rows]
-        duplicate = np.zeros(len(t_ns), dtype=np.bool_)
-        duplicate[rows[1:][stamps[1:] == stamps[:-1]]] = True
-        late = np.zeros(len(t_ns), dtype=np.bool_)
-        late[rows[~longest_rising(stamps)]] = True
-        drop(f"{prefix}duplicate stamp", duplicate)
-        drop(f"{prefix}stamp out of order", late)
-    return keep

@@ -17,11 +17,15 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.formats.common.files import first_bytes
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
+    damaged,
+    fixes_track,
     of_angles,
     on_gps_time,
     on_one_clock,
+    pictures_on_gps_time,
     position_track,
     said_of_fit,
     turned_as_stated,
@@ -71,13 +75,7 @@ class UlogFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file begins with ULog's magic bytes."""
-        if not path.is_file():
-            return False
-        try:
-            with path.open("rb") as file:
-                return file.read(len(MAGIC)) == MAGIC
-        except OSError:
-            return False
+        return first_bytes(path, len(MAGIC)) == MAGIC
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe topics and their messages, times, GPS, valid estimates, and damage."""
@@ -140,9 +138,7 @@ class UlogFormat:
         topics = topics_of(open_ulog(path, {"camera_capture", "camera_trigger", *_GPS}))
         for name in ("camera_capture", "camera_trigger"):
             if found := [topic for topic in topics if topic.name == name and len(topic)]:
-                t_ns = np.unique(found[0].t_ns())
-                fit = on_gps_time(path, _gps_time(topics), choice.time, [])
-                return t_ns if fit is None else np.unique(fit.other_ns(t_ns))
+                return pictures_on_gps_time(path, found[0].t_ns(), _gps_time(topics), choice)
         raise DataError(
             path, "holds no camera_capture or camera_trigger", "take the times of frames otherwise"
         )
@@ -187,16 +183,7 @@ def _position(
         values, usable = topic.numbers("lat", "lon", "alt"), np.ones(len(topic), dtype=np.bool_)
     else:
         values, usable = _fixes(topic)
-    track = position_track(
-        path,
-        topic.name,
-        topic.t_ns(),
-        values,
-        dropped,
-        on_earth=True,
-        height="sea level",
-        unusable={"no 3D fix": ~usable},
-    )
+    track = fixes_track(path, topic.name, topic.t_ns(), values, usable, dropped)
     return replace(track, accuracy_m=_accuracy(topic, usable))
 
 
@@ -428,11 +415,8 @@ def open_ulog(path: Path, wanted: Collection[str] | None) -> Any:
             return core.ULog(file, None if wanted is None else sorted(wanted))
     except DataError:
         raise
-    except OSError as error:
-        raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
     except Exception as error:  # damaged files raise many kinds of errors in this parser
-        problem = " ".join(str(error).split())[:100] or type(error).__name__
-        raise DataError(path, f"is damaged ({problem})", "download it from the autopilot again") from error
+        raise damaged(path, error) from error
 
 
 def topics_of(log: Any) -> list[Topic]:
@@ -450,7 +434,7 @@ def _refuse_bombs(path: Path) -> None:
     try:
         formats = dict(_definitions(path))
     except OSError as error:
-        raise DataError(path, f"cannot be read ({error.strerror})", "check the path") from error
+        raise damaged(path, error) from error
     sizes: dict[str, int] = {}
 
     def size(name: str, depth: int) -> int:

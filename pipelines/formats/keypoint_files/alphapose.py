@@ -12,8 +12,7 @@ from pathlib import Path
 
 from pipelines.formats.keypoint_files.keypoint_people import (
     Gathering,
-    choose_skeleton,
-    describe_detections,
+    KeypointFile,
     first_entry,
     is_alphapose_entry,
     load_json,
@@ -23,38 +22,25 @@ from pipelines.formats.keypoint_files.keypoint_people import (
     whole_number,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.records import Detections
 
 
-class AlphaPose:
+class AlphaPose(KeypointFile):
     """Reader of AlphaPose's `alphapose-results.json`, old and new."""
 
     name = "alphapose"
     title = "AlphaPose keypoints"
-    suffixes = (".json",)
 
     def recognises(self, path: Path) -> bool:
         """Return True for a list of results that name pictures, or have AlphaPose's `box` or `idx`."""
         return path.is_file() and any(is_alphapose_entry(first_entry(s)) for s in samples(path))
 
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe frames, people, the skeleton guessed from the number of keypoints, and confidences."""
-        return describe_detections(self.read_keypoints(path, skeleton=None, first_frame=0))
-
-    def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
-        """Read every person; pixels and keypoint scores as AlphaPose wrote them.
-
-        Raises:
-            DataError: not such a file, no keypoints, or a number of keypoints that differs from `skeleton`.
-        """
-        people = Gathering(path)
-        for where, entry in objects(load_json(path), path, "results"):
+    def gather(self, people: Gathering) -> None:
+        """Add every person, with the tracker's id."""
+        for where, entry in objects(load_json(people.path), people.path, "results"):
             frame = people.frame_of(entry.get("image_id"), where)
             if "keypoints" not in entry:
                 raise DataError(where, "has no keypoints", "check the file's format")
             people.add(frame, triples(entry["keypoints"], where), where, own_id=_track(entry.get("idx")))
-        chosen = choose_skeleton(path, people.count(), skeleton)
-        return people.detections(chosen, first_frame)
 
 
 def _track(idx: object) -> int | None:

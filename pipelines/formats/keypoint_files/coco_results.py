@@ -16,8 +16,7 @@ import numpy as np
 
 from pipelines.formats.keypoint_files.keypoint_people import (
     Gathering,
-    choose_skeleton,
-    describe_detections,
+    KeypointFile,
     first_entry,
     is_alphapose_entry,
     load_json,
@@ -28,40 +27,31 @@ from pipelines.formats.keypoint_files.keypoint_people import (
 )
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
-from pipelines.session.records import Detections
 
 
-class Coco:
+class Coco(KeypointFile):
     """Reader of COCO keypoint results and annotations."""
 
     name = "coco"
     title = "COCO keypoints"
-    suffixes = (".json",)
 
     def recognises(self, path: Path) -> bool:
         """Return True for a COCO file, even with boxes only or an empty list; reading reports the fault."""
         return path.is_file() and any(_is_annotations(s) or _is_results(s) for s in samples(path))
 
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe frames, people, the skeleton, and confidences."""
-        return describe_detections(self.read_keypoints(path, skeleton=None, first_frame=0))
-
-    def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
-        """Read every person; an annotation file also gives the joint names and the picture size.
-
-        Raises:
-            DataError: no keypoints, boxes only, or a number of keypoints that differs from `skeleton`.
-        """
-        people = Gathering(path)
-        content = load_json(path)
-        names, image_size = None, None
-        if isinstance(content, dict):
-            _add_annotations(content, people)
-            names, image_size = _joint_names(content), _picture_size(content, path)
-        else:
-            _add_results(content, people)
-        chosen = choose_skeleton(path, people.count(), skeleton, names)
-        return people.detections(chosen, first_frame, image_size)
+    def gather(self, people: Gathering) -> None:
+        """Add every person; an annotation file also states the joint names and the picture size."""
+        content = load_json(people.path)
+        boxes = (
+            _add_annotations(content, people) if isinstance(content, dict) else _add_results(content, people)
+        )
+        if boxes and not len(people):
+            raise DataError(
+                people.path,
+                f"holds boxes only, no keypoints, in all of its {boxes} entries",
+                "run a keypoint detector",
+            )
+        people.dropped["entry without keypoints"] += boxes
 
 
 def _is_annotations(sample: object) -> bool:
@@ -77,7 +67,8 @@ def _is_results(sample: object) -> bool:
     )
 
 
-def _add_results(content: object, people: Gathering) -> None:
+def _add_results(content: object, people: Gathering) -> int:
+    """Add the people of a list of results; return the number of entries without keypoints."""
     boxes = 0
     for where, entry in objects(content, people.path, "results"):
         frame = people.frame_of(entry.get("image_id"), where)
@@ -85,14 +76,16 @@ def _add_results(content: object, people: Gathering) -> None:
             people.add(frame, triples(entry["keypoints"], where), where)
         else:
             boxes += 1
-    _check_keypoints(people, boxes)
+    return boxes
 
 
-def _add_annotations(content: dict[str, object], people: Gathering) -> None:
+def _add_annotations(content: dict[str, object], people: Gathering) -> int:
+    """Add the people of an annotation file; return the number of annotations without keypoints."""
     frames: dict[str, int] = {}
+    sizes = set()
     for where, image in objects(content.get("images"), people.path, "images"):
-        name = image.get("file_name", image.get("id"))
-        frames[str(image.get("id"))] = people.frame_of(name, where)
+        frames[str(image.get("id"))] = people.frame_of(image.get("file_name", image.get("id")), where)
+        sizes.add((whole_number(image.get("width")), whole_number(image.get("height"))))
     boxes = 0
     for where, annotation in objects(content.get("annotations"), people.path, "annotations"):
         if not annotation.get("keypoints"):
@@ -105,17 +98,10 @@ def _add_annotations(content: dict[str, object], people: Gathering) -> None:
             )
         rows = _with_confidence(triples(annotation["keypoints"], where), where)
         people.add(frames[image_id], rows, where, own_id=whole_number(annotation.get("track_id")))
-    _check_keypoints(people, boxes)
-
-
-def _check_keypoints(people: Gathering, boxes: int) -> None:
-    if boxes and not len(people):
-        raise DataError(
-            people.path,
-            f"holds boxes only, no keypoints, in all of its {boxes} entries",
-            "run a keypoint detector",
-        )
-    people.dropped["entry without keypoints"] += boxes
+    people.joint_names = _joint_names(content)
+    width, height = sizes.pop() if len(sizes) == 1 else (None, None)
+    people.image_size = (width, height) if width and height else None
+    return boxes
 
 
 def _with_confidence(rows: Float, where: str) -> Float:
@@ -134,16 +120,6 @@ def _joint_names(content: dict[str, object]) -> tuple[str, ...] | None:
     if not isinstance(names, list):
         return None
     return tuple(str(name).strip().lower().replace(" ", "_") for name in names)
-
-
-def _picture_size(content: dict[str, object], path: Path) -> tuple[int, int] | None:
-    """Return the size of the pictures if all state the same; else None."""
-    sizes = {
-        (whole_number(image.get("width")), whole_number(image.get("height")))
-        for _, image in objects(content.get("images"), path, "images")
-    }
-    width, height = sizes.pop() if len(sizes) == 1 else (None, None)
-    return (width, height) if width and height else None
 
 
 FORMAT = Coco()

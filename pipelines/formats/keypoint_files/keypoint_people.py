@@ -146,41 +146,38 @@ def frame_number(name: object) -> int | None:
     return whole_number(int(digits[-1])) if digits and len(digits[-1]) < 20 else None
 
 
-def choose_skeleton(
-    path: Path, count: int, stated: str | None, names: tuple[str, ...] | None = None
-) -> Skeleton:
-    """Choose the skeleton of `count` keypoints: the user's, the one with the file's names, or the likeliest.
+class KeypointFile:
+    """Reader of the people of a keypoint file or folder; each format gathers them from its own layout."""
 
-    Raises:
-        DataError: the user's skeleton is unknown or has another number of joints, or no skeleton fits.
-    """
-    known = ", ".join(f"{s.name} ({len(s.joints)})" for s in SKELETONS.values())
-    if stated is not None:
-        skeleton = get_skeleton(stated)
-        if len(skeleton.joints) != count:
-            problem = f"has {count} keypoints per person where {stated} has {len(skeleton.joints)}"
-            raise DataError(path, problem, f"state the skeleton it was detected with: {known}")
-        return skeleton
-    candidates = skeleton_with(count)
-    if not candidates:
-        raise DataError(path, f"has {count} keypoints per person, as no known skeleton", f"there are {known}")
-    if names is None:
-        return candidates[0]
-    for skeleton in candidates:
-        if skeleton.joints == names:
-            return skeleton
-    raise DataError(
-        path,
-        f"names its {count} keypoints {', '.join(names[:4])}, ..., as no known skeleton",
-        f"state the skeleton if it is one of {known}",
-    )
+    suffixes = (".json",)
+
+    def gather(self, people: Gathering) -> None:
+        """Add every person of `people.path`; joint names and picture size too if the file states them."""
+        raise NotImplementedError
+
+    def describe(self, path: Path) -> dict[str, object]:
+        """Describe frames, people, the skeleton (stated, or guessed from the keypoints), and confidences."""
+        return _described(self.read_keypoints(path, skeleton=None, first_frame=0))
+
+    def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
+        """Read every person; pixels and scores as the file has them, cleaned by `Gathering.detections`.
+
+        Raises:
+            DataError: no readable file, another layout, no keypoints, or a number of keypoints that differs
+                from `skeleton`.
+        """
+        people = Gathering(path)
+        self.gather(people)
+        return people.detections(_choose_skeleton(people, skeleton), first_frame)
 
 
 class Gathering:
-    """People and frames of one camera, in the order in which a reader adds them (any order)."""
+    """People and frames of one camera, in any order; joint names and picture size if the file states them."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.joint_names: tuple[str, ...] | None = None
+        self.image_size: tuple[int, int] | None = None
         self.dropped: Counter[str] = Counter()
         self._listed: dict[int, str] = {}
         self._people: Counter[int] = Counter()
@@ -284,9 +281,7 @@ class Gathering:
             )
         return len(self._rows[0])
 
-    def detections(
-        self, skeleton: Skeleton, first_frame: int, image_size: tuple[int, int] | None = None
-    ) -> Detections:
+    def detections(self, skeleton: Skeleton, first_frame: int) -> Detections:
         """Return everything collected, cleaned and sorted.
 
         Frames before `first_frame` are dropped. A detection that repeats another one of its frame number by
@@ -332,7 +327,7 @@ class Gathering:
             xy=xy[rows],
             confidence=confidence[rows],
             frames_listed=listed[listed >= 0],
-            image_size=image_size,
+            image_size=self.image_size,
             dropped={cause: number for cause, number in sorted(dropped.items()) if number},
             adjusted={cause: number for cause, number in sorted(adjusted.items()) if number},
         )
@@ -363,6 +358,33 @@ class Gathering:
         return np.array(own if tracked else [self._rank[row] for row in rows], dtype=np.int64)
 
 
+def _choose_skeleton(people: Gathering, stated: str | None) -> Skeleton:
+    """Choose the skeleton: the user's, the one with the file's joint names, or the likeliest of this size.
+
+    Raises:
+        DataError: the user's skeleton is unknown or has another number of joints, or no skeleton fits.
+    """
+    path, count, names = people.path, people.count(), people.joint_names
+    known = ", ".join(f"{s.name} ({len(s.joints)})" for s in SKELETONS.values())
+    if stated is not None:
+        skeleton = get_skeleton(stated)
+        if len(skeleton.joints) != count:
+            problem = f"has {count} keypoints per person where {stated} has {len(skeleton.joints)}"
+            raise DataError(path, problem, f"state the skeleton it was detected with: {known}")
+        return skeleton
+    candidates = skeleton_with(count)
+    if not candidates:
+        raise DataError(path, f"has {count} keypoints per person, as no known skeleton", f"there are {known}")
+    found = candidates[:1] if names is None else [s for s in candidates if s.joints == names]
+    if not found:
+        raise DataError(
+            path,
+            f"names its {count} keypoints {', '.join((names or ())[:4])}, ..., as no known skeleton",
+            f"state the skeleton if it is one of {known}",
+        )
+    return found[0]
+
+
 def _checked(keypoints: Float) -> tuple[Float, Float, Counter[str], Counter[str]]:
     """Return checked positions [M, K, 2], confidences [M, K], and counts of dropped and adjusted values."""
     xy, confidence = keypoints[..., :2].copy(), keypoints[..., 2].copy()
@@ -385,7 +407,7 @@ def _checked(keypoints: Float) -> tuple[Float, Float, Counter[str], Counter[str]
     return xy, np.clip(confidence, 0.0, 1.0), counted[0], counted[1]
 
 
-def describe_detections(detections: Detections) -> dict[str, object]:
+def _described(detections: Detections) -> dict[str, object]:
     """Describe a keypoint file for `mocap info`."""
     found = np.isfinite(detections.xy).all(axis=-1)
     confidence = detections.confidence[found]

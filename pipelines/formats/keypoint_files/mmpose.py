@@ -16,8 +16,7 @@ import numpy as np
 
 from pipelines.formats.keypoint_files.keypoint_people import (
     Gathering,
-    choose_skeleton,
-    describe_detections,
+    KeypointFile,
     first_entry,
     frame_number,
     numbers,
@@ -25,36 +24,22 @@ from pipelines.formats.keypoint_files.keypoint_people import (
     samples,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.records import Detections
 
 
-class MMPose:
+class MMPose(KeypointFile):
     """Reader of a file of MMPose predictions, or of a folder with one file for every picture."""
 
     name = "mmpose"
     title = "MMPose keypoints"
-    suffixes = (".json",)
 
     def recognises(self, path: Path) -> bool:
         """Return True if a file, or some files across a folder, hold MMPose's frames or people."""
         return any(_is_prediction(sample) for sample in samples(path))
 
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe frames, people, the skeleton, and confidences."""
-        return describe_detections(self.read_keypoints(path, skeleton=None, first_frame=0))
-
-    def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
-        """Read every person, file by file; pixels and scores as MMPose wrote them.
-
-        Raises:
-            DataError: no readable file, no keypoints, or a number of keypoints that differs from `skeleton`.
-        """
-        people = Gathering(path)
-        names = None
+    def gather(self, people: Gathering) -> None:
+        """Add every person, file by file; the last joint names that a file states count."""
         for file, content in people.contents():
-            names = _read_file(file, content, people) or names
-        chosen = choose_skeleton(path, people.count(), skeleton, names)
-        return people.detections(chosen, first_frame)
+            people.joint_names = _read_file(file, content, people) or people.joint_names
 
 
 def _is_prediction(sample: object) -> bool:

@@ -15,8 +15,7 @@ import numpy as np
 
 from pipelines.formats.keypoint_files.keypoint_people import (
     Gathering,
-    choose_skeleton,
-    describe_detections,
+    KeypointFile,
     frame_number,
     objects,
     samples,
@@ -24,39 +23,25 @@ from pipelines.formats.keypoint_files.keypoint_people import (
     whole_number,
 )
 from pipelines.geometry.arrays import Float
-from pipelines.session.records import Detections
 from pipelines.session.skeletons import SKELETONS
 
 
-class OpenPose:
+class OpenPose(KeypointFile):
     """Reader of a folder of OpenPose JSON files, or of one of them."""
 
     name = "openpose"
     title = "OpenPose keypoints"
-    suffixes = (".json",)
 
     def recognises(self, path: Path) -> bool:
         """Return True if a file, or some files across a folder, are objects with a list `people`."""
         return any(_is_frame(sample) for sample in samples(path))
 
-    def describe(self, path: Path) -> dict[str, object]:
-        """Describe frames, people, the skeleton guessed from the keypoints, and confidences."""
-        return describe_detections(self.read_keypoints(path, skeleton=None, first_frame=0))
-
-    def read_keypoints(self, path: Path, *, skeleton: str | None, first_frame: int) -> Detections:
-        """Read every person, file by file; skip and count files that cannot be read.
-
-        Raises:
-            DataError: no readable file, no keypoints, two files of one frame, or a number of keypoints
-                that differs from `skeleton`.
-        """
-        people = Gathering(path)
+    def gather(self, people: Gathering) -> None:
+        """Add every person, file by file; skip and count files that are no frames."""
         for file, content in people.contents():
             _read_frame(file, content, people)
-        if skeleton is None and people.count() == 25:
-            skeleton = _order_of_25(people.keypoints())
-        chosen = choose_skeleton(path, people.count(), skeleton)
-        return people.detections(chosen, first_frame)
+        if people.count() == len(SKELETONS["body25"].joints):
+            people.joint_names = SKELETONS[_order_of_25(people.keypoints())].joints
 
 
 def _is_frame(content: object) -> bool:

@@ -93,9 +93,7 @@ class OctomapFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file begins like OctoMap's files."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        head = first_bytes(path, 64)
+        head = first_bytes(path, 64, suffixes=self.suffixes)
         return head.startswith((_BINARY, _FULL)) or _is_legacy(head)
 
     def describe(self, path: Path) -> dict[str, object]:

@@ -67,9 +67,7 @@ class PcdFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file has the lines that every PCD has."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        head = first_bytes(path)
+        head = first_bytes(path, suffixes=self.suffixes)
         return bool(re.search(rb"(?m)^(FIELDS|COLUMNS) ", head) and re.search(rb"(?m)^DATA ", head))
 
     def describe(self, path: Path) -> dict[str, object]:

@@ -65,9 +65,7 @@ class PlyFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file begins with the line `ply`."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        return first_bytes(path, 16).split(b"\n")[0].strip() == b"ply"
+        return first_bytes(path, 16, suffixes=self.suffixes).split(b"\n")[0].strip() == b"ply"
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe elements, properties, vertices, and their map at the default resolution."""

@@ -65,9 +65,7 @@ class RosMap:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file has the keys that map_server requires."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        head = read_head(path)
+        head = read_head(path, self.suffixes)
         keys = ("image", "resolution", "origin", "occupied_thresh")
         return all(re.search(rf"(?m)^{key}\s*:", head) for key in keys)
 

@@ -49,9 +49,7 @@ class PoseCsvFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the header names a time, a position and a quaternion."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        return find_header(read_head(path)) is not None
+        return find_header(read_head(path, self.suffixes)) is not None
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe rows, times, gaps, bounding box and losses."""

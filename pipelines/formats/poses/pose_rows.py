@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.rows import bounding_box, describe_times
+from pipelines.formats.common.rows import bounding_box, describe_times, kept_rows
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, Trajectory
@@ -67,17 +66,7 @@ def clean_poses(
         causes["not finite"] |= ~np.isfinite(covariance).all(axis=(1, 2))
 
     dropped = {"truncated last line": truncated} if truncated else {}
-    keep = np.ones(len(t_ns), dtype=np.bool_)
-    for cause, bad in causes.items():
-        _drop(keep, bad, cause, dropped)
-    late = np.flatnonzero(keep)
-    if len(late) > 1:
-        stamps = t_ns[late]
-        duplicate = np.zeros(len(stamps), dtype=np.bool_)
-        duplicate[1:] = stamps[1:] == stamps[:-1]
-        rising = longest_rising(stamps)
-        for cause, bad in (("duplicate stamp", duplicate), ("stamp out of order", ~rising)):
-            _drop(keep, np.isin(np.arange(len(keep)), late[bad]), cause, dropped)
+    keep = kept_rows(t_ns, causes, dropped)
     if not keep.any():
         counts = ", ".join(f"{count} {cause}" for cause, count in dropped.items()) or "it has no rows"
         raise DataError(source, f"holds no usable pose ({counts})", "check how it was written")
@@ -89,39 +78,6 @@ def clean_poses(
         covariance=covariance if covariance is None or keep.all() else covariance[keep],
         dropped=dropped,
     )
-
-
-def longest_rising(stamps: Int64) -> Bool:
-    """Mark the longest strictly rising chain of stamps, so that one wrong stamp costs one row only.
-
-    Patience sorting (Fredman 1975). Of equally long chains, the one with the smallest last stamp is taken.
-    """
-    if (np.diff(stamps) > 0).all():
-        return np.ones(len(stamps), dtype=np.bool_)
-    tails: list[int] = []  # smallest last stamp of a chain of each length
-    places: list[int] = []  # and the row of that stamp
-    before = np.full(len(stamps), -1, dtype=np.int64)
-    for place, stamp in enumerate(stamps.tolist()):
-        length = bisect_left(tails, stamp)
-        if length < len(tails) and tails[length] == stamp:
-            continue  # of equal stamps the first stays
-        before[place] = places[length - 1] if length else -1
-        tails[length : length + 1] = [stamp]
-        places[length : length + 1] = [place]
-    chain = np.zeros(len(stamps), dtype=np.bool_)
-    place = places[-1]
-    while place >= 0:
-        chain[place] = True
-        place = int(before[place])
-    return chain
-
-
-def _drop(keep: Bool, bad: Bool, cause: str, dropped: dict[str, int]) -> None:
-    """Remove the rows from `keep`, in place, and count those that were still in it."""
-    count = int(np.count_nonzero(keep & bad))
-    if count:
-        dropped[cause] = count
-        keep &= ~bad
 
 
 def describe_trajectory(trajectory: Trajectory) -> dict[str, object]:

@@ -42,11 +42,9 @@ class TumFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the first line of numbers has eight, without a CSV header above."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        head, _, _ = _take_header(_spaced(read_head(path)))
+        head, _, _ = _take_header(_spaced(read_head(path, self.suffixes)))
         first = next((line for line in head.split("\n") if line and not line.startswith("#")), "")
-        return find_header(read_head(path)) is None and _is_eight_numbers(first)
+        return find_header(read_head(path, self.suffixes)) is None and _is_eight_numbers(first)
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe rows, times, gaps, bounding box and losses."""

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.calibrations.ros_camera_info import ros_distortion
-from pipelines.formats.common.exporting import as_jpeg, ellipsoids_95, safe_file_name, surface_of, thinned
+from pipelines.formats.common.exporting import as_jpeg, ellipsoids_95, safe_file_name, shown_surface, thinned
 from pipelines.formats.logs.ros2_writing import Ros2Recording
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics
@@ -275,12 +275,7 @@ def _camera_info(lens: Intrinsics) -> dict[str, Any]:
 
 def _map(recording: Recording, start_ns: int) -> Iterator[Entry]:
     for occupancy in recording.maps():
-        surface = surface_of(occupancy)
-        if surface.cube_m > occupancy.resolution_m * 1.001:
-            recording.progress.note(
-                f"mcap: the map's {surface.voxels} surface voxels are gathered in cubes of "
-                f"{surface.cube_m:g} m, {len(surface.middle)} of them"
-            )
+        surface = shown_surface(recording, occupancy, "mcap")
         stamp_ns = max(occupancy.from_ns, start_ns)
         yield (
             stamp_ns,

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.formats.common.exporting import as_jpeg, ellipsoids_95, safe_file_name, surface_of, thinned
+from pipelines.formats.common.exporting import as_jpeg, ellipsoids_95, safe_file_name, shown_surface, thinned
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
 from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, JointMotion, Recording, Trajectory
@@ -153,12 +153,7 @@ def _log_pictures(rr: Any, stream: Any, recording: Recording, name: str, lens: I
 
 def _log_map(rr: Any, stream: Any, recording: Recording) -> None:
     for occupancy in recording.maps():
-        surface = surface_of(occupancy)
-        if surface.cube_m > occupancy.resolution_m * 1.001:
-            recording.progress.note(
-                f"rerun: the map's {surface.voxels} surface voxels are gathered in cubes of "
-                f"{surface.cube_m:g} m, {len(surface.middle)} of them"
-            )
+        surface = shown_surface(recording, occupancy, "rerun")
         points = rr.Points3D(surface.middle, radii=surface.cube_m / 2, colors=[_STONE])
         if occupancy.from_ns:
             if occupancy.from_ns < _LAST_WITHOUT_DATE_NS:

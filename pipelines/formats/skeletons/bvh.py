@@ -63,9 +63,7 @@ class BvhFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file begins with HIERARCHY and ROOT."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        return read_head(path).split(maxsplit=2)[:2] == ["HIERARCHY", "ROOT"]
+        return read_head(path, self.suffixes).split(maxsplit=2)[:2] == ["HIERARCHY", "ROOT"]
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe bones, frames, rate, seconds, the extent of the rest pose, and the box of its root."""

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.common.exporting import people_of
+from pipelines.formats.common.files import first_bytes
 from pipelines.formats.skeletons.joint_files import (
     METRES,
     EvenMotion,
@@ -62,11 +63,7 @@ class C3dFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the second byte is that of every C3D."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        with path.open("rb") as file:
-            start = file.read(2)
-        return len(start) == 2 and start[1] == _MAGIC
+        return first_bytes(path, 2, suffixes=self.suffixes)[1:] == bytes([_MAGIC])
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe stated unit, axes and rate, points, times, missing values, and the world box (z up)."""

@@ -58,6 +58,18 @@ def to_y_up(position: Float) -> Float:
     return position[..., [1, 2, 0]]
 
 
+def joint_columns(motion: JointMotion) -> dict[str, object]:
+    """Return t_ns, person, joint, x, y, z as columns of a long table, with a row for each of [T, P, J]."""
+    times, people, joints = motion.position.shape[:3]
+    t_ns, person, joint = np.meshgrid(motion.t_ns, np.arange(people), np.arange(joints), indexing="ij")
+    return {
+        "t_ns": t_ns.ravel(),
+        "person": person.ravel(),
+        "joint": np.array(motion.joints, dtype=object)[joint.ravel()],
+        **dict(zip("xyz", motion.position.reshape(times * people * joints, 3).T, strict=True)),
+    }
+
+
 @dataclass(frozen=True)
 class EvenMotion:
     """Motion with a constant time step."""

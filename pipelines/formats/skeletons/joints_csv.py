@@ -13,7 +13,7 @@ from pipelines.formats.common.exporting import write_tables
 from pipelines.formats.common.files import read_head, read_text
 from pipelines.formats.common.rows import cell_name, parse_stamps, parse_table, stamp_column
 from pipelines.formats.poses import pose_csv
-from pipelines.formats.skeletons.joint_files import describe_motion, to_metres_z_up
+from pipelines.formats.skeletons.joint_files import describe_motion, joint_columns, to_metres_z_up
 from pipelines.session.errors import DataError
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Int64, JointMotion, Recording
 
@@ -37,9 +37,7 @@ class JointsCsvFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the header names a time, a joint and x y z."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        return _find_columns(read_head(path).split("\n", 1)[0]) is not None
+        return _find_columns(read_head(path, self.suffixes).split("\n", 1)[0]) is not None
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe joints, people, times, missing values, and the box as if in metres with z up."""
@@ -157,14 +155,7 @@ def write_joints(path: Path, motion: JointMotion) -> None:
     """Write `t_ns,person,joint,x,y,z` and all other known values (covariance in m^2); NaN is blank."""
     import pandas as pd
 
-    times, people, joints = motion.position.shape[:3]
-    t_ns, person, joint = np.meshgrid(motion.t_ns, np.arange(people), np.arange(joints), indexing="ij")
-    columns: dict[str, object] = {
-        "t_ns": t_ns.ravel(),
-        "person": person.ravel(),
-        "joint": np.array(motion.joints, dtype=object)[joint.ravel()],
-        **dict(zip("xyz", motion.position.reshape(times * people * joints, 3).T, strict=True)),
-    }
+    columns = joint_columns(motion)
     if motion.covariance is not None:
         columns |= dict(zip(POINT_COVARIANCE_COLUMNS, motion.covariance.reshape(-1, 6).T, strict=True))
     if motion.views is not None:

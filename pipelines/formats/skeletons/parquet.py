@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.exporting import write_tables
+from pipelines.formats.skeletons.joint_files import joint_columns
 from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording, Trajectory
 from pipelines.session.tables import POSES, POSES_WITH_COVARIANCE, SKELETON, pose_table, write_table
 
@@ -40,18 +41,14 @@ def write_joints(path: Path, motion: JointMotion) -> None:
     """Write `tables.SKELETON`; unknown values become NaN, 0 views or an empty status."""
     import pandas as pd
 
-    times, people, joints = shape = motion.position.shape[:3]
-    t_ns, person, joint = np.meshgrid(motion.t_ns, np.arange(people), np.arange(joints), indexing="ij")
+    shape = motion.position.shape[:3]
     unknown = np.full(shape, np.nan)
     covariance = np.full((*shape, 6), np.nan) if motion.covariance is None else motion.covariance
     reprojection = unknown if motion.reprojection_px is None else motion.reprojection_px
     views = np.zeros(shape, np.int64) if motion.views is None else motion.views
     status = np.full(shape, "") if motion.status is None else motion.status
     columns: dict[str, object] = {
-        "t_ns": t_ns.ravel(),
-        "person": person.ravel(),
-        "joint": np.array(motion.joints, dtype=object)[joint.ravel()],
-        **dict(zip("xyz", motion.position.reshape(times * people * joints, 3).T, strict=True)),
+        **joint_columns(motion),
         **dict(zip(POINT_COVARIANCE_COLUMNS, covariance.reshape(-1, 6).T, strict=True)),
         "views": views.ravel(),
         "reprojection_px": reprojection.ravel(),

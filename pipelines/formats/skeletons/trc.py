@@ -53,9 +53,7 @@ class TrcFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the file begins like every TRC."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        return read_head(path).startswith("PathFileType")
+        return read_head(path, self.suffixes).startswith("PathFileType")
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe header, joints, times, missing values, and the box in the world (z up)."""

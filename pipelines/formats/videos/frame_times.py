@@ -12,6 +12,7 @@ from pipelines.formats.common.files import read_head, read_text
 from pipelines.formats.common.rows import (
     cell_name,
     describe_times,
+    drop_rows,
     format_seconds,
     parse_stamps,
     parse_table,
@@ -48,9 +49,7 @@ class FrameTimesFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True for a table of times, with or without frame numbers, or subtitles of each frame."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        head = read_head(path)
+        head = read_head(path, self.suffixes)
         if path.suffix.lower() == ".srt":
             subtitles = parse_subtitles(head)
             return bool(subtitles.has_clock.any()) and not subtitles.are_slow
@@ -227,15 +226,10 @@ def _clean(
     order = np.argsort(frame, kind="stable")
     keep = np.ones(len(order), dtype=np.bool_)
 
-    def drop(cause: str, bad: Bool) -> None:
-        if count := int(np.count_nonzero(keep & bad)):
-            dropped[cause] = count
-            keep[bad] = False
-
     for cause, bad in causes.items():
-        drop(cause, bad[order])
-    drop("duplicate frame", _not_rising(frame[order], keep))
-    drop("time not increasing", _not_rising(t_ns[order], keep))
+        drop_rows(keep, bad[order], cause, dropped)
+    drop_rows(keep, _not_rising(frame[order], keep), "duplicate frame", dropped)
+    drop_rows(keep, _not_rising(t_ns[order], keep), "time not increasing", dropped)
     kept = order[keep]
     if not len(kept):
         counts = ", ".join(f"{count} {cause}" for cause, count in dropped.items()) or "it has no rows"
