@@ -21,6 +21,8 @@ from tests.commands.runner import content, mocap_process, refusal, refused, succ
 from tests.commands.test_overlay import filmed_flight, session_of
 from tests.synthetic.flights import START_NS, write_flight
 
+RECORD = "export.json"
+
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -45,8 +47,8 @@ def test_all_formats_at_once_with_a_record_of_what_they_are(filmed: Path, tmp_pa
     names = "bvh,c3d,csv,mcap,parquet,rerun,trc,tum"
     result = json.loads(succeeds("export", filmed, "--to", names, "-o", out, "--pictures-hz", "5", "--json"))
     written = {Path(path).name for path in result["written"]}
-    record = json.loads((out / "export.json").read_text(encoding="utf-8"))["files"]
-    assert set(record) == written == {path.name for path in out.iterdir()} - {"export.json"}
+    record = json.loads((out / RECORD).read_text(encoding="utf-8"))["files"]
+    assert set(record) | {RECORD} == written | {RECORD} == {path.name for path in out.iterdir()}
     stated = {(facts["format"], facts["unit"], facts["axes"]) for facts in record.values()}
     assert {
         ("bvh", "cm", "y-up"),
@@ -54,7 +56,7 @@ def test_all_formats_at_once_with_a_record_of_what_they_are(filmed: Path, tmp_pa
         ("trc", "m", "y-up"),
         ("mcap", "m", "z-up"),
     } <= stated
-    assert any("turns of bones are held" in note for facts in record.values() for note in facts["notes"])
+    assert any("BVH" in note for facts in record.values() for note in facts["notes"])
     (log,) = out.glob("*.mcap")
     with AnyReader([log]) as reader:
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
@@ -102,7 +104,7 @@ def test_files_of_an_earlier_export_are_replaced_others_are_not(filmed: Path, tm
     assert "add --overwrite" in refused("export", filmed, "--to", "csv,c3d,trc", "-o", out)
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before, "all of them, or none"
     succeeds("export", filmed, "--to", "trc", "-o", out, "--overwrite")
-    record = json.loads((out / "export.json").read_text(encoding="utf-8"))["files"]
+    record = json.loads((out / RECORD).read_text(encoding="utf-8"))["files"]
     assert set(record) == {path.name for path in first.written}
     (out / "export.json").write_text("{", encoding="utf-8")
     assert "add --overwrite" in refused("export", filmed, "--to", "trc", "--unit", "cm", "-o", out)
@@ -121,21 +123,20 @@ def test_what_a_killed_export_left_goes_and_a_second_one_at_once_is_refused(
     (target / ".writing").mkdir()
     with FileLock(target / ".writing" / "lock"):
         line = refusal(mocap_process("export", filmed, "--to", "trc", "-o", target))
-    assert "is being written by another process" in line
+    assert str(target) in line
+    assert "process" in line
     assert content(target).items() >= before.items()
 
 
 def test_units_and_axes_only_where_there_is_a_choice(filmed: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    assert "csv, tum: are always in metres with z up" in refused(
-        "export", filmed, "--to", "csv,tum,trc", "--unit", "mm", "-o", out
-    )
-    assert "trc: has no unit inch; there are m, cm, mm" in refused(
-        "export", filmed, "--to", "trc", "--unit", "inch", "-o", out
-    )
-    assert "bvh: has no axes x-up; there are y-up, z-up" in refused(
-        "export", filmed, "--to", "bvh", "--axes", "x-up", "-o", out
-    )
+    for formats, option, value, names in (
+        ("csv,tum,trc", "--unit", "mm", ["csv, tum", "--unit", "--axes"]),
+        ("trc", "--unit", "inch", ["trc", "inch", "m, cm, mm"]),
+        ("bvh", "--axes", "x-up", ["bvh", "x-up", "y-up, z-up"]),
+    ):
+        line = refused("export", filmed, "--to", formats, option, value, "-o", out)
+        assert all(name in line for name in names), line
     assert not out.exists()
 
 
@@ -164,5 +165,5 @@ def test_c3d_is_truth(tmp_path: Path) -> None:
     truth = flight.position[:, flight.joints.index("nose")]
     np.testing.assert_allclose(nose[["x", "y", "z"]], truth, rtol=2.0**-24)
     said = succeeds("info", tmp_path / "truth.c3d")
-    assert "Biomechanics points (C3D)" in said
+    assert "(C3D)" in said
     assert "POINT:UNITS" in said

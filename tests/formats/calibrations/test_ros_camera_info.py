@@ -192,6 +192,8 @@ def test_opencvs_own_files_and_manifests_are_others(tmp_path: Path) -> None:
     for key, value in {"image_width": 640, "image_height": 480, "camera_matrix": MATRIX}.items():
         storage.write(key, value)
     storage.release()
-    assert not READER.recognises(tmp_path / "cv.yaml")
+    stored_by_opencv = tmp_path / "cv.yaml"
+    assert not READER.recognises(stored_by_opencv)
     (tmp_path / "flight.yaml").write_text("schema: 1\ncameras:\n  cam0:\n    intrinsics: left.yaml\n")
-    assert not any(format_.recognises(tmp_path / "flight.yaml") for format_ in FORMATS.all())
+    flight = tmp_path / "flight.yaml"
+    assert not any(format_.recognises(flight) for format_ in FORMATS.all())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from pipelines.geometry.geodesy import enu_from_geodetic
 from pipelines.geometry.poses import conjugate, multiply, rotate
 from pipelines.session.errors import DataError
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from tests.formats.refusals import refuses
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import BOOT_NS, HOME, DroneTruth, dataflash, drone_of, write_dataflash
 from tests.synthetic.flights import write_flight
@@ -88,7 +90,7 @@ def test_a_mount_that_counts_from_the_nose_alone(tmp_path: Path, truth: DroneTru
 def test_time_by_gps(tmp_path: Path, truth: DroneTruth) -> None:
     path = write_dataflash(tmp_path / "a.bin", truth)
     telemetry = read(path)
-    assert telemetry.clock == "UTC by GPS"
+    assert telemetry.fit is not None
     # GPS gives truncated ms: half a ms on average, and the autopilot's clock 1 us.
     assert np.abs(telemetry.position.t_ns - truth.t_ns).max() < 1_000_000
     np.testing.assert_array_equal(read(path, time="boot").position.t_ns, truth.boot_us * 1000)
@@ -159,19 +161,19 @@ def test_damage(tmp_path: Path, truth: DroneTruth, capfd: pytest.CaptureFixture[
     assert len(telemetry.position.t_ns) >= len(truth.t_ns) - 2
     assert capfd.readouterr().err == ""  # pymavlink prints each byte that it cannot read
     path.write_bytes(whole[:700])
-    with pytest.raises(DataError, match="has no POS, XKF1, NKF1 or GPS"):
+    with refuses(path, "POS", "XKF1", "NKF1", "GPS"):
         read(path)
     path.write_bytes(b"")
     assert not FORMAT.recognises(path)
-    with pytest.raises(DataError, match="is no ArduPilot log"):
+    with refuses(path, "ArduPilot"):
         read(path)
 
 
 def test_what_is_not_there(tmp_path: Path, truth: DroneTruth) -> None:
     path = write_dataflash(tmp_path / "a.bin", truth, kinds=("GPS", "ATT"))
-    with pytest.raises(DataError, match="has no local position; there is gps"):
+    with refuses(path, "local", "gps"):
         read(path, position="local")
-    with pytest.raises(DataError, match="holds no CAM or TRIG"):
+    with refuses(path, "CAM", "TRIG"):
         FORMAT.picture_times(path, TelemetryChoice())
     assert read(path).gimbal is None
 
@@ -181,7 +183,7 @@ def test_without_pymavlink_it_is_said_what_to_install(
 ) -> None:
     path = write_dataflash(tmp_path / "a.bin", truth)
     monkeypatch.setitem(sys.modules, "pymavlink.DFReader", None)
-    with pytest.raises(DataError, match=r'pip install "pymavlink\S*" "pyulog\S*"`$'):
+    with pytest.raises(DataError, match=r'"pymavlink\S*" "pyulog\S*"`$'):
         read(path)
 
 
@@ -201,11 +203,9 @@ def test_an_instance_is_that_of_an_estimator_and_never_that_of_a_mount(
         second.position.values - first.position.values, [[0, 50, 0]] * len(truth.t_ns), atol=1e-5
     )
     np.testing.assert_array_equal(second.gimbal.quaternion_xyzw, first.gimbal.quaternion_xyzw)
-    assert any("has 2 mounts (MNT): took the angles of the first, 0" in note for note in second.notes)
+    assert any(re.search(r"\b2\b.*MNT.*\b0\b", note) for note in second.notes)
     for position in ("global", "gps"):
-        with pytest.raises(
-            DataError, match=f"has no instance 1 of a {position} position; write position: local"
-        ):
+        with refuses(path, 1, position, "position: local"):
             read(path, position=position, instance=1)
-    with pytest.raises(DataError, match="has no instance 2 of a local position; leave `instance` out"):
+    with refuses(path, 2, "local"):
         read(path, instance=2)

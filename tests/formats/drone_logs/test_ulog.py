@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,8 @@ import pytest
 from pipelines.formats.drone_logs.ulog import FORMAT
 from pipelines.geometry.geodesy import place_at
 from pipelines.geometry.poses import conjugate, multiply
-from pipelines.session.errors import DataError
 from pipelines.session.telemetry import Telemetry, TelemetryChoice
+from tests.formats.refusals import refuses
 from tests.real_data import real_data
 from tests.synthetic.drone_logs import (
     BOOT_NS,
@@ -73,8 +74,7 @@ def test_one_message_stamped_twenty_minutes_late() -> None:
 
 def test_a_drone_that_never_knew_where_it_was_is_doubted() -> None:
     telemetry = read(real_data("logs/ulog/sample.ulg"))
-    assert any("never calls its horizontal position valid" in note for note in telemetry.notes)
-    assert any("no GPS time" in note for note in telemetry.notes)
+    assert any("vehicle_local_position never" in note for note in telemetry.notes)
     assert telemetry.clock == "boot"
     assert not telemetry.position.values[:, :2].any()
 
@@ -82,7 +82,7 @@ def test_a_drone_that_never_knew_where_it_was_is_doubted() -> None:
 def test_local_positions_before_the_estimator_was_ready_are_dropped() -> None:
     path, told = real_data("logs/ulog/sample_px4_events.ulg"), facts("sample_px4_events.ulg")
     telemetry = read(path)
-    assert telemetry.dropped == {"not valid to its estimator": 98}
+    assert list(telemetry.dropped.values()) == [98]
     reference = [*told["local_ref_lat_lon_alt"]]
     origin = telemetry.position.origin
     assert origin is not None
@@ -103,7 +103,6 @@ def test_axes_and_times(tmp_path: Path, truth: DroneTruth) -> None:
     assert np.abs(multiply(conjugate(truth.body), telemetry.body.quaternion_xyzw)[:, :3]).max() < 1e-6
     # The time of sampling is used, not that of publication 2 ms later; both clocks in whole microseconds.
     assert np.abs(telemetry.position.t_ns - truth.t_ns).max() <= 1001
-    assert telemetry.clock == "UTC by GPS"
     assert telemetry.fit is not None
     assert abs(telemetry.fit.offset_ns - (int(truth.t_ns[0]) - BOOT_NS)) <= 1001
 
@@ -133,7 +132,7 @@ def test_an_estimator_that_moves_its_origin_is_followed(tmp_path: Path, truth: D
     telemetry = read(write_ulog(tmp_path / "a.ulg", rows[:half] + later))
     # The vertical 40 m away is turned by 6e-6: 0.1 mm. Heights of 280 m fit 32-bit floats to 3e-5.
     np.testing.assert_allclose(telemetry.position.values, truth.enu, atol=5e-4)
-    assert any("moved its origin 1 times" in note for note in telemetry.notes)
+    assert any(re.search(r"origin 1\b", note) for note in telemetry.notes)
 
 
 def test_triggers(tmp_path: Path, truth: DroneTruth) -> None:
@@ -142,21 +141,23 @@ def test_triggers(tmp_path: Path, truth: DroneTruth) -> None:
     boot = FORMAT.picture_times(path, TelemetryChoice(time="boot"))
     np.testing.assert_array_equal(boot, truth.boot_us * 1000)
     rows = [row for row in ulog_rows(truth) if row[0] != "camera_trigger"]
-    with pytest.raises(DataError, match="holds no camera_capture"):
-        FORMAT.picture_times(write_ulog(tmp_path / "b.ulg", rows), TelemetryChoice())
+    path = write_ulog(tmp_path / "b.ulg", rows)
+    with refuses(path, "camera_capture", "camera_trigger"):
+        FORMAT.picture_times(path, TelemetryChoice())
 
 
 def test_what_is_not_there(tmp_path: Path, truth: DroneTruth) -> None:
     rows = [row for row in ulog_rows(truth) if row[0] == "vehicle_attitude"]
-    with pytest.raises(DataError, match="has no vehicle_local_position"):
-        read(write_ulog(tmp_path / "a.ulg", rows))
+    path = write_ulog(tmp_path / "a.ulg", rows)
+    with refuses(path, "vehicle_local_position", "vehicle_global_position"):
+        read(path)
     path = write_ulog(tmp_path / "b.ulg", ulog_rows(truth))
-    with pytest.raises(DataError, match="has no global position; there is local, gps"):
+    with refuses(path, "global", "local, gps"):
         read(path, position="global")
-    with pytest.raises(DataError, match="has no instance 3"):
+    with refuses(path, 3, "vehicle_local_position 0"):
         read(path, position="local", instance=3)
     no_gps = write_ulog(tmp_path / "c.ulg", [row for row in ulog_rows(truth) if "gps" not in row[0]])
-    with pytest.raises(DataError, match="holds no GPS time"):
+    with refuses(no_gps, "GPS", "time: gps"):
         read(no_gps, time="gps")
 
 
@@ -176,12 +177,10 @@ def test_an_instance_is_taken_or_refused(tmp_path: Path, truth: DroneTruth) -> N
     assert first.gimbal is not None
     assert second.gimbal is not None
     np.testing.assert_array_equal(second.gimbal.quaternion_xyzw, first.gimbal.quaternion_xyzw)
-    assert any("has 2 gimbals: took the angles of the first, 0" in note for note in second.notes)
-    with pytest.raises(
-        DataError, match="has no instance 2 of a position; there are vehicle_local_position 0, "
-    ):
+    assert any(re.search(r"\b2 gimbals.*\b0$", note) for note in second.notes)
+    with refuses(path, 2, "vehicle_local_position 0"):
         read(path, instance=2)
-    with pytest.raises(DataError, match="has no instance 1 of vehicle_local_position"):
+    with refuses(path, 1, "vehicle_local_position"):
         read(path, position="local", instance=1)
 
 
@@ -191,7 +190,7 @@ def test_damage(tmp_path: Path, truth: DroneTruth) -> None:
     cut.write_bytes(whole[: len(whole) * 2 // 3])
     assert 5 < len(read(cut).position.t_ns) < len(truth.t_ns)
     cut.write_bytes(whole[:12])
-    with pytest.raises(DataError, match=r"cut\.ulg"):
+    with refuses(cut):
         read(cut)
 
 
@@ -200,8 +199,8 @@ def test_definitions_that_unfold_without_end_are_refused(tmp_path: Path) -> None
     nested = [f"m{k}:m{k + 1}[60000] a;" for k in range(8)] + ["m8:float[60000] a;"]
     bomb = tmp_path / "bomb.ulg"
     bomb.write_bytes(head + b"".join(ulog_record("F", text.encode()) for text in nested))
-    with pytest.raises(DataError, match="fields"):
+    with refuses(bomb, "fields"):
         FORMAT.describe(bomb)
     bomb.write_bytes(head + ulog_record("F", b"loop:loop a;"))
-    with pytest.raises(DataError, match="by itself"):
+    with refuses(bomb, "loop"):
         FORMAT.describe(bomb)

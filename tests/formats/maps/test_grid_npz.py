@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from pipelines.formats.maps import grid_npz
 from pipelines.session import maps
-from pipelines.session.errors import DataError
 from pipelines.session.registries import MapFormat
 from tests.formats.damaged_maps import refuse_or_read
+from tests.formats.refusals import refuses
 
 READER: MapFormat = grid_npz.FORMAT
 
@@ -45,17 +44,19 @@ def test_a_map_of_a_session_can_be_given_to_another_flight(tmp_path: Path) -> No
 def test_its_resolution_is_its_own(tmp_path: Path) -> None:
     path = write(tmp_path / "site.npz")
     assert READER.read_map(path, resolution_m=0.5).resolution_m == 0.5
-    with pytest.raises(DataError, match=r"its voxels are 0\.5 m, not 0\.2 m"):
+    with refuses(path, 0.5, 0.2):
         READER.read_map(path, resolution_m=0.2)
 
 
 def test_other_npz_files_are_not_taken_for_maps(tmp_path: Path) -> None:
-    np.savez(tmp_path / "other.npz", a=[1, 2])
-    (tmp_path / "no.npz").write_bytes(b"PK\3\4 no zip")
-    assert not READER.recognises(tmp_path / "other.npz")
-    assert not READER.recognises(tmp_path / "no.npz")
+    other, broken = tmp_path / "other.npz", tmp_path / "no.npz"
+    np.savez(other, a=[1, 2])
+    broken.write_bytes(b"PK\3\4 no zip")
+    assert not READER.recognises(other)
+    assert not READER.recognises(broken)
 
 
 def test_damage_is_refused_or_read(tmp_path: Path) -> None:
     content = write(tmp_path / "site.npz").read_bytes()
-    assert refuse_or_read(READER, tmp_path / "bad.npz", content, tries=150) > 75
+    damaged = tmp_path / "bad.npz"
+    assert refuse_or_read(READER, damaged, content, tries=150) > 75

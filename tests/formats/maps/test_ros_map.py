@@ -19,6 +19,7 @@ from pipelines.formats.maps import ros_map
 from pipelines.session.errors import DataError
 from pipelines.session.registries import MapFormat
 from tests.formats.damaged_maps import damaged, refuse_or_read
+from tests.formats.refusals import refuses
 from tests.real_data import real_data
 
 READER: MapFormat = ros_map.FORMAT
@@ -159,7 +160,8 @@ def test_coarser_voxels_keep_every_wall(tmp_path: Path) -> None:
 def test_a_renamed_picture_is_found_beside_its_plan(tmp_path: Path) -> None:
     path = write(tmp_path, image="lost.png", name="map.pgm")
     said = READER.describe(path)
-    assert (said["image"], said["image named (absent)"]) == ("map.pgm", "lost.png")
+    assert said["image"] == "map.pgm"
+    assert "lost.png" in said.values()
 
 
 def test_a_picture_outside_of_the_folder_is_named_in_full_or_not_at_all(tmp_path: Path) -> None:
@@ -167,7 +169,7 @@ def test_a_picture_outside_of_the_folder_is_named_in_full_or_not_at_all(tmp_path
     (tmp_path / "outside.pgm").write_bytes(pgm(PICTURE))
     path = write(tmp_path / "plan", image="../outside.pgm", name="plan.pgm")
     (tmp_path / "plan" / "plan.pgm").unlink()
-    with pytest.raises(DataError, match=r"its picture \.\./outside\.pgm is not there"):
+    with refuses(path, "../outside.pgm"):
         READER.read_map(path)
     path.write_text(path.read_text(encoding="utf-8").replace("../outside.pgm", f"{tmp_path}/outside.pgm"))
     assert READER.describe(path)["image"] == "outside.pgm"
@@ -231,20 +233,22 @@ def test_unusable_pictures_are_one_clear_line(tmp_path: Path, picture: bytes, pr
 
 
 def test_plans_without_content_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="every pixel is unknown"):
-        READER.read_map(write(tmp_path, pgm(np.full((2, 2), 180))))
+    path = write(tmp_path, pgm(np.full((2, 2), 180)))
+    with refuses(path, "pixel", "thresholds"):
+        READER.read_map(path)
 
 
 def test_a_building_that_would_not_fit_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, pgm(np.zeros((1500, 1500), np.uint8)), resolution=0.01)
-    with pytest.raises(DataError, match=r"1500 x 1500 x 250 voxels of 0\.01 m.*resolution_m: 0\.04"):
+    with refuses(path, "1500 x 1500 x 250", 0.01, "resolution_m: 0.04"):
         READER.read_map(path)
     assert READER.describe(path)["occupied_voxels"] == 1500 * 1500 * 250
 
 
 def test_damage_is_refused_or_read(tmp_path: Path) -> None:
     content = write(tmp_path, origin=[0.0, 0.0, 0.3]).read_bytes()
-    assert refuse_or_read(READER, tmp_path / "map.yaml", content, tries=120) > 50
+    damaged = tmp_path / "map.yaml"
+    assert refuse_or_read(READER, damaged, content, tries=120) > 50
 
 
 @pytest.mark.parametrize("suffix", ["pgm", "png"])

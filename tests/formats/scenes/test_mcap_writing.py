@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipelines.formats.common.exporting import CHI2_95
 from pipelines.formats.scenes import mcap_writing
-from pipelines.session.errors import DataError
 from pipelines.session.records import Recording
 from pipelines.session.registries import Export
 from tests.formats.exported import (
@@ -29,6 +29,7 @@ from tests.formats.exported import (
     recording,
     stamps,
 )
+from tests.formats.refusals import refuses
 
 WRITER: Export = mcap_writing.EXPORT
 LINE_LIST, SPHERE_LIST, DELETE_ALL = 5, 7, 3
@@ -159,13 +160,13 @@ def test_poses_from_before_the_zero_of_a_clock_are_left_out_and_counted(tmp_path
     early = replace(track, t_ns=track.t_ns - START_NS - 100_000_000)
     (path,) = WRITER.write(Recording("x", None, {"a": early}, progress=listener), tmp_path)
     assert len(messages(path, "/tf")) == 7
-    assert "3 poses of a from before time 0" in listener.notes[0]
+    assert re.search(r"\b3\b.* a .*\b0\b", listener.notes[0])
 
 
 def test_times_that_ros_cannot_count_are_refused(tmp_path: Path) -> None:
     late = replace(flown(2), t_ns=np.array([2**31 * 10**9, 2**31 * 10**9 + 1]))
-    with pytest.raises(DataError, match="outside of 1970 to 2038"):
+    with refuses("x", 1970, 2038):
         WRITER.write(Recording("x", None, {"a": late}), tmp_path)
-    with pytest.raises(DataError, match="neither joints nor camera poses"):
+    with refuses("x", "reconstruct"):
         WRITER.write(Recording("x", None, {}), tmp_path)
     assert not list(tmp_path.iterdir())

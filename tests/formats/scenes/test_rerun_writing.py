@@ -98,5 +98,6 @@ def test_without_rerun_one_line_says_what_to_install(tmp_path: Path, monkeypatch
     monkeypatch.setattr(registries, "import_module", absent)
     with pytest.raises(DataError) as caught:
         WRITER.write(recording(), tmp_path)
-    assert str(caught.value) == 'rerun: is not installed; run `pip install "rerun-sdk>=0.24"`'
+    assert caught.value.source == "rerun"
+    assert '"rerun-sdk>=0.24"' in caught.value.remedy
     assert not list(tmp_path.iterdir())

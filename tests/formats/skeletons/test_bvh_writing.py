@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -17,11 +18,11 @@ from pipelines.formats.skeletons.bvh import read_motion
 from pipelines.formats.skeletons.bvh_writing import fit_rig, joint_positions
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import matrix_from_quaternion
-from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion
 from pipelines.session.registries import ChoiceOfAxes
 from pipelines.session.skeletons import take_joints, with_derived
 from tests.formats.exported import Listener, recording, walking, without
+from tests.formats.refusals import refuses
 
 WRITER: ChoiceOfAxes = bvh_writing.EXPORT
 WRITTEN_M = 1e-6  # six decimals of a degree over 2 m of bones, and of a centimetre: 0.04 micrometres
@@ -39,7 +40,8 @@ def seen_by_bvhtoolbox(path: Path, folder: Path) -> tuple[list[str], Float]:
         bvhtoolbox = pytest.importorskip("bvhtoolbox")
         converter = pytest.importorskip("bvhtoolbox.convert.bvh2csv")
     tree = bvhtoolbox.BvhTree(path.read_text())
-    assert converter.write_joint_positions(tree, str(folder / "positions.csv"))
+    positions = folder / "positions.csv"
+    assert converter.write_joint_positions(tree, str(positions))
     header, *rows = (folder / "positions.csv").read_text().splitlines()
     values = np.array([[float(cell) for cell in row.split(",")] for row in rows])
     names = [cell.rpartition(".")[0] for cell in header.split(",")[1::3]]
@@ -105,19 +107,18 @@ def test_what_is_missing_is_held_left_out_and_counted(tmp_path: Path) -> None:
     np.testing.assert_allclose(back.rotation[13, forearm], back.rotation[12, forearm], atol=1e-7)
     np.testing.assert_allclose(back.rotation[14, forearm], back.rotation[12, forearm], atol=1e-7)
     (note,) = listener.notes
-    assert "3 of 30 frames before and after the hips are seen were left out" in note
-    assert "the hips stay where they were in 1 of 27 frames" in note
+    # Frames before and after the hips are seen; frames without hips; held turns of bones.
     # Frame 10: the turns of hips, spine and left thigh; 15 and 16: the forearm. 13 bones have a direction.
-    assert "5 of 351 turns of bones are held" in note
+    assert re.findall(r"(\d+) of (\d+)", note) == [("3", "30"), ("1", "27"), ("5", "351")]
 
 
 def test_no_hips_no_rig(tmp_path: Path) -> None:
     motion = JointMotion(np.array([0]), ("nose", "left_shoulder", "right_shoulder"), np.ones((1, 1, 3, 3)))
-    with pytest.raises(DataError, match="lacks left_hip, right_hip: no rig can be fitted"):
+    with refuses("Mound_walk.bvh", "left_hip, right_hip"):
         WRITER.write(replace(recording(), motion=motion), tmp_path)
     apart = without(without(walking(4), "nose", [0]), "left_hip", [0, 1])
     without(apart, "left_shoulder", [2, 3])
-    with pytest.raises(DataError, match="never shows hips and neck at one time"):
+    with refuses("Mound_walk.bvh", "hips", "neck"):
         WRITER.write(replace(recording(), motion=apart), tmp_path)
 
 

@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 
 from pipelines.formats.skeletons import parquet
-from pipelines.session.errors import DataError
 from pipelines.session.records import Recording
 from pipelines.session.registries import Export
 from tests.formats.exported import flown, recording
+from tests.formats.refusals import refuses
 
 WRITER: Export = parquet.EXPORT
 
@@ -41,5 +41,5 @@ def test_the_same_bytes_again(tmp_path: Path) -> None:
 
 
 def test_nothing_to_export(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="neither joints nor camera poses"):
+    with refuses("x", "reconstruct"):
         WRITER.write(Recording("x", None, {}), tmp_path)

@@ -101,7 +101,7 @@ def test_a_video_begins_when_its_pictures_turn_as_the_poses_do(filmed: Path) -> 
     # With independent errors, 100 points in each of 19 stretches give a quarter of a millisecond.
     assert 1e-5 < sigma_s < 2e-3
     assert abs(error_s) < 4 * sigma_s + 1e-3  # the same test with formulas alone allows 1 ms
-    assert any("by the motion in its pictures" in line for line in described["warnings"])
+    assert any("motion" in line for line in described["warnings"])
 
 
 def test_a_drone_that_does_not_move_is_refused(filmed: Path, tmp_path: Path) -> None:
@@ -113,7 +113,8 @@ def test_a_drone_that_does_not_move_is_refused(filmed: Path, tmp_path: Path) -> 
     path = tmp_path / "flight.yaml"
     path.write_text(manifest.replace(f"{filmed}/drone1.tum", str(still)), encoding="utf-8")
     line = refused("ingest", path)
-    assert "do not say when the video began: they do not move as the poses do" in line
+    assert "drone1" in line
+    assert "poses" in line
 
 
 def test_a_start_that_is_known_roughly_is_refined(filmed: Path, tmp_path: Path) -> None:
@@ -124,9 +125,8 @@ def test_a_start_that_is_known_roughly_is_refined(filmed: Path, tmp_path: Path) 
         path.write_text(manifest.replace("{start_from: motion}", stated))
         if abs(off_s) > 1:
             line = refused("ingest", path)
-            assert (
-                "they move as the poses do -3.00 s from the stated start, which must be right to 1 s" in line
-            )
+            assert "-3.00 s" in line
+            assert "1 s" in line
             continue
         succeeds("ingest", path)
         described = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
@@ -147,7 +147,10 @@ def test_the_offset_of_a_clock_counts_once(filmed: Path, tmp_path: Path) -> None
     assert camera["clock"]["sigma_s"] < 2e-3  # the estimate, not the default of a clock without a sigma
     alone = "{start_from: motion}\n    clock: {offset_s: 5.5}"
     path.write_text(manifest.replace("{start_from: motion}", alone), encoding="utf-8")
-    assert "cameras.drone1: clock.offset_s: start_from: motion finds the start" in refused("ingest", path)
+    line = refused("ingest", path)
+    assert "cameras.drone1" in line
+    assert "clock.offset_s" in line
+    assert "start_from: motion" in line
 
 
 def test_a_camera_that_flies_beside_a_person_is_timed_by_what_it_passes(tmp_path: Path) -> None:

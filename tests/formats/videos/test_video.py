@@ -19,6 +19,7 @@ from pipelines.formats.videos.video import VideoReader, created_ns, frames, inde
 from pipelines.geometry.arrays import Picture
 from pipelines.session.errors import DataError
 from pipelines.session.registries import FORMATS, VideoFormat
+from tests.formats.refusals import refuses
 from tests.real_data import real_data
 from tests.synthetic.videos import (
     SIZE,
@@ -228,9 +229,9 @@ def test_ranges(tmp_path: Path) -> None:
         assert last is not None
         assert read_bar_code(last) == 59
         for start, stop, step in [(-1, 5, 1), (0, 61, 1), (5, 4, 1), (0, 5, 0)]:
-            with pytest.raises(DataError, match="it has 0 to 59"):
+            with refuses(path, 0, 59):
                 list(reader.frames(start, stop, step))
-        with pytest.raises(DataError, match="has no frames 60 to 60"):
+        with refuses(path, 60, 59):
             reader.read(60)
 
 
@@ -307,13 +308,14 @@ def test_a_cut_mp4_is_salvaged_and_says_what_it_lost(tmp_path: Path, share: floa
     held = sum(position + size <= length for position, size in places)
     with VideoReader(path) as reader:
         count = reader.index.count
-        assert reader.index.dropped == {"cut off": 60 - count}
+        assert list(reader.index.dropped.values()) == [60 - count]
         # Two frames in a row refer to later ones: decoding is ahead of showing by that and one more.
         assert held - 3 <= count <= held
         assert reader.index.pts_ns.tolist() == relative_ns(uneven_ticks(60))[:count]
         assert [read_bar_code(picture) for _, picture in reader.frames()] == list(range(count))
         assert reader.missing == set()
-    assert READER.describe(path)["dropped: cut off"] == 60 - count
+    described = READER.describe(path)
+    assert [value for key, value in described.items() if key.startswith("dropped")] == [60 - count]
 
 
 @pytest.mark.parametrize("suffix", [".mkv", ".ts"])
@@ -333,14 +335,15 @@ def test_a_stated_size_beyond_reason_is_not_believed(tmp_path: Path) -> None:
     content = path.read_bytes()
     assert content.count(inside) >= 3
     path.write_bytes(content.replace(inside, b"\xfe\x00\xfe\x00"))
-    with pytest.raises(DataError, match="none of its 3 frames can be decoded"):
+    with refuses(path, 3):
         index_video(path)
 
 
 def test_stamps_beyond_reason_are_refused(tmp_path: Path) -> None:
     ticks = even_ticks(3, step=40, first=5 * 10**12)
-    with pytest.raises(DataError, match=r"stamps its frames up to 5e\+09 s"):
-        index_video(write_video(tmp_path / "v.mkv", ticks, tick_s=Fraction(1, 1000), b_frames=0))
+    path = write_video(tmp_path / "v.mkv", ticks, tick_s=Fraction(1, 1000), b_frames=0)
+    with refuses(path, "5e+09"):
+        index_video(path)
 
 
 def test_pictures_that_change_their_size(tmp_path: Path) -> None:
@@ -352,7 +355,7 @@ def test_pictures_that_change_their_size(tmp_path: Path) -> None:
     place = content.index(inside, position, position + size)
     content[place : place + 4] = (height // 2).to_bytes(2, "big") + (width // 2).to_bytes(2, "big")
     small.write_bytes(content)
-    with pytest.raises(DataError, match="change from 320 x 96 to 160 x 48 px"):
+    with refuses(small, "320 x 96", "160 x 48"):
         list(frames(small))
 
 
@@ -391,12 +394,10 @@ def test_more_that_cannot_be_used(tmp_path: Path) -> None:
         path.write_bytes(bad)
         with pytest.raises(DataError, match=problem):
             index_video(path)
-    with pytest.raises(DataError, match="holds no video stream"):
-        index_video(write_sound(tmp_path / "sound.mp4"))
-    with pytest.raises(DataError, match=r"holds no frames|no video stream"):
-        index_video(write_video(tmp_path / "none.mp4", []))
-    with pytest.raises(DataError, match="cannot be read"):
-        index_video(tmp_path / "absent.mp4")
+    sound, empty = write_sound(tmp_path / "sound.mp4"), write_video(tmp_path / "none.mp4", [])
+    for path in (sound, empty, tmp_path / "absent.mp4"):
+        with refuses(path):
+            index_video(path)
 
 
 @settings(max_examples=30, deadline=None)
