@@ -28,6 +28,10 @@ from pipelines.drafting.found import (
     TopicFound,
     TopicKind,
     Video,
+    chains,
+    joined,
+    label_of_recording,
+    label_of_topic,
 )
 from pipelines.drafting.labels import (
     ACTOR,
@@ -43,15 +47,11 @@ from pipelines.drafting.labels import (
     Label,
     affinity,
     camera_names,
-    chains,
     fitting,
     hints_at_ned,
     is_called,
-    joined,
     label_of,
     label_of_place,
-    label_of_recording,
-    label_of_topic,
     order,
     unique,
 )

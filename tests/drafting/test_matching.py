@@ -19,8 +19,9 @@ from pipelines.drafting.found import (
     TopicFound,
     TopicKind,
     Video,
+    chains,
+    joined,
 )
-from pipelines.drafting.labels import chains, joined
 from pipelines.drafting.matching import CameraDraft, Choice, Draft, match
 
 SECOND = 10**9
