@@ -105,7 +105,8 @@ def parameters(node: Function) -> int:
 
 def is_phrase(text: str) -> bool:
     """Recognise English: two words beside each other, as no path, key, code or number has."""
-    plain = re.sub(r"\\.|[.*?+^$()\[\]{}|]", " ", text)
+    named = re.sub(r"\\?\.(?=\w)", "/", text)  # flight.session and poses\.parquet are names of files
+    plain = re.sub(r"\\.|[.*?+^$()\[\]{}|]", " ", named)
     return bool(re.search(r"(?<![\w./:=-])[A-Za-z]{2,},? [a-z]{2,}(?![\w/:=])", plain))
 
 

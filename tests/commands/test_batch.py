@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from pipelines.batch import Job, Outcome, Settings, run_flight
 from pipelines.report import Reported
 from pipelines.reporting.flights import FlightRow, render_flights
 from pipelines.session.errors import BusyError
+from pipelines.session.registries import install_command
 from tests.commands.runner import MOCAP, content, mocap, refused, succeeds
 from tests.synthetic.flights import write_flight
 
@@ -118,7 +120,7 @@ def test_cluster_makes_the_bytes_of_single_runs_and_a_killed_worker_loses_nothin
     assert process.returncode == 1
     failed, counted = told.strip().splitlines()[-2:]
     assert failed.startswith("failed: batch/day1/broken.yaml: ")
-    assert counted == "mocap: 1 of 3 flights failed"
+    assert re.findall(r"\d+", counted) == ["1", "3"]
     assert [content(manifest.with_suffix(".session")) for manifest in manifests] == single
 
     table = pd.read_csv(tmp_path / "batch" / "summary.csv").set_index("flight")
@@ -249,22 +251,24 @@ def test_what_a_batch_cannot_start_with(tmp_path: Path, monkeypatch: pytest.Monk
     write_flight(tmp_path / "a", seconds=0.1)
     write_flight(tmp_path / "b" / "a", seconds=0.1)
     pattern = tmp_path / "**" / "*.yaml"
-    assert "would be called a" in refused("batch", pattern, "-o", tmp_path / "out")
-    assert "matches nothing" in refused("batch", tmp_path / "*.nothing")
-    assert "no such stage" in refused("batch", pattern, "--stages", "ingest,fly")
+    line = refused("batch", pattern, "-o", tmp_path / "out")
+    assert line.startswith(f"mocap: {tmp_path}/b/a/flight.yaml: ")
+    assert f"{tmp_path}/a/flight.yaml" in line
+    assert refused("batch", tmp_path / "*.nothing").startswith(f"mocap: {tmp_path}/*.nothing: ")
+    line = refused("batch", pattern, "--stages", "ingest,fly")
+    assert line.startswith("mocap: --stages fly: ")
+    assert line.endswith(", ".join(batch.STAGES))
     foreign = tmp_path / "foreign"
     foreign.mkdir()
     (foreign / "summary.csv").write_text("my,own,table\n", encoding="utf-8")
     assert "--overwrite" in refused("batch", tmp_path / "a" / "*.yaml", "-o", foreign)
     assert mocap("batch", pattern, "--workers", "1", "--scheduler", "tcp://x:1").returncode == 2
     monkeypatch.setattr(batch, "_ANSWER_S", 0.2)
-    assert "no Dask scheduler answers" in refused(
+    assert "--scheduler tcp://127.0.0.1:9: " in refused(
         "batch", tmp_path / "a" / "*.yaml", "--scheduler", "tcp://127.0.0.1:9", "-o", tmp_path / "out"
     )
     monkeypatch.setitem(sys.modules, "distributed", None)
-    assert 'run `pip install "dask>=2024.8" "distributed>=2024.8"`' in refused(
-        "batch", tmp_path / "a" / "*.yaml"
-    )
+    assert install_command("batch") in refused("batch", tmp_path / "a" / "*.yaml")
 
 
 def test_page_escapes_what_stands_in_files() -> None:

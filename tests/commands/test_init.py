@@ -122,9 +122,9 @@ def test_as_a_command(tmp_path: Path) -> None:
     assert done.returncode == 0
     assert done.stdout.splitlines()[0] == "cameras: drone1, drone2"
     told = done.stderr.splitlines()
-    assert f"{tmp_path}/notes.txt: not recognised, left out" in told
-    assert f"{tmp_path}/frames/*.png: 30 files not recognised, left out" in told
-    assert sum("left out" in line for line in told) == 2
+    left_out = [line for line in told if line.startswith(str(tmp_path))]
+    assert [line.split()[0] for line in left_out] == [f"{tmp_path}/frames/*.png:", f"{tmp_path}/notes.txt:"]
+    assert "30" in left_out[0]
     assert [line for line in told if line.startswith("assumed: ")]
     succeeds("ingest", tmp_path / "flight.yaml")
 
@@ -138,9 +138,9 @@ def test_as_a_command(tmp_path: Path) -> None:
 
 def test_nothing_recognised_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("windy", encoding="utf-8")
-    assert "notes.txt: not recognised" in refused("init", tmp_path / "notes.txt")
+    assert "notes.txt: " in refused("init", tmp_path / "notes.txt")
     (tmp_path / "empty").mkdir()
-    assert "holds nothing that can be used" in refused("init", tmp_path / "empty")
+    assert refused("init", tmp_path / "empty").startswith(f"mocap: {tmp_path}/empty: ")
     assert not (tmp_path / "flight.yaml").exists()
 
 
@@ -149,15 +149,13 @@ def test_what_is_missing_stands_where_it_belongs(tmp_path: Path) -> None:
     for name in ("drone2.tum", "drone2_true.tum"):
         (tmp_path / name).unlink()
     result, stated = drafted(tmp_path)
-    assert sorted(result.missing) == [
-        "drone1, drone2: intrinsics: nothing of that name has them",
-        "drone2: pose: nothing of that name has poses",
-    ]
+    concerned = [remark.rpartition(": ")[0] for remark in sorted(result.missing)]
+    assert concerned == ["drone1, drone2: intrinsics", "drone2: pose"]
     assert "pose" not in stated["cameras"]["drone2"]
     lines = result.text.splitlines()
     at = lines.index("  drone2:")
     assert any("# pose: {tum: drone2.tum}  # missing" in line for line in lines[at:])
-    with pytest.raises(DataError, match=r"cameras\.drone1\.intrinsics: is missing"):
+    with pytest.raises(DataError, match=r"cameras\.drone1\.intrinsics: .*missing"):
         read_flight(result.path)
 
 
@@ -169,7 +167,7 @@ def test_the_truth_stands_in_for_poses_only_with_a_word(tmp_path: Path) -> None:
     result, stated = drafted(tmp_path)
     assert stated["cameras"]["drone2"]["pose"] == {"tum": "drone2_true.tum"}
     assert stated["truth"]["poses"] == {"drone1": "drone1_true.tum"}
-    assert "drone2: pose: what is called the truth, for there is nothing else" in result.assumed
+    assert any(remark.startswith("drone2: pose: ") and "truth" in remark for remark in result.assumed)
 
 
 def test_files_that_cannot_be_read_are_told_and_left_out(tmp_path: Path) -> None:
@@ -181,9 +179,8 @@ def test_files_that_cannot_be_read_are_told_and_left_out(tmp_path: Path) -> None
     result, _ = drafted(tmp_path)
     assert result.cameras == ["drone1"]
     reasons = {path.name: reason for path, reason in result.left_out.items()}
-    assert "1 values are not x, y, confidence" in reasons["drone3.json"]
-    assert reasons["drone2.json"].startswith("not recognised: it is no valid JSON (")
-    assert reasons["drone2.json"].endswith("left out")
+    assert reasons["drone3.json"].startswith("1 ")
+    assert " JSON (" in reasons["drone2.json"]
 
 
 HOSTILE = [
@@ -232,7 +229,8 @@ def test_a_name_that_is_no_text_is_left_out(tmp_path: Path) -> None:
     except OSError:
         pytest.skip("this file system takes only text for names")
     result, _ = drafted(tmp_path)
-    assert ["its name is no text" in reason for reason in result.left_out.values()] == [True]
+    [path] = result.left_out
+    assert os.fsencode(path.name) == b"\xff.json"
 
 
 # --- where things lie ----------------------------------------------------------------------------------
@@ -257,7 +255,7 @@ def test_a_folder_that_is_one_thing_has_its_manifest_beside_it(tmp_path: Path) -
     write_flight(tmp_path, cameras=1, keypoint_format="openpose").manifest.unlink()
     result = draft([tmp_path / "drone1"])
     assert result.path == tmp_path / "flight.yaml"
-    assert "keypoints: drone1  # OpenPose keypoints" in result.text
+    assert "    keypoints: drone1  # OpenPose" in result.text
 
 
 def test_keypoint_files_of_several_cameras_in_a_folder_are_not_frames_of_one(tmp_path: Path) -> None:
@@ -284,7 +282,9 @@ def test_parts_of_a_log_beside_a_video_are_one_log_and_not_the_folder(tmp_path: 
     assert camera["video"] == "drone1.mp4"
     # The container counts from 0, the log since the epoch.
     assert camera["frame_times"] == {"start": START_NS // 10**9}
-    assert "odom_ned sounds like north-east-down: then add axes: ned" in result.text
+    [line] = [line for line in result.text.splitlines() if line.startswith("    pose: ")]
+    assert "odom_ned " in line
+    assert line.endswith(" axes: ned")
     assert any("ned" in remark for remark in result.assumed)
 
 
@@ -366,7 +366,8 @@ def test_real_keypoints_without_videos_are_drafted_with_a_rate_to_check(tmp_path
     recording = real_data("pose2sim_single")
     result = draft([recording / "pose-associated", recording / "calibration"], tmp_path / "flight.yaml")
     assert not result.missing
-    assert result.assumed == ["cam01, cam02, cam03, cam04: frame_times: fps 30, the first frame at 0 s"]
+    [remark] = result.assumed
+    assert remark.startswith("cam01, cam02, cam03, cam04: frame_times: fps 30, ")
     edit(result.path, {"fps: 30": "fps: 60"})
     done = ingest(result.path)
     assert [c.frames.rate_hz for c in done.description.cameras.values()] == [pytest.approx(60)] * 4

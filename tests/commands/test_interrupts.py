@@ -17,10 +17,11 @@ def test_second_writer_says_so(tmp_path: Path) -> None:
     session = tmp_path / "flight.session"
     succeeds("ingest", flight.manifest)
     with locked(session):
+        holder = (session / ".lock.pid").read_text().strip()
         for arguments in (
             ("ingest", flight.manifest, "--force"),
             ("reconstruct", session),
             ("report", session),
         ):
-            assert "is being written by process" in refusal(mocap_process(*arguments))
+            assert f"process {holder};" in refusal(mocap_process(*arguments))
     succeeds("reconstruct", session)

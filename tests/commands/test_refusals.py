@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -16,7 +18,8 @@ import pytest
 
 from pipelines.geometry.cameras import project
 from pipelines.session.description import read_description
-from pipelines.session.registries import FORMATS
+from pipelines.session.registries import EXPORTS, FORMATS, NOISE_MODELS
+from pipelines.session.stage_records import COMMANDS
 from tests.commands.runner import content, mocap, mocap_process, refusal, refused, succeeds
 from tests.synthetic.flights import SyntheticFlight, write_flight
 
@@ -40,15 +43,14 @@ def test_unknown_key_names_the_nearest(flight: SyntheticFlight) -> None:
     flight.settings["wrold"] = {}
     flight.save()
     line = refusal(mocap_process("ingest", flight.manifest))  # as a shell sees it
-    assert "cameras.drone2.keypoint: unknown key, did you mean 'keypoints'?" in line
-    assert "wrold: unknown key, did you mean 'world'?" in line
+    assert re.search(r"cameras\.drone2\.keypoint: [^;]*'keypoints'\?; wrold: [^;]*'world'\?$", line)
 
 
 def test_parts_whose_readers_come_later_are_refused(flight: SyntheticFlight) -> None:
     flight.settings["actors"] = {"anna": {"log": "d1", "topic": "/actor"}}
     flight.save()
     line = refused("ingest", flight.manifest)
-    assert "actors: this version has no reader for it yet" in line
+    assert line.startswith(f"mocap: {flight.manifest}: actors: ")
 
 
 @pytest.mark.parametrize("change", [{"map": "site.bt"}, {"truth": "true.csv"}])
@@ -56,8 +58,8 @@ def test_file_that_is_not_there(flight: SyntheticFlight, change: dict[str, objec
     flight.settings.update(change)
     flight.save()
     line = refused("ingest", flight.manifest)
-    assert "No such file" in line
-    assert "check the path" in line
+    [path] = change.values()
+    assert f"/{path}: {os.strerror(errno.ENOENT)}" in line
 
 
 @pytest.mark.parametrize("stated", ["../drone1.tum", "poses/../../drone1.tum"])
@@ -67,7 +69,7 @@ def test_a_relative_path_does_not_leave_the_folder(flight: SyntheticFlight, stat
     stated = stated.replace("drone1.tum", outside.name)
     flight.settings["cameras"]["drone1"]["pose"]["tum"] = stated
     flight.save()
-    assert f"leads out of its folder ({stated})" in refused("ingest", flight.manifest)
+    assert f"({stated})" in refused("ingest", flight.manifest)
     flight.settings["cameras"]["drone1"]["pose"]["tum"] = str(outside)
     flight.save()
     succeeds("ingest", flight.manifest)
@@ -82,9 +84,9 @@ def test_nan_poses_are_counted_and_the_rest_is_used(flight: SyntheticFlight, tmp
     log.write_text("\n".join(rows) + "\n", encoding="utf-8")
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0
-    assert "drone1: poses dropped: 3 not finite" in done.stderr
+    assert re.search("^warning: drone1: poses .*: 3 ", done.stderr, re.MULTILINE)
     stored = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
-    assert stored["cameras"]["drone1"]["poses"]["dropped"] == {"not finite": 3}
+    assert list(stored["cameras"]["drone1"]["poses"]["dropped"].values()) == [3]
 
 
 @pytest.mark.parametrize("absurd", [1e9, -1e308])
@@ -101,13 +103,12 @@ def test_absurd_keypoints_are_counted_and_the_rest_is_used(
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0
     keypoints = session_json(tmp_path)["cameras"]["drone2"]["keypoints"]
-    assert keypoints["dropped"]["joint more than 1000000 px away"] == 2
-    assert keypoints["dropped"]["detection listed twice"] == 1
-    assert keypoints["adjusted"] == {"confidence above 1, set to 1": 17}
+    assert sorted(keypoints["dropped"].values()) == [1, 2]
+    assert list(keypoints["adjusted"].values()) == [17]
     lines = [line for line in done.stderr.splitlines() if line.startswith("warning: drone2: keypoints")]
     assert len(lines) == 2
-    assert any("2 joint more than 1000000 px away" in line for line in lines)
-    assert any("17 confidence above 1" in line for line in lines)
+    assert any(re.search(r": .*\b2 joint .*\b1000000 px", line) for line in lines)
+    assert any(re.search(r": 17 confidence ", line) for line in lines)
     succeeds("reconstruct", tmp_path / "flight.session")
     metrics = read_json(tmp_path / "flight.session" / "reconstruct" / "metrics.json")
     assert metrics["mpjpe_mm"] < 500  # one view at 1e9 px would put the joint kilometres away
@@ -147,7 +148,7 @@ def test_truth_of_nothing_but_absurd_positions_is_refused(flight: SyntheticFligh
     header, *rows = path.read_text(encoding="utf-8").splitlines()
     rows = [",".join([*row.split(",")[:-3], "1e9", "1e9", "1e9"]) for row in rows]
     path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
-    assert f"truth.csv: holds no position of a joint ({len(rows)} " in refused("ingest", flight.manifest)
+    assert re.search(rf"truth\.csv: .*\({len(rows)} ", refused("ingest", flight.manifest))
 
 
 def test_true_poses_that_are_left_out_are_counted(flight: SyntheticFlight, tmp_path: Path) -> None:
@@ -156,13 +157,14 @@ def test_true_poses_that_are_left_out_are_counted(flight: SyntheticFlight, tmp_p
     rows[20] = f"{rows[20].split()[0]} nan nan nan 0 0 0 1"
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")
     done = mocap("ingest", flight.manifest)
-    assert "warning: drone1: true poses dropped: 1 not finite" in done.stderr
-    assert session_json(tmp_path)["truth"]["poses_dropped"] == {"drone1": {"not finite": 1}}
+    assert re.search("^warning: drone1: true .*: 1 ", done.stderr, re.MULTILINE)
+    dropped = session_json(tmp_path)["truth"]["poses_dropped"]
+    assert {name: list(counts.values()) for name, counts in dropped.items()} == {"drone1": [1]}
 
 
 def test_log_of_nothing_but_nan(flight: SyntheticFlight, tmp_path: Path) -> None:
     (tmp_path / "drone1.tum").write_text("1700000000.0 nan nan nan 0 0 0 1\n", encoding="utf-8")
-    assert "drone1.tum: holds no usable pose" in refused("ingest", flight.manifest)
+    assert refused("ingest", flight.manifest).startswith(f"mocap: {tmp_path}/drone1.tum: ")
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", "no JSON"])
@@ -187,9 +189,7 @@ def test_frame_times_from_several_places_are_refused(
 ) -> None:
     flight.settings["cameras"]["drone1"]["frame_times"] = stated
     flight.save()
-    assert f"cameras.drone1.frame_times: has {keys}, which say different" in refused(
-        "ingest", flight.manifest
-    )
+    assert f"cameras.drone1.frame_times: has {keys}, " in refused("ingest", flight.manifest)
 
 
 def test_camera_without_overlap_in_time(flight: SyntheticFlight) -> None:
@@ -205,8 +205,8 @@ def test_static_camera_without_overlap_in_time(tmp_path: Path) -> None:
     flight.settings["cameras"]["drone3"]["frame_times"]["start"] = 1_700_000_600
     flight.save()
     line = refused("ingest", flight.manifest)
-    assert "cameras.drone3: frames" in line
-    assert "overlap in time with no other camera's" in line
+    assert line.startswith(f"mocap: {flight.manifest}: cameras.drone3: frames ")
+    assert "overlap" in line
 
 
 def test_picture_size_that_disagrees_with_the_calibration(flight: SyntheticFlight) -> None:
@@ -247,7 +247,9 @@ def test_keypoints_outside_the_calibrated_picture(flight: SyntheticFlight) -> No
         inline = flight.settings["cameras"][name]["intrinsics"]
         inline.update(width=640, height=360, cx=320, cy=180)
     flight.save()
-    assert "lie outside" in refused("ingest", flight.manifest)
+    line = refused("ingest", flight.manifest)
+    assert line.startswith(f"mocap: {flight.manifest}: cameras.drone1.intrinsics: ")
+    assert "image_size: [W, H]" in line
 
 
 def test_joints_that_nobody_sees_have_a_status(flight: SyntheticFlight, tmp_path: Path) -> None:
@@ -271,7 +273,8 @@ def test_when_nothing_is_reconstructed_the_gate_is_named(tmp_path: Path) -> None
     flight.save()
     succeeds("ingest", flight.manifest)
     line = refused("reconstruct", tmp_path / "flight.session")
-    assert "no joint could be reconstructed" in line
+    assert line.startswith(f"mocap: {tmp_path}/flight.session: ")
+    assert "(rejected 255;" in line
     assert not (tmp_path / "flight.session" / "reconstruct").exists()
 
 
@@ -284,16 +287,18 @@ def test_hostile_names_do_not_reach_the_terminal(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", ["reconstruct", "report"])
 def test_folder_that_is_no_session(tmp_path: Path, command: str) -> None:
-    assert "is not a session" in refused(command, tmp_path)
+    line = refused(command, tmp_path)
+    assert line.startswith(f"mocap: {tmp_path}: ")
+    assert COMMANDS["ingest"] in line
 
 
 def test_target_that_holds_something_else_is_refused(flight: SyntheticFlight, tmp_path: Path) -> None:
     other = tmp_path / "other"
     other.mkdir()
-    (other / "thesis.tex").write_text("years of work", encoding="utf-8")
+    (other / "thesis.tex").write_text("years", encoding="utf-8")
     assert "--overwrite" in refused("ingest", flight.manifest, "-o", other)
     succeeds("ingest", flight.manifest, "-o", other, "--overwrite")
-    assert (other / "thesis.tex").read_text(encoding="utf-8") == "years of work"
+    assert (other / "thesis.tex").read_text(encoding="utf-8") == "years"
 
 
 def test_session_of_another_flight_is_not_replaced_silently(flight: SyntheticFlight, tmp_path: Path) -> None:
@@ -301,15 +306,20 @@ def test_session_of_another_flight_is_not_replaced_silently(flight: SyntheticFli
     before = content(tmp_path / "flight.session")
     flight.settings["name"] = "Another flight"
     flight.save()
-    assert "holds the flight" in refused("ingest", flight.manifest)
+    assert refused("ingest", flight.manifest).startswith(f"mocap: {tmp_path}/flight.session: ")
     assert content(tmp_path / "flight.session") == before
 
 
-@pytest.mark.parametrize("escape", [r"\0", r"\ud800"])
-def test_text_that_no_name_of_a_file_can_hold(flight: SyntheticFlight, escape: str) -> None:
+@pytest.mark.parametrize(("escape", "held"), [(r"\0", "\0"), (r"\ud800", "\ud800")])
+def test_text_that_no_name_of_a_file_can_hold(flight: SyntheticFlight, escape: str, held: str) -> None:
     text = flight.manifest.read_text(encoding="utf-8")
     flight.manifest.write_text(text.replace("drone1.tum", f'"drone1{escape}.tum"', 1), encoding="utf-8")
-    assert "holds a text with impossible characters" in refused("ingest", flight.manifest)
+    line = refused("ingest", flight.manifest)
+    assert line.startswith(f"mocap: {flight.manifest}: cameras.drone1.pose.tum: ")
+    assert (
+        repr(f"drone1{json.loads(chr(34) + escape.replace(chr(92) + '0', chr(92) + 'u0000') + chr(34))}.tum")
+        in line
+    )
 
 
 HUGE = "0x" + "f" * 5000  # Python refuses to print it
@@ -351,16 +361,15 @@ def test_pipes_and_sockets_are_refused_and_not_waited_for(flight: SyntheticFligh
         os.mkfifo(pipe)
         for command in commands:
             said = refusal(mocap_process(command, pipe, timeout=60))
-            assert f"{pipe.name}: " in said
-            assert "is a pipe, a socket or a device" in said
+            assert re.search(rf"/{pipe.name}: .*\bpipe\b", said)
     flight.settings["cameras"]["drone1"]["pose"]["tum"] = "pipes/pipe.csv"
     flight.save()
     said = refusal(mocap_process("ingest", flight.manifest, timeout=60))
-    assert "pipe.csv: is a pipe, a socket or a device" in said
+    assert "pipe.csv: is a pipe" in said
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(os.path.relpath(folder / "s.srt"))  # names of sockets are short
-        assert "is a pipe, a socket or a device" in refused("info", folder / "s.srt")
-    assert "is a pipe, a socket or a device" in refused("info", "/dev/null")
+        assert "s.srt: is a pipe, a socket " in refused("info", folder / "s.srt")
+    assert refused("info", "/dev/null").startswith("mocap: /dev/null: is a pipe")
 
 
 def test_no_format_opens_a_pipe(tmp_path: Path) -> None:
@@ -383,13 +392,11 @@ def test_no_format_opens_a_pipe(tmp_path: Path) -> None:
 
 def test_unknown_export_lists_those_there_are(flight: SyntheticFlight, tmp_path: Path) -> None:
     succeeds("ingest", flight.manifest)
-    assert "bvh, c3d, csv, mcap, parquet, rerun, trc, tum" in refused(
-        "export", tmp_path / "flight.session", "--to", "fbx"
-    )
+    assert ", ".join(EXPORTS.names()) in refused("export", tmp_path / "flight.session", "--to", "fbx")
     assert "reconstruct" in refused("export", tmp_path / "flight.session", "--to", "trc")
 
 
 def test_unknown_noise_model_lists_those_there_are(flight: SyntheticFlight, tmp_path: Path) -> None:
     succeeds("ingest", flight.manifest)
     line = refused("reconstruct", tmp_path / "flight.session", "--pose-noise", "pink:position_m=1")
-    assert "bias, drift, gauss-markov, latency, white" in line
+    assert ", ".join(NOISE_MODELS.names()) in line

@@ -52,7 +52,7 @@ def test_usage_errors_are_clicks_own_otherwise() -> None:
     wrong = mocap("reconstruct", "a.session", "--persons", "0")
     assert wrong.returncode == 2
     assert " reconstruct [OPTIONS] SESSION" in wrong.stderr.splitlines()[0]
-    assert "Error: Invalid value for '--persons': 0 is not in the range" in wrong.stderr
+    assert "'--persons': 0 " in wrong.stderr
 
 
 @pytest.mark.parametrize("evil", EVIL)
@@ -63,7 +63,7 @@ def test_info_of_an_evil_file(tmp_path: Path, evil: str) -> None:
     printed = succeeds("info", path)
     assert not steering(printed)
     assert not any(line.startswith("mocap: ") for line in printed.splitlines())
-    assert "joints.csv: 3D joints as CSV" in printed
+    assert "joints.csv: 3D joints" in printed
     told = succeeds("info", path, "--json")
     assert not steering(told)
     assert json.loads(told)["path"] == str(path)  # nothing of the name is lost there
@@ -72,12 +72,13 @@ def test_info_of_an_evil_file(tmp_path: Path, evil: str) -> None:
 def test_a_name_that_is_no_text(tmp_path: Path) -> None:
     path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.csv"))
     path.write_text("t_ns,joint,x,y,z\n0,nose,1,2,3\n", encoding="utf-8")
-    assert "/?.csv: 3D joints as CSV" in succeeds("info", path)
+    assert "/?.csv: 3D joints" in succeeds("info", path)
     assert json.loads(succeeds("info", path, "--json"))["path"] == str(path)
 
 
 def test_every_command_that_names_files(tmp_path: Path) -> None:
-    folder = tmp_path / "a\x1b[31m\nmocap: all is well"
+    forged = "mocap: all is well"
+    folder = tmp_path / f"a\x1b[31m\n{forged}"
     flight = write_flight(folder, seconds=0.3)
     flight.settings["name"] = "Fly\x1b[2Jing\x9b"
     flight.save()
@@ -101,5 +102,5 @@ def test_every_command_that_names_files(tmp_path: Path) -> None:
         printed = done.stdout + done.stderr
         assert printed, command
         assert not steering(printed), (command, printed)
-        assert not any(line == "mocap: all is well" for line in printed.splitlines()), command
+        assert forged not in printed.splitlines(), command
         assert "Traceback" not in printed

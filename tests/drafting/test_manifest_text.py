@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +81,8 @@ def test_a_video_that_counts_from_elsewhere_starts_with_the_first_pose_rounded_u
     first_ns = EPOCH_NS + 123_456_789
     text, stated = written(Findings([video(300), poses(first_ns, first_ns + 20 * SECOND)]))
     assert stated["cameras"]["drone1"]["frame_times"] == {"start": 1700000000.124}
-    assert text.assumed == ["drone1: frame_times: start, when the first frame was taken"]
+    [remark] = text.assumed
+    assert remark.startswith("drone1: frame_times: start,")
 
 
 def test_truth_of_another_time_is_told_but_not_stated() -> None:
@@ -88,7 +90,7 @@ def test_truth_of_another_time_is_told_but_not_stated() -> None:
     findings = Findings([keypoints(0, 9), poses(EPOCH_NS, EPOCH_NS + SECOND), truth])
     text, stated = written(findings)
     assert "truth" not in stated
-    assert "# or truth: {joints: truth.csv}" in text.text
+    assert "truth: {joints: truth.csv}" in text.text
     assert stated["cameras"]["drone1"]["frame_times"] == {"start": 1700000000, "fps": 30}
 
 
@@ -104,7 +106,7 @@ def test_keypoints_of_several_formats_state_one() -> None:
     two = Keypoints(*about("drone1.json", "coco"), 10, 0, 9, ambiguous=True)
     text, stated = written(Findings([two]))
     assert stated["cameras"]["drone1"]["keypoints"] == {"path": "drone1.json", "format": "coco"}
-    assert "drone1: keypoints: that they are coco's" in text.assumed
+    assert any(r.startswith("drone1: keypoints: ") and r.endswith(" coco's") for r in text.assumed)
 
 
 def test_poses_logged_at_another_time_than_the_pictures_are_missing() -> None:
@@ -117,19 +119,21 @@ def test_poses_logged_at_another_time_than_the_pictures_are_missing() -> None:
         (topic("/drone1/image", "pictures", 0), topic("/drone1/odometry", "poses", 100)),
     )
     text, _ = written(Findings([log]))
-    assert "drone1: pose: there are no poses of the time when it filmed" in text.missing
+    assert any(remark.startswith("drone1: pose: ") for remark in text.missing)
+    assert "9 s from 0.000" in text.text, "the times of the film stand beside the poses"
 
 
 def test_one_map_is_stated_and_the_others_are_told() -> None:
     text, stated = written(Findings([video(9), Map(*about("a.bt")), Map(*about("b.pcd"))]))
     assert stated["map"] == "a.bt"
-    assert "# or map: b.pcd  # title of x" in text.text
+    assert re.search(r"^# .* map: b\.pcd  # ", text.text, re.MULTILINE)
 
 
 def test_without_a_camera_a_template_stands_in_a_comment() -> None:
     text, stated = written(Findings([Map(*about("a.bt"))]))
     assert "cameras" not in stated
-    assert text.missing == ["cameras: nothing was found that has pictures, keypoints or poses of a drone"]
+    [remark] = text.missing
+    assert remark.startswith("cameras: ")
     assert "#     pose: {tum: drone1.tum}" in text.text
 
 
@@ -138,9 +142,11 @@ def test_topics_of_a_log_that_has_no_place_are_named() -> None:
     empty = TopicFound("/odometry", "nav_msgs/msg/Odometry", "poses", 0, Span(0, 0))
     log = Recording(*about("site.bag"), (Path("/flight/site.bag"),), (truth, empty))
     text, _ = written(Findings([log]))
-    assert "#   site.bag  (title of x with /ground_truth)" in text.text
+    [line] = [line for line in text.text.splitlines() if "site.bag" in line]
+    assert line.startswith("# ")
+    assert line.endswith(" /ground_truth)")
 
 
 def test_many_cameras_are_told_in_short() -> None:
     text, _ = written(Findings([*[keypoints(0, 9, f"cam{k}.json") for k in range(9)]]))
-    assert "cam0, cam1, cam2, cam3, cam4, ...: pose: nothing of that name has poses" in text.missing
+    assert any(remark.startswith("cam0, cam1, cam2, cam3, cam4, ...: pose: ") for remark in text.missing)

@@ -7,6 +7,7 @@ import hashlib
 import itertools
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -21,7 +22,7 @@ import numpy as np
 import pytest
 
 from pipelines.session.errors import BusyError, DataError
-from pipelines.session.stage_records import SCHEMA, NewerSchemaError, Stage, key_of
+from pipelines.session.stage_records import COMMANDS, SCHEMA, NewerSchemaError, Stage, key_of
 from pipelines.session.stages import Run, locked, open_session
 from pipelines.session.storage import read_json, sha256_of, write_json
 
@@ -209,7 +210,7 @@ def test_a_full_disk_at_every_step_is_one_line(prepared: tuple[Path, Path], tmp_
         work(folder)
         assert contents(folder) == expected, f"disk full at step {step}"
     assert len(lines) > 40, "the faults were not injected"
-    assert all("No space left on device; free some space" in line for line in lines)
+    assert all(os.strerror(errno.ENOSPC) in line for line in lines)
 
 
 def test_what_is_published_was_synced_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -286,7 +287,7 @@ def test_a_second_writer_is_told_who_writes_until_that_one_is_killed(tmp_path: P
     folder = tmp_path / "a.session"
     work(folder)
     with other_process(HOLDER, folder) as process:
-        with pytest.raises(BusyError, match=rf"being written by process {process.pid}; wait"):
+        with pytest.raises(BusyError, match=rf"\b{process.pid}\b"):
             reconstruct(folder, "dlt")
         with pytest.raises(BusyError):
             ingest(folder, "old", OLD)
@@ -336,8 +337,10 @@ def test_a_copy_kept_by_the_user_stays(tmp_path: Path) -> None:
     folder = tmp_path / "a.session"
     work(folder)
     shutil.copytree(folder / "reconstruct", folder / "reconstruct.old")
+    kept = (folder / "reconstruct" / "skeleton").read_text()
     reconstruct(folder, "dlt")
-    assert (folder / "reconstruct.old" / "skeleton").read_text() == "robust first robust second"
+    assert (folder / "reconstruct" / "skeleton").read_text() != kept
+    assert (folder / "reconstruct.old" / "skeleton").read_text() == kept
 
 
 def test_the_key_is_the_hash_of_all_that_decides() -> None:
@@ -458,8 +461,9 @@ def test_a_record_that_lacks_something_is_one_line(tmp_path: Path) -> None:
     write_json(
         path, {name: value for name, value in read_json(path).items() if name not in {"key", "outputs"}}
     )
-    with pytest.raises(DataError, match=r"stage\.json: has no usable key, outputs; run the stage again"):
+    with pytest.raises(DataError, match=r"\bkey, outputs\b") as caught:
         open_session(folder).record("reconstruct")
+    assert caught.value.source == path
 
 
 def test_an_interrupted_stage_keeps_its_finished_chunks(tmp_path: Path) -> None:
@@ -514,7 +518,7 @@ def fail_to_ingest(folder: Path) -> None:
 
 def test_a_failed_first_ingest_leaves_nothing(tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "a.session"
-    with pytest.raises(DataError, match="cannot be used"):
+    with pytest.raises(DataError, match=r"flight\.yaml"):
         fail_to_ingest(folder)
     assert not folder.exists()
 
@@ -525,7 +529,7 @@ def test_a_failed_ingest_leaves_an_existing_folder_and_an_existing_session(tmp_p
     work(old)
     before = contents(old)
     for folder in (empty, old):
-        with pytest.raises(DataError, match="cannot be used"):
+        with pytest.raises(DataError, match=r"flight\.yaml"):
             fail_to_ingest(folder)
     assert contents(empty) == {}
     assert contents(old) == before
@@ -537,12 +541,13 @@ def test_a_foreign_folder_is_refused_unless_it_may_be_written_into(tmp_path: Pat
     (tmp_path / "map.new").mkdir()
     for name in ("thesis.tex", "session.json"):
         (tmp_path / name).write_bytes(foreign[name])
-    with pytest.raises(DataError, match=r"not empty \(3 entries, the first map\.new\); .*--overwrite"):
+    with pytest.raises(DataError, match=r"\b3\b.* map\.new\).*--overwrite") as caught:
         ingest(tmp_path, "new", NEW)
+    assert caught.value.source == tmp_path
     assert contents(tmp_path) == foreign
     assert not (tmp_path / ".lock").exists()
     ingest(tmp_path, "new", NEW, overwrite=True)
-    assert (tmp_path / "thesis.tex").read_bytes() == b"years of work"
+    assert (tmp_path / "thesis.tex").read_bytes() == foreign["thesis.tex"]
     assert (tmp_path / "map.new").is_dir()
     assert_record_of(tmp_path, "new")
 
@@ -555,8 +560,9 @@ def assert_record_of(folder: Path, flight: str) -> None:
 
 def test_a_file_and_a_place_below_a_file_are_no_targets(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(DataError, match="is a file, not a folder"):
+    with pytest.raises(DataError, match="--output") as caught:
         ingest(tmp_path / "file", "new", NEW)
+    assert caught.value.source == tmp_path / "file"
     with pytest.raises(DataError, match="Not a directory"):
         ingest(tmp_path / "file" / "a.session", "new", NEW)
 
@@ -564,7 +570,7 @@ def test_a_file_and_a_place_below_a_file_are_no_targets(tmp_path: Path) -> None:
 @pytest.mark.parametrize("opening", [open_session, lambda folder: reconstruct(folder, "dlt")])
 def test_what_is_no_session_is_told_to_become_one(tmp_path: Path, opening: Callable[[Path], object]) -> None:
     for folder in (tmp_path, tmp_path / "nothing"):
-        with pytest.raises(DataError, match="is not a session; make one with `mocap ingest"):
+        with pytest.raises(DataError, match=COMMANDS["ingest"]):
             opening(folder)
     assert list(tmp_path.iterdir()) == []
 
@@ -582,7 +588,7 @@ def test_newer_schemas_are_refused_and_left_alone(tmp_path: Path) -> None:
         path.write_text(json.dumps({**json.loads(kept), "schema": SCHEMA + 1}))
         before = contents(folder)
         for opening in openings:
-            with pytest.raises(NewerSchemaError, match=r"has schema 2, this version reads up to 1; update"):
+            with pytest.raises(NewerSchemaError, match=r"\b2\b.*\b1\b"):
                 opening(folder)
         assert contents(folder) == before
         path.write_bytes(kept)
@@ -593,16 +599,16 @@ def test_a_session_without_a_schema_number_is_damaged(tmp_path: Path, schema: ob
     folder = tmp_path / "a.session"
     work(folder)
     write_json(folder / "session.json", {"schema": schema})
-    with pytest.raises(DataError, match=r"states no schema number .*; run `mocap ingest` again"):
+    with pytest.raises(DataError, match=f"schema: {re.escape(repr(schema))}"):
         open_session(folder)
     ingest(folder, "new", NEW)
     open_session(folder)
 
 
 def test_ingest_publishes_only_what_it_owns(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"ingest does not own notes\.txt"):
+    with pytest.raises(ValueError, match=r"\bnotes\.txt$"):
         ingest(tmp_path / "a.session", "new", {"notes.txt": ""})
-    with pytest.raises(ValueError, match="no-such is not a stage"):
+    with pytest.raises(ValueError, match=r"^no-such "):
         Stage("no-such", 1)
 
 
@@ -610,5 +616,5 @@ def test_the_record_of_an_unpublished_stage_cannot_be_asked_for(tmp_path: Path) 
     work(tmp_path / "a.session")
     with locked(tmp_path / "a.session") as session:
         run = session.begin(RECONSTRUCT, settings={}, inputs={})
-        with pytest.raises(RuntimeError, match="not published"):
+        with pytest.raises(RuntimeError, match=r"^reconstruct "):
             _ = run.record

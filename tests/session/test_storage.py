@@ -75,7 +75,7 @@ def test_numpy_scalars_become_plain_ones() -> None:
     "value", [math.inf, -math.inf, np.float64(np.inf), {"deep": [np.array([1.0, np.inf])]}]
 )
 def test_infinity_is_neither_a_number_nor_missing(value: object) -> None:
-    with pytest.raises(ValueError, match="inf cannot be written"):
+    with pytest.raises(ValueError, match=r"^-?inf\b"):
         jsonable(value)
 
 
@@ -99,7 +99,7 @@ def test_json_is_readable_and_ends_with_a_newline(tmp_path: Path) -> None:
 def test_nan_is_never_written_and_the_old_file_stays(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     write_json(path, {"n": 1})
-    with pytest.raises(ValueError, match="not JSON compliant"):
+    with pytest.raises(ValueError, match="JSON"):
         write_json(path, {"n": math.nan})
     assert read_json(path) == {"n": 1}
     assert list(tmp_path.iterdir()) == [path]
@@ -122,13 +122,14 @@ def test_nan_is_never_written_and_the_old_file_stays(tmp_path: Path) -> None:
 def test_damaged_json_is_one_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.json"
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"a\.json: .*; mend it") as caught:
+    with pytest.raises(DataError) as caught:
         read_json(path, "mend it")
+    assert (caught.value.source, caught.value.remedy) == (path, "mend it")
     assert "\n" not in str(caught.value)
 
 
 def test_missing_json_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"a\.json: No such file"):
+    with pytest.raises(DataError, match=r"a\.json: " + os.strerror(errno.ENOENT)):
         read_json(tmp_path / "a.json")
 
 
@@ -162,7 +163,7 @@ def test_hash_of_a_folder_sees_names_contents_and_nothing_else(tmp_path: Path) -
 
 
 def test_hash_of_nothing_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="gone: No such file"):
+    with pytest.raises(DataError, match="gone: " + os.strerror(errno.ENOENT)):
         sha256_of(tmp_path / "gone")
 
 
@@ -181,14 +182,13 @@ def test_removing_takes_files_folders_links_and_nothing(tmp_path: Path) -> None:
 
 def test_errors_of_the_system_name_the_file_and_the_remedy() -> None:
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "skeleton.parquet")
-    assert (
-        str(as_data_error(full, Path("a.session")))
-        == "skeleton.parquet: No space left on device; free some space and run the command again"
-    )
+    error = as_data_error(full, Path("a.session"))
+    assert (error.source, error.problem) == ("skeleton.parquet", os.strerror(errno.ENOSPC))
+    assert "space" in error.remedy
     # pyarrow gives a text alone
-    assert str(as_data_error(OSError("cannot write"), Path("a.session"))).startswith(
-        "a.session: cannot write; "
-    )
+    error = as_data_error(OSError("unwritable"), Path("a.session"))
+    assert (error.source, error.problem) == (Path("a.session"), "unwritable")
+    assert error.remedy
 
 
 def test_the_stamp_of_a_file_tells_sizes_and_times_of_change(tmp_path: Path) -> None:
@@ -212,5 +212,5 @@ def test_the_stamp_of_a_file_tells_sizes_and_times_of_change(tmp_path: Path) -> 
     file.rename(tmp_path / "one" / "c")
     assert len({before[0], after[0], grown[0]}) == 3
     assert len({before[1], after[1], grown[1], file_stamp(folder)}) == 4
-    with pytest.raises(DataError, match="No such file"):
+    with pytest.raises(DataError, match=os.strerror(errno.ENOENT)):
         file_stamp(file)
