@@ -13,7 +13,8 @@ from mocap_cli.terminal import one_line, say
 from pipelines.session.errors import MocapError
 
 COMMANDS = (
-    *("init", "ingest", "reconstruct", "replan-compare", "report", "batch", "export", "simulate", "ablate"),
+    *("init", "ingest", "check", "reconstruct", "replan-compare", "report"),
+    *("batch", "export", "simulate", "ablate"),
     *("info", "models"),
 )
 """The commands in the order of their use. Each is `NAME_command` in the module `mocap_cli.NAME`."""

@@ -162,12 +162,14 @@ _settings_options = grouped(
     show_default="all cores",
     help="Threads; the result does not depend on them.",
 )
+@click.option("--strict", is_flag=True, help="Refuse a flight with a doubt (see `mocap check`).")
 @force_option
 @output_options
 def reconstruct_command(
     session: Path,
     settings: Settings,
     overlay: bool,
+    strict: bool,
     workers: int,
     force: bool,
     shown: Shown,
@@ -179,7 +181,9 @@ def reconstruct_command(
     if overlay:
         refuse_overlays(session, force=force)
     with watching(shown.level) as progress:
-        result = reconstruct(session, settings, workers=workers, force=force, progress=progress)
+        result = reconstruct(
+            session, settings, strict=strict, workers=workers, force=force, progress=progress
+        )
         videos = write_overlays(session, workers=workers, force=force, progress=progress) if overlay else []
     say_warnings(result.record.warnings, shown.quiet)
     if shown.as_json:

@@ -30,6 +30,7 @@ from pipelines.keypoints.swaps import undo_swaps_of_tracks
 from pipelines.keypoints.swaps_across_views import swaps_across_views
 from pipelines.reconstruction.background import Followed, prior_of, refine_cameras, rows_to_follow
 from pipelines.reconstruction.background_tracks import follow, people_boxes
+from pipelines.reconstruction.doubts.diagnosis import Doubt, doubts_of, said_doubts
 from pipelines.reconstruction.finishing import finish
 from pipelines.reconstruction.loading import (
     load_cameras,
@@ -73,7 +74,7 @@ if TYPE_CHECKING:
 
     from pipelines.reconstruction.refining import RefinedFlight
 
-RECONSTRUCT = Stage("reconstruct", revision=14)
+RECONSTRUCT = Stage("reconstruct", revision=15)
 
 _LONGEST_FILL_S = 10.0
 
@@ -114,22 +115,25 @@ def reconstruct(
     folder: Path,
     settings: Settings | None = None,
     *,
+    strict: bool = False,
     workers: int = 1,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Reconstructed:
-    """Triangulate the people of a session and measure the errors.
+    """Triangulate the people of a session, measure the errors, and doubt what cannot be right.
 
     Args:
         folder: the session.
         settings: the settings that determine the result.
+        strict: refuse a flight that is doubted.
         workers: the number of threads; the result does not depend on it.
         force: run it again even if nothing changed, and the detection too.
         progress: receives the progress.
 
     Raises:
-        DataError: the session cannot be used, one of its tables or the pictures were changed, or nothing
-            could be reconstructed; the message gives the counts of the reasons.
+        DataError: the session cannot be used, one of its tables or the pictures were changed, nothing could
+            be reconstructed (the message gives the counts of the reasons, and the mistake that explains
+            them), or the flight is doubted and `strict`.
         BusyError: another process writes the session.
     """
     settings = settings or Settings()
@@ -154,6 +158,7 @@ def reconstruct(
         )
         if run.finished:
             metrics = read_json(folder / "reconstruct" / "metrics.json")
+            _refuse_doubted(folder, metrics["doubts"], strict=strict)
             return Reconstructed(folder, run.record, metrics, skipped=True)
 
         progress.start("Reconstructing", 1 + 3 * settings.trials)
@@ -187,8 +192,16 @@ def reconstruct(
             for trial in range(settings.trials)
         )
         stored = next(attempts)
-        _refuse_nothing(folder, stored)
-        metrics = stored.metrics
+        doubts = doubts_of(
+            folder,
+            description,
+            cameras,
+            chosen=chosen_detections(cameras, stored.found, stored.association),
+            pose_noise=settings.pose_noise,
+        )
+        _refuse_nothing(folder, stored, doubts)
+        metrics = stored.metrics | {"doubts": [doubt.as_json() for doubt in doubts]}
+        _refuse_doubted(folder, metrics["doubts"], strict=strict)
         if settings.disturb_poses is not None:
             every = [metrics, *(attempt.metrics for attempt in attempts)]
             metrics = metrics | {"trials": told_together(every, settings.disturb_poses, settings.seed)}
@@ -198,6 +211,7 @@ def reconstruct(
         record = run.publish(
             counts=_counts(metrics, stored, swaps),
             warnings=[
+                *said_doubts(doubts),
                 *_said_hints(description, ingested, detected),
                 *warnings,
                 *stored.warnings,
@@ -321,6 +335,7 @@ class _Attempt:
     observations: Observations
     views: Views
     result: Triangulation
+    found: Candidates
     association: Association
     between_views: dict[str, int]  # counts of left-right swaps, see `swaps_across_views`
     metrics: dict[str, Any]
@@ -376,6 +391,7 @@ def _attempt(
         observations,
         views,
         result,
+        seen.found,
         seen.association,
         seen.between_views,
         metrics | finished | background | people | readout | (refined.metrics if refined else {}),
@@ -405,16 +421,8 @@ class _Seen:
 def _observe(flight: _Flight, cameras: list[Camera], settings: Settings) -> _Seen:
     """Associate people, interpolate their keypoints to common times, and correct left-right swaps."""
     between, pixel_sigma = flight.description.pose_interpolation, settings.pixel_sigma
-    found = candidates(cameras, between)
-    association = associate(
-        (found.t_ns - found.t_ns[0]) / 1e9,
-        found.xy,
-        found.confidence,
-        found.position,
-        found.rotation,
-        ray_sigma(cameras, found.t_ns, found.position, pixel_sigma=pixel_sigma),
-        actor=None if flight.actor is None else flight.actor.hips_at(found.t_ns),
-        people=settings.people,
+    found, association = find_people(
+        cameras, between, flight.actor, people=settings.people, pixel_sigma=pixel_sigma
     )
     base = time_base(cameras, settings.rate_hz)
     observations = observe(cameras, found, association.choice, base, between)
@@ -425,6 +433,41 @@ def _observe(flight: _Flight, cameras: list[Camera], settings: Settings) -> _See
     xy, confidence = on_sides(observations.xy, observations.confidence, sides)
     observations = replace(observations, xy=xy, confidence=confidence)
     return _Seen(found, association, observations, sides, between_views, anybody)
+
+
+def find_people(
+    cameras: list[Camera],
+    between: Interpolation,
+    actor: LoggedActor | None,
+    *,
+    people: int = Settings.people,
+    pixel_sigma: float = Settings.pixel_sigma,
+) -> tuple[Candidates, Association]:
+    """Collect all detections at common times, and associate them with people; person 0 is the actor."""
+    found = candidates(cameras, between)
+    association = associate(
+        (found.t_ns - found.t_ns[0]) / 1e9,
+        found.xy,
+        found.confidence,
+        found.position,
+        found.rotation,
+        ray_sigma(cameras, found.t_ns, found.position, pixel_sigma=pixel_sigma),
+        actor=None if actor is None else actor.hips_at(found.t_ns),
+        people=people,
+    )
+    return found, association
+
+
+def chosen_detections(cameras: Sequence[Camera], found: Candidates, association: Association) -> list[Int64]:
+    """Return for every picture [F] of each camera which of its detections the actor is; -1 for none."""
+    chosen = []
+    for index, camera in enumerate(cameras):
+        of_frame = np.full(len(camera.frame_t_ns), -1, dtype=np.int64)
+        frame, choice = found.frame[:, index], association.choice[:, index, 0]
+        used = (frame >= 0) & (choice >= 0)
+        of_frame[frame[used]] = choice[used]
+        chosen.append(of_frame)
+    return chosen
 
 
 def _with_background(description: Description) -> list[str]:
@@ -608,20 +651,28 @@ def _refine(
     )
 
 
-def _refuse_nothing(folder: Path, attempt: _Attempt) -> None:
-    """Refuse a result without any joint; the message gives the counts by status."""
+def _refuse_nothing(folder: Path, attempt: _Attempt, doubts: Sequence[Doubt]) -> None:
+    """Refuse a result without any joint; the message gives the counts by status, and the likely mistake."""
     status = attempt.result.status
     if (status == STATUS.index("ok")).any():
         return
     codes, counts = np.unique(status, return_counts=True)
     gates = ", ".join(f"{STATUS[code]} {count}" for code, count in zip(codes, counts, strict=True))
-    reasons = "; ".join(attempt.association.reasons)
+    reasons = [*attempt.association.reasons, *(doubt.what for doubt in doubts[:1] if doubt.remedy)]
+    remedies = [doubt.remedy for doubt in doubts[:1] if doubt.remedy]
     raise DataError(
         folder,
-        f"no joint could be reconstructed ({gates}; {said_noise(attempt.views)})"
-        + (f"; {reasons}" if reasons else ""),
-        "check calibration, clocks and poses, or state another pose noise with --pose-noise",
+        "; ".join([f"no joint could be reconstructed ({gates}; {said_noise(attempt.views)})", *reasons]),
+        *(remedies or ["check calibration, clocks and poses, or state another pose noise with --pose-noise"]),
     )
+
+
+def _refuse_doubted(folder: Path, doubts: Sequence[Mapping[str, Any]], *, strict: bool) -> None:
+    """Refuse a flight with a doubt if `strict`."""
+    if strict and doubts:
+        first = doubts[0]
+        more = f" ({len(doubts) - 1} more doubts)" if len(doubts) > 1 else ""
+        raise DataError(folder, f"is doubted: {first['what']} ({first['code']}){more}", str(first["remedy"]))
 
 
 def _unused(cameras: list[Camera], result: Triangulation) -> list[str]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.reporting.content import SessionContent, items, number, section
+from pipelines.reporting.content import SessionContent, items, number, section, text
 from pipelines.reporting.summary import Summary, errors_per_camera, finite_median
 from pipelines.reporting.wording import (
     STATUS_LABELS,
@@ -73,6 +73,14 @@ def _why_nothing(summary: Summary) -> str:
 
 def _lead(summary: Summary) -> str:
     share = summary.share or 0.0
+    doubt = next((doubt for doubt in items(summary.metrics, "doubts") if isinstance(doubt, dict)), None)
+    if doubt is not None:
+        remedy = text(doubt, "remedy")
+        return (
+            f"This flight is doubted: {text(doubt, 'what')}. "
+            + (f"In flight.yaml set {remedy}. " if remedy else "")
+            + f"{percent(share)} of {plural(summary.total, 'joint-frame')} were reconstructed all the same."
+        )
     amount = next(
         words
         for least, words in (

@@ -58,6 +58,13 @@ class FramesEntry(Entry):
     dropped: dict[str, int] = {}  # frames that the video has lost
 
 
+class MountEntry(Entry):
+    """Pose of a camera that is fixed to the body whose poses are logged: body_from_camera."""
+
+    translation: tuple[float, float, float]  # m
+    rotation_xyzw: tuple[float, float, float, float]
+
+
 class PosesEntry(Entry):
     """The poses of a camera, and the number of frames without a pose."""
 
@@ -69,6 +76,7 @@ class PosesEntry(Entry):
     frames_without_pose: int
     dropped: dict[str, int]
     stamps: str | None = None  # of a log's messages: header or receive
+    mount: MountEntry | None = None  # None where poses are the camera's own, or a gimbal turns it
 
 
 class KeypointsEntry(Entry):

@@ -186,6 +186,10 @@ class PoseSource(Part):
     altitude: Literal["relative", "absolute"] | float | None = None  # or metres, held throughout
     of: Literal["camera", "body"] | None = None
     axes: Axes | None = None
+    inverse: bool = False  # the file has camera_from_world, or body_from_world
+    quaternion: Literal["xyzw", "wxyz"] | None = None  # the order in which the file has it [its format's]
+    unit: Literal["m", "cm", "mm", "ft"] = "m"  # of its positions
+    world_from_source: WorldFromLog = WorldFromLog()  # where the file's zero and north lie in the world
 
     @model_validator(mode="after")
     def _only_where_it_belongs(self) -> PoseSource:
@@ -200,9 +204,15 @@ class PoseSource(Part):
                 not self.is_telemetry or self.attitude is not None,
                 "that is no drone's own log (those state theirs)",
             ),
+            ("inverse", "quaternion", "unit"): (
+                not self.is_telemetry and self.static is None,
+                "from a log, tum or csv",
+            ),
+            ("world_from_source",): (self.static is None, "that moves"),
         }
         for names, (may, whose) in allowed.items():
-            stated = [name for name in names if getattr(self, name) is not None]
+            unasked = {name: type(self).model_fields[name].default for name in names}
+            stated = [name for name, default in unasked.items() if getattr(self, name) != default]
             if stated and not may:
                 raise ValueError(f"{', '.join(stated)}: only a pose {whose} has that")
         if (self.parent is None) != (self.child is None):
@@ -309,6 +319,8 @@ class KeypointSource(Part):
     format: str | None = None
     skeleton: str | None = None
     first_frame: int = Field(0, ge=-_MOST_FRAMES, le=_MOST_FRAMES)
+    # true: found in mirrored pictures; x: x alone counts from the right; names: left is right, and no more
+    mirrored: bool | Literal["x", "names"] = False
     image_size: Annotated[list[Side], Field(min_length=2, max_length=2)] | None = None
 
 

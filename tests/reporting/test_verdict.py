@@ -126,3 +126,12 @@ def test_no_warnings_no_doubts(content: SessionContent) -> None:
     verdict = _verdict(quiet)
     assert numbers(verdict.lead)[0] == 100
     assert verdict.doubts == ()
+
+
+def test_a_doubt_comes_before_everything_else(content: SessionContent) -> None:
+    doubt = {"code": "mount", "cameras": ["mast"], "what": "W1", "evidence": {}, "remedy": "R1"}
+    doubted = replace(content, metrics={**(content.metrics or {}), "doubts": [doubt]})
+    lead = give_verdict(doubted, summarise(doubted)).lead
+    right = give_verdict(content, summarise(content)).lead
+    assert lead.index("W1") < lead.index("R1") < lead.index("81.1")
+    assert right.split()[0] not in lead

@@ -10,7 +10,7 @@ from typing import Self
 
 import numpy as np
 
-from pipelines.formats.flights.flight_sources import FlightSources, losses
+from pipelines.formats.flights.flight_sources import FlightSources, losses, mounted
 from pipelines.formats.flights.frame_sources import CameraFrames
 from pipelines.formats.flights.pose_doubts import doubts_of_speed, doubts_of_stillness
 from pipelines.geometry.cameras import Intrinsics
@@ -27,6 +27,7 @@ from pipelines.session.description import (
     KeypointsEntry,
     LogClockEntry,
     MapEntry,
+    MountEntry,
     OriginEntry,
     PlannedEntry,
     PosesEntry,
@@ -188,6 +189,8 @@ class FlightReader:
             detections, detector_format = sources.keypoints(camera.keypoints)
         intrinsics = sources.intrinsics(name, camera, video, detections)
         if detections is not None:
+            if camera.keypoints:
+                detections = unmirrored(detections, camera.keypoints.mirrored, intrinsics.width)
             detections = _near_picture(detections, intrinsics)
         frames = sources.frames(name, camera, video, detections, intrinsics)
         trajectory = sources.trajectory(name, camera, int(frames.t_ns[0]))
@@ -356,6 +359,7 @@ class FlightReader:
             frames_without_pose=without_pose,
             dropped=trajectory.dropped,
             stamps=self._sources.stamps(camera.pose.log) if camera.pose.log else None,
+            mount=_mount_entry(camera),
         )
 
     def _frames_without_pose(
@@ -404,6 +408,33 @@ def _keypoints_entry(
         dropped=detections.dropped,
         adjusted=detections.adjusted,
     )
+
+
+def unmirrored(detections: Detections, mirrored: bool | str, width: int) -> Detections:
+    """Undo that keypoints were found in mirrored pictures.
+
+    Args:
+        detections: as the file has them.
+        mirrored: True, or of what: "x" alone counts from the right, or "names" alone have left for right.
+        width: of the pictures, px.
+    """
+    if mirrored in (True, "x"):
+        xy = detections.xy.copy()
+        xy[..., 0] = width - 1 - xy[..., 0]
+        detections = replace(detections, xy=xy)
+    if mirrored in (True, "names"):
+        order = [detections.joints.index(_other_side(name, detections.joints)) for name in detections.joints]
+        detections = replace(
+            detections, xy=detections.xy[:, order], confidence=detections.confidence[:, order]
+        )
+    return detections
+
+
+def _other_side(name: str, joints: tuple[str, ...]) -> str:
+    """Return the name of the same joint on the other side; its own if there is none."""
+    other = {"left": "right", "right": "left"}.get(name.partition("_")[0])
+    opposite = f"{other}_{name.partition('_')[2]}" if other else name
+    return opposite if opposite in joints else name
 
 
 def _near_picture(detections: Detections, intrinsics: Intrinsics) -> Detections:
@@ -477,3 +508,11 @@ def _span_of_pictures(entries: Mapping[str, CameraEntry]) -> tuple[int, int]:
 def span_words(first_ns: int, last_ns: int) -> str:
     """Format a time span for messages."""
     return f"{first_ns / 1e9:.3f} to {last_ns / 1e9:.3f} s"
+
+
+def _mount_entry(camera: Camera) -> MountEntry | None:
+    """Describe how a camera is fixed to the body whose poses are logged; None where it is not fixed."""
+    if camera.mount is None or camera.gimbal is not None:
+        return None
+    translation, rotation_xyzw = mounted(camera.mount)
+    return MountEntry(translation=tuple(translation.tolist()), rotation_xyzw=tuple(rotation_xyzw.tolist()))

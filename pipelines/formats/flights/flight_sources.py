@@ -18,7 +18,7 @@ from pipelines.formats.flights.flight_logs import FlightLogs
 from pipelines.formats.flights.frame_sources import CameraFrames, FrameSources
 from pipelines.formats.flights.gimbal_angles import attitudes_at, stated_angles
 from pipelines.formats.flights.telemetry_poses import Origin, TelemetryPoses
-from pipelines.formats.flights.world_axes import body_in_enu, in_enu, in_world, refuse_projected
+from pipelines.formats.flights.world_axes import as_stated, body_in_enu, in_enu, in_world, refuse_projected
 from pipelines.formats.logs.maps import LoggedMaps
 from pipelines.formats.maps.ros_map import FORMAT as ROS_MAP
 from pipelines.geometry.arrays import Float
@@ -182,12 +182,17 @@ class FlightSources:
                 quaternion_xyzw=calibrated.quaternion_xyzw[None],
             )
             return self._local(self._base / pose.static.path, in_enu(still, self._axes(pose.axes)))
+        return in_world(self._moving_trajectory(name, camera), pose.world_from_source)
+
+    def _moving_trajectory(self, name: str, camera: Camera) -> Trajectory:
+        """Read world_from_camera over time, in the world of its source."""
+        pose = camera.pose
         if pose.is_telemetry:
             return self._telemetry.trajectory(name, camera, self._mounted(name, camera.mount))
         if pose.log:
             return self._local(self._logs.paths(pose.log)[0], self._logged_trajectory(name, camera, pose.log))
         stated = pose.tum or pose.csv or ""
-        trajectory = self._filed_trajectory(stated, "tum" if pose.tum else "csv")
+        trajectory = as_stated(self._filed_trajectory(stated, "tum" if pose.tum else "csv"), pose)
         if pose.of != "body":
             return self._local(self._base / stated, in_enu(trajectory, self._axes(pose.axes)))
         turned = self._local(self._base / stated, body_in_enu(trajectory, self._axes(pose.axes)))
@@ -227,15 +232,16 @@ class FlightSources:
             self._note(
                 f"{name}: poses in {log} are taken as the camera's (say `of: body` with a mount if not)"
             )
+        trajectory = as_stated(trajectory, pose)
         axes = self._axes(pose.axes, settings.axes)
         turned = in_enu(trajectory, axes) if of_camera else body_in_enu(trajectory, axes)
-        moved = in_world(turned, settings)
+        moved = in_world(turned, settings.world_from_log)
         return moved if of_camera else self._on_body(name, camera, moved)
 
     def _mounted(self, name: str, mount: Mount | None) -> tuple[Float, Float]:
         """Return lever arm [3] and rotation [4] of a camera in its body, or in its gimbal if there is one."""
         try:
-            return _mounted(mount)
+            return mounted(mount)
         except ValueError as error:
             place = f"{self._manifest}: cameras.{name}.mount"
             raise DataError(place, str(error), "say how the camera sits on the body") from None
@@ -300,7 +306,8 @@ class FlightSources:
         settings = self._logs.settings(log)
         trajectory = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
         return self._local(
-            self._logs.paths(log)[0], in_world(in_enu(trajectory, self._axes(settings.axes)), settings)
+            self._logs.paths(log)[0],
+            in_world(in_enu(trajectory, self._axes(settings.axes)), settings.world_from_log),
         )
 
     def planned(self, camera: str, plan: Plan) -> Trajectory:
@@ -315,7 +322,8 @@ class FlightSources:
         if sent is None:
             sent = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
         return self._local(
-            self._logs.paths(log)[0], in_world(in_enu(sent, self._axes(settings.axes)), settings)
+            self._logs.paths(log)[0],
+            in_world(in_enu(sent, self._axes(settings.axes)), settings.world_from_log),
         )
 
     def map(self, stated: str, resolution_m: float | None) -> Occupancy:
@@ -330,7 +338,9 @@ class FlightSources:
         settings = self._logs.settings(stated.log or "")
         axes = self._axes(settings.axes)
         found = self._logs.maps(
-            stated, lambda poses: in_world(in_enu(poses, axes), settings), max_gap_ns=self._max_gap_ns
+            stated,
+            lambda poses: in_world(in_enu(poses, axes), settings.world_from_log),
+            max_gap_ns=self._max_gap_ns,
         )
         for note in found.notes:
             self._note(note)
@@ -407,7 +417,7 @@ def losses(dropped: dict[str, int]) -> str:
     return ", ".join(f"{count} {cause}" for cause, count in dropped.items()) or "it is empty"
 
 
-def _mounted(mount: Mount | None) -> tuple[Float, Float]:
+def mounted(mount: Mount | None) -> tuple[Float, Float]:
     """Return lever arm [3] and rotation [4] of a camera in its body, or in its gimbal if there is one."""
     if mount is None:  # the manifest's checks guarantee a gimbal in this case
         return np.zeros(3), body_from_camera("forward")

@@ -196,7 +196,7 @@ class TelemetryPoses:
             )
         values, _ = self._in_world(name, track)
         still = np.tile([0.0, 0.0, 0.0, 1.0], (len(values), 1))
-        return in_world(Trajectory(track.t_ns, values, still), self._logs.settings(log))
+        return in_world(Trajectory(track.t_ns, values, still), self._logs.settings(log).world_from_log)
 
     # --- poses of cameras ------------------------------------------------------------------------------
 
@@ -337,7 +337,7 @@ class TelemetryPoses:
             if count:
                 dropped[cause] = int(count)
         poses = Trajectory(t_ns[known], position[known], quaternion[known], dropped=dropped)
-        return in_world(poses, settings)
+        return in_world(poses, settings.world_from_log)
 
     def _doubt(self, name: str, track: PositionTrack) -> None:
         if len(track.t_ns) < 2:

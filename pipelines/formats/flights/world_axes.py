@@ -14,14 +14,36 @@ from pipelines.geometry.poses import (
     carried_covariance,
     compose,
     enu_from_ned,
+    invert,
     matrix_from_quaternion,
     quaternion_from_rotation_vector,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Axes, Log
+from pipelines.session.manifest import Axes, PoseSource, WorldFromLog
 from pipelines.session.records import Trajectory
 
 _FARTHEST_M = 100_000.0  # from the origin: no drone flies so far, and UTM eastings begin at 166 km
+
+
+_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
+
+
+def as_stated(trajectory: Trajectory, pose: PoseSource) -> Trajectory:
+    """Return poses world_from_camera (or body) in metres, of a file that has them as the manifest states.
+
+    Covariances of inverted poses are left out: they are those of another pose.
+    """
+    position, quaternion, covariance = trajectory.position, trajectory.quaternion_xyzw, trajectory.covariance
+    if pose.quaternion == "wxyz":
+        quaternion = np.roll(quaternion, -1, axis=-1)
+    if pose.inverse:
+        position, quaternion = invert(position, quaternion)
+        covariance = None
+    if (metres := _METRES[pose.unit]) != 1.0:
+        position = position * metres
+        scale = np.diag([metres] * 3 + [1.0] * 3)
+        covariance = None if covariance is None else carried_covariance(scale, covariance)
+    return replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)
 
 
 def in_enu(trajectory: Trajectory, axes: Axes) -> Trajectory:
@@ -46,9 +68,10 @@ def body_in_enu(trajectory: Trajectory, axes: Axes) -> Trajectory:
     return replace(turned, quaternion_xyzw=quaternion, covariance=covariance)
 
 
-def in_world(trajectory: Trajectory, log: Log) -> Trajectory:
-    """Move a trajectory in the ENU axes of its log to the position of the log's origin in the world."""
-    place = log.world_from_log
+def in_world(trajectory: Trajectory, place: WorldFromLog) -> Trajectory:
+    """Move a trajectory in the ENU axes of its source to where the source has its origin in the world."""
+    if place == WorldFromLog():
+        return trajectory
     turn = quaternion_from_rotation_vector(np.array([0.0, 0.0, np.radians(place.yaw_deg)]))
     position, quaternion = compose(
         (np.array(place.translation), turn), (trajectory.position, trajectory.quaternion_xyzw)

@@ -23,7 +23,7 @@ from pipelines.formats.maps import octomap
 from pipelines.formats.maps.voxel_grids import occupancy_of
 from pipelines.geometry.poses import enu_from_ned
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Flight, Log, Map, WorldFromLog
+from pipelines.session.manifest import Flight, Map, WorldFromLog
 from pipelines.session.records import Occupancy, Trajectory
 from pipelines.session.registries import MapFormat
 from tests.formats.maps.test_octomap import at, file_of, ot_body
@@ -74,7 +74,7 @@ class Read:
             if ned:
                 position, quaternion = enu_from_ned(poses.position, poses.quaternion_xyzw)
                 poses = Trajectory(poses.t_ns, position, quaternion)
-            return in_world(poses, Log(path=["x"], world_from_log=place or WorldFromLog()))
+            return in_world(poses, place or WorldFromLog())
 
         with FlightLogs(flight, folder, self.notes.append) as logs:
             found = logs.maps(Map(log="a", **stated), to_world, max_gap_ns=SECOND)

@@ -1,0 +1,64 @@
+"""`mocap check`: whether a flight's description, logs and pictures fit together."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+from mocap_cli.options import Shown, output_options
+from mocap_cli.several import each
+from mocap_cli.terminal import say, say_warnings, watching
+from pipelines.session.errors import DataError
+
+
+@click.command("check", short_help="Doubt a flight that cannot be right, and name the mistake.")
+@each("path", "FLIGHT.yaml|SESSION")
+@click.option(
+    "--pose-noise", metavar="MODEL", help="As of `mocap reconstruct`: what is known of the poses' errors."
+)
+@click.option("--detector", default="blazepose", show_default=True, help="See `mocap models`.")
+@click.option("--strict", is_flag=True, help="Exit 1 if there is a doubt.")
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 256),
+    default=lambda: os.cpu_count() or 1,
+    show_default="all cores",
+    help="Threads; the result does not depend on them.",
+)
+@output_options
+def check_command(
+    path: Path,
+    pose_noise: str | None,
+    detector: str,
+    strict: bool,
+    workers: int,
+    shown: Shown,
+) -> dict[str, Any] | None:
+    """Doubt a flight that cannot be right, and name the mistake in its description.
+
+    Cameras, clocks, poses and people are held against each other; every mistake that flight.yaml can hold is
+    tried, and the one that explains what is odd is named with the line that mends it (docs/mistakes.md).
+    `mocap reconstruct` does the same. A flight without keypoints is looked at for a few seconds.
+    """
+    from pipelines.check import check
+
+    with watching(shown.level) as progress:
+        result = check(path, pose_noise=pose_noise, detector=detector, workers=workers, progress=progress)
+    say_warnings(result.warnings, shown.quiet)
+    if strict and result.doubts:
+        first = result.doubts[0]
+        raise DataError(path, f"is doubted: {first.what} ({first.code})", first.remedy)
+    if shown.as_json:
+        return {"path": str(path), "doubts": [doubt.as_json() for doubt in result.doubts]}
+    for doubt in result.doubts:
+        say(f"{doubt.code}: {doubt.what}")
+        say("  " + ", ".join(f"{name} {value:g}" for name, value in doubt.evidence.items()))
+        for line in doubt.remedy.split("; ") if doubt.remedy else []:
+            say(f"  set {line}")
+    if not result.doubts:
+        looked = f" (looked at: {result.pictures})" if result.pictures else ""
+        say(f"{path}: no doubt{looked}")
+    return None

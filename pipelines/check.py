@@ -1,0 +1,115 @@
+"""Check a flight: what its description, its logs and its pictures cannot all be true of.
+
+A flight that was not ingested yet is read into a temporary session. Where no keypoints are known, the
+detector looks at a few seconds in the middle of the flight.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipelines.detect import DETECT, cameras_to_detect, detect
+from pipelines.ingest import ingest
+from pipelines.reconstruct import chosen_detections, find_people
+from pipelines.reconstruction.doubts.diagnosis import Doubt, doubts_of
+from pipelines.reconstruction.loading import load_cameras
+from pipelines.session.description import Description, read_description
+from pipelines.session.errors import DataError
+from pipelines.session.people import logged_actor
+from pipelines.session.progress import Progress, Silent
+from pipelines.session.stage_records import StageRecord
+from pipelines.session.stages import WritableSession, locked
+
+_LOOK_S = 8.0
+"""Seconds in the middle of a flight that the detector looks at."""
+_LOOK_EVERY = 3
+"""It looks at every third picture of them: ten a second of thirty."""
+_CONFIDENT = 0.3  # as `reconstruct` has it unasked
+
+
+@dataclass(frozen=True)
+class Checked:
+    """The doubts of a flight."""
+
+    doubts: list[Doubt]
+    warnings: list[str]  # of ingest
+    pictures: str  # which pictures were looked at, in words; empty if all that have keypoints
+
+
+def check(
+    path: Path,
+    *,
+    pose_noise: str | None = None,
+    detector: str = "blazepose",
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> Checked:
+    """Check a session, or a flight by its manifest.
+
+    Args:
+        path: the folder of a session, or flight.yaml.
+        pose_noise: what is known of the poses' errors, instead of what flight.yaml says.
+        detector: looks at pictures without keypoints.
+        workers: the number of threads; the result does not depend on it.
+        progress: receives the progress.
+
+    Raises:
+        DataError: the flight cannot be read, or nobody is seen.
+        BusyError: another process writes the session.
+    """
+    progress = progress or Silent()
+    if path.is_dir():
+        return _checked(path, pose_noise, detector, workers, progress)
+    with tempfile.TemporaryDirectory(prefix="mocap-check-") as folder:
+        session = Path(folder) / "check.session"
+        ingest(path, session, progress=progress)
+        return _checked(session, pose_noise, detector, workers, progress)
+
+
+def _checked(
+    folder: Path, pose_noise: str | None, detector: str, workers: int, progress: Progress
+) -> Checked:
+    with locked(folder) as session:
+        if session.intact_record("ingest") is None:
+            raise DataError(folder, "was never ingested completely", "run `mocap ingest` again")
+        description = read_description(folder)
+        detected, pictures = _detected(session, description, detector, workers, progress)
+        cameras, _ = load_cameras(
+            folder, description, detected, min_confidence=_CONFIDENT, pose_noise=pose_noise
+        )
+        found = find_people(cameras, description.pose_interpolation, logged_actor(folder, description))
+        doubts = doubts_of(
+            folder,
+            description,
+            cameras,
+            chosen=chosen_detections(cameras, *found),
+            pose_noise=pose_noise,
+        )
+    return Checked(doubts, list(description.warnings), pictures)
+
+
+def _detected(
+    session: WritableSession, description: Description, detector: str, workers: int, progress: Progress
+) -> tuple[StageRecord | None, str]:
+    """Return the detection that the session has, else one of a few seconds; and its pictures in words."""
+    if not cameras_to_detect(description):
+        return None, ""
+    known = session.intact_record(DETECT.name)
+    if known is not None:
+        return known, ""
+    frames = [entry.frames for entry in description.cameras.values()]
+    first, last = max(each.first_t_ns for each in frames), min(each.last_t_ns for each in frames)
+    middle_s = ((first + last) / 2 - description.start_ns) / 1e9
+    start_s, end_s = max(0.0, middle_s - _LOOK_S / 2), middle_s + _LOOK_S / 2
+    record = detect(
+        session,
+        detector=detector,
+        every=_LOOK_EVERY,
+        start_s=start_s,
+        end_s=end_s,
+        workers=workers,
+        progress=progress,
+    )
+    return record, f"every third picture from {start_s:.1f} to {end_s:.1f} s"

@@ -1,0 +1,251 @@
+"""Doubts about a flight: what is odd about it, and the mistake in its description that explains that.
+
+A flight whose score is small is believed, unless a clock or a frame rate explains markedly more. Else every
+mistake that `hypotheses` knows is tried, and the best is named if it explains markedly more than the
+description does. If none does, the doubt is stated without a cause.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.reconstruction.doubts.hypotheses import Hypothesis, Trial, of_descriptions, of_paths, of_times
+from pipelines.reconstruction.doubts.scene import Sampled, Scene, sample, scene_of
+from pipelines.reconstruction.doubts.score import STATURE_M, Score, base_of, residual_px, solve
+from pipelines.reconstruction.observations import Camera
+from pipelines.session.description import Description
+from pipelines.session.maps import each_map
+from pipelines.session.people import logged_actor
+from pipelines.session.records import Int64
+
+CODES = (
+    "videos_swapped",
+    "mirrored",
+    "convention",
+    "axes",
+    "unit",
+    "mount",
+    "gimbal",
+    "intrinsics",
+    "keypoints_size",
+    "clock",
+    "frame_rate",
+    "origin",
+    "pose",
+    "body",
+    "ground",
+    "actor",
+    "residual",
+    "noise",
+)
+"""What a doubt can be of."""
+
+MARGIN = 3.0
+"""By how much a mistake must score better than the description to be named."""
+
+MARGIN_OF_TIMES = 2.0
+"""The same for clocks and frame rates, which only the scatter of rays can tell."""
+
+ODD = 4.0
+"""Score of a description from which more than times is tried."""
+
+SCATTERED = 0.7
+"""Scatter of rays from which more than times is tried, whatever the score; 0.4 to 0.65 on right flights."""
+
+DOUBTFUL = 6.0
+"""Score of a description above which it is doubted although no mistake explains it."""
+
+_ALIKE = 1.0  # hypotheses whose scores are this close are stated together
+_DISCRETE = 0.8  # the largest penalty of a hypothesis without a free number
+_TIMES = ("clock", "frame_rate")
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """One doubt, as metrics.json holds it."""
+
+    code: str  # one of CODES
+    cameras: list[str]
+    what: str  # one sentence
+    evidence: dict[str, float]
+    remedy: str  # the lines of flight.yaml to change; empty where no cause was found
+
+    def as_json(self) -> dict[str, object]:
+        """Return the mapping that is stored."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The doubts of a flight, those first that explain the most."""
+
+    doubts: list[Doubt]
+    score: float  # of the description; NaN where the cameras share no time
+    tried: int  # hypotheses
+
+
+def doubts_of(
+    folder: Path,
+    description: Description,
+    cameras: list[Camera],
+    *,
+    chosen: Sequence[Int64],
+    pose_noise: str | None = None,
+) -> list[Doubt]:
+    """Diagnose a session.
+
+    The person is the one who was chosen where several are seen; where a wrong description spoils that
+    choice, the one whom each camera shows in most pictures. The flight is doubted by the less odd of both.
+
+    Args:
+        folder: the session.
+        description: its session.json.
+        cameras: with their detections.
+        chosen: which detection [F] of each camera's pictures the actor is, -1 for none.
+        pose_noise: the value of `--pose-noise`, if any.
+
+    Raises:
+        DataError: a table or map of the session is damaged.
+    """
+    last = deque(each_map(folder) if description.map is not None else (), maxlen=1)
+    known = partial(
+        sample,
+        cameras,
+        description,
+        actor=logged_actor(folder, description),
+        last_map=last[0] if last else None,
+        pose_noise=pose_noise,
+    )
+    return min(map(diagnose, _distinct(known(chosen=chosen), known())), key=lambda found: found.score).doubts
+
+
+def _distinct(chosen: Sampled | None, prominent: Sampled | None) -> list[Sampled | None]:
+    """Leave out the second of two flights with the same person in all pictures."""
+    if chosen is None or prominent is None:
+        return [None]
+    same = all(
+        np.array_equal(one.pixels, other.pixels, equal_nan=True)
+        for one, other in zip(chosen.cameras, prominent.cameras, strict=True)
+    )
+    return [chosen] if same else [chosen, prominent]
+
+
+def said_doubts(doubts: list[Doubt]) -> list[str]:
+    """State doubts as warnings of a stage, with the lines that mend them."""
+    return [
+        f"doubt ({doubt.code}): {doubt.what}" + (f"; set {doubt.remedy}" if doubt.remedy else "")
+        for doubt in doubts
+    ]
+
+
+def diagnose(flight: Sampled | None) -> Diagnosis:
+    """Find what is odd about a flight, and why; a flight whose cameras share no time is not doubted here."""
+    if flight is None:
+        return Diagnosis([], float("nan"), 0)
+    described = scene_of(flight)
+    base, found = base_of(flight, described)
+    trial = Trial(flight, described, base)
+    hypotheses = [*of_paths(trial), *of_times(trial)]
+    explained = min((each.total for each in hypotheses), default=np.inf)
+    if base.total >= ODD or found.scatter >= SCATTERED or explained <= base.total - MARGIN_OF_TIMES:
+        hypotheses += list(of_descriptions(trial))
+    hypotheses.sort(key=lambda each: each.total)
+    causes = _causes(hypotheses, base.total)
+    doubts = [_doubt(each, found, described) for each in causes]
+    if doubts or base.total >= DOUBTFUL:
+        doubts += _oddities(found, described, flight)
+    return Diagnosis(doubts, base.total, len(hypotheses))
+
+
+def _causes(hypotheses: list[Hypothesis], described: float) -> list[Hypothesis]:
+    """Return the hypotheses that score next to the best, one of each code; none if it explains too little.
+
+    Those without a free number are first.
+    """
+    if not hypotheses:
+        return []
+    best = hypotheses[0]
+    margin = MARGIN_OF_TIMES if best.code in _TIMES else MARGIN
+    if best.total > described - margin:
+        return []
+    alike = [each for each in hypotheses if each.total <= best.total + _ALIKE]
+    causes: dict[str, Hypothesis] = {}
+    for each in sorted(alike, key=lambda each: (each.penalty > _DISCRETE, each.total)):
+        causes.setdefault(each.code, each)
+    return list(causes.values())
+
+
+def _doubt(cause: Hypothesis, described: Score, scene: Scene) -> Doubt:
+    evidence = {"residual_px": residual_px(scene, solve(scene)), "score": round(described.total, 2)}
+    if cause.score is not None and cause.scene is not None:
+        evidence |= {
+            "residual_px_if": residual_px(cause.scene, solve(cause.scene)),
+            "score_if": round(cause.score.total, 2),
+            "stature_m": _rounded(described.stature_m),
+            "stature_m_if": _rounded(cause.score.stature_m),
+        }
+    return Doubt(
+        cause.code,
+        list(cause.cameras),
+        cause.what,
+        {name: value for name, value in evidence.items() if np.isfinite(value)},
+        cause.remedy,
+    )
+
+
+def _rounded(value: float) -> float:
+    return round(float(value), 3)
+
+
+# What is odd about a person, by the name it has in a score: the code of its doubt, and the sentence.
+_ODD = {
+    "size": ("body", "the person is {stature:.2f} m tall; grown-ups are {usual:.2f} m, 95 % within 17 %"),
+    "shape": ("body", "the lengths of the limbs are not in the proportions of people"),
+    "limp": ("body", "the lengths of the limbs change over time"),
+    "upright": ("body", "the person does not stand upright"),
+    "wander": ("body", "the person leans to and fro"),
+    "face": ("body", "the face looks backwards, or left is right"),
+    "course": ("body", "the person walks sideways or backwards"),
+    "slide": ("body", "the foot that stands slides"),
+    "speed": ("body", "the person is faster than people run"),
+    "climb": ("body", "the person rises and falls faster than people do"),
+    "above": ("ground", "the person is above the drones"),
+    "ground": ("ground", "the feet are not on the ground of the map"),
+    "unposed": ("clock", "pictures were taken when nothing logs a pose"),
+    "actor": ("actor", "the person is elsewhere than the logged actor"),
+    "actor_path": ("actor", "the person takes another way than the logged actor"),
+    "behind": ("residual", "joints are behind the cameras that see them"),
+    "parallax": ("residual", "the cameras look from the same side: the rays hardly cross"),
+}
+_LEAST_ODD = 2.0  # standard deviations
+
+
+def _oddities(described: Score, scene: Scene, flight: Sampled) -> list[Doubt]:
+    """State what is odd about the description as such, the oddest of each code, the oddest first."""
+    names = [camera.name for camera in flight.cameras]
+    residual = residual_px(scene, solve(scene))
+    odd = sorted(described.odd.items(), key=lambda item: -item[1])
+    found: dict[str, Doubt] = {}
+    for name, value in odd:
+        if value >= _LEAST_ODD and name in _ODD:
+            code, said = _ODD[name]
+            what = said.format(stature=described.stature_m, usual=STATURE_M)
+            found.setdefault(code, Doubt(code, names, what, {name: round(value, 2)}, ""))
+    if described.misfit > _LEAST_ODD or "residual" in found or not found:
+        times = f"{described.misfit:.1f} times"
+        what = f"the rays miss each other by {times} what keypoints and poses are stated to err by"
+        evidence = {
+            "misfit": round(described.misfit, 2),
+            "residual_px": residual,
+            "scatter": round(described.scatter, 2),
+        }
+        found["residual"] = Doubt(
+            "residual", names, what, {k: v for k, v in evidence.items() if np.isfinite(v)}, ""
+        )
+    return list(found.values())

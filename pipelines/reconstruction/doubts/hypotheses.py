@@ -1,0 +1,694 @@
+"""Mistakes that a flight's description can hold, each as the scene that undoes it.
+
+A hypothesis has a penalty that grows with its freedom: a discrete one costs 0.5, one number of one camera 1.2
+and more, so that what explains equally well with less freedom is named first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, permutations
+
+import numpy as np
+
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
+from pipelines.reconstruction.doubts import remedies
+from pipelines.reconstruction.doubts.scene import JOINTS, Sampled, Scene, scene_of
+from pipelines.reconstruction.doubts.score import Base, Score, score, solve
+
+RATES = (25 / 30, 24 / 30, 30 / 25, 30 / 24, 2.0, 0.5)
+"""Factors between frame rates that are mistaken for each other: 25 for 30, 24 for 30, half and double."""
+
+_FLU_FROM_OPTICAL = matrix_from_quaternion(np.array([-0.5, 0.5, -0.5, 0.5]))
+_ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
+_FLU_FROM_FRD = np.diag([1.0, -1, -1])
+_FOCAL_FACTORS = (0.5, 2.0, 2 / 3, 1.5, 0.75, 4 / 3)  # calibrations of pictures of another size, or cropped
+_SPARE = 2.0  # hypotheses whose scores are farther from the best need no exact score
+_LONGEST_CLOCK_S = 3.0
+_LEAST_CLOCK_S = 0.05
+_LEAST_OCTAVES = 0.15
+_LEAST_ORIGIN_M = 0.5
+_SAME_PATH_M = 0.1
+_LEFT_RIGHT = [
+    JOINTS.index(name.replace("left", "@").replace("right", "left").replace("@", "right")) for name in JOINTS
+]
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A mistake, the scene without it, and its score."""
+
+    code: str
+    cameras: tuple[str, ...]
+    what: str
+    remedy: str
+    penalty: float
+    scene: Scene | None
+    score: Score | None = None
+    same_scatter: bool = False
+
+    @property
+    def total(self) -> float:
+        """The score with the penalty; what is seen directly, without a scene, wins over everything."""
+        return -np.inf if self.score is None else self.score.total + self.penalty
+
+
+class Trial:
+    """The flight as described, with which hypotheses are made and scored."""
+
+    def __init__(self, flight: Sampled, described: Scene, base: Base) -> None:
+        self.flight = flight
+        self.described = described
+        self.base = base
+        self.best_total = base.total
+        self.names = tuple(camera.name for camera in flight.cameras)
+        self.every = range(len(self.names))
+        self.moving = [index for index, camera in enumerate(flight.cameras) if not camera.static]
+
+    def scored(self, hypothesis: Hypothesis) -> Hypothesis:
+        """Score a hypothesis."""
+        if hypothesis.scene is None:
+            return hypothesis
+        found = score(
+            self.flight,
+            hypothesis.scene,
+            self.base,
+            same_scatter=hypothesis.same_scatter,
+            limit=self.best_total + _SPARE,
+        )
+        scored = replace(hypothesis, score=found)
+        self.best_total = min(self.best_total, scored.total)
+        return scored
+
+    def best(
+        self, make: Callable[[float], Hypothesis], low: float, high: float, count: int, least: float
+    ) -> Hypothesis | None:
+        """Search the value of a hypothesis with one number: a grid, then a golden section about its best.
+
+        Returns:
+            None if the best value is smaller than `least`: noise as stated explains that.
+        """
+        grid = np.linspace(low, high, count)
+        tried = [self.scored(make(float(value))) for value in grid]
+        best = min(range(count), key=lambda index: tried[index].total)
+        chosen, at = tried[best], float(grid[best])
+        if np.isfinite(chosen.total) and chosen.total < self.base.total + 10:
+            inner, value = self._golden(
+                make, float(grid[max(best - 1, 0)]), float(grid[min(best + 1, count - 1)])
+            )
+            if inner.total < chosen.total:
+                chosen, at = inner, value
+        return chosen if abs(at) >= least else None
+
+    def _golden(
+        self, make: Callable[[float], Hypothesis], low: float, high: float
+    ) -> tuple[Hypothesis, float]:
+        ratio = (np.sqrt(5) - 1) / 2
+        left, right = high - ratio * (high - low), low + ratio * (high - low)
+        at_left, at_right = self.scored(make(left)), self.scored(make(right))
+        for _ in range(12):
+            if at_left.total < at_right.total:
+                high, right, at_right = right, left, at_left
+                left = high - ratio * (high - low)
+                at_left = self.scored(make(left))
+            else:
+                low, left, at_left = left, right, at_right
+                right = low + ratio * (high - low)
+                at_right = self.scored(make(right))
+        return (at_left, left) if at_left.total < at_right.total else (at_right, right)
+
+    # --- scenes that differ in one thing ----------------------------------------------------------------
+
+    def turned_in_camera(self, turn: Float, cameras: Sequence[int]) -> Scene:
+        """Turn cameras [3, 3] about their own axes."""
+        return self._rotated(lambda _, rotation: rotation @ turn, cameras)
+
+    def turned_in_world(self, turn: Float, cameras: Sequence[int]) -> Scene:
+        """Turn cameras [3, 3] about the world's axes, where they are."""
+        return self._rotated(lambda _, rotation: turn @ rotation, cameras)
+
+    def turned_in_body(self, turn: Float, cameras: Sequence[int]) -> Scene:
+        """Turn cameras [3, 3] about the axes of the bodies that carry them."""
+        return self._rotated(
+            lambda index, rotation: rotation @ self.mount(index).T @ turn @ self.mount(index), cameras
+        )
+
+    def mount(self, index: int) -> Float:
+        """Return body_from_camera [3, 3] of a camera; looking forwards where it is not fixed to a body."""
+        stored = self.flight.cameras[index].mount
+        return _FLU_FROM_OPTICAL if stored is None else stored
+
+    def _rotated(self, turned: Callable[[int, Float], Float], cameras: Sequence[int]) -> Scene:
+        rotation = self.described.rotation.copy()
+        for index in cameras:
+            rotation[index] = turned(index, rotation[index])
+        return self.described.with_rotation(rotation)
+
+    def late(self, seconds: float, cameras: Sequence[int]) -> Scene:
+        """Add seconds to the times of cameras' pictures."""
+        late_s = np.zeros(len(self.names))
+        late_s[list(cameras)] = seconds
+        return scene_of(self.flight, late_s=late_s)
+
+    def focal(self, factor: float, cameras: Sequence[int]) -> Scene:
+        """Multiply the focal lengths of cameras."""
+        rays, focal_px = self.described.rays.copy(), self.described.focal_px.copy()
+        rays[list(cameras)] /= factor
+        focal_px[list(cameras)] *= factor
+        return replace(self.described, rays=rays, focal_px=focal_px)
+
+    def with_pixels(self, change: Callable[[Float, int], Float]) -> Scene:
+        """Change the pixels [F, J, 2] of every camera."""
+        return scene_of(
+            self.flight,
+            pixels=[change(camera.pixels, camera.intrinsics.width) for camera in self.flight.cameras],
+        )
+
+    def shifted(self, scene: Scene, index: int) -> tuple[Scene, Float]:
+        """Shift a camera [3] m to where its rays meet the others' best: linear, with a prior of 10 m."""
+        solved = solve(scene)
+        normals, distances = [], []
+        for other in self.every:
+            if other == index:
+                continue
+            normal = np.cross(solved.direction[index], solved.direction[other])
+            length = np.linalg.norm(normal, axis=-1)
+            used = solved.seen[index] & solved.seen[other] & (length > 0.1)
+            unit = normal[used] / length[used][:, None]
+            apart = np.broadcast_to((scene.position[index] - scene.position[other])[:, None, :], normal.shape)
+            normals.append(unit)
+            distances.append(-(unit * apart[used]).sum(axis=-1))
+        design, right = np.concatenate(normals), np.concatenate(distances)
+        shift = np.zeros(3)
+        weight = np.ones(len(right))
+        for _ in range(6 if len(right) else 0):
+            weighted = design * weight[:, None]
+            shift = np.linalg.solve(weighted.T @ design + 1e-5 * len(right) * np.eye(3), weighted.T @ right)
+            weight = 1 / np.maximum(np.abs(design @ shift - right), 0.05)
+        position = scene.position.copy()
+        position[index] = position[index] + shift
+        return replace(scene, position=position), shift
+
+    def apart(self) -> Scene:
+        """Shift all cameras but the first that moves, each to where its rays meet the others' best."""
+        scene = self.described
+        for _ in range(8 if len(self.names) > 2 else 1):
+            for index in self.moving[1:]:
+                scene, _ = self.shifted(scene, index)
+        return scene
+
+
+def _turn(axis: str, degrees: float) -> Float:
+    """Return the rotation [3, 3] about an axis."""
+    sine, cosine = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
+    if axis == "x":
+        return np.array([[1.0, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]])
+
+
+# --- what is tried on every flight ---------------------------------------------------------------------
+
+
+def of_times(trial: Trial) -> Iterator[Hypothesis]:
+    """Try clocks of single cameras, and the frame rate of all."""
+    described, names = trial.flight.cameras, trial.names
+    if trial.moving:
+        for index in trial.every:
+            found = trial.best(
+                lambda seconds, index=index: Hypothesis(  # type: ignore[misc]
+                    "clock",
+                    _pair(trial, [index]),
+                    f"the pictures of {names[index]} were taken {seconds:+.3f} s from where their clock says",
+                    remedies.clock(described, [index], seconds),
+                    1.0 + abs(seconds) / 2,
+                    trial.late(seconds, [index]),
+                ),
+                -_LONGEST_CLOCK_S,
+                _LONGEST_CLOCK_S,
+                31,
+                _LEAST_CLOCK_S,
+            )
+            if found is not None:
+                yield found
+    groups = [
+        (list(trial.every), "all cameras", 0.5),
+        *(([index], names[index], 0.8) for index in trial.every),
+    ]
+    for group, said, penalty in groups:
+        for factor in RATES:
+            slower = np.ones(len(names))
+            slower[group] = factor
+            yield trial.scored(
+                Hypothesis(
+                    "frame_rate",
+                    _pair(trial, group),
+                    f"the pictures of {said} follow each other {factor:.3g} times as slowly as stated",
+                    remedies.frame_rate(described, group, factor),
+                    penalty,
+                    scene_of(trial.flight, slower=slower),
+                )
+            )
+
+
+# --- what is tried where something is odd --------------------------------------------------------------
+
+
+def of_descriptions(trial: Trial) -> Iterator[Hypothesis]:
+    """Try everything else."""
+    for hypothesis in _discrete(trial):
+        yield trial.scored(hypothesis)
+    yield from _continuous(trial)
+
+
+def of_paths(trial: Trial) -> Iterator[Hypothesis]:
+    """Find cameras that fly the same path, or start at the same place: no picture is needed for that."""
+    position = trial.described.position
+    for one, other in combinations(trial.moving, 2):
+        apart = np.linalg.norm(position[one] - position[other], axis=-1)
+        apart = apart[np.isfinite(apart)]
+        if not len(apart):
+            continue
+        pair = (trial.names[one], trial.names[other])
+        if np.median(apart) < _SAME_PATH_M:
+            yield Hypothesis(
+                "pose",
+                pair,
+                f"{pair[0]} and {pair[1]} fly the same path: one of them has the other's topic or log",
+                remedies.topic(trial.flight.cameras, one, other),
+                0.0,
+                None,
+            )
+            continue
+        starts = [_start(trial, index) for index in (one, other)]
+        if (
+            starts[0] is not None
+            and starts[1] is not None
+            and np.linalg.norm(starts[0] - starts[1]) < _LEAST_ORIGIN_M
+        ):
+            yield Hypothesis(
+                "origin",
+                pair,
+                f"{pair[0]} and {pair[1]} start at the same place: each log counts from its own start",
+                remedies.own_origins(trial.flight.cameras, trial.apart().position - position),
+                0.0,
+                None,
+            )
+
+
+def _start(trial: Trial, index: int) -> Float | None:
+    """Return the first logged position [3] of a camera."""
+    position: Float = trial.flight.cameras[index].camera.trajectory.position
+    known = position[np.isfinite(position).all(axis=1)]
+    return known[0] if len(known) else None
+
+
+def _discrete(trial: Trial) -> Iterator[Hypothesis]:
+    yield from _permuted(trial)
+    yield from _mounted(trial)
+    yield from _tilts_negated(trial)
+    yield from _conventions(trial)
+    yield from _pixels(trial)
+
+
+def _permuted(trial: Trial) -> Iterator[Hypothesis]:
+    names = trial.names
+    if not 2 <= len(names) <= 5:
+        return
+    for order in permutations(trial.every):
+        moved = [index for index in trial.every if order[index] != index]
+        if moved:
+            said = ", ".join(f"{names[index]} has those of {names[order[index]]}" for index in moved)
+            yield Hypothesis(
+                "videos_swapped",
+                tuple(names[index] for index in moved),
+                f"pictures are exchanged: {said}",
+                remedies.videos(trial.flight.cameras, order),
+                0.5 + 0.25 * (len(moved) - 2),
+                scene_of(trial.flight, order=order),
+            )
+
+
+def _mounted(trial: Trial) -> Iterator[Hypothesis]:
+    """Try cameras that are rolled, or look another way, by right angles: all of them, then each."""
+    groups = [(trial.moving, 0.5), *(([index], 0.8) for index in trial.moving)]
+    for group, penalty in groups:
+        if not group or (len(group) == 1 and penalty == 0.5):
+            continue
+        whose = _whose(trial, group)
+        for degrees in (90, 180, 270):
+            yield Hypothesis(
+                "mount",
+                tuple(trial.names[index] for index in group),
+                f"{whose} rolled by {degrees} deg about the optical axis",
+                remedies.mount(trial.flight.cameras, group, lambda mount, d=degrees: mount @ _turn("z", d)),  # type: ignore[misc]
+                penalty,
+                trial.turned_in_camera(_turn("z", degrees), group),
+            )
+            yield Hypothesis(
+                "mount",
+                tuple(trial.names[index] for index in group),
+                f"{whose} mounted {degrees} deg to the left of where it is said to look",
+                remedies.mount(trial.flight.cameras, group, lambda mount, d=degrees: _turn("z", d) @ mount),  # type: ignore[misc]
+                penalty,
+                trial.turned_in_body(_turn("z", degrees), group),
+            )
+
+
+def _tilts_negated(trial: Trial) -> Iterator[Hypothesis]:
+    """Try the other sign of `down_deg`, of all cameras whose mounts state one."""
+    tilted = [index for index in trial.moving if abs(remedies.down_deg(trial.flight.cameras[index])) > 1]
+    if tilted:
+        cameras = trial.flight.cameras
+        rotation = trial.described.rotation.copy()
+        for index in tilted:
+            rotation[index] = rotation[index] @ _turn("x", 2 * remedies.down_deg(cameras[index]))
+        yield Hypothesis(
+            "mount",
+            tuple(trial.names[index] for index in tilted),
+            "the tilt of every camera has the wrong sign",
+            "; ".join(
+                remedies.mount(cameras, [index], _tilted_by(2 * remedies.down_deg(cameras[index])))
+                for index in tilted
+            ),
+            0.5,
+            trial.described.with_rotation(rotation),
+        )
+
+
+def _tilted_by(degrees: float) -> Callable[[Float], Float]:
+    """Return what tilts a mount upwards."""
+    return lambda mount: mount @ _turn("x", degrees)
+
+
+def _whose(trial: Trial, group: Sequence[int]) -> str:
+    return "every camera is" if len(group) == len(trial.names) else f"{trial.names[group[0]]} is"
+
+
+def _conventions(trial: Trial) -> Iterator[Hypothesis]:
+    """Try other meanings of the logged poses: axes, inverses, orders of quaternions, units."""
+    if not trial.moving:
+        return
+    scene, names, cameras = trial.described, trial.names, trial.flight.cameras
+    still = [index for index in trial.every if index not in trial.moving]
+
+    def hypothesis(code: str, what: str, remedy: str, rotation: Float, position: Float) -> Hypothesis:
+        rotation, position = rotation.copy(), position.copy()
+        rotation[still], position[still] = scene.rotation[still], scene.position[still]
+        changed = replace(scene, rotation=rotation, position=position)
+        return Hypothesis(code, names, what, remedy or f"make the log again: {what}", 0.5, changed)
+
+    mounts = np.stack([trial.mount(index) for index in trial.every])[:, None]
+    camera, place = scene.rotation, scene.position
+    body = camera @ np.swapaxes(mounts, -1, -2)
+    camera_inverse, body_inverse = np.swapaxes(camera, -1, -2), np.swapaxes(body, -1, -2)
+    yield from (
+        hypothesis(
+            "axes",
+            "the poses are in NED, of a body with FRD axes",
+            remedies.pose(cameras, "axes: ned"),
+            _ENU_FROM_NED @ body @ _FLU_FROM_FRD @ mounts,
+            place @ _ENU_FROM_NED.T,
+        ),
+        hypothesis(
+            "axes",
+            "the poses are in NED, of the camera",
+            remedies.pose(cameras, "axes: ned"),
+            _ENU_FROM_NED @ camera,
+            place @ _ENU_FROM_NED.T,
+        ),
+        hypothesis(
+            "axes",
+            "the poses are in ENU, and are taken for NED",
+            remedies.pose(cameras, "axes: enu"),
+            _ENU_FROM_NED.T @ body @ _FLU_FROM_FRD @ mounts,
+            place @ _ENU_FROM_NED,
+        ),
+        hypothesis(
+            "axes",
+            "the body's axes are FRD (forward, right, down)",
+            remedies.mount(cameras, trial.moving, lambda mount: _FLU_FROM_FRD @ mount),
+            body @ _FLU_FROM_FRD @ mounts,
+            place,
+        ),
+        hypothesis("axes", "the positions count z downwards", "", camera, place * [1.0, 1.0, -1.0]),
+        hypothesis("axes", "the positions have x and y exchanged", "", camera, place[..., [1, 0, 2]]),
+        hypothesis(
+            "convention",
+            "the poses are camera_from_world",
+            remedies.pose(cameras, "inverse: true"),
+            camera_inverse,
+            -np.einsum("ctij,ctj->cti", camera_inverse, place),
+        ),
+        hypothesis(
+            "convention",
+            "the poses are body_from_world",
+            remedies.pose(cameras, "inverse: true"),
+            body_inverse @ mounts,
+            -np.einsum("ctij,ctj->cti", body_inverse, place),
+        ),
+        hypothesis(
+            "convention",
+            "the attitudes are camera_from_world, the positions are not",
+            "",
+            camera_inverse,
+            place,
+        ),
+        hypothesis(
+            "convention",
+            "the attitudes are body_from_world, the positions are not",
+            "",
+            body_inverse @ mounts,
+            place,
+        ),
+        hypothesis(
+            "convention",
+            "the poses are of the body, and are taken for the camera's",
+            remedies.of_body(cameras),
+            camera @ _FLU_FROM_OPTICAL,
+            place,
+        ),
+        hypothesis(
+            "convention",
+            "the poses are of the camera, and are taken for the body's",
+            remedies.of_camera(cameras),
+            body,
+            place,
+        ),
+    )
+    for attitudes, carried in ((camera, np.eye(3)), (body, mounts)):
+        quaternion = quaternion_from_matrix(np.where(np.isfinite(attitudes), attitudes, np.eye(3)))
+        for roll, order in ((-1, "wxyz"), (1, "xyzw")):
+            turned = matrix_from_quaternion(np.roll(quaternion, roll, axis=-1))
+            yield hypothesis(
+                "convention",
+                f"the quaternions are written as {' '.join(order)}",
+                remedies.pose(cameras, f"quaternion: {order}"),
+                turned @ carried,
+                place,
+            )
+    for factor, unit in (
+        (0.3048, "ft"),
+        (1e-3, "mm"),
+        (1e-2, "cm"),
+        (1 / 0.3048, "m"),
+        (1e3, "m"),
+        (1e2, "m"),
+    ):
+        known = f"the positions are in {unit}"
+        yield Hypothesis(
+            "unit",
+            names,
+            known if factor < 1 else f"{known}, and {factor:.3g} times what is read",
+            remedies.pose(cameras, f"unit: {unit}"),
+            0.5,
+            replace(scene, position=place * factor),
+            same_scatter=True,
+        )
+
+
+def _pixels(trial: Trial) -> Iterator[Hypothesis]:
+    names, cameras = trial.names, trial.flight.cameras
+    for factor in (2.0, 0.5, 1.5, 2 / 3, 3.0, 1 / 3):
+        yield Hypothesis(
+            "keypoints_size",
+            names,
+            f"the keypoints are of pictures {1 / factor:.3g} times as large",
+            remedies.keypoints_size(cameras, 1 / factor),
+            0.5,
+            trial.with_pixels(lambda pixels, _, f=factor: pixels * f),  # type: ignore[misc]
+        )
+
+    def mirror(pixels: Float, width: int) -> Float:
+        return np.stack([width - 1 - pixels[..., 0], pixels[..., 1]], axis=-1)
+
+    def both(pixels: Float, width: int) -> Float:
+        return mirror(pixels, width)[:, _LEFT_RIGHT]
+
+    def renamed(pixels: Float, _: int) -> Float:
+        return pixels[:, _LEFT_RIGHT]
+
+    for what, value, penalty, change in (
+        ("the pictures were mirrored before the keypoints were found", "true", 0.5, both),
+        ("the keypoints count x from the right", "x", 0.5, mirror),
+        ("left and right are exchanged in the names of joints", "names", 0.8, renamed),
+    ):
+        yield Hypothesis(
+            "mirrored", names, what, remedies.mirrored(cameras, value), penalty, trial.with_pixels(change)
+        )
+
+
+def _continuous(trial: Trial) -> Iterator[Hypothesis]:
+    for found in _each_number(trial):
+        if found is not None:
+            yield found
+    if len(trial.names) > 2 and trial.moving:
+        scene = trial.apart()
+        yield trial.scored(
+            Hypothesis(
+                "origin",
+                trial.names,
+                "every log counts positions from a place of its own",
+                remedies.own_origins(trial.flight.cameras, scene.position - trial.described.position),
+                2.2,
+                scene,
+            )
+        )
+
+
+def _each_number(trial: Trial) -> Iterator[Hypothesis | None]:
+    cameras, names, every = trial.flight.cameras, trial.names, list(trial.every)
+    sigma = trial.described.sigma
+    least_deg = max(3.0, 4 * float(np.degrees(sigma[:, 1].max())))
+
+    def focal(group: list[int], penalty: float) -> Callable[[float], Hypothesis]:
+        return lambda octaves: Hypothesis(
+            "intrinsics",
+            tuple(names[index] for index in group),
+            f"the focal length of {_said(names, group)} is {2**octaves:.3g} times what is stated",
+            remedies.intrinsics(cameras, group, 2**octaves),
+            penalty,
+            trial.focal(2**octaves, group),
+        )
+
+    def pitch(group: list[int], penalty: float) -> Callable[[float], Hypothesis]:
+        return lambda degrees: Hypothesis(
+            "mount",
+            tuple(names[index] for index in group),
+            f"{_said(names, group)} looks {abs(degrees):.0f} deg {_higher(degrees)} than stated",
+            remedies.mount(cameras, group, lambda mount: mount @ _turn("x", degrees)),
+            penalty,
+            trial.turned_in_camera(_turn("x", degrees), group),
+        )
+
+    def heading(group: list[int], penalty: float) -> Callable[[float], Hypothesis]:
+        return lambda degrees: Hypothesis(
+            "pose",
+            _pair(trial, group),
+            f"the heading of {_said(names, group)} is {degrees:+.0f} deg from what is logged"
+            + _relative(trial, group),
+            remedies.mount(cameras, group, lambda mount: _turn("z", degrees) @ mount),
+            penalty,
+            trial.turned_in_world(_turn("z", degrees), group),
+        )
+
+    for factor in _FOCAL_FACTORS:
+        yield trial.scored(focal(every, 0.5)(float(np.log2(factor))))
+    yield trial.best(focal(every, 1.0), -1.5, 1.5, 19, _LEAST_OCTAVES)
+    if trial.moving:
+        moving = trial.moving
+        yield trial.best(pitch(moving, 1.0), -90, 90, 37, least_deg)
+        yield trial.best(heading(moving, 2.2), -180, 170, 36, least_deg)
+        yield trial.best(
+            lambda seconds: Hypothesis(
+                "clock",
+                names,
+                f"the pictures of all cameras were taken {seconds:+.3f} s from where their clocks say",
+                remedies.clock(cameras, every, seconds),
+                1.0 + abs(seconds) / 2,
+                trial.late(seconds, every),
+            ),
+            -_LONGEST_CLOCK_S,
+            _LONGEST_CLOCK_S,
+            31,
+            _LEAST_CLOCK_S,
+        )
+    for index in every:
+        yield trial.best(focal([index], 1.3), -1.5, 1.5, 19, _LEAST_OCTAVES)
+        if index not in trial.moving:
+            continue
+        yield trial.best(pitch([index], 1.3), -90, 90, 37, least_deg)
+        yield trial.best(heading([index], 1.3), -180, 170, 36, least_deg)
+        yield trial.best(_rolled(trial, index), -30, 30, 13, least_deg)
+        yield from _moved(trial, index, least_deg)
+
+
+def _rolled(trial: Trial, index: int) -> Callable[[float], Hypothesis]:
+    return lambda degrees: Hypothesis(
+        "mount",
+        (trial.names[index],),
+        f"{trial.names[index]} is rolled by {degrees:+.0f} deg about the optical axis",
+        remedies.mount(trial.flight.cameras, [index], lambda mount: mount @ _turn("z", degrees)),
+        1.5,
+        trial.turned_in_camera(_turn("z", degrees), [index]),
+    )
+
+
+def _moved(trial: Trial, index: int, least_deg: float) -> Iterator[Hypothesis | None]:
+    """Try another origin of one camera's log, and another north."""
+    cameras, name = trial.flight.cameras, trial.names[index]
+    scene, shift = trial.shifted(trial.described, index)
+    least_m = max(_LEAST_ORIGIN_M, 4 * float(trial.described.sigma[:, 0].max()))
+    if np.linalg.norm(shift) >= least_m:
+        yield trial.scored(
+            Hypothesis(
+                "origin",
+                _pair(trial, [index]),
+                f"the log of {name} has its zero {np.linalg.norm(shift):.1f} m from the world's"
+                + _relative(trial, [index]),
+                remedies.origin(cameras, index, shift, 0.0),
+                1.8,
+                scene,
+            )
+        )
+    located = trial.flight.hips is not None or trial.flight.ground is not None
+    if index == trial.moving[0] and len(trial.names) == 2 and not located:
+        return  # of two, one alone can be turned against the other
+
+    def turned(degrees: float) -> Hypothesis:
+        turn = _turn("z", degrees)
+        rotation, position = trial.described.rotation.copy(), trial.described.position.copy()
+        rotation[index], position[index] = turn @ rotation[index], position[index] @ turn.T
+        scene, shift = trial.shifted(replace(trial.described, rotation=rotation, position=position), index)
+        return Hypothesis(
+            "origin",
+            _pair(trial, [index]),
+            f"the log of {name} has its north {degrees:+.0f} deg from the world's"
+            + _relative(trial, [index]),
+            remedies.origin(cameras, index, shift, degrees),
+            2.2,
+            scene,
+        )
+
+    yield trial.best(turned, -180, 170, 36, least_deg)
+
+
+def _higher(degrees: float) -> str:
+    """Say which way a turn about a camera's x axis tilts it."""
+    return "higher" if degrees > 0 else "lower"
+
+
+def _said(names: Sequence[str], group: Sequence[int]) -> str:
+    return "every camera" if len(group) == len(names) else names[group[0]]
+
+
+def _pair(trial: Trial, group: Sequence[int]) -> tuple[str, ...]:
+    """Name the cameras of a group; of two cameras both, since neither can be told to be the wrong one."""
+    return trial.names if len(trial.names) == 2 else tuple(trial.names[index] for index in group)
+
+
+def _relative(trial: Trial, group: Sequence[int]) -> str:
+    if len(trial.names) == 2 and len(group) == 1:
+        return f" (relative to {trial.names[1 - group[0]]}: either may be wrong)"
+    return ""

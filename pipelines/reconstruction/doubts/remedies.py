@@ -1,0 +1,179 @@
+"""The lines of flight.yaml that undo a mistake, as `cameras.drone1.clock: {offset_s: 0.3}`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import get_args
+
+import numpy as np
+
+from pipelines.geometry.arrays import Float
+from pipelines.geometry.mounting import Looks, body_from_camera
+from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
+from pipelines.reconstruction.doubts.scene import Filmed
+
+_SAME = 1e-3  # of rotation matrices
+
+
+def _lines(cameras: Sequence[Filmed], group: Sequence[int], said: Callable[[Filmed], str]) -> str:
+    return "; ".join(f"cameras.{cameras[index].name}.{said(cameras[index])}" for index in group)
+
+
+def clock(cameras: Sequence[Filmed], group: Sequence[int], seconds: float) -> str:
+    """Move the clocks of cameras' pictures."""
+    return _lines(
+        cameras, group, lambda camera: f"clock.offset_s: {camera.entry.clock.offset_s + seconds:.3f}"
+    )
+
+
+def frame_rate(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
+    """State the frame rate of cameras, whose pictures follow each other `factor` times as slowly."""
+
+    def said(camera: Filmed) -> str:
+        steps = np.diff(camera.t_ns)
+        rate = 1e9 / float(np.median(steps)) / factor if len(steps) else float("nan")
+        return f"frame_times.fps: {_round(rate)}"
+
+    return _lines(cameras, group, said)
+
+
+def _round(rate: float) -> str:
+    """Round a rate to a usual one where it is that but for rounding."""
+    near = round(rate)
+    return f"{near}" if abs(rate / near - 1) < 0.005 else f"{rate:.3f}"
+
+
+def videos(cameras: Sequence[Filmed], order: Sequence[int]) -> str:
+    """Give cameras each other's pictures, or keypoints where those came with the flight."""
+
+    def said(camera: Filmed) -> str:
+        if camera.entry.keypoints is not None:
+            return f"keypoints.path: {camera.entry.keypoints.source}"
+        media = camera.entry.media
+        return f"video: {media.sources[0] if media and media.sources else camera.name}"
+
+    return "; ".join(
+        f"cameras.{cameras[index].name}.{said(cameras[other])}"
+        for index, other in enumerate(order)
+        if index != other
+    )
+
+
+def mount(cameras: Sequence[Filmed], group: Sequence[int], turned: Callable[[Float], Float]) -> str:
+    """Turn body_from_camera [3, 3] of cameras; of a camera without a mount, state what turns its pose."""
+
+    def said(camera: Filmed) -> str:
+        stored = camera.entry.poses.mount
+        if stored is None:
+            forwards = matrix_from_quaternion(body_from_camera("forward"))
+            rotation = quaternion_from_matrix(forwards.T @ turned(forwards))
+            return f"pose.of: body; cameras.{camera.name}.mount: {_rigid([0.0, 0.0, 0.0], rotation)}"
+        rotation = turned(matrix_from_quaternion(np.array(stored.rotation_xyzw)))
+        words = _as_words(rotation, stored.translation)
+        return f"mount: {words or _rigid(stored.translation, quaternion_from_matrix(rotation))}"
+
+    return _lines(cameras, group, said)
+
+
+def down_deg(camera: Filmed) -> float:
+    """Return by how much a camera's mount tilts it down; 0 without a mount, or where that is no tilt."""
+    mount = camera.mount
+    if mount is None:
+        return 0.0
+    tilt = float(np.degrees(np.arcsin(np.clip(-mount[2, 2], -1, 1))))
+    return tilt if abs(mount[2, 0]) < _SAME else 0.0  # the picture's right is level
+
+
+def _rigid(translation: Sequence[float], rotation_xyzw: Float) -> str:
+    numbers = ", ".join(f"{value:.6f}" for value in rotation_xyzw)
+    return f"{{body_from_camera: {{translation: {_vector(translation)}, rotation_xyzw: [{numbers}]}}}}"
+
+
+def _vector(values: Sequence[float]) -> str:
+    return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"
+
+
+def _as_words(rotation: Float, translation: Sequence[float]) -> str | None:
+    """State a mount as `looks` and `down_deg` where it is one."""
+    for looks in get_args(Looks):
+        level = matrix_from_quaternion(body_from_camera(looks))
+        tilt = level.T @ rotation
+        angle = float(np.degrees(np.arctan2(tilt[2, 1], tilt[1, 1])))
+        for down_deg in (0.0,) if looks in ("down", "up") else (angle, -angle):
+            if abs(down_deg) > 90:
+                continue
+            same = matrix_from_quaternion(body_from_camera(looks, down_deg))
+            if np.abs(same - rotation).max() < _SAME:
+                down = f", down_deg: {down_deg:.1f}" if abs(down_deg) >= 0.05 else ""
+                return f"{{looks: {looks}{down}, translation: {_vector(translation)}}}"
+    return None
+
+
+def pose(cameras: Sequence[Filmed], key: str) -> str:
+    """State how the poses of the moving cameras are written."""
+    return _lines(cameras, _moving(cameras), lambda _: f"pose.{key}")
+
+
+def of_body(cameras: Sequence[Filmed]) -> str:
+    """State that the poses of the moving cameras are of bodies, on which the cameras look forwards."""
+    both = "pose.of: body; cameras.{}.mount: {{looks: forward}}"
+    return _lines(cameras, _moving(cameras), lambda camera: both.format(camera.name))
+
+
+def of_camera(cameras: Sequence[Filmed]) -> str:
+    """State that the poses of the moving cameras are their own, without a mount."""
+    both = "pose.of: camera; cameras.{}.mount: null"
+    return _lines(cameras, _moving(cameras), lambda camera: both.format(camera.name))
+
+
+def _moving(cameras: Sequence[Filmed]) -> list[int]:
+    return [index for index, camera in enumerate(cameras) if not camera.static]
+
+
+def keypoints_size(cameras: Sequence[Filmed], factor: float) -> str:
+    """State the size of the pictures that keypoints are of."""
+
+    def said(camera: Filmed) -> str:
+        width, height = camera.intrinsics.width * factor, camera.intrinsics.height * factor
+        return f"keypoints.image_size: [{width:.0f}, {height:.0f}]"
+
+    return _lines(cameras, range(len(cameras)), said)
+
+
+def mirrored(cameras: Sequence[Filmed], value: str) -> str:
+    """State that keypoints are mirrored."""
+    return _lines(cameras, range(len(cameras)), lambda _: f"keypoints.mirrored: {value}")
+
+
+def intrinsics(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -> str:
+    """Multiply the focal lengths of cameras."""
+
+    def said(camera: Filmed) -> str:
+        own = camera.intrinsics
+        model = "" if own.model == "none" else f", model: {own.model}, distortion: {list(own.distortion)}"
+        return (
+            f"intrinsics: {{width: {own.width}, height: {own.height}, fx: {own.fx * factor:.1f},"
+            f" fy: {own.fy * factor:.1f}, cx: {own.cx:.1f}, cy: {own.cy:.1f}{model}}}"
+        )
+
+    return _lines(cameras, group, said)
+
+
+def topic(cameras: Sequence[Filmed], one: int, other: int) -> str:
+    """Ask for the topic or log of each of two cameras that have the same."""
+    return _lines(
+        cameras, (one, other), lambda camera: f"pose: {{log: ..., topic: ...}}  # that of {camera.name}"
+    )
+
+
+def origin(cameras: Sequence[Filmed], index: int, shift: Float | None, yaw_deg: float | None) -> str:
+    """Place the world of a camera's log in the flight's."""
+    translation = "[east, north, up]" if shift is None else _vector(np.round(shift, 2).tolist())
+    turn = f", yaw_deg: {yaw_deg:.1f}" if yaw_deg else ""
+    return _lines(cameras, [index], lambda _: f"pose.world_from_source: {{translation: {translation}{turn}}}")
+
+
+def own_origins(cameras: Sequence[Filmed], shifts: Float) -> str:
+    """Place the worlds of all logs; `shifts` [C, T, 3] are constant in time."""
+    moved = [index for index in range(len(cameras)) if np.nanmax(np.abs(shifts[index])) > 0]
+    return "; ".join(origin(cameras, index, np.nanmedian(shifts[index], axis=0), None) for index in moved)

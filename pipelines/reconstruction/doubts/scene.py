@@ -1,0 +1,317 @@
+"""A flight sampled at a few moments: whom each camera saw, from where, and how surely.
+
+Every hypothesis about a mistake in the flight's description is another scene of the same moments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.cameras import Intrinsics, undistort
+from pipelines.geometry.poses import matrix_from_quaternion
+from pipelines.reconstruction.observations import Camera
+from pipelines.session.camera_poses import stated_models
+from pipelines.session.description import CameraEntry, Description, Interpolation
+from pipelines.session.people import LoggedActor
+from pipelines.session.records import Int64, Occupancy
+
+JOINTS = (
+    "nose",
+    "left_ear",
+    "right_ear",
+    *(
+        f"{side}_{joint}"
+        for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+        for side in ("left", "right")
+    ),
+)
+"""The joints that are looked at; every skeleton of people has most of them."""
+
+MOMENTS = 60
+"""Moments of the flight that are looked at, in pairs of `STEP_NS`."""
+
+STEP_NS = 100_000_000
+"""Between the two moments of a pair, for speeds."""
+
+_UNKNOWN = (
+    0.3,
+    np.radians(1.0),
+    0.1,
+    np.radians(0.3),
+)  # of poses whose noise nobody states, in a usual flight
+_CALIBRATED = (0.003, 0.001, 0.0, 0.0)  # of a still camera
+_LONGEST_GAP_NS = 250_000_000  # between two pictures across which a keypoint is interpolated
+_NEW_SHARE = 0.5  # of a logged covariance: the part that is drawn anew in every pose
+
+
+class PoseSigma(NamedTuple):
+    """Standard deviations per axis of a camera's poses, and of the part that is new in every pose."""
+
+    position_m: float
+    rotation_rad: float
+    white_position_m: float
+    white_rotation_rad: float
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """One camera with the pixels of the person that it shows most."""
+
+    name: str
+    intrinsics: Intrinsics
+    t_ns: Int64  # [F] of its pictures
+    pixels: Float  # [F, J, 2] of `JOINTS`; NaN where nothing was found
+    camera: Camera
+    entry: CameraEntry
+    sigma: PoseSigma
+
+    @property
+    def static(self) -> bool:
+        """True if the camera stands still."""
+        return self.camera.static
+
+    @property
+    def mount(self) -> Float | None:
+        """body_from_camera [3, 3] where the camera is fixed to the body whose pose is logged, else None."""
+        stored = self.entry.poses.mount
+        return None if stored is None else matrix_from_quaternion(np.array(stored.rotation_xyzw))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What C cameras saw at T moments."""
+
+    rays: Float  # [C, T, J, 2] normalised image coordinates; NaN where nothing was seen
+    position: Float  # [C, T, 3] m
+    rotation: Float  # [C, T, 3, 3] world_from_camera
+    focal_px: Float  # [C]
+    sigma: Float  # [C, 4] as `PoseSigma`
+    person_px: Float  # [C] height of the person in the pictures, median
+
+    def with_rotation(self, rotation: Float) -> Scene:
+        """Replace the attitudes."""
+        return replace(self, rotation=rotation)
+
+
+class Sampled(NamedTuple):
+    """A flight as a diagnosis takes it."""
+
+    cameras: tuple[Filmed, ...]
+    between: Interpolation
+    t_ns: Int64  # [T] moments; those of a pair follow each other in `first` and `second`
+    first: Int64  # [T / 2] index of the first moment of each pair
+    second: Int64  # [T / 2]
+    hips: Float | None  # [T, 3] m, logged; None without a logged actor
+    ground: Ground | None
+
+
+class Ground(NamedTuple):
+    """Height of the ground, the top of the lowest occupied run of every column of a map."""
+
+    corner: Float  # [2] m
+    side_m: float
+    height: Float  # [X, Y] m; NaN where nothing is occupied
+
+    @classmethod
+    def of(cls, occupancy: Occupancy) -> Ground:
+        """Find the ground of a map."""
+        occupied = occupancy.probability > 0.5
+        first = np.argmax(occupied, axis=2)
+        above = np.arange(occupied.shape[2]) >= first[..., None]
+        free_above = ~occupied & above
+        top = np.where(free_above.any(axis=2), np.argmax(free_above, axis=2), occupied.shape[2])
+        height = occupancy.origin[2] + top * occupancy.resolution_m
+        return cls(
+            np.asarray(occupancy.origin[:2], dtype=np.float64),
+            occupancy.resolution_m,
+            np.where(occupied.any(axis=2), height, np.nan),
+        )
+
+    def under(self, points: Float) -> Float:
+        """Return the ground's height [N] under points [N, 3]; NaN beside the map."""
+        with np.errstate(invalid="ignore"):
+            cell = np.floor((points[:, :2] - self.corner) / self.side_m)
+            inside = np.all((cell >= 0) & (cell < self.height.shape), axis=1)
+        index = np.where(inside[:, None], cell, 0).astype(np.intp)
+        return np.where(inside, self.height[index[:, 0], index[:, 1]], np.nan)
+
+
+def sample(
+    cameras: list[Camera],
+    description: Description,
+    *,
+    actor: LoggedActor | None,
+    last_map: Occupancy | None,
+    chosen: Sequence[Int64] | None = None,
+    pose_noise: str | None = None,
+) -> Sampled | None:
+    """Choose the moments and the person; None where the cameras share no time.
+
+    Args:
+        cameras: with their detections.
+        description: session.json.
+        actor: where the actor was logged.
+        last_map: the map at the flight's end.
+        chosen: which detection [F] of each camera's pictures the person is, -1 for none; by default the
+            person whom a camera shows in most pictures.
+        pose_noise: the value of `--pose-noise`, if any.
+    """
+    filmed = tuple(
+        Filmed(
+            camera.name,
+            camera.intrinsics,
+            camera.frame_t_ns,
+            _pixels(camera, _most_seen(camera) if chosen is None else _chosen(camera, chosen[index])),
+            camera,
+            description.cameras[camera.name],
+            _sigma(camera, description.cameras[camera.name], pose_noise),
+        )
+        for index, camera in enumerate(cameras)
+    )
+    start = max(int(camera.t_ns[0]) for camera in filmed)
+    end = min(int(camera.t_ns[-1]) for camera in filmed)
+    if end - start <= STEP_NS:
+        return None
+    before = np.linspace(start, end - 1.1 * STEP_NS, MOMENTS // 2).astype(np.int64)
+    t_ns = np.sort(np.concatenate([before, before + STEP_NS]))
+    return Sampled(
+        filmed,
+        description.pose_interpolation,
+        t_ns,
+        np.searchsorted(t_ns, before),
+        np.searchsorted(t_ns, before + STEP_NS),
+        None if actor is None else actor.hips_at(t_ns),
+        None if last_map is None else Ground.of(last_map),
+    )
+
+
+def _most_seen(camera: Camera) -> Int64:
+    """Return the detections of the person whom the camera shows in most pictures.
+
+    People are told apart by the detector's own number; where that person is missing, the next is taken.
+    """
+    found = camera.detections
+    number, count = np.unique(found.person, return_counts=True)
+    rank = np.empty(len(number), dtype=np.intp)
+    rank[np.argsort(-count, kind="stable")] = np.arange(len(number))
+    order = np.lexsort((rank[np.searchsorted(number, found.person)], found.frame))
+    first: Int64 = order[np.unique(found.frame[order], return_index=True)[1]]
+    return first
+
+
+def _chosen(camera: Camera, of_frame: Int64) -> Int64:
+    """Return the detections that were chosen, by their rank [F] among those of their picture."""
+    frame = np.flatnonzero(of_frame >= 0)
+    return np.searchsorted(camera.detections.frame, frame) + of_frame[frame]
+
+
+def _pixels(camera: Camera, detection: Int64) -> Float:
+    """Return the pixels [F, J, 2] of given detections, at most one of a picture."""
+    found = camera.detections
+    pixels = np.full((len(camera.frame_t_ns), len(JOINTS), 2), np.nan)
+    for joint, name in enumerate(JOINTS):
+        if name in found.joints:
+            pixels[found.frame[detection], joint] = found.xy[detection, found.joints.index(name)]
+    return pixels
+
+
+def _sigma(camera: Camera, entry: CameraEntry, pose_noise: str | None) -> PoseSigma:
+    models = stated_models(camera.name, entry, pose_noise)
+    if models is not None:
+        white = [model for model in models if type(model).__name__ == "White"]
+        return PoseSigma(*_level(models), *_level(white))
+    if camera.sigma is not None:
+        position, rotation = np.median(camera.sigma, axis=0)
+        share = np.sqrt(_NEW_SHARE)
+        return PoseSigma(float(position), float(rotation), share * position, share * rotation)
+    return PoseSigma(*(_CALIBRATED if camera.static else _UNKNOWN))
+
+
+def _level(models: Sequence[object]) -> tuple[float, float]:
+    position = sum(getattr(model, "position_m", 0.0) ** 2 for model in models)
+    rotation = sum(getattr(model, "rotation_deg", 0.0) ** 2 for model in models)
+    return float(np.sqrt(position)), float(np.radians(np.sqrt(rotation)))
+
+
+# --- the scene as described, and with other pixels and times -------------------------------------------
+
+
+def scene_of(
+    flight: Sampled,
+    *,
+    late_s: Float | None = None,
+    slower: Float | None = None,
+    order: tuple[int, ...] | None = None,
+    pixels: list[Float] | None = None,
+) -> Scene:
+    """Look at the flight's moments.
+
+    Args:
+        flight: the flight.
+        late_s: [C] added to the times of each camera's pictures.
+        slower: [C] factor of the times between each camera's pictures.
+        order: whose pictures each camera has; its own by default.
+        pixels: other pixels [F, J, 2] of each camera's pictures.
+    """
+    cameras = flight.cameras
+    rays, person_px = [], []
+    for index, camera in enumerate(cameras):
+        source = cameras[index if order is None else order[index]]
+        seen = source.pixels if pixels is None else pixels[index]
+        since = (source.t_ns - flight.t_ns[0]).astype(np.float64)
+        if slower is not None:
+            since = since[0] + (since - since[0]) * slower[index]
+        if late_s is not None:
+            since = since + late_s[index] * 1e9
+        at = _interpolated(since, seen, (flight.t_ns - flight.t_ns[0]).astype(np.float64))
+        rays.append(undistort(at, camera.intrinsics))
+        person_px.append(_median(_extent(at)))
+    position, rotation = _poses(flight)
+    return Scene(
+        np.array(rays),
+        position,
+        rotation,
+        np.array([(camera.intrinsics.fx + camera.intrinsics.fy) / 2 for camera in cameras]),
+        np.array([camera.sigma for camera in cameras]),
+        np.nan_to_num(np.array(person_px)),
+    )
+
+
+def _poses(flight: Sampled) -> tuple[Float, Float]:
+    posed = [camera.camera.poses_at(flight.t_ns, flight.between) for camera in flight.cameras]
+    return np.array([position for position, _ in posed]), np.array([rotation for _, rotation in posed])
+
+
+def _interpolated(since: Float, values: Float, at: Float) -> Float:
+    """Interpolate values [F, J, 2] at times [T] (both ns); NaN across gaps and outside."""
+    if len(since) < 2:
+        return np.full((len(at), *values.shape[1:]), np.nan)
+    steps = np.diff(since)
+    longest = max(_LONGEST_GAP_NS, 1.5 * float(np.median(steps)))
+    before = np.clip(np.searchsorted(since, at, side="right") - 1, 0, len(since) - 2)
+    fraction = (at - since[before]) / steps[before]
+    within = (fraction >= 0) & (fraction <= 1) & (steps[before] <= longest)
+    weight = fraction[:, None, None]
+    between: Float = values[before] * (1 - weight) + values[before + 1] * weight
+    between[~within] = np.nan
+    return between
+
+
+def _extent(pixels: Float) -> Float:
+    """Return the height [T] px of a person in each picture; NaN where nobody is."""
+    row = pixels[..., 1]
+    seen = np.isfinite(row)
+    some = seen.any(axis=1)
+    high = np.where(seen, row, -np.inf).max(axis=1)
+    low = np.where(seen, row, np.inf).min(axis=1)
+    return np.where(some, high - np.where(some, low, 0.0), np.nan)
+
+
+def _median(values: Float) -> float:
+    finite: Bool = np.isfinite(values)
+    return float(np.median(values[finite])) if finite.any() else float("nan")

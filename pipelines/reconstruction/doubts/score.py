@@ -1,0 +1,432 @@
+"""How well a scene fits itself, and how much its people are people.
+
+Lower is better. A score adds three things:
+
+- the distances of rays from the joints that they make, over what keypoints and poses are stated to err by;
+- how odd the body, its place and its motion are, each against what is published of people;
+- the scatter of two cameras' rays within one picture, after a constant error of each pose was fitted with
+  its stated standard deviation as prior. Clocks and wrong conventions leave it, constant errors do not.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from pipelines.geometry.arrays import Bool, Float
+from pipelines.reconstruction.doubts.scene import JOINTS, STEP_NS, Sampled, Scene
+
+IMPOSSIBLE = 99.0
+"""Score of a scene in which next to nothing is seen by two cameras."""
+
+_INDEX = {name: index for index, name in enumerate(JOINTS)}
+_KEYPOINT_PX = 3.0
+_KEYPOINT_SHARE = (
+    0.015  # of the person's height in the picture; measured for BlazePose at 0 to 30 deg of tilt
+)
+_CHI2_MEDIAN = {1: 0.455, 3: 0.789, 5: 0.870}  # median of chi^2 over its degrees of freedom, by those
+_CHI2_MEDIAN_MORE = 0.9
+_FARTHEST_M = 30.0  # a joint farther away says nothing of how far stated errors move it
+_FEWEST = 60  # joints that two cameras see, in all moments
+
+# Lengths of limbs over stature: Winter, Biomechanics and Motor Control of Human Movement, 4th ed., fig. 4.1,
+# after Drillis and Contini 1964; from the middle of the hips to that of the shoulders for the torso.
+_LIMBS = (
+    ("left_hip", "left_knee", 0.245),
+    ("right_hip", "right_knee", 0.245),
+    ("left_knee", "left_ankle", 0.246),
+    ("right_knee", "right_ankle", 0.246),
+    ("left_shoulder", "left_elbow", 0.172),
+    ("right_shoulder", "right_elbow", 0.172),
+    ("left_elbow", "left_wrist", 0.150),
+    ("right_elbow", "right_wrist", 0.150),
+)
+_TORSO = 0.295
+STATURE_M = 1.73
+"""Of a grown-up; 95 % are within 17 % of it (NCD-RisC 2016, men and women together)."""
+
+_ANKLE_ABOVE_GROUND_M = 0.08
+SCATTER_WEIGHT = 12.0
+SCATTER_RANGE = (0.4, 30.0)  # what is less is no better: keypoints scatter by themselves
+
+
+class Score(NamedTuple):
+    """The score of a scene, and what it is made of."""
+
+    total: float
+    misfit: float  # of rays, standard deviations
+    scatter: float  # of rays within pictures, over the pixel noise
+    odd: dict[str, float]  # how odd each thing about the person is, in its own standard deviations
+    stature_m: float
+
+
+class Base(NamedTuple):
+    """The described scene, against which others are scored."""
+
+    total: float
+    scatter: float
+    covered: float  # share of joints and moments that two cameras see
+
+
+class Solved(NamedTuple):
+    """Joints of a scene."""
+
+    joints: Float  # [T, J, 3] m; NaN where fewer than two cameras see one
+    chi2: Float  # [T, J]
+    views: Float  # [T, J] how many cameras see it
+    in_front: Bool  # [T, J]
+    direction: Float  # [C, T, J, 3] unit rays in the world
+    seen: Bool  # [C, T, J]
+    depth: Float  # [C, T, J] m
+
+
+def solve(scene: Scene) -> Solved:
+    """Triangulate by least squares of distances to rays, weighted by what keypoints and poses err by."""
+    ones = np.ones((*scene.rays.shape[:-1], 1))
+    local = np.concatenate([scene.rays, ones], axis=-1)
+    local /= np.linalg.norm(local, axis=-1, keepdims=True)
+    direction = np.einsum("ctij,cthj->cthi", scene.rotation, local)
+    posed = np.asarray(np.isfinite(scene.position).all(axis=-1))[..., None]
+    seen = np.isfinite(direction).all(axis=-1) & posed
+    direction = np.where(seen[..., None], direction, 0.0)
+    position = np.where(posed[..., None], np.nan_to_num(scene.position)[:, :, None, :], 0.0)
+    across = np.eye(3) - direction[..., :, None] * direction[..., None, :]
+    across_position = np.einsum("cthij,cthj->cthi", across, np.broadcast_to(position, direction.shape))
+    angle2 = (_pixel_variance(scene) / scene.focal_px**2 + scene.sigma[:, 1] ** 2)[:, None, None]
+    place2 = (scene.sigma[:, 0] ** 2)[:, None, None]
+    depth = np.full(seen.shape, 10.0)
+    for _ in range(2):
+        distance = np.clip(np.abs(depth), 1e-3, 1e5)
+        weight = np.where(seen, 1.0 / (distance**2 * angle2 + place2), 0.0)
+        joints = _solve_symmetric(
+            np.einsum("cth,cthij->thij", weight, across), np.einsum("cth,cthi->thi", weight, across_position)
+        )
+        offset = joints[None] - position
+        depth = (offset * direction).sum(axis=-1)
+    miss2 = ((offset - depth[..., None] * direction) ** 2).sum(axis=-1)
+    views = seen.sum(axis=0)
+    joints = np.where((views >= 2)[..., None], joints, np.nan)
+    in_front = ((depth > 0) | ~seen).all(axis=0)
+    return Solved(joints, (weight * miss2).sum(axis=0), views, in_front, direction, seen, depth)
+
+
+def _pixel_variance(scene: Scene) -> Float:
+    variance: Float = _KEYPOINT_PX**2 + (_KEYPOINT_SHARE * scene.person_px) ** 2
+    return variance
+
+
+def _solve_symmetric(matrix: Float, right: Float) -> Float:
+    """Solve systems [..., 3, 3] by the adjugate."""
+    a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2]
+    d, e, f = matrix[..., 1, 1], matrix[..., 1, 2], matrix[..., 2, 2]
+    first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * first + b * second + c * third
+    determinant = np.where(np.abs(determinant) > 1e-30, determinant, 1e-30)
+    x, y, z = right[..., 0], right[..., 1], right[..., 2]
+    middle, last, cross = a * f - c * c, a * d - b * b, b * c - a * e
+    solved: Float = (
+        np.stack(
+            [
+                first * x + second * y + third * z,
+                second * x + middle * y + cross * z,
+                third * x + cross * y + last * z,
+            ],
+            axis=-1,
+        )
+        / determinant[..., None]
+    )
+    return solved
+
+
+@np.errstate(invalid="ignore", divide="ignore")
+def score(
+    flight: Sampled,
+    scene: Scene,
+    base: Base | None = None,
+    *,
+    same_scatter: bool = False,
+    limit: float = np.inf,
+) -> Score:
+    """Score a scene.
+
+    Args:
+        flight: its flight.
+        scene: the scene.
+        base: the scene as described; None if it is that.
+        same_scatter: True where a hypothesis can only seem to change the scatter, as a unit of lengths does.
+        limit: a score above it need not be exact: what takes time is left out once that is certain.
+    """
+    solved = solve(scene)
+    good = solved.views >= 2
+    if good.sum() < _FEWEST or (base is not None and good.mean() < 0.4 * base.covered):
+        return Score(IMPOSSIBLE, np.inf, np.inf, {}, np.nan)
+    misfit = _misfit(solved, good)
+    # Two cameras have one draw of constant errors between them: chi^2 of few.
+    soft = 2.0 if len(scene.focal_px) == 2 else 1.5
+    behind = (1 - float(solved.in_front[good].mean())) / 0.05
+    total = float(2 * np.log1p((misfit / soft) ** 2) + np.log1p(behind**2))
+    reference = None if base is None or same_scatter else base.scatter
+    gain = 0.0 if reference is None else SCATTER_WEIGHT * np.log(reference / SCATTER_RANGE[0])
+    if total - gain > limit:
+        return Score(total, misfit, np.inf, {"behind": behind}, np.nan)
+    person = _person(flight, scene, solved)
+    if person is None:
+        return Score(IMPOSSIBLE, misfit, np.inf, {}, np.nan)
+    odd = {"parallax": _parallax(solved)} | person.odd
+    total += sum(float(np.log1p(min(value, 50.0) ** 2)) for value in odd.values() if np.isfinite(value))
+    odd["behind"] = behind
+    if total - gain > limit:
+        return Score(total, misfit, np.inf, odd, person.stature_m)
+    scatter = _scatter(scene, solved)
+    if reference is not None:
+        total += SCATTER_WEIGHT * float(np.log(np.clip(scatter, *SCATTER_RANGE) / reference))
+    return Score(total, misfit, scatter, odd, person.stature_m)
+
+
+def base_of(flight: Sampled, scene: Scene) -> tuple[Base, Score]:
+    """Score the scene as described; other scenes are scored against it."""
+    described = score(flight, scene)
+    scatter = float(np.clip(described.scatter, *SCATTER_RANGE))
+    covered = float((solve(scene).views >= 2).mean())
+    return Base(described.total, scatter, covered), described
+
+
+def _misfit(solved: Solved, good: Bool) -> float:
+    """Return the root of the median chi^2 over its freedom: 1 where all is as stated."""
+    freedom = 2 * solved.views - 3
+    total, count = 0.0, 0
+    for value in np.unique(freedom[good]):
+        among = good & (freedom == value)
+        usual = _CHI2_MEDIAN.get(int(value), _CHI2_MEDIAN_MORE)
+        total += among.sum() * float(np.median(solved.chi2[among])) / value / usual
+        count += int(among.sum())
+    return float(np.sqrt(total / count))
+
+
+def _parallax(solved: Solved) -> float:
+    """Say how far the best pair of cameras is from seeing a person from two sides (0.1 rad)."""
+    best = 0.0
+    for one, other in combinations(range(len(solved.seen)), 2):
+        both = solved.seen[one] & solved.seen[other]
+        if both.any():
+            sine = np.linalg.norm(
+                np.cross(solved.direction[one][both], solved.direction[other][both]), axis=-1
+            )
+            best = max(best, float(np.median(sine)))
+    return max(0.0, 0.1 / max(best, 1e-4) - 1)
+
+
+def _scatter(scene: Scene, solved: Solved) -> float:
+    """Return the scatter of two cameras' rays within pictures over the pixel noise, mean over the pairs."""
+    variance = _pixel_variance(scene) / scene.focal_px**2
+    distance = np.clip(np.abs(solved.depth), 1e-4, 1e5)
+    found = [
+        _scatter_of_pair(scene, solved, distance, variance, pair)
+        for pair in combinations(range(len(scene.focal_px)), 2)
+    ]
+    known = [value for value in found if value is not None]
+    return float(np.mean(known)) if known else 9.0
+
+
+def _scatter_of_pair(
+    scene: Scene, solved: Solved, distance: Float, variance: Float, pair: tuple[int, int]
+) -> float | None:
+    """Fit constant errors of both poses to the rays' signed distances [T, J], and measure what they leave.
+
+    The distance of two rays along their common normal changes by the normal with a shift of a camera, and
+    by the lever (distance times ray) across the normal with a turn.
+    """
+    one, other = pair
+    normal = np.cross(solved.direction[one], solved.direction[other])
+    length = np.linalg.norm(normal, axis=-1)
+    used = solved.seen[one] & solved.seen[other] & (length > 0.15)
+    if used.sum() < _FEWEST:
+        return None
+    baseline = (scene.position[other] - scene.position[one])[:, None, :]
+    normal = normal / np.where(used, length, 1.0)[..., None]
+    apart = (normal * baseline).sum(axis=-1)[used]
+    noise = np.sqrt(
+        np.median((distance[one] ** 2 * variance[one] + distance[other] ** 2 * variance[other])[used])
+    )
+    columns = []
+    for camera, sign in ((one, -1.0), (other, 1.0)):
+        lever = distance[camera][..., None] * np.cross(solved.direction[camera], normal)
+        turned = np.einsum("tki,tjk->tji", scene.rotation[camera], lever)
+        columns += [sign * normal * scene.sigma[camera, 0], sign * turned * scene.sigma[camera, 1]]
+    design = np.nan_to_num(np.concatenate(columns, axis=-1)[used])
+    apart = np.nan_to_num(apart)
+    share = used.shape[0] / len(apart)  # a picture is one observation of a constant error
+    weight = np.ones(len(apart))
+    for _ in range(3):
+        weighted = design * (weight * share / noise**2)[:, None]
+        constant = np.linalg.solve(weighted.T @ design + np.eye(design.shape[1]), weighted.T @ apart)
+        left = apart - design @ constant
+        weight = 1 / np.maximum(np.abs(left) / (1.5 * noise), 1.0)
+    residual = np.full(used.shape, np.nan)
+    residual[used] = left
+    middle = _median_of_rows(residual)
+    return float(1.48 * np.median(np.abs(residual - middle[:, None])[used]) / noise)
+
+
+def _median_of_rows(values: Float) -> Float:
+    """Return the median of each row [T], NaN where nothing is finite; nanmedian is slow on small arrays."""
+    ordered = np.sort(values, axis=1)  # NaN last
+    count = np.isfinite(values).sum(axis=1)
+    low, high = np.maximum(count - 1, 0) // 2, count // 2
+    row = np.arange(len(values))
+    high = np.minimum(high, values.shape[1] - 1)
+    middle: Float = np.where(count > 0, (ordered[row, low] + ordered[row, high]) / 2, np.nan)
+    return middle
+
+
+class _Person(NamedTuple):
+    odd: dict[str, float]
+    stature_m: float
+
+
+def _person(flight: Sampled, scene: Scene, solved: Solved) -> _Person | None:
+    """Say how odd the person is; None if too few limbs are seen."""
+    body = _Body(solved.joints)
+    lengths = body.lengths()
+    medians = np.array([_median(length) for length, _ in lengths])
+    statures = medians / np.array([share for _, share in lengths])
+    if np.isfinite(statures).sum() < 5:
+        return None
+    stature = float(np.nanmedian(statures))
+    odd = {
+        "size": max(0.0, abs(np.log(stature / STATURE_M)) - 0.08) / 0.09,
+        "shape": float(np.nanmedian(np.abs(np.log(statures / stature)))) / 0.10,
+        "limp": float(np.nanmedian([_spread(length) for length, _ in lengths])) / 0.10,
+    }
+    odd["unposed"] = _unposed(scene) / 0.05
+    odd |= body.posture()
+    odd |= body.motion(flight, stature)
+    odd |= _place(flight, scene, solved, body)
+    return _Person(odd, stature)
+
+
+def _unposed(scene: Scene) -> float:
+    """Return the share of moments with a person in the picture and no pose, of the camera with the most."""
+    seen = np.isfinite(scene.rays[..., 0]).any(axis=-1)
+    posed = np.isfinite(scene.position).all(axis=-1)
+    return min(0.2, float((seen & ~posed).mean(axis=1).max()))
+
+
+class _Body:
+    """The joints of a person [T, J, 3] by name."""
+
+    def __init__(self, joints: Float) -> None:
+        self.joints = joints
+        self.hips = (self["left_hip"] + self["right_hip"]) / 2
+        self.shoulders = (self["left_shoulder"] + self["right_shoulder"]) / 2
+        self.ankles = (self["left_ankle"] + self["right_ankle"]) / 2
+
+    def __getitem__(self, name: str) -> Float:
+        joint: Float = self.joints[:, _INDEX[name]]
+        return joint
+
+    def lengths(self) -> list[tuple[Float, float]]:
+        """List the lengths [T] m of limbs and torso, and their usual shares of the stature."""
+        limbs = [(np.linalg.norm(self[start] - self[end], axis=-1), share) for start, end, share in _LIMBS]
+        return [*limbs, (np.linalg.norm(self.hips - self.shoulders, axis=-1), _TORSO)]
+
+    def posture(self) -> dict[str, float]:
+        """Say how far the person is from upright, and from a face in front."""
+        cosine = self._cosine()
+        middle = _median(cosine)
+        odd = {"upright": (1 - middle) / 0.15, "wander": _median(np.abs(cosine - middle)) / 0.1}
+        forwards = self._forwards()
+        nose = ((self["nose"] - (self["left_ear"] + self["right_ear"]) / 2) * forwards).sum(axis=-1)
+        nose = nose[np.isfinite(nose)]
+        if len(nose) > 20:
+            odd["face"] = max(0.0, 0.6 - float((nose > 0).mean())) / 0.06
+        return odd
+
+    def _cosine(self) -> Float:
+        """Return the cosine [T] of the body against the vertical."""
+        upwards = self.shoulders - self.ankles
+        cosine: Float = upwards[:, 2] / np.linalg.norm(upwards, axis=-1)
+        return cosine
+
+    def _forwards(self) -> Float:
+        """Return a horizontal vector [T, 3] to where the hips face."""
+        up = np.array([0.0, 0.0, 1.0 if _median(self._cosine()) > 0 else -1.0])
+        forwards: Float = np.cross(up, self["right_hip"] - self["left_hip"])
+        return forwards
+
+    def motion(self, flight: Sampled, stature: float) -> dict[str, float]:
+        """Say how oddly the person moves: not forwards, faster than people, or with a foot that slides."""
+        step_s = STEP_NS / 1e9
+        moved = (self.hips[flight.second] - self.hips[flight.first]) / step_s
+        fast = _quantile(np.linalg.norm(moved[:, :2], axis=-1), 0.75)
+        feet = [
+            np.linalg.norm(self[name][flight.second] - self[name][flight.first], axis=-1) / step_s
+            for name in ("left_ankle", "right_ankle")
+        ]
+        forwards = self._forwards()[flight.first, :2]
+        walks = np.linalg.norm(moved[:, :2], axis=-1) > 0.7
+        course = (moved[:, :2] * forwards).sum(axis=-1)[walks]
+        course /= np.linalg.norm(moved[walks, :2], axis=-1) * np.linalg.norm(forwards[walks], axis=-1)
+        ahead = _median(course) if np.isfinite(course).sum() >= 8 else 1.0
+        return {
+            "course": max(0.0, 0.5 - ahead) / 0.3,
+            "speed": max(0.0, fast - 4.0) / 2,
+            "climb": max(0.0, _median(np.abs(moved[:, 2])) - 0.5) / 0.5,
+            "slide": max(0.0, _median(np.minimum(*feet)) - 0.4 * stature / 1.7) / 0.5,
+        }
+
+
+def _place(flight: Sampled, scene: Scene, solved: Solved, body: _Body) -> dict[str, float]:
+    """Say how far the person is from where people are: below drones, on the ground, at the logged actor."""
+    odd: dict[str, float] = {}
+    far = [_median(np.abs(depth[seen])) for depth, seen in zip(solved.depth, solved.seen, strict=True)]
+    far_m = np.minimum(np.nan_to_num(np.array(far), nan=10.0), _FARTHEST_M)
+    stated_m = float(np.sqrt(np.mean(scene.sigma[:, 0] ** 2 + (far_m * scene.sigma[:, 1]) ** 2)))
+    if not all(camera.static for camera in flight.cameras):
+        odd["above"] = max(0.0, _median(body.hips[:, 2]) - _median(scene.position[..., 2])) / 2.0
+    if flight.ground is not None:
+        foot = np.fmin(body["left_ankle"][:, 2], body["right_ankle"][:, 2])
+        under = flight.ground.under(body.hips)
+        on_map = np.isfinite(under)
+        if on_map.sum() < 0.5 * np.isfinite(body.hips[:, 0]).sum():
+            odd["ground"] = 6.0
+        else:
+            height = abs(_median((foot - under)[on_map]) - _ANKLE_ABOVE_GROUND_M)
+            odd["ground"] = max(0.0, height - 0.25 - 2 * stated_m) / 0.25
+    if flight.hips is not None and np.isfinite(flight.hips[:, 0]).any():
+        apart = body.hips - flight.hips
+        constant = np.array([_median(apart[:, axis]) for axis in range(3)])
+        odd["actor"] = max(0.0, float(np.linalg.norm(constant)) - 0.25 - 2 * stated_m) / 0.4
+        odd["actor_path"] = max(0.0, _median(np.linalg.norm(apart - constant, axis=-1)) - 0.45) / 0.3
+    return {name: value for name, value in odd.items() if np.isfinite(value)}
+
+
+def _finite(values: Float) -> Float:
+    finite: Float = values[np.isfinite(values)]
+    return finite
+
+
+def _median(values: Float) -> float:
+    finite = _finite(values)
+    return float(np.median(finite)) if finite.size else float("nan")
+
+
+def _quantile(values: Float, share: float) -> float:
+    finite = np.sort(_finite(values))
+    return float(finite[int(share * (finite.size - 1))]) if finite.size else float("nan")
+
+
+def _spread(values: Float) -> float:
+    """Return the standard deviation of a length over its median, from its quartiles."""
+    return 0.74 * (_quantile(values, 0.75) - _quantile(values, 0.25)) / max(_median(values), 1e-9)
+
+
+def residual_px(scene: Scene, solved: Solved) -> float:
+    """Return the median distance (px) of keypoints from the joints that were triangulated from them."""
+    toward = solved.joints[None] - np.nan_to_num(scene.position)[:, :, None, :]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        across = np.linalg.norm(np.cross(solved.direction, toward), axis=-1) / np.abs(solved.depth)
+    pixels = np.where(solved.seen, across * scene.focal_px[:, None, None], np.nan)
+    return round(_median(pixels), 2)

@@ -1,0 +1,158 @@
+"""Doubts on simulated flights with one mistake in their description; the truth is which mistake was made."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from benchmarks.mistakes import (
+    COCO_SWAPPED,
+    FLIGHTS,
+    Change,
+    Described,
+    Pose,
+    clock,
+    focal,
+    heading,
+    mirrored,
+    mistaken,
+    of_cameras,
+    of_mounts,
+    of_poses,
+    same_topic,
+    swapped,
+    turned,
+    with_keypoints,
+    with_remedy,
+)
+from pipelines.geometry.poses import compose, invert
+from pipelines.reconstruction.doubts.diagnosis import CODES
+from tests.commands.runner import refused, succeeds
+
+THREE = next(flight for flight in FLIGHTS if flight.name == "kick3")
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Described:
+    return Described(THREE, tmp_path_factory.mktemp("doubts") / THREE.name)
+
+
+def doubts_of(manifest: Path) -> list[dict[str, Any]]:
+    """Ask `mocap check` for the doubts of a flight."""
+    found: list[dict[str, Any]] = json.loads(succeeds("check", manifest, "--json"))["doubts"]
+    for doubt in found:
+        assert set(doubt) == {"code", "cameras", "what", "evidence", "remedy"}
+        assert doubt["code"] in CODES
+        assert all(isinstance(value, int | float) for value in doubt["evidence"].values())
+    return found
+
+
+def test_a_right_flight_is_not_doubted(flight: Described) -> None:
+    assert doubts_of(mistaken(flight, None)) == []
+
+
+CASES: dict[str, tuple[str, Change]] = {
+    "videos": ("videos_swapped", swapped),
+    "focal": ("intrinsics", of_cameras(focal(2.0))),
+    "rolled": ("mount", of_mounts(turned("z", 180))),
+    "mirrored": ("mirrored", with_keypoints(mirrored)),
+    "clock": ("clock", of_cameras(clock(0.3), "drone1")),
+    "heading": ("pose", of_poses(heading(8), "drone1")),
+    "topic": ("pose", same_topic),
+    "feet": ("unit", of_poses(lambda pose: (pose[0] / 0.3048, pose[1]))),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_mistake_is_named_first(flight: Described, case: str) -> None:
+    code, change = CASES[case]
+    assert doubts_of(mistaken(flight, change))[0]["code"] == code
+
+
+@pytest.mark.parametrize("case", ["videos", "rolled", "mirrored", "feet"])
+def test_the_remedy_leaves_no_doubt(flight: Described, case: str) -> None:
+    manifest = mistaken(flight, CASES[case][1])
+    assert with_remedy(manifest, doubts_of(manifest)[0]["remedy"])
+    assert doubts_of(manifest) == []
+
+
+def test_reconstruct_states_doubts_and_strict_refuses(flight: Described, tmp_path: Path) -> None:
+    manifest, session = mistaken(flight, CASES["rolled"][1]), tmp_path / "rolled.session"
+    succeeds("ingest", manifest, "-o", session)
+    metrics = json.loads(succeeds("reconstruct", session, "--json"))
+    assert metrics["doubts"][0]["code"] == "mount"
+    assert metrics["doubts"][0]["remedy"].startswith("cameras.drone1.mount: {looks: forward, down_deg: 15")
+    assert "(mount)" in refused("reconstruct", session, "--strict")
+    assert (session / "reconstruct" / "metrics.json").exists()
+
+
+def test_what_cannot_be_reconstructed_names_the_mistake(flight: Described, tmp_path: Path) -> None:
+    manifest, session = mistaken(flight, of_mounts(turned("y", -90))), tmp_path / "left.session"
+    succeeds("ingest", manifest, "-o", session)
+    assert re.search(
+        r"cameras\.drone1\.mount: \{(looks: forward|body_from_camera)", refused("reconstruct", session)
+    )
+
+
+def tables_of(manifest: Path, session: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Ingest a flight; return the poses and the keypoints of its first camera."""
+    succeeds("ingest", manifest, "-o", session)
+    folder = session / "cameras" / "drone1"
+    return pd.read_parquet(folder / "poses.parquet"), pd.read_parquet(folder / "keypoints.parquet")
+
+
+SHIFT, YAW_DEG = np.array([3.0, -2.0, 0.5]), 25.0
+
+
+def moved_away(pose: Pose) -> Pose:
+    """Write a pose in a world whose zero and north lie elsewhere: world_from_source undoes it."""
+    return compose(invert(SHIFT, turned("z", YAW_DEG)), pose)
+
+
+KEYS: dict[str, tuple[Change, str]] = {
+    "inverse": (of_poses(lambda pose: invert(*pose)), "pose.inverse: true"),
+    "quaternion": (of_poses(lambda pose: (pose[0], np.roll(pose[1], 1, axis=-1))), "pose.quaternion: wxyz"),
+    "ft": (of_poses(lambda pose: (pose[0] / 0.3048, pose[1])), "pose.unit: ft"),
+    "cm": (of_poses(lambda pose: (pose[0] * 100, pose[1])), "pose.unit: cm"),
+    "world": (
+        of_poses(moved_away),
+        f"pose.world_from_source: {{translation: {SHIFT.tolist()}, yaw_deg: {YAW_DEG}}}",
+    ),
+    "x": (with_keypoints(mirrored), "keypoints.mirrored: x"),
+    "names": (with_keypoints(lambda pixels, _: pixels[COCO_SWAPPED]), "keypoints.mirrored: names"),
+    "pictures": (
+        with_keypoints(lambda pixels, width: mirrored(pixels, width)[COCO_SWAPPED]),
+        "keypoints.mirrored: true",
+    ),
+}
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_the_keys_of_remedies_undo_what_they_say(flight: Described, tmp_path: Path, key: str) -> None:
+    change, line = KEYS[key]
+    right = tables_of(mistaken(flight, None), tmp_path / "right.session")
+    manifest = mistaken(flight, change)
+    assert with_remedy(manifest, "; ".join(f"cameras.{name}.{line}" for name in flight.names))
+    poses, keypoints = tables_of(manifest, tmp_path / "mended.session")
+    order = ["frame", "person", "joint"]
+    pixels = [table.sort_values(order)[["x", "y"]].to_numpy() for table in (right[1], keypoints)]
+    assert np.abs(pixels[0] - pixels[1]).max() < 1e-9
+    sign = np.sign((poses[["qx", "qy", "qz", "qw"]] * right[0][["qx", "qy", "qz", "qw"]]).sum(axis=1))
+    for name in ("qx", "qy", "qz", "qw"):
+        poses[name] *= sign
+    # Written with nine decimals: an attitude that is off by 1e-9 moves what is 30 m away by 3e-8 m.
+    columns = ["x", "y", "z", "qx", "qy", "qz", "qw"]
+    assert np.abs(poses[columns].to_numpy() - right[0][columns].to_numpy()).max() < 1e-6
+
+
+def test_poses_that_state_themselves_take_no_such_keys(flight: Described, tmp_path: Path) -> None:
+    manifest = mistaken(flight, None)
+    assert with_remedy(manifest, "cameras.drone1.pose: {static: made/drone1_camera.yaml, inverse: true}")
+    assert "cameras.drone1.pose" in (line := refused("ingest", manifest, "-o", tmp_path / "still.session"))
+    assert "inverse" in line
