@@ -62,7 +62,7 @@ from pipelines.session.tables import (
 if TYPE_CHECKING:
     import pandas as pd
 
-DETECT = Stage("detect", revision=2)
+DETECT = Stage("detect", revision=3)
 
 _BLOCK = 300  # pictures: ten seconds of work are a small loss, and a search at each start costs little
 
@@ -94,6 +94,7 @@ def detect(
     session: WritableSession,
     *,
     detector: str = "blazepose",
+    people: int = 1,
     every: int = 1,
     start_s: float | None = None,
     end_s: float | None = None,
@@ -106,6 +107,7 @@ def detect(
     Args:
         session: locked by the caller.
         detector: a registered name, or a family's name, a colon and its argument.
+        people: the number that is wanted; of one who was logged, the actor alone is followed.
         every: use only every k-th picture.
         start_s: use only pictures at or after this time, in seconds since the flight's first frame of any
             camera, also of those with keypoints; by default from the first.
@@ -130,6 +132,7 @@ def detect(
     chosen = find_detector(detector)
     settings = {
         "detector": chosen.name,
+        "people": "one" if people == 1 else "several",
         "every": every,
         "cameras": sorted(media),
         "start_s": start_s,
@@ -164,7 +167,8 @@ def detect(
             "look at `mocap info`, or leave it out",
         )
     progress.start("Detecting keypoints", pictures)
-    produce = partial(_produce, work, _Hints(session.folder, description, media), chosen, progress)
+    hints_at = _Hints(session.folder, description, media)
+    produce = partial(_produce, work, hints_at, chosen, people == 1, progress)
     folders = side_by_side(
         lambda block: run.chunk(block.name, partial(produce, block)), blocks, workers=workers, halt=work.halt
     )
@@ -366,12 +370,18 @@ def _span_words(start_s: float | None, end_s: float | None) -> str:
 
 
 def _produce(
-    work: _Work, hints: _Hints, detector: Detector, progress: Progress, block: Block, folder: Path
+    work: _Work,
+    hints: _Hints,
+    detector: Detector,
+    only_one: bool,
+    progress: Progress,
+    block: Block,
+    folder: Path,
 ) -> None:
     """Write what the detector finds in the pictures of one block."""
     networks = work.networks(detector)
     frame, t_ns = work.frames(block)
-    tracker = PeopleTracker(networks)
+    tracker = PeopleTracker(networks, only_one=only_one)
     found: list[tuple[int, int, Float, Float]] = []
     undecoded = 0
     numbers = frame.tolist()

@@ -229,6 +229,7 @@ def _detected(
     detected = detect(
         session,
         detector=settings.detector,
+        people=settings.people,
         every=settings.every,
         start_s=settings.start_s,
         end_s=settings.end_s,

@@ -21,7 +21,7 @@ class FollowedAlone:
     """
 
     def __init__(self, networks: KeypointNetworks, joints: Sequence[str]) -> None:
-        self._tracker = PeopleTracker(networks)
+        self._tracker = PeopleTracker(networks, only_one=True)
         self._column = [networks.joints.index(name) if name in networks.joints else None for name in joints]
 
     def step(self, picture: Picture, *, hint: Hint | None) -> tuple[Float, Float]:

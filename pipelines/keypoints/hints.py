@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,9 @@ class Hint:
     centre: tuple[float, float]  # px
     height_px: float  # of the actor standing across the line of sight
     margin_px: float  # three sigma: how far from `centre` the actor may be
+    tallest_px: float = (
+        math.inf
+    )  # of the same actor nearer by three sigma; inf where that is behind the camera
 
 
 def project_actor(
@@ -61,8 +65,10 @@ def project_actor(
     if not np.isfinite(pixels).all():
         return None
     px_per_rad = float(np.sqrt(abs(np.linalg.det(pixels[1:] - pixels[0])))) / _STEP
+    nearest = distance - _SIGMAS * sigma_m
     margin = _SIGMAS * px_per_rad * float(np.hypot(sigma_m / distance, sigma_rad))
     x, y = float(pixels[0, 0]), float(pixels[0, 1])
     if not (-margin <= x <= intrinsics.width - 1 + margin and -margin <= y <= intrinsics.height - 1 + margin):
         return None
-    return Hint((x, y), px_per_rad * height_m / distance, margin)
+    tallest = px_per_rad * height_m / nearest if nearest > 0 else math.inf
+    return Hint((x, y), px_per_rad * height_m / distance, margin, tallest)

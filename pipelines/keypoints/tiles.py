@@ -11,13 +11,21 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
 from pipelines.geometry.arrays import Picture
 from pipelines.session.registries import KeypointNetworks, Region
 
-Candidate = tuple[Region, float]
+
+class Candidate(NamedTuple):
+    """A person that the person detector found, in pixels of the whole picture."""
+
+    region: Region
+    score: float
+    cut: bool  # by a tile's border inside the picture: the centre is only a guess
+
 
 CROP_PER_HEIGHT = 3.0
 """Side of the square in which the person detector finds a body, in body heights."""
@@ -96,17 +104,18 @@ def find_in(networks: KeypointNetworks, picture: Picture, parts: Iterable[Tile])
         parts: tiles to search.
 
     Returns:
-        Regions in pixels of the whole picture and their scores: whole bodies before those that a tile's
-        border cuts, then by score; of several at one place (in overlapping tiles) the first of these.
+        Whole bodies before those that a tile's border cuts, then by score; of several at one place (in
+        overlapping tiles) the first of these.
     """
-    found = []
-    for part in parts:
-        for region, score in networks.find_people(part.cut(picture)):
-            found.append((_is_cut(region, part, picture), -score, _moved(region, part)))
+    found = [
+        Candidate(_moved(region, part), score, _is_cut(region, part, picture))
+        for part in parts
+        for region, score in networks.find_people(part.cut(picture))
+    ]
     kept: list[Candidate] = []
-    for _, negative, region in sorted(found, key=lambda candidate: candidate[:2]):
-        if not any(same_place(region, other) for other, _ in kept):
-            kept.append((region, -negative))
+    for candidate in sorted(found, key=lambda each: (each.cut, -each.score)):
+        if not any(same_place(candidate.region, other.region) for other in kept):
+            kept.append(candidate)
     return kept
 
 

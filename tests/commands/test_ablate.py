@@ -168,7 +168,8 @@ class _Pointing:
 class _Follower:
     """Stand-in for the tracker: the person is at the hint, each joint one pixel right of the last."""
 
-    def __init__(self, networks: _Networks) -> None:
+    def __init__(self, networks: _Networks, *, only_one: bool) -> None:
+        assert only_one
         self.right = np.array([1.0, 0.0]) * np.arange(len(networks.joints))[:, None]
 
     def step(self, picture: Any, *, hint: Any) -> list[TrackedPerson]:

@@ -11,8 +11,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from benchmarks.detection import counted
+from benchmarks.detectors import SAMPLE
+from pipelines.detect import detect
 from pipelines.formats.skeletons.trc import FORMAT as TRC
+from pipelines.ingest import ingest
 from pipelines.session.registries import find_detector
+from pipelines.session.stages import locked
 from pipelines.session.tables import motion_from
 from tests.commands.runner import content, mocap_process, refused, succeeds
 from tests.real_data import real_data
@@ -20,13 +25,17 @@ from tests.real_data import real_data
 EVERY = 10
 
 
-@pytest.fixture
-def flight(tmp_path: Path) -> Path:
-    """Make a flight of four videos with their calibration, without keypoints."""
+def _fetch() -> None:
     if None in find_detector("blazepose").models().values():
         fetched = mocap_process("models", "fetch", "blazepose", timeout=300)
         if fetched.returncode:
             pytest.skip(f"the detector's networks cannot be fetched here: {fetched.stderr.strip()}")
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Path:
+    """Make a flight of four videos with their calibration, without keypoints."""
+    _fetch()
     recording = real_data("pose2sim_single")
     shutil.copytree(recording / "videos", tmp_path / "videos")
     calibration = recording / "calibration" / "Calib_qualisys.toml"
@@ -71,3 +80,23 @@ def test_keypoints_do_not_depend_on_workers(flight: Path) -> None:
 
 def test_unknown_detector_lists_those_there_are(flight: Path) -> None:
     assert "blazepose" in refused("reconstruct", flight.with_suffix(".session"), "--detector", "magic")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("people", [1, 2])
+def test_a_picture_costs_one_landmark_pass_and_hardly_a_search(tmp_path: Path, people: int) -> None:
+    """Look at the sample's first two seconds: one person, whom a log follows, and trees all around."""
+    _fetch()
+    session = ingest(SAMPLE / "flight.yaml", tmp_path / "sample.session").folder
+    with counted() as runs, locked(session) as writable:
+        record = detect(writable, people=people, end_s=2.0)
+    assert record is not None
+    cameras = record.counts["cameras"].values()
+    pictures = sum(camera["frames"] for camera in cameras)
+    assert pictures == 120
+    # One picture each is looked at twice, where the person is found.
+    assert runs["landmarks"] <= 1.05 * pictures
+    assert sum(camera["detections"] for camera in cameras) == pictures, "nobody but the person"
+    if people == 1:
+        # Nine squares cover the places where the actor may be; then one in every tenth picture.
+        assert runs["searches"] <= 2 * (9 + 60 // 10)

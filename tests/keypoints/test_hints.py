@@ -28,6 +28,15 @@ def test_an_actor_ahead_is_in_the_middle_and_as_tall_as_the_range_says() -> None
     assert hint.margin_px == pytest.approx(3 * 800 * math.hypot(0.03, math.radians(1)), rel=1e-3)
 
 
+def test_the_tallest_is_the_actor_nearer_by_three_sigma() -> None:
+    hint, anywhere = _hint(10, 0, 0, sigma_m=1.0), _hint(10, 0, 0, sigma_m=4.0)
+
+    assert hint is not None
+    assert anywhere is not None
+    assert hint.tallest_px == pytest.approx(800 * 1.75 / 7, rel=1e-3)
+    assert anywhere.tallest_px == math.inf, "three sigma reach behind the camera"
+
+
 def test_left_and_up_in_the_world_are_left_and_up_in_the_picture() -> None:
     hint = _hint(10, 2, 1)
 

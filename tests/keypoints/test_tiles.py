@@ -85,8 +85,8 @@ def test_people_are_found_once_and_in_the_pixels_of_the_whole_picture() -> None:
 
     # Those cut off by a tile's border may remain as further candidates: none elsewhere than on a body.
     for person in people:
-        assert np.min([np.hypot(r.centre[0] - person.x, r.centre[1] - person.y) for r, _ in found]) <= 0.5
-    places = np.array([region.centre for region, _ in found])
+        assert np.min([np.hypot(r.centre[0] - person.x, r.centre[1] - person.y) for r, *_ in found]) <= 0.5
+    places = np.array([each.region.centre for each in found])
     apart = np.linalg.norm(places[:, None] - places, axis=2)[np.triu_indices(len(places), 1)]
     # 0.2 of a region's side of 1.25 heights: cut bodies of 121 px have smaller regions.
     assert apart.min() >= 0.2 * 1.25 * 121 * 0.25
@@ -98,5 +98,5 @@ def test_small_people_are_found_by_tiles_and_not_in_the_whole(x: int, y: int) ->
     picture = draw(960, 540, Bar(x, y, 71))
 
     assert not find_in(BarNetworks(), picture, tiles(960, 540)[:1])
-    best, _ = find_in(BarNetworks(), picture, tiles(960, 540))[0]
-    assert best.centre == pytest.approx((x, y), abs=0.5)
+    best = find_in(BarNetworks(), picture, tiles(960, 540))[0]
+    assert best.region.centre == pytest.approx((x, y), abs=0.5)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from pipelines.geometry.arrays import Picture
 from pipelines.keypoints.hints import Hint
 from pipelines.keypoints.tracking import PeopleTracker, TrackedPerson
-from pipelines.session.registries import Region
+from pipelines.session.registries import Person, Region
 from tests.keypoints.bars import Bar, BarNetworks, draw
 
 WIDTH, HEIGHT = 960, 540
@@ -20,10 +21,13 @@ AWAY = Bar(-1000, -1000, 101)
 
 
 def _run(
-    pictures: Iterable[Picture], hints: Iterable[Hint | None] | None = None, **options: int
+    pictures: Iterable[Picture],
+    hints: Iterable[Hint | None] | None = None,
+    only_one: bool = False,
+    **options: int,
 ) -> tuple[list[list[TrackedPerson]], PeopleTracker, BarNetworks]:
     networks = BarNetworks()
-    tracker = PeopleTracker(networks, **options)
+    tracker = PeopleTracker(networks, only_one=only_one, **options)
     pictures = list(pictures)
     hints = [None] * len(pictures) if hints is None else hints
     seen = [tracker.step(picture, hint=hint) for picture, hint in zip(pictures, hints, strict=True)]
@@ -213,6 +217,108 @@ def test_no_more_people_than_asked_for_but_the_actor_always() -> None:
     assert max(len(people) for people in seen) == 2
     assert tracker.counts["beyond the most"] > 0
     assert any(abs(person.person.region.centre[0] - 700) < 1 for person in seen[-1])
+
+
+class _Telling(BarNetworks):
+    """Networks whose confidences tell people from trees: bars of 71 px are trees."""
+
+    person_confidence = 0.55
+
+    def locate(self, picture: Picture, regions: Sequence[Region]) -> list[Person]:
+        return [
+            replace(person, confidence=np.full(5, self._confidence(person)))
+            for person in super().locate(picture, regions)
+        ]
+
+    def _confidence(self, person: Person) -> float:
+        return 0.45 if person.region.side < 100 else 0.9
+
+
+def test_a_tree_is_dropped_after_a_few_pictures_beside_a_person() -> None:
+    """Look at a tree that is found first: it is alone for two pictures and has five to be a person."""
+    tree, person = Bar(200, 270, 71), Bar(700, 270, 121)
+    pictures = [draw(WIDTH, HEIGHT, tree)] * 2 + [draw(WIDTH, HEIGHT, tree, person)] * 40
+    tracker = PeopleTracker(networks := _Telling(), search_every=1)
+
+    tracks = _tracks([tracker.step(picture, hint=None) for picture in pictures])
+
+    assert tracks[:6] == [[0], [0], [0, 1], [0, 1], [1], [1]]
+    assert tracks[6:] == [[1]] * 36
+    assert tracker.counts["no people"] > 1
+    # Each search finds the tree again; a single pass is enough to see what it is.
+    assert len([region for region in networks.located[-20:] if region.side < 100]) <= 10
+
+
+def test_a_lone_thing_is_followed_and_so_is_one_that_can_be_the_actor() -> None:
+    """Keep a person whom the network hardly recognises, as from above, where nobody is more likely."""
+    doubtful, person = Bar(480, 270, 71), Bar(800, 270, 121)
+    alone, beside = draw(WIDTH, HEIGHT, doubtful), draw(WIDTH, HEIGHT, doubtful, person)
+    hint = Hint((485.0, 265.0), 71.0, 30.0, 80.0)
+    for picture, at, tracks in ((alone, None, [0]), (beside, hint, [0, 1])):
+        tracker = PeopleTracker(_Telling(), search_every=2)
+        seen = _tracks([tracker.step(picture, hint=at) for _ in range(20)])
+        assert seen[-1] == tracks
+        assert not tracker.counts["lost"]
+
+
+def test_one_wanted_without_a_log_is_searched_with_fewer_tiles() -> None:
+    pictures = [draw(WIDTH, HEIGHT, Bar(480, 270, 241))] * 31
+
+    searched = [len(_run(pictures, only_one=only_one)[2].searched) for only_one in (False, True)]
+
+    # 960x540 has 19 tiles: the picture, 3 squares of 540 px, 15 of 270 px.
+    assert searched == [19 + 3 * 8, 4 + 3 * 4]
+
+
+def test_the_actor_alone_is_followed_and_the_whole_picture_not_searched() -> None:
+    actor, bystander = Bar(700, 270, 121), Bar(200, 270, 121)
+    pictures = [draw(WIDTH, HEIGHT, bystander, actor)] * 40
+    hint = Hint((705.0, 265.0), 121.0, 30.0)
+
+    seen, tracker, networks = _run(pictures, [hint] * 40, only_one=True)
+
+    assert _tracks(seen) == [[0]] * 40
+    _assert_joints(seen[-1][0], actor)
+    # Two passes when found and one a picture; the square about the hint, and that again every ten pictures.
+    assert len(networks.located) == 2 + 39
+    assert networks.searched == [(363, 363)] * (1 + 3)
+    assert tracker.counts["searched"] == 4
+
+
+def test_who_is_too_large_to_be_the_actor_is_left_when_the_actor_comes() -> None:
+    near, actor = Bar(480, 270, 401), Bar(350, 270, 121)
+    hint = Hint((355.0, 265.0), 121.0, 80.0, 150.0)
+    pictures = [draw(WIDTH, HEIGHT, near)] * 3 + [draw(WIDTH, HEIGHT, near, actor)] * 3
+
+    seen, tracker, _ = _run(pictures, [hint] * 6, only_one=True)
+
+    assert _tracks(seen) == [[0]] * 3 + [[1]] * 3
+    _assert_joints(seen[-1][0], actor)
+    assert tracker.counts["not the actor"] == 1
+
+
+def test_somebody_else_near_the_hint_is_found_beside_the_one_who_was_taken_for_the_actor() -> None:
+    """Let a bystander stand where the actor may be: both are followed, and other cameras decide."""
+    bystander, actor = Bar(560, 270, 121), Bar(400, 270, 121)
+    pictures = [draw(WIDTH, HEIGHT, bystander)] + [draw(WIDTH, HEIGHT, bystander, actor)] * 100
+
+    seen, _, networks = _run(pictures, [Hint((480.0, 270.0), 121.0, 200.0)] * 101, only_one=True)
+
+    assert _tracks(seen)[-1] == [0, 1]
+    # Of four squares one is searched every ten pictures.
+    assert len(networks.searched) <= 4 + 85 + 10
+
+
+def test_an_actor_who_is_hidden_for_long_costs_few_searches() -> None:
+    actor = Bar(700, 270, 121)
+    hidden = [draw(WIDTH, HEIGHT)] * 100
+    pictures = [draw(WIDTH, HEIGHT, actor)] + hidden + [draw(WIDTH, HEIGHT, actor)] * 5
+
+    seen, tracker, _ = _run(pictures, [Hint((705.0, 265.0), 121.0, 30.0)] * 106, only_one=True)
+
+    assert seen[-1]
+    # In each of the first thirty pictures, then in every fifth of the other seventy.
+    assert tracker.counts["searched"] <= 1 + 30 + 70 // 5 + 2
 
 
 @settings(max_examples=10, deadline=None)
