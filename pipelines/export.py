@@ -13,7 +13,7 @@ import numpy as np
 
 from pipelines.formats.common.exporting import thinned
 from pipelines.formats.flights.pictures import open_pictures
-from pipelines.geometry.arrays import Picture
+from pipelines.geometry.arrays import Int64, Picture
 from pipelines.reporting.content import estimated_clocks
 from pipelines.reporting.frame_drawing import caption_of, draw_frame
 from pipelines.reporting.motion import Motion, motion_from_skeleton
@@ -22,7 +22,7 @@ from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.maps import each_map
 from pipelines.session.progress import Progress, Silent
-from pipelines.session.records import Int64, Recording
+from pipelines.session.records import Recording
 from pipelines.session.registries import EXPORTS, ChoiceOfAxes, Export
 from pipelines.session.stage_records import StageRecord
 from pipelines.session.stages import open_session, session_name

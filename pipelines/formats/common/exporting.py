@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Bytes, Float, Int64
 from pipelines.geometry.cameras import Intrinsics, rescaled
 from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64, JointMotion, Occupancy, Recording, Trajectory
+from pipelines.session.records import JointMotion, Occupancy, Recording, Trajectory
 
 _WIDEST_PX = 960
 _QUALITY = 85
@@ -81,7 +80,7 @@ def write_tables(
     return sorted(paths)
 
 
-def as_jpeg(camera: str, picture: NDArray[np.uint8], lens: Intrinsics) -> tuple[Intrinsics, bytes]:
+def as_jpeg(camera: str, picture: Bytes, lens: Intrinsics) -> tuple[Intrinsics, bytes]:
     """Shrink a BGR picture [height, width, 3] to at most 960 px in width; return its intrinsics and JPEG.
 
     Raises:

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,6 +25,9 @@ SECONDS, MILLISECONDS, MICROSECONDS, NANOSECONDS = 9, 6, 3, 0
 _UNITS = {"s": SECONDS, "sec": SECONDS, "ms": MILLISECONDS, "us": MICROSECONDS, "ns": NANOSECONDS}
 _STAMP_NAMES = {"t", "time", "timestamp", "stamp"}
 _LARGEST = 2**63 - 1
+
+NORM_TOLERANCE = 0.1
+"""Largest deviation of a quaternion from unit length: up to this rounding explains it, beyond not."""
 
 GAP_STEPS = 5
 """A gap is a step of more than this many median steps."""
@@ -241,6 +243,45 @@ def cell_name(cell: str) -> tuple[str, str]:
     if match is None:
         return cell.strip().lower(), ""
     return re.sub(r"[./\s]+", "_", match[1]).strip("_"), (match[2] or "").strip()
+
+
+@dataclass(frozen=True)
+class Heading:
+    """Line above a table that names its columns, the time among them."""
+
+    line: int  # its index in the file
+    delimiter: str
+    columns: int
+    stamp: int  # the time's column
+    unit: int  # the time's
+    names: dict[str, int]  # columns by the names of `cell_name`; the first of each name
+
+
+def find_heading(line: str, index: int = 0, delimiters: str = ",;\t") -> Heading | None:
+    """Parse a line as a heading, separated by the first of the delimiters in it; None if it names no time."""
+    delimiter = next((mark for mark in delimiters if mark in line), delimiters[0])
+    cells = line.split(delimiter)
+    stamp = stamp_column(cells)
+    names: dict[str, int] = {}
+    for column, cell in enumerate(cells):
+        names.setdefault(cell_name(cell)[0], column)
+    return None if stamp is None else Heading(index, delimiter, len(cells), *stamp, names)
+
+
+def rows_below(
+    path: Path, heading: Heading, text: str, columns: dict[str, int], numbers: dict[str, int]
+) -> TextTable:
+    """Apply `parse_table` to the rows of a text below its heading; the stamps are the text column "stamp"."""
+    lines = text.split("\n", heading.line + 1)
+    return parse_table(
+        path,
+        lines[-1] if len(lines) > heading.line + 1 else "",
+        delimiter=heading.delimiter,
+        columns=heading.columns,
+        text={"stamp": heading.stamp, **columns},
+        numbers=numbers,
+        first_line=heading.line + 2,
+    )
 
 
 def stamp_column(header: Sequence[str]) -> tuple[int, int] | None:

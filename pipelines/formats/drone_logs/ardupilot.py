@@ -31,12 +31,11 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     turned_as_stated,
     world_from_heading,
 )
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.geodesy import Place
 from pipelines.geometry.mounting import RelativeTo, attitude_in_enu
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64
 from pipelines.session.registries import need
 from pipelines.session.telemetry import AttitudeTrack, PositionTrack, Telemetry, TelemetryChoice
 

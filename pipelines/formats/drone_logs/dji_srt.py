@@ -34,9 +34,8 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     turned_as_stated,
     whatever_from,
 )
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64
 from pipelines.session.telemetry import AttitudeTrack, Height, Telemetry, TelemetryChoice
 
 _TIMECODE = r"(\d+):([0-5]\d):([0-6]\d)[,.](\d{3})"  # a Matrice 300 ends its 60th second at :60

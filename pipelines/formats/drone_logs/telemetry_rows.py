@@ -9,9 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.formats.common.rows import kept_rows
-from pipelines.formats.poses.pose_rows import NORM_TOLERANCE
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.formats.common.rows import NORM_TOLERANCE, kept_rows
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place, enu_from_geodetic, place_at
 from pipelines.geometry.mounting import RelativeTo, attitude_from_angles, attitude_in_enu, level_heading
@@ -21,7 +20,6 @@ from pipelines.geometry.poses import (
     multiply,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64
 from pipelines.session.telemetry import AttitudeTrack, Height, PositionTrack, Telemetry, TelemetryChoice
 
 _HELD_NS = 1_000_000_000  # receivers on drones report at least once a second

@@ -32,12 +32,11 @@ from pipelines.formats.drone_logs.telemetry_rows import (
     whatever_from,
     world_from_heading,
 )
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.clocks import ClockFit, fit_clock
 from pipelines.geometry.geodesy import Place, enu_from_enu
 from pipelines.geometry.mounting import attitude_in_enu
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64
 from pipelines.session.registries import need
 from pipelines.session.telemetry import AttitudeTrack, PositionTrack, Telemetry, TelemetryChoice
 

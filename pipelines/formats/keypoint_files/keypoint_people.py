@@ -10,9 +10,8 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.records import Detections
 from pipelines.session.skeletons import SKELETONS, Skeleton, get_skeleton, skeleton_with
@@ -332,7 +331,7 @@ class Gathering:
             adjusted={cause: number for cause, number in sorted(adjusted.items()) if number},
         )
 
-    def _repeats(self, keypoints: Float) -> NDArray[np.bool_]:
+    def _repeats(self, keypoints: Float) -> Bool:
         """Mark the people [M] with the keypoints [M, K, 3] and id of an earlier person of the same frame."""
         repeats = np.zeros(len(keypoints), dtype=np.bool_)
         # People who were not found have zeros only, so they are all equal.
@@ -346,7 +345,7 @@ class Gathering:
                 seen.add(detection)
         return repeats
 
-    def _person_numbers(self, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
+    def _person_numbers(self, kept: Bool) -> Int64:
         """Number the kept people by the detector's own ids, or by their positions within the frame.
 
         The positions are used if somebody has no id, or if several people of a frame share the only id.

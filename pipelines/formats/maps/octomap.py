@@ -20,10 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.formats.common.files import first_bytes, read_bytes, split_header
-from pipelines.geometry.arrays import Bytes, Float
+from pipelines.geometry.arrays import Bool, Bytes, Float, Float32, Int32, Int64
 from pipelines.session.errors import DataError
 from pipelines.session.maps import check_resolution, check_size, describe_grid
 from pipelines.session.records import Occupancy
@@ -47,28 +46,28 @@ _COPY_AGAIN = "copy or export it again"
 class Leaves:
     """Known leaves of a tree."""
 
-    key: NDArray[np.int32]  # [L, 3] lowest corner, in finest voxels, 0 at the lower end of the tree
-    depth: NDArray[np.uint8]  # [L] 0 root, 16 finest
-    log_odds: NDArray[np.float32]  # [L] ln(p / (1 - p))
+    key: Int32  # [L, 3] lowest corner, in finest voxels, 0 at the lower end of the tree
+    depth: Bytes  # [L] 0 root, 16 finest
+    log_odds: Float32  # [L] ln(p / (1 - p))
     nodes: int
 
     @property
-    def occupied(self) -> NDArray[np.bool_]:
+    def occupied(self) -> Bool:
         """[L] True for leaves of a probability of at least one half (OctoMap's threshold)."""
         return self.log_odds >= 0
 
-    def voxels(self, chosen: NDArray[np.bool_]) -> int:
+    def voxels(self, chosen: Bool) -> int:
         """Count the finest voxels that the chosen leaves stand for."""
         counts = np.bincount(self.depth[chosen], minlength=DEPTH + 1).tolist()
         return sum(count * 8 ** (DEPTH - depth) for depth, count in enumerate(counts))
 
-    def box(self, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def box(self, chosen: Bool) -> tuple[Int64, Int64]:
         """Return the lowest and highest corner of chosen leaves, in finest voxels from the world's origin."""
         key, depth = self.key[chosen].astype(np.int64), self.depth[chosen].astype(np.int64)
         corner = key + (1 << (DEPTH - depth))[:, None]
         return key.min(axis=0) - _CENTRE, corner.max(axis=0) - _CENTRE
 
-    def extent(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def extent(self) -> tuple[Int64, Int64]:
         """Return the box of all leaves."""
         return self.box(np.ones(len(self.depth), dtype=bool))
 
@@ -291,7 +290,7 @@ def _halvings(source: Path | str, finest_m: float, resolution_m: float | None) -
     return halvings
 
 
-def _box(name: str, leaves: Leaves, chosen: NDArray[np.bool_], resolution_m: float) -> dict[str, object]:
+def _box(name: str, leaves: Leaves, chosen: Bool, resolution_m: float) -> dict[str, object]:
     if not chosen.any():
         return {}
     low, high = leaves.box(chosen)
@@ -340,7 +339,7 @@ def write_octomap(path: Path, occupancy: Occupancy) -> None:
     path.write_bytes(header.encode() + words.tobytes())
 
 
-def _first_key(origin: Float, side_m: float) -> NDArray[np.int64]:
+def _first_key(origin: Float, side_m: float) -> Int64:
     """Return the finest voxel's key at the grid's corner, counted from the tree's lower end."""
     steps = np.asarray(origin, dtype=np.float64) / side_m
     nearest = np.rint(steps)
@@ -349,11 +348,11 @@ def _first_key(origin: Float, side_m: float) -> NDArray[np.int64]:
             f"the origin {np.asarray(origin).tolist()} is not on OctoMap's grid, "
             f"the multiples of {side_m:g} m"
         )
-    key: NDArray[np.int64] = nearest.astype(np.int64) + _CENTRE
+    key: Int64 = nearest.astype(np.int64) + _CENTRE
     return key
 
 
-def _check_reach(path: Path, first: NDArray[np.int64], shape: tuple[int, ...], side_m: float) -> None:
+def _check_reach(path: Path, first: Int64, shape: tuple[int, ...], side_m: float) -> None:
     end = first + np.array(shape)
     if (first < 0).any() or (end > 2 * _CENTRE).any():
         reach_m = max(int((_CENTRE - first).max()), int((end - _CENTRE).max())) * side_m

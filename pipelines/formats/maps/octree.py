@@ -9,16 +9,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bytes
+from pipelines.geometry.arrays import Bytes, Float32, Int32, Int64
 from pipelines.geometry.compilation import cached
 
 DEPTH = 16
 UNKNOWN, FREE, OCCUPIED, INNER = 0, 1, 2, 3  # values of the two bits that a .bt has for every child
 BREAKS_OFF, TOO_DEEP = -1, -2
 
-Int64 = NDArray[np.int64]
-Int32 = NDArray[np.int32]
-Float32 = NDArray[np.float32]
 
 # The stack holds at most seven siblings of every level above the current node, and its eight children.
 _STACK = 8 * (DEPTH + 1)

@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.common.files import first_bytes, leads_out, numbers, read_bytes, read_head, read_yaml
-from pipelines.geometry.arrays import Float
+from pipelines.formats.maps.voxel_grids import sampled
+from pipelines.geometry.arrays import Bool, Float, Float32
 from pipelines.session.errors import DataError
 from pipelines.session.maps import check_resolution, check_size, describe_grid
 from pipelines.session.records import Occupancy
@@ -168,7 +169,7 @@ def _find_image(path: Path, image: str) -> Path:
         ) from None
 
 
-def _probabilities(path: Path, plan: _Plan) -> NDArray[np.float32]:
+def _probabilities(path: Path, plan: _Plan) -> Float32:
     """Read probabilities [W, H] from the lower left corner; NaN is unknown."""
     shade, opaque = _picture(plan.image)
     if plan.mode == "raw":
@@ -188,7 +189,7 @@ def _probabilities(path: Path, plan: _Plan) -> NDArray[np.float32]:
     return np.ascontiguousarray(probability[::-1].T, dtype=np.float32)
 
 
-def _picture(image: Path) -> tuple[Float, NDArray[np.bool_]]:
+def _picture(image: Path) -> tuple[Float, Bool]:
     """Read the mean of the colours [H, W], 0 black to 1 white, and True where the picture is opaque."""
     head = first_bytes(image, 32)
     if head[:2] in {b"P2", b"P5"}:
@@ -231,7 +232,7 @@ def _read_pgm(image: Path) -> Float:
     return shade
 
 
-def _read_png(image: Path) -> tuple[Float, NDArray[np.bool_]]:
+def _read_png(image: Path) -> tuple[Float, Bool]:
     import cv2
 
     content = read_bytes(image)
@@ -276,34 +277,13 @@ def _world_from_plan(plan: _Plan) -> Float:
     return np.array([[c, -s], [s, c]])
 
 
-def _plane(plan: _Plan, pixels: NDArray[np.float32], side: float) -> NDArray[np.float32]:
-    """Turn the plan to the world's axes, [X, Y] from the corner that `_box` returns.
-
-    Samples form a square lattice of pitch p with the covering radius p / sqrt(2). The disc within a
-    pixel has half its side as radius. So every pixel is met if p is at most 1 / sqrt(2) of a pixel.
-    """
+def _plane(plan: _Plan, pixels: Float32, side: float) -> Float32:
+    """Turn the plan to the world's axes, [X, Y] from the corner that `_box` returns."""
     if plan.yaw == 0 and side == plan.resolution_m:
         return pixels
-    corner, shape = _box(plan, pixels.shape, side)
-    plane = np.full(shape[:2], np.nan, dtype=np.float32)
-    dense = math.ceil(math.sqrt(2) * side / plan.resolution_m)
-    centred = (np.arange(dense) + 0.5) / dense
-    for sub_x in centred:
-        for sub_y in centred:
-            x = corner[0] - plan.origin[0] + (np.arange(shape[0])[:, None] + sub_x) * side
-            y = corner[1] - plan.origin[1] + (np.arange(shape[1])[None, :] + sub_y) * side
-            np.fmax(plane, _looked_up(plan, pixels, x, y), out=plane)
-    return plane
-
-
-def _looked_up(plan: _Plan, pixels: NDArray[np.float32], x: Float, y: Float) -> NDArray[np.float32]:
-    """Look up the plan at x [X, 1], y [1, Y], metres from its origin in the world's axes; NaN outside."""
-    c, s = math.cos(plan.yaw), math.sin(plan.yaw)
-    column = np.floor((c * x + s * y) / plan.resolution_m).astype(np.int64)
-    row = np.floor((c * y - s * x) / plan.resolution_m).astype(np.int64)
-    inside = (column >= 0) & (column < pixels.shape[0]) & (row >= 0) & (row < pixels.shape[1])
-    found = pixels[np.where(inside, column, 0), np.where(inside, row, 0)]
-    return np.where(inside, found, np.float32(np.nan))
+    corner, (columns, rows, _) = _box(plan, pixels.shape, side)
+    layer = Occupancy(pixels[:, :, None], np.zeros(3), plan.resolution_m)
+    return sampled(layer, _world_from_plan(plan), corner[:2] - plan.origin, (columns, rows), side)[:, :, 0]
 
 
 FORMAT = RosMap()

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bytes, Float
+from pipelines.geometry.arrays import Bytes, Float, Float32, Int64
 from pipelines.geometry.poses import matrix_from_quaternion
 from pipelines.session.errors import DataError
 from pipelines.session.maps import MOST_VOXELS, check_resolution, check_size, describe_grid
@@ -64,8 +64,8 @@ class VoxelSet:
     def __init__(self, source: str, resolution_m: float | None) -> None:
         self._source = source
         self._side = check_resolution(source, DEFAULT_RESOLUTION_M if resolution_m is None else resolution_m)
-        self._keys: NDArray[np.int64] = np.zeros(0, np.int64)  # sorted
-        self._since_ns: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._keys: Int64 = np.zeros(0, np.int64)  # sorted
+        self._since_ns: Int64 = np.zeros(0, np.int64)
         self._low, self._high = np.full(3, _REACH, np.int64), np.full(3, -_REACH, np.int64)
         self.dropped: Counter[str] = Counter()
 
@@ -105,7 +105,7 @@ class VoxelSet:
         return x, y, z
 
     @property
-    def grew_ns(self) -> NDArray[np.int64]:
+    def grew_ns(self) -> Int64:
         """Times at which new voxels appeared, ascending; empty while there is no voxel."""
         return np.unique(self._since_ns)
 
@@ -231,7 +231,7 @@ def _box(points: Float, side: float) -> tuple[Float, Float]:
         return low, high - low + 1
 
 
-def _indices(points: Float, low: Float, side: float) -> NDArray[np.int64]:
+def _indices(points: Float, low: Float, side: float) -> Int64:
     return (np.floor(points / side) - low).astype(np.int64)
 
 
@@ -283,7 +283,7 @@ def placed(
 
 def extruded(
     source: str,
-    plan: NDArray[np.float32],
+    plan: Float32,
     resolution_m: float,
     world_from_plan: Pose,
     *,
@@ -356,33 +356,51 @@ def _squarely_turned(grid: Occupancy, rotation: Float) -> Occupancy:
 
 
 def _turned(source: str, grid: Occupancy, world_from_plane: Float, side: float) -> Occupancy:
-    """Turn by a rotation [2, 2] about the vertical axis through the origin of its frame.
-
-    Samples form a square lattice of pitch p with the covering radius p / sqrt(2). The disc within a
-    voxel has half its side as radius. So every voxel is met if p is at most 1 / sqrt(2) of a voxel.
-    """
+    """Turn by a rotation [2, 2] about the vertical axis through the origin of its frame."""
     columns, rows, layers = grid.probability.shape
     extent = np.array([columns, rows]) * grid.resolution_m
     corners = (grid.origin[:2] + np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * extent) @ world_from_plane.T
     low, high = corners.min(axis=0), corners.max(axis=0)
     x_count, y_count = np.maximum(np.ceil((high - low) / side - 1e-6).astype(int), 1).tolist()
     check_size(source, [x_count, y_count, layers], side, "state a larger resolution_m")
-    turned = np.full((x_count, y_count, layers), np.nan, dtype=np.float32)
+    turned = sampled(grid, world_from_plane, low, (x_count, y_count), side)
+    return Occupancy(turned, np.array([*low, grid.origin[2]]), side)
+
+
+def sampled(
+    grid: Occupancy, world_from_plane: Float, low: Float, shape: tuple[int, int], side: float
+) -> Float32:
+    """Sample a grid that is turned about the vertical so densely that every voxel is met.
+
+    Samples form a square lattice of pitch p with the covering radius p / sqrt(2). The disc within a
+    voxel has half its side as radius. So every voxel is met if p is at most 1 / sqrt(2) of a voxel.
+
+    Args:
+        grid: its origin and axes are those of its frame.
+        world_from_plane: rotation [2, 2] about the vertical axis through the origin of that frame.
+        low: [2] the lowest corner of the result, in the world's axes from that origin.
+        shape: voxels of the result along x and y.
+        side: of those voxels, m.
+
+    Returns:
+        [X, Y, Z] the largest probability met in each voxel; NaN if none.
+    """
+    turned = np.full((*shape, grid.probability.shape[2]), np.nan, dtype=np.float32)
     dense = math.ceil(math.sqrt(2) * side / grid.resolution_m)
     within = (np.arange(dense) + 0.5) / dense
-    step = max(1, _SLAB_VALUES // (y_count * layers))
-    y = low[1] + (np.arange(y_count)[:, None] + within) * side  # [Y, dense]
-    for first in range(0, x_count, step):
+    step = max(1, _SLAB_VALUES // turned[0].size)
+    y = low[1] + (np.arange(shape[1])[:, None] + within) * side  # [Y, dense]
+    for first in range(0, shape[0], step):
         slab = turned[first : first + step]
         x = low[0] + (np.arange(first, first + len(slab))[:, None] + within) * side
         for at_x in x.T:
             for at_y in y.T:
                 met = _looked_up(grid, world_from_plane, at_x[:, None], at_y[None, :])
                 np.fmax(slab, met, out=slab)
-    return Occupancy(turned, np.array([*low, grid.origin[2]]), side)
+    return turned
 
 
-def _looked_up(grid: Occupancy, world_from_plane: Float, x: Float, y: Float) -> NDArray[np.float32]:
+def _looked_up(grid: Occupancy, world_from_plane: Float, x: Float, y: Float) -> Float32:
     """Look up the columns of voxels [X, Y, Z] at x [X, 1] and y [1, Y] in the world's axes; NaN outside."""
     (c, minus_s), _ = world_from_plane
     column = np.floor((c * x - minus_s * y - grid.origin[0]) / grid.resolution_m).astype(np.int64)

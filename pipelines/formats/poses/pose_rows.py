@@ -1,21 +1,64 @@
-"""Cleaning of logged poses into a trajectory: one set of rules for every text format."""
+"""Poses in text: names of columns, and cleaning into a trajectory by one set of rules for every format."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.common.rows import bounding_box, describe_times, kept_rows
-from pipelines.geometry.arrays import Bool, Float
+from pipelines.formats.common.rows import (
+    NORM_TOLERANCE,
+    Heading,
+    bounding_box,
+    describe_times,
+    find_heading,
+    kept_rows,
+)
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64, Trajectory
+from pipelines.session.records import Trajectory
+
+POSITION, QUATERNION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+_POSITION_PREFIX = r"t|p_|pos_|position_|p_rs_r_|translation_|pose_position_|pose_pose_position_"
+_QUATERNION_PREFIX = r"q|q_|quat_|quaternion_|orientation_|q_rs_|pose_orientation_|pose_pose_orientation_"
 
 FARTHEST_M = 1e9
 """Largest coordinate: beyond the Moon, so no pose of a flight; squares of much larger ones overflow."""
 
-NORM_TOLERANCE = 0.1
-"""Largest deviation of a quaternion from unit length: up to this rounding explains it, beyond not."""
+
+def find_poses(text: str) -> tuple[Heading, dict[str, int]] | None:
+    """Find the heading of a table of poses, and the columns x, y, z, qx, qy, qz, qw and any of c00..c55.
+
+    It is the first line that is no comment. It may also be a comment whose cells are separated by more than
+    spaces (`#timestamp [ns],p_RS_R_x [m],...`). Comments of TUM files, with spaces only, do not count.
+    """
+    for index, line in enumerate(text.split("\n", 100)[:100]):
+        stripped = line.strip()
+        if not stripped:
+            continue
+        heading = find_heading(stripped, index)
+        columns: dict[str, int] = {}
+        for name, place in heading.names.items() if heading else ():
+            if (column := pose_column(name)) is not None:
+                columns.setdefault(column, place)
+        if heading is not None and all(name in columns for name in (*POSITION, *QUATERNION)):
+            return heading, columns
+        if not stripped.startswith("#"):
+            return None
+    return None
+
+
+def pose_column(name: str) -> str | None:
+    """Return the table column of a heading; None if it is none of a pose."""
+    covariance = re.fullmatch(r"c([0-5])([0-5])", name)
+    if name in POSITION or (covariance and covariance[1] <= covariance[2]):
+        return name
+    if match := re.fullmatch(rf"(?:{_POSITION_PREFIX})([xyz])", name):
+        return match[1]
+    if match := re.fullmatch(rf"(?:{_QUATERNION_PREFIX})([xyzw])", name):
+        return "q" + match[1]
+    return None
 
 
 def clean_poses(

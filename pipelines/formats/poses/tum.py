@@ -21,8 +21,7 @@ from pipelines.formats.common.rows import (
     parse_table,
     stamp_column,
 )
-from pipelines.formats.poses.pose_csv import find_header, pose_column
-from pipelines.formats.poses.pose_rows import clean_poses, describe_trajectory
+from pipelines.formats.poses.pose_rows import clean_poses, describe_trajectory, find_poses, pose_column
 from pipelines.session.errors import DataError
 from pipelines.session.records import JointMotion, Recording, Trajectory
 
@@ -44,7 +43,7 @@ class TumFormat:
         """Return True if the first line of numbers has eight, without a CSV header above."""
         head, _, _ = _take_header(_spaced(read_head(path, self.suffixes)))
         first = next((line for line in head.split("\n") if line and not line.startswith("#")), "")
-        return find_header(read_head(path, self.suffixes)) is None and _is_eight_numbers(first)
+        return find_poses(read_head(path, self.suffixes)) is None and _is_eight_numbers(first)
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe rows, times, gaps, bounding box and losses."""

@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 
 from pipelines.formats.common.exporting import as_jpeg, ellipsoids_95, safe_file_name, shown_surface, thinned
+from pipelines.geometry.arrays import Int64
 from pipelines.geometry.cameras import Intrinsics, camera_matrix
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64, JointMotion, Recording, Trajectory
+from pipelines.session.records import JointMotion, Recording, Trajectory
 from pipelines.session.registries import need
 from pipelines.session.skeletons import bones_of, with_derived
 

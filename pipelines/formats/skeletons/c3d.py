@@ -33,9 +33,9 @@ from pipelines.formats.skeletons.joint_files import (
     to_metres_z_up,
     to_y_up,
 )
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64, JointMotion, Recording
+from pipelines.session.records import JointMotion, Recording
 from pipelines.session.registries import need
 from pipelines.session.storage import as_data_error
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.formats.common.rows import bounding_box, describe_times
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.poses import interpolate_points
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Progress
-from pipelines.session.records import Int64, JointMotion
+from pipelines.session.records import JointMotion
 from pipelines.session.skeletons import SKELETONS
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.formats.common.exporting import write_tables
 from pipelines.formats.common.files import read_head, read_text
-from pipelines.formats.common.rows import cell_name, parse_stamps, parse_table, stamp_column
+from pipelines.formats.common.rows import Heading, find_heading, parse_stamps, rows_below
 from pipelines.formats.poses import pose_csv
 from pipelines.formats.skeletons.joint_files import describe_motion, joint_columns, to_metres_z_up
+from pipelines.geometry.arrays import Float, Int64
 from pipelines.session.errors import DataError
-from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Int64, JointMotion, Recording
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS, JointMotion, Recording
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -37,7 +36,7 @@ class JointsCsvFormat:
 
     def recognises(self, path: Path) -> bool:
         """Return True if the header names a time, a joint and x y z."""
-        return _find_columns(read_head(path, self.suffixes).split("\n", 1)[0]) is not None
+        return _find_heading(read_head(path, self.suffixes)) is not None
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe joints, people, times, missing values, and the box as if in metres with z up."""
@@ -50,25 +49,18 @@ class JointsCsvFormat:
             DataError: not text, no such header, a malformed or truncated line, a time or person that is no
                 number, a joint that occurs twice at one time, or rows too scattered for a dense table.
         """
-        first, _, body = read_text(path).partition("\n")
-        columns = _find_columns(first)
-        if columns is None:
+        text = read_text(path)
+        heading = _find_heading(text)
+        if heading is None:
             raise DataError(
                 path, "has no header that names the time, joint and x y z", "begin with t_ns,joint,x,y,z"
             )
-        person = {} if columns.person is None else {"person": columns.person}
-        table = parse_table(
-            path,
-            body,
-            delimiter=",",
-            columns=columns.count,
-            text={"stamp": columns.stamp, "joint": columns.joint, **person},
-            numbers=dict(zip("xyz", columns.xyz, strict=True)),
-            first_line=2,
-        )
+        names = heading.names
+        words = {name: names[name] for name in ("joint", "person") if name in names}
+        table = rows_below(path, heading, text, words, {axis: names[axis] for axis in "xyz"})
         if table.truncated:
             raise DataError(path, "its last line broke off", "copy the file again, or delete that line")
-        stamps, readable = parse_stamps(path, table.text["stamp"], columns.stamp_unit)
+        stamps, readable = parse_stamps(path, table.text["stamp"], heading.unit)
         if not readable.all():
             raise DataError(path, f"{np.count_nonzero(~readable)} rows have no readable time", "correct them")
         position = to_metres_z_up(path, table.stack(("x", "y", "z")), unit or "m", axes or "z-up")
@@ -76,27 +68,10 @@ class JointsCsvFormat:
         return _dense(path, stamps, people, table.text["joint"], position)
 
 
-@dataclass(frozen=True)
-class _Columns:
-    """Positions of the columns, and their total number."""
-
-    count: int
-    stamp: int
-    stamp_unit: int
-    joint: int
-    xyz: tuple[int, int, int]
-    person: int | None
-
-
-def _find_columns(line: str) -> _Columns | None:
-    """Find the columns that a header names; None if a required one is absent."""
-    cells = line.split(",")
-    stamp = stamp_column(cells)
-    index = {cell_name(cell)[0]: column for column, cell in reversed(list(enumerate(cells)))}
-    if stamp is None or not index.keys() >= {"joint", "x", "y", "z"}:
-        return None
-    xyz = (index["x"], index["y"], index["z"])
-    return _Columns(len(cells), stamp[0], stamp[1], index["joint"], xyz, index.get("person"))
+def _find_heading(text: str) -> Heading | None:
+    """Parse the first line; None if it names no time, joint or position."""
+    heading = find_heading(text.split("\n", 1)[0], delimiters=",")
+    return heading if heading and heading.names.keys() >= {"joint", "x", "y", "z"} else None
 
 
 def _people(path: Path, column: pa.ChunkedArray | None, rows: int) -> Int64:
@@ -117,9 +92,7 @@ def _people(path: Path, column: pa.ChunkedArray | None, rows: int) -> Int64:
     return np.asarray(numbers.to_numpy(), dtype=np.int64)
 
 
-def _dense(
-    path: Path, stamps: Int64, people: Int64, names: pa.ChunkedArray, position: NDArray[np.float64]
-) -> JointMotion:
+def _dense(path: Path, stamps: Int64, people: Int64, names: pa.ChunkedArray, position: Float) -> JointMotion:
     """Convert long rows [N] to dense arrays [T, P, J, 3]."""
     import pandas as pd
 

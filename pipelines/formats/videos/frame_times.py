@@ -10,18 +10,17 @@ import numpy as np
 
 from pipelines.formats.common.files import read_head, read_text
 from pipelines.formats.common.rows import (
-    cell_name,
+    Heading,
     describe_times,
     drop_rows,
+    find_heading,
     format_seconds,
     parse_stamps,
-    parse_table,
-    stamp_column,
+    rows_below,
 )
 from pipelines.formats.drone_logs.dji_srt import parse_subtitles, read_subtitles
-from pipelines.geometry.arrays import Bool
+from pipelines.geometry.arrays import Bool, Int64
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64
 
 _FRAME_NAMES = {"frame", "frame_id", "frame_index", "frame_number"}
 
@@ -53,8 +52,8 @@ class FrameTimesFormat:
         if path.suffix.lower() == ".srt":
             subtitles = parse_subtitles(head)
             return bool(subtitles.has_clock.any()) and not subtitles.are_slow
-        header = _find_header(head)
-        return header is not None and header.columns == (1 if header.frame is None else 2)
+        found = _find_heading(head)
+        return found is not None and found[0].columns == (1 if found[1] is None else 2)
 
     def describe(self, path: Path) -> dict[str, object]:
         """Describe rows, frame numbers, times, gaps, and losses."""
@@ -118,54 +117,32 @@ def times_of_frames(stamps: FrameStamps, pts_ns: Int64) -> tuple[Int64, Bool]:
 # --- CSV ------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Header:
-    line: int  # its index in the file
-    delimiter: str
-    columns: int
-    stamp: int
-    unit: int
-    frame: int | None
-
-
-def _find_header(text: str) -> _Header | None:
-    """Parse the first line that is not blank; None if it names no time."""
-    for index, line in enumerate(text.split("\n", 100)[:100]):
-        if not line.strip():
-            continue
-        delimiter = next((mark for mark in ",;\t" if mark in line), ",")
-        cells = line.split(delimiter)
-        stamp = stamp_column(cells)
-        frame = next((k for k, cell in enumerate(cells) if cell_name(cell)[0] in _FRAME_NAMES), None)
-        return None if stamp is None else _Header(index, delimiter, len(cells), *stamp, frame)
-    return None
+def _find_heading(text: str) -> tuple[Heading, int | None] | None:
+    """Parse the first line that is not blank, and the column of frame numbers; None if it names no time."""
+    first = next(((k, line) for k, line in enumerate(text.split("\n", 100)[:100]) if line.strip()), None)
+    heading = find_heading(first[1], first[0]) if first else None
+    if heading is None:
+        return None
+    return heading, next((column for name, column in heading.names.items() if name in _FRAME_NAMES), None)
 
 
 def _read_csv(path: Path) -> FrameStamps:
     text = read_text(path)
-    header = _find_header(text)
-    if header is None:
+    found = _find_heading(text)
+    if found is None:
         raise DataError(
             path, "has no header that names the time", "begin it with the line frame,t_ns (or t in seconds)"
         )
-    body = text.split("\n", header.line + 1)[header.line + 1 :]
-    if header.columns == 1:
+    heading, column = found
+    if heading.columns == 1:
         # Blank lines count here: row k is frame k.
-        lines = body[0].rstrip().split("\n") if body and body[0].strip() else []
-        t_ns, readable = parse_stamps(path, lines, header.unit)
+        lines = text.rstrip().split("\n")[heading.line + 1 :]
+        t_ns, readable = parse_stamps(path, lines, heading.unit)
         return _clean(path, np.arange(len(t_ns)), t_ns, None, {"no time": ~readable}, {})
-    table = parse_table(
-        path,
-        body[0] if body else "",
-        delimiter=header.delimiter,
-        columns=header.columns,
-        text={"stamp": header.stamp} | ({} if header.frame is None else {"frame": header.frame}),
-        numbers={},
-        first_line=header.line + 2,
-    )
-    t_ns, readable = parse_stamps(path, table.text["stamp"], header.unit)
+    table = rows_below(path, heading, text, {} if column is None else {"frame": column}, {})
+    t_ns, readable = parse_stamps(path, table.text["stamp"], heading.unit)
     frame, numbered = np.arange(len(t_ns)), np.ones(len(t_ns), dtype=np.bool_)
-    if header.frame is not None:
+    if column is not None:
         frame, numbered = _frame_numbers(table.text["frame"].to_pylist())
     dropped = {"truncated last line": table.truncated} if table.truncated else {}
     return _clean(path, frame, t_ns, None, {"no time": ~readable, "no frame number": ~numbered}, dropped)

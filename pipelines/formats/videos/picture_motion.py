@@ -5,13 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.formats.videos.video import VideoReader
-from pipelines.geometry.arrays import Float
+from pipelines.geometry.arrays import Float, Float32, Int64, Picture
 from pipelines.geometry.cameras import Intrinsics, rescaled, undistort
 from pipelines.geometry.clocks import Followed
-from pipelines.session.records import Int64
 
 _WIDTH_PX = 320  # width to which pictures are reduced: motion is still visible
 _STRETCH_NS = 200_000_000
@@ -19,8 +17,8 @@ _CORNERS = 100
 _LEAST_CORNERS = 12
 _CORNER_QUALITY, _CORNERS_APART_PX = 0.01, 8
 
-_Grey = NDArray[np.uint8]
-_Pixels = NDArray[np.float32]  # [C, 1, 2], OpenCV's layout
+_Grey = Picture
+_Pixels = Float32  # [C, 1, 2], OpenCV's layout
 
 
 def followed_points(path: Path, intrinsics: Intrinsics, pts_ns: Int64) -> Followed:

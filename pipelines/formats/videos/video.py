@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import numpy as np
 
 from pipelines.formats.common.rows import describe_times
-from pipelines.geometry.arrays import Picture
+from pipelines.geometry.arrays import Int64, Picture
 from pipelines.session.errors import DataError
-from pipelines.session.records import Int64, VideoIndex
+from pipelines.session.records import VideoIndex
 
 if TYPE_CHECKING:
     from av import Packet, VideoFrame

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.geometry.arrays import Picture
-from pipelines.session.records import Int64
+from pipelines.geometry.arrays import Int64, Picture
 
 if TYPE_CHECKING:
     from av import Packet, VideoStream
