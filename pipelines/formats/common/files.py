@@ -35,10 +35,7 @@ def read_bytes(path: Path) -> bytes:
 def first_bytes(path: Path, count: int = HEAD_BYTES, *, suffixes: Collection[str] = ()) -> bytes:
     """Read the beginning of a file, to recognise it; empty for what cannot be read. Never raises.
 
-    Args:
-        path: the file.
-        count: number of bytes.
-        suffixes: in lower case; the result is empty for any other suffix. Without suffixes, any will do.
+    If `suffixes` (in lower case) are stated, it is also empty for a file with another one.
     """
     if (suffixes and path.suffix.lower() not in suffixes) or is_special(path):
         return b""
@@ -50,12 +47,9 @@ def first_bytes(path: Path, count: int = HEAD_BYTES, *, suffixes: Collection[str
 
 
 def split_header(path: Path, content: bytes, last: str) -> tuple[list[list[str]], Bytes]:
-    """Split a file into the words of each header line and the bytes below the header.
+    """Split a file's content into the words of each header line and the bytes below the header.
 
-    Args:
-        path: the file, for messages.
-        content: all of it.
-        last: the first word of the header's last line.
+    `last` is the first word of the header's last line.
 
     Raises:
         DataError: no such line within the first 64 KiB.

@@ -56,10 +56,10 @@ def parse_table(
     numbers: dict[str, int],
     first_line: int,
 ) -> TextTable:
-    """Read delimited rows.
+    """Read delimited rows of `columns` cells; blank lines and lines that begin with # are skipped.
 
     If the last line does not parse, its writing was probably interrupted: it is left out and counted in
-    `truncated`. Blank lines and lines that begin with # are skipped.
+    `truncated`.
 
     Args:
         path: the file, for messages.
@@ -150,18 +150,11 @@ def _is_number(cell: str) -> bool:
 def parse_stamps(
     source: Path | str, texts: Sequence[str] | pa.ChunkedArray, unit: int = SECONDS
 ) -> tuple[Int64, Bool]:
-    """Parse stamps as nanoseconds, rounded to the nearest (halves away from zero), without any float between.
+    """Parse decimal stamps [N] as nanoseconds, rounded to the nearest (halves away from zero).
 
-    A float64 holds 1700000000.123456789 s only to 0.2 us.
-
-    Args:
-        source: the file, for messages.
-        texts: [N] decimal numbers, with an exponent or without.
-        unit: SECONDS, MILLISECONDS, MICROSECONDS or NANOSECONDS.
-
-    Returns:
-        [N] nanoseconds (0 if the text is unusable), and [N] True if the text is a finite number that
-        int64 nanoseconds can hold.
+    No float stands between: a float64 holds 1700000000.123456789 s only to 0.2 us. `unit` is SECONDS,
+    MILLISECONDS, MICROSECONDS or NANOSECONDS. The result is 0 where the second array is False, because the
+    text is no finite number that int64 nanoseconds can hold.
 
     Raises:
         DataError: most stamps are too large for the unit (after the year 2262), so the unit is wrong.
@@ -316,9 +309,8 @@ def kept_rows(
 ) -> Bool:
     """Mark the usable rows [N]; count the others in `dropped` under the first cause that applies.
 
-    After `causes` come "duplicate stamp" and "stamp out of order" (behind `prefix`): of the other rows, the
-    longest chain of rising stamps is kept, so that one wrong stamp costs one row. Of equal stamps the first
-    stays.
+    After `causes` come "duplicate stamp" (the first stays) and "stamp out of order", behind `prefix`: the
+    longest chain of rising stamps is kept, so that one wrong stamp costs one row.
     """
     keep = np.ones(len(t_ns), dtype=np.bool_)
     for cause, bad in causes.items():
@@ -365,11 +357,7 @@ def median_step_ns(t_ns: Int64) -> float | None:
 
 
 def describe_times(t_ns: Int64) -> dict[str, object]:
-    """Return first and last stamp, span, rate, and the number and the longest of the gaps.
-
-    Args:
-        t_ns: [N] strictly increasing.
-    """
+    """Return first and last stamp, span, rate, number of gaps and the longest, for rising stamps."""
     if not len(t_ns):
         return {}
     step = median_step_ns(t_ns)

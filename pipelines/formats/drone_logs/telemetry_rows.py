@@ -84,7 +84,7 @@ def attitude_track(
         name: name of the attitude in the log.
         t_ns: [N] stamps.
         quaternion_xyzw: [N, 4] of an FLU body in an ENU world, or of an FLU gimbal in an FLU body.
-        dropped: counts of dropped rows by cause.
+        dropped: receives the counts.
         relative_to: reference of the quaternions, world or body.
         stated: of a gimbal, its angles as the log gives them, as in `AttitudeTrack`.
     """
@@ -137,13 +137,10 @@ def pictures_on_gps_time(source: Path, t_ns: Int64, fit: ClockFit | None, choice
 
 
 def placed_by(track: PositionTrack, fixes: PositionTrack) -> tuple[PositionTrack, str]:
-    """Give a track in metres its origin on Earth, by GPS fixes of the same drone.
+    """Give a track in metres its origin on Earth, by GPS fixes of the same drone; say how they agree.
 
-    The origin comes from the median difference of the two, so that single wild fixes do not matter. A
-    constant error of the fixes stays in it.
-
-    Returns:
-        The track, and a sentence about the agreement of the two.
+    The origin comes from the median difference of the two, so single wild fixes do not matter. A constant
+    error of the fixes stays in it.
     """
     near = Place(*fixes.values[0].tolist())
     latitude, longitude, height = fixes.values.T
@@ -161,16 +158,9 @@ def placed_by(track: PositionTrack, fixes: PositionTrack) -> tuple[PositionTrack
 def world_from_heading(body: AttitudeTrack, t_ns: Int64, heading_from_gimbal: Float) -> Float:
     """Return attitudes [N, 4] of an FLU gimbal in an ENU world, from angles with yaw relative to the nose.
 
-    Autopilots log such angles: pitch and roll against the horizon, yaw against the heading.
-
-    Args:
-        body: attitude of the body in the world.
-        t_ns: [N] stamps.
-        heading_from_gimbal: [N, 4] as logged: an FRD gimbal in a level frame with x along the nose and
-            z down.
-
-    Returns:
-        [N, 4], NaN if the body's attitude is not known within a second.
+    Autopilots log such angles: pitch and roll against the horizon, yaw against the heading. So
+    `heading_from_gimbal` [N, 4] is an FRD gimbal in a level frame with x along the nose and z down. NaN if
+    the body's attitude is not known within a second.
     """
     _, turned = interpolate_poses(
         body.t_ns,
@@ -248,37 +238,23 @@ def said_of_fit(fit: ClockFit) -> str:
 
 
 def between_repeats(t_ns: Int64, values: Float) -> tuple[Float, int]:
-    """Interpolate the positions of a log that repeats each measurement until the next one comes.
+    """Interpolate the positions [N, D] of a log that repeats each measurement until the next one comes.
 
     If a value stays the same for longer than a second before it changes, the hold is kept until one second
-    before the change.
-
-    Args:
-        t_ns: [N] increasing stamps.
-        values: [N, D].
-
-    Returns:
-        [N, D], and the number of changed rows.
+    before the change. Also return the number of changed rows.
     """
     smooth = np.stack([_between_changes(t_ns, column, len(t_ns)) for column in values.T], axis=1)
     return smooth, int(np.count_nonzero((smooth != values).any(axis=1)))
 
 
 def between_refreshed_angles(t_ns: Int64, angles: Float) -> Float:
-    """Interpolate the angles of a log that repeats each measurement until the next one comes.
+    """Interpolate the angles [N, D] of a log that repeats each measurement until the next one comes.
 
     A gimbal that keeps an angle gives the same number at each measurement. So an angle counts as repeated
-    only for one refresh interval of the log. If a hold is longer, only its last refresh interval becomes a
-    line to the new angle, and the rest stays as logged. The refresh interval is the shortest time between two
-    changes, because a log that repeats cannot change sooner. It is used only if most changes follow each
-    other so soon; a log that changes only now and then stays as it is.
-
-    Args:
-        t_ns: [N] increasing stamps.
-        angles: [N, D] without jumps by full turns; each column may be refreshed at its own rate.
-
-    Returns:
-        [N, D].
+    only for one refresh interval of the log: of a longer hold, only the last interval becomes a line to the
+    new angle. The refresh interval is the shortest time between two changes, because a log that repeats
+    cannot change sooner. It is used only if most changes follow each other so soon. Angles have no jumps by
+    full turns; each column may be refreshed at its own rate.
     """
     return np.stack([_between_changes(t_ns, column, _refreshed_rows(column)) for column in angles.T], axis=1)
 

@@ -215,10 +215,8 @@ class Gathering:
     def frame_of(self, name: object, where: str, file: Path | None = None) -> int:
         """Return the frame number of a picture's name or number, and list that frame.
 
-        Args:
-            name: the name or number.
-            where: name of the entry for messages.
-            file: the file, if each of several files counts frames by itself.
+        `where` names the entry for messages. `file` is stated if each of several files counts frames by
+        itself.
 
         Raises:
             DataError: it has no number, or another picture has the same number (two cameras in one file?).
@@ -239,11 +237,11 @@ class Gathering:
     def add(
         self, frame: int, rows: Float, where: str, *, rank: int | None = None, own_id: int | None = None
     ) -> None:
-        """Add one person.
+        """Add a person of a frame with its rows [K, 3] of x, y, confidence.
 
         Args:
             frame: result of `frame_of`.
-            rows: [K, 3] x, y, confidence.
+            rows: the keypoints.
             where: name of the entry for messages.
             rank: position within the frame, if the file groups people by frame; else the next one.
             own_id: the tracker's id of the person.
@@ -269,7 +267,7 @@ class Gathering:
         """Return the number of keypoints of each person.
 
         Raises:
-            DataError: there are no people; the message gives the number of frames and the losses.
+            DataError: there are no people.
         """
         if not self._rows:
             causes = [f"{number} x {cause}" for cause, number in sorted(self.dropped.items()) if number]
@@ -283,12 +281,11 @@ class Gathering:
     def detections(self, skeleton: Skeleton, first_frame: int) -> Detections:
         """Return everything collected, cleaned and sorted.
 
-        Frames before `first_frame` are dropped. A detection that repeats another one of its frame number by
-        number is dropped too. A joint is missing (NaN, confidence 0) if its position is not finite or
-        further than `_FARTHEST_PX` from the top left pixel. It is also missing if its confidence is 0:
-        detectors write this for "not found", with any position. A confidence that is not finite or below 0
-        becomes 0. All of this except "not found" is counted in `dropped`. A confidence above 1 becomes 1 and
-        is counted in `adjusted`.
+        Frames before `first_frame` and repeated detections (equal number by number) are dropped. A joint is
+        missing (NaN, confidence 0) if its position is not finite or beyond `_FARTHEST_PX`, or if its
+        confidence is 0: detectors write this for "not found", with any position. A confidence that is not
+        finite or below 0 becomes 0. All of this except "not found" is counted in `dropped`. A confidence
+        above 1 becomes 1, counted in `adjusted`.
 
         Raises:
             DataError: no joint of any person is left.
@@ -348,7 +345,7 @@ class Gathering:
     def _person_numbers(self, kept: Bool) -> Int64:
         """Number the kept people by the detector's own ids, or by their positions within the frame.
 
-        The positions are used if somebody has no id, or if several people of a frame share the only id.
+        The positions count if somebody has no id, or if several people of a frame share the only id.
         """
         rows = np.flatnonzero(kept)
         own = [own_id for row in rows if (own_id := self._own_id[row]) is not None]

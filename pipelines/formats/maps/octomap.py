@@ -161,11 +161,8 @@ def occupancy_from(
 def leaves_of(source: Path | str, payload: Bytes, *, is_binary: bool, tree: str) -> Leaves:
     """Find the leaves of a tree without a header, as in octomap_msgs/Octomap.
 
-    Args:
-        source: the file or topic, for messages.
-        payload: the bytes that follow the header in a file.
-        is_binary: True for the layout of a .bt, else that of a .ot.
-        tree: the kind of tree; a .bt has one layout for all.
+    `payload` are the bytes that follow the header in a file, in the layout of a .bt (`is_binary`, one for all
+    kinds of trees) or a .ot.
 
     Raises:
         DataError: as in `binary_leaves` and `full_leaves`, or nodes of an unknown kind.
@@ -319,8 +316,7 @@ def write_octomap(path: Path, occupancy: Occupancy) -> None:
 
     Raises:
         ValueError: the origin is not a multiple of the resolution, or nothing in the map is known.
-        DataError: the map reaches further from the world's origin than an OctoMap of these voxels can
-            (32768 voxels).
+        DataError: the map is more than 32768 voxels from the world's origin.
     """
     from pipelines.formats.maps.octree import FREE, INNER, OCCUPIED, UNKNOWN, nodes_of, write_depth_first
 

@@ -28,12 +28,9 @@ _SLAB_VALUES = 1 << 22  # values of a turned grid that are sampled at a time
 
 
 def occupancy_of(source: Path | str, points: Float, resolution_m: float | None) -> Occupancy:
-    """Make the voxels of a point cloud; their corners are whole multiples of the resolution.
+    """Make the voxels of points [N, 3] m; corners are whole multiples of the resolution (default 0.2 m).
 
-    Args:
-        source: the file or topic, for messages.
-        points: [N, 3] metres; points that are not finite are left out and counted.
-        resolution_m: the side of a voxel; None for 0.2 m.
+    Points that are not finite are left out and counted.
 
     Raises:
         DataError: no finite point, an impossible resolution, or a box that is too large.
@@ -49,16 +46,10 @@ def occupancy_of(source: Path | str, points: Float, resolution_m: float | None) 
 
 
 class VoxelSet:
-    """Voxels of many clouds, each with the earliest time of a point in it.
-
-    Memory grows with the voxels, not with the points.
-
-    Args:
-        source: the log and topic, for messages.
-        resolution_m: the side of a voxel; None for 0.2 m.
+    """Voxels of many clouds, each with the earliest time of a point in it; memory grows with the voxels only.
 
     Raises:
-        DataError: an impossible resolution.
+        DataError: an impossible resolution (default 0.2 m).
     """
 
     def __init__(self, source: str, resolution_m: float | None) -> None:
@@ -147,14 +138,9 @@ def describe_points(source: Path | str, points: Float) -> dict[str, object]:
 def packed_points(
     path: Path, body: Bytes, count: int, columns: dict[str, tuple[str, int]], stride: int
 ) -> Float:
-    """Extract points [N, 3] from binary records.
+    """Extract points [N, 3] from binary records of `stride` bytes; more may follow the last.
 
-    Args:
-        path: the file, for messages.
-        body: the bytes from the first record on; more may follow the last.
-        count: number of records in the header.
-        columns: numpy type and offset within a record, for each of x, y and z.
-        stride: bytes of a record.
+    `columns` gives numpy type and offset within a record for each of x, y and z.
 
     Raises:
         DataError: the file ends before the last record.
@@ -180,14 +166,9 @@ def joined(columns: Sequence[NDArray[Any]]) -> Float:
 
 
 def written_points(path: Path, body: Bytes, skipped: int, count: int, columns: tuple[int, int, int]) -> Float:
-    """Parse points [N, 3] from rows of text.
+    """Parse points [N, 3] from rows of text, behind `skipped` rows of other elements.
 
-    Args:
-        path: the file, for messages.
-        body: the text below the header.
-        skipped: rows of other elements before the points.
-        count: number of rows of points in the header.
-        columns: indices of x, y and z in a row.
+    `columns` are the indices of x, y and z in a row, `count` is the number of points in the header.
 
     Raises:
         DataError: fewer rows, or a cell that is missing or no number.
@@ -205,11 +186,7 @@ def written_points(path: Path, body: Bytes, skipped: int, count: int, columns: t
 
 
 def check_count(path: Path, stated: int, there: int) -> None:
-    """Refuse a cloud with fewer points than its header states.
-
-    Raises:
-        DataError: there are fewer.
-    """
+    """Refuse a cloud with fewer points than its header states (DataError)."""
     if stated > there:
         raise DataError(
             path, f"breaks off: {there} of {stated} points are there", "copy it again or export it again"
@@ -247,19 +224,13 @@ def _rounded(values: Float) -> list[float]:
 def placed(
     source: str, grid: Occupancy, world_from_grid: Pose, *, resolution_m: float | None = None
 ) -> Occupancy:
-    """Convert a voxel grid to the world's axes.
+    """Convert a voxel grid in its own frame to the world's axes.
 
-    A grid that is turned by a multiple of a right angle keeps its voxels: they are only counted along other
-    axes. For any other turn about the vertical the grid is sampled so densely that every voxel is met. A
-    voxel takes the largest probability met in it: a wall may grow by a voxel, but never vanishes. A turn is
-    rounded to the nearest of these if no voxel moves by more than half its side, because counting in voxels
-    rounds by as much anyway.
-
-    Args:
-        source: the log and topic, for messages.
-        grid: its origin and axes are those of its frame.
-        world_from_grid: the pose of that frame.
-        resolution_m: another side for the voxels, for a grid of one layer.
+    Turned by a multiple of a right angle it keeps its voxels: they are only counted along other axes. For any
+    other turn about the vertical it is sampled so densely that every voxel is met. A voxel takes the largest
+    probability met in it: a wall may grow by a voxel, but never vanishes. A turn is rounded to the nearest of
+    these if no voxel moves by more than half its side, because counting in voxels rounds by as much anyway.
+    `resolution_m` is another side for the voxels, for a grid of one layer.
 
     Raises:
         DataError: the grid is tilted, or too large once it is turned.

@@ -72,13 +72,12 @@ def clean_poses(
 ) -> Trajectory:
     """Drop the rows that cannot be used, each counted under the first cause that applies.
 
-    - "truncated last line": rows that the reader already left out;
+    - "truncated last line": rows that the reader already left out at the end (`truncated`);
     - "not finite": a stamp or a number that is missing, NaN or infinite. A covariance that is blank
       as a whole is unknown (all zero) and keeps its row;
     - "zero quaternion", "quaternion not unit" (off by more than NORM_TOLERANCE; others are normalised);
     - "absurd position": further from the origin than FARTHEST_M;
-    - "duplicate stamp", "stamp out of order": of the other rows, the longest chain of rising stamps is
-      kept, so that one wrong stamp costs one row. Of equal stamps the first stays.
+    - "duplicate stamp", "stamp out of order" as in `kept_rows`.
 
     Args:
         source: the file, for messages.
@@ -87,7 +86,7 @@ def clean_poses(
         position: [N, 3] m.
         quaternion_xyzw: [N, 4].
         covariance: [N, 6, 6], if there is one.
-        truncated: number of rows that the reader left out at the end.
+        truncated: number of rows left out before.
 
     Raises:
         DataError: no row is left.

@@ -85,21 +85,15 @@ class BvhFormat:
 
 
 def read_motion(path: Path, *, unit: str, axes: str) -> SkeletalMotion:
-    """Read a BVH file as metres with z up.
+    """Read a BVH file as metres with z up; `unit` is m, cm, mm or inch, `axes` y-up or z-up.
 
     Some exports have bones above the first moving one, each with a single child (a `Reference` or scene
     root). They are merged into it, and its motion is then the root's. If a bone further down has moving
     position channels, it is put at their mean, if it is never further than 5 cm from it.
 
-    Args:
-        path: the file.
-        unit: of its lengths: m, cm, mm or inch.
-        axes: y-up or z-up.
-
     Raises:
-        DataError: an unknown unit or unknown axes; no BVH, an unfinished hierarchy, names that occur twice,
-            unknown channels; frames that are missing, too many or cut off, or with a number that is not
-            finite; a bone that moves against its parent by more than 5 cm.
+        DataError: an unknown unit or unknown axes; an unfinished hierarchy, names that occur twice, unknown
+            channels; frames that are missing, too many, cut off or not finite; a bone that moves too far.
     """
     if unit not in METRES:
         raise DataError(path, f"the unit {unit!r} is none of {', '.join(METRES)}", "state one of them")

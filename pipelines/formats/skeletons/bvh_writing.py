@@ -100,10 +100,8 @@ def _made_up(name: str, rigged: Rigged, frames: int) -> str:
 def write_motion(path: Path, motion: SkeletalMotion, *, unit: str, axes: str) -> None:
     """Write a motion at the constant rate of its first and last time; `bvh.read_motion` reads it back.
 
-    The hierarchy of bones comes first, then one line of channels per frame; see module `bvh` for the layout.
-
-    The root has position and rotation channels, every other bone rotations in the order Z, X, Y (Rz Rx Ry).
-    Angles are unwrapped (no jumps of 360 degrees). A bone without children ends in a site of length 0.
+    The root has position and rotation channels, every other bone rotations in the order Z, X, Y (Rz Rx Ry),
+    in degrees without jumps of 360. A bone without children ends in a site of length 0.
     """
     order = _IN_FILE[axes]
     scale = 1 / METRES[unit]
@@ -218,12 +216,7 @@ class Rigged:
 
 
 def fit_rig(source: str, motion: JointMotion, person: int) -> Rigged:
-    """Fit a rig to one person's joints at a constant rate.
-
-    Args:
-        source: name for messages.
-        motion: at least one time; missing joints are NaN.
-        person: index of the person.
+    """Fit a rig to one person's joints at a constant rate; `source` is the name for messages.
 
     Raises:
         DataError: hips and neck are never known at the same time.
@@ -255,19 +248,6 @@ def fit_rig(source: str, motion: JointMotion, person: int) -> Rigged:
         rotation=rotation,
     )
     return Rigged(skeletal, tuple(bone.joint for bone in bones), int(seen[0]), int(without_hips.sum()), *held)
-
-
-def joint_positions(motion: SkeletalMotion) -> Float:
-    """Compute the positions at which the bones of a rig begin, [T, B, 3] m, world."""
-    place = np.empty((len(motion.t_s), len(motion.bones), 3))
-    turned = np.empty((len(motion.t_s), len(motion.bones), 4))
-    for bone, parent in enumerate(motion.parent):
-        if parent < 0:
-            place[:, bone], turned[:, bone] = motion.root, motion.rotation[:, bone]
-        else:
-            place[:, bone] = place[:, parent] + rotate(turned[:, parent], motion.offset[bone])
-            turned[:, bone] = multiply(turned[:, parent], motion.rotation[:, bone])
-    return place
 
 
 def _bones(place: dict[str, Float]) -> tuple[list[_Bone], list[float]]:

@@ -80,17 +80,12 @@ class EvenMotion:
 
 
 def at_even_times(source: str, motion: JointMotion, progress: Progress) -> EvenMotion:
-    """Assign a motion to frames at its usual step, from its first time to its last.
+    """Assign a motion to frames at its usual step, from its first time (there must be one) to its last.
 
-    Every sample gets a frame, and a pause becomes empty frames. Samples within half a
-    millisecond of their frames stay as they are. If any is further off, all positions are interpolated
-    linearly between neighbours (never across a missing one), and the covariances are those of the nearest
-    sample. Both are noted, unless the stamps differ by rounding alone.
-
-    Args:
-        source: name of the motion for messages.
-        motion: at least one time.
-        progress: receives the notes.
+    Every sample gets a frame, and a pause becomes empty frames. Samples within half a millisecond of their
+    frames stay as they are. If any is further off, all positions are interpolated linearly between neighbours
+    (never across a missing one), and the covariances are those of the nearest sample. Both are noted, unless
+    the stamps differ by rounding alone.
 
     Raises:
         DataError: the times are too scattered for a rate.

@@ -56,7 +56,7 @@ class JointsCsvFormat:
                 path, "has no header that names the time, joint and x y z", "begin with t_ns,joint,x,y,z"
             )
         names = heading.names
-        words = {name: names[name] for name in ("joint", "person") if name in names}
+        words = {name: column for name, column in names.items() if name in ("joint", "person")}
         table = rows_below(path, heading, text, words, {axis: names[axis] for axis in "xyz"})
         if table.truncated:
             raise DataError(path, "its last line broke off", "copy the file again, or delete that line")

@@ -90,14 +90,10 @@ def read_frame_times(path: Path) -> FrameStamps:
 
 
 def times_of_frames(stamps: FrameStamps, pts_ns: Int64) -> tuple[Int64, Bool]:
-    """Assign a time to each frame of a video.
+    """Assign a time to each frame of a video, by its presentation times [N] since its first frame.
 
     If the stamps have `media_ns`, each frame takes the nearest one within half a frame, because subtitles
     round to a millisecond. Else frames are matched by number.
-
-    Args:
-        stamps: the frame times that were read.
-        pts_ns: [N] the video's presentation times since its first frame.
 
     Returns:
         [N] times, 0 if unknown, and [N] True if the time is known.

@@ -25,12 +25,8 @@ def followed_points(path: Path, intrinsics: Intrinsics, pts_ns: Int64) -> Follow
     """Find corners in the first pictures, and track each for a fifth of a second.
 
     Tracking is from picture to picture, with pyramids (Lucas and Kanade 1981; Bouguet 2000). A stretch that
-    misses a picture, or loses all but a few corners, is dropped.
-
-    Args:
-        path: the video.
-        intrinsics: of its pictures.
-        pts_ns: [F] strictly increasing stamps of the pictures to use, from the first on.
+    misses a picture, or loses all but a few corners, is dropped. `pts_ns` [F] are the strictly increasing
+    stamps of the pictures to use, from the first on.
 
     Raises:
         DataError: the video cannot be read.

@@ -79,28 +79,25 @@ class VideoContainer:
 def index_video(path: Path) -> VideoIndex:
     """Read the time at which each frame is shown, from the container; only the first picture is decoded.
 
-    The largest video stream is used; cover pictures are ignored. Frames that an edit list hides do not count,
-    nor do those that VP8 and VP9 code for reference only.
-    pts_ns[k] is the stamp of frame k less that of frame 0, rounded to a nanosecond once.
-
-    Counted in `dropped`: "cut off" (frames in the container's table after the end of the file; also the
-    last few frames shown later than the first lost one, because their numbers are unknown),
-    "no stamp", "duplicate stamp".
+    The largest video stream is used. Cover pictures do not count, nor frames that an edit list hides or that
+    VP8 and VP9 code for reference only. pts_ns[k] is the stamp of frame k less that of frame 0, rounded to a
+    nanosecond once. Counted in `dropped`: "cut off" (frames in the table after the end of the file; also the
+    last ones shown later than the first lost one, as their numbers are unknown), "no stamp", "duplicate
+    stamp".
 
     Raises:
-        DataError: missing, empty, no video container, without its table (an MP4 that was never closed),
-            without a video stream, a codec that cannot be decoded, no frame with a stamp, no frame that can
-            be decoded, or a picture size beyond the limit.
+        DataError: missing or no video that can be decoded; without its table (an MP4 that was never closed)
+            or stamps; or a picture size beyond the limit.
     """
     with VideoReader(path) as reader:
         return reader.index
 
 
 def created_ns(path: Path) -> int | None:
-    """Return the time in a video's metadata at which it was made, ns since the epoch; None without one.
+    """Return when a video was made by its metadata, ns since the epoch; None if unknown.
 
-    By definition, MP4 and MOV hold whole seconds of UTC. But some cameras write local time, and some the
-    time at which they closed the file.
+    MP4 and MOV hold whole seconds of UTC by definition. But some cameras write local time, and some the time
+    at which they closed the file.
 
     Raises:
         DataError: the file cannot be opened as a video.
@@ -130,10 +127,10 @@ def frames(
 
 
 class VideoReader:
-    """Open video with its `index`; frames are read by number, in any order.
+    """Open video with its `index`; frames are read by number, in any order. A context manager.
 
-    A context manager. Pictures are BGR, uint8, turned as in players and OpenCV, so that their size
-    is that of the index. `missing` holds the numbers of the undecodable frames found so far.
+    Pictures are BGR, turned as in players and OpenCV, so that their size is that of the index. `missing`
+    holds the numbers of the undecodable frames found so far.
 
     Raises:
         DataError: as in `index_video`.
@@ -179,10 +176,10 @@ class VideoReader:
         return next((picture for _, picture in self.frames(number, number + 1)), None)
 
     def frames(self, start: int = 0, stop: int | None = None, step: int = 1) -> Iterator[tuple[int, Picture]]:
-        """Yield numbers and pictures of frames start, start + step, ... before stop (default: all), in order.
+        """Yield numbers and pictures of frames start, start + step, ... before stop (default: all).
 
-        Pictures come one at a time. Frames that cannot be decoded are skipped; the others keep their
-        numbers. Several iterations may alternate.
+        Frames that cannot be decoded are skipped; the others keep their numbers. Several iterations may
+        alternate.
 
         Raises:
             DataError: no such frames, or a picture of another size than the first.
@@ -356,8 +353,8 @@ def _numbered(
 ) -> Iterator[tuple[int, VideoFrame]]:
     """Yield numbers and frames in the order of showing; undecodable frames are skipped.
 
-    After a seek, frames begin with the first key frame: frames shown before it may depend on
-    pictures that were not decoded.
+    After a seek they begin with the first key frame: earlier ones may depend on pictures that were not
+    decoded.
     """
     from av.error import FFmpegError
 
@@ -386,8 +383,8 @@ def open_container(path: Path) -> tuple[InputContainer, VideoStream]:
     """Open a container and its largest video stream, ready to decode; cover pictures are ignored.
 
     Raises:
-        DataError: missing, empty, no known container, without its table or a video stream, a
-            codec that cannot be decoded, or a picture size beyond the limit.
+        DataError: missing, empty, no known container, without its table or a video stream, a codec that
+            cannot be decoded, or a picture size beyond the limit.
     """
     import av
     from av.error import FFmpegError
@@ -506,9 +503,9 @@ def packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[V
 def is_shown(packet: Packet[VideoStream], codec: str) -> bool:
     """Test if a coded frame gives a picture.
 
-    VP8 and VP9 code frames that are never shown, only referred to (alternate reference frames). Some writers
-    store them as packets of their own, with the stamp of the next picture or one just before it.
-    VP8: RFC 6386, section 9.1. VP9: bitstream specification 0.6, section 6.2 and annex B (superframes).
+    VP8 and VP9 code frames that are only referred to (alternate reference frames); some writers store them as
+    packets of their own. VP8: RFC 6386, section 9.1. VP9: bitstream specification 0.6, section 6.2 and annex
+    B.
     """
     if codec not in {"vp8", "vp9"}:
         return True

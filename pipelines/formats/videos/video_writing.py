@@ -32,11 +32,11 @@ def write_h264(
     key_every: int = 60,
     bits_per_s: int | None = None,
 ) -> None:
-    """Encode pictures as H.264, 4:2:0, in one thread.
+    """Encode pictures [height, width, 3] BGR as an H.264 MP4, 4:2:0, in one thread.
 
     Args:
-        path: an MP4 to write.
-        pictures: [height, width, 3] BGR, as many as stamps.
+        path: the file to write.
+        pictures: as many as stamps.
         pts_ns: [N] strictly increasing times of showing, at least 0.
         width: of the pictures, even.
         height: of the pictures, even.

@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.formats.skeletons import bvh_writing
 from pipelines.formats.skeletons.bvh import read_motion
-from pipelines.formats.skeletons.bvh_writing import fit_rig, joint_positions
+from pipelines.formats.skeletons.bvh_writing import fit_rig
 from pipelines.geometry.arrays import Float
-from pipelines.geometry.poses import matrix_from_quaternion
-from pipelines.session.records import JointMotion
+from pipelines.geometry.poses import matrix_from_quaternion, multiply, rotate
+from pipelines.session.records import JointMotion, SkeletalMotion
 from pipelines.session.registries import ChoiceOfAxes
 from pipelines.session.skeletons import take_joints, with_derived
 from tests.formats.exported import Listener, recording, walking, without
@@ -31,6 +31,19 @@ WRITTEN_M = 1e-6  # six decimals of a degree over 2 m of bones, and of a centime
 def measured(motion: JointMotion, joints: tuple[str, ...]) -> Float:
     """Return the measured positions [T, B, 3] of a rig's joints; the hip is the middle of the hips."""
     return take_joints(*with_derived(motion.joints, motion.position[:, 0])[::-1], joints)
+
+
+def joint_positions(motion: SkeletalMotion) -> Float:
+    """Compute the positions at which the bones of a rig begin, [T, B, 3] m, world."""
+    place = np.empty((len(motion.t_s), len(motion.bones), 3))
+    turned = np.empty((len(motion.t_s), len(motion.bones), 4))
+    for bone, parent in enumerate(motion.parent):
+        if parent < 0:
+            place[:, bone], turned[:, bone] = motion.root, motion.rotation[:, bone]
+        else:
+            place[:, bone] = place[:, parent] + rotate(turned[:, parent], motion.offset[bone])
+            turned[:, bone] = multiply(turned[:, parent], motion.rotation[:, bone])
+    return place
 
 
 def seen_by_bvhtoolbox(path: Path, folder: Path) -> tuple[list[str], Float]:
