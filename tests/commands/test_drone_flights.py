@@ -166,7 +166,7 @@ def test_drones_that_log_body_and_gimbal(tmp_path: Path, write: Any, metres: flo
 
 @pytest.mark.parametrize("says_north", [True, False])
 @pytest.mark.parametrize("meant", ["world", "body", "heading"])
-def test_what_angles_count_from_is_as_the_user_says(tmp_path: Path, meant: str, says_north: bool) -> None:
+def test_the_stated_reference_of_angles_is_used(tmp_path: Path, meant: str, says_north: bool) -> None:
     """Check that the user's statement overrides the log's flags on the reference of its angles."""
 
     def write(folder: Path, name: str, truth: DroneTruth) -> dict[str, Any]:
@@ -287,7 +287,7 @@ def test_one_origin_for_all_where_none_is_stated(tmp_path: Path) -> None:
     np.testing.assert_allclose(second - first, true, atol=1e-4)
 
 
-def test_what_is_missing_is_told_in_one_line(tmp_path: Path) -> None:
+def test_missing_gimbal_angles_are_refused_with_the_remedy(tmp_path: Path) -> None:
     flight = with_poses(tmp_path, _srt)
     write_srt(tmp_path / "drone1.SRT", drone_of(flight, 0), gimbal=False)
     line = refused("ingest", flight.manifest)
@@ -413,7 +413,7 @@ def test_a_recorder_whose_clock_drifts_is_noted(tmp_path: Path) -> None:
     assert "60.0 ppm" in said
 
 
-def test_a_video_begins_when_its_container_says(tmp_path: Path) -> None:
+def test_a_video_starts_at_the_time_of_its_container(tmp_path: Path) -> None:
     import av
 
     flight = write_flight(tmp_path, cameras=1, seconds=1.0, clean=True)

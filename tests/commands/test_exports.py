@@ -75,7 +75,7 @@ def test_pictures_lie_where_the_skeleton_does(filmed: Path) -> None:
     assert not dict(load_recording(filmed).overlays("drone2")), "none unless they are asked for"
 
 
-def test_many_files_are_told_in_a_few_lines(filmed: Path, tmp_path: Path) -> None:
+def test_many_files_are_listed_in_a_few_lines(filmed: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = ("export", filmed, "--to", "tum", "-o", out)
     for what in ("written", "unchanged"):

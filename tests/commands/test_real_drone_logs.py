@@ -109,7 +109,7 @@ def test_subtitles_without_gimbal_angles(tmp_path: Path, name: str, start_s: flo
     ("stated", "from_take_off"),
     [({}, True), ({"altitude": "relative"}, True), ({"altitude": "absolute"}, False)],
 )
-def test_an_altitude_without_a_reference_is_what_init_and_ingest_both_say(
+def test_init_and_ingest_both_note_an_altitude_without_a_reference(
     tmp_path: Path, stated: dict[str, str], from_take_off: bool
 ) -> None:
     name = "second/mavic_air2.srt"
@@ -127,7 +127,7 @@ def test_an_altitude_without_a_reference_is_what_init_and_ingest_both_say(
         assert any("take-off" in line for line in assumed)
 
 
-def test_init_says_that_absolute_heights_are_absolute(tmp_path: Path) -> None:
+def test_init_notes_absolute_heights(tmp_path: Path) -> None:
     text = real_data("second/mavic_air2.srt").read_text(encoding="utf-8").replace("[altitude", "[abs_alt")
     (tmp_path / "air2.srt").write_text(text, encoding="utf-8")
     result = draft([tmp_path])
@@ -193,7 +193,7 @@ def test_what_is_left_open_is_drafted_as_comments(tmp_path: Path) -> None:
     assert any("camera" in line for line in result.missing)
 
 
-def test_nothing_says_how_it_was_turned(tmp_path: Path) -> None:
+def test_a_flight_of_unknown_attitude_is_refused(tmp_path: Path) -> None:
     path = write_flight(tmp_path, "logs/dji_srt/air2s.srt", 1659879640.8, {"dji": ""})
     with pytest.raises(DataError, match="gimbal"):
         ingest(path)

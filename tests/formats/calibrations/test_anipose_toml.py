@@ -131,7 +131,7 @@ def test_names_models_and_missing_poses(tmp_path: Path) -> None:
         ("[one]", "[other]\nname = 'one'\nsize=1\nmatrix=1\n[one]", "camera one"),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path: Path, old: str, new: str, problem: str) -> None:
+def test_faulty_content_is_refused(tmp_path: Path, old: str, new: str, problem: str) -> None:
     assert old in CAMERA
     with pytest.raises(DataError, match=problem):
         READER.read_calibration(write(tmp_path, CAMERA.replace(old, new, 1)))

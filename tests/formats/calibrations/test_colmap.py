@@ -134,7 +134,7 @@ def test_every_truncation_of_a_binary_model_is_an_error(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(whole)
 
 
-def test_counts_are_not_believed(tmp_path: Path) -> None:
+def test_counts_beyond_the_file_are_refused(tmp_path: Path) -> None:
     model({1: ("PINHOLE", PARAMETERS["PINHOLE"])}, {"a.jpg": 1}).write_binary(str(tmp_path))
     path = tmp_path / "images.bin"
     whole = path.read_bytes()
@@ -184,7 +184,7 @@ def test_text_with_blank_point_lines(tmp_path: Path) -> None:
         (CAMERAS.replace("PINHOLE", "EUCM"), IMAGES, "model EUCM"),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path: Path, cameras: str, images: str, problem: str) -> None:
+def test_faulty_content_is_refused(tmp_path: Path, cameras: str, images: str, problem: str) -> None:
     with pytest.raises(DataError, match=problem):
         READER.read_calibration(write(tmp_path, cameras, images))
 

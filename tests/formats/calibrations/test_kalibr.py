@@ -104,7 +104,7 @@ def test_the_header_of_old_files_is_skipped(tmp_path: Path) -> None:
         ({"rostopic": "x" * (1 << 20)}, "characters"),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path: Path, keys: dict[str, str | None], problem: str) -> None:
+def test_faulty_content_is_refused(tmp_path: Path, keys: dict[str, str | None], problem: str) -> None:
     with pytest.raises(DataError, match=problem) as caught:
         READER.read_calibration(chain(tmp_path / "c.yaml", **keys))
     assert "\n" not in str(caught.value)

@@ -104,12 +104,12 @@ def test_name_and_size_list(tmp_path: Path) -> None:
         ({"fisheye_model": 1}, "5 coefficients"),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path: Path, values: dict[str, object], problem: str) -> None:
+def test_faulty_content_is_refused(tmp_path: Path, values: dict[str, object], problem: str) -> None:
     with pytest.raises(DataError, match=problem):
         READER.read_calibration(store(tmp_path / "c.yml", **values))
 
 
-def test_stated_sizes_are_not_believed(tmp_path: Path) -> None:
+def test_stated_sizes_beyond_the_numbers_are_refused(tmp_path: Path) -> None:
     path = store(tmp_path / "c.yml")
     path.write_text(path.read_text().replace("rows: 3", "rows: 300000000", 1))
     with refuses(path, "3e+08", 3, 9):

@@ -142,7 +142,7 @@ def test_without_a_name_or_model(tmp_path: Path) -> None:
         ({"camera_name": "&a [*a]"}, None),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path: Path, keys: dict[str, str | None], problem: str | None) -> None:
+def test_faulty_content_is_refused(tmp_path: Path, keys: dict[str, str | None], problem: str | None) -> None:
     path = stored(tmp_path / "c.yaml", **keys)
     if problem is None:
         assert len(READER.read_calibration(path)) == 1

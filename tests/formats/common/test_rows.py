@@ -68,7 +68,7 @@ def test_odd_forms(text: str, expected: int) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "nan", "inf", "-inf", "abc", ".", "-", "1e999999999", "1.2.3", "0x10"])
-def test_what_is_no_stamp_is_said_to_be_none(text: str) -> None:
+def test_what_is_no_stamp_is_unreadable(text: str) -> None:
     t_ns, readable = parse_stamps("log", ["1.0", "2.0", text])
     assert readable.tolist() == [True, True, False]
     assert t_ns.tolist() == [1_000_000_000, 2_000_000_000, 0]

@@ -178,7 +178,7 @@ def test_what_is_not_there(tmp_path: Path, truth: DroneTruth) -> None:
     assert read(path).gimbal is None
 
 
-def test_without_pymavlink_it_is_said_what_to_install(
+def test_without_pymavlink_the_refusal_names_the_extra(
     tmp_path: Path, truth: DroneTruth, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_dataflash(tmp_path / "a.bin", truth)

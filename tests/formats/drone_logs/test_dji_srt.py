@@ -38,7 +38,7 @@ def read(path: Path, **choice: Any) -> Telemetry:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_real_files_hold_what_they_are_said_to(name: str) -> None:
+def test_real_files_are_read_as_their_facts_state(name: str) -> None:
     path, told = real_data(f"logs/dji_srt/{name}"), facts(name)
     assert FORMAT.recognises(path)
     described = FORMAT.describe(path)

@@ -47,7 +47,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> DroneTruth:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_real_logs_hold_what_they_are_said_to(name: str) -> None:
+def test_real_logs_are_read_as_their_facts_state(name: str) -> None:
     path, told = real_data(f"logs/ulog/{name}"), facts(name)
     assert FORMAT.recognises(path)
     described = FORMAT.describe(path)
@@ -72,7 +72,7 @@ def test_one_message_stamped_twenty_minutes_late() -> None:
     assert described["span_s"] == pytest.approx(6.5, abs=0.05)
 
 
-def test_a_drone_that_never_knew_where_it_was_is_doubted() -> None:
+def test_a_drone_without_a_valid_position_is_doubted() -> None:
     telemetry = read(real_data("logs/ulog/sample.ulg"))
     assert any("vehicle_local_position never" in note for note in telemetry.notes)
     assert telemetry.clock == "boot"

@@ -153,7 +153,7 @@ def test_real_files_are_of_one_keypoint_format_at_most(relative: str) -> None:
 
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(st.lists(st.integers(0, 3), min_size=1, max_size=8), st.integers(-3, 3))
-def test_a_video_and_its_pictures_say_the_same(
+def test_a_video_and_its_pictures_give_the_same_people(
     tmp_path_factory: pytest.TempPathFactory, crowd: list[int], first_frame: int
 ) -> None:
     frames = [[instance(100.0 * k + n) for n in range(count)] for k, count in enumerate([*crowd, 1, 1, 1, 1])]

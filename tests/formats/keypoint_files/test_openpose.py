@@ -49,7 +49,7 @@ def test_the_real_gait_recording_holds_what_is_known_of_it() -> None:
 
 @pytest.mark.parametrize("camera", ["cam01", "cam02", "cam03", "cam04"])
 @pytest.mark.parametrize("kind", ["pose", "pose-associated"])
-def test_the_real_four_camera_recording_is_told_to_be_body25b(camera: str, kind: str) -> None:
+def test_the_real_four_camera_recording_is_recognised_as_body25b(camera: str, kind: str) -> None:
     folder = real_data(f"pose2sim_single/{kind}/{camera}_json")
     found = FORMAT.read_keypoints(folder, skeleton=None, first_frame=0)
     stated = FORMAT.read_keypoints(folder, skeleton="body25b", first_frame=0)

@@ -230,7 +230,7 @@ def test_damage_is_refused_or_read(tmp_path: Path, kind: Literal["bt", "ot"]) ->
 @pytest.mark.parametrize(
     "name", ["octomap_geb079.bt", "octomap_fr_campus.bt", "octomap_simple.bt", "octomap_ecmrv4_withfree.ot"]
 )
-def test_real_maps_hold_what_octomap_says(name: str) -> None:
+def test_real_maps_are_read_as_by_octomap(name: str) -> None:
     facts = json.loads(real_data("facts.json").read_text())[f"maps/{name}"]
     file = real_data(f"maps/{name}")
     assert READER.recognises(file)

@@ -208,7 +208,7 @@ def test_damage_is_refused_or_read(tmp_path: Path, encoding: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["pcl_bunny_ascii", "pcl_colored_cloud", "ndt_omp_251370668"])
-def test_real_clouds_hold_what_other_readers_say(name: str) -> None:
+def test_real_clouds_are_read_as_by_other_readers(name: str) -> None:
     facts = json.loads(real_data("facts.json").read_text())[f"maps/{name}.pcd"]
     path = real_data(f"maps/{name}.pcd")
     assert READER.recognises(path)

@@ -115,7 +115,7 @@ def test_damage_is_refused_or_read(tmp_path: Path, encoding: str) -> None:
     assert refuse_or_read(READER, tmp_path / "a.ply", content, tries=300) > 100
 
 
-def test_the_real_cloud_holds_what_other_readers_say() -> None:
+def test_the_real_cloud_is_read_as_by_other_readers() -> None:
     facts = json.loads(real_data("facts.json").read_text())["maps/small_gicp_target.ply"]
     path = real_data("maps/small_gicp_target.ply")
     said = READER.describe(path)

@@ -84,7 +84,7 @@ def test_a_plan_stands_on_its_lower_left_corner(tmp_path: Path) -> None:
     ],
     ids=["commented", "16 bit", "plain", "png", "16 bit png", "coloured png"],
 )
-def test_every_kind_of_picture_says_the_same(tmp_path: Path, picture: bytes) -> None:
+def test_every_kind_of_picture_gives_the_same_map(tmp_path: Path, picture: bytes) -> None:
     np.testing.assert_array_equal(floor(write(tmp_path, picture)), [[0, 1], [0, 0], [0, np.nan]])
 
 
@@ -265,7 +265,7 @@ def test_damaged_pictures_are_refused_or_read(tmp_path: Path, suffix: str) -> No
 
 
 @pytest.mark.parametrize("name", ["nav2_depot", "nav2_testmap"])
-def test_real_plans_hold_what_their_pictures_say(name: str) -> None:
+def test_real_plans_hold_the_pixels_of_their_pictures(name: str) -> None:
     facts = json.loads(real_data("facts.json").read_text())[f"maps/{name}.pgm"]
     path = real_data(f"maps/{name}.yaml")
     assert READER.recognises(path)

@@ -293,7 +293,7 @@ def test_joints_whose_names_are_alike_get_their_own_files(tmp_path: Path) -> Non
     assert [READER.read_trajectory(path).position[0, 0] for path in paths] == [0, 3]
 
 
-def test_people_are_told_apart(tmp_path: Path) -> None:
+def test_each_person_gets_tracks_of_its_own(tmp_path: Path) -> None:
     motion = JointMotion(np.array([0]), ("nose",), np.ones((1, 2, 1, 3)))
     paths = WRITER.write(Recording("x", motion, {}), tmp_path)
     assert [path.name for path in paths] == ["x_person0_nose.tum", "x_person1_nose.tum"]

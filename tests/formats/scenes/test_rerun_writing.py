@@ -91,7 +91,7 @@ def test_the_map_is_there(chunks: dict[str, list[Any]]) -> None:
     assert len(points) == 26
 
 
-def test_without_rerun_one_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_rerun_the_refusal_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def absent(name: str) -> None:
         raise ImportError(name)
 

@@ -244,7 +244,7 @@ def test_position_channels_take_the_place_of_an_offset_unless_they_are_zero(tmp_
         ("HIERARCHY\nROOT a\n{\nOFFSET 0 0 0\n}\nMOTION\nFrames: 1\nFrame Time: 1\n1\n", "has no channels"),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path: Path, text: str, problem: str) -> None:
+def test_faulty_content_is_refused(tmp_path: Path, text: str, problem: str) -> None:
     path = write(tmp_path, text)
     with pytest.raises(DataError, match=problem):
         read_motion(path, unit="cm", axes="y-up")

@@ -127,7 +127,7 @@ def test_files_of_others_begin_at_their_first_frame(tmp_path: Path) -> None:
     assert (facts["POINT:UNITS"], facts["rows"], facts["joints"]) == ("mm", 3, ["right_hip", "LASI"])
 
 
-def test_what_is_wrong_is_said(tmp_path: Path) -> None:
+def test_faulty_content_is_refused(tmp_path: Path) -> None:
     whole = write(tmp_path / "a.c3d", walking(30)).read_bytes()
     for size in (600, 1400, len(whole) - 4000):
         cut = tmp_path / f"{size}.c3d"
@@ -157,7 +157,7 @@ def test_the_same_motion_gives_the_same_bytes(tmp_path: Path) -> None:
     assert first == second
 
 
-def test_without_ezc3d_one_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_ezc3d_the_refusal_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "a.c3d", walking(2))
 
     def absent(name: str) -> None:

@@ -19,7 +19,7 @@ def moving(t_ns: np.ndarray) -> JointMotion:
     return JointMotion(t_ns, ("nose",), position)
 
 
-def test_stamps_of_whole_milliseconds_are_kept_and_said() -> None:
+def test_stamps_of_whole_milliseconds_are_kept_with_a_note() -> None:
     exact = np.arange(301) * 1e9 / 30
     t_ns = START_NS + np.rint(exact / 1e6).astype(np.int64) * 1_000_000
     listener = Listener()

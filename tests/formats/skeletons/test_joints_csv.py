@@ -68,7 +68,7 @@ def test_seconds_units_and_axes(tmp_path: Path) -> None:
         ("t_ns,person,joint,x,y,z\n1,,nose,1,2,3\n", "1 rows name no person|no whole number"),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path: Path, text: str, problem: str) -> None:
+def test_faulty_content_is_refused(tmp_path: Path, text: str, problem: str) -> None:
     with pytest.raises(DataError, match=problem):
         read(write(tmp_path, text))
 

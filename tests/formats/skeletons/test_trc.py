@@ -106,7 +106,7 @@ def test_the_header_of_a_real_file_may_count_wrong() -> None:
         (HEADER.replace("C7", ""), "names 1 markers above 6 columns"),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path: Path, text: str, problem: str) -> None:
+def test_faulty_content_is_refused(tmp_path: Path, text: str, problem: str) -> None:
     with pytest.raises(DataError, match=problem):
         read(write(tmp_path, text))
 

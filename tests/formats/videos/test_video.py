@@ -171,7 +171,7 @@ def test_frames_that_vp8_never_shows_are_none(tmp_path: Path) -> None:
         (b"\x84..\x84.\xc1\x03\x02\xc1", False),
     ],
 )
-def test_the_heads_of_vp9_frames_say_if_they_are_shown(content: bytes, shown: bool) -> None:
+def test_the_heads_of_vp9_frames_state_if_they_are_shown(content: bytes, shown: bool) -> None:
     packet = cast("av.Packet[av.VideoStream]", av.Packet(content))
     assert is_shown(packet, "vp9") == shown
     assert is_shown(packet, "h264")
@@ -298,7 +298,7 @@ def test_damage_between_key_frames_ends_at_the_next(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.8, 0.95])
-def test_a_cut_mp4_is_salvaged_and_says_what_it_lost(tmp_path: Path, share: float) -> None:
+def test_a_cut_mp4_is_salvaged_and_its_losses_are_counted(tmp_path: Path, share: float) -> None:
     path = write_video(tmp_path / "v.mp4", uneven_ticks(60))
     places = packets(path)
     content = path.read_bytes()
@@ -328,7 +328,7 @@ def test_other_containers_are_read_as_far_as_they_go(tmp_path: Path, suffix: str
     assert numbers == [(k, k) for k in range(len(numbers))]
 
 
-def test_a_stated_size_beyond_reason_is_not_believed(tmp_path: Path) -> None:
+def test_a_stated_size_beyond_reason_is_refused(tmp_path: Path) -> None:
     path = write_video(tmp_path / "v.mov", even_ticks(3), codec="mjpeg")
     width, height = SIZE
     inside = height.to_bytes(2, "big") + width.to_bytes(2, "big")
@@ -471,7 +471,7 @@ def test_real_recordings_decode_as_ffmpeg_does(name: str) -> None:
         (None, None),
     ],
 )
-def test_when_a_video_says_that_it_was_made(tmp_path: Path, stated: str | None, made_ns: int | None) -> None:
+def test_the_stated_time_of_creation_is_read(tmp_path: Path, stated: str | None, made_ns: int | None) -> None:
     import av
 
     path = tmp_path / "a.mp4"
