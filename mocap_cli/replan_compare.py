@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mocap_cli.filming import Rendering, film_arms, print_filmed, render_options
 from mocap_cli.options import (
     FiniteRange,
     Shown,
@@ -21,6 +20,7 @@ from mocap_cli.several import each
 from mocap_cli.terminal import print_table, say, say_warnings, watching
 
 if TYPE_CHECKING:
+    from pipelines import film
     from pipelines.planning.scene import Settings
 
 
@@ -115,38 +115,82 @@ _settings_options = grouped(
 )
 
 
+def _film_settings(
+    *,
+    render: bool,
+    render_hz: float,
+    render_start: float | None,
+    render_end: float | None,
+    detector: str,
+    scenario: Path | None,
+) -> tuple[film.Settings, Path | None] | None:
+    """Return the settings of the film and the scenario; None without --render."""
+    from pipelines import film
+
+    return (film.Settings(render_hz, render_start, render_end, detector), scenario) if render else None
+
+
+_film_options = grouped(
+    "filmed",
+    _film_settings,
+    click.option(
+        "--render",
+        is_flag=True,
+        help="Film every arm of a simulated flight and run the detector on the pictures:"
+        " SESSION/film/ARM/CAMERA.mp4.",
+    ),
+    click.option(
+        "--render-hz", type=FiniteRange(0.1, 30), default=5.0, show_default=True, help="Pictures a second."
+    ),
+    click.option("--render-start", type=FiniteRange(0, 1e6), metavar="S", help="Film from then on only."),
+    click.option("--render-end", type=FiniteRange(0, 1e6), metavar="S", help="And before then only."),
+    click.option("--detector", default="blazepose", show_default=True, help="See `mocap models`."),
+    click.option(
+        "--scenario",
+        type=any_path,
+        metavar="SCENARIO.yaml",
+        help="Of the simulated flight [default: scenario.yaml beside the flight].",
+    ),
+)
+
+
 @click.command("replan-compare", short_help="Fly other planners against the log, compare.")
 @each("session", "SESSION")
 @_settings_options
-@render_options
+@_film_options
 @force_option
 @output_options
 def replan_compare_command(
     session: Path,
     settings: Settings,
-    rendering: Rendering | None,
+    filmed: tuple[film.Settings, Path | None] | None,
     force: bool,
     shown: Shown,
 ) -> dict[str, Any] | None:
     """Replay formation planners against the logged actor and map, and compare them in numbers.
 
-    The actor's own skeleton is filmed again from each planner's cameras, with simulated errors of detector
-    and poses. Every figure of a replay is simulated; `flown` and `planned` are what the log says.
+    What each planner's cameras would measure of the actor's own skeleton is simulated, with errors of
+    detector and poses. Every figure of a replay is simulated; `flown` and `planned` are what the log says.
     """
     from pipelines.replan import replan
 
     with watching(shown.level) as progress:
         result = replan(session, settings, force=force, progress=progress)
-        filmed = None
-        if rendering is not None:
-            filmed = film_arms(session, rendering, force=force, progress=progress)
+        figures = None
+        if filmed is not None:
+            from pipelines.film import film
+
+            settings_of_film, scenario = filmed
+            figures = film(
+                session, settings_of_film, scenario=scenario, force=force, progress=progress
+            ).metrics
     say_warnings(result.record.warnings, shown.quiet)
     if shown.as_json:
-        return result.metrics if filmed is None else result.metrics | {"filmed": filmed}
+        return result.metrics if figures is None else result.metrics | {"filmed": figures}
     if not shown.quiet:
         _print(result.metrics)
-        if filmed is not None:
-            print_filmed(filmed)
+        if figures is not None:
+            _print_filmed(figures)
     say(f"{'unchanged' if result.skipped else 'written'}: {result.folder / 'replan'}")
     return None
 
@@ -183,3 +227,45 @@ def _with_interval(estimate: dict[str, Any] | None) -> str | None:
         return text
     low, high = estimate["interval"]
     return f"{text} [{low:.1f}, {high:.1f}]"
+
+
+def _print_filmed(metrics: dict[str, Any]) -> None:
+    """Print a table with one row for each arm."""
+    say()
+    say(f"filmed (simulated) at {metrics['rate_hz']:g} Hz, keypoints by {metrics['detector']}:")
+    header = [
+        "arm",
+        "pictures",
+        "tilt deg",
+        "max",
+        "within 5 deg %",
+        "in view %",
+        "detected %",
+        "PCK %",
+        "keypoint px",
+    ]
+    header += ["reprojection px", "measured %", "MPJPE mm", "in common mm", "PCK150 %"]
+    rows: list[list[object]] = [
+        [
+            name,
+            arm["pictures"],
+            arm["tilt_deg"]["mean"],
+            arm["tilt_deg"]["max"],
+            100 * arm["tilt_deg"]["within_5_share"],
+            100 * arm["in_view_share"],
+            100 * arm["detected_share"],
+            _percent(arm["keypoint_pck"]),
+            arm["keypoint_median_px"],
+            None if arm["reprojection_px"] is None else arm["reprojection_px"]["mean"],
+            _percent(arm["reconstructed_share"]),
+            arm["mpjpe_mm"],
+            arm["common_mpjpe_mm"],
+            _percent(arm["pck150"]),
+        ]
+        for name, arm in metrics["arms"].items()
+    ]
+    print_table(header, rows)
+
+
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share

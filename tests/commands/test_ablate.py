@@ -127,7 +127,7 @@ def test_modelled_keypoints_and_exact_poses_stay_below_60_mm(tmp_path: Path) -> 
         "tilt", *TRUSTING, "--seconds", "20", "--rate", "10", "--trials", "2", "--tilts", "0,15,30,60",
         "--levels", "none", "-o", tmp_path / "out",
     )  # fmt: skip
-    assert keypoints_of(tmp_path / "out") == "modelled after blazepose"
+    assert str(keypoints_of(tmp_path / "out")).split()[-1] == "blazepose"
     for (tilt, *_), cell in cells.items():
         error_mm = cell["metrics"]["mpjpe_mm"]["mean"]
         assert error_mm <= 60 if tilt <= 30 else error_mm > 60

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -104,14 +105,14 @@ def calm(tmp_path: Path) -> Path:
 def test_arms_see_with_the_errors_of_the_detector_that_the_session_used(calm: Path) -> None:
     options = ("--arms", "fixed", "--trials", "4")
     before = compared(calm, *options)
-    assert before["keypoints"] == "modelled after blazepose"
+    assert before["keypoints"].split()[-1] == "blazepose"
     with locked(calm) as session:
         run = session.begin(DETECT, settings={"detector": "blazepose-heavy"}, inputs={}, force=False)
         run.publish(counts={}, warnings=[])
     after = compared(calm, *options)
-    assert after["keypoints"] == "modelled after blazepose-heavy"
+    assert after["keypoints"].split()[-1] == "blazepose-heavy"
     # The same draws, smaller errors.
-    errors = [told["arms"]["fixed"]["mpjpe_mm"] for told in (after, before)]
+    errors = [metrics["arms"]["fixed"]["mpjpe_mm"] for metrics in (after, before)]
     assert errors[0] < errors[1]
 
 
@@ -136,9 +137,12 @@ def test_at_a_mound_the_adaptive_formation_keeps_low_and_measures_better(mound: 
     # What is violated stands first: the ring, that is flown, goes through the mound.
     first, then = metrics["verdict"].split(". ", 1)
     assert metrics["warnings"][0] == first
-    assert first.startswith("flown collides with an obstacle")
-    assert then.startswith("adaptive keeps the tilt at ")
-    assert "smaller (simulated)" in metrics["verdict"]
+    assert arms["flown"]["limit_violations"]["collision"] > 0
+    assert first.startswith("flown ")
+    tilts = [f"{arms[name]['tilt_deg']['max']:.0f}" for name in ("adaptive", "fixed")]
+    assert re.search(r"^adaptive .*\b{}\b.*\bfixed\b.*\b{}\b".format(*tilts), then)
+    assert f"{-against_fixed['mpjpe_mm']['mean']:.1f} mm" in then
+    assert "(simulated)" in then
     for name in ("adaptive", "fixed"):
         violations = arms[name]["limit_violations"]
         assert set(violations.values()) == {0}
@@ -195,7 +199,7 @@ def test_unchanged_is_skipped_and_forced_is_the_same(calm: Path) -> None:
     assert "written" in compare(calm, "--trials", "2", "--force").stdout
     assert content(calm) == before
     other = compare(calm, "--trials", "2", "--seed", "1")
-    assert "replaced the comparison made with seed = 0 (now 1)" in other.stderr
+    assert "seed = 0 (now 1)" in other.stderr
     assert content(calm) != before
 
 
@@ -229,7 +233,7 @@ def test_in_the_open_nothing_is_found_between_the_arms(calm: Path) -> None:
     assert (difference["arm"], difference["against"]) == ("adaptive", "fixed")
     assert difference["mpjpe_mm"] == {"mean": 0.0, "interval": [0.0, 0.0]}
     assert difference["tilt_deg"]["mean"] == 0.0
-    assert "no difference" in metrics["verdict"]
+    assert "+0.0 mm [+0.0, +0.0]" in metrics["verdict"]
     assert metrics["mode"] == "plan-only"
     closed = compared(calm, "--arms", "fixed,adaptive", "--trials", "3")
     assert closed["arms"]["fixed"]["range_m"] != metrics["arms"]["fixed"]["range_m"]
@@ -249,7 +253,8 @@ def test_the_options_reach_the_planner(calm: Path, tmp_path: Path) -> None:
     assert metrics["pose_noise_from"] == "--pose-noise"
     assert arm["range_m"]["mean"] == pytest.approx(6, abs=0.3)
     assert arm["tilt_deg"]["mean"] == pytest.approx(30, abs=3)
-    assert metrics["verdict"] == "fixed flew alone: there is nothing to compare it with"
+    assert metrics["differences"] == []
+    assert metrics["verdict"].startswith("fixed ")
     stated = json.loads((calm / "replan" / "stage.json").read_text())["settings"]
     assert (stated["planner.horizon_knots"], stated["planner.yaws"]) == (7, 12)
     table = pd.read_parquet(calm / "replan" / "fixed" / "trajectories.parquet")
@@ -264,7 +269,7 @@ def test_yaws_count_from_the_heading_of_who_walks_north(tmp_path: Path) -> None:
     assert compared(session, *asked)["yaw_deg"] == pytest.approx(90)
     turned = compared(session, *asked, "--yaw-frame", "heading")
     assert turned["yaw_deg"] == pytest.approx(180, abs=10)  # from where the hips sway to in the first metre
-    assert any("yaws count from where the actor heads" in note for note in turned["notes"])
+    assert any(f"{turned['yaw_deg'] - 90:.1f} deg" in note for note in turned["notes"])
     stated = json.loads((session / "replan" / "stage.json").read_text())["settings"]
     assert stated["planner.yaw_frame"] == "heading"
     yaw = pd.read_parquet(session / "replan" / "fixed" / "trajectories.parquet")["formation_yaw_rad"]
@@ -276,12 +281,12 @@ def test_without_an_actor_the_reconstruction_says_where_he_was(tmp_path: Path) -
     session = tmp_path / "flight.session"
     ingest(flight.manifest, session=session)
     line = refused(session)
-    assert "no logged actor and no reconstruction" in line
-    assert "mocap reconstruct" in line
+    assert "flight.session" in line
+    assert "reconstruct`" in line
+    assert "`actor:`" in line
     reconstruct(session)
     done = compare(session, "--trials", "2")
     assert done.exit_code == 0, done.stderr
-    assert "no map: open space" in done.stderr
     metrics = json.loads((session / "replan" / "metrics.json").read_text())
     assert metrics["actor"] == {"planned_with": "reconstruction", "scored_against": "truth"}
     assert metrics["maps"] == 0
@@ -295,8 +300,10 @@ def test_who_knows_no_skeleton_is_told_so(tmp_path: Path) -> None:
     session = _without_truth(tmp_path)
     done = compare(session, "--trials", "2")
     assert done.exit_code == 0, done.stderr
-    assert "no skeleton to look at" in done.stderr
-    assert "could not be compared" in done.stdout
+    assert "reconstruct`" in done.stderr
+    blind = json.loads((session / "replan" / "metrics.json").read_text())
+    assert blind["skeleton"] is None
+    assert blind["differences"][0]["mpjpe_mm"] is None
     reconstruct(session)
     metrics = compared(session, "--trials", "2")
     assert metrics["skeleton"] == "reconstruction"
@@ -317,7 +324,9 @@ def test_still_cameras_have_not_flown(tmp_path: Path) -> None:
     session = tmp_path / "flight.session"
     ingest(flight.manifest, session=session)
     reconstruct(session)
-    assert "stand still" in refused(session, "--arms", "fixed,flown")
+    line = refused(session, "--arms", "fixed,flown")
+    assert "flight.session" in line
+    assert "flown" in line
     assert list(compared(session, "--trials", "1")["arms"]) == ["adaptive", "fixed"]
 
 
@@ -330,14 +339,14 @@ def test_what_the_map_and_the_log_leave_open_is_said(tmp_path: Path) -> None:
     actor[kept].to_parquet(session / "actor.parquet", index=False)
     as_if_written(session, "actor.parquet", "ingest")
     metrics = compared(session, "--trials", "1", "--yaw", "0", "--radius", "3", "--tilt", "0")
-    said = " | ".join(metrics["warnings"])
-    assert "the map does not cover" in said
-    assert "not measured 1 times for more than 1 s" in said
-    assert "1 of 2 drones start within 0.5 m of an obstacle" in said
-    for arm in (metrics["arms"][name] for name in ("adaptive", "fixed")):  # told, left, and said first
+    warnings = " | ".join(metrics["warnings"])
+    for figures in (r"\bmap\b.* \d+ %", r"\b1 times\b.* 1 s\b.* 1\.\d s\b", r"\b1 of 2\b.* 0\.5 m\b"):
+        assert re.search(figures, warnings)
+    for arm in (metrics["arms"][name] for name in ("adaptive", "fixed")):  # counted, left, and named first
         assert arm["limit_violations"]["collision"] == arm["limit_violations"]["clearance"] == 1
         assert arm["safety"]["left"] > 0
-    assert metrics["warnings"][0].startswith("adaptive collides with an obstacle (once)")
+    assert metrics["warnings"][0].startswith("adaptive ")
+    assert "(once)" in metrics["warnings"][0]
 
 
 def test_a_real_map_is_loaded_and_flown_in(tmp_path: Path) -> None:
@@ -386,4 +395,4 @@ def test_bad_settings_get_one_line(mound: Path, tmp_path: Path) -> None:
         assert said in line
         assert "planner.yaml" in line
     assert "nothing.yaml" in refused(mound, "--config", tmp_path / "nothing.yaml")
-    assert "is not a session" in refused(tmp_path)
+    assert f"{tmp_path}: " in refused(tmp_path)

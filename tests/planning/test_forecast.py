@@ -67,12 +67,12 @@ def test_errors_are_as_large_as_stated() -> None:
 
 def test_what_is_refused() -> None:
     actor = ActorFilter(q=0.1, sigma_m=0.2)
-    with pytest.raises(ValueError, match="nothing was measured"):
+    with pytest.raises(ValueError, match=r"\bmeasured\b"):
         actor.at(0.0)
-    with pytest.raises(ValueError, match="nothing was measured"):
+    with pytest.raises(ValueError, match=r"\bmeasured\b"):
         actor.forecast(np.zeros(1))
     actor.measure(1.0, np.zeros(3))
-    with pytest.raises(ValueError, match="time goes back"):
+    with pytest.raises(ValueError, match=r"\b0\.1 s\b"):
         actor.measure(0.9, np.zeros(3))
     with pytest.raises(ValueError, match="finite"):
         actor.measure(2.0, np.array([0, np.nan, 0]))

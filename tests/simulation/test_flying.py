@@ -209,7 +209,7 @@ def test_a_planner_knows_the_past_alone() -> None:
 
 @pytest.mark.parametrize("slots", [np.zeros((2, 3)), np.full((1, 3), np.nan)])
 def test_a_planner_must_give_a_slot_for_each(slots: Float) -> None:
-    with pytest.raises(ValueError, match="the planner's slots at 0 s are not"):
+    with pytest.raises(ValueError, match=r"slots .*\b0 s\b"):
         fly_with(
             lambda _: (slots, np.zeros_like(slots)),
             np.zeros((1, 3)),
@@ -318,7 +318,7 @@ def test_short_flights_and_empty_teams(drones: int, count: int) -> None:
 
 def test_nonsense_is_refused() -> None:
     slots = np.ones((1, 3, 3))
-    with pytest.raises(ValueError, match="increase strictly"):
+    with pytest.raises(ValueError, match="increase"):
         fly(slots, slots[0], np.array([0.0, 0.0, 1.0]), Limits())
     slots[0, 1, 2] = np.nan
     with pytest.raises(ValueError, match="finite"):

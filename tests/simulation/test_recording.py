@@ -130,7 +130,7 @@ def test_between_moments_poses_go_on_smoothly() -> None:
 
 def test_before_and_after_the_flight_there_are_no_poses() -> None:
     for moment in (-1_010_000_000, 10_010_000_000):
-        with pytest.raises(ValueError, match="before or after the flight"):
+        with pytest.raises(ValueError, match=r"before|after"):
             poses_at(PATHS, 0, np.array([0, moment]))
     assert poses_at(PATHS, 0, np.empty(0, dtype=np.int64)).camera_position.shape == (0, 3)
 
@@ -259,7 +259,7 @@ def test_the_actor_is_estimated_only_where_known() -> None:
     t_ns, position = estimate_actor(t_s, hip, sigma_m=0.0, rate_hz=10.0, span_s=(0.0, 4.0), rng=generator())
     assert (position == 0).all()
     assert len(t_ns) in {39, 40}
-    with pytest.raises(ValueError, match="not known throughout"):
+    with pytest.raises(ValueError, match="throughout"):
         estimate_actor(t_s, hip, sigma_m=0.0, rate_hz=10.0, span_s=(0.0, 6.0), rng=generator())
     empty = estimate_actor(t_s, hip, sigma_m=0.2, rate_hz=10.0, span_s=(0.0, 0.0), rng=generator())
     assert empty[1].shape == (0, 3)

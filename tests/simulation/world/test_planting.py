@@ -59,15 +59,13 @@ def test_trees_are_as_dense_everywhere() -> None:
 
 
 def test_a_wood_that_does_not_fit_is_one_clear_line() -> None:
-    with pytest.raises(
-        DataError, match=r"^world\.wood: found room for 0 of 3 trees within 5 m .*smaller clear_m$"
-    ):
+    with pytest.raises(DataError, match=r"^world\.wood: .*\b0 of 3\b.*\b5 m\b.*\bclear_m$"):
         build_world(spec(count=3, radius_m=5.0, clear_m=6.0), 5, keep_clear=WAY)
-    with pytest.raises(DataError, match=r"found room for \d+ of 500 trees within 8 m"):
+    with pytest.raises(DataError, match=r"^world\.wood: .*\b\d+ of 500\b.*\b8 m\b"):
         build_world(spec(count=500, radius_m=8.0, clear_m=0.0), 5, keep_clear=NOBODY)
 
 
 def test_a_wall_needs_a_length() -> None:
     walls = [{"start": [0.0, 1.0], "end": [3.0, 1.0]}, {"start": [2.0, 2.0], "end": [2.0, 2.0]}]
-    with pytest.raises(DataError, match=r"^world\.walls\[1\]: begins where it ends, at \[2\.0, 2\.0\]"):
+    with pytest.raises(DataError, match=r"^world\.walls\[1\]: .*\[2\.0, 2\.0\]"):
         build_world(scenario.World.model_validate({"walls": walls}), 1, keep_clear=NOBODY)
