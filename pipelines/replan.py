@@ -237,7 +237,7 @@ def _detect(
     joints: tuple[str, ...],
     errors: DetectorErrors,
 ) -> tuple[Float, Float]:
-    """Simulate the detector by a model with tilt and distance (`measuring.Detect`)."""
+    """Simulate the detector by a model with tilt and distance (`arm_flights.Detect`)."""
     tilt_deg, height_px = view_of(camera, target, height_m=_HEIGHT_M, focal_px=focal_px)
     return detect_keypoints(pixels, free, tilt_deg, height_px, errors, rng, joints=joints)
 
