@@ -229,11 +229,7 @@ def reconstructed(
 
 
 def compared(points: Mapping[StudyMethod, Float], filmed: Walk) -> dict[StudyMethod, Row]:
-    """Compute the errors of several methods on one walk.
-
-    Args:
-        points: [T * J, 3] m of every method, joints fastest.
-        filmed: the walk with its true joints.
+    """Compute the errors of several methods on one walk, from points [T * J, 3] m of each, joints fastest.
 
     Returns:
         By method the result of `measure` on the joint-frames that all methods have (per joint only the three

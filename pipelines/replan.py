@@ -80,10 +80,7 @@ def planner_settings(
 ) -> PlannerConfig:
     """Read planner settings of a YAML file (docs/planner.md), if there is one, and change some of them.
 
-    Args:
-        path: the file.
-        changes: settings that override the file.
-        horizon_s: the time that the search looks ahead, rounded up to whole knots.
+    `horizon_s`, the time that the search looks ahead, is rounded up to whole knots.
 
     Raises:
         DataError: the file cannot be read, or a setting is unknown or out of range.
@@ -104,13 +101,7 @@ def replan(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Replanned:
-    """Fly the planners again and compare them.
-
-    Args:
-        folder: the session.
-        settings: the settings that determine the result.
-        force: run it again even if nothing changed.
-        progress: receives the progress.
+    """Replay the planners on a session, and compare them; run again even if nothing changed with `force`.
 
     Raises:
         DataError: the session cannot be used (it has no positions of the actor, or a table was changed), or a

@@ -272,13 +272,8 @@ def measure(
 ) -> Measured:
     """Measure a skeleton in several trials.
 
-    Args:
-        paths: cameras and person.
-        field: the distance field of the obstacles.
-        detect: the detector.
-        start_m: the end of sight lines next to the joint that is left out: maps contain the person.
-        trials: independent draws of all noise.
-        seed: of the random numbers. Trial k of camera i has the same numbers for any other path.
+    The last `start_m` of a sight line, next to the joint, is left out: maps contain the person. Trial k of
+    camera i has the same random numbers for any other path.
     """
     joints = paths.joints
     cameras, times, count = len(paths.position), *joints.shape[:2]

@@ -270,11 +270,7 @@ def verdict(
 ) -> str:
     """Compare an arm with another in one sentence: tilt, reconstruction error, coverage.
 
-    Args:
-        arm: the arm that is judged.
-        against: the arm that it is compared with.
-        arms: scores by arm, as in metrics.json.
-        difference: of the two, arm minus against, as in metrics.json.
+    `arms` and `difference` (of the two, arm minus against) are those of metrics.json.
     """
     return (
         f"{_about_tilt(arm, against, arms)}; {_about_error(difference)}{_about_coverage(arm, against, arms)}"
@@ -282,13 +278,7 @@ def verdict(
 
 
 def broken_limits(arm: str, scores: Mapping[str, Any], config: PlannerConfig) -> str | None:
-    """Name every limit that an arm violates, and how often; None if it keeps all of them.
-
-    Args:
-        arm: its name.
-        scores: of the arm, as in metrics.json.
-        config: the limits.
-    """
+    """Name every limit that an arm violates, and how often; None if it keeps all of them."""
     kinds = {
         "collision": "collides with an obstacle",
         "clearance": f"comes within {config.drone_radius_m:g} m of an obstacle",

@@ -89,18 +89,11 @@ def nearest(grid: Grid, x: float, y: float, z: float) -> float:
 
 @helper
 def sampling(x: float, y: float, z: float, start_m: float, side_m: float, rule: Float) -> int:
-    """Set the sampling of a sight line, in voxels of that side; return the number of samples.
+    """Set the sampling of a sight line x, y, z (m, camera from actor); return the number of samples.
 
-    Samples are at most half a voxel apart.
-
-    Args:
-        x: m, the camera from the actor, as the next two.
-        y: see there.
-        z: see there.
-        start_m: distance from the actor at which the line begins.
-        side_m: of a voxel.
-        rule: [11] is filled: the first sample from the actor, the step to the next, one over it by axis,
-            all three in voxels; samples per metre; and the length of the line in m.
+    The line begins `start_m` from the actor. Samples are at most half a voxel (`side_m`) apart. `rule` [11]
+    is filled: the first sample from the actor, the step to the next, one over it by axis, all three in
+    voxels; samples per metre; and the length of the line in m.
     """
     length = math.sqrt(x * x + y * y + z * z)
     rule[10] = length

@@ -29,12 +29,9 @@ class ActorFilter:
     """Position and velocity of the actor from the measurements so far, and nothing later.
 
     x = [p, v] per axis, F = [[1, dt], [0, 1]], Q = q [[dt^3/3, dt^2/2], [dt^2/2, dt]] (white noise
-    acceleration), measurements of the position with standard deviation `sigma_m` per axis. All three axes
-    have the same model and noise, so that one 2x2 covariance serves them all.
-
-    Args:
-        q: m^2/s^3, spectral density of the acceleration's noise.
-        sigma_m: of the measured position, per axis.
+    acceleration of spectral density q, m^2/s^3), measurements of the position with standard deviation
+    `sigma_m` per axis. All three axes have the same model and noise, so that one 2x2 covariance serves them
+    all.
     """
 
     def __init__(self, *, q: float, sigma_m: float) -> None:

@@ -116,17 +116,9 @@ class Guard:
         return [states[age:] for states, age in zip(self._states, self._age, strict=True)]
 
     def admit(self, drone: int, t_s: float, plan: Plan, actor: ActorFilter, field: DistanceField) -> Plan:
-        """Commit a drone to the best safe motion.
+        """Commit a drone to the best safe motion, and return the plan that is flown.
 
-        Args:
-            drone: its index.
-            t_s: now.
-            plan: the local planner's plan, from the drone's place and now.
-            actor: the filter that forecasts the actor.
-            field: the distance field of the obstacles.
-
-        Returns:
-            The plan that is flown.
+        `plan` is the local planner's, from the drone's place and now.
         """
         after_s = self._flying.period_s * np.arange(self._states.shape[1], dtype=np.float64)
         around = _Around(field, self._others(drone), actor.forecast(t_s + after_s))

@@ -17,14 +17,8 @@ def ray_information(offset: Float, config: PlannerConfig) -> Float:
     """Compute one camera's expected information on a point: I = p (1 - d d')/s^2, none along the ray d.
 
     s^2 = (rho sigma_px/f)^2 + (rho sigma_rot)^2 + sigma_pos^2, rho the distance; p is the measured share of
-    joints that a detector places at that tilt. By geometry alone, steep views would be as good.
-
-    Args:
-        offset: [..., 3] metres, from the point to the camera, not zero.
-        config: pixel, rotation and position noise.
-
-    Returns:
-        [..., 3, 3] 1/m^2.
+    joints that a detector places at that tilt. By geometry alone, steep views would be as good. Offsets
+    [..., 3] m go from the point to the camera and are not zero; the result is [..., 3, 3] 1/m^2.
     """
     square = np.sum(offset**2, axis=-1)[..., None, None]
     turned = config.pixel_sigma_rad**2 + np.radians(config.rotation_sigma_deg) ** 2

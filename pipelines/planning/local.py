@@ -447,14 +447,9 @@ class LocalPlanner:
 
 
 def closest_approach(path: Float, others: Float) -> float:
-    """Compute the least distance in metres between points that fly straight between waypoints.
+    """Compute the least distance in metres of a path to others [M, N + 1, 3], straight between waypoints.
 
-    Args:
-        path: [N + 1, 3].
-        others: [M, N + 1, 3] at the same times.
-
-    Returns:
-        inf without other drones.
+    `path` is [N + 1, 3]. The distance is inf without other drones.
     """
     apart = path - others
     start, way = apart[:, :-1], np.diff(apart, axis=1)

@@ -89,12 +89,6 @@ class Pilot:
     Central planning, local planning and tracking have the rates of the configuration, counted from the
     first call. Drones plan one after the other, each with the latest plans of the others.
 
-    Args:
-        arm: the planner of the cameras' slots.
-        config: weights and rates.
-        start: the formation at the start.
-        clock: seconds, for `times`.
-
     Raises:
         ValueError: an impossible number of drones.
     """

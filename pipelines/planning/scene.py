@@ -210,20 +210,11 @@ def hidden_shares(
     *,
     start_m: float = PlannerConfig().sight_start_m,
 ) -> dict[str, float]:
-    """Compute the share of moments in which an occupied voxel stood between a camera and the actor.
+    """Compute for each camera the share of moments in which an occupied voxel hid the actor from it.
 
     Ten moments a second, while the camera's pose is known; true poses and hips where they are known. Each
-    map counts from its own time on; unknown voxels are free.
-
-    Args:
-        flight: the poses of the cameras and the actor's positions.
-        description: the session's.
-        maps: in any order, one at least.
-        start_m: the end of the sight line next to the actor is left out, this much of it: maps contain the
-            actor.
-
-    Returns:
-        By camera; those without a pose at any of the moments are left out.
+    map counts from its own time on; unknown voxels are free. `start_m` of the sight line next to the actor
+    is left out: maps contain the actor. Cameras without a pose at any of the moments are left out.
     """
     first_ns, last_ns = int(flight.actor_t_ns[0]), int(flight.actor_t_ns[-1])
     count = max(2, round((last_ns - first_ns) / 1e9 * _HIDDEN_HZ) + 1)

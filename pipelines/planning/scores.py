@@ -95,18 +95,11 @@ def predicted_errors(position: Float, actor: Float, field: DistanceField, config
 
 
 def near_obstacle(t_s: Float, slot_position: Float, actor: Float, field: DistanceField) -> Bool:
-    """Find the times when something higher than the actor's hips is within 15 m of a slot, level distance.
+    """Find the times [T] when something higher than the actor's hips is within 15 m (level) of a slot.
 
-    The ground is always near. Obstacles for a drone at a low tilt rise above the actor.
-
-    Args:
-        t_s: [T] seconds, ascending.
-        slot_position: [N, T, 3] metres, world.
-        actor: [T, 3] metres, world.
-        field: the distance field of the obstacles.
-
-    Returns:
-        [T]; tested five times a second, and constant until the next test.
+    The ground is always near. Obstacles for a drone at a low tilt rise above the actor. `t_s` [T] ascends,
+    `slot_position` is [N, T, 3] and `actor` [T, 3] m, world. Tested five times a second, and constant until
+    the next test.
     """
     grid = field.grid
     occupied = grid.distance_m < 0.0

@@ -123,16 +123,7 @@ def _look_at_slots(
 def _slot_costs(
     grid: Grid, sight: Sight, actor: Float, offsets: Float, eps_obs_m: float, start_m: float
 ) -> tuple[Float, Float]:
-    """Compute the obstacle cost and the occupied share of the sight line, both [T, S, n].
-
-    Args:
-        grid: the distance field.
-        sight: the same for sight lines.
-        actor: [T, 3] forecast.
-        offsets: [S, n, 3] slots of every state, from the actor.
-        eps_obs_m: the distance from which obstacles count.
-        start_m: distance from the actor at which sight lines begin.
-    """
+    """Compute obstacle cost and occupied share of the sight line, [T, S, n] each; see `costs_of_slots`."""
     shape = (actor.shape[0], offsets.shape[0], offsets.shape[1])
     obstacle, share = np.zeros(shape), np.zeros(shape)
     _look_at_slots(grid, sight, actor, offsets, eps_obs_m, start_m, obstacle, share)
@@ -231,18 +222,10 @@ def turn_the_shorter_way(slots: Float) -> None:
 def cheapest_slots(
     grid: Grid, sight: Sight, actor: Float, formations: Formations, w: SlotWeights, commanded: Float
 ) -> Float:
-    """Plan a formation in one call: look at the slots, weigh, search.
+    """Plan a formation in one call, from the slots [n, 3] that are commanded now: look, weigh, search.
 
-    Args:
-        grid: the distance field.
-        sight: the same for sight lines.
-        actor: [T, 3] forecast.
-        formations: the formations to choose from.
-        w: the weights.
-        commanded: [n, 3] the slots that are commanded now.
-
-    Returns:
-        [T + 1, n, 3] slots at the knots, the first as commanded; yaw is continuous.
+    `actor` is its forecast [T, 3]. Return slots [T + 1, n, 3] at the knots, the first as commanded; yaw is
+    continuous.
     """
     shape = (actor.shape[0], formations.slots.shape[0], formations.slots.shape[1])
     obstacle, share = np.zeros(shape), np.zeros(shape)
@@ -286,17 +269,11 @@ def _time_between(start: Float, goal: Float, rates: Float) -> Float:
 
 
 def best_sequence(cost: Float, grid: Lattice, start: Float) -> tuple[Int64, float]:
-    """Find the cheapest way through a cost map, and its cost.
+    """Find the cheapest way through a finite cost map [T, S]: [T] indices of states, and the sum of costs.
 
-    Args:
-        cost: [T, S], finite.
-        grid: the states.
-        start: [3] commanded now, anywhere between the states. The first step reaches the states that the
-            rates allow, or else the nearest state.
-
-    Returns:
-        [T] indices of states, and the sum of costs and moves. Ties are broken in favour of the same state, or
-        else the nearest one.
+    `start` [3] is commanded now, anywhere between the states. The first step reaches the states that the
+    rates allow, or else the nearest state. Ties are broken in favour of the same state, or else the nearest
+    one.
     """
     return _cheapest_sequence(np.ascontiguousarray(cost), grid, start)
 
@@ -309,16 +286,10 @@ class SlotCosts(NamedTuple):
 
 
 def costs_of_slots(field: DistanceField, actor: Float, offsets: Float, config: PlannerConfig) -> SlotCosts:
-    """Compute the costs of every slot.
+    """Compute the costs of every slot, offsets [S, n, 3] m from the actor's forecast [T, 3] m, world.
 
     The integrand of the obstacle cost that Ho et al. print ignores its variable; here it is one minus the
     signed distance over the local planner's `eps_obs_m`, so that both planners keep the same distance.
-
-    Args:
-        field: the distance field of the obstacles.
-        actor: [T, 3] forecast, metres, world.
-        offsets: [S, n, 3] metres, the slots of each state from the actor.
-        config: `eps_obs_m`, `sight_start_m`.
     """
     actor = np.ascontiguousarray(actor)
     eps_m, start_m = config.eps_obs_m, config.sight_start_m

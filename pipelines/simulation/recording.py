@@ -91,15 +91,10 @@ def frame_times(lens: Lens, duration_s: float, rng: np.random.Generator) -> Int6
 
 
 def poses_at(paths: DronePaths, drone: int, t_ns: Int64) -> DronePoses:
-    """Interpolate the true poses of one drone at any moments of its path.
+    """Interpolate the true poses of one drone at moments [M] (ns since the flight's start) of its path.
 
     Positions follow the cubic through the path's positions and velocities, attitudes turn evenly. The
     camera always sits at the lever arm's end.
-
-    Args:
-        paths: the flight.
-        drone: its index.
-        t_ns: [M] since the flight's start.
 
     Raises:
         ValueError: a moment outside the path.

@@ -45,17 +45,10 @@ def joined(*surfaces: Surface) -> Surface:
 
 
 def hidden_by(surface: Surface, eye: Float, targets: Float) -> Bool:
-    """Test if a surface stands between an eye and targets.
+    """Test if a surface, whose both sides hide, stands between an eye [3] and targets [N, 3] m, world.
 
-    Exact up to rounding, which counts where a line runs through the edge of a triangle.
-
-    Args:
-        surface: the triangles; both of their sides hide.
-        eye: [3] m, world.
-        targets: [N, 3] m, world.
-
-    Returns:
-        [N]; False for a target with NaN.
+    Exact up to rounding, which counts where a line runs through the edge of a triangle. False for a target
+    with NaN.
     """
     out = np.empty(len(targets), dtype=np.bool_)
     eye, targets = np.ascontiguousarray(eye, np.float64), np.ascontiguousarray(targets, np.float64)

@@ -41,17 +41,10 @@ def crouch(plan: Plan, seconds: float, depth: float) -> None:
 
 
 def reach(plan: Plan, side: str, height_m: float, seconds: float, shoulder_m: float, arm_m: float) -> None:
-    """Move a hand (or both) up and ahead to a height above the ground, hold it there, and move it back.
+    """Move a hand (or both) up to a height above the ground, hold it there, and move it back.
 
-    Trunk and knees bend to reach heights below the waist.
-
-    Args:
-        plan: the plan that the action is added to.
-        side: left, right or both.
-        height_m: of the hand's joint.
-        seconds: time that it is held.
-        shoulder_m: height of the shoulders of the person standing.
-        arm_m: from shoulder to wrist.
+    Trunk and knees bend to reach heights below the waist. `shoulder_m` is the height of the shoulders of
+    the person standing, `arm_m` the length from shoulder to wrist.
     """
     there = plan.t_s + _REACH_S
     back = there + seconds

@@ -82,14 +82,9 @@ _BRIGHTEST = 4.0  # of the exposed light; the curve is constant above
 
 
 def developed(light: Float32, key: int) -> Bytes:
-    """Convert a field of light to the bytes of a picture.
+    """Convert a field of linear RGB light [H, W, 3] to the BGR bytes of a picture.
 
-    Args:
-        light: [H, W, 3] linear RGB.
-        key: of the noise, 64 bits; the same key gives the same noise.
-
-    Returns:
-        [H, W, 3] BGR.
+    The same key (64 bits) gives the same noise.
     """
     return _developed(light, np.uint64(key), _CURVE)
 
@@ -149,15 +144,11 @@ seventh of the sensor's noise."""
 
 
 def exposed_moments(rows: int, *, exposure_s: float, readout_s: float) -> tuple[Float, Float]:
-    """Choose moments whose weighted means are the rows of a picture.
+    """Choose moments whose weighted means are the rows of a picture, read from the first to the last.
 
     A row's light is the mean over its exposure of light that changes linearly between the moments. The
-    middle of the middle row's exposure is the picture's time.
-
-    Args:
-        rows: of the picture, read from the first to the last.
-        exposure_s: of each row.
-        readout_s: from the first row to the last.
+    middle of the middle row's exposure is the picture's time. `readout_s` is from the first row to the
+    last.
 
     Returns:
         [K] s against the picture's time, ascending, and [K, rows] weights whose columns add up to 1.

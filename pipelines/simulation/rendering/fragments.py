@@ -43,21 +43,12 @@ def room_for(count: int) -> Fragments:
 
 @cached
 def gather(band: Band, first_row: int, view: View, mesh: Mesh, fragments: Fragments, sky: Float32) -> int:
-    """Find the fragments of a band's pixels.
+    """Find the fragments of a band's pixels, and their number.
 
-    Samples of one face in one pixel become one fragment at their common centre, which lies on the face
-    and inside it. Samples without a face see land below the horizon, and nothing above.
-
-    Args:
-        band: the faces that the samples see, drawn with `SHIFTS_PX`.
-        first_row: the picture's row that is the band's first.
-        view: the camera.
-        mesh: the mesh of the band's faces.
-        fragments: room for as many as there are samples; filled.
-        sky: [R * W] share of each pixel's samples that see nothing; filled.
-
-    Returns:
-        The number of fragments.
+    Samples of one face in one pixel become one fragment at their common centre, which lies on the face and
+    inside it. Samples without a face see land below the horizon, and nothing above. The band was drawn with
+    `SHIFTS_PX`, `first_row` is its first row in the picture. Filled are `fragments`, with room for as many
+    as there are samples, and `sky` [R * W], the share of each pixel's samples that see nothing.
     """
     nearness, source = band
     position, turn, pinhole, land = view

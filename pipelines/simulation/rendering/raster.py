@@ -112,14 +112,9 @@ class Band(NamedTuple):
 def projected(
     vertices: Float, faces: Int32, position: Float, world_from_camera: Float, intrinsics: Intrinsics
 ) -> Projected:
-    """Project the faces that may touch the picture, cut at `NEAR_M` in front of the camera.
+    """Project the faces [F, 3] that may touch a pinhole's picture, cut at `NEAR_M` in front of the camera.
 
-    Args:
-        vertices: [V, 3] m, world.
-        faces: [F, 3] rows of `vertices`.
-        position: [3] m, of the camera in the world.
-        world_from_camera: [3, 3] rotation.
-        intrinsics: the camera, taken as a pinhole.
+    Vertices [V, 3] and the position [3] are in m, world; `world_from_camera` is a rotation [3, 3].
     """
     pinhole = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
     points = _in_camera(vertices, position, world_from_camera)
@@ -144,16 +139,10 @@ def empty_band(sample_rows: int, width: int) -> Band:
 
 @cached
 def draw(triangles: Projected, chosen: Int32, shifts_px: Float, first_sample_row: int, band: Band) -> None:
-    """Draw triangles into a band: every sample keeps the nearest; the first of equals.
+    """Draw the chosen triangles in order into a band: a sample keeps the nearest, the first of equals.
 
-    A sample on an edge belongs to both triangles, so that neighbours leave no gap.
-
-    Args:
-        triangles: all of the picture's.
-        chosen: rows of the triangles to draw, in that order.
-        shifts_px: `SHIFTS_PX` or `CENTRES_PX`.
-        first_sample_row: the picture's sample row that is the band's first.
-        band: changed in place.
+    A sample on an edge belongs to both triangles, so that neighbours leave no gap. `shifts_px` is
+    `SHIFTS_PX` or `CENTRES_PX`, `first_sample_row` the picture's sample row that is the band's first.
     """
     corners, source = triangles
     nearness, seen = band

@@ -153,16 +153,10 @@ class Renderer:
     def silhouette(
         self, position: Float, quaternion_xyzw: Float, person: Surface, others: Sequence[Surface] = ()
     ) -> Bool:
-        """Return the pixels at whose centres the camera sees the person, without the lens's distortion.
+        """Return the pixels [H, W] at whose centres the camera sees the person, without distortion.
 
-        Args:
-            position: [3] m, of the camera in the world.
-            quaternion_xyzw: [4] world_from_camera.
-            person: the person's surface.
-            others: other surfaces that may stand in front, besides the static ones.
-
-        Returns:
-            [H, W].
+        `others` are surfaces that may stand in front, besides the static ones; poses are those of
+        `picture`.
         """
         meshes = [mesh_of([person]), self._static, *(mesh_of([other]) for other in others)]
         seen = self._at_centres(position, quaternion_xyzw, stacked(meshes)).source
@@ -170,15 +164,9 @@ class Renderer:
         return mine
 
     def depth(self, position: Float, quaternion_xyzw: Float, people: Sequence[Surface] = ()) -> Float32:
-        """Return the depth at each pixel's centre, along the optical axis, without the lens's distortion.
+        """Return the depth [H, W] m at pixels' centres, along the optical axis, without distortion.
 
-        Args:
-            position: [3] m, of the camera in the world.
-            quaternion_xyzw: [4] world_from_camera.
-            people: the surfaces that move.
-
-        Returns:
-            [H, W] m; infinite where no surface is seen.
+        It is infinite where no surface is seen; poses are those of `picture`.
         """
         mesh = stacked([self._static, *(mesh_of([person]) for person in people)])
         nearness = self._at_centres(position, quaternion_xyzw, mesh).nearness

@@ -28,16 +28,11 @@ HAZE_M = 700.0  # distance at which haze has half its effect
 def shade(
     fragments: Fragments, count: int, sun: Float32, sky: Float32, first_row: int, view: View, light: Float32
 ) -> None:
-    """Write the light of the pixels of a band: the mean of the light at their samples.
+    """Write the light [R, W, 3] of the pixels of a band: the mean of the light at their samples.
 
-    Args:
-        fragments: of the band.
-        count: of the fragments.
-        sun: [N] cosine of the sun's incidence times the share of it that reaches a fragment.
-        sky: [R * W] share of each pixel's samples that see sky.
-        first_row: the row of the picture that is the band's first.
-        view: the camera.
-        light: [R, W, 3] the rows of the picture; written.
+    `sun` [N] is the cosine of the sun's incidence times the share of it that reaches a fragment, `sky` [R *
+    W] the share of each pixel's samples that see sky, `first_row` the row of the picture that is the band's
+    first.
     """
     _fill_sky(sky, first_row, view.world_from_camera, view.pinhole, light)
     _add(

@@ -35,14 +35,10 @@ def sun_axes(sun: Float) -> Float:
 
 
 def shadow_map(mesh: Mesh, region: Float, axes: Float, *, finest_m: float, most_texels: int) -> ShadowMap:
-    """Draw the map of a mesh over the part of the plane that some points cover.
+    """Draw the map of a mesh over the part of the plane that some points [N, 3] m, one at least, cover.
 
-    Args:
-        mesh: the surfaces that cast shadows; faces outside the region are left out.
-        region: [N, 3] m, at least one point; the map covers their projections.
-        axes: from `sun_axes`.
-        finest_m: side of a texel; larger if the map needs more than `most_texels`.
-        most_texels: largest number of texels along a side.
+    Faces outside that region are left out. The side of a texel is `finest_m`, or larger if the map needs
+    more than `most_texels` along a side.
     """
     covered = np.einsum("ij,nj->ni", axes[:2], region)
     low, high = covered.min(axis=0), covered.max(axis=0)

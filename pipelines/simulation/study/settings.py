@@ -146,9 +146,7 @@ def settings_for(
 def command_of(settings: Mapping[str, Any], output: str) -> str:
     """Return the `mocap ablate ...` that makes a study again; defaults are left out.
 
-    Args:
-        settings: as summary.json holds them, the noise as models by label.
-        output: the folder.
+    `settings` are those of summary.json, the noise as models by label.
 
     Raises:
         KeyError, TypeError, ValueError: they are not the settings of a study.

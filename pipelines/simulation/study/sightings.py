@@ -80,13 +80,7 @@ class Sightings:
 
 
 def walk(seconds: float, rate_hz: float, seed: int) -> Walk:
-    """Return a person who walks on a circle at an even pace.
-
-    Args:
-        seconds: duration.
-        rate_hz: of the pictures.
-        seed: of the person's way of walking.
-    """
+    """Return a person who walks on a circle at an even pace."""
     look = Body()
     person = make_body(look)
     distance_m = _SPEED_MPS * (seconds + 2 * _UNDER_WAY_S + _AIM_S)
@@ -124,13 +118,7 @@ def _smoothed(at: Callable[[Float], BodyMotion], t_s: Float) -> Float:
 
 
 def formation(of: Walk, *, cameras: int, tilt_deg: float) -> Formation:
-    """Place cameras in their slots: 360/n degrees apart, 90 for two, `RANGE_M` from the person.
-
-    Args:
-        of: the filmed person.
-        cameras: number of cameras.
-        tilt_deg: of their slots above the person.
-    """
+    """Place cameras in their slots: 360/n degrees apart, 90 for two, `RANGE_M` from the person."""
     position, quaternion = orbit(
         of.t_ns / 1e9,
         of.aim,
@@ -188,18 +176,10 @@ def views_of(
     seed: int,
     trial: int,
 ) -> Views:
-    """Return the input of triangulation: keypoints, logged poses, and the sigmas of these poses.
+    """Return the input of triangulation: keypoints, logged poses, sigmas; T * J rows, joints fastest.
 
-    Args:
-        of: the filmed person.
-        seen_by: the cameras.
-        sightings: the keypoints found.
-        noise: the errors of the logged poses; their true standard deviation is the pose sigma.
-        seed: source of random numbers.
-        trial: number of the draw.
-
-    Returns:
-        Views with N = T * J rows, joints fastest.
+    The true standard deviation of the noise on the logged poses is the pose sigma; `trial` is the number of
+    the draw.
     """
     cameras, times, joints = sightings.confidence.shape
     position, rotation = np.empty((times, cameras, 3)), np.empty((times, cameras, 3, 3))
@@ -251,17 +231,8 @@ def measure_arm(
 ) -> dict[str, Any]:
     """Measure an arm: figures by their names in film/metrics.json.
 
-    Shares are of pictures, of joints in them, or of moments.
-
-    Args:
-        of: the filmed person.
-        seen_by: N cameras at T moments.
-        sightings: the keypoints found in their pictures.
-        views: the input of triangulation, one row for each joint-frame.
-        points: [T, J, 3] m, the triangulated joints, NaN where there is none.
-        tilt_deg: [N, T] of the cameras above the person.
-        range_m: [N, T] distances of the cameras from the person.
-        desired_tilt_deg: the planners' desired tilt.
+    Shares are of pictures, of joints in them, or of moments. `views` has one row for each joint-frame of
+    `points` [T, J, 3] m, NaN where there is none; tilts and ranges [N, T] are the cameras' from the person.
     """
     exact = exact_keypoints(of, seen_by).xy
     inside = np.isfinite(exact[..., 0])

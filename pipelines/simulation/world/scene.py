@@ -99,11 +99,8 @@ class World:
 def build_world(spec: scenario.World, seed: int, *, keep_clear: Float) -> World:
     """Raise the mounds, plant the wood, stand trees and walls on the ground.
 
-    Args:
-        spec: the world of the scenario.
-        seed: of the wood and of the looks of things.
-        keep_clear: [K, 2] m, points of the actor's way, which the wood keeps clear of. Trees with a place in
-            the scenario stand at that place.
+    `keep_clear` [K, 2] m are points of the actor's way, which the wood keeps clear of. Trees with a place
+    in the scenario stand at that place.
 
     Raises:
         DataError: the wood does not fit, or a wall has no length.
