@@ -79,7 +79,7 @@ def _print_comparisons(sessions: Mapping[str, Path], trials: int) -> None:
     settings = Settings(arms=ARMS, trials=trials, planner=planner_settings(SCENARIOS / "planner.yaml", {}))
     found = {name: replan(session, settings).metrics for name, session in sessions.items()}
     scores = {(name, arm): metrics["arms"][arm] for name, metrics in found.items() for arm in ARMS}
-    rows = [[*of, *arm_figures(told, f"{told['mpjpe_mm']:.1f}")] for of, told in scores.items()]
+    rows = [[*of, *arm_figures(figures, f"{figures['mpjpe_mm']:.1f}")] for of, figures in scores.items()]
     print("\n".join(markdown_table(["scenario", "arm", *ARM_COLUMNS], rows)))
     rows = []
     for name, metrics in found.items():

@@ -24,6 +24,7 @@ from pipelines.geometry.noise import NoiseModel
 from pipelines.keypoints.actor_hints import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD
 from pipelines.keypoints.alone import FollowedAlone
 from pipelines.keypoints.hints import project_actor
+from pipelines.planning.arm_flights import poses_from
 from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.loading import LoggedFlight, load_flight
 from pipelines.reporting.frame_drawing import draw_frame, with_inlet
@@ -256,15 +257,11 @@ def _arm(
     settings: Settings,
 ) -> _Arm:
     table = read_table(folder / "replan" / name / "trajectories.parquet", REPLAN)
-    cameras = tuple(dict.fromkeys(table["camera"]))
+    cameras, position, quaternion = poses_from(table)
     t_ns = table["t_ns"].to_numpy(np.int64)[:: len(cameras)]
     rows = _rows(t_ns, settings)
     if len(rows) < 2:
         raise DataError(folder, f"{len(rows)} pictures lie in the span that is to be filmed", "widen it")
-
-    def dense(*columns: str) -> Float:
-        values = table[list(columns)].to_numpy(np.float64).reshape(len(t_ns), len(cameras), len(columns))
-        return np.ascontiguousarray(values[rows].swapaxes(0, 1))
 
     moments = t_ns[rows]
     followed, *others = setting.people
@@ -272,7 +269,9 @@ def _arm(
     motion, person = followed.moving(t_s), followed.person
     joints = person.keypoints(motion)
     walked = Walk(moments, person, followed.look.body.height_m, motion, joints, motion.root)
-    seen_by = Formation(dense("x", "y", "z"), dense("qx", "qy", "qz", "qw"), flight.cameras[0].intrinsics)
+    seen_by = Formation(
+        position.take(rows, axis=1), quaternion.take(rows, axis=1), flight.cameras[0].intrinsics
+    )
     hips = None if actor is None else actor.hips_at(moments)
     beside = [(each.person, each.moving(t_s)) for each in others]
     return _Arm(cameras, walked, beside, seen_by, hips, flight.cameras[0].noise)

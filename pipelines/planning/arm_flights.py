@@ -197,13 +197,19 @@ def flight_from(
     table: pd.DataFrame, known: Bool, separation: dict[str, int], safety: dict[str, int]
 ) -> ArmFlight:
     """Rebuild the flight that `trajectories` stored."""
+    names, position, quaternion = poses_from(table)
+    return ArmFlight(names, position, quaternion, _dense(table, _SLOT, len(names)), known, separation, safety)
+
+
+def poses_from(table: pd.DataFrame) -> tuple[tuple[str, ...], Float, Float]:
+    """Return the cameras' names, positions [N, T, 3] and quaternions [N, T, 4] of stored trajectories."""
     names = tuple(dict.fromkeys(table["camera"]))
+    return names, _dense(table, _POSITION, len(names)), _dense(table, _QUATERNION, len(names))
 
-    def array(columns: list[str]) -> Float:
-        rows = table[columns].to_numpy(np.float64).reshape(-1, len(names), len(columns))
-        return np.ascontiguousarray(rows.swapaxes(0, 1))
 
-    return ArmFlight(names, array(_POSITION), array(_QUATERNION), array(_SLOT), known, separation, safety)
+def _dense(table: pd.DataFrame, columns: list[str], cameras: int) -> Float:
+    rows = table[columns].to_numpy(np.float64).reshape(-1, cameras, len(columns))
+    return np.ascontiguousarray(rows.swapaxes(0, 1))
 
 
 def _rows(values: Float) -> Float:

@@ -237,8 +237,8 @@ def test_methods_are_compared_where_all_of_them_have_a_point(tmp_path: Path) -> 
     assert [(row["method"], row["trial"]) for row in rows] == [
         (method, str(trial)) for trial in range(2) for method in ("dlt", "midpoint", "robust")
     ]
-    told = np.mean([float(row["mpjpe_mm"]) for row in rows if row["method"] == "robust"])
-    assert told == pytest.approx(robust["mpjpe_mm"]["mean"])
+    mean_mm = np.mean([float(row["mpjpe_mm"]) for row in rows if row["method"] == "robust"])
+    assert mean_mm == pytest.approx(robust["mpjpe_mm"]["mean"])
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -69,7 +69,7 @@ def test_arms_are_filmed_and_a_detector_looks_at_them(tmp_path: Path) -> None:
     assert re.search(r"session: 1 pictures\b", refused(session, *SMALL, "--render-start", "0.9"))
 
 
-class BegunError(Exception):
+class StartedError(Exception):
     """Error with the inputs of a stage, raised instead of running it."""
 
 
@@ -79,14 +79,14 @@ def test_another_motion_file_is_another_film(tmp_path: Path, monkeypatch: pytest
     scenario, motion = tmp_path / "danced.yaml", tmp_path / "dance.bvh"
     scenario.write_text(SHORT.replace("[walk: {distance_m: 5}]", "{bvh: dance.bvh}"), encoding="utf-8")
 
-    def begun(*_: object, inputs: dict[str, str], **__: object) -> None:
-        raise BegunError(inputs)
+    def start(*_: object, inputs: dict[str, str], **__: object) -> None:
+        raise StartedError(inputs)
 
-    monkeypatch.setattr(WritableSession, "begin", begun)
+    monkeypatch.setattr(WritableSession, "begin", start)
     inputs = []
     for text in ("one", "another", "one"):
         motion.write_text(text, encoding="utf-8")
-        with pytest.raises(BegunError) as caught:
+        with pytest.raises(StartedError) as caught:
             film(session, Settings(detector=spot_detector(tmp_path)), scenario=scenario)
         inputs.append(caught.value.args[0])
     assert inputs[0] == inputs[2]

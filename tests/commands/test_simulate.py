@@ -461,7 +461,7 @@ HOSTILE = {
     "two things at once": ("{distance_m: 5}", "{distance_m: 5, to: [1, 2]}", "exactly one"),
     "unknown noise": ("white:", "pink:", "pink"),
     "noise below zero": ("position_m: 0.1", "position_m: -0.1", "position_m"),
-    "a planner told to turn": (
+    "a planner with a yaw rate": (
         "count: 2",
         "count: 2\n  formation: {planner: adaptive, yaw_rate_deg_per_s: 4}",
         "are the ring's",

@@ -62,8 +62,8 @@ def test_all_unknown_keys_are_in_one_message() -> None:
 )
 def test_cells_that_no_formation_reaches_are_told(values: dict[str, Any], named: list[str]) -> None:
     config = PlannerConfig(**values)
-    told = config.out_of_reach()
-    assert [line.partition(",")[0] for line in told] == named
+    lines = config.out_of_reach()
+    assert [line.partition(",")[0] for line in lines] == named
     # As the search has it: a cell has a neighbour beside itself, or it has not.
     for name, yaws, knot_s in (
         ("yaws", config.yaws, config.knot_s),
@@ -73,4 +73,4 @@ def test_cells_that_no_formation_reaches_are_told(values: dict[str, Any], named:
         states[:, 0] = yaw_set(yaws, 0.0)
         neighbours = lattice(states, rates=np.array(config.slot_rates), knot_s=knot_s, w_turn=1.0).neighbours
         alone = (neighbours >= 0).sum(axis=1).max() == 1
-        assert (alone and yaws > 1) == any(line.startswith(f"{name}:") for line in told)
+        assert (alone and yaws > 1) == any(line.startswith(f"{name}:") for line in lines)
