@@ -114,7 +114,7 @@ def main() -> None:
                 continue
             by_tilt = {t: [measure(folder, name, t, k) for k in range(len(LOOKS))] for t in TILTS_DEG}
             print_table(by_tilt)
-            print_telling(by_tilt)
+            print_separation(by_tilt)
             print_swaps([flight for flights in by_tilt.values() for flight in flights])
             if options.write:
                 write_table(name, by_tilt)
@@ -315,7 +315,7 @@ def print_table(by_tilt: dict[int, list[Sightings]]) -> None:
         )
 
 
-def print_telling(by_tilt: dict[int, list[Sightings]]) -> None:
+def print_separation(by_tilt: dict[int, list[Sightings]]) -> None:
     """Print how well the confidence separates bad keypoints from good ones: the area under the ROC curve."""
     flights = [flight for own in by_tilt.values() for flight in own]
     share = np.concatenate([flight.error_px / flight.height_px[:, None] for flight in flights]).ravel()
@@ -326,7 +326,7 @@ def print_telling(by_tilt: dict[int, list[Sightings]]) -> None:
     pairs = float(bad.sum()) * float((~bad).sum())
     area = (rank[bad].sum() - bad.sum() * (bad.sum() + 1) / 2) / pairs
     print(
-        f"confidence tells errors above {100 * GOOD:g} % of the height: area under the ROC curve {area:.2f}"
+        f"confidence separates errors above {100 * GOOD:g} % of the height: area under the ROC curve {area:.2f}"
     )
 
 
