@@ -325,9 +325,7 @@ def print_separation(by_tilt: dict[int, list[Sightings]]) -> None:
     rank = rankdata(-confidence[found])
     pairs = float(bad.sum()) * float((~bad).sum())
     area = (rank[bad].sum() - bad.sum() * (bad.sum() + 1) / 2) / pairs
-    print(
-        f"confidence separates errors above {100 * GOOD:g} % of the height: area under the ROC curve {area:.2f}"
-    )
+    print(f"errors above {100 * GOOD:g} % of the height by confidence: area under the ROC curve {area:.2f}")
 
 
 def print_swaps(flights: list[Sightings]) -> None:
