@@ -86,8 +86,8 @@ def _poses() -> Numbers:
     for name, commands in POSES.commands.items():
         for command in commands:
             _run(command)
-        told = _read(f"{PLACE}/{name}.session/reconstruct/metrics.json")
-        numbers[name] = {key: told[key] for key in POSES.measures}
+        metrics = _read(f"{PLACE}/{name}.session/reconstruct/metrics.json")
+        numbers[name] = {key: metrics[key] for key in POSES.measures}
     _run(POSES.compare)
     for key in POSES.figures:
         _keep(f"{PLACE}/compared/{key}.svg", f"poses-{key.removeprefix('compare-')}")
@@ -157,13 +157,13 @@ def _children_s() -> float:
 def _spent() -> dict[str, float]:
     """Read the processor time (s) of the commands so far."""
     path = ROOT / _TIMES
-    told: dict[str, float] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    return told
+    stored: dict[str, float] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return stored
 
 
 def _read(path: str) -> dict[str, Any]:
-    told: dict[str, Any] = json.loads((ROOT / path).read_text(encoding="utf-8"))
-    return told
+    stored: dict[str, Any] = json.loads((ROOT / path).read_text(encoding="utf-8"))
+    return stored
 
 
 def _keep(figure: str, name: str) -> None:
@@ -198,7 +198,7 @@ def _study(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _arms(metrics: Mapping[str, Any]) -> dict[str, Any]:
-    arms = {arm: {key: told[key] for key in _ARM} for arm, told in metrics["arms"].items()}
+    arms = {arm: {key: scores[key] for key in _ARM} for arm, scores in metrics["arms"].items()}
     return {"trials": metrics["trials"], "arms": arms, "verdict": metrics["verdict"]}
 
 

@@ -143,9 +143,9 @@ def _head(numbers: Numbers) -> list[str]:
 
 def _poses(numbers: Numbers) -> list[str]:
     rows = []
-    for name, told in numbers["poses"].items():
-        errors = [_fixed(told[key], 1) for key in POSES.measures[:3]]
-        shares = [_fixed(100 * told[key], 1) for key in POSES.measures[3:]]
+    for name, metrics in numbers["poses"].items():
+        errors = [_fixed(metrics[key], 1) for key in POSES.measures[:3]]
+        shares = [_fixed(100 * metrics[key], 1) for key in POSES.measures[3:]]
         rows.append([POSES.names[name], *errors, *shares])
     commands = [command for own in POSES.commands.values() for command in own]
     header = ["poses", "MPJPE mm", "root-relative mm", "PA mm", "PCK@150 mm %", "measured %"]
@@ -186,11 +186,11 @@ def _studies(numbers: Numbers) -> list[str]:
 
 def _arms(numbers: Numbers) -> list[str]:
     rows, verdicts = [], []
-    for scenario, told in numbers["arms"].items():
-        for arm, scores in told["arms"].items():
+    for scenario, compared in numbers["arms"].items():
+        for arm, scores in compared["arms"].items():
             error = _estimate(scores["reconstruction_error"]["mpjpe_mm"])
             rows.append([scenario, arm, *arm_figures(scores, error)])
-        verdicts.append(f"- **{scenario}**: {told['verdict']}")
+        verdicts.append(f"- **{scenario}**: {compared['verdict']}")
     commands = [command for own in SCENARIOS.values() for command in own]
     lines = [
         "## Planners: adaptive against fixed",
@@ -214,17 +214,17 @@ def _arms(numbers: Numbers) -> list[str]:
 def _filming(numbers: Numbers) -> list[str]:
     rows = []
     for name, arms in numbers["filmed"].items():
-        for arm, told in arms.items():
-            tilt = told["tilt_deg"]
-            shares = (tilt["within_5_share"], told["in_view_share"], told["detected_share"])
+        for arm, scores in arms.items():
+            tilt = scores["tilt_deg"]
+            shares = (tilt["within_5_share"], scores["in_view_share"], scores["detected_share"])
             rows.append(
                 [
                     *(FILMED_NAMES[name], arm, _fixed(tilt["mean"], 1), _fixed(tilt["max"], 1)),
                     *(_fixed(100 * share, 0) for share in shares),
-                    _fixed(100 * told["keypoint_pck"], 1),
-                    _fixed(told["reprojection_px"]["mean"], 1),
-                    *(_fixed(100 * told[key], 1) for key in ("reconstructed_share", "pck150")),
-                    *(_fixed(told[key], 1) for key in ("mpjpe_mm", "root_mpjpe_mm")),
+                    _fixed(100 * scores["keypoint_pck"], 1),
+                    _fixed(scores["reprojection_px"]["mean"], 1),
+                    *(_fixed(100 * scores[key], 1) for key in ("reconstructed_share", "pck150")),
+                    *(_fixed(scores[key], 1) for key in ("mpjpe_mm", "root_mpjpe_mm")),
                 ]
             )
     header = ["experiment", "arm", "tilt mean deg", "max", "within 5 deg %", "in view %", "detected %"]
@@ -290,8 +290,8 @@ def _fixed(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def _estimate(told: Mapping[str, Any]) -> str:
-    if told["mean"] is None or told["interval"] is None:
-        return _fixed(told["mean"], 1)
-    low, high = told["interval"]
-    return f"{told['mean']:.1f} [{low:.1f}, {high:.1f}]"
+def _estimate(stated: Mapping[str, Any]) -> str:
+    if stated["mean"] is None or stated["interval"] is None:
+        return _fixed(stated["mean"], 1)
+    low, high = stated["interval"]
+    return f"{stated['mean']:.1f} [{low:.1f}, {high:.1f}]"

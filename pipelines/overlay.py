@@ -21,7 +21,7 @@ from pipelines.geometry.arrays import Picture
 from pipelines.reporting.frame_drawing import blank_frame, caption_of, draw_frame, padded_to_even
 from pipelines.reporting.motion import Motion, motion_from_skeleton
 from pipelines.reporting.overlays import FilmedCamera, read_filmed, status_at, views_of
-from pipelines.session.description import Description, MediaEntry, read_description
+from pipelines.session.description import Description, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
 from pipelines.session.records import Int64
@@ -124,11 +124,7 @@ def _begin(
 
 
 def _videos(folder: Path, record: StageRecord) -> list[Path]:
-    return [_video(folder / "overlay", name) for name in record.counts["cameras"]]
-
-
-def _video(folder: Path, camera: str) -> Path:
-    return folder / f"{camera}.mp4"
+    return [folder / "overlay" / f"{name}.mp4" for name in record.counts["cameras"]]
 
 
 def _refuse_foreign(folder: Path, force: bool) -> None:
@@ -163,7 +159,8 @@ def _still_there(
     """List the cameras whose pictures are still where they were at ingest."""
     there, gone = [], []
     for name in cameras:
-        missing = [path for path in _media(description, name).paths if not (folder / path).exists()]
+        media = description.cameras[name].media
+        missing = [path for path in media.paths if not (folder / path).exists()] if media else []
         if missing:
             gone.append((name, folder / missing[0]))
         else:
@@ -177,13 +174,6 @@ def _still_there(
     for name, path in gone:
         progress.note(f"{name}: no overlay, its pictures are not there any more ({path.resolve()})")
     return there
-
-
-def _media(description: Description, camera: str) -> MediaEntry:
-    media = description.cameras[camera].media
-    if media is None:
-        raise ValueError(f"{camera} has no pictures")
-    return media
 
 
 @dataclass(frozen=True)
@@ -280,7 +270,7 @@ def _draw(
     for film in films:
         name = film.camera.name
         own = [part for (of, _), part in zip(items, parts, strict=True) if of is film]
-        join_videos(_video(run.folder, name), [part / "part.mp4" for part in own])
+        join_videos(run.folder / f"{name}.mp4", [part / "part.mp4" for part in own])
         total: Counter[str] = Counter()
         for part in own:
             total.update(read_json(part / "counts.json"))

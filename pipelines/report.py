@@ -76,9 +76,8 @@ def report(folder: Path, *, studies: Sequence[Path] = (), force: bool = False) -
     with locked(folder) as session:
         records = _finished_stages(session)
         inputs = {name: digest for record in records.values() for name, digest in record.outputs.items()}
-        inputs |= {
-            f"key of {name}": record.key for name, record in records.items()
-        }  # their settings are shown
+        # The settings of the stages are shown: their keys cover them.
+        inputs |= {f"key of {name}": record.key for name, record in records.items()}
         description = read_description(folder)
         _refuse_changed_pictures(folder, description)
         settings = {
@@ -179,33 +178,34 @@ def write_figures_of(
     except OSError as error:
         raise as_data_error(error, target) from error
     studied = [read_study(study) for study in studies]
-    records = [_finished_stages(open_session(folder)) for folder in folders]
     labels = _labels([folder.resolve() for folder in folders])
-    keys = [{name: record.key for name, record in own.items()} for own in records]
-    descriptions = [read_description(folder) for folder in folders]
-    if len(folders) == 1:  # a comparison shows no pictures
-        _refuse_changed_pictures(folders[0], descriptions[0])
-    pictures_there = [_pictures_there(*each) for each in zip(folders, descriptions, strict=True)]
-    told = {
+    sessions = {
+        label: (folder, read_description(folder), _finished_stages(open_session(folder)))
+        for label, folder in zip(labels, folders, strict=True)
+    }
+    (folder, description, _), *others = sessions.values()
+    if not others:  # a comparison shows no pictures
+        _refuse_changed_pictures(folder, description)
+    made_of = {
         "revision": _FIGURES_REVISION,
-        "pictures": pictures_there,
-        "sessions": dict(zip(labels, keys, strict=True)),
+        "pictures": [_pictures_there(*each[:2]) for each in sessions.values()],
+        "sessions": {
+            label: {name: record.key for name, record in records.items()}
+            for label, (_, _, records) in sessions.items()
+        },
         "studies": _named(studied),
     }
-    key = hash_of(told)
+    key = hash_of(made_of)
     if not force and is_made(target, key, mark=MARK):
         return Figures(target, skipped=True)
-    contents = {
-        label: _load(*each)
-        for label, each in zip(labels, zip(folders, descriptions, records, strict=True), strict=True)
-    }
-    with ExitStack() as stack:
-        if len(folders) == 1:
-            pictures, _ = _open_pictures(folders[0], descriptions[0], stack)
+    contents = {label: _load(*each) for label, each in sessions.items()}
+    if others:
+        plates = draw_comparison(compare(contents))
+    else:
+        with ExitStack() as stack:
+            pictures, _ = _open_pictures(folder, description, stack)
             content = replace(contents[labels[0]], studies=tuple(studied))
             plates = draw_session(content, partial(_read_frame, pictures))
-        else:
-            plates = draw_comparison(compare(contents))
     with whole_folder(target, key, mark=MARK, overwrite=True) as making:
         write_figures(making.folder, plates, contents, key)
         making.publish()

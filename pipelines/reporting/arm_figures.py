@@ -20,9 +20,9 @@ from pipelines.reporting.plates import (
     MOST_POINTS,
     MUTED,
     PAPER,
-    WIDTH_IN,
     Plate,
     every,
+    new_figure,
     page_style,
     quiet,
     stacked,
@@ -55,12 +55,10 @@ def draw_arms(replan: Replan) -> dict[str, Plate]:
 
 def draw_arms_over_time(arms: tuple[Arm, ...]) -> Plate:
     """Draw four strips, one below the other, over the same time."""
-    from matplotlib.figure import Figure
-
     strips = sum(len(arm.cameras) for arm in arms)
     heights_in = [1.35, 1.15, 0.3 + 0.085 * strips, 1.15]
     with page_style():
-        figure = Figure((WIDTH_IN, 0.7 + sum(heights_in)), layout="constrained")
+        figure = new_figure(0.7 + sum(heights_in))
         tilt, reach, sight, error = figure.subplots(4, 1, sharex=True, height_ratios=heights_in)
         for arm in arms:
             _band(tilt, arm, arm.tilt_deg)
@@ -75,16 +73,15 @@ def draw_arms_over_time(arms: tuple[Arm, ...]) -> Plate:
         error.set_ylim(0, _top(arms))
         error.set_xlabel("time (s)")
         for axes in (tilt, reach, error):
-            axes.grid(visible=True, axis="y")
-            quiet(axes, grid=False)
-        quiet(sight)
+            quiet(axes, "y")
+        quiet(sight, "x")
         sight.spines["bottom"].set_visible(False)
         error.set_xlim(*span_s(arms))
         figure.align_ylabels([tilt, reach, sight, error])
         handles, labels = error.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper left", ncols=len(arms))
         title = "Tilt, range, sight and predicted error over time"
-        told = " ".join(_told_over_time(arm) for arm in arms)
+        description = " ".join(_describe_over_time(arm) for arm in arms)
     caption = (
         "Above: tilt of the cameras over the actor and their range, the mean of an arm's drones as a line "
         "and all of them within the band. Middle: a row per drone, drawn while something stands between it "
@@ -97,9 +94,8 @@ def draw_arms_over_time(arms: tuple[Arm, ...]) -> Plate:
     cut = [arm for arm in arms if np.nanmax(arm.predicted_error_m, initial=0.0) * 100 > _top(arms)]
     if cut:
         caption += f" Errors above {quantity(_top(arms), 'cm', 0)} are cut off."
-    return Plate(
-        "arms-time", title, caption, told, figure, {"": stacked([_numbers_over_time(arm) for arm in arms])}
-    )
+    numbers = {"": stacked([_numbers_over_time(arm) for arm in arms])}
+    return Plate("arms-time", title, caption, description, figure, numbers)
 
 
 def _numbers_over_time(arm: Arm) -> pd.DataFrame:
@@ -171,7 +167,7 @@ def _top(arms: tuple[Arm, ...]) -> float:
     return float(min(1.08 * known.max(), 3.0 * np.percentile(known, 90))) or 1.0
 
 
-def _told_over_time(arm: Arm) -> str:
+def _describe_over_time(arm: Arm) -> str:
     known = arm.predicted_error_m[np.isfinite(arm.predicted_error_m)]
     median_cm = 100 * float(np.median(known)) if len(known) else None
     return (
@@ -191,13 +187,10 @@ _TURN_DEG = 360.0
 
 def draw_yaw(arms: tuple[Arm, ...], costs: CostMap | None) -> Plate:
     """Draw all arms in one figure; without a cost map their yaws alone."""
-    from matplotlib.figure import Figure
-
     low, high = _span_deg(arms)
     with page_style():
-        figure = Figure((WIDTH_IN, 3.3), layout="constrained")
+        figure = new_figure(3.3)
         axes = figure.subplots()
-        axes.grid(visible=True, axis="y")
         levels, step = ([], 1) if costs is None else _draw_costs(axes, costs, low, high)
         for arm in arms:
             _draw_yaws(axes, arm)
@@ -206,10 +199,10 @@ def draw_yaw(arms: tuple[Arm, ...], costs: CostMap | None) -> Plate:
         axes.set_xlim(*span_s(arms))
         axes.set_xlabel("time (s)")
         axes.set_ylabel("formation yaw (deg)")
-        quiet(axes, grid=False)
+        quiet(axes, "y")
         _yaw_legend(figure, axes, levels)
         title = "The formation's yaw" + ("" if costs is None else " over what it would cost")
-        told = " ".join(_told_yaw(arm) for arm in arms)
+        description = " ".join(_describe_yaw(arm) for arm in arms)
     caption = (
         "Solid: the yaw that an arm chose for its first drone, counterclockwise from east and without "
         "jumps of a turn; dashed: where that drone was."
@@ -222,7 +215,7 @@ def draw_yaw(arms: tuple[Arm, ...], costs: CostMap | None) -> Plate:
             else " Every yaw would have cost the same at any time."
         )
         caption += f" One column in {step} is drawn." if step > 1 else ""
-    return Plate("arms-yaw", title, caption, told, figure, _yaw_numbers(arms, costs))
+    return Plate("arms-yaw", title, caption, description, figure, _yaw_numbers(arms, costs))
 
 
 def _span_deg(arms: tuple[Arm, ...]) -> tuple[float, float]:
@@ -307,7 +300,7 @@ def _yaw_legend(figure: Figure, axes: Axes, levels: list[float]) -> None:
     figure.legend(handles=[*entries, *shades], loc="outside upper left", ncols=len(entries) + len(shades))
 
 
-def _told_yaw(arm: Arm) -> str:
+def _describe_yaw(arm: Arm) -> str:
     chosen = arm.commanded_yaw_deg[np.isfinite(arm.commanded_yaw_deg)]
     found = chosen if len(chosen) else arm.yaw_deg[np.isfinite(arm.yaw_deg)]
     if not len(found):

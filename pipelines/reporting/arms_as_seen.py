@@ -17,6 +17,7 @@ from pipelines.reporting.plates import (
     STATUS_COLOURS,
     WIDTH_IN,
     Plate,
+    new_figure,
     page_style,
     stacked,
     table,
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
 MOMENTS = 4
 _CAMERAS = 2  # of each arm: more make the people too small to see
 _HIDDEN = STATUS_COLOURS["rejected"]
@@ -47,9 +47,7 @@ def draw_as_seen(replan: Replan) -> Plate | None:
     columns = min(_CAMERAS, max(len(seen.cameras) for _, seen in looks))
     panel_in = (WIDTH_IN - 0.3) / (len(chosen) * columns)
     with page_style():
-        from matplotlib.figure import Figure
-
-        figure = Figure((WIDTH_IN, 0.5 + len(looks) * (panel_in + 0.2)), layout="constrained")
+        figure = new_figure(0.5 + len(looks) * (panel_in + 0.2))
         panels = figure.subplots(len(looks), len(chosen) * columns, squeeze=False)
         for row, (arm, seen) in zip(panels, looks, strict=True):
             for k, at_s in enumerate(chosen.tolist()):
@@ -62,7 +60,7 @@ def draw_as_seen(replan: Replan) -> Plate | None:
             row[0].set_ylabel(shortened(arm.name), color=CAMERAS[arm.colour], fontsize=8.2)
         _legend(figure)
         title = "The actor as each arm would have seen it"
-        told = " ".join(_told(arm, seen) for arm, seen in looks)
+        description = " ".join(_describe(arm, seen) for arm, seen in looks)
     skipped = max(len(seen.cameras) for _, seen in looks) > columns
     caption = (
         "The skeleton in the pictures of each arm's cameras, all enlarged alike"
@@ -73,7 +71,7 @@ def draw_as_seen(replan: Replan) -> Plate | None:
         "Exact, by map and field of view: no detector's errors."
     )
     numbers = {"": stacked([_numbers(arm, seen) for arm, seen in looks])}
-    return Plate("arms-seen", title, caption, told, figure, numbers)
+    return Plate("arms-seen", title, caption, description, figure, numbers)
 
 
 def moments(looks: list[tuple[Arm, Seen]]) -> Float:
@@ -118,8 +116,8 @@ def _draw(axes: Axes, arm: Arm, seen: Seen, camera: int, at: int, side_px: float
     _draw_skeleton(axes, seen.joints, pixels, status, CAMERAS[arm.colour])
     found, known = int((status == "seen").sum()), int((status != "").sum())
     tilt_deg = float(arm.tilt_deg[camera, _nearest(arm.t_s, seen.t_s[at : at + 1])[0]])
-    told = f"{shortened(seen.cameras[camera])}, {quantity(tilt_deg, 'deg', 0)}"
-    axes.set_title(told, fontsize=6.4, loc="left", pad=2, color=MUTED)
+    words = f"{shortened(seen.cameras[camera])}, {quantity(tilt_deg, 'deg', 0)}"
+    axes.set_title(words, fontsize=6.4, loc="left", pad=2, color=MUTED)
     axes.text(
         0.97,
         0.03,
@@ -192,7 +190,7 @@ def _legend(figure: Figure) -> None:
     figure.legend(handles=entries, loc="outside upper left", ncols=2)
 
 
-def _told(arm: Arm, seen: Seen) -> str:
+def _describe(arm: Arm, seen: Seen) -> str:
     known = seen.status != ""
     shares = [
         f"{plural(int((seen.status == word).sum()), 'joint')} {word}"

@@ -20,8 +20,8 @@ import numpy as np
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.bootstrap import Series, interval_of, intervals, resampled
 from pipelines.geometry.metrics import aligned_distances, bone_lengths, root_relative_distances
-from pipelines.reporting.content import SessionContent
-from pipelines.reporting.motion import Motion
+from pipelines.reporting.content import SessionContent, text
+from pipelines.reporting.motion import Motion, middles
 from pipelines.reporting.summary import Summary, summarise
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.records import Int64
@@ -81,7 +81,7 @@ MEASURES = (
     ),
     Measure("tilt", "Tilt", "deg", 1, "", "of the cameras above the actor, mean over cameras"),
 )
-_OF = {measure.key: measure for measure in MEASURES}
+MEASURE_OF = {measure.key: measure for measure in MEASURES}
 
 
 @dataclass(frozen=True)
@@ -135,6 +135,11 @@ class Judged:
         motion = self.summary.motion
         return motion.t_ns if motion is not None else np.empty(0, dtype=np.int64)
 
+    @property
+    def method(self) -> str:
+        """Method of the reconstruction; empty without one."""
+        return text(self.summary.metrics, "method")
+
 
 @dataclass(frozen=True)
 class Difference:
@@ -166,7 +171,12 @@ class Pair:
     @property
     def decisive(self) -> Measure | None:
         """Measure of the verdict: the error where both have truth, else the reprojection."""
-        return next((_OF[key] for key in ("mpjpe", "reprojection") if key in self.differences), None)
+        return next((MEASURE_OF[key] for key in ("mpjpe", "reprojection") if key in self.differences), None)
+
+    @property
+    def by_measure(self) -> list[tuple[Measure, Difference]]:
+        """Differences with their measures, in the order of `MEASURES`."""
+        return [(one, self.differences[one.key]) for one in MEASURES if one.key in self.differences]
 
 
 @dataclass(frozen=True)
@@ -263,7 +273,7 @@ def _bone_values(motion: Motion) -> Values:
 
 def _tilt(content: SessionContent, summary: Summary, motion: Motion) -> Values:
     """Compute the cameras' mean elevation above the first person, deg [T, 1]; NaN where one has no pose."""
-    actor = _middle(motion)
+    actor = middles(motion.measured_position)[:, 0]
     away = camera_positions(content, summary, motion.t_ns) - actor
     tilt = np.degrees(np.arctan2(away[..., 2], np.linalg.norm(away[..., :2], axis=-1)))
     return Values(("formation",), tilt.mean(axis=0)[:, None])
@@ -281,15 +291,6 @@ def camera_positions(content: SessionContent, summary: Summary, t_ns: Int64) -> 
         position, _ = poses_at(track, t_ns, between, static=camera.entry.poses.static)
         positions.append(position)
     return np.stack(positions) if positions else np.full((1, len(t_ns), 3), np.nan)
-
-
-def _middle(motion: Motion) -> Float:
-    """Return the coordinate-wise median [T, 3] of the first person's measured joints; NaN where none are."""
-    position = motion.measured_position[:, 0]
-    middle = np.full((len(position), 3), np.nan)
-    there = np.isfinite(position[..., 0]).any(axis=1)
-    middle[there] = np.nanmedian(position[there], axis=1)
-    return middle
 
 
 # --- two sessions --------------------------------------------------------------------------------------
@@ -326,7 +327,8 @@ def _same_motion(first: Judged, other: Judged) -> tuple[Int64, Int64] | None:
         apart = ours[rows[0]][:, 0, place[0]] - theirs[rows[1]][:, 0, place[1]]
         limit_m = _SAME_TRUTH_M
     else:
-        apart, limit_m = _middle(a)[rows[0]] - _middle(b)[rows[1]], _SAME_PLACE_M
+        first_m, other_m = (middles(motion.measured_position)[:, 0] for motion in (a, b))
+        apart, limit_m = first_m[rows[0]] - other_m[rows[1]], _SAME_PLACE_M
     distance = np.linalg.norm(apart, axis=-1)
     known = distance[np.isfinite(distance)]
     return rows if known.size and float(np.median(known)) < limit_m else None

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.reporting.comparison import MEASURES, Comparison, Judged, Measure, Pair
+from pipelines.reporting.comparison import MEASURE_OF, MEASURES, Comparison, Judged, Measure, Pair
 from pipelines.reporting.plates import (
     CAMERAS,
     LINE_STYLES,
     MUTED,
-    WIDTH_IN,
     Plate,
+    new_figure,
     page_style,
     percentiles,
     quiet,
@@ -51,10 +51,9 @@ def draw_comparison(comparison: Comparison) -> dict[str, Plate]:
 def shown_measure(comparison: Comparison) -> Measure | None:
     """Return the error from truth if every session with a skeleton has it, else the reprojection."""
     having = [one for one in comparison.sessions if one.values]
-    keys = {measure.key: measure for measure in MEASURES}
     for key in ("mpjpe", "reprojection"):
         if having and all(key in one.estimates for one in having):
-            return keys[key]
+            return MEASURE_OF[key]
     return None
 
 
@@ -78,22 +77,18 @@ def seconds_of(comparison: Comparison, session: Judged) -> Float:
 
 
 def _over_time(comparison: Comparison, measure: Measure) -> Plate:
-    from matplotlib.figure import Figure
-
     there = [one for one in comparison.sessions if one.values]
-    known = {one.key: one for one in MEASURES}
     shown = [measure] + [
-        known[key] for key in _OVER_TIME if any(key in one.values for one in comparison.sessions)
+        MEASURE_OF[key] for key in _OVER_TIME if any(key in one.values for one in comparison.sessions)
     ]
     seconds = {one.label: seconds_of(comparison, one) for one in there}
     drawn = []
     with page_style():
-        figure = Figure((WIDTH_IN, 0.7 + 1.5 + 1.1 * (len(shown) - 1)), layout="constrained")
+        figure = new_figure(0.7 + 1.5 + 1.1 * (len(shown) - 1))
         panels = figure.subplots(
             len(shown), 1, sharex=True, squeeze=False, height_ratios=[1.5, *[1.1] * (len(shown) - 1)]
         )[:, 0]
         for axes, of in zip(panels, shown, strict=True):
-            axes.grid(visible=True, axis="y")
             drawn += [
                 _draw_over_time(axes, comparison, one, of, seconds[one.label], band=of is measure)
                 for one in there
@@ -104,20 +99,20 @@ def _over_time(comparison: Comparison, measure: Measure) -> Plate:
                 axes.set_ylim(0, 104)
             elif of.key != "tilt":
                 axes.set_ylim(bottom=0)
-            quiet(axes, grid=False)
+            quiet(axes, "y")
         panels[-1].set_xlabel("time (s)")
         panels[-1].set_xlim(min(s[0] for s in seconds.values()), max(s[-1] for s in seconds.values()))
         figure.align_ylabels(list(panels))
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper left", ncols=min(len(labels), 4))
         title = f"{measure.label} over time, and what goes with it"
-        told = listing(
+        listed = listing(
             f"{one.label} {quantity(one.estimates[measure.key].value, measure.unit, measure.digits)}"
             for one in there
         )
-        told = f"Means over the flights: {told}."
+        description = f"Means over the flights: {listed}."
     caption = _caption_over_time(comparison, shown, bands=len(there) <= _MOST_BANDS)
-    return Plate("compare-time", title, caption, told, figure, {"": stacked(drawn)})
+    return Plate("compare-time", title, caption, description, figure, {"": stacked(drawn)})
 
 
 def _caption_over_time(comparison: Comparison, shown: list[Measure], *, bands: bool) -> str:
@@ -177,8 +172,6 @@ def joints_of(comparison: Comparison) -> list[str]:
 
 
 def _joint_bars(comparison: Comparison, measure: Measure) -> Plate:
-    from matplotlib.figure import Figure
-
     joints = [
         name
         for name in joints_of(comparison)
@@ -186,25 +179,23 @@ def _joint_bars(comparison: Comparison, measure: Measure) -> Plate:
     ]
     there = [one for one in comparison.sessions if one.values]
     thick = 0.8 / len(there)
-    known = {one.key: one for one in MEASURES}
     with page_style():
         height = 0.8 + max(0.075 * len(there), 0.15) * 1.25 * max(len(joints), 6)
-        figure = Figure((WIDTH_IN, height), layout="constrained")
+        figure = new_figure(height)
         sides = figure.subplots(1, 2, sharey=True, width_ratios=[1.5, 1])
-        for axes, of in zip(sides, (measure, known["share"]), strict=True):
-            axes.grid(visible=True, axis="x")
+        for axes, of in zip(sides, (measure, MEASURE_OF["share"]), strict=True):
             for k, one in enumerate(there):
                 _draw_bars(axes, one, of, joints, (k - (len(there) - 1) / 2) * thick, thick, comparison)
             axes.set_ylim(len(joints) - 0.5, -0.5)
             axes.set_xlabel(f"{of.name} ({of.unit})")
-            quiet(axes, grid=False)
+            quiet(axes, "x")
         sides[0].set_yticks(range(len(joints)), [shortened(joint_label(name)) for name in joints])
         sides[0].set_xlim(left=0)
         sides[1].set_xlim(0, 100)
         handles, labels = sides[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper left", ncols=min(len(labels), 4))
         title = f"{measure.label} of every joint, and how often it was measured"
-        told = " ".join(
+        description = " ".join(
             f"{one.label}: "
             + listing(
                 f"{joint_label(name)} {fixed(found.value, measure.digits)}"
@@ -216,12 +207,12 @@ def _joint_bars(comparison: Comparison, measure: Measure) -> Plate:
     caption = "Thin lines: the 95 % intervals of the means."
     rows = [
         (one.label, f"{of.name} ({of.unit})", name, estimate.value, *(estimate.interval or (np.nan, np.nan)))
-        for of in (measure, known["share"])
+        for of in (measure, MEASURE_OF["share"])
         for one in there
         for name, estimate in one.per_joint.get(of.key, {}).items()
     ]
     numbers = tabled(("session", "measure", "joint", "value", "low", "high"), rows)
-    return Plate("compare-joints", title, caption, told, figure, {"": numbers})
+    return Plate("compare-joints", title, caption, description, figure, {"": numbers})
 
 
 def _draw_bars(
@@ -251,8 +242,6 @@ def _draw_bars(
 
 
 def _differences(comparison: Comparison) -> Plate:
-    from matplotlib.figure import Figure
-
     measures = [
         one
         for one in MEASURES
@@ -265,7 +254,7 @@ def _differences(comparison: Comparison) -> Plate:
     drawn = []
     with page_style():
         rows = len(measures)
-        figure = Figure((WIDTH_IN, 0.9 + rows * max(0.2, 0.1 * len(pairs))), layout="constrained")
+        figure = new_figure(0.9 + rows * max(0.2, 0.1 * len(pairs)))
         axes = figure.subplots()
         axes.axvline(0, color=MUTED, linewidth=0.8)
         for p, pair in enumerate(pairs):
@@ -273,10 +262,9 @@ def _differences(comparison: Comparison) -> Plate:
             drawn += _draw_pair(axes, pair, measures, shift, colour_of(comparison, pair.other))
         axes.set_yticks(range(rows), [f"{one.label}{_ARROW[one.better]}" for one in measures])
         axes.set_ylim(rows - 0.5, -0.5)
-        axes.grid(visible=True, axis="x")
         first = shortened(comparison.sessions[0].label)
         axes.set_xlabel(f"difference from {first} (% of its value)")
-        quiet(axes, grid=False)
+        quiet(axes, "x")
         if len(pairs) > 1:
             figure.legend(loc="outside upper left", ncols=min(len(pairs), 4))
         title = "All differences at a glance"
@@ -285,9 +273,9 @@ def _differences(comparison: Comparison) -> Plate:
         "interval; a line across zero is within noise. Beside each measure stands which way is better."
     )
     columns = ("session", "measure", "difference_percent", "low_percent", "high_percent")
-    told = listing(f"{session} {measure} {fixed(value)} %" for session, measure, value, _, _ in drawn)
+    listed = listing(f"{session} {measure} {fixed(value)} %" for session, measure, value, _, _ in drawn)
     numbers = tabled(columns, drawn)
-    return Plate("compare-differences", title, caption, f"{told}.", figure, {"": numbers})
+    return Plate("compare-differences", title, caption, f"{listed}.", figure, {"": numbers})
 
 
 def _draw_pair(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
@@ -11,7 +10,6 @@ from markupsafe import Markup
 from pipelines.geometry.bootstrap import LEVEL, RESAMPLES, STRETCH_S
 from pipelines.reporting import wording
 from pipelines.reporting.comparison import (
-    MEASURES,
     Comparison,
     Difference,
     Estimate,
@@ -30,40 +28,6 @@ GENERATOR = "mocap: sessions side by side"
 """Mark of a page of ours, which may be overwritten."""
 
 
-@dataclass(frozen=True)
-class SessionRow:
-    """One session in the tables."""
-
-    label: str
-    judged: Judged
-    colour: str  # the page's variable
-    flight: str
-    kind: str
-    method: str
-    started: str
-
-
-@dataclass(frozen=True)
-class DifferenceRow:
-    """One measure of a pair."""
-
-    measure: Measure
-    found: Difference
-    lower: str
-    verdict: str
-
-
-@dataclass(frozen=True)
-class PairTable:
-    """A session against the first."""
-
-    first: str
-    other: str
-    by_time: bool
-    rows: list[DifferenceRow]
-    per_joint: dict[str, float]  # of the measure that is shown joint by joint
-
-
 def render_comparison(contents: Mapping[str, SessionContent]) -> tuple[str, dict[str, Plate]]:
     """Render the complete HTML of a comparison; return it and its figures by their keys.
 
@@ -76,8 +40,8 @@ def render_comparison(contents: Mapping[str, SessionContent]) -> tuple[str, dict
     comparison = compare(contents)
     measure = shown_measure(comparison)
     plates = draw_comparison(comparison)
-    sessions = [_row(comparison, one) for one in comparison.sessions]
-    pairs = [_table(pair, measure) for pair in comparison.pairs]
+    shown = [pair.differences.get(measure.key) if measure is not None else None for pair in comparison.pairs]
+    per_joint = [found.per_joint if found is not None else {} for found in shown]
     page = (
         environment()
         .get_template("comparison.html.j2")
@@ -86,15 +50,16 @@ def render_comparison(contents: Mapping[str, SessionContent]) -> tuple[str, dict
             title=_title(comparison),
             simulated=all(one.summary.description.simulated for one in comparison.sessions),
             verdict=judge(comparison),
-            sessions=sessions,
-            measures=comparison.measures,
-            pairs=pairs,
+            comparison=comparison,
             measure=measure,
-            decided=any(pair.per_joint for pair in pairs),
+            per_joint=per_joint if any(per_joint) else [],
             joints=joints_of(comparison),
             plates=plates,
             # Our own drawing, in which every name was escaped when it was written.
             drawings={key: Markup(plate.svg) for key, plate in plates.items()},  # noqa: S704
+            colour_of=lambda session: PALETTE[colour_of(comparison, session)],
+            judgement=_judgement,
+            moment=wording.moment,
             settings=_differing_settings(comparison),
         )
     )
@@ -108,39 +73,8 @@ def _title(comparison: Comparison) -> str:
     return wording.listing(flights)
 
 
-def _row(comparison: Comparison, session: Judged) -> SessionRow:
-    summary = session.summary
-    return SessionRow(
-        label=session.label,
-        judged=session,
-        colour=PALETTE[colour_of(comparison, session)],
-        flight=summary.description.flight,
-        kind="simulated" if summary.description.simulated else "real",
-        method=text(summary.metrics, "method"),
-        started=wording.moment(summary.origin_ns),
-    )
-
-
-def _table(pair: Pair, measure: Measure | None) -> PairTable:
-    shown = pair.differences.get(measure.key) if measure is not None else None
-    return PairTable(
-        first=pair.first.label,
-        other=pair.other.label,
-        by_time=pair.by_time,
-        rows=[
-            DifferenceRow(one, found, _lower(found), _word(one, found))
-            for one in MEASURES
-            if (found := pair.differences.get(one.key)) is not None
-        ],
-        per_joint=shown.per_joint if shown is not None else {},
-    )
-
-
-def _lower(found: Difference) -> str:
-    return f"{found.lower} of {found.joints}" if found.joints > 1 else wording.ABSENT
-
-
-def _word(measure: Measure, found: Difference) -> str:
+def _judgement(measure: Measure, found: Difference) -> str:
+    """Judge a difference in two words at most."""
     if found.estimate.interval is None:
         return "too few moments"
     if not found.estimate.is_clear:
@@ -188,7 +122,7 @@ def judge(comparison: Comparison) -> Verdict:
     return Verdict(
         lead,
         quality=tuple(sentences if len(sentences) > 1 else ())
-        + tuple(told for pair in comparison.pairs for told in _also(pair)),
+        + tuple(sentence for pair in comparison.pairs for sentence in _also(pair)),
         certainty=tuple(_how(comparison)),
         doubts=tuple(dict.fromkeys(_doubts(comparison))),
     )
@@ -237,7 +171,7 @@ def _sentence(pair: Pair) -> str:
     change = found.estimate
     if change.interval is None:
         return (
-            f"Which of {names} is better cannot be told: there are too few moments. Their joints lie "
+            f"Which of {names} is better is not known: there are too few moments. Their joints lie "
             f"{listing(values)} {what}."
         )
     if not change.is_clear:
@@ -269,26 +203,18 @@ def _why_not(pair: Pair) -> str:
 def _also(pair: Pair) -> list[str]:
     """Describe the other differences that are larger than chance."""
     decisive = pair.decisive
-    told = [
+    sentences = [
         f"{measure.name} {amount(measure, found.other)} against {fixed(found.first, measure.digits)}"
-        for measure, found in _clear(pair)
-        if decisive is None or measure.key != decisive.key
+        for measure, found in pair.by_measure
+        if found.estimate.is_clear and (decisive is None or measure.key != decisive.key)
     ]
-    if not told:
+    if not sentences:
         return []
-    return [f"Beside that, {named(pair.other)} differs from {named(pair.first)} in {listing(told)}."]
-
-
-def _clear(pair: Pair) -> list[tuple[Measure, Difference]]:
-    return [
-        (measure, pair.differences[measure.key])
-        for measure in MEASURES
-        if measure.key in pair.differences and pair.differences[measure.key].estimate.is_clear
-    ]
+    return [f"Beside that, {named(pair.other)} differs from {named(pair.first)} in {listing(sentences)}."]
 
 
 def _how(comparison: Comparison) -> list[str]:
-    told = []
+    sentences = []
     for pair in comparison.pairs:
         measure = pair.decisive
         if measure is None:
@@ -296,22 +222,22 @@ def _how(comparison: Comparison) -> list[str]:
         found = pair.differences[measure.key]
         names = f"{named(pair.first)} and {named(pair.other)}"
         if pair.by_time:
-            told.append(
+            sentences.append(
                 f"{names} hold the same motion at {plural(pair.times, 'common time')}: they are compared "
                 f"moment by moment, on the {plural(found.pairs, 'joint-frame')} that both measured."
             )
         else:
-            told.append(
+            sentences.append(
                 f"{names} do not hold the same motion at the same times: they are compared joint by joint, "
                 f"each joint’s mean in one with its mean in the other; {named(pair.other)} has the smaller "
                 f"one for {found.lower} of {plural(found.joints, 'joint')}."
             )
-    told.append(
+    sentences.append(
         f"Intervals come from {fixed(RESAMPLES, 0)} resampled flights, made of stretches of "
         f"{quantity(STRETCH_S, 's', 0)}. They speak of these flights, not of the next ones: what is the same "
         "all through a flight, such as a constant pose error, does not show in them."
     )
-    return told
+    return sentences
 
 
 def _doubts(comparison: Comparison) -> list[str]:
@@ -360,11 +286,11 @@ def _other_lenses(pair: Pair) -> bool:
 
 def _unlike(sessions: Sequence[Judged]) -> list[str]:
     """List differences in how the sessions were made."""
-    told = []
+    sentences = []
     for what, values in (
         (
             "were reconstructed by different methods",
-            [text(one.summary.metrics, "method") for one in sessions],
+            [one.method for one in sessions],
         ),
         ("have different numbers of cameras", [str(len(one.summary.cameras)) for one in sessions]),
         (
@@ -376,5 +302,5 @@ def _unlike(sessions: Sequence[Judged]) -> list[str]:
             pairs = listing(
                 f"{named(one)} {value or 'none'}" for one, value in zip(sessions, values, strict=True)
             )
-            told.append(f"The sessions {what}: {pairs}.")
-    return told
+            sentences.append(f"The sessions {what}: {pairs}.")
+    return sentences

@@ -46,7 +46,7 @@ def write_figures(
         contents: the sessions that they are of, by label; the mark names their flights.
         key: equal for equal figures; it is stored in the mark.
     """
-    told = []
+    listed = []
     for plate in plates.values():
         names = _write_drawing(folder, plate.key, plate.figure)
         for what, numbers in plate.numbers.items():
@@ -57,12 +57,12 @@ def write_figures(
             )
             names.append(name)
         words = {"title": plate.title, "caption": plate.caption, "description": plate.description}
-        told.append({"figure": plate.key, **words, "files": names})
+        listed.append({"figure": plate.key, **words, "files": names})
     sessions = {
         label: {"flight": content.session.flight, "simulated": content.session.simulated}
         for label, content in contents.items()
     }
-    write_json(folder / MARK, {"schema": 1, "key": key, "sessions": sessions, "figures": told})
+    write_json(folder / MARK, {"schema": 1, "key": key, "sessions": sessions, "figures": listed})
 
 
 def _write_drawing(folder: Path, key: str, figure: Figure) -> list[str]:
@@ -107,6 +107,6 @@ def _ours(folder: Path) -> set[str]:
     """Return the names of the files that the mark in a folder lists."""
     if not (folder / MARK).is_file():
         return set()
-    told = read_json(folder / MARK, "remove it, or name another folder with --figures").get("figures")
-    figures = told if isinstance(told, list) else []
+    stated = read_json(folder / MARK, "remove it, or name another folder with --figures").get("figures")
+    figures = stated if isinstance(stated, list) else []
     return {MARK, *(name for each in figures if isinstance(each, dict) for name in each.get("files", ()))}

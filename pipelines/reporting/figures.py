@@ -26,6 +26,7 @@ from pipelines.reporting.plates import (
     STATUS_COLOURS,
     WIDTH_IN,
     Plate,
+    new_figure,
     page_style,
     percentiles,
     quiet,
@@ -71,11 +72,9 @@ def draw_all(summary: Summary, poses: Mapping[str, pd.DataFrame]) -> dict[str, P
 
 
 def _timeline(cameras: tuple[CameraRow, ...]) -> Plate:
-    from matplotlib.figure import Figure
-
     rows = len(cameras)
     with page_style():
-        figure = Figure((WIDTH_IN, 0.55 + 0.26 * rows), layout="constrained")
+        figure = new_figure(0.55 + 0.26 * rows)
         axes = figure.subplots()
         for k, camera in enumerate(cameras):
             axes.barh(
@@ -87,9 +86,9 @@ def _timeline(cameras: tuple[CameraRow, ...]) -> Plate:
         axes.set_yticks(range(rows), [shortened(camera.name) for camera in cameras])
         axes.set_ylim(rows - 0.5, -0.5)
         axes.set_xlabel("time (s)")
-        quiet(axes)
+        quiet(axes, "x")
         title = "When each camera had frames and poses"
-    told = " ".join(_spoken(camera) for camera in cameras)
+    description = " ".join(_describe(camera) for camera in cameras)
     gaps = any(camera.gaps_s for camera in cameras)
     caption = "A bar spans the frames of a camera" + (
         "; where it is cut to a thin line, its pose log has a gap." if gaps else "; no pose log has a gap."
@@ -97,10 +96,10 @@ def _timeline(cameras: tuple[CameraRow, ...]) -> Plate:
     spans = [(c.name, "frames", c.first_s, c.last_s) for c in cameras]
     spans += [(c.name, "gap in poses", start, end) for c in cameras for start, end in c.gaps_s]
     numbers = tabled(("camera", "what", "start_s", "end_s"), spans)
-    return Plate("timeline", title, caption, told, figure, {"": numbers})
+    return Plate("timeline", title, caption, description, figure, {"": numbers})
 
 
-def _spoken(camera: CameraRow) -> str:
+def _describe(camera: CameraRow) -> str:
     gaps = f"{plural(len(camera.gaps_s), 'gap')} in the poses" if camera.gaps_s else "no gap in the poses"
     return f"{camera.name}: {fixed(camera.first_s)} s to {fixed(camera.last_s)} s, {gaps}."
 
@@ -109,11 +108,9 @@ def _spoken(camera: CameraRow) -> str:
 
 
 def _joint_bars(summary: Summary) -> Plate:
-    from matplotlib.figure import Figure
-
     rows = summary.joints
     with page_style():
-        figure = Figure((WIDTH_IN / 2, _joint_height_in(summary)), layout="constrained")
+        figure = new_figure(_joint_height_in(summary), WIDTH_IN / 2)
         axes = figure.subplots()
         left = np.zeros(len(rows))
         for word in summary.statuses:
@@ -124,10 +121,9 @@ def _joint_bars(summary: Summary) -> Plate:
         axes.set_ylim(len(rows) - 0.5, -0.5)
         axes.set_xlim(0, 100)
         axes.set_xlabel("share of times (%)")
-        quiet(axes)
-        axes.tick_params(axis="y", length=0)
+        quiet(axes, "x")
         title = "What became of every joint"
-        told = listing(f"{joint_label(row.name)} {percent(row.share)}" for row in rows)
+        listed = listing(f"{joint_label(row.name)} {percent(row.share)}" for row in rows)
     numbers = table(
         joint=[row.name for row in rows],
         **{
@@ -136,7 +132,7 @@ def _joint_bars(summary: Summary) -> Plate:
         },
     )
     caption = "Colours as in the figure of errors over time."
-    return Plate("joints", title, caption, f"Share measured: {told}.", figure, {"": numbers})
+    return Plate("joints", title, caption, f"Share measured: {listed}.", figure, {"": numbers})
 
 
 def _joint_height_in(summary: Summary) -> float:
@@ -145,28 +141,24 @@ def _joint_height_in(summary: Summary) -> float:
 
 
 def _bone_lengths(summary: Summary) -> Plate:
-    from matplotlib.figure import Figure
-
     bones = summary.bones
     names = list(dict.fromkeys(bone.name for bone in bones))
     colours = {"left": LEFT, "right": RIGHT, "": MIDDLE}
     with page_style():
-        figure = Figure((WIDTH_IN / 2, _joint_height_in(summary)), layout="constrained")
+        figure = new_figure(_joint_height_in(summary), WIDTH_IN / 2)
         axes = figure.subplots()
         for bone in bones:
             y = names.index(bone.name) + {"left": -0.17, "right": 0.17, "": 0.0}[bone.side]
             colour = colours[bone.side]
             axes.plot([100 * bone.low_m, 100 * bone.high_m], [y, y], color=colour, linewidth=2.2, alpha=0.45)
             axes.plot(100 * bone.median_m, y, "o", color=colour, markersize=3.6)
-        axes.grid(visible=True, axis="x")
         axes.set_yticks(range(len(names)), names)
         axes.set_ylim(len(names) - 0.5, -0.5)
         axes.set_xlim(left=0)
         axes.set_xlabel("length (cm)")
-        quiet(axes, grid=False)
-        axes.tick_params(axis="y", length=0)
+        quiet(axes, "x")
         title = "Bone lengths"
-        told = listing(
+        listed = listing(
             f"{f'{b.side} {b.name}'.strip()} {quantity(100 * b.median_m, 'cm')} ± {percent(b.spread)}"
             for b in bones
         )
@@ -181,7 +173,7 @@ def _bone_lengths(summary: Summary) -> Plate:
         p90_cm=[100 * b.high_m for b in bones],
         relative_spread=[b.spread for b in bones],
     )
-    return Plate("bones", title, caption, f"Median and relative spread: {told}.", figure, {"": numbers})
+    return Plate("bones", title, caption, f"Median and relative spread: {listed}.", figure, {"": numbers})
 
 
 # --- over time -----------------------------------------------------------------------------------------
@@ -189,8 +181,6 @@ def _bone_lengths(summary: Summary) -> Plate:
 
 def draw_over_time(summary: Summary, motion: Motion) -> Plate:
     """Draw errors, and the share of measured joints; distances from truth where that is known."""
-    from matplotlib.figure import Figure
-
     seconds = (motion.t_ns - summary.origin_ns) / 1e9
     values = motion.reprojection_px if summary.errors_mm is None else summary.errors_mm
     unit = "px" if summary.errors_mm is None else "mm"
@@ -200,7 +190,7 @@ def draw_over_time(summary: Summary, motion: Motion) -> Plate:
     shown = {word: 100 * shares[STATUS.index(word)] for word in summary.statuses}
     middle, low, high = percentiles(np.where(motion.measured, values, np.nan), seconds, bins)
     with page_style():
-        figure = Figure((WIDTH_IN, 3.5), layout="constrained")
+        figure = new_figure(3.5)
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
         _draw_errors(upper, centres, middle, low, high)
         upper.set_ylabel(f"{what} ({unit})")
@@ -209,7 +199,7 @@ def draw_over_time(summary: Summary, motion: Motion) -> Plate:
         figure.legend(loc="outside upper left", ncols=len(STATUS))
         title = f"{what.capitalize()} over time, and what became of the joints"
         worst = int(np.nanargmax(middle)) if np.isfinite(middle).any() else None
-        told = (
+        description = (
             "No joint was measured."
             if worst is None
             else f"The median over joints lies between {quantity(float(np.nanmin(middle)), unit)} and "
@@ -226,16 +216,15 @@ def draw_over_time(summary: Summary, motion: Motion) -> Plate:
         **{f"median_{unit}": middle, f"p10_{unit}": low, f"p90_{unit}": high},
         **{f"{word}_percent": share for word, share in shown.items()},
     )
-    return Plate("time", title, caption, told, figure, {"": numbers})
+    return Plate("time", title, caption, description, figure, {"": numbers})
 
 
 def _draw_errors(axes: Axes, centres: Float, middle: Float, low: Float, high: Float) -> None:
     """Draw a line on its range, from zero."""
-    axes.grid(visible=True, axis="y")
     axes.fill_between(centres, low, high, color=STATUS_COLOURS["ok"], alpha=0.22, linewidth=0)
     axes.plot(centres, middle, color=STATUS_COLOURS["ok"])
     axes.set_ylim(0, 1.08 * np.nanmax(high, initial=0.0) or 1.0)
-    quiet(axes, grid=False)
+    quiet(axes, "y")
 
 
 def _draw_percentages(axes: Axes, bins: Float, shown: Mapping[str, Float]) -> None:
@@ -250,7 +239,7 @@ def _draw_percentages(axes: Axes, bins: Float, shown: Mapping[str, Float]) -> No
     axes.set_ylim(0, 100)
     axes.set_xlim(bins[0], bins[-1])
     axes.set_ylabel("joints (%)")
-    quiet(axes)
+    quiet(axes, "x")
 
 
 def _status_shares(seconds: Float, motion: Motion, bins: Float) -> tuple[Float, Float]:
@@ -282,8 +271,6 @@ def draw_snapshots(summary: Summary, motion: Motion) -> Plate:
 
     At least one joint must have been measured.
     """
-    from matplotlib.figure import Figure
-
     chosen = _fullest_times(motion)
     joints, position = with_derived(motion.joints, motion.measured_position[chosen, 0])
     # The median over the snapshots: a joint far below the ground must not lift every body.
@@ -292,7 +279,7 @@ def draw_snapshots(summary: Summary, motion: Motion) -> Plate:
     bottom = float(np.clip(np.nanmin(position[..., 2]) - ground, -_DEEPEST_M, 0.0)) - 0.05
     width = _STRIDE_M * SNAPSHOTS
     with page_style():
-        figure = Figure((WIDTH_IN, 0.5 + (WIDTH_IN - 0.6) * (top - bottom) / width), layout="constrained")
+        figure = new_figure(0.5 + (WIDTH_IN - 0.6) * (top - bottom) / width)
         axes = figure.subplots()
         seconds = [(int(motion.t_ns[k]) - summary.origin_ns) / 1e9 for k in chosen]
         labels = [f"{fixed(t_s)} s" for t_s in seconds]
@@ -307,12 +294,11 @@ def draw_snapshots(summary: Summary, motion: Motion) -> Plate:
         axes.set_aspect("equal")
         axes.set_xticks(_STRIDE_M * np.arange(len(chosen)), labels)
         axes.set_ylabel("height (m)")
-        axes.grid(visible=True, axis="y")
-        quiet(axes, grid=False)
+        quiet(axes, "y")
         axes.spines["bottom"].set_visible(False)
         axes.tick_params(axis="x", length=0)
         title = "The body at a few moments"
-        told = f"{plural(len(chosen), 'snapshot')} at {listing(labels)}."
+        description = f"{plural(len(chosen), 'snapshot')} at {listing(labels)}."
     whose = "" if motion.position.shape[1] == 1 else " of the first person"
     caption = (
         f"The fullest skeleton{whose} in each stretch of time, facing right and seen from its right, "
@@ -326,7 +312,7 @@ def draw_snapshots(summary: Summary, motion: Motion) -> Plate:
         right_m=places[:, 0],
         above_ground_m=places[:, 1],
     )
-    return Plate("body", title, caption, told, figure, {"": numbers})
+    return Plate("body", title, caption, description, figure, {"": numbers})
 
 
 def _fullest_times(motion: Motion) -> list[int]:

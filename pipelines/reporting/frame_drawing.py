@@ -89,12 +89,12 @@ def caption_of(view: View, status: NDArray[np.int8], method: str) -> tuple[str, 
         method: of the reconstruction.
     """
     counts = np.bincount(status[status >= 0].ravel(), minlength=len(STATUS))
-    said = [f"{count} {word}" for word, count in zip(STATUS, counts, strict=True) if count]
-    if not said:
-        said = ["no skeleton at this time"]
+    words = [f"{count} {word}" for word, count in zip(STATUS, counts, strict=True) if count]
+    if not words:
+        words = ["no skeleton at this time"]
     if not view.has_pose:
-        said.append("no camera pose at this time")
-    return f"{view.camera}   frame {view.frame}   {view.t_s:.3f} s", f"{method}: {', '.join(said)}"
+        words.append("no camera pose at this time")
+    return f"{view.camera}   frame {view.frame}   {view.t_s:.3f} s", f"{method}: {', '.join(words)}"
 
 
 def padded_to_even(picture: Picture) -> Picture:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.poses import rotate
-from pipelines.reporting.motion import Motion
+from pipelines.reporting.motion import Motion, middles
 from pipelines.reporting.plates import (
     CAMERAS,
     INK,
@@ -24,6 +24,7 @@ from pipelines.reporting.plates import (
     axis_label,
     every,
     near_zero,
+    new_figure,
     page_style,
     quiet,
     stacked,
@@ -46,19 +47,16 @@ def draw_paths(
     cameras: tuple[CameraRow, ...], poses: Mapping[str, pd.DataFrame], motion: Motion | None
 ) -> Plate:
     """Draw the paths on the ground plane; without a motion those of the cameras alone."""
-    from matplotlib.figure import Figure
-
     tracks = {camera.name: trajectory_from(poses[camera.name]) for camera in cameras if camera.name in poses}
-    people = _middles(motion) if motion is not None else []
+    people = list(np.moveaxis(middles(motion.measured_position)[..., :2], 1, 0)) if motion is not None else []
     low, high = _bounds([*people, *(track.position[:, :2] for track in tracks.values())])
     origin = near_zero(low)
     extent = np.maximum(high - low, 2.0)
     height_in = float(np.clip(0.75 * WIDTH_IN * extent[1] / extent[0], 3.2, 6.2))
 
     with page_style():
-        figure = Figure((WIDTH_IN, height_in), layout="constrained")
+        figure = new_figure(height_in)
         axes = figure.subplots()
-        axes.grid(visible=True)
         drawn = []
         for k, camera in enumerate(cameras):
             if camera.name in tracks:
@@ -76,16 +74,16 @@ def draw_paths(
         axes.set_xlabel(axis_label("east", origin[0]))
         axes.set_ylabel(axis_label("north", origin[1]))
         figure.legend(loc="outside right upper")
-        quiet(axes, grid=False)
+        quiet(axes, "both")
         title = "Seen from above"
         paths = [f"{name} over {quantity(_way_m(t.position), 'm')}" for name, t in tracks.items()]
         paths += [f"the actor over {quantity(_way_m(person), 'm')}" for person in people]
-        told = f"Paths on the ground plane: {listing(paths)}."
+        description = f"Paths on the ground plane: {listing(paths)}."
     caption = "Paths of the cameras" + (" and of the actor (middle of the measured joints)" if people else "")
     caption += "; an open circle marks the start, short strokes the direction of view."
     caption += _decimation(max((stride for _, _, stride in drawn), default=1), "pose")
     numbers = [table(who=who, east_m=path[:, 0], north_m=path[:, 1]) for who, path, _ in drawn]
-    return Plate("top", title, caption, told, figure, {"": stacked(numbers)})
+    return Plate("top", title, caption, description, figure, {"": stacked(numbers)})
 
 
 def _bounds(paths: list[Float]) -> tuple[Float, Float]:
@@ -148,20 +146,6 @@ def _drawn_path(t_ns: Int64, path: Float, gap_starts_ns: list[int]) -> tuple[Flo
     return (np.concatenate(pieces), stride) if pieces else (path, stride)
 
 
-def _middles(motion: Motion) -> list[Float]:
-    """Compute the middle of each person's measured joints from above, [T, 2]; NaN where there are none.
-
-    It is the coordinate-wise median: one wrong joint does not bend the path.
-    """
-    middles = []
-    for position in np.moveaxis(motion.measured_position[..., :2], 1, 0):
-        seen = np.isfinite(position[..., 0]).any(axis=1)
-        middle = np.full((len(position), 2), np.nan)
-        middle[seen] = np.nanmedian(position[seen], axis=1)
-        middles.append(middle)
-    return middles
-
-
 def _decimation(step: int, noun: str) -> str:
     return f" One {noun} in {step} is drawn." if step > 1 else ""
 
@@ -177,8 +161,6 @@ _HIDDEN = STATUS_COLOURS["rejected"]
 
 def draw_from_above(replan: Replan) -> Plate:
     """Draw one panel for each arm, all of the same stretch of land."""
-    from matplotlib.figure import Figure
-
     arms = replan.arms
     low, high = bounds_of(arms)
     margin = 0.08 * float((high - low).max()) + 2.0
@@ -190,7 +172,7 @@ def draw_from_above(replan: Replan) -> Plate:
     height_in = float(np.clip(panel_in * (high - low)[1] / (high - low)[0], 0.5 * panel_in, 6.0))
     ground = None if replan.terrain is None else heights(replan.terrain)
     with page_style():
-        figure = Figure((WIDTH_IN, 0.75 + rows * (height_in + 0.25)), layout="constrained")
+        figure = new_figure(0.75 + rows * (height_in + 0.25))
         panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for k, axes in enumerate(panels.flat):
             if k >= len(arms):
@@ -202,18 +184,18 @@ def draw_from_above(replan: Replan) -> Plate:
                 axes.tick_params(labelbottom=True)
             if k % columns == 0:
                 axes.set_ylabel(axis_label("north", origin[1]))
-            quiet(axes, grid=False)
+            quiet(axes)
         levels = [] if ground is None else [m for m in HEIGHT_LEVELS_M if ground.above_m.max() >= m]
         _legend(figure, arms, levels)
         title = "The arms from above"
-        told = " ".join(_told(arm) for arm in arms)
+        description = " ".join(_describe(arm) for arm in arms)
     numbers = {"": stacked([_arm_numbers(arm) for arm in arms])}
     if ground is not None:
         east_m, north_m = np.meshgrid(ground.east_m, ground.north_m, indexing="ij")
         numbers["heights"] = table(
             east_m=east_m.ravel(), north_m=north_m.ravel(), above_ground_m=ground.above_m.ravel()
         )
-    return Plate("arms-top", title, _caption(replan, levels), told, figure, numbers)
+    return Plate("arms-top", title, _caption(replan, levels), description, figure, numbers)
 
 
 def _arm_numbers(arm: Arm) -> pd.DataFrame:
@@ -351,7 +333,7 @@ def _caption(replan: Replan, levels: list[float]) -> str:
     return caption + (f" One pose in {step} is drawn." if step > 1 else "")
 
 
-def _told(arm: Arm) -> str:
+def _describe(arm: Arm) -> str:
     paths = zip(arm.cameras, arm.position, strict=True)
     ways = [f"{name} {quantity(_way_m(path), 'm')}" for name, path in paths]
     chosen = keyframes(arm)

@@ -75,6 +75,22 @@ def motion_from_skeleton(table: pd.DataFrame) -> Motion:
     )
 
 
+def full_covariance(upper: Float) -> Float:
+    """Return matrices [..., 3, 3] of their upper triangles [..., 6]: POINT_COVARIANCE_COLUMNS."""
+    return upper[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*upper.shape[:-1], 3, 3)
+
+
+def middles(position: Float) -> Float:
+    """Return the middles [T, P, 3] of people with joints [T, P, J, 3]; NaN where no joint is known.
+
+    It is the coordinate-wise median: one wrong joint does not bend a path.
+    """
+    there = np.isfinite(position[..., 0]).any(axis=-1)
+    middle = np.full((*position.shape[:2], 3), np.nan)
+    middle[there] = np.nanmedian(position[there], axis=1)
+    return middle
+
+
 def errors_mm(motion: Motion, truth: Float) -> Float:
     """Compute the distance of every measured joint from truth in mm, [T, P, J]; NaN if either is missing."""
     distance: Float = 1000 * np.linalg.norm(motion.measured_position - truth, axis=-1)
@@ -89,7 +105,7 @@ def share_inside_95(motion: Motion, truth: Float) -> float | None:
     """
     error = motion.measured_position - truth
     usable = np.isfinite(error).all(axis=-1) & np.isfinite(motion.covariance).all(axis=-1)
-    covariance = motion.covariance[usable][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    covariance = full_covariance(motion.covariance[usable])
     positive = np.linalg.eigvalsh(covariance)[:, 0] > 0
     if not positive.any():
         return None

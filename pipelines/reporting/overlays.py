@@ -21,8 +21,8 @@ from pipelines.geometry.cameras import Intrinsics, project
 from pipelines.geometry.poses import interpolate_points, matrix_from_quaternion
 from pipelines.geometry.triangulation import STATUS
 from pipelines.reporting.content import SessionContent, estimated_clocks, number, section
-from pipelines.reporting.motion import Motion
-from pipelines.reporting.summary import CameraRow, Summary
+from pipelines.reporting.motion import Motion, full_covariance
+from pipelines.reporting.summary import Summary
 from pipelines.session.camera_poses import poses_at
 from pipelines.session.description import Description, Interpolation
 from pipelines.session.records import Int64, Trajectory
@@ -107,7 +107,14 @@ def collect_moments(
     motion = summary.motion
     if motion is None or not motion.measured.any():
         return ()
-    cameras = [_camera(row, content, summary) for row in summary.cameras if row.name in content.keypoints]
+    least = number(section(content.stages.get("reconstruct", {}), "settings"), "min_confidence") or 0.0
+    cameras = [
+        FilmedCamera.of(
+            name, content.session, content.frames[name], content.keypoints[name], least, content.poses[name]
+        )
+        for name in content.session.cameras
+        if name in content.keypoints
+    ]
     if not cameras:
         return ()
     chosen, worst = choose_moments(motion, summary.errors_mm)
@@ -205,6 +212,29 @@ class FilmedCamera:
     static: bool  # the first pose of the track holds all the time
     between: Interpolation  # limits of the track's interpolation
 
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        description: Description,
+        frames: pd.DataFrame,
+        keypoints: pd.DataFrame,
+        least: float,
+        poses: pd.DataFrame,
+    ) -> FilmedCamera:
+        """Take a camera from its tables; keypoints below the least confidence were not used."""
+        entry = description.cameras[name]
+        return cls(
+            name=name,
+            intrinsics=entry.intrinsics.intrinsics(),
+            frame=frames["frame"].to_numpy(np.int64),
+            frame_t_ns=frames["t_ns"].to_numpy(np.int64),
+            keypoints=keypoints[keypoints["confidence"] >= least],
+            track=trajectory_from(poses),
+            static=entry.poses.static,
+            between=description.pose_interpolation,
+        )
+
     def nearest_frame(self, t_ns: int) -> int | None:
         """Return the row of the frame nearest to a time; None where none lies within a frame period."""
         nearest = int(np.argmin(np.abs(self.frame_t_ns - t_ns)))
@@ -221,23 +251,6 @@ class FilmedCamera:
         """Interpolate world_from_camera at times [N]: position [N, 3], rotation [N, 3, 3], NaN if none."""
         position, quaternion = poses_at(self.track, t_ns, self.between, static=self.static)
         return position, matrix_from_quaternion(quaternion)
-
-
-def _camera(camera: CameraRow, content: SessionContent, summary: Summary) -> FilmedCamera:
-    frames, keypoints = content.frames[camera.name], content.keypoints[camera.name]
-    settings = section(content.stages.get("reconstruct", {}), "settings")
-    # Keypoints that the reconstruction did not use are no measure of it.
-    used = keypoints["confidence"] >= (number(settings, "min_confidence") or 0.0)
-    return FilmedCamera(
-        name=camera.name,
-        intrinsics=camera.entry.intrinsics.intrinsics(),
-        frame=frames["frame"].to_numpy(np.int64),
-        frame_t_ns=frames["t_ns"].to_numpy(np.int64),
-        keypoints=keypoints[used],
-        track=trajectory_from(content.poses[camera.name]),
-        static=camera.entry.poses.static,
-        between=summary.description.pose_interpolation,
-    )
 
 
 def status_at(motion: Motion, t_ns: Int64) -> NDArray[np.int8]:
@@ -327,14 +340,13 @@ def seen_spread(points: Float, covariance: Float, world_from_camera: Float, lens
     Returns:
         [..., 2, 2] px^2, NaN where a number is missing.
     """
-    full = covariance[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*covariance.shape[:-1], 3, 3)
     step = _STEP * np.abs(points[..., 2])[..., None]
     columns = [
         (project(points + step * axis, lens) - project(points - step * axis, lens)) / (2 * step)
         for axis in np.eye(3)
     ]
     derivative = np.stack(columns, axis=-1) @ np.swapaxes(world_from_camera, -1, -2)
-    spread: Float = derivative @ full @ np.swapaxes(derivative, -1, -2)
+    spread: Float = derivative @ full_covariance(covariance) @ np.swapaxes(derivative, -1, -2)
     return spread
 
 
@@ -383,18 +395,12 @@ def read_filmed(
     refined = refined_poses(folder, record)
     filmed = {}
     for name, table in frames.items():
-        entry = description.cameras[name]
-        stage = "cameras" if entry.keypoints is not None else "detect"
+        stage = "cameras" if description.cameras[name].keypoints is not None else "detect"
         keypoints = read_table(folder / stage / name / "keypoints.parquet", KEYPOINTS)
-        logged = trajectory_from(read_table(folder / "cameras" / name / "poses.parquet", POSES))
-        filmed[name] = FilmedCamera(
-            name=name,
-            intrinsics=entry.intrinsics.intrinsics(),
-            frame=table["frame"].to_numpy(np.int64),
-            frame_t_ns=table["t_ns"].to_numpy(np.int64) + offset_ns.get(name, 0),
-            keypoints=keypoints[keypoints["confidence"] >= record.settings["min_confidence"]],
-            track=refined.get(name, logged),
-            static=entry.poses.static,
-            between=description.pose_interpolation,
+        poses = read_table(folder / "cameras" / name / "poses.parquet", POSES)
+        shifted = table.assign(t_ns=table["t_ns"] + offset_ns.get(name, 0))
+        camera = FilmedCamera.of(
+            name, description, shifted, keypoints, record.settings["min_confidence"], poses
         )
+        filmed[name] = replace(camera, track=refined.get(name, camera.track))
     return filmed

@@ -27,26 +27,6 @@ from pipelines.reporting.wording import environment
 
 
 @dataclass(frozen=True)
-class KeyFigure:
-    """One of the large numbers under the title."""
-
-    value: str
-    unit: str
-    label: str
-
-
-@dataclass(frozen=True)
-class StageNote:
-    """Settings and counts of one stage."""
-
-    name: str
-    key: str
-    settings: list[tuple[str, str]]
-    flight: list[tuple[str, str]]
-    counts: list[tuple[str, str]]
-
-
-@dataclass(frozen=True)
 class Overlays:
     """The skeleton in the pictures: the moments, a drawing of every view, and facts about all of them."""
 
@@ -162,16 +142,16 @@ def _overlays(content: SessionContent, summary: Summary, read_frame: ReadFrame |
     )
 
 
-def _key_figures(summary: Summary) -> list[KeyFigure]:
-    """Return at most five numbers that say how good a recording is."""
+def _key_figures(summary: Summary) -> list[tuple[str, str, str]]:
+    """Return at most five numbers that say how good a recording is: value, unit and label."""
     if summary.share is None:
         frames = sum(camera.entry.frames.count for camera in summary.cameras)
         return [
-            KeyFigure(wording.whole(len(summary.cameras)), "", "cameras"),
-            KeyFigure(wording.whole(frames), "", "frames"),
+            (wording.whole(len(summary.cameras)), "", "cameras"),
+            (wording.whole(frames), "", "frames"),
         ]
     share, _, unit = wording.percent(summary.share).rpartition(wording.THIN)
-    figures = [KeyFigure(share, unit, "of joint-frames measured")]
+    figures = [(share, unit, "of joint-frames measured")]
     for key, label in (
         ("mpjpe_mm", "mean error (MPJPE)"),
         ("root_mpjpe_mm", "relative to the hips"),
@@ -179,10 +159,10 @@ def _key_figures(summary: Summary) -> list[KeyFigure]:
     ):
         value = number(summary.metrics, key)
         if value is not None:
-            figures.append(KeyFigure(wording.fixed(value), "mm", label))
+            figures.append((wording.fixed(value), "mm", label))
     reprojection = number(section(summary.metrics, "reprojection_px"), "median")
     if reprojection is not None:
-        figures.append(KeyFigure(wording.fixed(reprojection), "px", "median reprojection"))
+        figures.append((wording.fixed(reprojection), "px", "median reprojection"))
     return figures
 
 
@@ -190,20 +170,21 @@ def _made_by(content: SessionContent) -> list[tuple[str, str]]:
     """Group the stages by the versions that made them: stages and versions."""
     made: dict[str, list[str]] = {}
     for stage in content.stages:
-        if told := content.made_by.get(stage):
-            versions = ", ".join(f"{name} {number}" for name, number in told.items())
+        if made_by := content.made_by.get(stage):
+            versions = ", ".join(f"{name} {number}" for name, number in made_by.items())
             made.setdefault(versions, []).append(stage)
     return [(wording.listing(stages), versions) for versions, stages in made.items()]
 
 
-def _stage_note(stage: str, record: Mapping[str, object]) -> StageNote:
+def _stage_note(stage: str, record: Mapping[str, object]) -> dict[str, object]:
+    """Return the settings and counts of one stage as rows."""
     settings = section(record, "settings")
     flight = section(settings, "flight")
     settings.pop("flight", None)
-    return StageNote(
-        name=stage,
-        key=text(record, "key"),
-        settings=wording.flattened(settings),
-        flight=[row for row in wording.flattened(flight) if row[1] != "none"],
-        counts=wording.flattened(section(record, "counts")),
-    )
+    return {
+        "name": stage,
+        "key": text(record, "key"),
+        "settings": wording.flattened(settings),
+        "flight": [row for row in wording.flattened(flight) if row[1] != "none"],
+        "counts": wording.flattened(section(record, "counts")),
+    }

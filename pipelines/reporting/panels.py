@@ -26,6 +26,7 @@ from pipelines.reporting.plates import (
     STATUS_COLOURS,
     WIDTH_IN,
     Plate,
+    new_figure,
     page_style,
     quiet,
     stacked,
@@ -258,12 +259,10 @@ def draw_overlays(moments: Sequence[Moment]) -> dict[str, Plate]:
 
 
 def _moment(k: int, moment: Moment) -> Plate:
-    from matplotlib.figure import Figure
-
     columns = min(len(moment.views), _MOST_COLUMNS)
     rows = -(-len(moment.views) // columns)
     with page_style():
-        figure = Figure((WIDTH_IN, rows * (WIDTH_IN / columns + 0.2)), layout="constrained")
+        figure = new_figure(rows * (WIDTH_IN / columns + 0.2))
         panels = list(figure.subplots(rows, columns, squeeze=False).flat)
         for axes in panels:
             axes.set_visible(False)
@@ -280,9 +279,9 @@ def _moment(k: int, moment: Moment) -> Plate:
         )
     elif moment.worst:
         caption += " The moment with the largest reprojection error."
-    told = listing(f"{view.camera} {quantity(view.median_px, 'px')}" for view in moment.views)
+    errors = listing(f"{view.camera} {quantity(view.median_px, 'px')}" for view in moment.views)
     numbers = {"": stacked([_numbers_of_view(view) for view in moment.views])}
-    return Plate(f"overlay-{k}", title, caption, f"Median reprojection error: {told}.", figure, numbers)
+    return Plate(f"overlay-{k}", title, caption, f"Median reprojection error: {errors}.", figure, numbers)
 
 
 def _draw_view(axes: Axes, view: View) -> None:
@@ -300,7 +299,7 @@ def _draw_view(axes: Axes, view: View) -> None:
     axes.set_facecolor(GRID)
     axes.set_xticks([])
     axes.set_yticks([])
-    quiet(axes, grid=False)
+    quiet(axes)
     axes.spines["bottom"].set_visible(False)
     place = {name: j for j, name in enumerate(view.joints)}
     for body in view.reprojected:

@@ -246,12 +246,19 @@ def axis_label(direction: str, origin_m: float) -> str:
     return f"{direction} (m)" if origin_m == 0 else f"{direction} of {fixed(origin_m, 0)} m (m)"
 
 
-def quiet(axes: Axes, *, grid: bool = True) -> None:
-    """Make axes light: no frame on the left, a thin line below."""
+def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
+    """Make an empty figure whose layout is solved when it is drawn; call it within `page_style`."""
+    from matplotlib.figure import Figure
+
+    return Figure((width_in, height_in), layout="constrained")
+
+
+def quiet(axes: Axes, grid: Literal["x", "y", "both"] | None = None) -> None:
+    """Make axes light: no frame on the left, a thin line below, and grid lines across the axes named."""
     axes.spines["left"].set_visible(False)
     axes.tick_params(axis="y", length=0)
-    if grid:
-        axes.grid(visible=True, axis="x", color=GRID)
+    if grid is not None:
+        axes.grid(visible=True, axis=grid)
 
 
 def time_bins(seconds: Float, most: int = MOST_BINS) -> Float:

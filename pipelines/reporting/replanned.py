@@ -251,7 +251,7 @@ def _setting(metrics: Mapping[str, object]) -> str:
     flown = [name for name in names if section(section(metrics, "arms"), name).get("simulated") is False]
     drones, duration_s = number(metrics, "drones"), number(metrics, "duration_s")
     trials, skeleton = number(metrics, "trials"), text(metrics, "skeleton")
-    said = [
+    sentences = [
         f"{plural(drones or 0, 'drone')} over {fixed(duration_s)} s, {text(metrics, 'mode') or 'replayed'}.",
         f"Simulated: {listing(name for name in names if name not in flown)}"
         + (f"; {listing(flown)} {'is' if len(flown) == 1 else 'are'} what the log says." if flown else "."),
@@ -260,7 +260,7 @@ def _setting(metrics: Mapping[str, object]) -> str:
         else f"Every reconstruction error is simulated: {plural(trials or 0, 'draw')} of noise, filming "
         + ("the true skeleton." if skeleton == "truth" else f"the skeleton of {skeleton}."),
     ]
-    return " ".join(said)
+    return " ".join(sentences)
 
 
 def _level(level: float | None) -> str:

@@ -17,14 +17,24 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.reporting.content import StudyContent
-from pipelines.reporting.plates import CAMERAS, GRID, INK, LEVELS, MUTED, WIDTH_IN, Plate, page_style, tabled
+from pipelines.reporting.plates import (
+    CAMERAS,
+    GRID,
+    INK,
+    LEVELS,
+    MUTED,
+    WIDTH_IN,
+    Plate,
+    new_figure,
+    page_style,
+    tabled,
+)
 from pipelines.reporting.wording import fixed, quantity
 from pipelines.session.records import Int64
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
 
 Row = dict[str, Any]
 
@@ -46,6 +56,21 @@ _VARIED = {"tilt": "tilt_deg", "robots": "drones"}
 _RESAMPLES = 2000
 _TAIL_PERCENT = 2.5
 _NOTHING_MM = 1e-3  # errors below are none: no ratio is taken to them
+
+_PANEL_IN, _ROW_IN, _SMALLEST_IN = 2.7, 2.0, 5.4
+_MARKERS = "osD^vPX*"
+_BESIDE = 0.012  # of the axis, between the error bars of neighbouring curves if the axis has words
+_LETTERS_PER_IN = 16  # of the title
+_HEADROOM, _LEAST_TOP = 1.04, 1.0  # above the highest marker; least top of the axis
+_DPI = 160
+
+_TITLES = {
+    "tilt": "Error against tilt",
+    "robots": "Error against the number of drones",
+    "noise": "Error against the kind of pose noise",
+}
+_SHOWN = (METRICS["mpjpe_mm"], METRICS["reconstructed_share"])  # tables on a session's page
+_BEST = ("refined", "robust", "midpoint", "dlt")  # the sentence is about the first one available
 
 
 def estimates(rows: Sequence[Row], study: str, *, seed: int) -> list[dict[str, Any]]:
@@ -71,10 +96,10 @@ def estimates(rows: Sequence[Row], study: str, *, seed: int) -> list[dict[str, A
         by_condition.setdefault(tuple(row[name] for name in _CONDITION), []).append(row)
     varied = _CONDITION.index(_VARIED.get(study, "method"))
     first = next(iter(by_condition))[varied]
-    told = []
+    made = []
     for condition, own in by_condition.items():
         others = by_condition[(*condition[:varied], first, *condition[varied + 1 :])]
-        told.append(
+        made.append(
             {
                 **dict(zip(_CONDITION, condition, strict=True)),
                 "metrics": {name: _mean(own, name, seed) for name in own[0] if _is_measured(name)},
@@ -82,7 +107,7 @@ def estimates(rows: Sequence[Row], study: str, *, seed: int) -> list[dict[str, A
                 "per_joint": _per_joint(own),
             }
         )
-    return told
+    return made
 
 
 def _is_measured(name: str) -> bool:
@@ -127,14 +152,14 @@ def _estimate(mean: float, drawn: Float, trials: int) -> dict[str, Any]:
 
 
 def _per_joint(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
-    told: dict[str, dict[str, float | None]] = {}
+    means: dict[str, dict[str, float | None]] = {}
     for joint, errors in rows[0]["per_joint"].items():
-        told[joint] = {}
+        means[joint] = {}
         for name in errors:
             values = [row["per_joint"][joint][name] for row in rows]
             there = [value for value in values if value is not None]
-            told[joint][name] = float(np.mean(there)) if there else None
-    return told
+            means[joint][name] = float(np.mean(there)) if there else None
+    return means
 
 
 def results_csv(rows: Sequence[Row]) -> str:
@@ -156,34 +181,29 @@ class Table:
 
     title: str
     header: list[str]
-    rows: list[list[str]]
+    names: int  # columns of names, before those of figures
+    rows: list[list[str]]  # a figure as `mean [low, high]`, without an interval where there is none
 
 
 def tables(summary: Mapping[str, Any]) -> list[Table]:
     """Make the tables for readers, as text; `-` where nothing could be measured."""
-    head, columns = _heads(summary)
-    first = summary["settings"]["methods"][0] if summary["study"] == "noise" else columns[0]
-    told = []
+    settings, study = summary["settings"], summary["study"]
+    columns = {
+        "tilt": [f"{tilt:g} deg" for tilt in settings["tilts_deg"]],
+        "robots": [f"{drones} drones" for drones in settings["drones"]],
+    }.get(study, list(settings["noise"]))
+    head = ["method"] if study == "noise" else ["noise", "method"]
+    first = settings["methods"][0] if study == "noise" else columns[0]
+    made = []
     for name, title in [*METRICS.items(), ("ratio", f"MPJPE relative to {first}, on common joint-frames")]:
-        lines = _lines(summary)
-        if name == "fell_back":  # only refined can fall back
-            lines = [(label, cells) for label, cells in lines if label[-1] == "refined"]
-            if not lines:
-                continue
-        rows = [[*label, *(_text(cell, name) for cell in cells)] for label, cells in lines]
-        told.append(Table(title, [*head, *columns], rows))
-    return told
-
-
-def _heads(summary: Mapping[str, Any]) -> tuple[list[str], list[str]]:
-    """Return the headers of the line names, and of their figures."""
-    settings = summary["settings"]
-    match summary["study"]:
-        case "tilt":
-            return ["noise", "method"], [f"{tilt:g} deg" for tilt in settings["tilts_deg"]]
-        case "robots":
-            return ["noise", "method"], [f"{drones} drones" for drones in settings["drones"]]
-    return ["method"], list(settings["noise"])
+        rows = [
+            [*label, *(_text(cell, name) for cell in cells)]
+            for label, cells in _lines(summary)
+            if name != "fell_back" or label[-1] == "refined"  # no other method can fall back
+        ]
+        if rows:
+            made.append(Table(title, [*head, *columns], len(head), rows))
+    return made
 
 
 def _lines(summary: Mapping[str, Any]) -> list[tuple[tuple[str, ...], list[Mapping[str, Any]]]]:
@@ -213,8 +233,16 @@ def _text(cell: Mapping[str, Any], name: str) -> str:
 
 
 def draw(folder: Path, summary: Mapping[str, Any]) -> None:
-    """Write the study's figure as SVG, PNG and PDF."""
-    save_study(folder, drawing(summary), f"Simulated: {setting(summary)}")
+    """Write the study's figure as `figure.svg`, `.png` and `.pdf`; equal summaries give equal bytes."""
+    width_in = max(0.6 + _PANEL_IN * len(_panels(summary)), _SMALLEST_IN)
+    figure = draw_study(summary, width_in, f"Simulated: {setting(summary)}")
+    with page_style():
+        # Neither dates nor versions: the same study gives the same files.
+        figure.savefig(folder / "figure.svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(folder / "figure.png", dpi=_DPI, metadata={"Software": None})
+        figure.savefig(
+            folder / "figure.pdf", metadata={"CreationDate": None, "Creator": None, "Producer": None}
+        )
 
 
 def setting(summary: Mapping[str, Any]) -> str:
@@ -228,154 +256,81 @@ def setting(summary: Mapping[str, Any]) -> str:
     )
 
 
-def drawing(summary: Mapping[str, Any]) -> StudyDrawing:
-    """Make the study's figure: a row for each of the first two metrics."""
-    study, settings = summary["study"], summary["settings"]
+def _panels(summary: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, list[Mapping[str, Any]]]]]]:
+    """Return the title of each panel of a row, and its curves: their names, and the cells along the axis."""
     lines = _lines(summary)
-    rows = []
-    for name in _DRAWN:
-        if study == "noise":
-            panels = [Panel("", [_curve(label[0], cells, name) for label, cells in lines])]
-        else:
-            panels = [
-                Panel(method, [_curve(noise, cells, name) for (noise, of), cells in lines if of == method])
-                for method in settings["methods"]
-            ]
-        rows.append((METRICS[name], panels))
-    match study:
-        case "tilt":
-            return StudyDrawing(rows, settings["tilts_deg"], "tilt of the formation, deg", "pose noise", True)
-        case "robots":
-            return StudyDrawing(rows, settings["drones"], "drones", "pose noise", True)
-    return StudyDrawing(rows, list(settings["noise"]), "pose noise", "method", False)
+    if summary["study"] == "noise":
+        return [("", [(label[0], cells) for label, cells in lines])]
+    return [
+        (method, [(noise, cells) for (noise, of), cells in lines if of == method])
+        for method in summary["settings"]["methods"]
+    ]
 
 
-def _curve(label: str, cells: Sequence[Mapping[str, Any]], name: str) -> Curve:
-    found = [cell["metrics"][name] for cell in cells]
-    return Curve(
-        label,
-        [None if each is None else each["mean"] for each in found],
-        [None if each is None or each["interval"] is None else tuple(each["interval"]) for each in found],
-    )
-
-
-_PANEL_IN, _ROW_IN, _SMALLEST_IN = 2.7, 2.0, 5.4
-_MARKERS = "osD^vPX*"
-_BESIDE = 0.012  # of the axis, between the error bars of neighbouring curves if the axis has words
-_LETTERS_PER_IN = 16  # of the title
-_HEADROOM, _LEAST_TOP = 1.04, 1.0  # above the highest marker; least top of the axis
-_DPI = 160
-
-
-@dataclass(frozen=True)
-class Curve:
-    """One line of a panel; None where nothing could be measured."""
-
-    label: str
-    mean: Sequence[float | None]
-    interval: Sequence[tuple[float, float] | None]
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One pair of axes."""
-
-    title: str
-    curves: Sequence[Curve]
-
-
-@dataclass(frozen=True)
-class StudyDrawing:
-    """Contents of a study's figure."""
-
-    rows: Sequence[tuple[str, Sequence[Panel]]]
-    """Name of each measured figure, and its panels, the same number in every row."""
-    at: Sequence[float] | Sequence[str]
-    """The values along the horizontal axis; words are put side by side."""
-    axis: str
-    """Title of the horizontal axis."""
-    legend: str
-    """Title of the legend of curves."""
-    ordered: bool
-    """True if the curves have an order, which their colours then show."""
-
-
-def save_study(folder: Path, drawing: StudyDrawing, title: str) -> None:
-    """Write `figure.svg`, `.png` and `.pdf`; equal arguments give equal bytes."""
-    width_in = max(0.6 + _PANEL_IN * len(drawing.rows[0][1]), _SMALLEST_IN)
-    figure = draw_study(drawing, width_in, title)
+def draw_study(summary: Mapping[str, Any], width_in: float, title: str = "") -> Figure:
+    """Draw a row of panels for each of two metrics, with a title above everything if there is one."""
+    settings = summary["settings"]
+    at, axis, legend = {
+        "tilt": (settings["tilts_deg"], "tilt of the formation, deg", "pose noise"),
+        "robots": (settings["drones"], "drones", "pose noise"),
+    }.get(summary["study"], (list(settings["noise"]), "pose noise", "method"))
+    panels = _panels(summary)
     with page_style():
-        # Neither dates nor versions: the same study gives the same files.
-        figure.savefig(folder / "figure.svg", metadata={"Date": None, "Creator": None})
-        figure.savefig(folder / "figure.png", dpi=_DPI, metadata={"Software": None})
-        figure.savefig(
-            folder / "figure.pdf", metadata={"CreationDate": None, "Creator": None, "Producer": None}
-        )
-
-
-def draw_study(drawing: StudyDrawing, width_in: float, title: str = "") -> Figure:
-    """Draw a study, with a title above everything if there is one."""
-    from matplotlib.figure import Figure
-
-    rows, at = drawing.rows, drawing.at
-    columns = len(rows[0][1])
-    with page_style():
-        figure = Figure((width_in, 0.9 + _ROW_IN * len(rows)), layout="constrained")
-        grid = figure.subplots(len(rows), columns, sharex=True, sharey="row", squeeze=False)
-        for (measured, panels), line in zip(rows, grid, strict=True):
-            for panel, axes in zip(panels, line, strict=True):
-                _draw_panel(axes, panel, at, ordered=drawing.ordered)
-            line[0].set_ylabel(measured)
-            line[0].set_ylim(0, _HEADROOM * max(line[0].get_ylim()[1], _LEAST_TOP))
-        for panel, axes in zip(rows[0][1], grid[0], strict=True):
-            axes.set_title(panel.title, color=INK, fontsize=8.4)
+        figure = new_figure(0.9 + _ROW_IN * len(_DRAWN), width_in)
+        grid = figure.subplots(len(_DRAWN), len(panels), sharex=True, sharey="row", squeeze=False)
+        for name, row in zip(_DRAWN, grid, strict=True):
+            for (_, curves), axes in zip(panels, row, strict=True):
+                _draw_curves(axes, name, curves, at)
+            row[0].set_ylabel(METRICS[name])
+            row[0].set_ylim(0, _HEADROOM * max(row[0].get_ylim()[1], _LEAST_TOP))
+        for (method, _), axes in zip(panels, grid[0], strict=True):
+            axes.set_title(method, color=INK, fontsize=8.4)
         for axes in grid[-1]:
-            axes.set_xlabel(drawing.axis)
+            axes.set_xlabel(axis)
         handles, labels = grid[0][0].get_legend_handles_labels()
-        below = min(len(labels), 3 * columns)
-        figure.legend(handles, labels, title=drawing.legend, loc="outside lower center", ncols=below)
+        below = min(len(labels), 3 * len(panels))
+        figure.legend(handles, labels, title=legend, loc="outside lower center", ncols=below)
         if title:
             lines = wrap(title, int(_LETTERS_PER_IN * width_in))
             figure.suptitle("\n".join(lines), color=MUTED, fontsize=8.0)
     return figure
 
 
-def _draw_panel(axes: Axes, panel: Panel, at: Sequence[float] | Sequence[str], *, ordered: bool) -> None:
+def _draw_curves(
+    axes: Axes,
+    name: str,
+    curves: Sequence[tuple[str, Sequence[Mapping[str, Any]]]],
+    at: Sequence[float] | Sequence[str],
+) -> None:
+    """Draw the means of a metric with their intervals; words along the axis are put side by side."""
     numbers = [float(value) if isinstance(value, int | float) else k for k, value in enumerate(at)]
     words = any(isinstance(value, str) for value in at)
     step = _BESIDE * (len(at) - 1 or 1) if words else 0.0
-    for k, curve in enumerate(panel.curves):
-        shift = (k - (len(panel.curves) - 1) / 2) * step
-        there = [
-            (x + shift, y, interval or (y, y))
-            for x, y, interval in zip(numbers, curve.mean, curve.interval, strict=True)
-            if y is not None
-        ]
+    for k, (label, cells) in enumerate(curves):
+        shift = (k - (len(curves) - 1) / 2) * step
+        found = zip(numbers, (cell["metrics"][name] for cell in cells), strict=True)
+        there = [(x + shift, y["mean"], y["interval"] or (y["mean"],) * 2) for x, y in found if y is not None]
         below, above = ([abs(y - interval[end]) for _, y, interval in there] for end in (0, 1))
         axes.errorbar(
             [x for x, *_ in there],
             [y for _, y, _ in there],
             [below, above],
-            label=curve.label,
-            color=_colour(k, len(panel.curves), ordered),
+            label=label,
+            color=CAMERAS[k % len(CAMERAS)]
+            if words or len(curves) > len(LEVELS)
+            else LEVELS[k + len(LEVELS) - len(curves)],  # levels of noise have an order
             marker=_MARKERS[k % len(_MARKERS)],
             markersize=3.2,
             linestyle="none" if words else "-",
             capsize=2.0,
             elinewidth=0.8,
         )
-    axes.set_xticks(numbers, [_label(value, len(at)) for value in at])
+    axes.set_xticks(numbers, [_tick(value, len(at)) for value in at])
     axes.grid(axis="y", color=GRID)
     axes.tick_params(length=0)
 
 
-def _colour(k: int, count: int, ordered: bool) -> Any:
-    if ordered and count <= len(LEVELS):
-        return LEVELS[k + len(LEVELS) - count]
-    return CAMERAS[k % len(CAMERAS)]
-
-
-def _label(value: float | str, count: int) -> str:
+def _tick(value: float | str, count: int) -> str:
     """Format a tick label: words are wrapped in lines that leave room for those beside them."""
     if not isinstance(value, str):
         return f"{value:g}"
@@ -383,26 +338,6 @@ def _label(value: float | str, count: int) -> str:
 
 
 # --- on a session's page -------------------------------------------------------------------------------
-
-
-_TITLES = {
-    "tilt": "Error against tilt",
-    "robots": "Error against the number of drones",
-    "noise": "Error against the kind of pose noise",
-}
-_SHOWN = {METRICS["mpjpe_mm"]: True, METRICS["reconstructed_share"]: False}  # True: on common joint-frames
-_BEST = ("refined", "robust", "midpoint", "dlt")  # the sentence is about the first one available
-
-
-@dataclass(frozen=True)
-class StudyTable:
-    """One figure of a study by condition."""
-
-    title: str
-    in_common: bool  # on the joint-frames that every method has
-    header: list[str]
-    names: int  # columns of names, before those of figures
-    rows: list[list[tuple[str, str]]]  # the mean, and its interval where there is one
 
 
 @dataclass(frozen=True)
@@ -415,7 +350,7 @@ class Study:
     setting: str
     command: str
     digest: str  # of its summary.json
-    tables: tuple[StudyTable, ...]
+    tables: tuple[Table, ...]
 
 
 def summarise_studies(contents: Sequence[StudyContent]) -> tuple[Study, ...]:
@@ -426,47 +361,30 @@ def summarise_studies(contents: Sequence[StudyContent]) -> tuple[Study, ...]:
     """
     return tuple(
         Study(
-            key=_key(k),
+            key=f"study-{k}",
             title=_TITLES[each.summary["study"]],
             sentence=what_it_shows(each.summary),
             setting=setting(each.summary),
             command=each.command,
             digest=each.digest,
-            tables=tuple(
-                _study_table(table, 1 if each.summary["study"] == "noise" else 2)
-                for table in tables(each.summary)
-                if table.title in _SHOWN
-            ),
+            tables=tuple(table for table in tables(each.summary) if table.title in _SHOWN),
         )
-        for k, each in enumerate(contents)
+        for k, each in enumerate(contents, start=1)
     )
 
 
 def draw_studies(contents: Sequence[StudyContent]) -> dict[str, Plate]:
     """Draw the studies' figures, by key."""
-    return {_key(k): _plate(_key(k), each.summary) for k, each in enumerate(contents)}
-
-
-def _key(k: int) -> str:
-    return f"study-{k + 1}"
-
-
-def _study_table(table: Table, names: int) -> StudyTable:
-    rows = []
-    for row in table.rows:
-        figures = [text.rstrip("]").partition(" [") for text in row[names:]]
-        found = [(mean, interval.replace(", ", " to ")) for mean, _, interval in figures]
-        rows.append([*((name, "") for name in row[:names]), *found])
-    return StudyTable(table.title, _SHOWN[table.title], table.header, names, rows)
+    plates = [_plate(f"study-{k}", each.summary) for k, each in enumerate(contents, start=1)]
+    return {plate.key: plate for plate in plates}
 
 
 def _plate(key: str, summary: Mapping[str, Any]) -> Plate:
     names = ("tilt_deg", "drones", "noise", "method")
-    measured = ("mpjpe_mm", "root_mpjpe_mm")
-    columns = [*names, *(f"{name}{end}" for name in measured for end in ("", "_low", "_high"))]
+    columns = [*names, *(f"{name}{end}" for name in _DRAWN for end in ("", "_low", "_high"))]
     rows = []
     for cell in summary["cells"]:
-        found = [cell["metrics"][name] or {"mean": None, "interval": None} for name in measured]
+        found = [cell["metrics"][name] or {"mean": None, "interval": None} for name in _DRAWN]
         figures = [value for each in found for value in (each["mean"], *(each["interval"] or (None, None)))]
         rows.append([*(cell[name] for name in names), *figures])
     return Plate(
@@ -474,7 +392,7 @@ def _plate(key: str, summary: Mapping[str, Any]) -> Plate:
         title=_TITLES[summary["study"]],
         caption=f"Simulated: {setting(summary)}.",
         description=what_it_shows(summary),
-        figure=draw_study(drawing(summary), WIDTH_IN),
+        figure=draw_study(summary, WIDTH_IN),
         numbers={"": tabled(columns, rows)},
     )
 
@@ -489,22 +407,22 @@ def what_it_shows(summary: Mapping[str, Any]) -> str:
     noise = own[-1]["noise"]
     first, *_, last = [cell for cell in own if cell["noise"] == noise] * 2  # a single one is both
     under = "without pose noise" if noise == "none" else f"under {noise} pose noise"
-    said = f"{under}, {method} errs {_mm(first)} {_where(summary, first)}"
+    sentence = f"{under}, {method} errs {_mm(first)} {_where(summary, first)}"
     if first is last:
-        return f"{said[0].upper()}{said[1:]}."
+        return f"{sentence[0].upper()}{sentence[1:]}."
     times = ""
     if last["ratio"] is not None and first["ratio"]["mean"] == 1:
         times = f", {last['ratio']['mean']:.2f} times as much{_interval(last['ratio'])}"
-    return f"{said[0].upper()}{said[1:]} and {_mm(last)} {_where(summary, last)}{times}."
+    return f"{sentence[0].upper()}{sentence[1:]} and {_mm(last)} {_where(summary, last)}{times}."
 
 
 def _least_and_most(method: str, cells: Sequence[Mapping[str, Any]]) -> str:
     least, *_, most = sorted(cells, key=lambda cell: float(cell["metrics"]["mpjpe_mm"]["mean"])) * 2
-    said = f"{method[0].upper()}{method[1:]} errs "
+    sentence = f"{method[0].upper()}{method[1:]} errs "
     if least is most:
-        return f"{said}{_mm(least)} under {least['noise']}."
+        return f"{sentence}{_mm(least)} under {least['noise']}."
     ends = [f"under {cell['noise']}, {_mm(cell)}{_interval_mm(cell)}" for cell in (least, most)]
-    return f"{said}least {ends[0]}, and most {ends[1]}."
+    return f"{sentence}least {ends[0]}, and most {ends[1]}."
 
 
 def _where(summary: Mapping[str, Any], cell: Mapping[str, Any]) -> str:

@@ -354,7 +354,7 @@ def _quality_row(content: SessionContent, summary: Summary, camera: CameraRow) -
 def _stated_noise(camera: CameraRow, poses: pd.DataFrame | None) -> str:
     """Describe the errors of the poses, by flight.yaml or by the log."""
     if camera.entry.pose_noise:
-        return "; ".join(_noise_words(name, told) for name, told in camera.entry.pose_noise.items())
+        return "; ".join(_noise_words(name, model) for name, model in camera.entry.pose_noise.items())
     covariance = logged_covariance(trajectory_from(poses)) if poses is not None else None
     if covariance is not None:
         variances = np.diagonal(covariance, axis1=1, axis2=2)
@@ -365,12 +365,12 @@ def _stated_noise(camera: CameraRow, poses: pd.DataFrame | None) -> str:
     return "stands still" if camera.entry.poses.static else "nothing"
 
 
-def _noise_words(name: str, told: dict[str, float | str]) -> str:
+def _noise_words(name: str, model: dict[str, float | str]) -> str:
     words = []
-    for key, value in told.items():
+    for key, value in model.items():
         before, unit = _NOISE_UNITS.get(key, (key.replace("_", " "), ""))
-        said = f"{value:g}{THIN}{unit}".strip() if isinstance(value, float | int) else str(value)
-        words.append(f"{before} {said}".strip())
+        stated = f"{value:g}{THIN}{unit}".strip() if isinstance(value, float | int) else str(value)
+        words.append(f"{before} {stated}".strip())
     return f"{name.replace('_', ' ')} {', '.join(words)}"
 
 

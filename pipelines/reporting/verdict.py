@@ -27,7 +27,7 @@ NOTABLE_LOSS = 0.01
 # A camera is named among the doubts when its reprojection error is this many times the usual one.
 ODD_CAMERA = 2.0
 # A calibrated 95 % ellipsoid holds 95 % of the truths; outside these shares the page says so.
-BELIEVABLE_SHARES = (0.90, 0.99)
+CALIBRATED_SHARES = (0.90, 0.99)
 # Measured joints further from truth than this are named among the doubts, however few.
 LARGE_ERROR_MM = 300.0
 # Root-relative error below this part of the absolute one: the cameras' poses carry most of the error.
@@ -138,7 +138,7 @@ def _certainty(summary: Summary) -> list[str]:
         return ["The method states no uncertainty for its positions."]
     sentences = [f"The stated uncertainty of a joint is {quantity(1000 * sigma, 'mm')} per axis (median)."]
     if summary.inside_95 is not None:
-        low, high = BELIEVABLE_SHARES
+        low, high = CALIBRATED_SHARES
         judgement = (
             "too small: do not rely on it"
             if summary.inside_95 < low

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.geometry.arrays import Float
-from pipelines.reporting.motion import Motion, side_of
+from pipelines.reporting.motion import Motion, full_covariance, middles, side_of
 from pipelines.reporting.replanned import Arm, Replan
 from pipelines.reporting.summary import CameraRow, Summary
 from pipelines.reporting.terrain import Surface, surface
@@ -138,9 +138,9 @@ class _Body:
     @classmethod
     def of(cls, motion: Motion, truth: Float | None) -> _Body:
         position = motion.measured_position
-        middle = _middle(position)
+        middle = middles(position)
         if truth is not None:
-            middle = np.where(np.isnan(middle), _middle(truth), middle)
+            middle = np.where(np.isnan(middle), middles(truth), middle)
             truth = truth - middle[:, :, None]
         lowest = _lowest(position)
         return cls(
@@ -196,14 +196,6 @@ class _Body:
         ]
 
 
-def _middle(position: Float) -> Float:
-    """Return the coordinate-wise median [T, P, 3] over the joints that are there; NaN where none is."""
-    there = np.isfinite(position[..., 0]).any(axis=-1)
-    middle = np.full((*position.shape[:2], 3), np.nan)
-    middle[there] = np.nanmedian(position[there], axis=1)
-    return middle
-
-
 def _lowest(position: Float) -> Float:
     """Return the height of the lowest joint [T, P]; NaN where there is none."""
     height = position[..., 2]
@@ -213,7 +205,7 @@ def _lowest(position: Float) -> Float:
 
 def _square_root(covariance: Float) -> Float | None:
     """Compute Cholesky factors [..., 6] of covariances [..., 6] (upper triangles); None without any."""
-    full = covariance[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    full = full_covariance(covariance).reshape(-1, 3, 3)
     known = np.isfinite(full).all(axis=(1, 2))
     positive = np.zeros(len(full), dtype=np.bool_)
     positive[known] = np.linalg.eigvalsh(full[known])[:, 0] > 0

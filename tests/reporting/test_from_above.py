@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipelines.reporting import from_above
-from pipelines.reporting.motion import motion_from_skeleton
+from pipelines.reporting.motion import middles, motion_from_skeleton
 from pipelines.reporting.plates import MOST_POINTS
 
 from .conftest import RATE_HZ, make_skeleton, true_positions
@@ -28,6 +28,6 @@ def test_middle_of_the_body_ignores_a_stray_joint() -> None:
     positions = true_positions(np.arange(10) / RATE_HZ)
     table[["x", "y", "z"]] = positions.reshape(-1, 3)
     table.loc[table["joint"] == "left_wrist", "x"] = 1e6
-    (middle,) = from_above._middles(motion_from_skeleton(table))
+    (middle,) = np.moveaxis(middles(motion_from_skeleton(table).measured_position)[..., :2], 1, 0)
     # The median of a body stays within the body: no wider than 0.4 m around its mean.
     assert np.abs(middle - positions.mean(axis=1)[:, :2]).max() < 0.4
