@@ -65,10 +65,10 @@ def draw_as_seen(replan: Replan) -> Plate | None:
     caption = (
         "The skeleton in the pictures of each arm's cameras, all enlarged alike"
         + (f" (the first {columns} cameras)" if skipped else "")
-        + ", with its tilt over the actor and how many joints it sees. Of every quarter of the flight, the "
-        "moment at which the cameras shown together see the fewest joints; of several, that of the highest "
-        "tilt. Open and dotted: hidden by what stands in the map; joints outside the picture are left out. "
-        "Exact, by map and field of view: no detector's errors."
+        + ", with its tilt over the actor and how many joints it sees. Each quarter of the flight is shown "
+        "at the moment when these cameras together see the fewest joints; of several such moments, at the "
+        "highest tilt. Open and dotted: hidden by an obstacle; joints outside the picture are left "
+        "out. Computed from map and field of view, without a detector's errors."
     )
     numbers = {"": stacked([_numbers(arm, seen) for arm, seen in looks])}
     return Plate("arms-seen", title, caption, description, figure, numbers)

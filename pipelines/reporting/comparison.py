@@ -63,7 +63,12 @@ MEASURES = (
     ),
     Measure("pa_mpjpe", "PA-MPJPE", "mm", 1, "less", "after the best shift, turn and scale of each frame"),
     Measure(
-        "pck150", "PCK at 150 mm", "%", 1, "more", "share of true joints met within 150 mm; missing ones not"
+        "pck150",
+        "PCK at 150 mm",
+        "%",
+        1,
+        "more",
+        "share of true joints reconstructed within 150 mm; missing ones count as wrong",
     ),
     Measure(
         "reprojection", "Reprojection", "px", 2, "less", "mean distance from the keypoints, of the views used"

@@ -210,7 +210,7 @@ def _also(pair: Pair) -> list[str]:
     ]
     if not sentences:
         return []
-    return [f"Beside that, {named(pair.other)} differs from {named(pair.first)} in {listing(sentences)}."]
+    return [f"{named(pair.other)} also differs from {named(pair.first)} in {listing(sentences)}."]
 
 
 def _how(comparison: Comparison) -> list[str]:
@@ -234,8 +234,8 @@ def _how(comparison: Comparison) -> list[str]:
             )
     sentences.append(
         f"Intervals come from {fixed(RESAMPLES, 0)} resampled flights, made of stretches of "
-        f"{quantity(STRETCH_S, 's', 0)}. They speak of these flights, not of the next ones: what is the same "
-        "all through a flight, such as a constant pose error, does not show in them."
+        f"{quantity(STRETCH_S, 's', 0)}. They are valid for these flights only: an error that is constant "
+        "during a flight, such as a constant pose error, is not part of them."
     )
     return sentences
 
@@ -269,7 +269,7 @@ def _doubts(comparison: Comparison) -> list[str]:
             )
     doubts += _unlike(comparison.sessions)
     doubts += [
-        f"What {stage} of {named(session)} was made of has changed since: run it again."
+        f"The inputs of {stage} of {named(session)} have changed since: run it again."
         for session in comparison.sessions
         for stage in session.content.outdated
     ]

@@ -122,7 +122,7 @@ def _joint_bars(summary: Summary) -> Plate:
         axes.set_xlim(0, 100)
         axes.set_xlabel("share of times (%)")
         quiet(axes, "x")
-        title = "What became of every joint"
+        title = "Status of every joint"
         listed = listing(f"{joint_label(row.name)} {percent(row.share)}" for row in rows)
     numbers = table(
         joint=[row.name for row in rows],
@@ -197,7 +197,7 @@ def draw_over_time(summary: Summary, motion: Motion) -> Plate:
         _draw_percentages(lower, bins, shown)
         lower.set_xlabel("time (s)")
         figure.legend(loc="outside upper left", ncols=len(STATUS))
-        title = f"{what.capitalize()} over time, and what became of the joints"
+        title = f"{what.capitalize()} over time, and the status of the joints"
         worst = int(np.nanargmax(middle)) if np.isfinite(middle).any() else None
         description = (
             "No joint was measured."

@@ -22,6 +22,7 @@ from pipelines.reporting.plates import (
     WIDTH_IN,
     Plate,
     axis_label,
+    bounds,
     every,
     near_zero,
     new_figure,
@@ -49,7 +50,7 @@ def draw_paths(
     """Draw the paths on the ground plane; without a motion those of the cameras alone."""
     tracks = {camera.name: trajectory_from(poses[camera.name]) for camera in cameras if camera.name in poses}
     people = list(np.moveaxis(middles(motion.measured_position)[..., :2], 1, 0)) if motion is not None else []
-    low, high = _bounds([*people, *(track.position[:, :2] for track in tracks.values())])
+    low, high = bounds([*people, *(track.position[:, :2] for track in tracks.values())])
     origin = near_zero(low)
     extent = np.maximum(high - low, 2.0)
     height_in = float(np.clip(0.75 * WIDTH_IN * extent[1] / extent[0], 3.2, 6.2))
@@ -84,13 +85,6 @@ def draw_paths(
     caption += _decimation(max((stride for _, _, stride in drawn), default=1), "pose")
     numbers = [table(who=who, east_m=path[:, 0], north_m=path[:, 1]) for who, path, _ in drawn]
     return Plate("top", title, caption, description, figure, {"": stacked(numbers)})
-
-
-def _bounds(paths: list[Float]) -> tuple[Float, Float]:
-    """Return the corners [2] of the box that holds all paths [N, 2]; zero where there is none."""
-    everything = np.concatenate([np.full((1, 2), np.nan), *paths])
-    everything = everything[np.isfinite(everything).all(axis=1)]
-    return (everything.min(axis=0), everything.max(axis=0)) if len(everything) else (np.zeros(2),) * 2
 
 
 def _draw_camera(

@@ -236,6 +236,13 @@ def every(count: int, most: int) -> int:
     return max(1, -(-count // most))
 
 
+def bounds(paths: Sequence[Float]) -> tuple[Float, Float]:
+    """Return the corners [2] of the box that holds all paths [N, 2]; zero where there is none."""
+    points = np.concatenate([np.zeros((0, 2)), *paths])
+    points = points[np.isfinite(points).all(axis=1)]
+    return (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(2), np.zeros(2))
+
+
 def near_zero(low: Float) -> Float:
     """Return the offset to subtract from coordinates whose least is `low`: 0, or a round number if far."""
     return np.where(np.abs(low) > _FAR_M, np.floor(low / 1000) * 1000, 0.0)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
 from pipelines.reporting.content import ReplanContent, items, number, section, text
+from pipelines.reporting.plates import bounds
 from pipelines.reporting.terrain import Terrain, terrain_around
 from pipelines.reporting.wording import ABSENT, THIN, fixed, listing, percent, plural
 from pipelines.session.records import Int64
@@ -136,12 +137,7 @@ def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Re
 
 def bounds_of(arms: tuple[Arm, ...]) -> tuple[Float, Float]:
     """Return the corners [2] of the box that holds all arms and the actor, seen from above, in m."""
-    points = [path[..., :2].reshape(-1, 2) for arm in arms for path in (arm.position, arm.actor)]
-    everywhere = np.concatenate([np.zeros((0, 2)), *points])
-    everywhere = everywhere[np.isfinite(everywhere).all(axis=1)]
-    if not len(everywhere):
-        return np.zeros(2), np.zeros(2)
-    return everywhere.min(axis=0), everywhere.max(axis=0)
+    return bounds([path[..., :2].reshape(-1, 2) for arm in arms for path in (arm.position, arm.actor)])
 
 
 def span_s(arms: tuple[Arm, ...]) -> tuple[float, float]:
@@ -254,7 +250,7 @@ def _setting(metrics: Mapping[str, object]) -> str:
     sentences = [
         f"{plural(drones or 0, 'drone')} over {fixed(duration_s)} s, {text(metrics, 'mode') or 'replayed'}.",
         f"Simulated: {listing(name for name in names if name not in flown)}"
-        + (f"; {listing(flown)} {'is' if len(flown) == 1 else 'are'} what the log says." if flown else "."),
+        + (f"; {listing(flown)} {'comes' if len(flown) == 1 else 'come'} from the log." if flown else "."),
         "No skeleton was known, so there is no reconstruction error."
         if not skeleton
         else f"Every reconstruction error is simulated: {plural(trials or 0, 'draw')} of noise, filming "

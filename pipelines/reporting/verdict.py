@@ -112,8 +112,8 @@ def _quality(summary: Summary) -> list[str]:
         )
         if root is not None and root < MOSTLY_SHARED * absolute:
             sentences.append(
-                "Most of that is a shift common to all joints, as wrong camera poses make it, "
-                "rather than a wrong shape of the body."
+                "Most of that is a shift common to all joints, which wrong camera poses cause, "
+                "not a wrong shape of the body."
             )
     else:
         sentences.append("There is no truth to compare with, so the error in the world is not known.")
@@ -215,7 +215,7 @@ def _doubts(content: SessionContent, summary: Summary) -> list[str]:
     ]
     doubts += _large_errors(summary)
     doubts += _odd_cameras(summary)
-    doubts += [f"What {stage} was made of has changed since: run it again." for stage in content.outdated]
+    doubts += [f"The inputs of {stage} have changed since: run it again." for stage in content.outdated]
     doubts += summary.description.warnings
     for record in content.stages.values():
         doubts += [str(warning) for warning in items(record, "warnings")]

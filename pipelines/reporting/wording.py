@@ -32,7 +32,7 @@ STATUS_REASONS = {
     "ok": "reconstructed from at least two views that agree",
     "filled": "the position was filled in between measured ones",
     "few_views": "fewer than two cameras saw the joint at the same time",
-    "low_parallax": "the cameras looked along nearly the same line, so the distance is open",
+    "low_parallax": "the cameras looked along nearly the same line, which leaves the distance undetermined",
     "rejected": "the views disagreed by more than pixel and pose noise explain",
     "not_detected": "the keypoint detector found the joint in no camera",
     "no_pose": "the cameras had no pose at these times",

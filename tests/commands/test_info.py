@@ -108,7 +108,7 @@ def test_a_stage_whose_data_changed_is_out_of_date(tmp_path: Path) -> None:
     flight.save()
     succeeds("ingest", flight.manifest)
     assert "run it again" in reading(session)["reconstruct"]["out of date"]
-    changed = "What reconstruct was made of has changed since: run it again."
+    changed = "The inputs of reconstruct have changed since: run it again."
     succeeds("report", session)
     assert changed in (session / "report" / "index.html").read_text(encoding="utf-8")
     succeeds("reconstruct", session)
