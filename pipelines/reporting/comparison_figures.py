@@ -16,6 +16,7 @@ from pipelines.reporting.plates import (
     LINE_STYLES,
     MUTED,
     Plate,
+    means,
     new_figure,
     page_style,
     percentiles,
@@ -148,18 +149,6 @@ def _draw_over_time(
     axes.plot(centres, middle, color=colour, linestyle=line, label=shortened(session.label))
     what = f"{measure.name} ({measure.unit})"
     return table(session=session.label, measure=what, t_s=centres, value=middle, p10=low, p90=high)
-
-
-def means(values: Float, seconds: Float, bins: Float) -> Float:
-    """Compute the mean of the finite values in each bin; NaN in an empty one."""
-    edges = np.searchsorted(seconds, bins)
-    result = np.full(len(bins) - 1, np.nan)
-    for k in range(len(bins) - 1):
-        inside = values[edges[k] : edges[k + 1]]
-        finite = inside[np.isfinite(inside)]
-        if finite.size:
-            result[k] = finite.mean()
-    return result
 
 
 # --- joint by joint ------------------------------------------------------------------------------------

@@ -18,11 +18,9 @@ from pipelines.reporting.from_above import draw_paths
 from pipelines.reporting.motion import Motion, side_of
 from pipelines.reporting.plates import (
     CAMERAS,
-    LEFT,
-    MIDDLE,
     MUTED,
     PAPER,
-    RIGHT,
+    SIDES,
     STATUS_COLOURS,
     WIDTH_IN,
     Plate,
@@ -143,13 +141,12 @@ def _joint_height_in(summary: Summary) -> float:
 def _bone_lengths(summary: Summary) -> Plate:
     bones = summary.bones
     names = list(dict.fromkeys(bone.name for bone in bones))
-    colours = {"left": LEFT, "right": RIGHT, "": MIDDLE}
     with page_style():
         figure = new_figure(_joint_height_in(summary), WIDTH_IN / 2)
         axes = figure.subplots()
         for bone in bones:
             y = names.index(bone.name) + {"left": -0.17, "right": 0.17, "": 0.0}[bone.side]
-            colour = colours[bone.side]
+            colour = SIDES[bone.side]
             axes.plot([100 * bone.low_m, 100 * bone.high_m], [y, y], color=colour, linewidth=2.2, alpha=0.45)
             axes.plot(100 * bone.median_m, y, "o", color=colour, markersize=3.6)
         axes.set_yticks(range(len(names)), names)
@@ -348,6 +345,7 @@ def _three_quarter_view(body: Float, joints: tuple[str, ...]) -> tuple[Float, Fl
 def _draw_body(axes: Axes, aside: Float, up: Float, joints: tuple[str, ...]) -> None:
     place = {name: (aside[j], up[j]) for j, name in enumerate(joints)}
     for start, end in bones_of(joints):
-        colour, order = {"left": (LEFT, 2), "right": (RIGHT, 4), "": (MIDDLE, 3)}[side_of(start, end)]
-        axes.plot(*zip(place[start], place[end], strict=True), color=colour, linewidth=1.7, zorder=order)
+        side = side_of(start, end)
+        order = {"left": 2, "right": 4, "": 3}[side]
+        axes.plot(*zip(place[start], place[end], strict=True), color=SIDES[side], linewidth=1.7, zorder=order)
     axes.plot(aside, up, "o", color=MUTED, markersize=1.6, zorder=5)

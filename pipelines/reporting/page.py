@@ -5,8 +5,8 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib.resources import files
+from typing import Any
 
 from markupsafe import Markup
 
@@ -15,7 +15,7 @@ from pipelines.reporting import wording
 from pipelines.reporting.arm_figures import draw_arms
 from pipelines.reporting.content import SessionContent, as_reconstructed, number, section, text
 from pipelines.reporting.figures import draw_all
-from pipelines.reporting.overlays import Moment, ReadFrame, collect_moments
+from pipelines.reporting.overlays import ReadFrame, collect_moments
 from pipelines.reporting.panels import draw_overlays, draw_panel, picture_width
 from pipelines.reporting.plates import Plate
 from pipelines.reporting.replanned import Replan, summarise_replan
@@ -24,19 +24,6 @@ from pipelines.reporting.summary import Summary, errors_per_camera, measures, qu
 from pipelines.reporting.verdict import give_verdict
 from pipelines.reporting.viewer import make_scene
 from pipelines.reporting.wording import environment
-
-
-@dataclass(frozen=True)
-class Overlays:
-    """The skeleton in the pictures: the moments, a drawing of every view, and facts about all of them."""
-
-    moments: tuple[Moment, ...]
-    drawings: dict[tuple[int, str], Markup]  # (moment, camera)
-    pictures: int  # number of drawings with a picture
-    rejected: bool  # True if any joint is marked so
-    unmeasured: bool
-    others: bool  # True if people beside the skeleton's are drawn
-    refined: bool  # True if the cameras' poses are refined, not logged
 
 
 def render_page(content: SessionContent, read_frame: ReadFrame | None = None) -> str:
@@ -80,7 +67,7 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
             hidden=bool(content.hidden),
             made_by=_made_by(content),
             viewer_script=Markup(script),  # noqa: S704 - our own file
-            policy=_policy(script, pictures=overlays is not None and overlays.pictures > 0),
+            policy=_policy(script, pictures=overlays is not None and overlays["pictures"] > 0),
             overlays=overlays,
             # Our own drawing, in which every name was escaped when it was written.
             drawings={key: Markup(plate.svg) for key, plate in plates.items()},  # noqa: S704
@@ -124,22 +111,25 @@ def _policy(script: str, *, pictures: bool) -> str:
     return "; ".join(rules + ["img-src data:"] * pictures)
 
 
-def _overlays(content: SessionContent, summary: Summary, read_frame: ReadFrame | None) -> Overlays | None:
+def _overlays(
+    content: SessionContent, summary: Summary, read_frame: ReadFrame | None
+) -> dict[str, Any] | None:
+    """Collect the moments, a drawing of every view, and facts about all of them; None without a view."""
     moments = collect_moments(content, summary, read_frame)
     views = {(m, view.camera): view for m, moment in enumerate(moments) for view in moment.views}
     if not views:
         return None
     width_px = picture_width(len(views))
-    return Overlays(
-        moments=moments,
+    return {
+        "moments": moments,
         # Our own drawing, without a word from the session's files.
-        drawings={key: Markup(draw_panel(view, width_px)) for key, view in views.items()},  # noqa: S704
-        pictures=sum(view.picture is not None for view in views.values()),
-        rejected=any(view.rejected.any() for view in views.values()),
-        unmeasured=any(view.unmeasured.any() for view in views.values()),
-        others=any(len(view.others) for view in views.values()),
-        refined=bool(content.refined),
-    )
+        "drawings": {key: Markup(draw_panel(view, width_px)) for key, view in views.items()},  # noqa: S704
+        "pictures": sum(view.picture is not None for view in views.values()),
+        "rejected": any(view.rejected.any() for view in views.values()),
+        "unmeasured": any(view.unmeasured.any() for view in views.values()),
+        "others": any(len(view.others) for view in views.values()),  # people beside the skeleton's
+        "refined": bool(content.refined),
+    }
 
 
 def _key_figures(summary: Summary) -> list[tuple[str, str, str]]:

@@ -19,10 +19,8 @@ from pipelines.reporting.overlays import Moment, View
 from pipelines.reporting.plates import (
     GRID,
     INK,
-    LEFT,
-    MIDDLE,
     MUTED,
-    RIGHT,
+    SIDES,
     STATUS_COLOURS,
     WIDTH_IN,
     Plate,
@@ -304,7 +302,7 @@ def _draw_view(axes: Axes, view: View) -> None:
     place = {name: j for j, name in enumerate(view.joints)}
     for body in view.reprojected:
         for a, b in bones_of(view.joints):
-            colour = {"left": LEFT, "right": RIGHT, "": MIDDLE}[side_of(a, b)]
+            colour = SIDES[side_of(a, b)]
             ends = body[[place[a], place[b]]].T
             axes.plot(*ends, color=_CASING, linewidth=2.6, alpha=0.75, zorder=2)
             axes.plot(*ends, color=colour, linewidth=1.3, zorder=3)

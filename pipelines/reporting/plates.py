@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 
 
 INK, MUTED, GRID, PAPER = "#22262a", "#666d74", "#dddcd6", "#fefdfb"
-LEFT, RIGHT, MIDDLE = "#1f78b5", "#c8561b", "#4a4f55"
+SIDES = {"left": "#1f78b5", "right": "#c8561b", "": "#4a4f55"}
+"""Colours of the sides of the body, by the words of `motion.side_of`."""
 CAMERAS = ("#0072b2", "#d55e00", "#009e73", "#b0528f", "#a87900", "#4f8fc4")
 """Colours of cameras, after Okabe and Ito's for all kinds of colour vision, darkened for thin lines."""
 LEVELS = ("#9db8c9", "#5f97bd", "#1f6da5", "#123f66")
@@ -49,9 +50,7 @@ PALETTE = {
     MUTED: "--muted",
     GRID: "--grid",
     PAPER: "--paper",
-    LEFT: "--left",
-    RIGHT: "--right",
-    MIDDLE: "--middle",
+    **{colour: f"--{side or 'middle'}" for side, colour in SIDES.items()},
     **{colour: f"--camera-{k}" for k, colour in enumerate(CAMERAS)},
     **{colour: f"--level-{k}" for k, colour in enumerate(LEVELS)},
     **{colour: f"--status-{word.replace('_', '-')}" for word, colour in STATUS_COLOURS.items()},
@@ -278,11 +277,20 @@ def time_bins(seconds: Float, most: int = MOST_BINS) -> Float:
 
 def percentiles(values: Float, seconds: Float, bins: Float) -> tuple[Float, Float, Float]:
     """Compute median, 10th and 90th percentile of the finite values in each bin; NaN in an empty one."""
-    edges = np.searchsorted(seconds, bins)
-    result = np.full((3, len(bins) - 1), np.nan)
-    for k in range(len(bins) - 1):
-        inside = values[edges[k] : edges[k + 1]]
-        finite = inside[np.isfinite(inside)]
-        if finite.size:
-            result[:, k] = np.percentile(finite, [50, 10, 90])
-    return result[0], result[1], result[2]
+    result = [
+        np.percentile(finite, [50, 10, 90]) if finite.size else np.full(3, np.nan)
+        for finite in _by_bin(values, seconds, bins)
+    ]
+    middle, low, high = np.array(result).T
+    return middle, low, high
+
+
+def means(values: Float, seconds: Float, bins: Float) -> Float:
+    """Compute the mean of the finite values in each bin; NaN in an empty one."""
+    return np.array([f.mean() if f.size else np.nan for f in _by_bin(values, seconds, bins)])
+
+
+def _by_bin(values: Float, seconds: Float, bins: Float) -> list[Float]:
+    """Return the finite values [T, ...] of the times in each bin."""
+    inside = np.split(values, np.searchsorted(seconds, bins))[1:-1]
+    return [part[np.isfinite(part)] for part in inside]
