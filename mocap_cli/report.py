@@ -83,21 +83,18 @@ def report_command(
             drawn = write_figures_of(ones, figures, studies=studies, overwrite=overwrite, force=force)
             progress.advance()
     for result in results:
-        say_warnings(result.record.warnings, shown.quiet)
+        say_warnings(result.warnings, shown.quiet)
     if shown.as_json:
         print_json(
             {
-                "pages": [str(result.page) for result in results],
-                "comparison": None if compared is None else str(compared.page),
-                "figures": None if drawn is None else str(drawn.folder),
+                "pages": [str(result.place) for result in results],
+                "comparison": None if compared is None else str(compared.place),
+                "figures": None if drawn is None else str(drawn.place),
                 "failed": failed,
             }
         )
         end(failed, ones)
         return
-    pages = [(one.skipped, one.page) for one in results]
-    pages += [] if compared is None else [(compared.skipped, compared.page)]
-    pages += [] if drawn is None else [(drawn.skipped, drawn.folder)]
-    for skipped, page in pages:
-        say(f"{'unchanged' if skipped else 'written'}: {page}")
+    for result in [*results, *(one for one in (compared, drawn) if one is not None)]:
+        say(f"{'unchanged' if result.skipped else 'written'}: {result.place}")
     end(failed, ones)

@@ -52,11 +52,11 @@ _FIGURES_REVISION = 3
 
 @dataclass(frozen=True)
 class Reported:
-    """Result of a report."""
+    """Result of writing a page, or the files of its figures."""
 
-    page: Path
-    record: StageRecord
+    place: Path  # the page, or the folder of the files
     skipped: bool  # True if nothing had changed
+    warnings: Sequence[str] = ()
 
 
 def report(folder: Path, *, studies: Sequence[Path] = (), force: bool = False) -> Reported:
@@ -88,27 +88,19 @@ def report(folder: Path, *, studies: Sequence[Path] = (), force: bool = False) -
         run = session.begin(REPORT, settings=settings, inputs=inputs, force=force)
         page = folder / "report" / "index.html"
         if run.finished:
-            return Reported(page, run.record, skipped=True)
+            return Reported(page, skipped=True, warnings=run.record.warnings)
         with ExitStack() as stack:
             pictures, warnings = _open_pictures(folder, description, stack)
             content = replace(_load(folder, description, records), studies=tuple(studied))
             html = render_page(content, read_frame=partial(_read_frame, pictures))
         (run.folder / "index.html").write_text(html, encoding="utf-8")
         record = run.publish(counts={}, warnings=warnings)
-    return Reported(page, record, skipped=False)
-
-
-@dataclass(frozen=True)
-class Compared:
-    """Result of a comparison of several sessions."""
-
-    page: Path
-    skipped: bool  # True if the page existed already with the same bytes
+    return Reported(page, skipped=False, warnings=record.warnings)
 
 
 def compare_sessions(
     folders: Sequence[Path], output: Path | None = None, *, overwrite: bool = False
-) -> Compared:
+) -> Reported:
     """Write the page that compares every session with the first.
 
     Args:
@@ -132,20 +124,12 @@ def compare_sessions(
         if not overwrite:
             _refuse_foreign(page)
         if page.is_file() and page.read_bytes() == html.encode():
-            return Compared(page, skipped=True)
+            return Reported(page, skipped=True)
         page.parent.mkdir(parents=True, exist_ok=True)
         write_whole(page, html.encode())
     except OSError as error:
         raise as_data_error(error, page) from error
-    return Compared(page, skipped=False)
-
-
-@dataclass(frozen=True)
-class Figures:
-    """Result of writing the figures of a page as files."""
-
-    folder: Path
-    skipped: bool  # True if nothing had changed
+    return Reported(page, skipped=False)
 
 
 def write_figures_of(
@@ -155,7 +139,7 @@ def write_figures_of(
     studies: Sequence[Path] = (),
     overwrite: bool = False,
     force: bool = False,
-) -> Figures:
+) -> Reported:
     """Write the figures of a session's page, or of the page that compares several, as files.
 
     The files are PNG, SVG and PDF 180 mm wide (90 mm where two are side by side), the numbers of each figure
@@ -197,7 +181,7 @@ def write_figures_of(
     }
     key = hash_of(made_of)
     if not force and is_made(target, key, mark=MARK):
-        return Figures(target, skipped=True)
+        return Reported(target, skipped=True)
     contents = {label: _load(*each) for label, each in sessions.items()}
     if others:
         plates = draw_comparison(compare(contents))
@@ -209,7 +193,7 @@ def write_figures_of(
     with whole_folder(target, key, mark=MARK, overwrite=True) as making:
         write_figures(making.folder, plates, contents, key)
         making.publish()
-    return Figures(target, skipped=False)
+    return Reported(target, skipped=False)
 
 
 def read_study(folder: Path) -> StudyContent:

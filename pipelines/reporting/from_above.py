@@ -15,7 +15,6 @@ from pipelines.reporting.plates import (
     CAMERAS,
     INK,
     LINE_STYLES,
-    MOST_POINTS,
     MUTED,
     PAPER,
     STATUS_COLOURS,
@@ -120,7 +119,7 @@ def _draw_camera(
 
 def _draw_person(axes: Axes, label: str, person: Float, line: object) -> tuple[Float, int]:
     """Draw a person's path [T, 2] and its start; return the drawn path, and the stride of its poses."""
-    stride = every(len(person), MOST_POINTS)
+    stride = every(len(person))
     path = person[::stride]
     axes.plot(*path.T, color=INK, linewidth=2.0, linestyle=line, label=label, zorder=4)
     start = path[np.isfinite(path[:, 0])][:1]
@@ -130,7 +129,7 @@ def _draw_person(axes: Axes, label: str, person: Float, line: object) -> tuple[F
 
 def _drawn_path(t_ns: Int64, path: Float, gap_starts_ns: list[int]) -> tuple[Float, int]:
     """Return a decimated path, broken where the poses have a gap, and the stride of its poses."""
-    stride = every(len(path), MOST_POINTS)
+    stride = every(len(path))
     breaks = np.unique(np.searchsorted(t_ns, gap_starts_ns, side="right"))
     pieces = []
     for rows in np.split(np.arange(len(path)), breaks):
@@ -253,7 +252,7 @@ def _draw_heights(axes: Axes, ground: Heights, origin: Float) -> None:
 
 
 def _draw_arm(axes: Axes, arm: Arm, origin: Float) -> None:
-    stride = every(len(arm.t_s), MOST_POINTS)
+    stride = every(len(arm.t_s))
     actor, places = arm.actor[:, :2] - origin, arm.position[..., :2] - origin
     axes.plot(*actor[::stride].T, color=INK, linewidth=1.8, zorder=4)
     chosen = keyframes(arm)
@@ -323,7 +322,7 @@ def _caption(replan: Replan, levels: list[float]) -> str:
             if levels
             else f" Nothing in the map rises {quantity(LOWEST_M, 'm')} above the ground."
         )
-    step = every(len(replan.arms[0].t_s), MOST_POINTS)
+    step = every(len(replan.arms[0].t_s))
     return caption + (f" One pose in {step} is drawn." if step > 1 else "")
 
 

@@ -15,7 +15,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from unittest.mock import ANY
 
 import pandas as pd
 import pytest
@@ -190,7 +189,7 @@ def test_flight_that_fails_late_gets_its_report(tmp_path: Path, monkeypatch: pyt
 
     def write_no_page(folder: Path, *, force: bool) -> Reported:
         reported.append(folder)
-        return Reported(folder, ANY, skipped=False)
+        return Reported(folder, skipped=False)
 
     monkeypatch.setattr(batch, "report", write_no_page)  # a real one takes seconds
     settings = Settings(stages=("ingest", "replan-compare", "report"))

@@ -29,12 +29,12 @@ def sessions(tmp_path: Path, content: SessionContent, monkeypatch: pytest.Monkey
 def test_page_lies_beside_the_first_session(sessions: list[Path], tmp_path: Path) -> None:
     done = compare_sessions(sessions)
     page = tmp_path / "comparison" / "index.html"
-    assert (done.page, done.skipped) == (page, False)
-    assert done.page.read_text() == f"{GENERATOR} a b"
+    assert (done.place, done.skipped) == (page, False)
+    assert done.place.read_text() == f"{GENERATOR} a b"
     assert compare_sessions(sessions).skipped
     # A page of ours is written anew.
     assert not compare_sessions(sessions[::-1]).skipped
-    assert done.page.read_text() == f"{GENERATOR} b a"
+    assert done.place.read_text() == f"{GENERATOR} b a"
     assert list(page.parent.iterdir()) == [page]
 
 
