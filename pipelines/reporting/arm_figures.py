@@ -13,17 +13,18 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Float
 from pipelines.reporting.arms_as_seen import draw_as_seen
-from pipelines.reporting.from_above import SHADE, draw_from_above
+from pipelines.reporting.from_above import draw_from_above
 from pipelines.reporting.plates import (
     CAMERAS,
     LINE_STYLES,
-    MUTED,
     PAPER,
     Plate,
     every,
     new_figure,
     page_style,
     quiet,
+    shade,
+    shade_keys,
     stacked,
     table,
 )
@@ -276,26 +277,14 @@ def _draw_costs(axes: Axes, costs: CostMap, low: float, high: float) -> tuple[li
     yaw_deg = np.concatenate([costs.yaw_deg + _TURN_DEG * turn for turn in turns])
     drawn = (yaw_deg > low - 20) & (yaw_deg < high + 20)
     over_turns = np.tile(cost, (1, len(turns)))[:, drawn]
-    for level in levels:
-        axes.contourf(
-            t_s, yaw_deg[drawn], over_turns.T, levels=[level, np.inf], colors=[MUTED], alpha=SHADE, zorder=1
-        )
+    shade(axes, t_s, yaw_deg[drawn], over_turns, levels)
     return levels, step
 
 
 def _yaw_legend(figure: Figure, axes: Axes, levels: list[float]) -> None:
-    from matplotlib.patches import Patch
-
     entries, _ = axes.get_legend_handles_labels()
-    shades = [
-        Patch(
-            color=MUTED,
-            alpha=1 - (1 - SHADE) ** (k + 1),
-            linewidth=0,
-            label=f"cost above {significant(level, 2)}" if k == 0 else significant(level, 2),
-        )
-        for k, level in enumerate(levels)
-    ]
+    words = [significant(level, 2) for level in levels]
+    shades = shade_keys([f"cost above {word}" if k == 0 else word for k, word in enumerate(words)])
     figure.legend(handles=[*entries, *shades], loc="outside upper left", ncols=len(entries) + len(shades))
 
 

@@ -27,6 +27,8 @@ from pipelines.reporting.plates import (
     new_figure,
     page_style,
     quiet,
+    shade,
+    shade_keys,
     stacked,
     table,
 )
@@ -148,7 +150,6 @@ def _decimation(step: int, noun: str) -> str:
 
 KEYFRAMES = 6
 HEIGHT_LEVELS_M = (LOWEST_M, 1.0, 2.0, 4.0, 8.0, 16.0)
-SHADE = 0.17  # opacity of one level on those below
 _HIDDEN = STATUS_COLOURS["rejected"]
 
 
@@ -229,26 +230,12 @@ def _draw_panel(axes: Axes, arm: Arm, ground: Heights | None, low: Float, high: 
     axes.set_ylim(low[1] - origin[1], high[1] - origin[1])
     axes.set_aspect("equal")
     axes.grid(visible=True)
-    if ground is not None:
-        _draw_heights(axes, ground, origin)
+    if ground is not None and min(ground.above_m.shape) >= 2:
+        east_m, north_m = ground.east_m - origin[0], ground.north_m - origin[1]
+        levels = [level for level in HEIGHT_LEVELS_M if ground.above_m.max() >= level]
+        shade(axes, east_m, north_m, ground.above_m, levels)
     _draw_arm(axes, arm, origin)
     axes.set_title(shortened(arm.name), fontsize=8.2, color=CAMERAS[arm.colour], loc="left")
-
-
-def _draw_heights(axes: Axes, ground: Heights, origin: Float) -> None:
-    if min(ground.above_m.shape) < 2:
-        return
-    for level in HEIGHT_LEVELS_M:
-        if ground.above_m.max() >= level:
-            axes.contourf(
-                ground.east_m - origin[0],
-                ground.north_m - origin[1],
-                ground.above_m.T,
-                levels=[level, np.inf],
-                colors=[MUTED],
-                alpha=SHADE,
-                zorder=1,
-            )
 
 
 def _draw_arm(axes: Axes, arm: Arm, origin: Float) -> None:
@@ -302,10 +289,7 @@ def _legend(figure: Figure, arms: tuple[Arm, ...], levels: list[float]) -> None:
     ]
     if not all(arm.visible[:, keyframes(arm)].all() for arm in arms):
         entries.append(Line2D([], [], color=_HIDDEN, linestyle=LINE_STYLES[2], linewidth=1.0, label="hidden"))
-    entries += [
-        Patch(color=MUTED, alpha=1 - (1 - SHADE) ** (k + 1), linewidth=0, label=f"above {level:g} m")
-        for k, level in enumerate(levels)
-    ]
+    entries += shade_keys([f"above {level:g} m" for level in levels])
     figure.legend(handles=entries, loc="outside upper left", ncols=min(len(entries), 10))
 
 

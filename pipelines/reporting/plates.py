@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
     from matplotlib.typing import RcKeyType
 
 
@@ -188,6 +189,7 @@ LINE_STYLES: tuple[Literal["-"] | tuple[int, tuple[float, ...]], ...] = (
     (0, (4.0, 1.5)),
     (0, (1.0, 1.2)),
 )
+_SHADE = 0.17  # opacity of one level on those below
 # World coordinates beyond this are shown relative to a round number near them.
 _FAR_M = 10_000.0
 
@@ -265,6 +267,22 @@ def quiet(axes: Axes, grid: Literal["x", "y", "both"] | None = None) -> None:
     axes.tick_params(axis="y", length=0)
     if grid is not None:
         axes.grid(visible=True, axis=grid)
+
+
+def shade(axes: Axes, x: Float, y: Float, values: Float, levels: Sequence[float]) -> None:
+    """Shade where values [X, Y] exceed each level, one shade on the other."""
+    for level in levels:
+        axes.contourf(x, y, values.T, levels=[level, np.inf], colors=[MUTED], alpha=_SHADE, zorder=1)
+
+
+def shade_keys(labels: Sequence[str]) -> list[Patch]:
+    """Make the entries of a legend for the shades of as many levels."""
+    from matplotlib.patches import Patch
+
+    return [
+        Patch(color=MUTED, alpha=1 - (1 - _SHADE) ** (k + 1), linewidth=0, label=label)
+        for k, label in enumerate(labels)
+    ]
 
 
 def time_bins(seconds: Float, most: int = MOST_BINS) -> Float:
