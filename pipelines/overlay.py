@@ -26,7 +26,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.progress import Halt, Progress, Silent, side_by_side
 from pipelines.session.records import Int64
 from pipelines.session.stage_records import Stage, StageRecord
-from pipelines.session.stages import Run, WritableSession, locked, open_session
+from pipelines.session.stages import Run, locked, open_session
 from pipelines.session.storage import read_json, write_json
 from pipelines.session.tables import FRAMES, SKELETON, read_table, rows_between
 
@@ -80,7 +80,13 @@ def write_overlays(
         wanted = _with_pictures(folder, description, cameras)
         _refuse_foreign(folder, force)
         refuse_changed_pictures(folder, description, wanted)
-        begin = partial(_begin, session, description, record, (start_s, end_s), force)
+
+        def begin(names: Sequence[str]) -> Run:
+            settings = {"cameras": list(names), "start_s": start_s, "end_s": end_s}
+            inputs = {"reconstruct": record.key}  # which covers all tables that it was made of
+            inputs |= {f"pictures of {name}": description.recorded[f"pictures of {name}"] for name in names}
+            return session.begin(OVERLAY, settings=settings, inputs=inputs, force=force)
+
         run = begin(wanted)
         if not run.finished:  # else pictures that are gone by now are not needed
             wanted = _still_there(folder, description, wanted, progress, all_of_them=cameras is not None)
@@ -88,8 +94,10 @@ def write_overlays(
         if run.finished:
             return _videos(folder, run.record)
         films = _films(folder, description, record, wanted, (start_s, end_s), progress)
-        counts = _draw(folder, films, _show(folder, description, record), run, workers, progress)
-        return _videos(folder, run.publish(counts={"method": record.settings["method"], "cameras": counts}))
+        motion = motion_from_skeleton(read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON))
+        method = record.settings["method"]
+        counts = _draw(folder, films, _Show(description, motion, method), run, workers, progress)
+        return _videos(folder, run.publish(counts={"method": method, "cameras": counts}))
 
 
 def refuse_overlays(folder: Path, *, force: bool = False) -> None:
@@ -105,22 +113,6 @@ def refuse_overlays(folder: Path, *, force: bool = False) -> None:
     refuse_changed_pictures(folder, description, wanted)
     if session.record("overlay") is None:
         _still_there(folder, description, wanted, Silent(), all_of_them=False)
-
-
-def _begin(
-    session: WritableSession,
-    description: Description,
-    record: StageRecord,
-    span_s: tuple[float | None, float | None],
-    force: bool,
-    cameras: Sequence[str],
-) -> Run:
-    """Begin the stage; the reconstruction's key covers all tables that it was made of."""
-    start_s, end_s = span_s
-    settings = {"cameras": list(cameras), "start_s": start_s, "end_s": end_s}
-    inputs = {"reconstruct": record.key}
-    inputs |= {f"pictures of {name}": description.recorded[f"pictures of {name}"] for name in cameras}
-    return session.begin(OVERLAY, settings=settings, inputs=inputs, force=force)
 
 
 def _videos(folder: Path, record: StageRecord) -> list[Path]:
@@ -245,11 +237,6 @@ class _Show:
     description: Description
     motion: Motion
     method: str
-
-
-def _show(folder: Path, description: Description, record: StageRecord) -> _Show:
-    skeleton = read_table(folder / "reconstruct" / "skeleton.parquet", SKELETON)
-    return _Show(description, motion_from_skeleton(skeleton), record.settings["method"])
 
 
 def _draw(
