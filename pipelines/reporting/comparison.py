@@ -198,11 +198,7 @@ class Comparison:
 
 
 def compare(contents: Mapping[str, SessionContent]) -> Comparison:
-    """Measure sessions, and compare every one with the first.
-
-    Args:
-        contents: the sessions, by label.
-    """
+    """Measure sessions, by label, and compare every one with the first."""
     sessions = tuple(_judged(label, content) for label, content in contents.items())
     return Comparison(sessions, tuple(_pair(sessions[0], other) for other in sessions[1:]))
 
@@ -415,11 +411,7 @@ def _paired_by_joint(first: Judged, other: Judged, ours: Values, theirs: Values)
 
 
 def labels_of(names: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return a label for every session: its name, after as many parent folders as make it unique.
-
-    Args:
-        names: of each session its name, after the names of its parent folders.
-    """
+    """Return a label for every session: the last of its names, after as many parents as make it unique."""
     for depth in range(1, 1 + max(len(name) for name in names)):
         labels = ["/".join(name[-depth:]) for name in names]
         if all(one != next_ for one, next_ in pairwise(sorted(labels))):

@@ -31,11 +31,8 @@ GENERATOR = "mocap: sessions side by side"
 def render_comparison(contents: Mapping[str, SessionContent]) -> tuple[str, dict[str, Plate]]:
     """Render the complete HTML of a comparison; return it and its figures by their keys.
 
-    The same contents give the same bytes; all text from the sessions' files is escaped. The page loads
-    nothing and runs nothing.
-
-    Args:
-        contents: the contents of the sessions, by label; two at least.
+    The same contents, of two or more sessions by label, give the same bytes; all text from the sessions'
+    files is escaped. The page loads nothing and runs nothing.
     """
     comparison = compare(contents)
     measure = shown_measure(comparison)

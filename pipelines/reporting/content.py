@@ -81,11 +81,7 @@ def text(mapping: Mapping[str, object], key: str) -> str:
 
 
 def estimated_clocks(metrics: Mapping[str, object]) -> dict[str, int]:
-    """Read the estimated clock offsets, ns: the amounts to add to the cameras' ingested frame times.
-
-    Args:
-        metrics: reconstruct/metrics.json.
-    """
+    """Read the clock offsets, ns, of reconstruct/metrics.json: what to add to the ingested frame times."""
     offsets = section(metrics, "clock_offsets_s")
     return {name: round((number(offsets, name) or 0.0) * 1e9) for name in offsets}
 

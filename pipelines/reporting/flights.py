@@ -61,11 +61,7 @@ class FlightRow:
 
 
 def render_flights(rows: Sequence[FlightRow]) -> str:
-    """Render the complete HTML of the summary; it loads nothing, and text from files is escaped.
-
-    Args:
-        rows: of every flight, in the order in which they are shown.
-    """
+    """Render the complete HTML of the summary; it loads nothing, and text from files is escaped."""
     arms = list(dict.fromkeys(name for row in rows for name in row.arms))
     failed = sum(row.error is not None for row in rows)
     return (

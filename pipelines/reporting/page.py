@@ -31,11 +31,8 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
 
     The same content gives the same bytes: no dates of making, no paths of this machine.
     All text from the session's files is escaped. The page loads nothing; it runs the one script of
-    its 3D viewer, which its policy names by hash, and nothing else.
-
-    Args:
-        content: the session's contents.
-        read_frame: reads the pictures behind the overlays; without it they are drawn on plain ground.
+    its 3D viewer, which its policy names by hash, and nothing else. Without `read_frame`, which reads the
+    pictures behind the overlays, they are drawn on plain ground.
     """
     summary = summarise(content)
     replan = _replan(summary, content)
@@ -80,14 +77,7 @@ def render_page(content: SessionContent, read_frame: ReadFrame | None = None) ->
 
 
 def draw_session(content: SessionContent, read_frame: ReadFrame | None = None) -> dict[str, Plate]:
-    """Draw every figure of the page but the 3D viewer, by its key.
-
-    The overlays have one figure for each moment.
-
-    Args:
-        content: the session's contents.
-        read_frame: reads the pictures behind the overlays; without it they are drawn on plain ground.
-    """
+    """Draw every figure of the page but the 3D viewer, by its key; the overlays have one for each moment."""
     summary = summarise(content)
     moments = collect_moments(as_reconstructed(content), summary, read_frame)
     return _draw(summary, content, _replan(summary, content)) | draw_overlays(moments)

@@ -64,13 +64,9 @@ def picture_width(panels: int) -> int:
 
 
 def draw_panel(view: View, width_px: int) -> str:
-    """Draw one view as an `<svg>` without a word from the session's files.
+    """Draw one view as an `<svg>`, its picture at most `width_px` wide, without a word of the session.
 
     The same view gives the same bytes, with the same build of OpenCV where there is a picture.
-
-    Args:
-        view: the view to draw.
-        width_px: largest width of its picture.
     """
     size = (view.intrinsics.width, view.intrinsics.height)
     window = window_of(view, size)

@@ -137,11 +137,7 @@ def settled(figure: Figure, scale: float = 1.0) -> Iterator[None]:
 def inline_svg(figure: Figure, key: str, title: str, description: str) -> str:
     """Return the figure as an `<svg>` element for the inside of a page.
 
-    Args:
-        figure: the figure.
-        key: prefix of every id, one of its own for each figure of a page.
-        title: its subject, for readers who cannot see it.
-        description: the picture in words, with its numbers.
+    The key is the prefix of its ids; title and description are for readers who cannot see it.
     """
     buffer = io.StringIO()
     with page_style(), settled(figure):

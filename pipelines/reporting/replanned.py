@@ -110,10 +110,7 @@ class Replan:
 def summarise_replan(content: ReplanContent, origin_ns: int, cameras: int) -> Replan:
     """Collect everything that the page says and draws of a comparison.
 
-    Args:
-        content: the stored comparison.
-        origin_ns: the page's zero of time.
-        cameras: number of the session's cameras.
+    Times count from `origin_ns`; the arms' colours follow those of the session's cameras, of this number.
     """
     metrics = content.metrics
     stated = section(metrics, "arms")

@@ -53,14 +53,9 @@ def make_scene(
 ) -> Scene | None:
     """Pack a session for the viewer; None where there is nothing to be seen.
 
-    Every camera's pose is interpolated to the times of the skeleton, never across a gap as the session
-    defines it. Without a measured skeleton the cameras alone are shown.
-
-    Args:
-        summary: the session in numbers.
-        poses: camera: tables.POSES.
-        replan: planners that flew again. The cameras of simulated arms are packed beside those of the
-            session, with the map around them.
+    Every camera's pose (tables.POSES) is interpolated to the times of the skeleton, never across a gap as
+    the session defines it. Without a measured skeleton the cameras alone are shown. The cameras of simulated
+    arms are packed beside those of the session, with the map around them.
     """
     motion = summary.motion if summary.motion is not None and summary.motion.measured.any() else None
     cameras = [camera for camera in summary.cameras if camera.name in poses]
