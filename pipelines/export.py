@@ -97,13 +97,13 @@ def export(
                 own.mkdir()
                 notes = _Notes(progress)
                 unit_, axes_ = shapes[format_.name] or (None, None)
-                asked = replace(recording, unit=unit_, axes=axes_, progress=notes)
-                for path in format_.write(asked, own):
+                wanted = replace(recording, unit=unit_, axes=axes_, progress=notes)
+                for path in format_.write(wanted, own):
                     made[path] = {
                         "format": format_.name,
                         "unit": unit_ or "m",
                         "axes": axes_ or "z-up",
-                        "notes": notes.said,
+                        "notes": notes.kept,
                     }
             return _move(made, target, overwrite)
     except OSError as error:
@@ -118,7 +118,7 @@ class _Notes:
     """Progress that passes everything on and keeps the notes for export.json."""
 
     whom: Progress
-    said: list[str] = field(default_factory=list)
+    kept: list[str] = field(default_factory=list)
 
     def start(self, task: str, total: int) -> None:
         self.whom.start(task, total)
@@ -127,7 +127,7 @@ class _Notes:
         self.whom.advance(steps)
 
     def note(self, message: str) -> None:
-        self.said.append(message)
+        self.kept.append(message)
         self.whom.note(message)
 
 

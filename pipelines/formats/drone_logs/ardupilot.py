@@ -21,13 +21,13 @@ from pipelines.formats.common.files import first_bytes
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
     damaged,
+    describe_fit,
     fixes_track,
     of_angles,
     on_gps_time,
     on_one_clock,
     pictures_on_gps_time,
     position_track,
-    said_of_fit,
     turned_as_stated,
     world_from_heading,
 )
@@ -147,7 +147,7 @@ class ArduPilotFormat:
         if gps is not None and len(gps):
             facts["gps_fixes"] = int(np.count_nonzero(gps.numbers("Status") >= _3D_FIX))
         if (fit := _gps_time(log)) is not None:
-            facts["gps_time"] = said_of_fit(fit)
+            facts["gps_time"] = describe_fit(fit)
         if lost := sum(rows.lost for rows in timed):
             facts["dropped: cut off"] = lost
         facts["topics"] = [f"{name} {count}" for name, count in sorted(log.counts.items())]

@@ -139,12 +139,12 @@ class DjiSrtFormat:
             "height_absolute_m": "absolute",
             "height_m": "altitude",
         }
-        facts |= {said: _range(columns[name], 3) for said, name in heights.items() if _any(columns[name])}
-        for said, part in (("gimbal", "gb"), ("body", "drone")):
+        facts |= {label: _range(columns[name], 3) for label, name in heights.items() if _any(columns[name])}
+        for label, part in (("gimbal", "gb"), ("body", "drone")):
             angles = _angles(columns, part)
             if _any(angles):
-                facts[f"{said}_angles"] = int(np.count_nonzero(np.isfinite(angles).all(axis=1)))
-                facts[f"{said}_pitch_deg"] = _range(angles[:, 1], 2)
+                facts[f"{label}_angles"] = int(np.count_nonzero(np.isfinite(angles).all(axis=1)))
+                facts[f"{label}_pitch_deg"] = _range(angles[:, 1], 2)
         if not any(name.endswith("_angles") for name in facts):
             facts["orientation"] = "none: state a gimbal in the manifest"
         return facts
@@ -160,7 +160,7 @@ class DjiSrtFormat:
         subtitles = read_subtitles(path)
         columns = _columns(subtitles.texts)
         t_ns, timed = subtitles.times()
-        height, which, said = _height(path, columns, choice)
+        height, which, note_on_height = _height(path, columns, choice)
         dropped: dict[str, int] = {}
         track = position_track(
             path,
@@ -178,7 +178,7 @@ class DjiSrtFormat:
             body=_attitude("F.PRY", t_ns[timed], _angles(columns, "drone")[timed], dropped),
             gimbal=_attitude("its gimbal angles", t_ns[timed], _angles(columns, "gb")[timed], dropped),
             clock=_clock_name(subtitles),
-            notes=tuple(f"{path}: {note}" for note in _notes(subtitles, said, moved, len(values))),
+            notes=tuple(f"{path}: {note}" for note in _notes(subtitles, note_on_height, moved, len(values))),
             dropped=dropped,
         )
 
@@ -236,31 +236,31 @@ def _timecode_ns(block: re.Match[str]) -> int:
 
 def _columns(texts: Sequence[str]) -> dict[str, Float]:
     """Return all columns of `_COLUMNS`, [B] each, NaN if a subtitle does not hold the value."""
-    rows = [_said(text) for text in texts]
+    rows = [_fields(text) for text in texts]
     return {name: np.array([row.get(name, np.nan) for row in rows]) for name in _COLUMNS}
 
 
-def _said(text: str) -> dict[str, float]:
-    said: dict[str, float] = {}
+def _fields(text: str) -> dict[str, float]:
+    fields: dict[str, float] = {}
     for bracket in _BRACKETS.findall(text):
         for key, number in _PAIR.findall(bracket):
             name = key.lower()
-            said[_HEIGHTS.get(name) or _NAMES.get(name, name)] = float(number)
+            fields[_HEIGHTS.get(name) or _NAMES.get(name, name)] = float(number)
     if "GPS" in text and (gps := _GPS.search(text)):
         first, second, third = (float(part) for part in gps.groups()[:3])
         if gps[4]:  # the M of a height: only this form begins with the latitude
-            said |= {"latitude": first, "longitude": second, "absolute": third}
+            fields |= {"latitude": first, "longitude": second, "absolute": third}
         else:
-            said |= {"longitude": first, "latitude": second}
+            fields |= {"longitude": first, "latitude": second}
         if above := _ABOVE_TAKE_OFF.search(text):
-            said.setdefault("relative", float(above[1]))
+            fields.setdefault("relative", float(above[1]))
         for part, pattern in _ANGLES.items():
             if angles := pattern.search(text):
                 pitch, roll, yaw = (float(angle) for angle in angles.groups())
-                said |= {f"{part}_pitch": pitch, f"{part}_roll": roll, f"{part}_yaw": yaw}
-    if "latitude" not in said or "longitude" not in said:  # the text was cut between the two
-        said.pop("latitude", None)
-    return said
+                fields |= {f"{part}_pitch": pitch, f"{part}_roll": roll, f"{part}_yaw": yaw}
+    if "latitude" not in fields or "longitude" not in fields:  # the text was cut between the two
+        fields.pop("latitude", None)
+    return fields
 
 
 def _height(path: Path, columns: Mapping[str, Float], choice: TelemetryChoice) -> tuple[Float, Height, str]:

@@ -151,8 +151,8 @@ def placed_by(track: PositionTrack, fixes: PositionTrack) -> tuple[PositionTrack
         return track, f"{track.name} and {fixes.name} share no time: nothing says where on Earth it lies"
     middle = np.median(apart, axis=0)
     scatter_m = 1.4826 * float(np.median(np.linalg.norm(apart - middle, axis=1)))
-    said = f"{track.name} placed on Earth by {fixes.name}, which scatters by {scatter_m:.2g} m about it"
-    return replace(track, origin=place_at(middle, near)), said
+    note = f"{track.name} placed on Earth by {fixes.name}, which scatters by {scatter_m:.2g} m about it"
+    return replace(track, origin=place_at(middle, near)), note
 
 
 def world_from_heading(body: AttitudeTrack, t_ns: Int64, heading_from_gimbal: Float) -> Float:
@@ -214,9 +214,9 @@ def on_gps_time(
         notes.append("holds no GPS time: its stamps count from boot")
         return None
     if wanted == "boot":
-        notes.append(f"its stamps count from boot, as asked ({said_of_fit(fit)})")
+        notes.append(f"its stamps count from boot, as asked ({describe_fit(fit)})")
         return None
-    notes.append(f"its stamps are turned to UTC: {said_of_fit(fit)}")
+    notes.append(f"its stamps are turned to UTC: {describe_fit(fit)}")
     return fit
 
 
@@ -228,7 +228,7 @@ def damaged(path: Path, error: Exception) -> DataError:
     return DataError(path, f"is damaged ({problem})", "download it from the autopilot again")
 
 
-def said_of_fit(fit: ClockFit) -> str:
+def describe_fit(fit: ClockFit) -> str:
     """Describe clock offset and drift between a log's own clock and GPS time, in words."""
     return (
         f"GPS time is {fit.offset_ns / 1e9:.3f} s ahead of its clock, drifting {fit.drift_ppm:.1f} ppm"

@@ -21,13 +21,13 @@ from pipelines.formats.common.files import first_bytes
 from pipelines.formats.drone_logs.telemetry_rows import (
     attitude_track,
     damaged,
+    describe_fit,
     fixes_track,
     of_angles,
     on_gps_time,
     on_one_clock,
     pictures_on_gps_time,
     position_track,
-    said_of_fit,
     turned_as_stated,
     whatever_from,
     world_from_heading,
@@ -82,16 +82,16 @@ class UlogFormat:
         topics = topics_of(log)
         stamps = [np.asarray(topic.columns["timestamp"]).astype(np.int64) for topic in topics]
         every = np.concatenate([np.zeros(0, dtype=np.int64), *stamps]) * 1000
-        begun = every >= log.start_timestamp * 1000
-        near = begun & ~_far_off(every, begun)
+        since_start = every >= log.start_timestamp * 1000
+        near = since_start & ~_far_off(every, since_start)
         facts: dict[str, object] = {
             "hardware": str(log.msg_info_dict.get("ver_hw", "")),
             "messages": len(every),
             "span_s": round(float(np.ptp(every[near])) / 1e9, 6) if near.any() else 0.0,
         }
-        if early := int(np.count_nonzero(~begun)):
+        if early := int(np.count_nonzero(~since_start)):
             facts["messages_stamped_before_the_log_began"] = early
-        if stray := int(np.count_nonzero(begun & ~near)):
+        if stray := int(np.count_nonzero(since_start & ~near)):
             facts["messages_stamped_far_off"] = stray
         facts["dropouts"] = len(log.dropouts)
         if log.file_corruption:
@@ -106,7 +106,7 @@ class UlogFormat:
                 facts["first_position"] = [round(v, 7) for v in values[0].tolist()]
                 break
         if (fit := _gps_time(topics)) is not None:
-            facts["gps_time"] = said_of_fit(fit)
+            facts["gps_time"] = describe_fit(fit)
         facts["topics"] = [f"{name} {len(topic)}" for name, topic in sorted(by_name.items())]
         return facts
 
@@ -297,7 +297,10 @@ def _gimbal(
             notes.append(
                 "mount_orientation is taken as relative to the body (else gimbal: {relative_to: world})"
             )
-            turned, stated = turned_as_stated(angles, relative_to="body"), whatever_from(of_angles(angles))
+            turned, stated = (
+                turned_as_stated(angles, relative_to="body"),
+                whatever_from(of_angles(angles)),
+            )
             return attitude_track(
                 topic.name, topic.t_ns(), turned, dropped, relative_to="body", stated=stated
             )
@@ -335,7 +338,7 @@ def _gps_time(topics: Sequence[Topic]) -> ClockFit | None:
 def _instance(
     path: Path, topics: Sequence[Topic], names: Sequence[str], choice: TelemetryChoice, *, wanted: bool
 ) -> Topic | None:
-    """Return the topic of the instance asked for, the first by default; None if there is none.
+    """Return the topic of the chosen instance, the first by default; None if there is none.
 
     vehicle_* is the estimate that the autopilot flew by, estimator_* that of each single estimator.
 

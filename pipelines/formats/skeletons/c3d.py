@@ -73,8 +73,8 @@ class C3dFormat:
             "POINT:Y_SCREEN": _text(contents, "POINT", "Y_SCREEN"),
             "POINT:RATE": _number(contents, "POINT", "RATE"),
         }
-        said = {key: value for key, value in stated.items() if value is not None}
-        return {**said, **describe_motion(_motion(path, contents, unit=None, axes=None))}
+        known = {key: value for key, value in stated.items() if value is not None}
+        return {**known, **describe_motion(_motion(path, contents, unit=None, axes=None))}
 
     def read_joints(self, path: Path, *, unit: str | None, axes: str | None) -> JointMotion:
         """Read every frame; a point with a negative residual is NaN.
@@ -136,7 +136,7 @@ def _is_chain(section: bytes, order: str) -> bool:
     name, and the distance to the next record. A parameter then has its type, its dimensions and its values.
     """
     at, groups = 4, set()
-    asked: set[int] = set()
+    wanted: set[int] = set()
     try:
         while at < len(section) and section[at]:
             name, group = struct.unpack_from("2b", section, at)
@@ -146,7 +146,7 @@ def _is_chain(section: bytes, order: str) -> bool:
                 groups.add(-group)
                 end = step + 3 + section[step + 2]
             else:
-                asked.add(group)
+                wanted.add(group)
                 kind, dimensions = struct.unpack_from("bB", section, step + 2)
                 sides = section[step + 4 : step + 4 + dimensions]
                 end = step + 4 + dimensions + abs(kind) * math.prod(sides)
@@ -162,7 +162,7 @@ def _is_chain(section: bytes, order: str) -> bool:
                 return False
     except (IndexError, struct.error):
         return False
-    return asked <= groups
+    return wanted <= groups
 
 
 def _motion(path: Path, contents: Any, *, unit: str | None, axes: str | None) -> JointMotion:
@@ -243,8 +243,8 @@ def _times(path: Path, contents: Any, frames: int) -> Int64:
     if not rate or not 0 < rate < 1e6:
         raise DataError(path, f"states a rate of {rate} Hz", _EXPORT_AGAIN)
     number = contents["header"]["points"]["first_frame"]
-    began = number if 0 <= number < _MOST_FIRST_FRAME else 0
-    times: Int64 = np.rint((began + np.arange(frames)) * (1e9 / rate)).astype(np.int64)
+    start = number if 0 <= number < _MOST_FIRST_FRAME else 0
+    times: Int64 = np.rint((start + np.arange(frames)) * (1e9 / rate)).astype(np.int64)
     return times
 
 
