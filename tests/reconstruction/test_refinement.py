@@ -27,7 +27,8 @@ from pipelines.geometry.noise import (
 from pipelines.reconstruction.refinement import elimination, kernels
 from pipelines.reconstruction.refinement.elimination import covariances, eliminate, moments, step
 from pipelines.reconstruction.refinement.estimate import initial_state, shrunk, solve
-from pipelines.reconstruction.refinement.problem import Knowledge, Pictures, State, build, lay_out
+from pipelines.reconstruction.refinement.kernels import State
+from pipelines.reconstruction.refinement.problem import Knowledge, Pictures, build, lay_out
 from pipelines.reconstruction.refinement.refine import corrected, refine
 from pipelines.reconstruction.refinement.system import System, misfit, parted, prior_cost
 from tests.reconstruction.formations import BONES, STATED_PX, Formation, formation, mean_mm
@@ -159,7 +160,7 @@ def test_covariances_are_those_of_the_whole_inverse(times: int, knots: int) -> N
     ends = still[0][system.problem.bones]
     shared = state.shared.copy()
     shared[-2:] = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)
-    state = replace(state, position=still, shared=shared)
+    state = state._replace(position=still, shared=shared)
     system = with_exact_pictures(system, state)
     hessian = picture_hessian(system, state) + prior_hessian(system, state)
     # Lengths of which the estimate holds 1e-6 in addition, and joints 1e-4: far below what is measured.

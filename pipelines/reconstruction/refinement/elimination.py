@@ -13,42 +13,24 @@ backward pass reaches it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.reconstruction.refinement import kernels, sweeps
-from pipelines.reconstruction.refinement.problem import State
+from pipelines.reconstruction.refinement.kernels import State
+from pipelines.reconstruction.refinement.sweeps import Factors, Moments
 from pipelines.reconstruction.refinement.system import Half, System, halved
 from pipelines.session.progress import Halt, side_by_side
 
 Part = TypeVar("Part")
 Result = TypeVar("Result")
 
-# Their arguments are assembled from tuples, whose lengths mypy does not know.
-_forwards: Callable[..., tuple[int, float]] = sweeps.forwards
-_visit: Callable[..., tuple[Float, int]] = sweeps.visit
-_whiten: Callable[..., None] = kernels.whiten
-
 _SEGMENT = 256  # times of the skeleton
 _KEPT_BYTES = 300e6  # of a half's factors, before segments are factorised twice
 _HELD = 1e10  # 1 / m^2, of a bone length
-_ANYWHERE_M = 100.0  # prior sigma of an unseen joint around its start
-
-
-@dataclass(frozen=True)
-class Moments:
-    """Posterior mean squares and variances of the quantities whose standard deviations are the levels."""
-
-    acceleration: Float  # [2, J, J] sums of mean squares and of variances over the times
-    bones: Float  # [B] sums of mean squares
-    image: Float  # [J, 2] weighted squares of residuals, and their degrees of freedom after the fit
-    white: Float  # [2, 3] of position, rotation: sums of mean squares, count, sum of determined shares
-    walked: Float  # [c, 3] of the changes between knots per s: sums of mean squares, count, variances
-    starting: Float  # [c + shared, 2] mean squares and variances at the first time
-    times: int
 
 
 @dataclass
@@ -143,26 +125,13 @@ class _Front:
 
 
 @dataclass
-class _Factors:
-    """Factors of a segment's elimination; see `sweeps.forwards`."""
-
-    first_interval: int
-    inverse: Float
-    across: Float
-    solved: Float
-    knot_inverse: Float
-    knot_across: Float
-    knot_solved: Float
-
-
-@dataclass
 class _Swept:
     """Half of the flight after its elimination."""
 
     half: Half
     state: State  # its part
     fronts: list[_Front]  # at the start of every segment, to recompute its factors
-    factors: dict[int, _Factors]  # of the segments whose factors are kept
+    factors: dict[int, Factors]  # of the segments whose factors are kept
     rest: _Front
     log_determinant: float
 
@@ -203,16 +172,14 @@ def _begin(half: Half, state: State) -> _Front:
     front = _Front(np.zeros((system.size, system.size)), np.zeros(system.size), 0)
     if not half.turned:
         _add_priors(system, state, front)
-    if system.layout.knot_count:
+    if system.layout.entries.knot_count:
         sweeps.begin(
             front.matrix,
             front.gradient,
             3 * system.problem.joints,
-            system.layout.knot_count,
+            system.layout.entries.knot_count,
             state.knots,
-            half.tie_before,
-            half.tie_after,
-            half.tie_variance,
+            half.ties,
         )
     return front
 
@@ -222,27 +189,27 @@ def _add_priors(system: System, state: State, front: _Front) -> None:
     layout, n3 = system.layout, 9 * system.problem.joints
     for (_, process), (at_knots, column) in zip(layout.processes, layout.place, strict=True):
         value = state.knots[0] if at_knots else state.shared
-        offset = n3 if at_knots else n3 + 2 * layout.knot_count
+        offset = n3 if at_knots else n3 + 2 * layout.entries.knot_count
         for i in range(column, column + 3):
             front.matrix[offset + i, offset + i] += 1 / process.sigma0**2
             front.gradient[offset + i] += value[i] / process.sigma0**2
-    for column, sigma in zip(layout.clock_column, layout.clock_sigma_s, strict=True):
+    for column, sigma in zip(layout.entries.clock_column, layout.clock_sigma_s, strict=True):
         if column >= 0:
-            place = n3 + 2 * layout.knot_count + column
+            place = n3 + 2 * layout.entries.knot_count + column
             front.matrix[place, place] += 1 / sigma**2
             front.gradient[place] += state.shared[column] / sigma**2
-    for place in range(n3 + 2 * layout.knot_count + layout.bone_column, system.size):
+    for place in range(n3 + 2 * layout.entries.knot_count + layout.bone_column, system.size):
         # A length without data keeps its value.
         front.matrix[place, place] += _HELD if system.held else 1e-6
 
 
-def _eliminate(half: Half, state: State, front: _Front, first: int, last: int) -> tuple[_Factors, float]:
+def _eliminate(half: Half, state: State, front: _Front, first: int, last: int) -> tuple[Factors, float]:
     """Eliminate the knots and joints of times from `first` to before `last`; change the front in place."""
     system = half.system
-    n, c = 3 * system.problem.joints, system.layout.knot_count
+    n, c = 3 * system.problem.joints, system.layout.entries.knot_count
     times, size = last - first, system.size
     knots = int(half.of_time[last]) - front.interval if c else 0
-    factors = _Factors(
+    factors = Factors(
         front.interval,
         np.zeros((times, n, n)),
         np.zeros((times, size - n, n)),
@@ -251,30 +218,9 @@ def _eliminate(half: Half, state: State, front: _Front, first: int, last: int) -
         np.zeros((knots, size - n - c, c)),
         np.zeros((knots, c)),
     )
-    grown = system.grown(state)
     try:
-        front.interval, log_determinant = _forwards(
-            first,
-            last,
-            *half.arguments(state),
-            system.inverse_acceleration,
-            1 / _ANYWHERE_M**2,
-            system.problem.bones,
-            system.knowledge.bone_sigma_m,
-            grown,
-            half.own_times,
-            half.tie_before,
-            half.tie_after,
-            half.tie_variance,
-            front.matrix,
-            front.gradient,
-            front.interval,
-            factors.inverse,
-            factors.across,
-            factors.solved,
-            factors.knot_inverse,
-            factors.knot_across,
-            factors.knot_solved,
+        front.interval, log_determinant = sweeps.forwards(
+            first, last, half.sweep(state), front.matrix, front.gradient, front.interval, factors
         )
     except np.linalg.LinAlgError as error:
         raise np.linalg.LinAlgError("the equations of the refinement are singular") from error
@@ -315,7 +261,7 @@ def _last_covariance(at: Eliminated) -> Float:
 # --- backwards -----------------------------------------------------------------------------------------
 
 
-def _factors_backwards(swept: _Swept, halt: Halt) -> Iterator[tuple[int, int, _Factors]]:
+def _factors_backwards(swept: _Swept, halt: Halt) -> Iterator[tuple[int, int, Factors]]:
     segments = _segments(swept.half)
     for index in range(len(segments) - 1, -1, -1):
         halt.check()
@@ -341,7 +287,7 @@ def _solve_back(
     shared = np.ascontiguousarray(last_solution[len(last_solution) - layout.shared_count :])
     moved = State(position.reshape(state.position.shape), knots, shared, np.zeros_like(state.white))
     if rng is None:
-        _add_white(system, state, moved)
+        kernels.whiten(system.equations(state, system.problem.t_s, system.pictures), moved)
     return moved
 
 
@@ -350,7 +296,7 @@ def _follow_back(
 ) -> tuple[Float, Float]:
     """Solve for the joints [T, n] of a half and for the knots [K, c]; knots of the other half stay 0."""
     half, state = swept.half, swept.state
-    n, count = 3 * half.system.problem.joints, half.system.layout.knot_count
+    n, count = 3 * half.system.problem.joints, half.system.layout.entries.knot_count
     alive = last_solution[half.met()]
     position, knots = np.zeros((len(half.t_s), n)), np.zeros_like(state.knots)
     position[-2:] = alive[: 2 * n].reshape(2, n)
@@ -359,52 +305,14 @@ def _follow_back(
     if count:
         knots[interval : interval + 2] = alive[2 * n : 2 * n + 2 * count].reshape(2, count)
     for first, last, factors in _factors_backwards(swept, halt):
-        solved, knot_solved = factors.solved, factors.knot_solved
+        used = factors
         if rng is not None:
-            solved, knot_solved = rng.standard_normal(solved.shape), rng.standard_normal(knot_solved.shape)
-        interval = sweeps.backwards(
-            first,
-            last,
-            half.of_time,
-            interval,
-            factors.first_interval,
-            factors.inverse,
-            factors.across,
-            solved,
-            factors.knot_inverse,
-            factors.knot_across,
-            knot_solved,
-            position,
-            knots,
-            shared,
-        )
+            used = factors._replace(
+                solved=rng.standard_normal(factors.solved.shape),
+                knot_solved=rng.standard_normal(factors.knot_solved.shape),
+            )
+        interval = sweeps.backwards(first, last, half.of_time, interval, used, position, knots, shared)
     return position, knots
-
-
-def _add_white(system: System, state: State, moved: State) -> None:
-    """Add the step of every picture's white error to the step of all other unknowns, in place."""
-    problem, pictures = system.problem, system.problem.pictures
-    _whiten(
-        problem.t_s,
-        state.position,
-        state.knots,
-        state.shared,
-        state.white,
-        moved.position,
-        moved.knots,
-        moved.shared,
-        pictures.first,
-        pictures.camera,
-        pictures.when_s,
-        system.fraction,
-        system.of_time[pictures.first],
-        *system.picture_arguments(),
-        system.bound2,
-        system.white_row,
-        system.white_precision,
-        *system.entries(),
-        moved.white,
-    )
 
 
 def _visit_back(
@@ -412,52 +320,31 @@ def _visit_back(
 ) -> Moments:
     """Compute the moments of a half, linearised at `state`; fill `covariance` unless it is empty."""
     half = swept.half
-    problem, layout = half.system.problem, half.system.layout
-    joints, place = problem.joints, half.met()
+    problem, layout, sweep = half.system.problem, half.system.layout, half.sweep(state)
+    joints, knot_count, place = problem.joints, layout.entries.knot_count, half.met()
     others = np.ascontiguousarray(last_covariance[np.ix_(place, place)])
     found = Moments(
         np.zeros((2, joints, joints)),
         np.zeros(len(problem.bones)),
         np.zeros((joints, 2)),
         np.zeros((2, 3)),
-        np.zeros((layout.knot_count, 3)),
-        np.zeros((0 if half.turned else layout.knot_count + layout.shared_count, 2)),
+        np.zeros((knot_count, 3)),
+        np.zeros((0 if half.turned else knot_count + layout.shared_count, 2)),
         half.count,
     )
-    knot_t_s = half.knot_t_s
     interval = swept.rest.interval
-    if layout.knot_count and every and not half.turned:
-        sweeps.last_walk(others, 3 * joints, layout.knot_count, state.knots, knot_t_s, interval, found.walked)
+    if knot_count and every and not half.turned:
+        sweeps.last_walk(others, 3 * joints, knot_count, state.knots, half.knot_t_s, interval, found.walked)
     for first, last, factors in _factors_backwards(swept, halt):
-        others, interval = _visit(
-            first,
-            last,
-            *half.arguments(state),
-            problem.bones,
-            half.own_times,
-            knot_t_s,
-            others,
-            interval,
-            factors.first_interval,
-            factors.inverse,
-            factors.across,
-            factors.knot_inverse,
-            factors.knot_across,
-            every,
-            covariance,
-            found.acceleration,
-            found.bones,
-            found.image,
-            found.white,
-            found.walked,
-            found.starting,
+        others, interval = sweeps.visit(
+            first, last, sweep, others, interval, factors, every, covariance, found
         )
     return found
 
 
 def _added(first: Moments, second: Moments) -> Moments:
     """Add the moments of both halves; `starting` is the first half's."""
-    sums = {each.name: getattr(first, each.name) for each in fields(Moments)}
-    for name in sums.keys() - {"starting"}:
-        sums[name] = sums[name] + getattr(second, name)
-    return Moments(**sums)
+    sums = {
+        name: getattr(first, name) + getattr(second, name) for name in Moments._fields if name != "starting"
+    }
+    return first._replace(**sums)

@@ -24,8 +24,10 @@ from scipy.sparse.csgraph import connected_components
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import ROTATION, PoseErrors, Process
-from pipelines.reconstruction.refinement.elimination import Eliminated, Moments, eliminate, moments, step
-from pipelines.reconstruction.refinement.problem import Knowledge, Problem, State, lay_out
+from pipelines.reconstruction.refinement.elimination import Eliminated, eliminate, moments, step
+from pipelines.reconstruction.refinement.kernels import State
+from pipelines.reconstruction.refinement.problem import Knowledge, Problem, lay_out
+from pipelines.reconstruction.refinement.sweeps import Moments
 from pipelines.reconstruction.refinement.system import System, misfit, prior_cost
 
 BOUND = 3.5
@@ -152,7 +154,7 @@ def evidence(problem: Problem, known: Knowledge, state: State) -> float:
     there = np.isfinite(system.white_precision[:, 0, 0])
     certainty = np.zeros(len(there))
     certainty[there] = np.linalg.slogdet(system.white_precision[there])[1]
-    value += 0.5 * float(certainty[system.white_row].sum())
+    value += 0.5 * float(certainty[system.pictures.white_row].sum())
     for (_, process), (at_knots, column) in zip(system.layout.processes, system.layout.place, strict=True):
         value -= 3 * float(np.log(process.sigma0))
         if at_knots:
@@ -170,7 +172,7 @@ def initial_state(problem: Problem, known: Knowledge, position: Float) -> State:
         shared[layout.bone_column :] = np.median(lengths, axis=0)
     return State(
         np.ascontiguousarray(position),  # of one layout: everything is compiled for that
-        np.zeros((len(problem.knot_t_s), layout.knot_count)),
+        np.zeros((len(problem.knot_t_s), layout.entries.knot_count)),
         shared,
         np.zeros((len(problem.pictures.first), 6)),
     )
@@ -336,7 +338,7 @@ def _poses(system: System, found: Moments) -> tuple[PoseErrors, ...]:
     for (camera, process), place in zip(layout.processes, layout.place, strict=True):
         by_place.setdefault(known.poses[camera].processes.index(process), []).append(place)
     processes = [
-        _process(process, by_place[index], found, layout.knot_count)
+        _process(process, by_place[index], found, layout.entries.knot_count)
         for index, process in enumerate(known.poses[0].processes)
     ]
     return (PoseErrors((white[0], white[1]), tuple(processes)),) * len(known.poses)

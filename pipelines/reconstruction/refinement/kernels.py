@@ -9,14 +9,83 @@ Interpolation is quadratic over three times of the skeleton.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from pipelines.geometry.arrays import Float, Int64
+from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.compilation import cached, helper
 
 NUMBERS = 10  # of a picture: shift in the world, rotation, shift in the camera, clock
 WHITE = 6  # the first of them have a white part
 _NEAREST_M = 0.1  # a joint nearer to the camera's plane is not used
+
+
+class State(NamedTuple):
+    """Values of the unknowns."""
+
+    position: Float  # [T, J, 3] m
+    knots: Float  # [K, knot_count]
+    shared: Float  # [shared_count]
+    white: Float  # [G, 6]
+
+    def moved(self, step: State, share: float) -> State:
+        """Return the state moved by a share of a step."""
+        return State(*(value + share * change for value, change in zip(self, step, strict=True)))
+
+
+class Entries(NamedTuple):
+    """Links from unknowns to the numbers that they add to, camera by camera; see `problem.Layout`."""
+
+    start: Int64  # [C + 1] first entry of each camera
+    number: Int64  # [E] of the picture's ten
+    knot: Bool  # [E] False for an unknown shared by all times
+    column: Int64  # [E] among the unknowns of a knot, or the shared ones
+    clock_column: Int64  # [C] -1 for a known clock
+    knot_count: int  # unknowns of a knot
+
+
+class PictureArrays(NamedTuple):
+    """Pictures in the order of `first`, as `problem.Pictures`, with their places in a system's priors."""
+
+    first: Int64  # [G]
+    camera: Int64  # [G]
+    when_s: Float  # [G]
+    xy: Float  # [G, J, 2]
+    sharpness: Float  # [G, J]
+    trust: Float  # [G, J]
+    position: Float  # [G, 3]
+    rotation: Float  # [G, 3, 3]
+    speed: Float  # [G, 3]
+    turn: Float  # [G, 3]
+    interval: Int64  # [G] the knot before
+    fraction: Float  # [G] of the time to the next knot
+    white_row: Int64  # [G] row of `Equations.white_precision`
+
+
+class Equations(NamedTuple):
+    """Pictures and the state at which they are linearised."""
+
+    t_s: Float  # [T]
+    state: State
+    pictures: PictureArrays
+    entries: Entries
+    bound2: float  # of the robust loss
+    white_precision: Float  # [., 6, 6] inverse covariances of white errors; inf without white errors
+
+
+class Linearised(NamedTuple):
+    """Equations of one picture, overwritten by the next."""
+
+    joints: Float  # [J, 3] m at the picture's time
+    velocity: Float  # [J, 3] m/s
+    weight: Float  # [3] of the skeleton's three times
+    slope: Float  # [3] of the same, for the velocity
+    number: Float  # [10]
+    residual: Float  # [J, 2] whitened; NaN for joints that are not seen or behind the camera
+    by_joint: Float  # [J, 2, 3]
+    by_number: Float  # [J, 2, 10]
+    view_weight: Float  # [J] 0 for joints without a residual
 
 
 @helper
@@ -179,46 +248,6 @@ def loss_of(squared: float, bound2: float) -> float:
 
 
 @helper
-def normal_equations(
-    residual: Float,
-    by_joint: Float,
-    by_number: Float,
-    trust: Float,
-    of_joints: Float,
-    across: Float,
-    of_numbers: Float,
-    joint_gradient: Float,
-    number_gradient: Float,
-) -> None:
-    """Sum the normal equations of a picture: [J, 3, 3], [J, 3, 10], [10, 10], gradients [J, 3], [10]."""
-    of_joints[:] = 0.0
-    across[:] = 0.0
-    of_numbers[:] = 0.0
-    joint_gradient[:] = 0.0
-    number_gradient[:] = 0.0
-    for joint in range(len(residual)):
-        weight = trust[joint]
-        if weight == 0.0 or np.isnan(residual[joint, 0]):
-            continue
-        for axis in range(2):
-            r = weight * residual[joint, axis]
-            for a in range(NUMBERS):
-                weighted = weight * by_number[joint, axis, a]
-                number_gradient[a] += by_number[joint, axis, a] * r
-                for b in range(a + 1):
-                    of_numbers[a, b] += weighted * by_number[joint, axis, b]
-                for i in range(3):
-                    across[joint, i, a] += by_joint[joint, axis, i] * weighted
-            for i in range(3):
-                joint_gradient[joint, i] += by_joint[joint, axis, i] * r
-                for j in range(3):
-                    of_joints[joint, i, j] += weight * by_joint[joint, axis, i] * by_joint[joint, axis, j]
-    for a in range(NUMBERS):
-        for b in range(a):
-            of_numbers[b, a] = of_numbers[a, b]
-
-
-@helper
 def factorise(matrix: Float) -> None:
     """Replace a small matrix by its lower Cholesky factor."""
     n = len(matrix)
@@ -271,10 +300,7 @@ def numbers_of(
     camera: int,
     fraction: float,
     interval: int,
-    entry_start: Int64,
-    entry_number: Int64,
-    entry_knot: Int64,
-    entry_column: Int64,
+    entries: Entries,
     knots: Float,
     shared: Float,
     white: Float,
@@ -282,131 +308,151 @@ def numbers_of(
 ) -> None:
     """Compute the ten numbers of a picture from the unknowns."""
     out[:] = 0.0
-    for e in range(entry_start[camera], entry_start[camera + 1]):
-        column = entry_column[e]
-        if entry_knot[e]:
+    for e in range(entries.start[camera], entries.start[camera + 1]):
+        column = entries.column[e]
+        if entries.knot[e]:
             value = (1 - fraction) * knots[interval, column] + fraction * knots[interval + 1, column]
         else:
             value = shared[column]
-        out[entry_number[e]] += value
+        out[entries.number[e]] += value
     for i in range(WHITE):
         out[i] += white[i]
 
 
 @helper
-def entries_of(
-    camera: int,
-    fraction: float,
-    n: int,
-    knot_count: int,
-    entry_start: Int64,
-    entry_number: Int64,
-    entry_knot: Int64,
-    entry_column: Int64,
-    column: Int64,
-    of_number: Int64,
-    share: Float,
+def unknowns_of(
+    camera: int, fraction: float, n: int, entries: Entries, column: Int64, of_number: Int64, share: Float
 ) -> int:
     """List the front's unknowns in a picture's numbers with their shares, and return their count."""
-    entries = 0
-    for e in range(entry_start[camera], entry_start[camera + 1]):
-        if entry_knot[e]:
-            column[entries] = 3 * n + entry_column[e]
-            of_number[entries] = entry_number[e]
-            share[entries] = 1 - fraction
-            entries += 1
-            column[entries] = 3 * n + knot_count + entry_column[e]
-            of_number[entries] = entry_number[e]
-            share[entries] = fraction
+    count = 0
+    for e in range(entries.start[camera], entries.start[camera + 1]):
+        if entries.knot[e]:
+            column[count] = 3 * n + entries.column[e]
+            of_number[count] = entries.number[e]
+            share[count] = 1 - fraction
+            count += 1
+            column[count] = 3 * n + entries.knot_count + entries.column[e]
+            of_number[count] = entries.number[e]
+            share[count] = fraction
         else:
-            column[entries] = 3 * n + 2 * knot_count + entry_column[e]
-            of_number[entries] = entry_number[e]
-            share[entries] = 1.0
-        entries += 1
-    return entries
+            column[count] = 3 * n + 2 * entries.knot_count + entries.column[e]
+            of_number[count] = entries.number[e]
+            share[count] = 1.0
+        count += 1
+    return count
+
+
+@helper
+def linearised(J: int) -> Linearised:
+    """Allocate the equations of a picture of J joints."""
+    return Linearised(
+        np.empty((J, 3)), np.empty((J, 3)), np.empty(3), np.empty(3), np.empty(NUMBERS), np.empty((J, 2)),
+        np.zeros((J, 2, 3)), np.zeros((J, 2, NUMBERS)), np.empty(J),
+    )  # fmt: skip
+
+
+@helper
+def linearise_picture(
+    g: int, t_s: Float, state: State, pictures: PictureArrays, entries: Entries, out: Linearised
+) -> None:
+    """Linearise a picture at the state; `view_weight` is left to `weigh`."""
+    c = pictures.camera[g]
+    clock = entries.clock_column[c]
+    when = pictures.when_s[g] + (state.shared[clock] if clock >= 0 else 0.0)
+    at_picture(pictures.first[g], t_s, when, state.position, out.weight, out.slope, out.joints, out.velocity)
+    numbers_of(
+        c, pictures.fraction[g], pictures.interval[g], entries, state.knots, state.shared, state.white[g],
+        out.number,
+    )  # fmt: skip
+    linearise(
+        out.joints, out.velocity, out.number, pictures.xy[g], pictures.sharpness[g], pictures.position[g],
+        pictures.rotation[g], pictures.speed[g], pictures.turn[g], out.residual, out.by_joint, out.by_number,
+    )  # fmt: skip
+
+
+@helper
+def weigh(residual: Float, trust: Float, bound2: float, view_weight: Float) -> None:
+    """Compute the weights [J] of a picture's views from their residuals [J, 2]; 0 without a residual."""
+    for joint in range(len(residual)):
+        squared = residual[joint, 0] ** 2 + residual[joint, 1] ** 2
+        view_weight[joint] = 0.0 if np.isnan(squared) else trust[joint] * confidence_of(squared, bound2)
+
+
+@helper
+def normal_equations(
+    picture: Linearised,
+    of_joints: Float,
+    across: Float,
+    of_numbers: Float,
+    joint_gradient: Float,
+    number_gradient: Float,
+) -> None:
+    """Sum the normal equations of a picture: [J, 3, 3], [J, 3, 10], [10, 10], gradients [J, 3], [10]."""
+    residual, by_joint, by_number = picture.residual, picture.by_joint, picture.by_number
+    of_joints[:] = 0.0
+    across[:] = 0.0
+    of_numbers[:] = 0.0
+    joint_gradient[:] = 0.0
+    number_gradient[:] = 0.0
+    for joint in range(len(residual)):
+        weight = picture.view_weight[joint]
+        if weight == 0.0:
+            continue
+        for axis in range(2):
+            r = weight * residual[joint, axis]
+            for a in range(NUMBERS):
+                weighted = weight * by_number[joint, axis, a]
+                number_gradient[a] += by_number[joint, axis, a] * r
+                for b in range(a + 1):
+                    of_numbers[a, b] += weighted * by_number[joint, axis, b]
+                for i in range(3):
+                    across[joint, i, a] += by_joint[joint, axis, i] * weighted
+            for i in range(3):
+                joint_gradient[joint, i] += by_joint[joint, axis, i] * r
+                for j in range(3):
+                    of_joints[joint, i, j] += weight * by_joint[joint, axis, i] * by_joint[joint, axis, j]
+    for a in range(NUMBERS):
+        for b in range(a):
+            of_numbers[b, a] = of_numbers[a, b]
 
 
 @helper
 def assemble(
-    first_picture: int,
-    last_picture: int,
-    first: int,
-    t_s: Float,
-    position: Float,
-    knots: Float,
-    shared: Float,
-    white: Float,
-    camera: Int64,
-    when: Float,
-    fraction: Float,
-    interval: int,
-    xy: Float,
-    sharpness: Float,
-    pose_position: Float,
-    pose_rotation: Float,
-    speed: Float,
-    turn: Float,
-    trust: Float,
-    bound2: float,
-    white_row: Int64,
-    white_precision: Float,
-    entry_start: Int64,
-    entry_number: Int64,
-    entry_knot: Int64,
-    entry_column: Int64,
-    clock_column: Int64,
-    knot_count: int,
-    front: Float,
-    gradient: Float,
+    first_picture: int, last_picture: int, equations: Equations, front: Float, gradient: Float
 ) -> float:
-    """Add the pictures whose three times begin at `first` to the front.
+    """Add pictures with the same three times to the front.
 
     Returns half the logarithm of the determinant of the white errors' equations, which are eliminated.
 
     The front's unknowns are the joints at three times, the knots on both sides of the interval, and the
-    shared unknowns; only its lower triangle is kept. `white_precision` [., 6, 6] at row `white_row` [G] is
-    the inverse covariance of a picture's white error, inf if it has none.
+    shared unknowns; only its lower triangle is kept.
     """
-    J = position.shape[1]
+    t_s, state, pictures, entries, bound2, white_precision = equations
+    white = state.white
+    J = state.position.shape[1]
     n = 3 * J
-    out, rate = np.empty((J, 3)), np.empty((J, 3))
-    weight, slope, number = np.empty(3), np.empty(3), np.empty(NUMBERS)
-    residual, by_joint, by_number = np.empty((J, 2)), np.zeros((J, 2, 3)), np.zeros((J, 2, NUMBERS))
+    picture = linearised(J)
+    weight = picture.weight
     of_joints, across = np.empty((J, 3, 3)), np.empty((J, 3, NUMBERS))
     of_numbers = np.empty((NUMBERS, NUMBERS))
     joint_gradient, number_gradient = np.empty((J, 3)), np.empty(NUMBERS)
-    believed = np.empty(J)
     factor, by_white = np.empty((WHITE, WHITE)), np.empty((n + NUMBERS + 1, WHITE))
     z = by_white[n + NUMBERS]  # the gradient is stored below the derivatives
-    most = 2 * (entry_column.size + 1)
+    most = 2 * (entries.column.size + 1)
     column, of_number, share = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
     half = 0.0
     for g in range(first_picture, last_picture):
-        c = camera[g]
-        moved = when[g] + (shared[clock_column[c]] if clock_column[c] >= 0 else 0.0)
-        at_picture(first, t_s, moved, position, weight, slope, out, rate)
-        numbers_of(
-            c, fraction[g], interval, entry_start, entry_number, entry_knot, entry_column, knots, shared,
-            white[g], number,
-        )  # fmt: skip
-        linearise(
-            out, rate, number, xy[g], sharpness[g], pose_position[g], pose_rotation[g], speed[g], turn[g],
-            residual, by_joint, by_number,
-        )  # fmt: skip
-        for joint in range(J):
-            squared = residual[joint, 0] ** 2 + residual[joint, 1] ** 2
-            believed[joint] = trust[g, joint] * confidence_of(squared, bound2)
-        normal_equations(
-            residual, by_joint, by_number, believed, of_joints, across, of_numbers, joint_gradient,
-            number_gradient,
-        )  # fmt: skip
-        eliminated = np.isfinite(white_precision[white_row[g], 0, 0])
+        linearise_picture(g, t_s, state, pictures, entries, picture)
+        weigh(picture.residual, pictures.trust[g], bound2, picture.view_weight)
+        normal_equations(picture, of_joints, across, of_numbers, joint_gradient, number_gradient)
+        row = pictures.white_row[g]
+        eliminated = np.isfinite(white_precision[row, 0, 0])
         if eliminated:
             for a in range(WHITE):
                 z[a] = number_gradient[a]
                 for b in range(WHITE):
-                    factor[a, b] = of_numbers[a, b] + white_precision[white_row[g], a, b]
-                    z[a] += white_precision[white_row[g], a, b] * white[g, b]
+                    factor[a, b] = of_numbers[a, b] + white_precision[row, a, b]
+                    z[a] += white_precision[row, a, b] * white[g, b]
                 for p in range(n):
                     by_white[p, a] = across[p // 3, p % 3, a]
                 for b in range(NUMBERS):
@@ -414,15 +460,12 @@ def assemble(
             factorise(factor)
             for a in range(WHITE):
                 half += np.log(factor[a, a])
-            for row in range(len(by_white)):
-                forward(factor, by_white[row])
+            for line in range(len(by_white)):
+                forward(factor, by_white[line])
         else:
             by_white[:] = 0.0
 
-        entries = entries_of(
-            c, fraction[g], n, knot_count, entry_start, entry_number, entry_knot, entry_column, column,
-            of_number, share,
-        )  # fmt: skip
+        unknowns = unknowns_of(pictures.camera[g], pictures.fraction[g], n, entries, column, of_number, share)
 
         for k in range(3):
             if weight[k] == 0.0:
@@ -449,20 +492,20 @@ def assemble(
                 for a in range(WHITE):
                     down -= by_white[p, a] * z[a]
                 gradient[k * n + p] += weight[k] * down
-            for e in range(entries):
+            for e in range(unknowns):
                 a = of_number[e]
                 for p in range(n):
                     total = across[p // 3, p % 3, a]
                     for i in range(WHITE):
                         total -= by_white[p, i] * by_white[n + a, i]
                     front[column[e], k * n + p] += weight[k] * share[e] * total
-        for e in range(entries):
+        for e in range(unknowns):
             a = of_number[e]
             down = number_gradient[a]
             for i in range(WHITE):
                 down -= by_white[n + a, i] * z[i]
             gradient[column[e]] += share[e] * down
-            for f in range(entries):
+            for f in range(unknowns):
                 if column[f] <= column[e]:
                     b = of_number[f]
                     total = of_numbers[a, b]
@@ -473,225 +516,106 @@ def assemble(
 
 
 @cached
-def whiten(
-    t_s: Float,
-    position: Float,
-    knots: Float,
-    shared: Float,
-    white: Float,
-    step_position: Float,
-    step_knots: Float,
-    step_shared: Float,
-    first: Int64,
-    camera: Int64,
-    when: Float,
-    fraction: Float,
-    interval: Int64,
-    xy: Float,
-    sharpness: Float,
-    pose_position: Float,
-    pose_rotation: Float,
-    speed: Float,
-    turn: Float,
-    trust: Float,
-    bound2: float,
-    white_row: Int64,
-    white_precision: Float,
-    entry_start: Int64,
-    entry_number: Int64,
-    entry_knot: Int64,
-    entry_column: Int64,
-    clock_column: Int64,
-    step_white: Float,
-) -> None:
-    """Compute the step of every picture's white error [G, 6] for a given step of all other unknowns."""
-    J = position.shape[1]
-    out, rate = np.empty((J, 3)), np.empty((J, 3))
-    weight, slope, number, numbers_by = np.empty(3), np.empty(3), np.empty(NUMBERS), np.empty(NUMBERS)
-    residual, by_joint, by_number = np.empty((J, 2)), np.zeros((J, 2, 3)), np.zeros((J, 2, NUMBERS))
-    factor, nothing = np.empty((WHITE, WHITE)), np.zeros(WHITE)
-    for g in range(len(camera)):
-        c = camera[g]
-        z = step_white[g]
+def whiten(equations: Equations, step: State) -> None:
+    """Compute the step of every picture's white error for a given step of all other unknowns, in place."""
+    t_s, state, pictures, entries, bound2, white_precision = equations
+    white = state.white
+    J = state.position.shape[1]
+    picture = linearised(J)
+    residual, by_joint, by_number = picture.residual, picture.by_joint, picture.by_number
+    numbers_by, factor, nothing = np.empty(NUMBERS), np.empty((WHITE, WHITE)), np.zeros(WHITE)
+    for g in range(len(pictures.camera)):
+        z = step.white[g]
         z[:] = 0.0
-        if not np.isfinite(white_precision[white_row[g], 0, 0]):
+        row = pictures.white_row[g]
+        if not np.isfinite(white_precision[row, 0, 0]):
             continue
-        moved = when[g] + (shared[clock_column[c]] if clock_column[c] >= 0 else 0.0)
-        at_picture(first[g], t_s, moved, position, weight, slope, out, rate)
+        linearise_picture(g, t_s, state, pictures, entries, picture)
+        weigh(residual, pictures.trust[g], bound2, picture.view_weight)
         numbers_of(
-            c, fraction[g], interval[g], entry_start, entry_number, entry_knot, entry_column, knots, shared,
-            white[g], number,
-        )  # fmt: skip
-        numbers_of(
-            c, fraction[g], interval[g], entry_start, entry_number, entry_knot, entry_column, step_knots,
-            step_shared, nothing, numbers_by,
-        )  # fmt: skip
-        linearise(
-            out, rate, number, xy[g], sharpness[g], pose_position[g], pose_rotation[g], speed[g], turn[g],
-            residual, by_joint, by_number,
+            pictures.camera[g], pictures.fraction[g], pictures.interval[g], entries, step.knots,
+            step.shared, nothing, numbers_by,
         )  # fmt: skip
         for a in range(WHITE):
             for b in range(WHITE):
-                factor[a, b] = white_precision[white_row[g], a, b]
+                factor[a, b] = white_precision[row, a, b]
                 z[a] -= factor[a, b] * white[g, b]
         for joint in range(J):
             if np.isnan(residual[joint, 0]):
                 continue
-            squared = residual[joint, 0] ** 2 + residual[joint, 1] ** 2
-            believed = trust[g, joint] * confidence_of(squared, bound2)
+            view_weight = picture.view_weight[joint]
             for axis in range(2):
                 after = residual[joint, axis]
                 for i in range(3):
                     for k in range(3):
-                        after += by_joint[joint, axis, i] * weight[k] * step_position[first[g] + k, joint, i]
+                        by_time = by_joint[joint, axis, i] * picture.weight[k]
+                        after += by_time * step.position[pictures.first[g] + k, joint, i]
                 for a in range(NUMBERS):
                     after += by_number[joint, axis, a] * numbers_by[a]
                 for a in range(WHITE):
-                    z[a] -= believed * by_number[joint, axis, a] * after
+                    z[a] -= view_weight * by_number[joint, axis, a] * after
                     for b in range(WHITE):
-                        factor[a, b] += believed * by_number[joint, axis, a] * by_number[joint, axis, b]
+                        factor[a, b] += view_weight * by_number[joint, axis, a] * by_number[joint, axis, b]
         factorise(factor)
         forward(factor, z)
         backward(factor, z)
 
 
 @cached
-def misfit(
-    t_s: Float,
-    position: Float,
-    knots: Float,
-    shared: Float,
-    white: Float,
-    first: Int64,
-    camera: Int64,
-    when: Float,
-    fraction: Float,
-    interval: Int64,
-    xy: Float,
-    sharpness: Float,
-    pose_position: Float,
-    pose_rotation: Float,
-    speed: Float,
-    turn: Float,
-    trust: Float,
-    bound2: float,
-    entry_start: Int64,
-    entry_number: Int64,
-    entry_knot: Int64,
-    entry_column: Int64,
-    clock_column: Int64,
-    residuals: Float,
-    numbers: Float,
-) -> float:
+def misfit(equations: Equations, residuals: Float, numbers: Float) -> float:
     """Compute the loss of all pictures; fill whitened residuals [G, J, 2] (NaN unseen), numbers [G, 10]."""
-    J = position.shape[1]
-    out, rate = np.empty((J, 3)), np.empty((J, 3))
-    weight, slope = np.empty(3), np.empty(3)
-    by_joint, by_number = np.zeros((J, 2, 3)), np.zeros((J, 2, NUMBERS))
+    t_s, state, pictures, entries, bound2, _ = equations
+    picture = linearised(state.position.shape[1])
+    residual, trust = picture.residual, pictures.trust
     total = 0.0
-    for g in range(len(camera)):
-        c = camera[g]
-        moved = when[g] + (shared[clock_column[c]] if clock_column[c] >= 0 else 0.0)
-        at_picture(first[g], t_s, moved, position, weight, slope, out, rate)
-        numbers_of(
-            c, fraction[g], interval[g], entry_start, entry_number, entry_knot, entry_column, knots, shared,
-            white[g], numbers[g],
-        )  # fmt: skip
-        linearise(
-            out, rate, numbers[g], xy[g], sharpness[g], pose_position[g], pose_rotation[g], speed[g], turn[g],
-            residuals[g], by_joint, by_number,
-        )  # fmt: skip
-        for joint in range(J):
-            value = residuals[g, joint, 0] ** 2 + residuals[g, joint, 1] ** 2
+    for g in range(len(residuals)):
+        linearise_picture(g, t_s, state, pictures, entries, picture)
+        for a in range(NUMBERS):
+            numbers[g, a] = picture.number[a]
+        for joint in range(len(residual)):
+            for axis in range(2):
+                residuals[g, joint, axis] = residual[joint, axis]
+            value = residual[joint, 0] ** 2 + residual[joint, 1] ** 2
             if not np.isnan(value):
                 total += trust[g, joint] * loss_of(value, bound2)
     return total
 
 
+class Posterior(NamedTuple):
+    """Covariances of the unknowns in a picture's residuals, overwritten by the next picture."""
+
+    of_joints: Float  # [J, 3, 3] m^2 at the picture's time
+    across: Float  # [J, 3, 10] of joints with the picture's numbers
+    of_numbers: Float  # [10, 10] white part included
+    of_white: Float  # [6] variances of the white part alone
+
+
 @helper
 def posterior_of_picture(
-    g: int,
-    first: int,
-    t_s: Float,
-    position: Float,
-    knots: Float,
-    shared: Float,
-    white: Float,
-    camera: Int64,
-    when: Float,
-    fraction: Float,
-    interval: int,
-    xy: Float,
-    sharpness: Float,
-    pose_position: Float,
-    pose_rotation: Float,
-    speed: Float,
-    turn: Float,
-    trust: Float,
-    bound2: float,
-    white_row: Int64,
-    white_precision: Float,
-    entry_start: Int64,
-    entry_number: Int64,
-    entry_knot: Int64,
-    entry_column: Int64,
-    clock_column: Int64,
-    knot_count: int,
-    residual: Float,
-    believed: Float,
-    by_joint: Float,
-    by_number: Float,
-    whole: Float,
-    of_joints: Float,
-    across: Float,
-    of_numbers: Float,
-    of_white: Float,
+    g: int, equations: Equations, whole: Float, picture: Linearised, out: Posterior
 ) -> None:
-    """Compute a picture's residuals, weights and derivatives, and the posterior of their unknowns.
-
-    Outputs as in `linearise`: `residual` [J, 2], whitened; `by_joint` [J, 2, 3]; `by_number` [J, 2, 10].
-    `believed` [J] is the weight of each view, 0 if not seen. From the front's covariance `whole` [N, N] come
-    the covariances of the joints at the picture's time, `of_joints` [J, 3, 3], of joints with the picture's
-    numbers, `across` [J, 3, 10], and of the numbers, `of_numbers` [10, 10], white part included. `of_white`
-    [6] are the variances of the white part alone.
-    """
-    J = position.shape[1]
+    """Linearise a picture, and compute the posterior of its unknowns from the front's covariance [N, N]."""
+    t_s, state, pictures, entries, bound2, white_precision = equations
+    weight = picture.weight
+    of_joints, across, of_numbers, of_white = out
+    J = len(of_joints)
     n = 3 * J
-    out, rate = np.empty((J, 3)), np.empty((J, 3))
-    weight, slope, number = np.empty(3), np.empty(3), np.empty(NUMBERS)
     joint_gradient, number_gradient = np.empty((J, 3)), np.empty(NUMBERS)
     factor, own = np.zeros((WHITE, WHITE)), np.zeros((WHITE, WHITE))
-    c = camera[g]
-    moved = when[g] + (shared[clock_column[c]] if clock_column[c] >= 0 else 0.0)
-    at_picture(first, t_s, moved, position, weight, slope, out, rate)
-    numbers_of(
-        c, fraction[g], interval, entry_start, entry_number, entry_knot, entry_column, knots, shared,
-        white[g], number,
-    )  # fmt: skip
-    linearise(
-        out, rate, number, xy[g], sharpness[g], pose_position[g], pose_rotation[g], speed[g], turn[g],
-        residual, by_joint, by_number,
-    )  # fmt: skip
-    for joint in range(J):
-        squared = residual[joint, 0] ** 2 + residual[joint, 1] ** 2
-        believed[joint] = 0.0 if np.isnan(squared) else trust[g, joint] * confidence_of(squared, bound2)
-    most = 2 * (entry_column.size + 1)
+    linearise_picture(g, t_s, state, pictures, entries, picture)
+    weigh(picture.residual, pictures.trust[g], bound2, picture.view_weight)
+    most = 2 * (entries.column.size + 1)
     column, of_number, share = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
-    entries = entries_of(
-        c, fraction[g], n, knot_count, entry_start, entry_number, entry_knot, entry_column, column, of_number,
-        share,
-    )  # fmt: skip
+    unknowns = unknowns_of(pictures.camera[g], pictures.fraction[g], n, entries, column, of_number, share)
     # The white error depends on the front by `follows` [6, N], and has its own posterior in addition.
     follows = np.zeros((WHITE, len(whole)))
-    has_white = np.isfinite(white_precision[white_row[g], 0, 0])
+    row = pictures.white_row[g]
+    has_white = np.isfinite(white_precision[row, 0, 0])
     if has_white:
-        normal_equations(
-            residual, by_joint, by_number, believed, of_joints, across, of_numbers, joint_gradient,
-            number_gradient,
-        )  # fmt: skip
+        normal_equations(picture, of_joints, across, of_numbers, joint_gradient, number_gradient)
         for a in range(WHITE):
             for b in range(WHITE):
-                factor[a, b] = of_numbers[a, b] + white_precision[white_row[g], a, b]
+                factor[a, b] = of_numbers[a, b] + white_precision[row, a, b]
         factorise(factor)
         for a in range(WHITE):
             own[a, a] = 1.0
@@ -703,7 +627,7 @@ def posterior_of_picture(
                     total += own[a, b] * across[p // 3, p % 3, b]
                 for k in range(3):
                     follows[a, k * n + p] -= weight[k] * total
-            for e in range(entries):
+            for e in range(unknowns):
                 for b in range(WHITE):
                     follows[a, column[e]] -= share[e] * own[a, b] * of_numbers[of_number[e], b]
     of_joints[:] = 0.0
@@ -718,10 +642,10 @@ def posterior_of_picture(
                     for j in range(3):
                         q = m * n + 3 * joint + j
                         of_joints[joint, i, j] += weight[k] * weight[m] * whole[p, q]
-                for e in range(entries):
+                for e in range(unknowns):
                     across[joint, i, of_number[e]] += weight[k] * share[e] * whole[p, column[e]]
-    for e in range(entries):
-        for f in range(entries):
+    for e in range(unknowns):
+        for f in range(unknowns):
             both = share[e] * share[f] * whole[column[e], column[f]]
             of_numbers[of_number[e], of_number[f]] += both
     if not has_white:
@@ -733,7 +657,7 @@ def posterior_of_picture(
             for k in range(3):
                 for i in range(3):
                     across[joint, i, a] += weight[k] * with_front[a, k * n + 3 * joint + i]
-        for e in range(entries):
+        for e in range(unknowns):
             both = share[e] * with_front[a, column[e]]
             of_numbers[a, of_number[e]] += both
             of_numbers[of_number[e], a] += both

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.noise import PoseErrors, Process
+from pipelines.reconstruction.refinement.kernels import Entries
 
 CLOCK = 9
 """Index of the clock offset among a picture's ten numbers (see `kernels`)."""
@@ -40,19 +41,14 @@ class Pictures:
 class Layout:
     """Places of the unknowns other than joints: at knots in time, or shared by all times.
 
-    A process adds to three of its camera's ten numbers. An entry links an unknown to the number it adds to.
-    Shared unknowns are constant errors, then clocks, then bone lengths.
+    A process adds to three of its camera's ten numbers. Shared unknowns are constant errors, then clocks,
+    then bone lengths.
     """
 
     processes: tuple[tuple[int, Process], ...]  # (camera, process)
     place: tuple[tuple[bool, int], ...]  # of each process: at knots?, first column
-    entry_start: Int64  # [C + 1]
-    entry_number: Int64
-    entry_knot: Bool
-    entry_column: Int64
-    clock_column: Int64  # [C], -1 for a known clock
+    entries: Entries
     clock_sigma_s: Float  # [C]
-    knot_count: int  # unknowns of one knot
     bone_column: int
     shared_count: int
     knot_t_s: Float  # [K]
@@ -87,13 +83,15 @@ def lay_out(errors: Sequence[PoseErrors], clock_sigma_s: Float, bones: int, knot
     return Layout(
         processes=tuple(processes),
         place=tuple(place),
-        entry_start=np.array(start, dtype=np.int64),
-        entry_number=np.array(number, dtype=np.int64),
-        entry_knot=np.array(knot, dtype=np.bool_),
-        entry_column=np.array(column, dtype=np.int64),
-        clock_column=clock_column,
+        entries=Entries(
+            np.array(start, dtype=np.int64),
+            np.array(number, dtype=np.int64),
+            np.array(knot, dtype=np.bool_),
+            np.array(column, dtype=np.int64),
+            clock_column,
+            knot_count,
+        ),
         clock_sigma_s=clock_sigma_s,
-        knot_count=knot_count,
         bone_column=shared_count,
         shared_count=shared_count + bones,
         knot_t_s=knot_t_s,
@@ -141,26 +139,6 @@ class Problem:
         interval = of_time[self.pictures.first]
         span = np.diff(self.knot_t_s)[interval]
         return of_time, (self.pictures.when_s - self.knot_t_s[interval]) / span
-
-
-@dataclass(frozen=True)
-class State:
-    """Values of the unknowns."""
-
-    position: Float  # [T, J, 3] m
-    knots: Float  # [K, knot_count]
-    shared: Float  # [shared_count]
-    white: Float  # [G, 6]
-
-    def moved(self, step: State, share: float) -> State:
-        """Return the state moved by a share of a step."""
-        return replace(
-            self,
-            position=self.position + share * step.position,
-            knots=self.knots + share * step.knots,
-            shared=self.shared + share * step.shared,
-            white=self.white + share * step.white,
-        )
 
 
 # --- construction --------------------------------------------------------------------------------------

@@ -24,8 +24,8 @@ from pipelines.reconstruction.refinement.estimate import (
     shrunk,
     solve,
 )
-from pipelines.reconstruction.refinement.kernels import turned
-from pipelines.reconstruction.refinement.problem import Knowledge, Pictures, Problem, Sighting, State, build
+from pipelines.reconstruction.refinement.kernels import State, turned
+from pipelines.reconstruction.refinement.problem import Knowledge, Pictures, Problem, Sighting, build
 from pipelines.reconstruction.refinement.system import System, misfit
 
 _WINDOWS, _WINDOW = 3, 100  # stretches of the flight, in times, from which the prior is found
@@ -237,7 +237,7 @@ def _quickly(system: System, state: State, known: Knowledge) -> Float:
     right for slow errors and wrong for limbs: their motion would be smoothed away, or become jittery.
     """
     pictures = system.problem.pictures
-    slow = replace(state, white=np.zeros_like(state.white))
+    slow = state._replace(white=np.zeros_like(state.white))
     _, _, numbers = misfit(system, slow)
     position, rotation = corrected(pictures.position, pictures.rotation, numbers)
     # Clocks and the motion that depends on them stay unknowns.
@@ -581,7 +581,7 @@ def _corrections(system: System, state: State, shift: Float) -> tuple[tuple[Floa
 
 
 def _of_clocks(system: System, shared: Float) -> Float:
-    column = system.layout.clock_column
+    column = system.layout.entries.clock_column
     return np.where(column >= 0, shared[np.maximum(column, 0)], 0.0)
 
 

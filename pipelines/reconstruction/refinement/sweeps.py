@@ -7,6 +7,8 @@ front as x = R' (y - W' z), with R the inverse of the Cholesky factor of their o
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Int64
@@ -14,13 +16,67 @@ from pipelines.geometry.compilation import cached, helper
 from pipelines.reconstruction.refinement.kernels import (
     NUMBERS,
     WHITE,
+    Equations,
+    Linearised,
+    Posterior,
     add_bones,
     add_motion,
     assemble,
+    linearised,
     posterior_of_picture,
 )
 
 _STRIP = 48  # rows; with fewer, products are too small to be fast
+
+
+class Ties(NamedTuple):
+    """Priors of knots' changes: before * knot - after * next knot has mean 0 and this variance."""
+
+    before: Float  # [K - 1, c]
+    after: Float  # [K - 1, c]
+    variance: Float  # [K - 1, c]; inf if the tie belongs to the other half
+
+
+class Sweep(NamedTuple):
+    """Half of a flight with the priors of its motion; T times, the last two shared with the other half."""
+
+    equations: Equations
+    starts: Int64  # [T - 1] index of the first picture of each time
+    of_time: Int64  # [T - 1] the knot before each eliminated time, and before the meeting
+    curvature: Float  # [T - 2, 3] weights of three positions for their acceleration
+    spread: Float  # [T - 2] its variance relative to the usual
+    precision: Float  # [J, J] of an acceleration
+    hold: float  # added to the diagonal of joints, so that unseen ones stay near their start
+    bones: Int64  # [B, 2]
+    bone_sigma: Float  # [B] m
+    grown: float  # size of the body over that for which the priors hold
+    own_times: int  # of the last three times, those whose bones count in this half
+    knot_t_s: Float  # [K]
+    ties: Ties
+
+
+class Factors(NamedTuple):
+    """Factors of a stretch's elimination: rows of its times, and of its knots from the first interval."""
+
+    first_interval: int
+    inverse: Float  # [., n, n] R
+    across: Float  # [., m, n] W
+    solved: Float  # [., n] y
+    knot_inverse: Float  # [., c, c]
+    knot_across: Float  # [., m', c]
+    knot_solved: Float  # [., c]
+
+
+class Moments(NamedTuple):
+    """Posterior mean squares and variances of the quantities whose standard deviations are the levels."""
+
+    acceleration: Float  # [2, J, J] sums of mean squares and of variances over the times
+    bones: Float  # [B] sums of mean squares
+    image: Float  # [J, 2] weighted squares of residuals, and their degrees of freedom after the fit
+    white: Float  # [2, 3] of position, rotation: sums of mean squares, count, sum of determined shares
+    walked: Float  # [c, 3] of the changes between knots per s: sums of mean squares, count, variances
+    starting: Float  # [c + shared, 2] mean squares and variances at the first time; empty in the second half
+    times: int
 
 
 @helper
@@ -77,97 +133,47 @@ def eliminate(
 
 @cached
 def forwards(
-    first: int,
-    last: int,
-    t_s: Float,
-    position: Float,
-    knots: Float,
-    shared: Float,
-    white: Float,
-    starts: Int64,
-    camera: Int64,
-    when: Float,
-    fraction: Float,
-    of_time: Int64,
-    xy: Float,
-    sharpness: Float,
-    pose_position: Float,
-    pose_rotation: Float,
-    speed: Float,
-    turn: Float,
-    trust: Float,
-    bound2: float,
-    white_row: Int64,
-    white_precision: Float,
-    entry_start: Int64,
-    entry_number: Int64,
-    entry_knot: Int64,
-    entry_column: Int64,
-    clock_column: Int64,
-    knot_count: int,
-    curvature: Float,
-    spread: Float,
-    precision: Float,
-    hold: float,
-    bones: Int64,
-    bone_sigma: Float,
-    grown: float,
-    own_times: int,
-    tie_before: Float,
-    tie_after: Float,
-    tie_variance: Float,
-    front: Float,
-    gradient: Float,
-    interval: int,
-    inverse: Float,
-    across: Float,
-    solved: Float,
-    knot_inverse: Float,
-    knot_across: Float,
-    knot_solved: Float,
+    first: int, last: int, sweep: Sweep, front: Float, gradient: Float, interval: int, factors: Factors
 ) -> tuple[int, float]:
     """Eliminate joints and knots of the times from `first` to before `last`; change the front in place.
 
-    Of the last three times, only bones of the first `own_times` count here. Factors go to row `time - first`
-    of `inverse` [., n, n], `across` [., m, n] and `solved` [., n]. Factors of knots go to row `k - interval`
-    of the knot arrays. Returns the interval of the time `last`, in which the front ends, and half the log
+    Writes the factors. Returns the interval of the time `last`, in which the front ends, and half the log
     determinant of all eliminated unknowns, white errors included.
     """
+    position, shared = sweep.equations.state.position, sweep.equations.state.shared
+    knots, bones, own_times = sweep.equations.state.knots, sweep.bones, sweep.own_times
+    starts, of_time, grown = sweep.starts, sweep.of_time, sweep.grown
+    inverse, across, solved = factors.inverse, factors.across, factors.solved
     J = position.shape[1]
-    n, c = 3 * J, knot_count
+    n, c = 3 * J, sweep.equations.entries.knot_count
     size = len(gradient)
     s = size - 3 * n - 2 * c
     lengths = shared[len(shared) - len(bones) :]
     length_offset = size - len(bones)
     half = 0.0
-    first_interval = interval
     own, beside = np.empty((n, n)), np.empty((size - n, n))
     knot_own, knot_beside = np.empty((c, c)), np.empty((2 * n + c + s, c))
     for time in range(first, last + 1):
         while c and interval < of_time[time]:
-            k = interval - first_interval
+            k = interval - factors.first_interval
             half += eliminate_knot(
-                front, gradient, n, c, knot_own, knot_beside, knot_inverse[k], knot_across[k], knot_solved[k]
-            )
+                front, gradient, n, c, knot_own, knot_beside, factors.knot_inverse[k],
+                factors.knot_across[k], factors.knot_solved[k],
+            )  # fmt: skip
             interval += 1
-            tie_knots(front, gradient, n, c, knots, interval, tie_before, tie_after, tie_variance)
+            tie_knots(front, gradient, n, c, knots, interval, sweep.ties)
         if time == last:
             break
-        half += assemble(
-            starts[time], starts[time + 1], time, t_s, position, knots, shared, white, camera, when, fraction,
-            interval, xy, sharpness, pose_position, pose_rotation, speed, turn, trust, bound2,
-            white_row, white_precision, entry_start, entry_number, entry_knot, entry_column, clock_column,
-            knot_count, front, gradient,
-        )  # fmt: skip
+        half += assemble(starts[time], starts[time + 1], sweep.equations, front, gradient)
         add_motion(
-            position[time : time + 3], curvature[time], precision, 1.0 / (spread[time] * grown**2), hold,
-            lengths, length_offset, front, gradient,
+            position[time : time + 3], sweep.curvature[time], sweep.precision,
+            1.0 / (sweep.spread[time] * grown**2), sweep.hold, lengths, length_offset, front, gradient,
         )  # fmt: skip
         # All bones of a time at once with the first of its three; the last two times may have their own.
-        for offset in range(1 if time < len(t_s) - 3 else own_times):
+        for offset in range(1 if time < len(position) - 3 else own_times):
             add_bones(
-                position[time + offset], bones, lengths, bone_sigma, grown, n * offset, length_offset, front,
-                gradient,
+                position[time + offset], bones, lengths, sweep.bone_sigma, grown, n * offset, length_offset,
+                front, gradient,
             )  # fmt: skip
         copy_block(front, 0, 0, own)
         copy_block(front, n, 0, beside)
@@ -265,14 +271,12 @@ def tie_knots(
     c: int,
     knots: Float,
     interval: int,
-    by_before: Float,
-    by_after: Float,
-    variance: Float,
+    ties: Ties,
 ) -> None:
     """Add the random walk between the knot before and the knot after."""
     before, after = 3 * n, 3 * n + c
     for i in range(c):
-        b, a, q = by_before[interval, i], by_after[interval, i], variance[interval, i]
+        b, a, q = ties.before[interval, i], ties.after[interval, i], ties.variance[interval, i]
         change = a * knots[interval + 1, i] - b * knots[interval, i]
         front[before + i, before + i] += b * b / q
         front[after + i, after + i] += a * a / q
@@ -282,18 +286,9 @@ def tie_knots(
 
 
 @cached
-def begin(
-    front: Float,
-    gradient: Float,
-    n: int,
-    c: int,
-    knots: Float,
-    by_before: Float,
-    by_after: Float,
-    variance: Float,
-) -> None:
+def begin(front: Float, gradient: Float, n: int, c: int, knots: Float, ties: Ties) -> None:
     """Tie the first two knots."""
-    tie_knots(front, gradient, n, c, knots, 0, by_before, by_after, variance)
+    tie_knots(front, gradient, n, c, knots, 0, ties)
 
 
 @cached
@@ -302,18 +297,13 @@ def backwards(
     last: int,
     of_time: Int64,
     interval: int,
-    first_interval: int,
-    inverse: Float,
-    across: Float,
-    solved: Float,
-    knot_inverse: Float,
-    knot_across: Float,
-    knot_solved: Float,
+    factors: Factors,
     position: Float,
     knots: Float,
     shared: Float,
 ) -> int:
     """Solve for joints [T, n] and knots [K, c] of a stretch from its end, in place; return the interval."""
+    inverse, across, solved = factors.inverse, factors.across, factors.solved
     n, c = position.shape[1], knots.shape[1]
     s = len(shared)
     z, zk = np.empty(2 * n + 2 * c + s), np.empty(2 * n + c + s)
@@ -323,12 +313,9 @@ def backwards(
     rest_n, rest_c = np.empty(n), np.empty(c)
     for time in range(last - 1, first - 2, -1):
         # Solve knots eliminated after this time first; at the end, those before the stretch.
-        while c and interval > (of_time[time] if time >= first else first_interval):
+        while c and interval > (of_time[time] if time >= first else factors.first_interval):
             interval -= 1
-            follow_knot(
-                interval - first_interval, time, interval, n, c, zk, rest_c, knot_inverse, knot_across,
-                knot_solved, position, knots,
-            )  # fmt: skip
+            follow_knot(time, interval, zk, rest_c, factors, position, knots)
         if time < first:
             break
         row = time - first
@@ -352,20 +339,12 @@ def backwards(
 
 @helper
 def follow_knot(
-    row: int,
-    time: int,
-    interval: int,
-    n: int,
-    c: int,
-    z: Float,
-    rest: Float,
-    inverse: Float,
-    across: Float,
-    solved: Float,
-    position: Float,
-    knots: Float,
+    time: int, interval: int, z: Float, rest: Float, factors: Factors, position: Float, knots: Float
 ) -> None:
     """Solve for a knot from the next knot and the joints at `time` + 1 and `time` + 2."""
+    n, c = position.shape[1], knots.shape[1]
+    row = interval - factors.first_interval
+    inverse, across, solved = factors.knot_inverse, factors.knot_across, factors.knot_solved
     for i in range(n):
         z[i] = position[time + 1, i]
         z[n + i] = position[time + 2, i]
@@ -403,83 +382,43 @@ def join(inverse: Float, across: Float, others: Float) -> tuple[Float, Float]:
 def visit(
     first: int,
     last: int,
-    t_s: Float,
-    position: Float,
-    knots: Float,
-    shared: Float,
-    white: Float,
-    starts: Int64,
-    camera: Int64,
-    when: Float,
-    fraction: Float,
-    of_time: Int64,
-    xy: Float,
-    sharpness: Float,
-    pose_position: Float,
-    pose_rotation: Float,
-    speed: Float,
-    turn: Float,
-    trust: Float,
-    bound2: float,
-    white_row: Int64,
-    white_precision: Float,
-    entry_start: Int64,
-    entry_number: Int64,
-    entry_knot: Int64,
-    entry_column: Int64,
-    clock_column: Int64,
-    knot_count: int,
-    curvature: Float,
-    spread: Float,
-    bones: Int64,
-    own_times: int,
-    knot_t_s: Float,
+    sweep: Sweep,
     others: Float,
     interval: int,
-    first_interval: int,
-    inverse: Float,
-    across: Float,
-    knot_inverse: Float,
-    knot_across: Float,
+    factors: Factors,
     every: int,
     covariance: Float,
-    acceleration: Float,
-    bone_sums: Float,
-    image: Float,
-    white_sums: Float,
-    walked: Float,
-    starting: Float,
+    sums: Moments,
 ) -> tuple[Float, int]:
     """Compute covariances of a stretch from its end, and sums for the levels.
 
     `others` [m, m] is the covariance of the unknowns alive at the end. `covariance` [T, J, 3, 3] is filled
-    unless empty; of the last three times only the first `own_times`. Sums are made unless `every` is 0, over
-    the pictures of every `every`-th time: `acceleration` [2, J, J] posterior mean squares and variances;
-    `bone_sums` [B]; `image` [J, 2] weighted squares, and their degrees of freedom after the fit; `white_sums`
-    [2, 3] of position and rotation: mean squares, count, share determined by the pictures (1 - posterior /
-    prior variance); `walked` [c, 3] of every knot's change per s: mean squares, count, posterior variances;
-    `starting` [c + shared, 2] at time 0, unless empty: mean square, variance. Returns the covariance of the
-    unknowns alive at the beginning, and the interval there.
+    unless empty; of the last three times only the half's own. Sums are made unless `every` is 0, over the
+    pictures of every `every`-th time. Returns the covariance of the unknowns alive at the beginning, and the
+    interval there.
     """
-    J = position.shape[1]
-    n, c = 3 * J, knot_count
+    equations, starts, of_time = sweep.equations, sweep.starts, sweep.of_time
+    knots, shared, white = equations.state.knots, equations.state.shared, equations.state.white
+    inverse, across, starting = factors.inverse, factors.across, sums.starting
+    J = equations.state.position.shape[1]
+    n, c = 3 * J, equations.entries.knot_count
     m = len(others)
     size = m + n
     whole = np.empty((size, size))
     alive = others.copy()
-    believed, residual = np.empty(J), np.empty((J, 2))
-    by_joint, by_number = np.zeros((J, 2, 3)), np.zeros((J, 2, NUMBERS))
-    of_joints, beside = np.empty((J, 3, 3)), np.empty((J, 3, NUMBERS))
-    of_numbers, of_white = np.empty((NUMBERS, NUMBERS)), np.empty(WHITE)
-    last_time = len(t_s) - 3
+    picture = linearised(J)
+    posterior = Posterior(
+        np.empty((J, 3, 3)), np.empty((J, 3, NUMBERS)), np.empty((NUMBERS, NUMBERS)), np.empty(WHITE)
+    )
+    last_time = len(equations.t_s) - 3
     for time in range(last - 1, first - 2, -1):
         # As in the forward pass; at the end, the knots before the stretch.
-        while c and interval > (of_time[time] if time >= first else first_interval):
+        while c and interval > (of_time[time] if time >= first else factors.first_interval):
             interval -= 1
-            row = interval - first_interval
-            alive = before_knot(alive, n, c, knot_inverse[row], knot_across[row])
+            row = interval - factors.first_interval
+            alive = before_knot(alive, n, c, factors.knot_inverse[row], factors.knot_across[row])
             if every:
-                walk_of(alive, n, c, knots, knot_t_s, interval, walked)
+                walk_of(alive, n, c, knots, sweep.knot_t_s, interval, sums.walked)
         if time < first:
             break
         row = time - first
@@ -494,7 +433,7 @@ def visit(
             for j in range(m):
                 whole[n + i, n + j] = alive[i, j]
         if len(covariance):
-            for k in range(own_times if time == last_time else 1):
+            for k in range(sweep.own_times if time == last_time else 1):
                 for joint in range(J):
                     p = k * n + 3 * joint
                     for a in range(3):
@@ -503,19 +442,16 @@ def visit(
                                 k * n + 3 * joint + a, k * n + 3 * joint + b
                             ]
         if every:
-            acceleration_of(whole, position, curvature, spread, time, acceleration)
-            bones_of(whole, position, shared, bones, time, bone_sums)
+            acceleration_of(
+                whole, equations.state.position, sweep.curvature, sweep.spread, time, sums.acceleration
+            )
+            bones_of(whole, equations.state.position, shared, sweep.bones, time, sums.bones)
             if time % every == 0:
                 for g in range(starts[time], starts[time + 1]):
-                    posterior_of_picture(
-                        g, time, t_s, position, knots, shared, white, camera, when, fraction, interval, xy,
-                        sharpness, pose_position, pose_rotation, speed, turn, trust, bound2, white_row,
-                        white_precision, entry_start, entry_number, entry_knot, entry_column, clock_column,
-                        knot_count, residual, believed, by_joint, by_number, whole, of_joints, beside,
-                        of_numbers, of_white,
-                    )  # fmt: skip
-                    noise_of(residual, believed, by_joint, by_number, of_joints, beside, of_numbers, image)
-                    white_of(white[g], white_precision[white_row[g]], of_white, white_sums)
+                    posterior_of_picture(g, equations, whole, picture, posterior)
+                    noise_of(picture, posterior, sums.image)
+                    precision = equations.white_precision[equations.pictures.white_row[g]]
+                    white_of(white[g], precision, posterior.of_white, sums.white)
             if time == 0 and len(starting):
                 for i in range(c):
                     starting[i, 0] = knots[0, i] ** 2 + whole[3 * n + i, 3 * n + i]
@@ -639,19 +575,13 @@ def bones_of(whole: Float, position: Float, shared: Float, bones: Int64, time: i
 
 
 @helper
-def noise_of(
-    residual: Float,
-    believed: Float,
-    by_joint: Float,
-    by_number: Float,
-    of_joints: Float,
-    across: Float,
-    of_numbers: Float,
-    sums: Float,
-) -> None:
-    """Add a picture's contribution to image noise [J, 2]; arguments as in `posterior_of_picture`."""
-    for joint in range(len(believed)):
-        if believed[joint] == 0.0:
+def noise_of(picture: Linearised, posterior: Posterior, sums: Float) -> None:
+    """Add a picture's contribution to image noise [J, 2]."""
+    residual, by_joint, by_number = picture.residual, picture.by_joint, picture.by_number
+    view_weight = picture.view_weight
+    of_joints, across, of_numbers = posterior.of_joints, posterior.across, posterior.of_numbers
+    for joint in range(len(view_weight)):
+        if view_weight[joint] == 0.0:
             continue
         for axis in range(2):
             variance = 0.0
@@ -667,8 +597,8 @@ def noise_of(
                 for b in range(NUMBERS):
                     follows += of_numbers[a, b] * by_number[joint, axis, b]
                 variance += by_number[joint, axis, a] * follows
-            sums[joint, 0] += believed[joint] * residual[joint, axis] ** 2
-            sums[joint, 1] += believed[joint] * (1 - variance)
+            sums[joint, 0] += view_weight[joint] * residual[joint, axis] ** 2
+            sums[joint, 1] += view_weight[joint] * (1 - variance)
 
 
 @helper
@@ -677,8 +607,8 @@ def white_of(white: Float, precision: Float, variance: Float, sums: Float) -> No
     for i in range(WHITE):
         if not np.isfinite(precision[i, i]):
             continue
-        told = 1 - variance[i] * precision[i, i]
+        determined = 1 - variance[i] * precision[i, i]
         part = i // 3
         sums[part, 0] += white[i] ** 2 + variance[i]
         sums[part, 1] += 1
-        sums[part, 2] += told
+        sums[part, 2] += determined

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float, Int64
 from pipelines.geometry.noise import EXACT, PoseErrors
 from pipelines.reconstruction.refinement import kernels
-from pipelines.reconstruction.refinement.problem import Knowledge, Layout, Problem, State
+from pipelines.reconstruction.refinement.kernels import Equations, PictureArrays, State
+from pipelines.reconstruction.refinement.problem import Knowledge, Layout, Problem
+from pipelines.reconstruction.refinement.sweeps import Sweep, Ties
 
-# Its arguments are assembled from tuples, whose lengths mypy does not know.
-_misfit: Callable[..., float] = kernels.misfit
+_ANYWHERE_M = 100.0  # prior sigma of an unseen joint around its start
 
 
 @dataclass(frozen=True)
@@ -33,29 +34,39 @@ class System:
     layout: Layout
     bound2: float  # of the robust loss
     held: bool = False  # bone lengths stay as they are
-    sharpness: Float = field(init=False)
-    white_row: Int64 = field(init=False)  # [G] row of each picture in `white_precision`
+    pictures: PictureArrays = field(init=False)
     white_precision: Float = field(init=False)  # [., 6, 6] of each camera, then of logged poses; inf without
     inverse_acceleration: Float = field(init=False)  # [J, J]
-    of_time: Int64 = field(init=False)  # [T - 2]
-    fraction: Float = field(init=False)  # [G]
+    of_time: Int64 = field(init=False)  # [T - 2] the knot before each time
     usual_step_s: float = field(init=False)
     tie_kept: Float = field(init=False)  # [K - 1, c] share of a slow error that is left at the next knot
     tie_variance: Float = field(init=False)  # [K - 1, c] variance added from knot to knot
 
     def __post_init__(self) -> None:
         """Derive the values that every linearisation needs."""
-        problem, known = self.problem, self.knowledge
+        problem, known, seen = self.problem, self.knowledge, self.problem.pictures
         of_time, fraction = problem.intervals()
         white_row, white_precision = _white_errors(problem, known.poses)
         kept, variance = _ties(self.layout)
         derived = {
-            "sharpness": problem.pictures.sharpness / (known.pixel_scale * np.sqrt(known.memory)),
-            "white_row": white_row,
+            "pictures": PictureArrays(
+                first=seen.first,
+                camera=seen.camera,
+                when_s=seen.when_s,
+                xy=seen.xy,
+                sharpness=seen.sharpness / (known.pixel_scale * np.sqrt(known.memory)),
+                trust=seen.trust,
+                position=seen.position,
+                rotation=seen.rotation,
+                speed=seen.speed,
+                turn=seen.turn,
+                interval=of_time[seen.first],
+                fraction=fraction,
+                white_row=white_row,
+            ),
             "white_precision": white_precision,
             "inverse_acceleration": np.linalg.inv(known.acceleration),
             "of_time": of_time,
-            "fraction": fraction,
             "usual_step_s": float(np.median(np.diff(problem.t_s))),
             "tie_kept": kept,
             "tie_variance": variance,
@@ -66,31 +77,11 @@ class System:
     @property
     def size(self) -> int:
         """Number of unknowns of a front."""
-        return 9 * self.problem.joints + 2 * self.layout.knot_count + self.layout.shared_count
+        return 9 * self.problem.joints + 2 * self.layout.entries.knot_count + self.layout.shared_count
 
-    def picture_arguments(self) -> tuple[Any, ...]:
-        """Collect the kernels' arguments between a picture's place in time and the robust bound."""
-        pictures = self.problem.pictures
-        return (
-            pictures.xy,
-            self.sharpness,
-            pictures.position,
-            pictures.rotation,
-            pictures.speed,
-            pictures.turn,
-            pictures.trust,
-        )
-
-    def entries(self) -> tuple[Any, ...]:
-        """Collect the kernels' arguments on the layout."""
-        layout = self.layout
-        return (
-            layout.entry_start,
-            layout.entry_number,
-            layout.entry_knot,
-            layout.entry_column,
-            layout.clock_column,
-        )
+    def equations(self, state: State, t_s: Float, pictures: PictureArrays) -> Equations:
+        """Collect the arguments of the kernels."""
+        return Equations(t_s, state, pictures, self.layout.entries, self.bound2, self.white_precision)
 
     def grown(self, state: State) -> float:
         """Compute the ratio of the body's size to the one for which the prior of motion and bones holds."""
@@ -121,8 +112,8 @@ def _ties(layout: Layout) -> tuple[Float, Float]:
     """Compute the share kept and the variance added [K - 1, c] from each knot to the next."""
     elapsed_s = np.diff(layout.knot_t_s)
     kept, variance = (
-        np.ones((len(elapsed_s), layout.knot_count)),
-        np.ones((len(elapsed_s), layout.knot_count)),
+        np.ones((len(elapsed_s), layout.entries.knot_count)),
+        np.ones((len(elapsed_s), layout.entries.knot_count)),
     )
     for (_, process), (at_knots, column) in zip(layout.processes, layout.place, strict=True):
         if at_knots:
@@ -137,26 +128,9 @@ def misfit(system: System, state: State) -> tuple[float, Float, Float]:
 
     Residuals are NaN, and cost nothing, for joints that were not seen or lie behind the camera.
     """
-    pictures = system.problem.pictures
-    residual = np.empty(pictures.xy.shape)
-    numbers = np.empty((len(pictures.first), kernels.NUMBERS))
-    total: float = _misfit(
-        system.problem.t_s,
-        state.position,
-        state.knots,
-        state.shared,
-        state.white,
-        pictures.first,
-        pictures.camera,
-        pictures.when_s,
-        system.fraction,
-        system.of_time[pictures.first],
-        *system.picture_arguments(),
-        system.bound2,
-        *system.entries(),
-        residual,
-        numbers,
-    )
+    residual = np.empty(system.pictures.xy.shape)
+    numbers = np.empty((len(residual), kernels.NUMBERS))
+    total = kernels.misfit(system.equations(state, system.problem.t_s, system.pictures), residual, numbers)
     return total, residual, numbers
 
 
@@ -173,7 +147,7 @@ def prior_cost(system: System, state: State) -> float:
     lengths = state.shared[layout.bone_column :]
     cost += np.sum(((_bone_lengths(problem, state.position) - lengths) / known.bone_sigma_m) ** 2)
     cost /= system.grown(state) ** 2
-    precision = system.white_precision[system.white_row]
+    precision = system.white_precision[system.pictures.white_row]
     there = np.isfinite(precision[:, 0, 0])
     white = state.white[there]
     cost += np.sum((precision[there] @ white[..., None])[..., 0] * white)
@@ -182,8 +156,8 @@ def prior_cost(system: System, state: State) -> float:
         cost += np.sum(begins[column : column + 3] ** 2) / process.sigma0**2
     changes = state.knots[1:] - system.tie_kept * state.knots[:-1]
     cost += np.sum(changes**2 / system.tie_variance)
-    clocks = layout.clock_column >= 0
-    cost += np.sum((state.shared[layout.clock_column[clocks]] / layout.clock_sigma_s[clocks]) ** 2)
+    clocks = layout.entries.clock_column >= 0
+    cost += np.sum((state.shared[layout.entries.clock_column[clocks]] / layout.clock_sigma_s[clocks]) ** 2)
     return float(cost)
 
 
@@ -208,30 +182,16 @@ class Half:
     meeting: int  # the first of the flight's two times at which the halves meet
     pictures: int  # of the flight, that belong to the first half
     t_s: Float  # [T] decreasing in the turned half
+    knot_t_s: Float  # [K] the same
     of_time: Int64  # [T - 1] the knot before each eliminated time, and before the meeting
     starts: Int64  # [T - 1] index of the first picture of each time
-    of_pictures: tuple[Any, ...]  # camera, time, fraction, `System.picture_arguments`, row of the white error
-    curvature: Float  # [T - 2, 3] weights of three positions for their acceleration
-    spread: Float  # [T - 2] its variance relative to the usual
-    tie_before: Float  # [K - 1, c] prior of a tie: tie_before * knot - tie_after * next knot has mean 0
-    tie_after: Float  # [K - 1, c] factor of the next knot
-    tie_variance: Float  # [K - 1, c] variance of that difference; inf if the tie belongs to the other half
-
-    @property
-    def knot_t_s(self) -> Float:
-        """Times of the knots [K]."""
-        knot_t_s = self.system.layout.knot_t_s
-        return _turned(knot_t_s) if self.turned else knot_t_s
+    seen: PictureArrays
+    ties: Ties
 
     @property
     def count(self) -> int:
         """Number of eliminated times."""
         return len(self.t_s) - 2
-
-    @property
-    def own_times(self) -> int:
-        """Number of the last three times that belong to this half; those of the meeting are the first's."""
-        return 1 if self.turned else 3
 
     def of_times(self, values: NDArray[Value]) -> NDArray[Value]:
         """Return this half's part of values [T', ...] at the flight's times."""
@@ -248,36 +208,34 @@ class Half:
 
     def met(self) -> Int64:
         """Return the place of each unknown alive at the meeting, in the order of the first half."""
-        n, c = 3 * self.system.problem.joints, self.system.layout.knot_count
+        n, c = 3 * self.system.problem.joints, self.system.layout.entries.knot_count
         place = np.arange(2 * n + 2 * c + self.system.layout.shared_count)
         if self.turned:
             joints, knots = place[: 2 * n].reshape(2, n), place[2 * n : 2 * n + 2 * c].reshape(2, c)
             joints[:], knots[:] = joints[::-1].copy(), knots[::-1].copy()
         return place
 
-    def arguments(self, part: State) -> tuple[Any, ...]:
-        """Collect the arguments of the sweeps: the half and its linearisation point."""
+    def sweep(self, state: State) -> Sweep:
+        """Collect the arguments of the sweeps for this half's part of a state."""
         system = self.system
-        camera, when_s, fraction, *seen, white_row = self.of_pictures
-        return (
-            self.t_s,
-            part.position,
-            part.knots,
-            part.shared,
-            part.white,
-            self.starts,
-            camera,
-            when_s,
-            fraction,
-            self.of_time,
-            *seen,
-            system.bound2,
-            white_row,
-            system.white_precision,
-            *system.entries(),
-            system.layout.knot_count,
-            self.curvature,
-            self.spread,
+        before, after = np.diff(self.t_s)[:-1], np.diff(self.t_s)[1:]
+        return Sweep(
+            equations=system.equations(state, self.t_s, self.seen),
+            starts=self.starts,
+            of_time=self.of_time,
+            curvature=np.stack(
+                [2 / (before * (before + after)), -2 / (before * after), 2 / (after * (before + after))],
+                axis=1,
+            ),
+            spread=system.usual_step_s / np.abs(0.5 * (before + after)),
+            precision=system.inverse_acceleration,
+            hold=1 / _ANYWHERE_M**2,
+            bones=system.problem.bones,
+            bone_sigma=system.knowledge.bone_sigma_m,
+            grown=system.grown(state),
+            own_times=1 if self.turned else 3,  # those of the meeting are the first's
+            knot_t_s=self.knot_t_s,
+            ties=self.ties,
         )
 
 
@@ -293,49 +251,38 @@ def parted(system: System, meeting: int) -> tuple[Half, Half]:
 
 
 def _half(system: System, meeting: int, pictures: int, *, turned: bool) -> Half:
-    problem, seen = system.problem, system.problem.pictures
+    problem, seen = system.problem, system.pictures
     last_interval = max(len(problem.knot_t_s) - 2, 0)
     met_at = int(system.of_time[min(meeting, len(system.of_time) - 1)])
-    variance = system.tie_variance
+    before, after, variance = system.tie_kept, np.ones_like(system.tie_kept), system.tie_variance
     if turned:
+        order: Callable[[NDArray[Any]], NDArray[Any]] = _turned
         mine, t_s = slice(pictures, None), _turned(problem.t_s[meeting:])
-        first = len(problem.t_s) - 3 - seen.first[mine]
+        first = _turned(len(problem.t_s) - 3 - seen.first[mine])
         of_time = last_interval - np.append(system.of_time[meeting:][::-1], met_at)
-        variance = variance.copy()
+        before, after, variance = after, before, variance.copy()
         variance[met_at] = np.inf
     else:
+        order = np.ascontiguousarray
         mine, t_s = slice(0, pictures), problem.t_s[: meeting + 2]
         first = seen.first[mine]
         of_time = np.append(system.of_time[:meeting], met_at)
-    order: Callable[[NDArray[Any]], NDArray[Any]] = _turned if turned else np.ascontiguousarray
-    ties = system.tie_kept, np.ones_like(system.tie_kept)
-    tie_before, tie_after = ties[::-1] if turned else ties
-    before, after = np.diff(t_s)[:-1], np.diff(t_s)[1:]
+    own = PictureArrays(*(order(values[mine]) for values in seen))
     return Half(
         system=system,
         turned=turned,
         meeting=meeting,
         pictures=pictures,
         t_s=t_s,
+        knot_t_s=order(problem.knot_t_s),
         of_time=of_time,
-        starts=np.searchsorted(order(first), np.arange(len(t_s) - 1)),
-        of_pictures=tuple(
-            order(values[mine])
-            for values in (
-                seen.camera,
-                seen.when_s,
-                1 - system.fraction if turned else system.fraction,
-                *system.picture_arguments(),
-                system.white_row,
-            )
+        starts=np.searchsorted(first, np.arange(len(t_s) - 1)),
+        seen=own._replace(
+            first=first,
+            interval=of_time[first],
+            fraction=1 - own.fraction if turned else own.fraction,
         ),
-        curvature=np.stack(
-            [2 / (before * (before + after)), -2 / (before * after), 2 / (after * (before + after))], axis=1
-        ),
-        spread=system.usual_step_s / np.abs(0.5 * (before + after)),
-        tie_before=order(tie_before),
-        tie_after=order(tie_after),
-        tie_variance=order(variance),
+        ties=Ties(order(before), order(after), order(variance)),
     )
 
 
