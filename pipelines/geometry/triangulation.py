@@ -39,11 +39,14 @@ from functools import cache
 from itertools import combinations, islice
 from itertools import count as count_up
 from math import comb, cos, gcd, radians
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int8, Int64
+
+if TYPE_CHECKING:
+    from pipelines.geometry.triangulation_kernels import Found
 
 Method = Literal["dlt", "midpoint", "robust"]
 
@@ -131,7 +134,6 @@ def triangulate(
     *,
     method: Method,
     min_views: int = 2,
-    min_parallax_deg: float = MIN_PARALLAX_DEG,
     gate: float = GATE,
     threads: int = 1,
 ) -> Triangulation:
@@ -142,7 +144,7 @@ def triangulate(
     * `not_detected`: by no camera.
     * `few_views`: detected by fewer than `min_views` cameras.
     * `no_pose`: fewer than `min_views` of the detections have a camera pose.
-    * `low_parallax`: no two viewing lines differ by `min_parallax_deg` (opposite directions do not count).
+    * `low_parallax`: no two viewing lines differ by `MIN_PARALLAX_DEG` (opposite directions do not count).
     * `rejected`: fewer than `min_views` views agree within `gate` (`robust`), or the point is behind one of
       its cameras (`dlt` and `midpoint`, which reject no view).
 
@@ -150,105 +152,60 @@ def triangulate(
         views: the observations.
         method: see the module; `min_views` and the parallax apply to all three, `gate` to `robust`.
         min_views: views needed, and inliers needed; at least 2.
-        min_parallax_deg: least angle between two viewing lines.
         gate: in standard deviations of a view's image point, pixel and pose noise together.
         threads: at most this many, and no more than there are processors.
 
     Raises:
-        ValueError: min_views below 2, a parallax or gate out of range.
+        ValueError: min_views below 2, or a gate that is not above 0.
     """
-    n, cameras = views.weight.shape
-    covariance, count, residual_px = np.empty((n, 3, 3)), np.empty(n, np.int64), np.empty((n, cameras))
-    found = _run(views, method, min_views, min_parallax_deg, gate, threads, covariance, count, residual_px)
-    return Triangulation(found.points, found.inlier, found.status, covariance, count, residual_px)
+    found = _run(views, method, min_views, gate, threads, len(views.weight))
+    return Triangulation(*found)
 
 
-def locate(
-    views: Views,
-    *,
-    method: Method,
-    min_views: int = 2,
-    min_parallax_deg: float = MIN_PARALLAX_DEG,
-    gate: float = GATE,
-    threads: int = 1,
-) -> Points:
+def locate(views: Views, *, method: Method, gate: float = GATE, threads: int = 1) -> Points:
     """Triangulate without covariances and residuals, for studies over many draws of noise."""
-    nothing = np.empty((0, 3, 3)), np.empty(0, np.int64), np.empty((0, 0))
-    return _run(views, method, min_views, min_parallax_deg, gate, threads, *nothing)
+    return Points(*_run(views, method, 2, gate, threads, 0)[:3])
 
 
-def _run(
-    views: Views,
-    method: Method,
-    min_views: int,
-    min_parallax_deg: float,
-    gate: float,
-    threads: int,
-    covariance: Float,
-    count: Int64,
-    residual_px: Float,
-) -> Points:
-    """Run the kernel over blocks of joint-frames; fill the last three arrays unless they are empty."""
-    if min_views < 2 or not 0 < min_parallax_deg < 90 or not gate > 0:
-        raise ValueError(
-            f"min_views={min_views}, min_parallax_deg={min_parallax_deg}, gate={gate}: out of range"
-        )
+def _run(views: Views, method: Method, min_views: int, gate: float, threads: int, described: int) -> Found:
+    """Run the kernel over blocks of joint-frames; `described` is the length of the last three results."""
+    if min_views < 2 or not gate > 0:
+        raise ValueError(f"min_views={min_views}, gate={gate}: out of range")
     from pipelines.geometry import triangulation_kernels as kernels
 
     n, cameras = views.weight.shape
-    found = Points(np.empty((n, 3)), np.empty((n, cameras), np.bool_), np.empty(n, np.int8))
-    code = {"dlt": kernels.DLT, "midpoint": kernels.MIDPOINT, "robust": kernels.ROBUST}[method]
-    xy, weight, position, rotation, focal, pixel_sigma, pose_sigma = (
-        np.ascontiguousarray(array, np.float64)
-        for array in (
-            views.xy,
-            views.weight,
-            views.position,
-            views.rotation,
-            views.focal,
-            views.pixel_sigma,
-            views.pose_sigma,
-        )
+    found = kernels.Found(
+        np.empty((n, 3)),
+        np.empty((n, cameras), np.bool_),
+        np.empty(n, np.int8),
+        np.empty((described, 3, 3)),
+        np.empty(described, np.int64),
+        np.empty((described, cameras)),
     )
-    pose_index = np.ascontiguousarray(views.pose_index, np.int64)
-    pairs, pair_count = _pair_table(cameras)
-    cos2_min = cos(radians(min_parallax_deg)) ** 2
-
-    def block(first: int, last: int) -> None:
-        kernels.triangulate_range(
-            first,
-            last,
-            code,
-            xy,
-            weight,
-            pose_index,
-            position,
-            rotation,
-            focal,
-            pixel_sigma,
-            pose_sigma,
-            pairs,
-            pair_count,
-            min_views,
-            cos2_min,
-            float(gate) ** 2,
-            found.points,
-            covariance,
-            count,
-            found.inlier,
-            residual_px,
-            found.status,
-        )
-
+    contiguous: list[Any] = [
+        np.ascontiguousarray(getattr(views, name), np.int64 if name == "pose_index" else np.float64)
+        for name in kernels.ViewArrays._fields
+    ]
+    arrays = kernels.ViewArrays(*contiguous)
+    gates = kernels.Gates(
+        {"dlt": kernels.DLT, "midpoint": kernels.MIDPOINT, "robust": kernels.ROBUST}[method],
+        min_views,
+        cos(radians(MIN_PARALLAX_DEG)) ** 2,
+        float(gate) ** 2,
+        *_pair_table(cameras),
+    )
     starts = range(0, n, _BLOCK)
     workers = min(threads, os.cpu_count() or 1, len(starts))
     if workers <= 1:
-        block(0, n)
+        kernels.triangulate_range(0, n, arrays, gates, found)
         return found
     # The kernel releases the interpreter lock and each block writes its own rows, so plain threads suffice.
     # Unlike numba's own threads, they may be started from several threads at once.
     with ThreadPoolExecutor(workers) as pool:
-        for done in [pool.submit(block, first, min(first + _BLOCK, n)) for first in starts]:
+        for done in [
+            pool.submit(kernels.triangulate_range, first, min(first + _BLOCK, n), arrays, gates, found)
+            for first in starts
+        ]:
             done.result()
     return found
 
@@ -269,13 +226,7 @@ def reprojection_px(views: Views, points: Float) -> Float:
     return result
 
 
-def estimate_noise(
-    views: Views,
-    *,
-    min_parallax_deg: float = MIN_PARALLAX_DEG,
-    gate: float = GATE,
-    threads: int = 1,
-) -> Float:
+def estimate_noise(views: Views, *, threads: int = 1) -> Float:
     """Estimate the pixel noise per axis [C] that explains the views' residuals; at least the stated one.
 
     Residuals may be larger than the stated pixel and pose noise explain, because poses are worse than their
@@ -301,13 +252,7 @@ def estimate_noise(
     )
 
     def explain(seen: Views, method: Method, sigma: Float) -> Float:
-        result = triangulate(
-            replace(seen, pixel_sigma=sigma),
-            method=method,
-            min_parallax_deg=min_parallax_deg,
-            gate=gate,
-            threads=threads,
-        )
+        result = triangulate(replace(seen, pixel_sigma=sigma), method=method, threads=threads)
         return _explaining_sigma(sample, result)
 
     table, count = _pair_table(cameras)

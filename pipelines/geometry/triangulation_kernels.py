@@ -10,6 +10,7 @@ moved to the mean camera centre, so that an origin kilometres away costs no prec
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,6 +28,41 @@ OK, FILLED, FEW_VIEWS, LOW_PARALLAX, REJECTED, NOT_DETECTED, NO_POSE = range(7) 
 # and 0.1 for 0.5 m / 2 deg (where the covariance changes with the depth); one step more would cost 40 %.
 CONVERGED = 1e-2
 MAX_STEPS = 10
+
+
+class ViewArrays(NamedTuple):
+    """Contiguous arrays of `triangulation.Views`."""
+
+    xy: Float  # [N, C, 2]
+    weight: Float  # [N, C]
+    pose_index: Int64  # [N]
+    position: Float  # [F, C, 3]
+    rotation: Float  # [F, C, 3, 3]
+    focal: Float  # [C]
+    pixel_sigma: Float  # [C]
+    pose_sigma: Float  # [F, C, 2]
+
+
+class Gates(NamedTuple):
+    """Method, and the conditions for a point."""
+
+    method: int  # DLT, MIDPOINT or ROBUST
+    min_views: int
+    cos2_min: float  # of the least parallax
+    gate2: float
+    pairs: Int64  # [m, k, 2] pairs of m views that propose a point
+    pair_count: Int64  # [m]
+
+
+class Found(NamedTuple):
+    """Results; see `triangulation.Triangulation`."""
+
+    points: Float  # [N, 3]
+    inlier: Bool  # [N, C]
+    status: Int8  # [N]
+    covariance: Float  # [N, 3, 3], or without rows if points alone are wanted; so the next two
+    views: Int64  # [N]
+    residual_px: Float  # [N, C]
 
 
 @helper
@@ -664,34 +700,11 @@ def _describe(
 
 
 @cached
-def triangulate_range(
-    first: int,
-    last: int,
-    method: int,
-    xy: Float,
-    weight: Float,
-    pose_index: Int64,
-    position: Float,
-    rotation: Float,
-    focal: Float,
-    pixel_sigma: Float,
-    pose_sigma: Float,
-    pair_table: Int64,
-    pair_count: Int64,
-    min_views: int,
-    cos2_min: float,
-    gate2: float,
-    points: Float,
-    covariance: Float,
-    count: Int64,
-    inlier: Bool,
-    residual_px: Float,
-    status: Int8,
-) -> None:
-    """Triangulate the joint-frames first <= n < last into the arrays at the end.
-
-    If `covariance` has no rows, `covariance`, `count` and `residual_px` are not written.
-    """
+def triangulate_range(first: int, last: int, views: ViewArrays, gates: Gates, found: Found) -> None:
+    """Triangulate the joint-frames first <= n < last."""
+    xy, weight, pose_index, position, rotation, focal, pixel_sigma, pose_sigma = views
+    method, min_views, cos2_min, gate2, pair_table, pair_count = gates
+    points, inlier, status, covariance, count, residual_px = found
     n_cameras = weight.shape[1]
     describe = covariance.shape[0] > 0
     camera = np.empty((n_cameras, 14))
@@ -706,41 +719,33 @@ def triangulate_range(
         if pose_index[n] != loaded:
             loaded = pose_index[n]
             origin = _load_cameras(position, rotation, pose_sigma, loaded, camera, posed)
-        views, detected = _load_views(xy, weight, n, camera, posed, ids, ray)
+        seen, detected = _load_views(xy, weight, n, camera, posed, ids, ray)
         if describe or method == ROBUST:
-            _load_noise(ids, ray, views, camera, pixel_variance)
+            _load_noise(ids, ray, seen, camera, pixel_variance)
         x = y = z = math.nan
         if detected == 0:
             outcome = NOT_DETECTED
         elif detected < min_views:
             outcome = FEW_VIEWS
-        elif views < min_views:
+        elif seen < min_views:
             outcome = NO_POSE
         else:
-            for k in range(views):
+            for k in range(seen):
                 used[k] = True
             outcome = OK
             if method == ROBUST:
                 x, y, z, outcome = _robust(
-                    ids,
-                    ray,
-                    views,
-                    used,
-                    camera,
-                    pair_table[views],
-                    pair_count[views],
-                    gate2,
-                    cos2_min,
+                    ids, ray, seen, used, camera, pair_table[seen], pair_count[seen], gate2, cos2_min,
                     min_views,
-                )
-            elif not _parallax(ray, used, views, cos2_min):
+                )  # fmt: skip
+            elif not _parallax(ray, used, seen, cos2_min):
                 outcome = LOW_PARALLAX
             else:
                 if method == MIDPOINT:
-                    x, y, z = _midpoint(ids, ray, views, camera)
+                    x, y, z = _midpoint(ids, ray, seen, camera)
                 else:
-                    x, y, z = _dlt(ids, ray, views, camera, focal)
-                if not _in_front(ids, views, camera, x, y, z):
+                    x, y, z = _dlt(ids, ray, seen, camera, focal)
+                if not _in_front(ids, seen, camera, x, y, z):
                     outcome = REJECTED
         status[n] = outcome
         for c in range(n_cameras):
@@ -749,7 +754,7 @@ def triangulate_range(
             points[n, 0] = x + origin[0]
             points[n, 1] = y + origin[1]
             points[n, 2] = z + origin[2]
-            for k in range(views):
+            for k in range(seen):
                 inlier[n, ids[k]] = used[k]
         else:
             points[n, :] = math.nan
@@ -757,14 +762,14 @@ def triangulate_range(
             residual_px[n, :] = math.nan
             total = 0
             if outcome == OK:
-                s = _describe(n, method, ids, ray, views, camera, focal, x, y, z, inlier, residual_px)
+                s = _describe(n, method, ids, ray, seen, camera, focal, x, y, z, inlier, residual_px)
                 covariance[n, 0, 0] = s[0]
                 covariance[n, 0, 1] = covariance[n, 1, 0] = s[1]
                 covariance[n, 0, 2] = covariance[n, 2, 0] = s[2]
                 covariance[n, 1, 1] = s[3]
                 covariance[n, 1, 2] = covariance[n, 2, 1] = s[4]
                 covariance[n, 2, 2] = s[5]
-                for k in range(views):
+                for k in range(seen):
                     total += used[k]
             else:
                 covariance[n, :, :] = math.nan
