@@ -248,12 +248,12 @@ def test_where_the_halves_meet_makes_no_difference(meeting: int, monkeypatch: py
     state = unpacked(packed(state) + rng.normal(0.0, 0.01, packed(state).size), state)
     system = System(problem, known, lay_out(known.poses, known.clock_sigma_s, 2, problem.knot_t_s), 9.0)
     # The two times that lack this bound are those of the meeting.
-    monkeypatch.setattr(elimination, "_ANYWHERE_M", 1e6)
+    monkeypatch.setattr("pipelines.reconstruction.refinement.system._ANYWHERE_M", 1e6)
     found = []
     for at_time in (6, meeting):  # 6: the second half has no times of its own
         monkeypatch.setattr(elimination, "halved", partial(parted, meeting=at_time))
         at = eliminate(system, state)
-        sums = vars(moments(system, state, at, every=1))
+        sums = moments(system, state, at, every=1)._asdict()
         del sums["bones"]  # those of the meeting are left out
         found.append([at.log_determinant, packed(step(system, at)), covariances(system, at), *sums.values()])
     for whole, parts in zip(*found, strict=True):
@@ -267,9 +267,7 @@ def test_two_threads_give_the_same_bytes() -> None:
     for threads in (1, 2):
         problem = replace(system.problem, threads=threads)
         again, solved, at = solve(problem, system.knowledge, state, rounds=2)
-        found.append(
-            [packed(solved), covariances(again, at), *vars(moments(again, solved, at, every=1)).values()]
-        )
+        found.append([packed(solved), covariances(again, at), *moments(again, solved, at, every=1)])
     for alone, together in zip(*found, strict=True):
         np.testing.assert_array_equal(alone, together)
 
