@@ -1,9 +1,11 @@
-"""Confidence intervals of means over a flight, by a block bootstrap, because neighbouring errors correlate.
+"""Confidence intervals of means, by the bootstrap: over trials, or over a flight, where neighbours correlate.
 
-This is the circular block bootstrap (Politis & Romano 1992). The flight is treated as a circle. Stretches of
-a fixed length are drawn from it with replacement and joined to a flight of the same length. The interval
-holds the middle 95 % of the means of many such flights. It does not include errors that are constant during
-the flight, such as a constant pose error. So it is valid for this flight, not for the next.
+Trials are independent: as many are drawn from them with replacement as there are (Efron & Tibshirani 1993,
+13.3). Over a flight this is the circular block bootstrap (Politis & Romano 1992). The flight is treated as a
+circle. Stretches of a fixed length are drawn from it with replacement and joined to a flight of the same
+length. The interval holds the middle 95 % of the means of many such draws. It does not include errors that
+are the same in all trials or constant during the flight, such as a constant pose error. So it is valid for
+this flight, not for the next.
 """
 
 from __future__ import annotations
@@ -16,15 +18,23 @@ import numpy as np
 from pipelines.geometry.arrays import Float, Int64
 
 Series = tuple[Float, Float]
-"""Sums [T] and weights [T] of a figure at every moment: the figure is the ratio of their totals."""
+"""Sums [T] and weights [T] of a figure at every moment or trial: the figure is the ratio of their totals."""
 
 LEVEL = 0.95
-STRETCH_S = 2.0
-"""Length of a stretch: two steps of a walk. Errors of detectors and of white poses decorrelate sooner."""
+STRETCH_S = 5.0
+"""Length of a stretch: the longest time over which the figures of a flight correlate.
 
-RESAMPLES = 1000
+Errors of detectors and white pose errors decorrelate within two steps of a walk, 2 s; tilt, occlusion and
+drifting pose errors follow the actor's path, past an obstacle or around a turn, for up to 5 s. Too short a
+stretch makes the interval too narrow. Too long a one makes only its ends less certain.
+"""
+
+RESAMPLES = 2000
+"""Draws; the ends of an interval scatter by 4 % of half its width."""
+
+_TAIL_PERCENT = 2.5
 _FEWEST_STRETCHES = 5
-_FEWEST_SAMPLES = 10
+_FEWEST_SAMPLES, _FEWEST_TRIALS = 10, 2
 
 
 def stretch_samples(t_ns: Int64) -> int:
@@ -34,32 +44,32 @@ def stretch_samples(t_ns: Int64) -> int:
 
 
 def intervals(
-    series: Mapping[str, Series], t_ns: Int64, *, seed: int = 0
+    series: Mapping[str, Series], t_ns: Int64 | None, *, seed: int = 0
 ) -> dict[str, tuple[float, float] | None]:
     """Compute the interval of every figure, with the same draws for all of them.
 
     Args:
         series: by name, [T] each; nothing may be NaN.
-        t_ns: [T] strictly increasing.
+        t_ns: [T] strictly increasing; None for independent trials.
         seed: of the draws.
 
     Returns:
-        By name; None with fewer than ten samples, or if a resampled flight has no data for the figure.
+        By name; None with fewer than ten samples or two trials, or if a draw has no data for the figure.
     """
     return {name: interval_of(values) for name, values in resampled(series, t_ns, seed=seed).items()}
 
 
-def resampled(series: Mapping[str, Series], t_ns: Int64, *, seed: int = 0) -> dict[str, Float]:
-    """Compute every figure of every resampled flight, [RESAMPLES], with the same draws for all figures.
+def resampled(series: Mapping[str, Series], t_ns: Int64 | None, *, seed: int = 0) -> dict[str, Float]:
+    """Compute every figure of every draw, [RESAMPLES], with the same draws for all figures.
 
-    The arguments are those of `intervals`. A value is NaN if a resampled flight has no data for the figure.
-    All values are NaN with fewer than ten samples.
+    The arguments are those of `intervals`. A value is NaN if a draw has no data for the figure. All values
+    are NaN with fewer than ten samples or two trials.
     """
-    times = len(t_ns)
-    if times < _FEWEST_SAMPLES:
+    count = len(next(iter(series.values()))[0]) if series else 0
+    if count < (_FEWEST_TRIALS if t_ns is None else _FEWEST_SAMPLES):
         return {name: np.full(RESAMPLES, np.nan) for name in series}
-    length = stretch_samples(t_ns)
-    first = np.random.default_rng(seed).integers(times, size=(RESAMPLES, math.ceil(times / length)))
+    length = 1 if t_ns is None else stretch_samples(t_ns)
+    first = np.random.default_rng([seed, count]).integers(count, size=(RESAMPLES, math.ceil(count / length)))
     found = {}
     for name, (sums, weights) in series.items():
         total, weight = (_of_stretches(values, length)[first].sum(axis=1) for values in (sums, weights))
@@ -69,15 +79,16 @@ def resampled(series: Mapping[str, Series], t_ns: Int64, *, seed: int = 0) -> di
 
 
 def interval_of(values: Float) -> tuple[float, float] | None:
-    """Return the middle 95 % of a figure of resampled flights; None if any of them has no data for it."""
+    """Return the middle 95 % of a figure's draws; None if any of them has no data for it."""
     if not np.isfinite(values).all():
         return None
-    tail = 50 * (1 - LEVEL)
-    low, high = np.percentile(values, [tail, 100 - tail])
+    low, high = np.percentile(values, [_TAIL_PERCENT, 100 - _TAIL_PERCENT])
     return float(low), float(high)
 
 
 def _of_stretches(values: Float, length: int) -> Float:
     """Sum [T] the stretch that begins at each sample; stretches wrap around the end."""
+    if length == 1:
+        return values
     total = np.concatenate([[0.0], np.cumsum(np.concatenate([values, values[: length - 1]]))])
     return np.asarray(total[length:] - total[:-length], dtype=np.float64)

@@ -1,7 +1,7 @@
 """Comparison of arms, as in metrics.json: scores, differences with their intervals, and the verdict.
 
-Intervals are percentiles of bootstrap means (Efron & Tibshirani 1993, 13.3): of the trials for errors, which
-are independent draws, and of stretches of the flight for figures that depend on the flight's course.
+Intervals are those of `geometry.bootstrap`: over the trials for errors, which are independent draws, and over
+stretches of the flight for figures that depend on the flight's course.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipelines.geometry.arrays import Bool, Float, Float32
+from pipelines.geometry.arrays import Bool, Float, Float32, Int64
+from pipelines.geometry.bootstrap import LEVEL, STRETCH_S, intervals
 from pipelines.planning.arm_flights import LOGGED, ArmFlight
 from pipelines.planning.config import PlannerConfig
 from pipelines.planning.distance_field import visible
@@ -21,10 +21,6 @@ from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.scene import Scene
 from pipelines.planning.scores import score
 
-RESAMPLES = 2000
-LEVEL = 0.95
-STRETCH_S = 5.0
-"""Length of the pieces in which the flight is resampled, because neighbouring moments are alike, s."""
 REFERENCE = "fixed"
 """Arm that the others are compared with; the first arm where it is missing."""
 _ALIKE_DEG = 2.0  # smaller differences of tilt are not reported
@@ -45,28 +41,19 @@ class Estimate:
 
 def mean_of_trials(values: Float, seed: int) -> Estimate | None:
     """Compute the mean of a figure over trials [K]; None without any, no interval for a single one."""
-    return _weighted(values, np.ones(len(values)), seed)
+    return _mean(values, None, seed)
 
 
-def mean_over_time(values: Float, counted: Bool, stretch: NDArray[np.int64], seed: int) -> Estimate | None:
-    """Compute the mean over the moments that count, with the interval of whole stretches.
+def mean_over_time(values: Float, counted: Bool, t_ns: Int64, seed: int) -> Estimate | None:
+    """Compute the mean over the moments that count, which are joined and resampled in stretches.
 
     Args:
         values: [T] or [N, T].
         counted: [T].
-        stretch: [T] the number of the stretch of every moment (`stretches`).
+        t_ns: [T] strictly increasing.
         seed: of the resampling.
     """
-    flat = np.atleast_2d(values).mean(axis=0)
-    weight = np.bincount(stretch, weights=counted.astype(np.float64)).astype(np.float64)
-    total = np.bincount(stretch, weights=np.where(counted, flat, 0.0)).astype(np.float64)
-    used = weight > 0
-    return _weighted(total[used] / weight[used], weight[used], seed)
-
-
-def stretches(t_s: Float) -> NDArray[np.int64]:
-    """Return the stretch [T] that each moment belongs to."""
-    return (t_s // STRETCH_S).astype(np.int64)
+    return _mean(np.atleast_2d(values).mean(axis=0)[counted], t_ns[counted], seed)
 
 
 def common_frames(errors: Mapping[str, Float32]) -> Bool:
@@ -98,18 +85,12 @@ def coverage(error_m: Float32, joint_frames: int) -> Float:
     return share
 
 
-def _weighted(values: Float, weight: Float, seed: int) -> Estimate | None:
-    """Compute the weighted mean of independent values, and its bootstrap interval."""
+def _mean(values: Float, t_ns: Int64 | None, seed: int) -> Estimate | None:
+    """Compute the mean of values over trials or times, and its interval."""
     if not len(values):
         return None
-    mean = float((values * weight).sum() / weight.sum())
-    if len(values) < 2:
-        return Estimate(mean, None)
-    rows = np.random.default_rng([seed, len(values)]).integers(len(values), size=(RESAMPLES, len(values)))
-    means = (values * weight)[rows].sum(axis=1) / weight[rows].sum(axis=1)
-    tail = 50 * (1 - LEVEL)
-    low, high = np.percentile(means, [tail, 100 - tail])
-    return Estimate(mean, (float(low), float(high)))
+    interval = intervals({"mean": (values, np.ones(len(values)))}, t_ns, seed=seed)["mean"]
+    return Estimate(float(values.mean()), interval)
 
 
 @dataclass(frozen=True)
@@ -206,7 +187,7 @@ def _difference(scene: Scene, one: ArmResult, other: ArmResult, shared: Bool | N
         of(scene, one.flight).mean(axis=0) - of(scene, other.flight).mean(axis=0)
         for of in (_tilt_deg, _hidden)
     )
-    always, stretch = np.ones(len(scene.t_ns), dtype=np.bool_), stretches(scene.t_s)
+    always = np.ones(len(scene.t_ns), dtype=np.bool_)
     seed = scene.settings.seed
     error = cover = None
     if one.error_m is not None and other.error_m is not None and shared is not None:
@@ -216,9 +197,9 @@ def _difference(scene: Scene, one: ArmResult, other: ArmResult, shared: Bool | N
             coverage(one.error_m, one.joint_frames) - coverage(other.error_m, other.joint_frames), seed
         )
     return {
-        "tilt_deg": _json(mean_over_time(tilt_deg, always, stretch, seed)),
-        "tilt_near_obstacle_deg": _json(mean_over_time(tilt_deg, scene.near, stretch, seed)),
-        "occluded_share": _json(mean_over_time(hidden, always, stretch, seed)),
+        "tilt_deg": _json(mean_over_time(tilt_deg, always, scene.t_ns, seed)),
+        "tilt_near_obstacle_deg": _json(mean_over_time(tilt_deg, scene.near, scene.t_ns, seed)),
+        "occluded_share": _json(mean_over_time(hidden, always, scene.t_ns, seed)),
         "mpjpe_mm": _json(error),
         "coverage": _json(cover),
         "simulated": True,

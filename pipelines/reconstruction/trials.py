@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.geometry import bootstrap
 from pipelines.geometry.noise import NoiseModel, disturb, sum_sigma
 from pipelines.reconstruction.observations import Camera
 from pipelines.session.errors import DataError
@@ -32,8 +33,6 @@ _FIGURES = (
     "acceleration_error_mm_s2",
     "reconstructed_share",
 )
-_RESAMPLES = 2000
-_TAIL_PERCENT = 2.5
 
 
 def disturbances(text: str | None, trials: int) -> list[NoiseModel] | None:
@@ -77,24 +76,21 @@ def told_together(metrics: Sequence[Mapping[str, Any]], text: str, seed: int) ->
 
     Returns:
         JSON-able, null for figures that could not be measured: `each` trial's figures, their `mean`, `std`
-        (about the mean, n - 1) and the `intervals` that hold 95 % of the means of resampled trials (Efron &
-        Tibshirani 1993, 13.3); both null for less than two trials.
+        (about the mean, n - 1) and the `intervals` of `geometry.bootstrap` over trials; both null for less
+        than two trials.
     """
     each = [_figures(told) for told in metrics]
     mean: dict[str, float | None] = {}
     std: dict[str, float | None] = {}
-    intervals: dict[str, list[float] | None] = {}
+    ends: dict[str, list[float] | None] = {}
     for name in each[0]:
         values = np.array([told[name] for told in each if told[name] is not None], dtype=np.float64)
         mean[name] = float(values.mean()) if values.size else None
-        std[name] = intervals[name] = None
+        std[name] = ends[name] = None
         if values.size > 1:
             std[name] = float(values.std(ddof=1))
-            rows = np.random.default_rng([seed, values.size]).integers(
-                values.size, size=(_RESAMPLES, values.size)
-            )
-            ends = np.percentile(values[rows].mean(axis=1), [_TAIL_PERCENT, 100 - _TAIL_PERCENT])
-            intervals[name] = [float(end) for end in ends]
+            found = bootstrap.intervals({name: (values, np.ones(values.size))}, None, seed=seed)[name]
+            ends[name] = None if found is None else list(found)
     return {
         "disturb_poses": text,
         "seed": seed,
@@ -102,7 +98,7 @@ def told_together(metrics: Sequence[Mapping[str, Any]], text: str, seed: int) ->
         "stored": STORED,
         "mean": mean,
         "std": std,
-        "intervals": intervals,
+        "intervals": ends,
         "each": each,
     }
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.geometry.arrays import Float
+from pipelines.geometry.bootstrap import interval_of, resampled
 from pipelines.reporting.content import StudyContent
 from pipelines.reporting.plates import (
     CAMERAS,
@@ -30,7 +31,6 @@ from pipelines.reporting.plates import (
     tabled,
 )
 from pipelines.reporting.wording import fixed, quantity
-from pipelines.session.records import Int64
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,8 +53,6 @@ _SHARES = {"pck150", "reconstructed_share", "fell_back"}  # in percent there
 _DRAWN = ("mpjpe_mm", "root_mpjpe_mm")
 _CONDITION = ("tilt_deg", "drones", "noise", "noise_model", "method")
 _VARIED = {"tilt": "tilt_deg", "robots": "drones"}
-_RESAMPLES = 2000
-_TAIL_PERCENT = 2.5
 _NOTHING_MM = 1e-3  # errors below are none: no ratio is taken to them
 
 _PANEL_IN, _ROW_IN, _SMALLEST_IN = 2.7, 2.0, 5.4
@@ -76,7 +74,7 @@ _BEST = ("refined", "robust", "midpoint", "dlt")  # the sentence is about the fi
 def estimates(rows: Sequence[Row], study: str, *, seed: int) -> list[dict[str, Any]]:
     """Compute the means over trials of every condition and method.
 
-    Intervals hold 95 % of the means of resampled trials (Efron & Tibshirani 1993, 13.3).
+    Intervals are those of `geometry.bootstrap` over trials.
 
     Args:
         rows: of every trial.
@@ -114,16 +112,12 @@ def _is_measured(name: str) -> bool:
     return name not in {*_CONDITION, "trial", "per_joint"}
 
 
-def _resampled(trials: int, seed: int) -> Int64:
-    """Draw rows of trials [B, K] with replacement."""
-    return np.random.default_rng([seed, trials]).integers(trials, size=(_RESAMPLES, trials))
-
-
 def _mean(rows: Sequence[Row], name: str, seed: int) -> dict[str, Any] | None:
     values = np.array([row[name] for row in rows if row[name] is not None], dtype=np.float64)
     if not values.size:
         return None
-    return _estimate(float(values.mean()), values[_resampled(len(values), seed)].mean(axis=1), len(values))
+    drawn = resampled({name: (values, np.ones(len(values)))}, None, seed=seed)[name]
+    return _estimate(float(values.mean()), drawn, len(values))
 
 
 def _ratio(rows: Sequence[Row], others: Sequence[Row], seed: int) -> dict[str, Any] | None:
@@ -139,16 +133,14 @@ def _ratio(rows: Sequence[Row], others: Sequence[Row], seed: int) -> dict[str, A
     if not len(pairs) or pairs[:, 1].min() < _NOTHING_MM:
         return None
     own, other = pairs.mean(axis=0)
-    drawn = pairs[_resampled(len(pairs), seed)].mean(axis=1)
-    return _estimate(float(own / other), drawn[:, 0] / drawn[:, 1], len(pairs))
+    drawn = resampled({"": (pairs[:, 0], pairs[:, 1])}, None, seed=seed)[""]
+    return _estimate(float(own / other), drawn, len(pairs))
 
 
 def _estimate(mean: float, drawn: Float, trials: int) -> dict[str, Any]:
-    interval = None
-    if drawn.min() < drawn.max():  # trials without chance (exact poses, pictures filmed once) have none
-        low, high = np.percentile(drawn, [_TAIL_PERCENT, 100 - _TAIL_PERCENT])
-        interval = [float(low), float(high)]
-    return {"mean": mean, "interval": interval, "trials": trials}
+    # Trials without chance (exact poses, pictures filmed once) have no interval.
+    ends = interval_of(drawn) if drawn.min() < drawn.max() else None
+    return {"mean": mean, "interval": None if ends is None else list(ends), "trials": trials}
 
 
 def _per_joint(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:

@@ -127,11 +127,11 @@ def test_intervals_are_those_of_known_variances(content: SessionContent, apart: 
     assert pair.by_time is not apart
     assert interval is not None
     width = 2 * NORMAL_95 * np.sqrt(2 * 20**2 / 12 / frames)
-    # The spread of white stretches of two samples is known to 1 / sqrt(600) * sqrt(1.5) = 5 %, that of 1000
-    # draws to 2 %, their tails to 4 %: three standard deviations of all of it are 20 %.
+    # The spread of white stretches of five samples is known to sqrt(4 * 5 / 3 / 600) / 2 = 5 %, that of 2000
+    # draws to 1.5 %, their tails to 3 %: three standard deviations of all of it are 20 %.
     assert interval[1] - interval[0] == pytest.approx(width, rel=0.2)
-    assert STRETCH_S == 2.0
-    assert RESAMPLES == 1000
+    assert STRETCH_S == 5.0
+    assert RESAMPLES == 2000
 
 
 def test_verdict_names_the_better_one_and_by_how_much(content: SessionContent) -> None:
