@@ -34,7 +34,7 @@ def both_errors_mm(cameras: int, level: str, seed: int) -> tuple[float, float]:
     """Compute the mean errors (mm) over joint-frames that both losses reconstruct, in one draw."""
     rng = np.random.default_rng([seed, cameras])
     truth, exact = ring(FRAMES, cameras)
-    views = with_pose_noise(with_pixel_noise(exact, rng), rng, level, constant=True, told=False)
+    views = with_pose_noise(with_pixel_noise(exact, rng), rng, level, constant=True, stated=False)
     views = replace(views, pixel_sigma=estimate_noise(views))
     plain = triangulate(views, method="robust").points
     heavy = triangulate_heavy_tailed(views, threads=1).points

@@ -51,7 +51,7 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, nargs="*", default=[2, 3, 5])
     parser.add_argument("--long", type=int, default=2250, help="frames of the speed table, 0 for none")
     arguments = parser.parse_args()
-    formation_and_refined(60, 3, (), 0, told=True)  # compiles
+    formation_and_refined(60, 3, (), 0, stated=True)  # compiles
     if arguments.long:
         print_speed(arguments.long)
     if arguments.seeds:
@@ -66,7 +66,7 @@ def print_speed(times: int) -> None:
     for name, share in (("2 px", 0.0), ("outliers", 0.05)):
         flight = formation(times, 5, (), 0, bad_share=share)
         started, busy = time.perf_counter(), time.process_time()
-        result = refined_of(flight, (), told=True, threads=2)
+        result = refined_of(flight, (), stated=True, threads=2)
         elapsed, busy = time.perf_counter() - started, time.process_time() - busy
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(
@@ -85,22 +85,25 @@ def print_speed(times: int) -> None:
 
 
 def print_noise(times: int, cameras: Sequence[int], seeds: int) -> None:
-    """Print results for every noise model, stated (told) or not, with hovering and moving cameras."""
+    """Print results for every noise model, stated (stated) or not, with hovering and moving cameras."""
     print(f"\n{seeds} flights of {times} frames, 0.3 m / 1 deg, 2 px: mean mm, absolute / root-relative")
-    print("| noise | cameras | formation | told | robust | refined | ratio (worst) | NEES | fell back |")
+    print("| noise | cameras | formation | stated | robust | refined | ratio (worst) | NEES | fell back |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for name, models in MODELS.items():
         for count in cameras:
             for still in (False, True):
-                for told in (True, False):
+                for stated in (True, False):
                     rows = np.array(
-                        [row_of(times, count, models, seed, still=still, told=told) for seed in range(seeds)]
+                        [
+                            row_of(times, count, models, seed, still=still, stated=stated)
+                            for seed in range(seeds)
+                        ]
                     )
                     mean = rows.mean(axis=0)
                     ratio = rows[:, 2] / rows[:, 0]
-                    believed = rows[rows[:, 5] == 0, 4]
-                    nees = f"{believed.mean():.2f}" if len(believed) else ""
-                    formed, knows = ("hovering" if still else "moving"), ("yes" if told else "no")
+                    kept = rows[rows[:, 5] == 0, 4]
+                    nees = f"{kept.mean():.2f}" if len(kept) else ""
+                    formed, knows = ("hovering" if still else "moving"), ("yes" if stated else "no")
                     print(
                         f"| {name} | {count} | {formed} | {knows}"
                         f" | {mean[0]:.0f} / {mean[1]:.0f} | {mean[2]:.1f} / {mean[3]:.1f}"
@@ -112,10 +115,10 @@ def print_noise(times: int, cameras: Sequence[int], seeds: int) -> None:
 
 
 def row_of(
-    times: int, cameras: int, models: Sequence[NoiseModel], seed: int, *, still: bool, told: bool
+    times: int, cameras: int, models: Sequence[NoiseModel], seed: int, *, still: bool, stated: bool
 ) -> list[float]:
     """Compute errors of `robust` and `refined` (`robust`'s after a fallback), NEES, and fallback (0 or 1)."""
-    flight, result = formation_and_refined(times, cameras, models, seed, told=told, still=still)
+    flight, result = formation_and_refined(times, cameras, models, seed, stated=stated, still=still)
     fell = result.fallback is not None
     position = flight.start if fell else result.position
     nees = np.nan if fell else mean_nees(result, flight.truth)
@@ -130,17 +133,17 @@ def row_of(
 
 
 def formation_and_refined(
-    times: int, cameras: int, models: Sequence[NoiseModel], seed: int, *, told: bool, still: bool = False
+    times: int, cameras: int, models: Sequence[NoiseModel], seed: int, *, stated: bool, still: bool = False
 ) -> tuple[Formation, Refined]:
     """Simulate a flight and refine it."""
     flight = formation(times, cameras, models, seed, still=still)
-    return flight, refined_of(flight, models, told=told)
+    return flight, refined_of(flight, models, stated=stated)
 
 
-def refined_of(flight: Formation, models: Sequence[NoiseModel], *, told: bool, threads: int = 1) -> Refined:
-    """Refine a flight; without stated noise (`told` False) the refinement estimates the levels itself."""
+def refined_of(flight: Formation, models: Sequence[NoiseModel], *, stated: bool, threads: int = 1) -> Refined:
+    """Refine a flight; without stated noise (`stated` False) the refinement estimates the levels itself."""
     count = len(flight.sightings)
-    prior = [pose_errors(models)] * count if told else None
+    prior = [pose_errors(models)] * count if stated else None
     return refine(flight.t_s, flight.sightings, flight.start, BONES, prior, np.zeros(count), threads=threads)
 
 

@@ -1,7 +1,7 @@
 """Distance of `refined` from the information bound, and calibration of its covariances, on short flights.
 
 python -m benchmarks.refine_calibration [--noise NAME ...] [--draws N] [--times T] [--cameras N ...]
-    [--told WHAT]
+    [--stated LEVELS]
 
 Simulated: the walk and the formations of `benchmarks.refine`, moving cameras, every flight with its own
 keypoint and pose errors. All joint-frames of a flight share its pose errors, so a flight is one draw:
@@ -63,32 +63,32 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=400)
     parser.add_argument("--times", type=int, default=90, help="frames of each flight, at 30 Hz")
     parser.add_argument("--cameras", type=int, nargs="*", default=[2, 3, 5])
-    parser.add_argument("--told", default="right", choices=["right", "nothing"])
+    parser.add_argument("--stated", default="right", choices=["right", "nothing"])
     arguments = parser.parse_args()
     print("RMS in mm: absolute / root-relative / PA")
     print(
-        "| noise | n | told | flights | fell back | robust | refined | bound, learned | bound, known"
+        "| noise | n | stated | flights | fell back | robust | refined | bound, learned | bound, known"
         " | refined / learned | refined / known | NEES | within 95 % ellipsoids | CPU s a flight |"
     )
     print("|" + " --- |" * 14)
     with get_context("spawn").Pool(2) as pool:
         for name in arguments.noise:
             for cameras in arguments.cameras:
-                one = partial(drawn, name, arguments.times, cameras, arguments.told == "right")
+                one = partial(drawn, name, arguments.times, cameras, arguments.stated == "right")
                 draws = list(pool.imap(one, range(arguments.draws)))
                 exact = formation(arguments.times, cameras, (), 0)
                 known = expected_mm(exact, MODELS[name], accelerations(exact.truth), _EXPECTED, seed=0)
-                print(f"| {name} | {cameras} | {arguments.told} | {row_of(draws, known)} |", flush=True)
+                print(f"| {name} | {cameras} | {arguments.stated} | {row_of(draws, known)} |", flush=True)
                 for seed, draw in enumerate(draws):
                     if draw.fallback is not None:
                         print(f"  flight {seed} fell back: {draw.fallback}", flush=True)
 
 
-def drawn(name: str, times: int, cameras: int, told: bool, seed: int) -> Draw:
+def drawn(name: str, times: int, cameras: int, stated: bool, seed: int) -> Draw:
     """Simulate and refine one flight; its processor time is that of the refinement."""
     flight = formation(times, cameras, MODELS[name], seed, pixel_px=_PIXEL_PX)
     began = time.process_time()
-    result = refined_of(flight, MODELS[name], told=told)
+    result = refined_of(flight, MODELS[name], stated=stated)
     cpu_s = time.process_time() - began
     robust_mm = errors_mm(flight.start - flight.truth, flight.truth)
     if result.fallback is not None:
@@ -102,16 +102,16 @@ def drawn(name: str, times: int, cameras: int, told: bool, seed: int) -> Draw:
 
 def row_of(draws: Sequence[Draw], known_mm: Float) -> str:
     """Format the cells of one noise model."""
-    believed = [draw.squares for draw in draws if draw.squares is not None]
+    kept = [draw.squares for draw in draws if draw.squares is not None]
     robust, refined, learned = (
         np.sqrt(np.nanmean(np.square([getattr(draw, f"{name}_mm") for draw in draws]), axis=0))
         for name in ("robust", "refined", "bound")
     )
-    nees = [float(squares.mean()) for squares in believed]
-    within = [100 * float((squares < CHI2_95).mean()) for squares in believed]
+    nees = [float(squares.mean()) for squares in kept]
+    within = [100 * float((squares < CHI2_95).mean()) for squares in kept]
     ratios = [" / ".join(f"{value:.2f}" for value in refined / bound) for bound in (learned, known_mm)]
     return (
-        f"{len(draws)} | {len(draws) - len(believed)} | {slashed(robust)} | {slashed(refined)}"
+        f"{len(draws)} | {len(draws) - len(kept)} | {slashed(robust)} | {slashed(refined)}"
         f" | {slashed(learned)} | {slashed(known_mm)} | {' | '.join(ratios)}"
         f" | {with_error(nees, 2)} | {with_error(within, 1)}"
         f" | {np.mean([draw.cpu_s for draw in draws]):.1f}"

@@ -1,11 +1,11 @@
 """Search for cases where `refined` is worse than `robust`: noise stated, stated wrongly and not stated.
 
 python -m benchmarks.refine_grid [--seeds N] [--times T] [--cameras N ...] [--tilts DEG ...]
-    [--noise NAME ...] [--told WHAT ...] [--formation KIND ...] [--keypoints KIND ...]
+    [--noise NAME ...] [--stated WHAT ...] [--formation KIND ...] [--keypoints KIND ...]
     [--bad-share SHARE] [--csv FILE]
 
 Simulated: the walk and the formations of `benchmarks.refine`, 0.3 m / 1 deg, 2 px. A cell is a noise model, a
-number of cameras, hovering or moving, a tilt and the stated noise (`--told`). Its ratio is that of the mean
+number of cameras, hovering or moving, a tilt and the stated noise (`--stated`). Its ratio is that of the mean
 errors over the seeds; after a fallback the errors of `robust` count. With `--bad-share 0.05` the same flights
 with the same noise have 5 % of their keypoints 100 to 300 px off, and 5 % missing. Two processes; set
 OPENBLAS_NUM_THREADS=1.
@@ -49,7 +49,7 @@ class Case:
     cameras: int
     hovering: bool
     tilt_deg: float
-    told: str  # right, wrong, nothing
+    stated: str  # right, wrong, nothing
     keypoints: str  # white; correlated: as a detector's, see `KEYPOINTS`
     bad_share: float  # share of keypoints that are far off, and share that are missing
     times: int
@@ -84,7 +84,7 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, nargs="*", default=[2, 3, 4, 5])
     parser.add_argument("--tilts", type=float, nargs="*", default=[15.0, 45.0])
     parser.add_argument("--noise", nargs="*", default=list(MODELS), choices=list(MODELS))
-    parser.add_argument("--told", nargs="*", default=["right", "wrong", "nothing"])
+    parser.add_argument("--stated", nargs="*", default=["right", "wrong", "nothing"])
     parser.add_argument("--formation", nargs="*", default=["moving", "hovering"])
     parser.add_argument("--keypoints", nargs="*", default=["white"], choices=list(KEYPOINTS))
     parser.add_argument("--bad-share", type=float, default=0.0, help="of keypoints far off, and missing")
@@ -96,7 +96,7 @@ def main() -> None:
             arguments.cameras,
             [name == "hovering" for name in arguments.formation],
             arguments.tilts,
-            arguments.told,
+            arguments.stated,
             arguments.keypoints,
             [arguments.bad_share],
         )
@@ -106,7 +106,7 @@ def main() -> None:
     if arguments.bad_share:
         print(f"{arguments.bad_share:.0%} of the keypoints far off, {arguments.bad_share:.0%} missing\n")
     print(
-        "| noise | n | formation | tilt | told | keypoints | robust mm | refined mm | ratio (worst) | NEES"
+        "| noise | n | formation | tilt | stated | keypoints | robust mm | refined mm | ratio (worst) | NEES"
         " | fell back | CPU s |"
     )
     print("|" + " --- |" * 12)
@@ -149,8 +149,8 @@ def outcome_of(case: Case) -> Outcome:
         constant_px=constant_px,
         bad_share=case.bad_share,
     )
-    told = {"right": models, "wrong": _WRONG[case.noise], "nothing": None}[case.told]
-    prior = None if told is None else [pose_errors(told)] * case.cameras
+    stated = {"right": models, "wrong": _WRONG[case.noise], "nothing": None}[case.stated]
+    prior = None if stated is None else [pose_errors(stated)] * case.cameras
     began = time.process_time()
     result = refine(flight.t_s, flight.sightings, flight.start, BONES, prior, np.zeros(case.cameras))
     took = time.process_time() - began
@@ -181,7 +181,7 @@ def summary(found: Sequence[tuple[Case, Outcome]]) -> tuple[str, float]:
         str(case.cameras),
         "hovering" if case.hovering else "moving",
         f"{case.tilt_deg:.0f}",
-        case.told,
+        case.stated,
         case.keypoints,
         f"{robust.mean():.0f} / {roots[0]:.0f}",
         f"{refined.mean():.1f} / {roots[1]:.1f}",

@@ -127,14 +127,14 @@ def print_peers(truth: Float, noisy: Views, outliers: Views, repeats: int) -> No
 
 def print_pose_errors(draws: int) -> None:
     """Print the mean error under constant pose errors over `draws` independent draws."""
-    print(f"\nMean mm over {draws} draws of a constant pose error, 2 px; told: pose_sigma states it")
-    print("joints alone: told, without the gate of pictures")
+    print(f"\nMean mm over {draws} draws of a constant pose error, 2 px; stated: in pose_sigma")
+    print("joints alone: stated, without the gate of pictures")
     print(
-        "only good: `robust`, told, of exactly the good views of the outliers; and what each reconstructed\n"
+        "only good: `robust`, stated, of only the good views of the outliers; and what each reconstructed\n"
     )
     print(
-        "| cameras | level | midpoint | robust, told | not told | outliers: midpoint | joints alone | told"
-        " | not told | only good | joints alone, % there | told, % there | only good, % there |"
+        "| cameras | level | midpoint | robust, stated | not stated | outliers: midpoint | joints alone"
+        " | stated | not stated | only good | joints alone, % there | stated, % there | only good, % there |"
     )
     print("|" + " --- |" * 13)
     for cameras in (2, 3, 4, 5):
@@ -154,15 +154,15 @@ def print_pose_errors(draws: int) -> None:
 def errors_of(exact: Views, truth: Float, level: str, draw: int) -> list[float]:
     """Compute one draw: errors without and with outliers and of good views only; reconstructed shares."""
     rng = np.random.default_rng(draw)
-    told = with_pose_noise(with_pixel_noise(exact, rng), rng, level, constant=True, told=True)
-    outliers, good = with_outliers(told, rng, uniform=False)
+    known = with_pose_noise(with_pixel_noise(exact, rng), rng, level, constant=True, stated=True)
+    outliers, good = with_outliers(known, rng, uniform=False)
     alone = locate(replace(outliers, pixel_sigma=estimate_noise(outliers)), method="robust").points
     despite = robustly(outliers)
     only_good = robustly(replace(outliers, weight=outliers.weight * good))
     return [
-        error_mm(locate(told, method="midpoint").points, truth),
-        error_mm(robustly(told), truth),
-        error_mm(robustly(silent(told)), truth),
+        error_mm(locate(known, method="midpoint").points, truth),
+        error_mm(robustly(known), truth),
+        error_mm(robustly(silent(known)), truth),
         error_mm(locate(outliers, method="midpoint").points, truth),
         error_mm(alone, truth),
         error_mm(despite, truth),
@@ -176,8 +176,8 @@ def errors_of(exact: Views, truth: Float, level: str, draw: int) -> list[float]:
 
 def robustly(views: Views) -> Float:
     """Triangulate with `robust` as used for moving cameras."""
-    told = replace(views, pixel_sigma=estimate_noise(views))
-    return triangulate_pictures(told, picture=views.pose_index, pixel_sigma=views.pixel_sigma).points
+    noisy = replace(views, pixel_sigma=estimate_noise(views))
+    return triangulate_pictures(noisy, picture=views.pose_index, pixel_sigma=views.pixel_sigma).points
 
 
 def silent(views: Views) -> Views:

@@ -79,12 +79,13 @@ def _checked(
         cameras, _ = load_cameras(
             folder, description, detected, min_confidence=_CONFIDENT, pose_noise=pose_noise
         )
-        found = find_people(cameras, description.pose_interpolation, logged_actor(folder, description))
+        actor = logged_actor(folder, description)
+        found, association, _ = find_people(cameras, description.pose_interpolation, actor)
         doubts = doubts_of(
             folder,
             description,
             cameras,
-            chosen=chosen_detections(cameras, *found),
+            chosen=chosen_detections(cameras, found, association),
             pose_noise=pose_noise,
         )
     return Checked(doubts, list(description.warnings), pictures)

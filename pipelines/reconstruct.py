@@ -52,13 +52,13 @@ from pipelines.reconstruction.results import assess, camera_poses_table, skeleto
 from pipelines.reconstruction.smoothing import smoother
 from pipelines.reconstruction.solving import (
     UNKNOWN_SIGMA,
+    noise_text,
     ray_sigma,
     refused_people,
-    said_noise,
     solver_for,
     views_with_noise,
 )
-from pipelines.reconstruction.trials import disturbances, disturbed, told_together
+from pipelines.reconstruction.trials import disturbances, disturbed, summary_of_trials
 from pipelines.session.description import Description, Interpolation, read_description
 from pipelines.session.errors import DataError
 from pipelines.session.people import LoggedActor, logged_actor, true_joints_at
@@ -204,21 +204,21 @@ def reconstruct(
         _refuse_doubted(folder, metrics["doubts"], strict=strict)
         if settings.disturb_poses is not None:
             every = [metrics, *(attempt.metrics for attempt in attempts)]
-            metrics = metrics | {"trials": told_together(every, settings.disturb_poses, settings.seed)}
-            warnings.append(_said_disturbance(settings))
+            metrics = metrics | {"trials": summary_of_trials(every, settings.disturb_poses, settings.seed)}
+            warnings.append(_disturbance_warning(settings))
         metrics = jsonable(metrics)
         _write(run.folder, stored, metrics)
         record = run.publish(
             counts=_counts(metrics, stored, swaps),
             warnings=[
                 *said_doubts(doubts),
-                *_said_hints(description, ingested, detected),
+                *_hint_warnings(description, ingested, detected),
                 *warnings,
                 *stored.warnings,
-                *_unused(cameras, stored.result),
+                *_unused_cameras(cameras, stored.result),
             ],
         )
-        _tell_replaced(run, progress)
+        _note_replaced(run, progress)
     return Reconstructed(folder, record, metrics, skipped=False)
 
 
@@ -259,7 +259,9 @@ def _inputs(ingested: StageRecord, detected: StageRecord | None, measured: Path 
     return inputs if measured is None else inputs | {"calibration of confidences": sha256_of(measured)}
 
 
-def _said_hints(description: Description, ingested: StageRecord, detected: StageRecord | None) -> list[str]:
+def _hint_warnings(
+    description: Description, ingested: StageRecord, detected: StageRecord | None
+) -> list[str]:
     """Say where keypoints were found with other clocks, poses or calibrations than were ingested last."""
     if detected is None or hints_from(detected) == hints_of(
         description, ingested, detected.counts["cameras"]
@@ -280,7 +282,7 @@ def _check_fill(fill_s: float | None) -> None:
         )
 
 
-def _said_disturbance(settings: Settings) -> str:
+def _disturbance_warning(settings: Settings) -> str:
     draws = "a single draw" if settings.trials == 1 else f"trial 0 of {settings.trials}"
     return (
         f"the poses were disturbed by {settings.disturb_poses}: the skeleton and the figures without `trials`"
@@ -298,17 +300,17 @@ def _write(folder: Path, attempt: _Attempt, metrics: Mapping[str, object]) -> No
 
 def _counts(metrics: Mapping[str, Any], attempt: _Attempt, swaps: Mapping[str, object]) -> dict[str, object]:
     """Count joints by status, undone swaps, filled and smoothed joints, and events of the association."""
-    told_apart = ("views", "ambiguous", "switches", "refused", "resumed")
+    events = ("views", "ambiguous", "switches", "refused", "resumed")
     return {
         **metrics["status_counts"],
-        "association": {name: getattr(attempt.association, name).tolist() for name in told_apart},
+        "association": {name: getattr(attempt.association, name).tolist() for name in events},
         "left_right_swaps": {"undone_over_time": swaps, "between_views": attempt.between_views},
         "filled": metrics["filled"],
         "smoothing": metrics["smoothing"],
     }
 
 
-def _tell_replaced(run: Run, progress: Progress) -> None:
+def _note_replaced(run: Run, progress: Progress) -> None:
     """Report the changed settings of a replaced reconstruction, and the stages removed with it."""
     for name, (before, now) in run.replaces.items():
         progress.note(f"replaced the reconstruction made with {name} = {before} (now {now})")
@@ -401,8 +403,8 @@ def _attempt(
             *warnings,
             *(refined.warnings if refined else []),
             *seen.association.reasons,
-            *_said_people(people["people"]),
-            *_said_readout(readout),
+            *_people_warnings(people["people"]),
+            *_readout_warnings(readout),
         ],
     )
 
@@ -422,15 +424,14 @@ class _Seen:
 def _observe(flight: _Flight, cameras: list[Camera], settings: Settings) -> _Seen:
     """Associate people, interpolate their keypoints to common times, and correct left-right swaps."""
     between, pixel_sigma = flight.description.pose_interpolation, settings.pixel_sigma
-    found, association = find_people(
+    found, association, sigma = find_people(
         cameras, between, flight.actor, people=settings.people, pixel_sigma=pixel_sigma
     )
     base = time_base(cameras, settings.rate_hz)
     observations = observe(cameras, found, association.choice, base, between)
     nearest = np.clip(np.searchsorted(found.t_ns, observations.t_ns), 0, len(found.t_ns) - 1)
     anybody = np.asarray((found.confidence > 0).any(axis=(1, 2, 3)), dtype=np.bool_)[nearest]
-    sigma = ray_sigma(cameras, observations.t_ns, observations.position, pixel_sigma=pixel_sigma)
-    sides, between_views = _agreeing_sides(observations, sigma)
+    sides, between_views = _agreeing_sides(observations, sigma[nearest])
     xy, confidence = on_sides(observations.xy, observations.confidence, sides)
     observations = replace(observations, xy=xy, confidence=confidence)
     return _Seen(found, association, observations, sides, between_views, anybody)
@@ -443,20 +444,24 @@ def find_people(
     *,
     people: int = Settings.people,
     pixel_sigma: float = Settings.pixel_sigma,
-) -> tuple[Candidates, Association]:
-    """Collect all detections at common times, and associate them with people; person 0 is the actor."""
+) -> tuple[Candidates, Association, Float]:
+    """Collect all detections at common times, and associate them with people; person 0 is the actor.
+
+    The last result is the uncertainty of rays, see `ray_sigma`.
+    """
     found = candidates(cameras, between)
+    sigma = ray_sigma(cameras, found.t_ns, found.position, pixel_sigma=pixel_sigma)
     association = associate(
         (found.t_ns - found.t_ns[0]) / 1e9,
         found.xy,
         found.confidence,
         found.position,
         found.rotation,
-        ray_sigma(cameras, found.t_ns, found.position, pixel_sigma=pixel_sigma),
+        sigma,
         actor=None if actor is None else actor.hips_at(found.t_ns),
         people=people,
     )
-    return found, association
+    return found, association, sigma
 
 
 def chosen_detections(cameras: Sequence[Camera], found: Candidates, association: Association) -> list[Int64]:
@@ -494,7 +499,7 @@ def _people_seen(cameras: Sequence[Camera], association: Association) -> dict[st
     }
 
 
-def _said_people(people: Mapping[str, Any]) -> list[str]:
+def _people_warnings(people: Mapping[str, Any]) -> list[str]:
     """Write a warning on unused detections, and on more people than requested."""
     unused = [f"{name} {count}" for name, count in people["detections_not_used"].items() if count]
     if not unused:
@@ -520,7 +525,7 @@ def _readout(cameras: Sequence[Camera], seen: _Seen) -> dict[str, Any]:
     return {"readout": rolling} if rolling else {}
 
 
-def _said_readout(readout: Mapping[str, Any]) -> list[str]:
+def _readout_warnings(readout: Mapping[str, Any]) -> list[str]:
     """Say which cameras have keypoints that could not be moved."""
     return [
         f"{name}: {counts['without_motion']} keypoints stand at the picture's time instead of their row's:"
@@ -663,7 +668,7 @@ def _refuse_nothing(folder: Path, attempt: _Attempt, doubts: Sequence[Doubt]) ->
     remedies = [doubt.remedy for doubt in doubts[:1] if doubt.remedy]
     raise DataError(
         folder,
-        "; ".join([f"no joint could be reconstructed ({gates}; {said_noise(attempt.views)})", *reasons]),
+        "; ".join([f"no joint could be reconstructed ({gates}; {noise_text(attempt.views)})", *reasons]),
         *(remedies or ["check calibration, clocks and poses, or state another pose noise with --pose-noise"]),
     )
 
@@ -676,7 +681,7 @@ def _refuse_doubted(folder: Path, doubts: Sequence[Mapping[str, Any]], *, strict
         raise DataError(folder, f"is doubted: {first['what']} ({first['code']}){more}", str(first["remedy"]))
 
 
-def _unused(cameras: list[Camera], result: Triangulation) -> list[str]:
+def _unused_cameras(cameras: list[Camera], result: Triangulation) -> list[str]:
     """Write a warning for cameras without inliers: wrong place, wrong time, or another person."""
     used = np.atleast_1d(result.inlier.any(axis=0))
     return [

@@ -380,8 +380,8 @@ def _gross(views: Views, picture: Int64, points: Float, pixel_sigma: Float, thre
         moved, judged = _moved(replace(views, pixel_sigma=pixel_sigma), picture, points)
         moved = replace(moved, pixel_sigma=estimate_noise(moved, threads=threads))
         agreed = locate(moved, method="robust", gate=_GROSS, threads=threads)
-        told = np.isin(agreed.status, (STATUS.index("ok"), STATUS.index("rejected")))
-        before, gross = gross, told[:, None] & judged & ~agreed.inlier
+        located = np.isin(agreed.status, (STATUS.index("ok"), STATUS.index("rejected")))
+        before, gross = gross, located[:, None] & judged & ~agreed.inlier
         if np.array_equal(before, gross):
             break
         points = locate(_without(gross, views), method="robust", threads=threads).points

@@ -38,7 +38,7 @@ from pipelines.session.description import Interpolation
 from pipelines.session.records import Trajectory
 
 _RATE_HZ = 15.0  # of the pictures used: between them poses are interpolated
-_LASTS_S = 10.0  # drift over this time is treated as a constant error
+_CONSTANT_S = 10.0  # drift over this time is treated as a constant error
 
 
 @dataclass(frozen=True)
@@ -69,11 +69,11 @@ def prior_of(errors: PoseErrors | None, level: Float) -> PosePrior:
     if errors is None:
         half = (float(level[0] / np.sqrt(2)), float(level[1] / np.sqrt(2)))
         return PosePrior(half, half)
-    lasting = np.zeros(2)
+    constant = np.zeros(2)
     for process in errors.processes:
         kind = 1 if process.number == ROTATION else 0
-        lasting[kind] += process.sigma0**2 + process.rate**2 * _LASTS_S
-    return PosePrior(errors.white, (float(np.sqrt(lasting[0])), float(np.sqrt(lasting[1]))))
+        constant[kind] += process.sigma0**2 + process.rate**2 * _CONSTANT_S
+    return PosePrior(errors.white, (float(np.sqrt(constant[0])), float(np.sqrt(constant[1]))))
 
 
 def refine_cameras(
@@ -98,13 +98,13 @@ def refine_cameras(
         The cameras; the entry of each in metrics.json; a line for each camera that keeps its logged poses.
     """
     refined: list[Camera] = []
-    told: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     refusals: list[str] = []
     for camera, prior in zip(cameras, priors, strict=True):
         seen = followed[camera.name]
         if isinstance(seen, str):
             refined.append(camera)
-            told[camera.name] = {"used": False, "reason": seen}
+            entries[camera.name] = {"used": False, "reason": seen}
         else:
             t_ns = camera.frame_t_ns[seen.rows]
             logged = camera.poses_at(t_ns, between)
@@ -117,11 +117,11 @@ def refine_cameras(
                 prior,
             )
             refined.append(camera if found.refused else _with_poses(camera, t_ns, found, prior, stated))
-            told[camera.name] = _told(found, prior)
-        if told[camera.name]["reason"] is not None:
-            reason = told[camera.name]["reason"]
+            entries[camera.name] = _entry(found, prior)
+        if entries[camera.name]["reason"] is not None:
+            reason = entries[camera.name]["reason"]
             refusals.append(f"{camera.name}: its logged poses stay, because {reason}")
-    return refined, told, refusals
+    return refined, entries, refusals
 
 
 def _rays(tracks: Tracks, camera: Camera, t_ns: Int64) -> Float:
@@ -154,15 +154,15 @@ def _with_poses(camera: Camera, t_ns: Int64, found: Adjusted, prior: PosePrior, 
     # The remaining attitude errors change slowly: neighbouring pictures share their points.
     turn = float(np.median(sigma[:, 1]))
     left = PoseErrors(
-        (max(float(np.sqrt(max(np.median(sigma[:, 0]) ** 2 - prior.lasting[0] ** 2, 0.0))), 1e-3), turn / 2),
-        (Process(SHIFT_IN_WORLD, max(prior.lasting[0], 1e-3)), Process(ROTATION, turn)),
+        (max(float(np.sqrt(max(np.median(sigma[:, 0]) ** 2 - prior.constant[0] ** 2, 0.0))), 1e-3), turn / 2),
+        (Process(SHIFT_IN_WORLD, max(prior.constant[0], 1e-3)), Process(ROTATION, turn)),
     )
     return replace(
         camera, trajectory=trajectory, sigma=sigma, covariance=covariance, errors=left if stated else None
     )
 
 
-def _told(found: Adjusted, prior: PosePrior) -> dict[str, Any]:
+def _entry(found: Adjusted, prior: PosePrior) -> dict[str, Any]:
     used = found.refused is None
     turn = np.diagonal(found.covariance[:, 3:, 3:], axis1=1, axis2=2).mean(axis=1)
     return {
@@ -201,13 +201,13 @@ _LEAST_GAIN = 0.9  # of the attitude's prior sigma: above it the background adds
 class PosePrior:
     """Standard deviations (m, rad) per axis of the white and of the constant part of logged pose errors."""
 
-    fresh: tuple[float, float]
-    lasting: tuple[float, float]
+    white: tuple[float, float]
+    constant: tuple[float, float]
 
     @property
     def level(self) -> Float:
         """Standard deviation of both parts together [2] (m, rad)."""
-        level: Float = np.hypot(self.fresh, self.lasting)
+        level: Float = np.hypot(self.white, self.constant)
         return level
 
     def covariance(self, times: int) -> Float:
@@ -359,11 +359,11 @@ class _Stretch:
         Returns None if the adjustment does not converge.
         """
         times = len(self.position)
-        errors, lasting, points = np.zeros((times, 6)), np.zeros(6), self.start
-        fresh = np.repeat(self.prior.fresh, 3)
+        errors, constant, points = np.zeros((times, 6)), np.zeros(6), self.start
+        white = np.repeat(self.prior.white, 3)
         # A shift of the whole path causes no residual: the path stays at the logged position.
-        steady = np.repeat([0.0, self.prior.lasting[1]], 3)
-        fresh, steady = np.maximum(fresh, 1e-5), np.maximum(steady, 1e-5)
+        steady = np.repeat([0.0, self.prior.constant[1]], 3)
+        white, steady = np.maximum(white, 1e-5), np.maximum(steady, 1e-5)
         normal = np.empty((0, 0))
         whitened = np.empty(0)
         for _ in range(_ROUNDS):
@@ -372,12 +372,12 @@ class _Stretch:
             whitened = np.linalg.norm(residual, axis=1) / self.sigma
             weight = 1 / (1 + (whitened / _LOSS) ** 2) / self.sigma**2
             normal, step, moves = self._step(
-                by_pose, by_point, residual, weight, errors, lasting, fresh, steady
+                by_pose, by_point, residual, weight, errors, constant, white, steady
             )
             if not np.isfinite(step).all():
                 return None
             errors = errors + step[:-6].reshape(times, 6)
-            lasting = lasting + step[-6:]
+            constant = constant + step[-6:]
             points = points + moves
             if np.abs(step).max() < _CONVERGED:
                 break
@@ -386,7 +386,7 @@ class _Stretch:
         covariance: Float = np.asarray(inverse, dtype=np.float64)[np.arange(times), :, np.arange(times)]
         if not (np.linalg.eigvalsh(covariance) > 0).all():
             return None
-        covariance[:, range(3), range(3)] += self.prior.lasting[0] ** 2
+        covariance[:, range(3), range(3)] += self.prior.constant[0] ** 2
         return position, rotation, covariance, errors, _PIXEL_SIGMA * float(np.median(whitened))
 
     def _poses(self, errors: Float) -> tuple[Float, Float]:
@@ -418,8 +418,8 @@ class _Stretch:
         residual: Float,
         weight: Float,
         errors: Float,
-        lasting: Float,
-        fresh: Float,
+        constant: Float,
+        white: Float,
         steady: Float,
     ) -> tuple[Float, Float, Float]:
         """Compute one Gauss-Newton step: reduced normal matrix, step of the poses, and of the points."""
@@ -447,12 +447,12 @@ class _Stretch:
         force[:size] = pull.ravel() - cut @ right.ravel()
         for t in range(times):
             place = slice(6 * t, 6 * t + 6)
-            normal[place, place] += pose[t] + np.diag(1 / fresh**2)
-            normal[place, size:] = normal[size:, place] = -np.diag(1 / fresh**2)
-        normal[size:, size:] = np.diag(1 / steady**2 + times / fresh**2)
-        apart = (errors - lasting) / fresh**2
+            normal[place, place] += pose[t] + np.diag(1 / white**2)
+            normal[place, size:] = normal[size:, place] = -np.diag(1 / white**2)
+        normal[size:, size:] = np.diag(1 / steady**2 + times / white**2)
+        apart = (errors - constant) / white**2
         force[:size] -= apart.ravel()
-        force[size:] = apart.sum(axis=0) - lasting / steady**2
+        force[size:] = apart.sum(axis=0) - constant / steady**2
         step = np.asarray(np.linalg.solve(normal, force), dtype=np.float64)
         back = right - np.asarray(across.T @ step[:size]).reshape(points, 3)
         return normal, step, np.einsum("nij,nj->ni", inverse, back)

@@ -41,7 +41,7 @@ def finish(
         The result, and JSON-able `filled` and `smoothing`, None for a step not requested. Residuals are
         those of the new positions. Filled joints have no residuals and no views.
     """
-    told: dict[str, Any] = {"filled": None, "smoothing": None}
+    report: dict[str, Any] = {"filled": None, "smoothing": None}
     shape = observations.confidence.shape[:3]
     position = result.points.reshape(*shape, 3)
     covariance = result.covariance.reshape(*shape, 3, 3)
@@ -49,12 +49,12 @@ def finish(
     if fill_s is not None:
         filled = fill_gaps(observations.t_ns, position, covariance, status, max_gap_s=fill_s)
         position, covariance, status = filled.position, filled.covariance, filled.status
-        told["filled"] = {"longest_gap_s": fill_s, **filled.counts}
+        report["filled"] = {"longest_gap_s": fill_s, **filled.counts}
     residual_px = result.residual_px
     if smoother is not None:
         smooth = smoother.apply(observations.t_ns, position, covariance)
         position, covariance = smooth.position, smooth.covariance
-        told["smoothing"] = smooth.told
+        report["smoothing"] = smooth.report
         measured = result.status == STATUS.index("ok")
         again = reprojection_px(views, position.reshape(-1, 3))
         residual_px = np.where(measured[:, None], again, result.residual_px)
@@ -64,7 +64,7 @@ def finish(
         covariance=covariance.reshape(-1, 3, 3),
         status=status.ravel(),
         residual_px=residual_px,
-    ), told
+    ), report
 
 
 # --- gaps ----------------------------------------------------------------------------------------------

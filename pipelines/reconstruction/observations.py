@@ -168,15 +168,19 @@ def candidates(cameras: list[Camera], between: Interpolation) -> Candidates:
     joints = cameras[0].rays.shape[2]
     xy = np.full((len(t_ns), len(cameras), people, joints, 2), np.nan)
     confidence = np.zeros(xy.shape[:-1])
-    poses = []
     for c, camera in enumerate(cameras):
         (near,) = np.nonzero(frame[:, c] >= 0)
         seen = camera.rays.shape[1]
         xy[near, c, :seen] = camera.rays[frame[near, c]]
         confidence[near, c, :seen] = camera.confidence[frame[near, c]]
-        poses.append(camera.poses_at(t_ns, between))
+    return Candidates(t_ns, frame, xy, confidence, *_poses_at(cameras, t_ns, between))
+
+
+def _poses_at(cameras: list[Camera], t_ns: Int64, between: Interpolation) -> tuple[Float, Float]:
+    """Interpolate world_from_camera of all cameras: position [T, C, 3], rotation [T, C, 3, 3]."""
+    poses = [camera.poses_at(t_ns, between) for camera in cameras]
     position, rotation = (np.stack(part, axis=1) for part in zip(*poses, strict=True))
-    return Candidates(t_ns, frame, xy, confidence, position, rotation)
+    return position, rotation
 
 
 def observe(
@@ -192,17 +196,20 @@ def observe(
         cameras: all of them, in order.
         found: the candidates to which `choice` refers.
         choice: [T', C, P] index of each person's detection in the camera's frame, -1 for none.
-        t_ns: [T] the common times.
+        t_ns: [T] the common times; poses at times of the candidates are theirs.
         between: rules for interpolating between logged poses.
     """
-    views, weights, poses, sigmas = [], [], [], []
+    views, weights, sigmas = [], [], []
     for c, camera in enumerate(cameras):
         xy, confidence = sightings_of(camera, found, c, choice[:, c])
         views.append(_at(camera, xy, t_ns))
         weights.append(_at(camera, confidence, t_ns))
-        poses.append(camera.poses_at(t_ns, between))
         sigmas.append(camera.sigma_at(t_ns))
-    position, rotation = (np.stack(part, axis=1) for part in zip(*poses, strict=True))
+    rows = np.minimum(np.searchsorted(found.t_ns, t_ns), len(found.t_ns) - 1)
+    if (found.t_ns[rows] == t_ns).all():
+        position, rotation = found.position[rows], found.rotation[rows]
+    else:
+        position, rotation = _poses_at(cameras, t_ns, between)
     stated = [sigma for sigma in sigmas if sigma is not None]
     pose_sigma = _all_sigmas(cameras, sigmas) if stated else None
     return Observations(

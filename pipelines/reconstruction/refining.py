@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 _SEARCHED = 300  # times of the skeleton that the search for clock offsets uses, at most
 _MOST_SHIFTS = 6  # of the clocks; offsets of 0.2 s took one to five
-_UNTOLD = 0.5  # a clock is determined if its posterior sigma is below this share of its prior sigma
+_UNDETERMINED = 0.5  # a clock is determined if its posterior sigma is below this share of its prior sigma
 _HEAD = ("nose", "left_eye", "right_eye", "left_ear", "right_ear")  # as rigid as a bone
 
 
@@ -86,10 +86,10 @@ class RefinedFlight:
 
 def refine_flight(flight: RobustFlight) -> RefinedFlight:
     """Refine the result of `robust` for a flight."""
-    refined, offset_s = _settle_clocks(flight, _begun_offsets_s(flight))
+    refined, offset_s = _settle_clocks(flight, _initial_clock_offsets_s(flight))
     warnings = [
         *refined.warnings,
-        *_untold_clocks(refined, flight.cameras, flight.clock_sigma_s),
+        *_undetermined_clocks(refined, flight.cameras, flight.clock_sigma_s),
         *_unsettled_clocks(refined, flight.cameras),
     ]
     metrics = _metrics(refined, flight.cameras, offset_s)
@@ -97,8 +97,8 @@ def refine_flight(flight: RobustFlight) -> RefinedFlight:
         warnings.append(f"refined: fell back to robust, because {refined.fallback}")
         return RefinedFlight(flight.observations, flight.views, flight.result, None, metrics, warnings)
 
-    observed, views = _seen_with(refined, flight, offset_s)
-    result = _believed(refined, views, flight.threads)
+    observed, views = _observe_refined(refined, flight, offset_s)
+    result = _keep_reconstructed_joints(refined, views, flight.threads)
     poses = _camera_table(flight, refined, offset_s)
     return RefinedFlight(observed, views, result, poses, metrics, warnings)
 
@@ -106,15 +106,15 @@ def refine_flight(flight: RobustFlight) -> RefinedFlight:
 # --- clocks --------------------------------------------------------------------------------------------
 
 
-def _begun_offsets_s(flight: RobustFlight) -> Float:
-    """Find the initial offset [C] s of every clock from some times of the flight, see `begun_offsets_s`."""
+def _initial_clock_offsets_s(flight: RobustFlight) -> Float:
+    """Find the initial offset [C] s of every clock from some times of the flight, see `initial_offsets_s`."""
     times = len(flight.observations.t_ns)
     every = -(-times // _SEARCHED)
 
     def views_at(shift_s: float) -> Views:
-        return _seen_from(flight, np.where(flight.clock_sigma_s > 0, shift_s, 0.0), every)[1]
+        return _observe_with_offsets(flight, np.where(flight.clock_sigma_s > 0, shift_s, 0.0), every)[1]
 
-    return begun_offsets_s(views_at, len(range(0, times, every)), flight.clock_sigma_s)
+    return initial_offsets_s(views_at, len(range(0, times, every)), flight.clock_sigma_s)
 
 
 def _settle_clocks(flight: RobustFlight, offset_s: Float) -> tuple[Refined, Float]:
@@ -124,17 +124,17 @@ def _settle_clocks(flight: RobustFlight, offset_s: Float) -> tuple[Refined, Floa
     Also, estimated levels of pose noise absorb part of a large offset. So the stamps are shifted by the
     estimated offsets, and the refinement is repeated until the remaining correction is small.
     """
-    started = _robustly(flight, offset_s) if offset_s.any() else flight.result
+    started = _triangulate_with_offsets(flight, offset_s) if offset_s.any() else flight.result
     for _ in range(1 + _MOST_SHIFTS):
-        refined = _refined_from(flight, offset_s, started)
+        refined = _refine_with_offsets(flight, offset_s, started)
         offset_s = offset_s + refined.clock_offset_s
         if np.abs(refined.clock_offset_s).max() <= SETTLED_S:
             break
-        started = _robustly(flight, offset_s)
+        started = _triangulate_with_offsets(flight, offset_s)
     return refined, offset_s
 
 
-def _refined_from(flight: RobustFlight, offset_s: Float, started: Triangulation) -> Refined:
+def _refine_with_offsets(flight: RobustFlight, offset_s: Float, started: Triangulation) -> Refined:
     """Run the refinement with these clock offsets, starting from these points."""
     _, people, joints, _ = flight.observations.confidence.shape
     cameras = _shifted(flight.cameras, offset_s)
@@ -149,9 +149,9 @@ def _refined_from(flight: RobustFlight, offset_s: Float, started: Triangulation)
     )
 
 
-def _robustly(flight: RobustFlight, offset_s: Float) -> Triangulation:
+def _triangulate_with_offsets(flight: RobustFlight, offset_s: Float) -> Triangulation:
     """Triangulate the flight by `robust` with these clock offsets."""
-    _, views = _seen_from(flight, offset_s)
+    _, views = _observe_with_offsets(flight, offset_s)
     views = replace(views, pixel_sigma=estimate_noise(views, threads=flight.threads))
     return triangulate_pictures(
         views,
@@ -161,13 +161,13 @@ def _robustly(flight: RobustFlight, offset_s: Float) -> Triangulation:
     )
 
 
-def _untold_clocks(refined: Refined, cameras: Sequence[Camera], prior_s: Float) -> list[str]:
+def _undetermined_clocks(refined: Refined, cameras: Sequence[Camera], prior_s: Float) -> list[str]:
     """List clocks that pictures do not determine: nothing moved, or straight camera paths compensate."""
     return [
-        f"refined: the pictures do not tell the clock of {camera.name}: its offset is known to {sigma:.2g} s "
-        f"where {prior:.2g} s were stated"
+        f"refined: the videos do not determine the clock of {camera.name}: the sigma of its offset is "
+        f"{sigma:.2g} s ({prior:.2g} s stated)"
         for camera, sigma, prior in zip(cameras, refined.clock_sigma_s, prior_s, strict=True)
-        if refined.fallback is None and prior > 0 and sigma > _UNTOLD * prior
+        if refined.fallback is None and prior > 0 and sigma > _UNDETERMINED * prior
     ]
 
 
@@ -184,7 +184,9 @@ def _unsettled_clocks(refined: Refined, cameras: Sequence[Camera]) -> list[str]:
 # --- observations with other clocks and poses -----------------------------------------------------------
 
 
-def _seen_from(flight: RobustFlight, offset_s: Float, every: int = 1) -> tuple[Observations, Views]:
+def _observe_with_offsets(
+    flight: RobustFlight, offset_s: Float, every: int = 1
+) -> tuple[Observations, Views]:
     """Observe with these clock offsets, at every k-th time of the skeleton."""
     cameras = _shifted(flight.cameras, offset_s)
     t_ns, sides = flight.observations.t_ns[::every], flight.sides[::every]
@@ -203,9 +205,11 @@ def _seen_from(flight: RobustFlight, offset_s: Float, every: int = 1) -> tuple[O
     )
 
 
-def _seen_with(refined: Refined, flight: RobustFlight, offset_s: Float) -> tuple[Observations, Views]:
+def _observe_refined(refined: Refined, flight: RobustFlight, offset_s: Float) -> tuple[Observations, Views]:
     """Observe with these clock offsets and the corrected poses, which count as exact."""
-    observed, views = _seen_from(flight, offset_s) if offset_s.any() else (flight.observations, flight.views)
+    observed, views = (
+        _observe_with_offsets(flight, offset_s) if offset_s.any() else (flight.observations, flight.views)
+    )
     position, rotation = observed.position.copy(), observed.rotation.copy()
     for c in range(len(flight.cameras)):
         numbers = _numbers_at(refined.corrections[c], flight.t_s - refined.clock_offset_s[c])
@@ -221,7 +225,7 @@ def _seen_with(refined: Refined, flight: RobustFlight, offset_s: Float) -> tuple
     return replace(observed, position=position, rotation=rotation), views
 
 
-def _believed(refined: Refined, views: Views, threads: int) -> Triangulation:
+def _keep_reconstructed_joints(refined: Refined, views: Views, threads: int) -> Triangulation:
     """Keep the estimate's points and covariances where `robust` reconstructs the joint from these views."""
     gated = triangulate(views, method="robust", threads=threads)
     position, covariance = refined.position.reshape(-1, 3), refined.covariance.reshape(-1, 3, 3)
@@ -335,7 +339,7 @@ _CLEARER = 0.8  # share of the disagreement without a shift that the best shift 
 _LIMBS = 75.0  # percentile: half of the joints swing too little, and some views are wrong
 
 
-def begun_offsets_s(views_at: Callable[[float], Views], instants: int, clock_sigma_s: Float) -> Float:
+def initial_offsets_s(views_at: Callable[[float], Views], instants: int, clock_sigma_s: Float) -> Float:
     """Find an initial offset [C] s of every clock, to about two pictures; 0 for known clocks.
 
     Views agree at the right offset. Pose errors move all joints of a view together and must not count: the
@@ -348,13 +352,13 @@ def begun_offsets_s(views_at: Callable[[float], Views], instants: int, clock_sig
         clock_sigma_s: [C] prior standard deviation of each offset, 0 for a known clock. Without a known
             clock all offsets are 0.
     """
-    begun = np.zeros(len(clock_sigma_s))
+    initial_s = np.zeros(len(clock_sigma_s))
     unknown = np.flatnonzero(clock_sigma_s > 0)
-    if not len(unknown) or len(unknown) == len(begun):
-        return begun
+    if not len(unknown) or len(unknown) == len(initial_s):
+        return initial_s
     steps = int(_REACH * clock_sigma_s.max() / _STEP_S)
     shifts_s = _STEP_S * np.arange(-steps, steps + 1)
-    disagreement = np.full((len(shifts_s), len(begun)), np.inf)
+    disagreement = np.full((len(shifts_s), len(initial_s)), np.inf)
     for row, shift_s in enumerate(shifts_s):
         views = views_at(float(shift_s))
         for camera in unknown[np.abs(shift_s) <= _REACH * clock_sigma_s[unknown]]:
@@ -362,8 +366,8 @@ def begun_offsets_s(views_at: Callable[[float], Views], instants: int, clock_sig
     for camera in unknown:
         best = int(np.argmin(disagreement[:, camera]))
         if disagreement[best, camera] < _CLEARER * disagreement[steps, camera]:
-            begun[camera] = shifts_s[best]
-    return begun
+            initial_s[camera] = shifts_s[best]
+    return initial_s
 
 
 def _disagreement(views: Views, instants: int, known: Bool, camera: int) -> float:
@@ -415,8 +419,8 @@ def refined_points(
         Points [N, 3] m, NaN for none, and the reason of the fallback, None without one.
     """
     times, cameras = views.position.shape[:2]
-    told = replace(views, pixel_sigma=estimate_noise(views))
-    start = triangulate_pictures(told, picture=views.pose_index, pixel_sigma=views.pixel_sigma).points
+    noisy = replace(views, pixel_sigma=estimate_noise(views))
+    start = triangulate_pictures(noisy, picture=views.pose_index, pixel_sigma=views.pixel_sigma).points
     sightings = [
         Sighting(
             t_s=t_s,

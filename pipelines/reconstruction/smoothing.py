@@ -34,7 +34,7 @@ class Smoothed:
 
     position: Float  # [T, P, J, 3] m
     covariance: Float  # [T, P, J, 3, 3] m^2
-    told: dict[str, Any]  # JSON-able: the filter, its effective cutoff or density, runs that were too short
+    report: dict[str, Any]  # JSON-able: the filter, its effective cutoff or density, runs that were too short
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Butterworth:
             smooth[first:stop, person, joint] = (
                 sosfiltfilt(sections, own - own[0], axis=0, padlen=padding) + own[0]
             )  # far from the origin digits are lost
-        told = {
+        report = {
             "filter": "butterworth",
             "passes": "one forwards, one backwards: no lag",
             "order": int(self.order),
@@ -89,7 +89,7 @@ class Butterworth:
             "joint_frames_in_runs_too_short": short,
             "covariances": "as before smoothing",
         }
-        return Smoothed(smooth, covariance, told)
+        return Smoothed(smooth, covariance, report)
 
     def _design_hz(self, rate_hz: float) -> float:
         """Compute the -3 dB frequency of one pass for which two passes have theirs at `cutoff_hz`.
@@ -145,13 +145,13 @@ class RauchTungStriebel:
             densities,
             states,
         )
-        lasting = np.maximum(1 - share, 0.0)[:, None, None] * known
+        correlated = np.maximum(1 - share, 0.0)[:, None, None] * known
         own = used[:, columns]
         new_position, new_covariance = position.copy(), covariance.copy()
         new_position[:, columns] = np.where(own[..., None], smooth, measured)
-        new_covariance[:, columns] = np.where(own[..., None, None], uncertain + lasting, known)
+        new_covariance[:, columns] = np.where(own[..., None, None], uncertain + correlated, known)
         median = float(np.median(densities)) if shape[1] else None
-        told = {
+        report = {
             "filter": "rts",
             "model": f"constant {self.model}",
             "density": density if density is not None else median,
@@ -163,7 +163,7 @@ class RauchTungStriebel:
             "joint_frames_in_runs_too_short": int((np.isfinite(position[..., 0]) & ~used).sum()),
             "covariances": "of the smoother",
         }
-        return Smoothed(new_position, new_covariance, told)
+        return Smoothed(new_position, new_covariance, report)
 
 
 Smoother = Butterworth | RauchTungStriebel

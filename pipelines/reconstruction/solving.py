@@ -137,7 +137,7 @@ def refused_people(result: Triangulation, observations: Observations, seen: Bool
     return replace(result, status=marked.ravel())
 
 
-def said_noise(views: Views) -> str:
+def noise_text(views: Views) -> str:
     """Describe the noise that the gates used."""
     position_m, rotation_rad = np.median(views.pose_sigma, axis=(0, 1))
     pixels = float(np.median(views.pixel_sigma))

@@ -66,7 +66,7 @@ def disturbed(cameras: Sequence[Camera], models: Sequence[NoiseModel], seed: int
     return moved
 
 
-def told_together(metrics: Sequence[Mapping[str, Any]], text: str, seed: int) -> dict[str, Any]:
+def summary_of_trials(metrics: Sequence[Mapping[str, Any]], text: str, seed: int) -> dict[str, Any]:
     """Summarise all trials for metrics.json.
 
     Args:
@@ -79,12 +79,12 @@ def told_together(metrics: Sequence[Mapping[str, Any]], text: str, seed: int) ->
         (about the mean, n - 1) and the `intervals` of `geometry.bootstrap` over trials; both null for less
         than two trials.
     """
-    each = [_figures(told) for told in metrics]
+    each = [_figures(trial) for trial in metrics]
     mean: dict[str, float | None] = {}
     std: dict[str, float | None] = {}
     ends: dict[str, list[float] | None] = {}
     for name in each[0]:
-        values = np.array([told[name] for told in each if told[name] is not None], dtype=np.float64)
+        values = np.array([trial[name] for trial in each if trial[name] is not None], dtype=np.float64)
         mean[name] = float(values.mean()) if values.size else None
         std[name] = ends[name] = None
         if values.size > 1:
@@ -103,9 +103,9 @@ def told_together(metrics: Sequence[Mapping[str, Any]], text: str, seed: int) ->
     }
 
 
-def _figures(told: Mapping[str, Any]) -> dict[str, float | None]:
-    figures: dict[str, float | None] = {name: told[name] for name in _FIGURES}
-    figures["reprojection_px_median"] = told["reprojection_px"]["median"]
-    if "refinement" in told:
-        figures["fell_back"] = float(told["refinement"]["fallback"] is not None)
+def _figures(metrics: Mapping[str, Any]) -> dict[str, float | None]:
+    figures: dict[str, float | None] = {name: metrics[name] for name in _FIGURES}
+    figures["reprojection_px_median"] = metrics["reprojection_px"]["median"]
+    if "refinement" in metrics:
+        figures["fell_back"] = float(metrics["refinement"]["fallback"] is not None)
     return figures

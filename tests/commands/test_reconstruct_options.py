@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -102,13 +103,13 @@ def test_people_beyond_those_asked_for_are_counted_and_said(tmp_path: Path) -> N
     }
     (line,) = [line for line in stage(session)["warnings"] if "nobody who was reconstructed" in line]
     assert f"drone1 {passing['drone1']}, drone2 {passing['drone2']}" in line
-    assert f"more than 1 at {times} of {times} times" in line
+    assert re.search(rf"\b2\b.*\b1\b.*\b{times}\b.*\b{times}\b", line)
     assert "--persons 2" in line
     both = run(session, "--persons", "2")["people"]
     assert both["seen_at_once"] == both["asked"] == 2
     assert both["times_with_more"] == 0
     assert set(both["detections_not_used"].values()) == {0}
-    assert not any("nobody who was reconstructed" in line for line in stage(session)["warnings"])
+    assert not any("--persons" in line for line in stage(session)["warnings"])
 
 
 def test_gaps_stay_open_until_somebody_asks(clean: tuple[SyntheticFlight, Path]) -> None:
@@ -199,7 +200,7 @@ def point_variances(flight: SyntheticFlight, position_covariance: Any) -> Any:
 def test_the_terminal_shows_the_figures_that_matter_in_a_table(clean: tuple[SyntheticFlight, Path]) -> None:
     _, session = clean
     text = command(session, "--smooth", "butterworth").stdout
-    assert "smoothed: butterworth, cutoff 6 Hz" in text
+    assert re.search(r"\bbutterworth\b.*\b6 Hz", text)
     for figure in ("MPJPE mm", "PCK@150 mm %", "reprojection px, mean", "jerk", "reconstructed %"):
         assert sum(line.startswith(figure) for line in text.splitlines()) == 1
     assert "left_wrist" not in text

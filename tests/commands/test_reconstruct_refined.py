@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -97,8 +98,8 @@ def test_a_clock_that_does_not_settle_is_told(tmp_path: Path, monkeypatch: pytes
     # The search ahead of the estimate goes in steps of 67 ms and leaves some 30 of these.
     monkeypatch.setattr(refining, "_MOST_SHIFTS", 0)
     done = mocap("reconstruct", session, "--method", "refined")
-    assert "the clock of drone2 did not settle: the last of 1 estimates still moved it by" in done.stderr
-    assert "drone1 did not settle" not in done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if "settle" in line]
+    assert re.search(r"\bdrone2\b.*\b1\b.*\d ms", line)
 
 
 @pytest.mark.slow
@@ -149,7 +150,7 @@ def test_refined_falls_back_to_what_robust_gives_and_says_why(
     refined = json.loads(done.stdout)
     reason = refined["refinement"]["fallback"]
     assert reason.startswith(because)
-    assert f"refined: fell back to robust, because {reason}" in done.stderr
+    assert any("robust" in line and line.endswith(reason) for line in done.stderr.splitlines())
     assert (session / "reconstruct" / "skeleton.parquet").read_bytes() == skeleton
     assert not (session / "reconstruct" / "cameras.parquet").exists()
     of_refined_alone = {"method", "clock_offsets_s"}

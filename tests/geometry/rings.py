@@ -64,13 +64,13 @@ def with_pixel_noise(views: Views, rng: np.random.Generator, sigma_px: float = 2
 
 
 def with_pose_noise(
-    views: Views, rng: np.random.Generator, level: str, *, constant: bool, told: bool
+    views: Views, rng: np.random.Generator, level: str, *, constant: bool, stated: bool
 ) -> Views:
     position_m, rotation_deg = LEVELS[level]
     rotation_rad = np.radians(rotation_deg)
     frames, cameras, _ = views.position.shape
     draws = rng.standard_normal((1 if constant else frames, cameras, 6))
-    sigma = np.broadcast_to([position_m, rotation_rad], (frames, cameras, 2)) if told else views.pose_sigma
+    sigma = np.broadcast_to([position_m, rotation_rad], (frames, cameras, 2)) if stated else views.pose_sigma
     return replace(
         views,
         position=views.position + position_m * draws[..., :3],

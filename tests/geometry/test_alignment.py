@@ -118,7 +118,7 @@ def test_a_batch_is_its_members_and_nan_where_there_is_no_answer() -> None:
 def test_too_few_points_are_refused() -> None:
     source = cloud(4)
     source[:2] = np.nan
-    with pytest.raises(ValueError, match="2 common points"):
+    with pytest.raises(ValueError, match=r"^2\b.*\b3$"):
         align(source, cloud(4), with_scale=True)
 
 

@@ -20,14 +20,14 @@ from pipelines.geometry.triangulation import (
 from tests.geometry.rings import FOCAL, LEVELS, ring, with_outliers, with_pixel_noise, with_pose_noise
 
 
-def told(views: Views) -> Views:
+def with_estimated_noise(views: Views) -> Views:
     return replace(views, pixel_sigma=estimate_noise(views))
 
 
 def gated(views: Views, picture: Int64 | None = None) -> Triangulation:
     """Triangulate views of one person, or of the given rows of the same person and picture."""
     of = views.pose_index if picture is None else picture
-    return triangulate_pictures(told(views), picture=of, pixel_sigma=views.pixel_sigma)
+    return triangulate_pictures(with_estimated_noise(views), picture=of, pixel_sigma=views.pixel_sigma)
 
 
 def error_mm(points: Float, truth: Float) -> float:
@@ -53,9 +53,9 @@ def test_where_nothing_errs_grossly_nothing_changes(cameras: int, level: str, co
     rng = np.random.default_rng(cameras)
     views = with_pixel_noise(ring(20, cameras)[1], rng)
     if level != "0":
-        views = with_pose_noise(views, rng, level, constant=constant, told=True)
+        views = with_pose_noise(views, rng, level, constant=constant, stated=True)
 
-    found, usual = gated(views), triangulate(told(views), method="robust")
+    found, usual = gated(views), triangulate(with_estimated_noise(views), method="robust")
 
     if level == "c" and not constant:
         changed = (found.inlier != usual.inlier).any(axis=1)
@@ -82,10 +82,10 @@ def test_outliers_cost_no_more_than_their_views(
     errors = []
     for seed in range(12):
         rng = np.random.default_rng(seed)
-        clean = with_pose_noise(with_pixel_noise(exact, rng), rng, level, constant=constant, told=stated)
+        clean = with_pose_noise(with_pixel_noise(exact, rng), rng, level, constant=constant, stated=stated)
         bad, good = with_outliers(clean, rng, uniform=False)
-        only_good = triangulate(told(replace(bad, weight=bad.weight * good)), method="robust")
-        without = triangulate(told(clean), method="robust")
+        only_good = triangulate(with_estimated_noise(replace(bad, weight=bad.weight * good)), method="robust")
+        without = triangulate(with_estimated_noise(clean), method="robust")
         errors.append([error_mm(of.points, truth) for of in (gated(bad), only_good, without)])
 
     with_them, of_good, without_them = np.mean(errors, axis=0)
@@ -95,7 +95,7 @@ def test_outliers_cost_no_more_than_their_views(
 
 def test_exactly_the_gross_errors_are_left_out_and_show_their_residuals() -> None:
     rng = np.random.default_rng(7)
-    views = with_pose_noise(with_pixel_noise(ring(100, 5)[1], rng), rng, "b", constant=True, told=True)
+    views = with_pose_noise(with_pixel_noise(ring(100, 5)[1], rng), rng, "b", constant=True, stated=True)
     bad, good = with_outliers(views, rng, uniform=False)
     outlier = ~good & np.isfinite(bad.xy[..., 0])
 
@@ -112,7 +112,7 @@ def test_exactly_the_gross_errors_are_left_out_and_show_their_residuals() -> Non
 
 def test_two_cameras_lose_the_joint_and_say_that_views_disagreed() -> None:
     rng = np.random.default_rng(8)
-    views = with_pose_noise(with_pixel_noise(ring(100, 2)[1], rng), rng, "b", constant=True, told=True)
+    views = with_pose_noise(with_pixel_noise(ring(100, 2)[1], rng), rng, "b", constant=True, stated=True)
     bad, good = with_outliers(views, rng, uniform=False)
     seen = np.isfinite(bad.xy[..., 0]).all(axis=1)
 
@@ -130,7 +130,7 @@ def test_two_cameras_lose_the_joint_and_say_that_views_disagreed() -> None:
 
 def test_rows_of_a_picture_need_not_stand_together() -> None:
     rng = np.random.default_rng(9)
-    views = with_pose_noise(with_pixel_noise(ring(50, 4)[1], rng), rng, "b", constant=True, told=True)
+    views = with_pose_noise(with_pixel_noise(ring(50, 4)[1], rng), rng, "b", constant=True, stated=True)
     bad, good = with_outliers(views, rng, uniform=False)
     order = rng.permutation(len(bad.weight))
     mixed = replace(bad, xy=bad.xy[order], weight=bad.weight[order], pose_index=bad.pose_index[order])
@@ -146,12 +146,12 @@ def test_a_picture_of_few_joints_tells_nothing() -> None:
     rng = np.random.default_rng(10)
     exact = ring(60, 3)[1]
     four = np.flatnonzero(np.arange(60 * 17) % 17 < 4)
-    views = with_pose_noise(with_pixel_noise(exact, rng), rng, "b", constant=True, told=True)
+    views = with_pose_noise(with_pixel_noise(exact, rng), rng, "b", constant=True, stated=True)
     xy = views.xy.copy()
     xy[::17, 0, 0] += 150 / FOCAL
     few = replace(views, xy=xy[four], weight=views.weight[four], pose_index=views.pose_index[four])
 
-    assert same(gated(few), triangulate(told(few), method="robust"))
+    assert same(gated(few), triangulate(with_estimated_noise(few), method="robust"))
     whole = gated(replace(views, xy=xy))
     assert not whole.inlier[::17, 0].any()
 
@@ -174,7 +174,7 @@ def test_people_far_apart_share_no_shift() -> None:
     rng = np.random.default_rng(11)
     truth, exact = ring(60, 5)
     aside = replace(exact, position=exact.position - np.array([4.0, 0.0, 0.0]))
-    logged = with_pose_noise(exact, rng, "b", constant=True, told=True)
+    logged = with_pose_noise(exact, rng, "b", constant=True, stated=True)
     # A person 4 m further east looks like one seen by cameras 4 m further west.
     seen = exact.xy.copy()
     away = np.einsum(
@@ -192,8 +192,8 @@ def test_people_far_apart_share_no_shift() -> None:
     hidden[(picture % 2 == 1) & (np.arange(len(picture)) % 17 > 5)] = 0
     views = replace(views, weight=hidden)
 
-    assert same(gated(views, picture), triangulate(told(views), method="robust"))
-    assert not same(gated(views, views.pose_index), triangulate(told(views), method="robust"))
+    assert same(gated(views, picture), triangulate(with_estimated_noise(views), method="robust"))
+    assert not same(gated(views, views.pose_index), triangulate(with_estimated_noise(views), method="robust"))
 
 
 def test_what_has_no_keypoint_or_no_pose_is_not_gross() -> None:
@@ -204,7 +204,7 @@ def test_what_has_no_keypoint_or_no_pose_is_not_gross() -> None:
     position[10:20, 1] = np.nan
     lacking = replace(views, xy=xy, position=position)
 
-    assert same(gated(lacking), triangulate(told(lacking), method="robust"))
+    assert same(gated(lacking), triangulate(with_estimated_noise(lacking), method="robust"))
 
 
 def test_one_camera_finds_nothing() -> None:

@@ -216,7 +216,7 @@ def test_logs_of_one_row_or_none() -> None:
 @pytest.mark.parametrize("stamps", [[0, 5, 5], [0, 5, 4]])
 def test_stamps_that_do_not_increase_are_refused(stamps: list[int]) -> None:
     t_ns = np.array(stamps, dtype=np.int64)
-    with pytest.raises(ValueError, match="increase strictly"):
+    with pytest.raises(ValueError, match="stamps"):
         interpolate_points(t_ns, np.zeros((3, 1)), t_ns, max_gap_ns=10)
 
 

@@ -139,7 +139,7 @@ def test_the_shortest_way_is_taken() -> None:
 
 
 @pytest.mark.parametrize(
-    ("parent", "child", "told"),
+    ("parent", "child", "named"),
     [
         ("world", "camra", r"no frame 'camra' \(nearest: camera"),
         ("xyzzy", "camera", r"no frame 'xyzzy' \(there are base, camera, island, map"),
@@ -147,7 +147,7 @@ def test_the_shortest_way_is_taken() -> None:
         ("base", "base", "both 'base'"),
     ],
 )
-def test_wrong_frames_are_told_with_those_there_are(parent: str, child: str, told: str) -> None:
+def test_wrong_frames_are_named_with_those_there_are(parent: str, child: str, named: str) -> None:
     links = a_drone() | {("sea", "island"): still((0, 0, 0))}
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=named):
         chain(links, parent, child, max_gap_ns=S)

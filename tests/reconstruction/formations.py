@@ -144,10 +144,10 @@ def triangulated(sightings: Sequence[Sighting]) -> Float:
         pixel_sigma=np.array([s.pixel_sigma for s in sightings]),
         pose_sigma=np.zeros((times, count, 2)),
     )
-    told = replace(views, pixel_sigma=estimate_noise(views))
-    return triangulate_pictures(told, picture=views.pose_index, pixel_sigma=views.pixel_sigma).points.reshape(
-        times, joints, 3
-    )
+    noisy = replace(views, pixel_sigma=estimate_noise(views))
+    return triangulate_pictures(
+        noisy, picture=views.pose_index, pixel_sigma=views.pixel_sigma
+    ).points.reshape(times, joints, 3)
 
 
 def mean_mm(estimate: Float, truth: Float, where: Float | None = None) -> float:

@@ -63,8 +63,8 @@ def sighted(position: Float, rotation: Float, rng: np.random.Generator) -> tuple
 
 def logged(position: Float, rotation: Float, rng: np.random.Generator) -> tuple[Float, Float]:
     """Add errors drawn from the prior to poses."""
-    lasting = rng.normal(0, 1, 6) * np.repeat(PRIOR.lasting, 3)
-    error = lasting + rng.normal(0, 1, (len(position), 6)) * np.repeat(PRIOR.fresh, 3)
+    constant = rng.normal(0, 1, 6) * np.repeat(PRIOR.constant, 3)
+    error = constant + rng.normal(0, 1, (len(position), 6)) * np.repeat(PRIOR.white, 3)
     turned = matrix_from_quaternion(quaternion_from_rotation_vector(error[:, 3:]))
     return position + error[:, :3], rotation @ turned
 
@@ -114,7 +114,7 @@ def test_the_stated_covariance_of_attitudes_is_what_they_have() -> None:
         # Paths are not moved: the constant part of the positions' errors stays.
         moved = (found.position - at).mean(axis=0)
         np.testing.assert_allclose(moved, 0, atol=0.02)
-        assert (found.covariance[:, range(3), range(3)] >= PRIOR.lasting[0] ** 2).all()
+        assert (found.covariance[:, range(3), range(3)] >= PRIOR.constant[0] ** 2).all()
     # The stated noise of points (0.5 px) is larger than the true one (0.3), and the loss keeps 10 % fewer.
     assert 0.5 < np.mean(squared) < 3 + 2 * np.sqrt(6 / flights)
 
@@ -224,10 +224,10 @@ def _reversed(tracks: object) -> tuple[list[int], list[int], Float]:
 def test_stated_models_say_what_is_new_and_what_lasts() -> None:
     errors = PoseErrors((0.02, 0.003), (Process(SHIFT_IN_WORLD, 0.3), Process(ROTATION, 0.04, rate=0.01)))
     prior = prior_of(errors, np.zeros(2))
-    assert prior.fresh == (0.02, 0.003)
-    assert prior.lasting == pytest.approx((0.3, np.sqrt(0.04**2 + 0.01**2 * 10)))
+    assert prior.white == (0.02, 0.003)
+    assert prior.constant == pytest.approx((0.3, np.sqrt(0.04**2 + 0.01**2 * 10)))
     np.testing.assert_allclose(prior_of(None, np.array([0.3, 0.02])).level, [0.3, 0.02])
-    assert replace(prior, fresh=(0.0, 0.0)).level == pytest.approx(prior.lasting)
+    assert replace(prior, white=(0.0, 0.0)).level == pytest.approx(prior.constant)
 
 
 @pytest.mark.parametrize("shutter", ["global", "rolling", "rolling, not stated"])
@@ -281,8 +281,8 @@ def test_a_rolling_shutter_does_not_bend_the_background(shutter: str) -> None:
     )
     between = Interpolation(max_gap_s=1.0, max_extrapolation_s=0.0)
     followed = {"drone1": Followed(np.arange(len(t_ns)), tracks)}
-    (found,), told, _ = refine_cameras([camera], followed, [PRIOR], between=between, stated=True)
+    (found,), entries, _ = refine_cameras([camera], followed, [PRIOR], between=between, stated=True)
     left = turns_deg(matrix_from_quaternion(found.trajectory.quaternion_xyzw), turned[stamps])
-    assert told["drone1"]["used"]
+    assert entries["drone1"]["used"]
     left_deg = float(np.sqrt(np.mean(left**2)))
     assert left_deg > 0.2 if shutter == "rolling, not stated" else left_deg < 0.15

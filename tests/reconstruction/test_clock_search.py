@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.noise import Bias, NoiseModel, White
 from pipelines.geometry.triangulation import Views
-from pipelines.reconstruction.refining import begun_offsets_s
+from pipelines.reconstruction.refining import initial_offsets_s
 from tests.reconstruction.formations import FOCAL_PX, Formation, formation
 
 TIMES, LATE_S, SIGMA_S = 150, 0.45, 0.5
@@ -40,15 +40,15 @@ def seen(flight: Formation, shift_s: float, unknown: NDArray[np.bool_]) -> Views
     )
 
 
-def begun(flight: Formation, sigma_s: Float) -> Float:
-    return begun_offsets_s(lambda shift_s: seen(flight, shift_s, sigma_s > 0), TIMES, sigma_s)
+def initial_offsets(flight: Formation, sigma_s: Float) -> Float:
+    return initial_offsets_s(lambda shift_s: seen(flight, shift_s, sigma_s > 0), TIMES, sigma_s)
 
 
 @pytest.mark.parametrize("models", [[], ROUGH], ids=["exact", "rough"])
 @pytest.mark.parametrize("late_s", [LATE_S, -LATE_S])
 def test_half_a_second_is_found_to_a_step(models: list[NoiseModel], late_s: float) -> None:
     flight = formation(TIMES, 3, models, 0, late_s=(0.0, late_s, 0.0))
-    found = begun(flight, np.array([0.0, SIGMA_S, SIGMA_S]))
+    found = initial_offsets(flight, np.array([0.0, SIGMA_S, SIGMA_S]))
     assert found[0] == 0.0
     np.testing.assert_allclose(found[1:], [late_s, 0.0], atol=STEP_S)
 
@@ -56,14 +56,14 @@ def test_half_a_second_is_found_to_a_step(models: list[NoiseModel], late_s: floa
 def test_a_camera_that_sees_nothing_for_a_while_is_left_out_then() -> None:
     flight = formation(TIMES, 3, [], 0, late_s=(0.0, 0.0, LATE_S))
     flight.sightings[1].xy[40:80] = np.nan
-    found = begun(flight, np.array([0.0, 0.0, SIGMA_S]))
+    found = initial_offsets(flight, np.array([0.0, 0.0, SIGMA_S]))
     np.testing.assert_allclose(found, [0.0, 0.0, LATE_S], atol=STEP_S)
 
 
 def test_nothing_is_begun_where_all_clocks_are_known_or_none() -> None:
     flight = formation(TIMES, 2, [], 0, late_s=(0.0, LATE_S))
-    assert not begun(flight, np.zeros(2)).any()
-    assert not begun(flight, np.full(2, SIGMA_S)).any()
+    assert not initial_offsets(flight, np.zeros(2)).any()
+    assert not initial_offsets(flight, np.full(2, SIGMA_S)).any()
 
 
 def test_who_stands_still_leaves_clocks_where_they_are() -> None:
@@ -71,4 +71,4 @@ def test_who_stands_still_leaves_clocks_where_they_are() -> None:
     rng = np.random.default_rng(0)
     for sighting in flight.sightings:
         sighting.xy[:] = sighting.xy[:1] + rng.normal(0, 2 / FOCAL_PX, sighting.xy.shape)
-    assert not begun(flight, np.array([0.0, SIGMA_S])).any()
+    assert not initial_offsets(flight, np.array([0.0, SIGMA_S])).any()

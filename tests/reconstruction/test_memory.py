@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.reconstruction.refinement.estimate import lasting
+from pipelines.reconstruction.refinement.estimate import memory_of_whole_error
 
 FRAMES, FLIGHTS = 1000, 2000
 
@@ -25,9 +25,11 @@ def test_the_mean_of_errors_that_hardly_show_is_as_uncertain(kept: float, scale:
         error[k] = kept * error[k - 1] + np.sqrt(1 - kept**2) * rng.normal(size=FLIGHTS)
     seen = scale * rng.normal(size=error.shape) + np.sqrt(1 - scale**2) * error
     of_one = scale**2 / FRAMES  # variance of the mean if the visible errors were independent
-    assert lasting(tau, scale) == pytest.approx(seen.mean(axis=0).var() / of_one, rel=0.13 + tau / FRAMES)
+    assert memory_of_whole_error(tau, scale) == pytest.approx(
+        seen.mean(axis=0).var() / of_one, rel=0.13 + tau / FRAMES
+    )
 
 
 def test_points_better_than_stated_are_no_reason_to_count_them_less_than_their_memory_says() -> None:
-    assert lasting(3.0, 1.0) == 3.0
-    assert lasting(3.0, 2.0) == 3.0
+    assert memory_of_whole_error(3.0, 1.0) == 3.0
+    assert memory_of_whole_error(3.0, 2.0) == 3.0

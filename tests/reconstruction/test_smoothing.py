@@ -57,8 +57,8 @@ def test_the_gain_is_that_of_two_passes_and_nothing_lags(order: int) -> None:
     # Far from the ends: what the ends start dies by e^-1 in 1 / (2 pi 6 Hz sin(pi/8)) = 70 ms or less.
     middle = slice(180, 420)
     np.testing.assert_allclose(smoothed.position[middle, 0, 0], expected[middle], atol=1e-9)
-    assert smoothed.told["cutoff_hz"] == cutoff_hz
-    assert smoothed.told["cutoff_of_a_pass_hz"] > cutoff_hz
+    assert smoothed.report["cutoff_hz"] == cutoff_hz
+    assert smoothed.report["cutoff_of_a_pass_hz"] > cutoff_hz
 
 
 def test_runs_on_both_sides_of_a_gap_know_nothing_of_each_other() -> None:
@@ -84,13 +84,13 @@ def test_what_is_too_short_is_left_as_it_is_and_counted() -> None:
     position, covariance = one_joint(values)
     smoothed = Butterworth().apply(stamps(60), position, covariance)
     np.testing.assert_array_equal(smoothed.position[:8], position[:8])
-    assert smoothed.told["joint_frames_in_runs_too_short"] == 8
+    assert smoothed.report["joint_frames_in_runs_too_short"] == 8
     assert smoothed.covariance is covariance
 
 
 def test_a_filter_needs_an_even_rate_and_a_cutoff_below_half_of_it() -> None:
     position, covariance = one_joint(np.zeros((100, 3)))
-    with pytest.raises(DataError, match=r"cutoff_hz=30 is not below half the skeleton's rate \(30 Hz\)"):
+    with pytest.raises(DataError, match=r"cutoff_hz=30\b.*\(30 Hz\)"):
         Butterworth(cutoff_hz=30).apply(stamps(100), position, covariance)
     uneven = stamps(100) + np.tile([0, 8_000_000], 50)
     with pytest.raises(DataError, match="uneven"):
@@ -212,13 +212,13 @@ def test_errors_that_last_are_not_smoothed_away() -> None:
     position, covariance = one_joint(values)
     covariance = covariance * (1 + 100)  # both errors
     smoothed = RauchTungStriebel().apply(stamps(count), position, covariance)
-    assert smoothed.told["new_share_of_variance"] == pytest.approx(1 / 101, rel=0.3)
+    assert smoothed.report["new_share_of_variance"] == pytest.approx(1 / 101, rel=0.3)
     middle = slice(50, 350)
     kept = np.trace(smoothed.covariance[middle, 0, 0], axis1=1, axis2=2) / 3
     np.testing.assert_allclose(kept, 1e-2, rtol=0.02)
     left = (smoothed.position[:, 0, 0] - truth - [0.1, -0.1, 0.1])[middle]
     assert np.sqrt(np.mean(left**2)) < 0.005  # of 1 cm
-    assert 0 < smoothed.told["cutoff_hz"] < RATE / 2
+    assert 0 < smoothed.report["cutoff_hz"] < RATE / 2
 
 
 def test_a_stated_density_takes_covariances_at_their_word() -> None:

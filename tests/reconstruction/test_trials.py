@@ -9,7 +9,7 @@ import pytest
 
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.reconstruction.observations import Camera
-from pipelines.reconstruction.trials import disturbances, disturbed, told_together
+from pipelines.reconstruction.trials import disturbances, disturbed, summary_of_trials
 from pipelines.session.errors import DataError
 from pipelines.session.records import Detections, Trajectory
 
@@ -67,7 +67,7 @@ def test_nonsense_is_refused_in_a_line(text: str | None, trials: int, said: str)
     assert "\n" not in str(refused.value)
 
 
-def told(mpjpe_mm: float | None) -> dict[str, Any]:
+def metrics_of(mpjpe_mm: float | None) -> dict[str, Any]:
     names = (
         "mpjpe_mm root_mpjpe_mm pa_mpjpe_mm e_recon_m2 e_recon_terms e_recon_per_joint_frame_m2 pck150"
         " pck150_auc acceleration_error_mm_s2 reconstructed_share"
@@ -76,7 +76,9 @@ def told(mpjpe_mm: float | None) -> dict[str, Any]:
 
 
 def test_trials_together() -> None:
-    said = told_together([told(100.0), told(None), told(140.0)], "white:position_m=1", 0)
+    said = summary_of_trials(
+        [metrics_of(100.0), metrics_of(None), metrics_of(140.0)], "white:position_m=1", 0
+    )
     assert (said["count"], said["stored"], said["seed"]) == (3, 0, 0)
     assert [each["mpjpe_mm"] for each in said["each"]] == [100.0, None, 140.0]
     assert said["mean"]["mpjpe_mm"] == 120
@@ -85,6 +87,6 @@ def test_trials_together() -> None:
     assert said["intervals"]["mpjpe_mm"] == [100, 140]
     assert said["mean"]["pa_mpjpe_mm"] is None
     assert said["std"]["reprojection_px_median"] == 0
-    alone = told_together([told(100.0)], "white:position_m=1", 0)
+    alone = summary_of_trials([metrics_of(100.0)], "white:position_m=1", 0)
     assert alone["mean"]["mpjpe_mm"] == 100
     assert alone["std"]["mpjpe_mm"] is alone["intervals"]["mpjpe_mm"] is None

@@ -129,7 +129,7 @@ def learn(
         if poses and index == rounds // 2:
             memory = memory_of(system, state)
             if memory > REMEMBERED:
-                memory = lasting(memory, known.pixel_scale)
+                memory = memory_of_whole_error(memory, known.pixel_scale)
             known = replace(known, memory=memory)
     return known, state
 
@@ -186,7 +186,7 @@ _BODY_ACCELERATION, _BODY_COUNT = 1.5, 3.0  # m/s^2, weight of this prior; the s
 _LEAST_ACCELERATION = 0.1  # m/s^2, along any combination of joints
 _LEAST_BONE_M = 0.001
 _STRIDE = 1.5  # overshoot of a step over its goal, on a logarithmic scale
-_LEAST_TOLD = 0.03  # least share of a level determined by data: levels without data stay unchanged
+_LEAST_DETERMINED = 0.03  # least share of a level determined by data: levels without data stay unchanged
 _CHANGES = (0.04, 6.0)  # bounds of the change of a variance in one round
 _MOST_OF_CONSTANT = 1.6
 """Upper bound for constant errors: they are only a few numbers, and can diverge with the scale."""
@@ -214,8 +214,8 @@ def reestimated(system: System, state: State, at: Eliminated, *, poses: bool, mo
     grown = system.grown(state)
     before = known.bone_sigma_m * grown
     bones = before * (np.sqrt(found.bones / found.times) / before) ** _STRIDE
-    squares, told = found.image.sum(axis=0)
-    scale = known.pixel_scale * float(np.sqrt(squares / max(told, 1.0)))
+    squares, determined = found.image.sum(axis=0)
+    scale = known.pixel_scale * float(np.sqrt(squares / max(determined, 1.0)))
     return replace(
         known,
         acceleration=_acceleration(known.acceleration * grown**2, found, _bodies(system.problem)),
@@ -284,7 +284,7 @@ def _acceleration(before: Float, found: Moments, bodies: Float) -> Float:
     root, inverse = (vectors * values**power @ vectors.T for power in (0.5, -0.5))
     squares, variance = (inverse @ part @ inverse / found.times for part in found.acceleration)
     shares, axes = np.linalg.eigh(np.eye(len(before)) - (variance + variance.T) / 2)
-    known = np.maximum(shares, _LEAST_TOLD)
+    known = np.maximum(shares, _LEAST_DETERMINED)
     estimate = axes.T @ (squares - variance) @ axes + np.diag(known - shares)
     for body in bodies.T:
         along = axes.T @ inverse @ body
@@ -311,10 +311,10 @@ def _bodies(problem: Problem) -> Float:
     return np.eye(count)[label]
 
 
-def _change(squares: float, told: float, count: float) -> float:
+def _change(squares: float, determined: float, count: float) -> float:
     """Compute the factor on a variance from the mean square of estimates and the share the data determine."""
-    known = max(told / count, _LEAST_TOLD)
-    goal = (squares / count + known - told / count) / known
+    known = max(determined / count, _LEAST_DETERMINED)
+    goal = (squares / count + known - determined / count) / known
     return float(np.clip(max(goal, 1e-9) ** _STRIDE, *_CHANGES))
 
 
@@ -326,13 +326,13 @@ def _poses(system: System, found: Moments) -> tuple[PoseErrors, ...]:
     stray2 = before**2 - np.square(known.poses[0].white)
     white = []
     for part in range(2):
-        squares, count, told = found.white[part]
+        squares, count, determined = found.white[part]
         if count == 0:
             white.append(0.0)
             continue
         variance = before[part] ** 2
-        estimates = squares / variance - (count - told)
-        wanted = variance * _change(estimates, told, count) - stray2[part]
+        estimates = squares / variance - (count - determined)
+        wanted = variance * _change(estimates, determined, count) - stray2[part]
         white.append(max(float(np.sqrt(max(wanted, 0.0))), _LEAST_WHITE[part]))
     by_place: dict[int, list[tuple[bool, int]]] = {}
     for (camera, process), place in zip(layout.processes, layout.place, strict=True):
@@ -350,15 +350,15 @@ def _process(process: Process, places: list[tuple[bool, int]], found: Moments, k
     at_knots = places[0][0]
     starting = found.starting[columns if at_knots else columns + knot_count]
     variance = process.sigma0**2
-    told = float(np.sum(1 - starting[:, 1] / variance))
+    determined = float(np.sum(1 - starting[:, 1] / variance))
     estimates = float(np.sum(starting[:, 0] - starting[:, 1])) / variance
-    sigma0 = process.sigma0 * np.sqrt(min(_change(estimates, told, len(columns)), _MOST_OF_CONSTANT))
+    sigma0 = process.sigma0 * np.sqrt(min(_change(estimates, determined, len(columns)), _MOST_OF_CONSTANT))
     rate = 0.0
     if process.rate > 0:
         squares, count, spread = found.walked[columns].sum(axis=0)
-        told = count - spread / process.rate**2
+        determined = count - spread / process.rate**2
         estimates = (squares - spread) / process.rate**2
-        rate = max(process.rate * float(np.sqrt(_change(estimates, told, count))), _LEAST_RATE[part])
+        rate = max(process.rate * float(np.sqrt(_change(estimates, determined, count))), _LEAST_RATE[part])
     return replace(process, sigma0=max(float(sigma0), _LEAST_CONSTANT[part]), rate=rate)
 
 
@@ -405,7 +405,7 @@ def memory_of(system: System, state: State) -> float:
     return min(tau, _MOST)
 
 
-def lasting(memory: float, pixel_scale: float) -> float:
+def memory_of_whole_error(memory: float, pixel_scale: float) -> float:
     """Compute the memory of image points if part of their error does not show in residuals.
 
     The error of a single point is known beforehand: for a detector, the measured one. Residuals show only

@@ -34,7 +34,7 @@ _ROUNDS = 8
 _ROOT_ACCELERATION, _OWN_ACCELERATION = 3.0, 10.0  # m/s^2, initial values: a walking body, its limbs
 _BONE_SIGMA_M = 0.02
 _FEWEST_TIMES = 20
-_ABRUPT = 3.0  # times the accelerations of the prior, for the estimate of clocks and slow pose errors
+_LOOSE_MOTION = 3.0  # times the accelerations of the prior, for the estimate of clocks and slow pose errors
 SETTLED_S = 2e-3
 """Offset of a clock that may stay in the pictures' stamps."""
 _UNEXPLAINED = 1.15  # times the image noise that the pictures show between neighbours: the prior is wrong
@@ -44,7 +44,7 @@ _SIGMAS = 4.0
 _SETTLING = 4  # rounds to test how well given levels explain the pictures
 _STATED = 10.0  # bonus on the log evidence of stated levels
 _STATED_DRIFT = 0.5  # bonus per picture if errors change over time: between knots they count as white
-_HARDLY_COUNTS = 30.0
+_UNINFORMATIVE_MEMORY = 30.0
 """Memory of image points from which levels of slow pose errors cannot be estimated."""
 _SMALL_SCALE = 0.01  # standard deviation of the formation's scale that does not matter
 _UNSEEN_SCALE = 0.85  # posterior over prior sigma of the scale above which pictures do not determine it
@@ -58,18 +58,22 @@ _FARTHEST_STATED = 3.2
 sqrt(30.7 / 3): the root of a chi-square variable with three degrees of freedom over three exceeds it once in
 a million times.
 """
-_TOLD_PLACE = 0.7
+_DETERMINED_PLACE = 0.7
 """Share of a triangulated point's error by slow pose errors; above it, pictures do not determine a place."""
 _REFUSED = 0.5  # per picture: log evidence that stated levels may lie below the refused ones
 _UNLIKE_STATED = "refined: the stated pose noise does not explain the pictures; "
 _INSTEAD = {"estimated": "it was estimated instead", "exact": "the poses were taken as they are"}
-_PLACED_AS_LOGGED = (
-    "refined: pictures hardly tell where the person was, and nobody stated pose noise that explains them: on "
-    "average the skeleton stays where the logged poses put it"
+PLACED_AS_LOGGED = (
+    "refined: the videos do not determine the person's absolute position; it is taken from the logged poses "
+    "(state pose_noise to change this)"
 )
-_RESTS_ON_STATED = (
-    "refined: the formation hardly changes, so pictures tell neither its scale nor constant pose errors in "
-    "the cameras' own frames: these rest on the stated pose noise alone"
+UNOBSERVED = (
+    "the formation hardly changes, so the videos determine neither its scale nor constant pose errors: state "
+    "the pose noise"
+)
+RESTS_ON_STATED = (
+    "refined: the formation hardly changes, so the videos determine neither its scale nor constant pose "
+    "errors in the cameras' own frames: both rest on the stated pose noise alone"
 )
 
 
@@ -116,12 +120,12 @@ def refine(
         return _none(sightings, start, "too few joints or times were triangulated")
     sightings = [_take(sighting, part) for sighting in sightings]
     bones = _renumbered(bones, part)
-    begun = _without_gaps(t_s, start[:, part])
+    filled = _without_gaps(t_s, start[:, part])
     problem = build(t_s, sightings, bones, threads=threads)
     refused = None
     try:
-        for found in _priors(problem, sightings, begun, prior, clock_sigma_s):
-            refined = _refined(problem, start, part, begun, found)
+        for found in _priors(problem, sightings, filled, prior, clock_sigma_s):
+            refined = _refined(problem, start, part, filled, found)
             if refined.fallback is None:
                 return refined
             refused = refused or refined
@@ -140,14 +144,14 @@ class _Prior:
     expected_m: float  # largest allowed move of the skeleton
 
 
-def _refined(problem: Problem, start: Float, part: Bool, begun: Float, prior: _Prior) -> Refined:
+def _refined(problem: Problem, start: Float, part: Bool, filled: Float, prior: _Prior) -> Refined:
     """Estimate under a prior, and check the result; `fallback` gives the reason if a check fails.
 
     Raises:
         LinAlgError: its equations are singular.
     """
     known, cameras = prior.known, len(prior.known.poses)
-    state = initial_state(problem, known, begun)
+    state = initial_state(problem, known, filled)
     clock_s, clock_left_s = _clocks(problem, known, state)
     if np.abs(clock_s).max() <= SETTLED_S:
         known = replace(known, clock_sigma_s=clock_left_s)
@@ -156,26 +160,26 @@ def _refined(problem: Problem, start: Float, part: Bool, begun: Float, prior: _P
     covariance = covariances(system, at)
     doubts = _doubts(system, state, at, learned=prior.learned)
     as_stated = not prior.learned and _scale_unseen(system, state, at)
-    as_logged = prior.learned and _unplaced(system, state, at, covariance)
+    as_logged = prior.learned and _position_undetermined(system, state, at, covariance)
     del at  # the next solutions have their own factors
-    slowly = system, state  # determines the poses
+    slow = system, state  # determines the poses
     if known.memory > REMEMBERED:
-        quick = _quickly(*slowly, freely)
-    elif _all_lasts(problem, known, state):
-        slowly = _abruptly(problem, known, state)[:2]
-        quick = _quickly(*slowly, freely)
+        joints = _joints_without_slow_errors(*slow, freely)
+    elif _mainly_slow(problem, known, state):
+        slow = _solve_with_loose_motion(problem, known, state)[:2]
+        joints = _joints_without_slow_errors(*slow, freely)
     else:
-        quick = state.position
-    fallback = doubts or _too_far(quick, begun, prior.expected_m)
-    shift = np.median(begun - quick, axis=(0, 1)) if as_logged else np.zeros(3)
+        joints = state.position
+    fallback = doubts or _too_far(joints, filled, prior.expected_m)
+    shift = np.median(filled - joints, axis=(0, 1)) if as_logged else np.zeros(3)
     position = np.full_like(start, np.nan)
-    position[:, part] = quick + shift
+    position[:, part] = joints + shift
     whole = np.full((*start.shape, 3), np.nan)
     whole[:, part] = covariance
     return Refined(
         position=position,
         covariance=whole,
-        corrections=_corrections(*slowly, shift),
+        corrections=_corrections(*slow, shift),
         clock_offset_s=clock_s,
         clock_sigma_s=clock_left_s,
         levels=_levels(known),
@@ -184,8 +188,8 @@ def _refined(problem: Problem, start: Float, part: Bool, begun: Float, prior: _P
         learned=prior.learned,
         warnings=(
             *prior.warnings,
-            *([_RESTS_ON_STATED] if as_stated else []),
-            *([_PLACED_AS_LOGGED] if as_logged else []),
+            *([RESTS_ON_STATED] if as_stated else []),
+            *([PLACED_AS_LOGGED] if as_logged else []),
         ),
         fallback=fallback,
     )
@@ -195,12 +199,12 @@ def _clocks(problem: Problem, known: Knowledge, state: State) -> tuple[Float, Fl
     """Estimate each clock's offset and its standard deviation [C] s, 0 for known clocks."""
     if not (known.clock_sigma_s > 0).any():
         return np.zeros(len(known.poses)), np.zeros(len(known.poses))
-    system, state, at = _abruptly(problem, known, state)
+    system, state, at = _solve_with_loose_motion(problem, known, state)
     left = np.sqrt(np.diagonal(shared_covariance(system, at)))
     return _of_clocks(system, state.shared), _of_clocks(system, left)
 
 
-def _all_lasts(problem: Problem, known: Knowledge, state: State) -> bool:
+def _mainly_slow(problem: Problem, known: Knowledge, state: State) -> bool:
     """Test if pose errors are mainly slow: white ones move a joint in the pictures less than keypoint noise.
 
     Larger white errors are separated from motion only by the tight motion prior, which must then be kept.
@@ -218,7 +222,9 @@ def _spread_of(cameras: int) -> float:
     return float(np.sqrt(4.5 / cameras))
 
 
-def _abruptly(problem: Problem, known: Knowledge, state: State) -> tuple[System, State, Eliminated]:
+def _solve_with_loose_motion(
+    problem: Problem, known: Knowledge, state: State
+) -> tuple[System, State, Eliminated]:
     """Estimate clock offsets and slow pose errors with a looser motion prior (accelerations 3 times larger).
 
     The accelerations of a gait repeat and are not random. The tight prior makes the swings of limbs smaller.
@@ -226,11 +232,11 @@ def _abruptly(problem: Problem, known: Knowledge, state: State) -> tuple[System,
     and constant pose errors. With no motion prior at all, a picture would fit anywhere between two times of
     the skeleton, and some clocks would not be estimated.
     """
-    abrupt = replace(known, acceleration=_ABRUPT**2 * known.acceleration)
-    return solve(problem, abrupt, state, rounds=_ROUNDS)
+    loose = replace(known, acceleration=_LOOSE_MOTION**2 * known.acceleration)
+    return solve(problem, loose, state, rounds=_ROUNDS)
 
 
-def _quickly(system: System, state: State, known: Knowledge) -> Float:
+def _joints_without_slow_errors(system: System, state: State, known: Knowledge) -> Float:
     """Estimate the joints [T, J, 3] after removing slow pose errors, with the full weight of keypoints.
 
     Slow errors were estimated with correlated keypoints weighted less, or with a looser motion prior. That is
@@ -248,8 +254,8 @@ def _quickly(system: System, state: State, known: Knowledge) -> Float:
         white = errors.white_with_stray(knot_s)
         poses.append(PoseErrors((float(white[0]), float(white[1])), (), errors.logged))
     known = replace(known, poses=tuple(poses), memory=1.0)
-    begun = initial_state(problem, known, state.position)
-    _, found, _ = solve(problem, known, begun, rounds=4, bounds=(BOUND,))
+    initial = initial_state(problem, known, state.position)
+    _, found, _ = solve(problem, known, initial, rounds=4, bounds=(BOUND,))
     return found.position
 
 
@@ -324,13 +330,13 @@ def _priors(
     guess, image, disagreement_m, range_m = _first_guess(problem, start[chosen])
     stated_m = 0.0 if prior is None else float(np.mean([_ray_sigma_m(errors, range_m) for errors in prior]))
     spread = _spread_of(len(sightings))
-    begun = _unlearned(problem, start[chosen], (guess,) * len(sightings), clock_sigma_s)
-    state = initial_state(problem, begun, start[chosen])
-    free, state = learn(problem, begun, state, poses=True, rounds=_LEARNING_ROUNDS)
+    unlearned = _unlearned(problem, start[chosen], (guess,) * len(sightings), clock_sigma_s)
+    state = initial_state(problem, unlearned, start[chosen])
+    free, state = learn(problem, unlearned, state, poses=True, rounds=_LEARNING_ROUNDS)
     # The alternatives use the same motion, bones and image noise: from round to round, learning these changes
     # the evidence by more than the differences between right levels.
     found = {}
-    if free.memory < _HARDLY_COUNTS:
+    if free.memory < _UNINFORMATIVE_MEMORY:
         found["estimated"] = (evidence(problem, free, state), free, state)
     exact = (PoseErrors((0.0, 0.0), ()),) * len(sightings)
     others = {} if prior is None else {"stated": tuple(prior)}
@@ -348,7 +354,7 @@ def _priors(
     if not found:
         raise np.linalg.LinAlgError("the equations are singular whatever the pose noise")
     # Stated levels are replaced only for a clear difference of evidence.
-    reason = {"stated": _reason(problem, prior, lasting=free.memory > REMEMBERED)}
+    reason = {"stated": _evidence_margin(problem, prior, correlated=free.memory > REMEMBERED)}
     best = max(found, key=lambda name: found[name][0] + reason.get(name, 0.0))
     tried = [best]
     if best == "estimated" and "stated" in found:
@@ -372,13 +378,13 @@ def _priors(
         )
 
 
-def _reason(problem: Problem, stated: Sequence[PoseErrors] | None, *, lasting: bool) -> float:
+def _evidence_margin(problem: Problem, stated: Sequence[PoseErrors] | None, *, correlated: bool) -> float:
     """Compute the margin by which the evidence of other levels must exceed that of the stated ones.
 
     With correlated keypoint errors the margin is larger, because keypoints then count little in the evidence.
     """
     changes = any(not process.constant for errors in stated or () for process in errors.processes)
-    return _STATED + (_STATED_DRIFT * len(problem.pictures.first) if changes or lasting else 0.0)
+    return _STATED + (_STATED_DRIFT * len(problem.pictures.first) if changes or correlated else 0.0)
 
 
 def _stretches(times: int) -> Int64:
@@ -421,12 +427,12 @@ def _first_guess(problem: Problem, start: Float) -> tuple[PoseErrors, float, flo
         image.append(_spread(np.diff(own[mine], axis=0)) / np.sqrt(2))
     # A joint's position absorbs three of its 2 n residuals: of their sum, not equally in each camera.
     lost = np.sqrt(2 * cameras / (2 * cameras - 3))
-    quick, all_of_it = lost * float(np.median(white)), lost * float(np.median(total))
-    slow = 1.5 * float(np.sqrt(max(all_of_it**2 - quick**2, (_SLOW_SHARE * all_of_it) ** 2)))
-    quick *= 1.2
+    fast, all_of_it = lost * float(np.median(white)), lost * float(np.median(total))
+    slow = 1.5 * float(np.sqrt(max(all_of_it**2 - fast**2, (_SLOW_SHARE * all_of_it) ** 2)))
+    fast *= 1.2
     range_m = float(np.nanmedian(distance))
     guess = PoseErrors(
-        (max(0.8 * quick * range_m, 0.01), max(0.6 * quick, 1e-3)),
+        (max(0.8 * fast * range_m, 0.01), max(0.6 * fast, 1e-3)),
         (
             Process(SHIFT_IN_WORLD, max(0.8 * slow * range_m, 0.02), 0.03),
             Process(ROTATION, max(0.6 * slow, 2e-3), 2e-3),
@@ -489,10 +495,7 @@ def _doubts(system: System, state: State, at: Eliminated, *, learned: bool) -> s
         side = "wider" if grown > 0 else "closer"
         return f"the cameras would stand {100 * abs(grown):.0f} % {side} than logged"
     if learned and _scale_unseen(system, state, at):
-        return (
-            "the formation hardly changes, so pictures tell neither its scale nor how far off poses are "
-            "all along, and nobody stated it: state the pose noise"
-        )
+        return UNOBSERVED
     for (camera, process), (at_knots, column) in zip(
         system.layout.processes, system.layout.place, strict=True
     ):
@@ -503,7 +506,7 @@ def _doubts(system: System, state: State, at: Eliminated, *, learned: bool) -> s
     return None
 
 
-def _unplaced(system: System, state: State, at: Eliminated, covariance: Float) -> bool:
+def _position_undetermined(system: System, state: State, at: Eliminated, covariance: Float) -> bool:
     """Test if the person's absolute position is not determined by the pictures.
 
     Constant errors are only a few numbers, and their estimated levels are uncertain. If the posterior of the
@@ -519,7 +522,7 @@ def _unplaced(system: System, state: State, at: Eliminated, covariance: Float) -
         return False
     left_m = float(np.sqrt(np.trace(covariance, axis1=-2, axis2=-1).mean()))
     unseen = _scale_left(system, state, at) > _UNSEEN_SCALE
-    return unseen or left_m > _TOLD_PLACE * slow_m * _spread_of(len(poses))
+    return unseen or left_m > _DETERMINED_PLACE * slow_m * _spread_of(len(poses))
 
 
 def _scale_unseen(system: System, state: State, at: Eliminated) -> bool:
@@ -530,8 +533,8 @@ def _scale_unseen(system: System, state: State, at: Eliminated) -> bool:
 def _scale_left(system: System, state: State, at: Eliminated) -> float:
     """Compute the ratio of posterior to prior standard deviation of the formation's scale."""
     lengths = state.shared[system.layout.bone_column :]
-    told = shared_covariance(system, at)[system.layout.bone_column :, system.layout.bone_column :]
-    return float(np.sqrt(told.sum())) / float(lengths.sum()) / _scale_sigma(system)
+    posterior = shared_covariance(system, at)[system.layout.bone_column :, system.layout.bone_column :]
+    return float(np.sqrt(posterior.sum())) / float(lengths.sum()) / _scale_sigma(system)
 
 
 def _scale_sigma(system: System) -> float:
@@ -547,9 +550,9 @@ def _apart(pictures: Pictures, position: Float) -> Float:
     return away
 
 
-def _too_far(position: Float, begun: Float, expected_m: float) -> str | None:
+def _too_far(position: Float, filled: Float, expected_m: float) -> str | None:
     """Check the move of the skeleton; return the reason to refuse it if the views do not explain it."""
-    moved_m = float(np.median(np.linalg.norm(position - begun, axis=-1)))
+    moved_m = float(np.median(np.linalg.norm(position - filled, axis=-1)))
     if moved_m > expected_m:
         return f"the skeleton would move by {moved_m:.2f} m where the views let expect {expected_m:.2f} m"
     return None
