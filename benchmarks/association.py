@@ -94,7 +94,7 @@ def views_of(choice: Int64, xy: Float, confidence: Float, position: Float, rotat
     taken = np.where(absent[..., None], np.nan, np.take_along_axis(xy, chosen[..., None], axis=2))
     weight = np.where(absent, 0.0, np.take_along_axis(confidence, chosen, axis=2))
     return Views(
-        xy=np.moveaxis(taken, 1, 3).reshape(-1, CAMERAS, 2),
+        rays=np.moveaxis(taken, 1, 3).reshape(-1, CAMERAS, 2),
         weight=np.moveaxis(weight, 1, 3).reshape(-1, CAMERAS),
         pose_index=np.repeat(np.arange(frames), PEOPLE * 17),
         position=position,

@@ -144,7 +144,7 @@ def expected_mm(
         seen = np.einsum("tji,tkj->tki", flight.rotation[camera], away)
         xy = seen[..., :2] / seen[..., 2:]
         exact.append(
-            replace(sighting, xy=xy, position=flight.position[camera], rotation=flight.rotation[camera])
+            replace(sighting, rays=xy, position=flight.position[camera], rotation=flight.rotation[camera])
         )
     problem = build(flight.t_s, exact, BONES)
     ends = flight.truth[:, BONES]

@@ -98,7 +98,7 @@ def pictures_row(label: str, views: Views, truth: Float, threads: int, repeats: 
 def print_peers(truth: Float, noisy: Views, outliers: Views, repeats: int) -> None:
     """Print the same figures of other tools."""
     two_views = Views(
-        noisy.xy[:, :2],
+        noisy.rays[:, :2],
         noisy.weight[:, :2],
         noisy.pose_index,
         noisy.position[:, :2],
@@ -200,7 +200,7 @@ def peer_row(name: str, run: Callable[[Views], Float], data: list[Views], truth:
 def numpy_svd(views: Views) -> Float:
     """Triangulate by the homogeneous linear method with numpy's batched SVD."""
     P = projections(views)[views.pose_index]
-    rows = views.xy[..., None] * P[:, :, 2:] - P[:, :, :2]
+    rows = views.rays[..., None] * P[:, :, 2:] - P[:, :, :2]
     X = np.linalg.svd(rows.reshape(len(rows), -1, 4))[2][:, -1]
     points: Float = X[:, :3] / X[:, 3:]
     return points
@@ -209,8 +209,8 @@ def numpy_svd(views: Views) -> Float:
 def opencv(views: Views) -> Float:
     """Triangulate with cv2.triangulatePoints, which takes two cameras and one pose of them per call."""
     P = projections(views)
-    joints = len(views.xy) // len(P)
-    pairs = views.xy.reshape(len(P), joints, 2, 2)
+    joints = len(views.rays) // len(P)
+    pairs = views.rays.reshape(len(P), joints, 2, 2)
     found = [
         cv2.triangulatePoints(p[0], p[1], xy[:, 0].T, xy[:, 1].T) for p, xy in zip(P, pairs, strict=True)
     ]
@@ -226,7 +226,7 @@ def pycolmap_ransac(views: Views) -> Float:
     options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
     options.ransac.max_error = GATE_PX
     poses = [[pycolmap.Rigid3d(p) for p in row] for row in projections(views)]
-    pixels = views.xy * FOCAL + [960, 540]
+    pixels = views.rays * FOCAL + [960, 540]
     points = np.full((len(pixels), 3), np.nan)
     for n, seen in enumerate(np.isfinite(pixels.sum(axis=2))):
         row = [pose for pose, there in zip(poses[views.pose_index[n]], seen, strict=True) if there]
@@ -248,7 +248,7 @@ def part(views: Views, rows: slice) -> Views:
     instants = slice(0, int(views.pose_index[rows].max()) + 1)
     return replace(
         views,
-        xy=views.xy[rows],
+        rays=views.rays[rows],
         weight=views.weight[rows],
         pose_index=views.pose_index[rows],
         position=views.position[instants],

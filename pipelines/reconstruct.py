@@ -432,8 +432,8 @@ def _observe(flight: _Flight, cameras: list[Camera], settings: Settings) -> _See
     nearest = np.clip(np.searchsorted(found.t_ns, observations.t_ns), 0, len(found.t_ns) - 1)
     anybody = np.asarray((found.confidence > 0).any(axis=(1, 2, 3)), dtype=np.bool_)[nearest]
     sides, between_views = _agreeing_sides(observations, sigma[nearest])
-    xy, confidence = on_sides(observations.xy, observations.confidence, sides)
-    observations = replace(observations, xy=xy, confidence=confidence)
+    rays, confidence = on_sides(observations.rays, observations.confidence, sides)
+    observations = replace(observations, rays=rays, confidence=confidence)
     return _Seen(found, association, observations, sides, between_views, anybody)
 
 
@@ -453,7 +453,7 @@ def find_people(
     sigma = ray_sigma(cameras, found.t_ns, found.position, pixel_sigma=pixel_sigma)
     association = associate(
         (found.t_ns - found.t_ns[0]) / 1e9,
-        found.xy,
+        found.rays,
         found.confidence,
         found.position,
         found.rotation,
@@ -616,9 +616,9 @@ def _agreeing_sides(observations: Observations, sigma: Float) -> tuple[Int64, di
     """Find the sides [T, P, J, C] on which most cameras agree; see `swaps_across_views`."""
     sides = np.empty(observations.confidence.shape, dtype=np.int64)
     total: Counter[str] = Counter()
-    for person in range(observations.xy.shape[1]):
+    for person in range(observations.rays.shape[1]):
         sides[:, person], counts = swaps_across_views(
-            observations.xy[:, person],
+            observations.rays[:, person],
             observations.position,
             observations.rotation,
             sigma,

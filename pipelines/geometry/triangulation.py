@@ -72,12 +72,12 @@ _START_WIDTH = (
 class Views:
     """Observations of N joint-frames by C cameras, and the cameras' poses at F instants.
 
-    A view is absent where `xy` or the pose is NaN or `weight` is 0. Image points are normalised and free of
-    distortion, (x/z, y/z) in the camera's frame. Joints of one instant share its row of poses. Triangulation
+    A view is absent where `rays` or the pose is NaN or `weight` is 0. Rays are normalised image points,
+    undistorted, (x/z, y/z) in the camera's frame. Joints of one instant share its row of poses. Triangulation
     is fastest if joints of one instant are neighbours in N.
     """
 
-    xy: Float  # [N, C, 2]
+    rays: Float  # [N, C, 2]
     weight: Float  # [N, C] confidence
     pose_index: Int64  # [N] row of the three arrays below
     position: Float  # [F, C, 3] m, camera centre in the world
@@ -91,7 +91,7 @@ class Views:
         n, cameras = self.weight.shape
         instants = self.position.shape[0]
         expected = {
-            "xy": (n, cameras, 2),
+            "rays": (n, cameras, 2),
             "pose_index": (n,),
             "position": (instants, cameras, 3),
             "rotation": (instants, cameras, 3, 3),
@@ -220,7 +220,7 @@ def reprojection_px(views: Views, points: Float) -> Float:
     rotation, position = views.rotation[views.pose_index], views.position[views.pose_index]
     x, y, z = np.einsum("ncij,nci->jnc", rotation, points[:, None] - position)
     depth = np.where(z > 0, z, 1.0)
-    distance = views.focal * np.hypot(x / depth - views.xy[..., 0], y / depth - views.xy[..., 1])
+    distance = views.focal * np.hypot(x / depth - views.rays[..., 0], y / depth - views.rays[..., 1])
     seen = (views.weight > 0) & np.isfinite(distance)
     result: Float = np.where(seen, np.where(z > 0, distance, np.inf), np.nan)
     return result
@@ -248,7 +248,7 @@ def estimate_noise(views: Views, *, threads: int = 1) -> Float:
         return views.pixel_sigma
     chosen = np.linspace(0, n - 1, min(n, _NOISE_SAMPLE)).astype(np.int64)
     sample = replace(
-        views, xy=views.xy[chosen], weight=views.weight[chosen], pose_index=views.pose_index[chosen]
+        views, rays=views.rays[chosen], weight=views.weight[chosen], pose_index=views.pose_index[chosen]
     )
 
     def explain(seen: Views, method: Method, sigma: Float) -> Float:
@@ -368,7 +368,7 @@ def triangulate_pictures(
     lost = rows[np.isnan(found.points[rows, 0])]
     status, residual_px = found.status.copy(), found.residual_px.copy()
     status[lost] = STATUS.index("rejected")
-    own = replace(views, xy=views.xy[rows], weight=views.weight[rows], pose_index=views.pose_index[rows])
+    own = replace(views, rays=views.rays[rows], weight=views.weight[rows], pose_index=views.pose_index[rows])
     residual_px[rows] = np.where(gross[rows], reprojection_px(own, found.points[rows]), residual_px[rows])
     return replace(found, status=status, residual_px=residual_px)
 
@@ -397,22 +397,22 @@ def _moved(views: Views, picture: Int64, points: Float) -> tuple[Views, Bool]:
 
     order = np.argsort(picture, kind="stable")
     starts = np.flatnonzero(np.diff(picture[order], prepend=-1, append=-1))
-    xy, judged = np.array(views.xy, np.float64, order="C"), np.zeros(views.weight.shape, dtype=np.bool_)
+    rays, judged = np.array(views.rays, np.float64, order="C"), np.zeros(views.weight.shape, dtype=np.bool_)
     move_pictures(
         order,
         starts,
         _FEWEST,
         np.ascontiguousarray(points),
-        np.ascontiguousarray(views.xy, np.float64),
+        np.ascontiguousarray(views.rays, np.float64),
         np.ascontiguousarray(views.weight, np.float64),
         np.ascontiguousarray(views.pose_index, np.int64),
         np.ascontiguousarray(views.position, np.float64),
         np.ascontiguousarray(views.rotation, np.float64),
-        xy,
+        rays,
         judged,
     )
     weight = np.where(judged, views.weight, 0.0)
-    return replace(views, xy=xy, weight=weight, pose_sigma=np.zeros_like(views.pose_sigma)), judged
+    return replace(views, rays=rays, weight=weight, pose_sigma=np.zeros_like(views.pose_sigma)), judged
 
 
 def _without(gross: Bool, views: Views) -> Views:

@@ -33,7 +33,7 @@ MAX_STEPS = 10
 class ViewArrays(NamedTuple):
     """Contiguous arrays of `triangulation.Views`."""
 
-    xy: Float  # [N, C, 2]
+    rays: Float  # [N, C, 2]
     weight: Float  # [N, C]
     pose_index: Int64  # [N]
     position: Float  # [F, C, 3]
@@ -132,7 +132,7 @@ def _load_cameras(
 
 @helper
 def _load_views(
-    xy: Float, weight: Float, n: int, camera: Float, posed: Bool, ids: Int64, ray: Float
+    rays: Float, weight: Float, n: int, camera: Float, posed: Bool, ids: Int64, ray: Float
 ) -> tuple[int, int]:
     """Collect the usable views of one joint-frame; return their number and the number of detections.
 
@@ -141,8 +141,8 @@ def _load_views(
     """
     views = detected = 0
     for c in range(weight.shape[1]):
-        x = xy[n, c, 0]
-        y = xy[n, c, 1]
+        x = rays[n, c, 0]
+        y = rays[n, c, 1]
         w = weight[n, c]
         if not (w > 0.0 and math.isfinite(w + x + y)):
             continue
@@ -702,7 +702,7 @@ def _describe(
 @cached
 def triangulate_range(first: int, last: int, views: ViewArrays, gates: Gates, found: Found) -> None:
     """Triangulate the joint-frames first <= n < last."""
-    xy, weight, pose_index, position, rotation, focal, pixel_sigma, pose_sigma = views
+    rays, weight, pose_index, position, rotation, focal, pixel_sigma, pose_sigma = views
     method, min_views, cos2_min, gate2, pair_table, pair_count = gates
     points, inlier, status, covariance, count, residual_px = found
     n_cameras = weight.shape[1]
@@ -719,7 +719,7 @@ def triangulate_range(first: int, last: int, views: ViewArrays, gates: Gates, fo
         if pose_index[n] != loaded:
             loaded = pose_index[n]
             origin = _load_cameras(position, rotation, pose_sigma, loaded, camera, posed)
-        seen, detected = _load_views(xy, weight, n, camera, posed, ids, ray)
+        seen, detected = _load_views(rays, weight, n, camera, posed, ids, ray)
         if describe or method == ROBUST:
             _load_noise(ids, ray, seen, camera, pixel_variance)
         x = y = z = math.nan
@@ -798,8 +798,8 @@ def _median(values: Float, count: int) -> float:
 
 
 @helper
-def _seen(xy: Float, weight: Float, n: int, c: int) -> bool:
-    return weight[n, c] > 0.0 and math.isfinite(weight[n, c] + xy[n, c, 0] + xy[n, c, 1])
+def _seen(rays: Float, weight: Float, n: int, c: int) -> bool:
+    return weight[n, c] > 0.0 and math.isfinite(weight[n, c] + rays[n, c, 0] + rays[n, c, 1])
 
 
 @cached
@@ -808,7 +808,7 @@ def move_pictures(
     starts: Int64,
     fewest: int,
     points: Float,
-    xy: Float,
+    rays: Float,
     weight: Float,
     pose_index: Int64,
     position: Float,
@@ -822,10 +822,10 @@ def move_pictures(
     front of its camera has no residual and is moved with the others. Pictures with fewer than `fewest`
     residuals stay as they are.
 
-    `order` [N], `starts` [P + 1]; `points` [N, 3] m in the world, NaN where there is none; `xy` [N, C, 2]
+    `order` [N], `starts` [P + 1]; `points` [N, 3] m in the world, NaN where there is none; `rays` [N, C, 2]
     normalised, NaN or of weight 0 where unseen; `weight` [N, C]; `pose_index` [N] into `position` [F, C, 3] m
     and `rotation` [F, C, 3, 3] world_from_camera, NaN without a pose. Written: `moved` [N, C, 2], which
-    starts as a copy of `xy`, and `judged` [N, C], which starts as False.
+    starts as a copy of `rays`, and `judged` [N, C], which starts as False.
     """
     most = 0
     for p in range(len(starts) - 1):
@@ -837,7 +837,7 @@ def move_pictures(
             count = 0
             for k in range(starts[p], starts[p + 1]):
                 n = order[k]
-                if not _seen(xy, weight, n, c):
+                if not _seen(rays, weight, n, c):
                     continue
                 at = pose_index[n]
                 dx = points[n, 0] - position[at, c, 0]
@@ -848,8 +848,8 @@ def move_pictures(
                     continue
                 right = rotation[at, c, 0, 0] * dx + rotation[at, c, 1, 0] * dy + rotation[at, c, 2, 0] * dz
                 down = rotation[at, c, 0, 1] * dx + rotation[at, c, 1, 1] * dy + rotation[at, c, 2, 1] * dz
-                u[count] = right / depth - xy[n, c, 0]
-                v[count] = down / depth - xy[n, c, 1]
+                u[count] = right / depth - rays[n, c, 0]
+                v[count] = down / depth - rays[n, c, 1]
                 count += 1
             if count < fewest:
                 continue
@@ -857,7 +857,7 @@ def move_pictures(
             shift_v = _median(v, count)
             for k in range(starts[p], starts[p + 1]):
                 n = order[k]
-                if _seen(xy, weight, n, c):
-                    moved[n, c, 0] = xy[n, c, 0] + shift_u
-                    moved[n, c, 1] = xy[n, c, 1] + shift_v
+                if _seen(rays, weight, n, c):
+                    moved[n, c, 0] = rays[n, c, 0] + shift_u
+                    moved[n, c, 1] = rays[n, c, 1] + shift_v
                     judged[n, c] = True

@@ -305,7 +305,7 @@ def measure(
             rays[:, :, i] = undistort(xy, lens)
             weight[:, :, i] = np.where(confidence >= MIN_CONFIDENCE, confidence, 0.0)
         views = Views(
-            xy=rays.reshape(-1, cameras, 2),
+            rays=rays.reshape(-1, cameras, 2),
             weight=weight.reshape(-1, cameras),
             pose_index=np.repeat(np.arange(times), count),
             position=logged_position,

@@ -129,20 +129,20 @@ def _rays(tracks: Tracks, camera: Camera, t_ns: Int64) -> Float:
 
     Points of a rolling shutter go on from their rows' times by their own velocities.
     """
-    xy = undistort(tracks.xy, camera.intrinsics)
+    rays = undistort(tracks.xy, camera.intrinsics)
     if not camera.intrinsics.readout_s:
-        return xy
+        return rays
     delay_s = row_delay_s(tracks.xy[:, 1], camera.intrinsics)
     order = np.lexsort((tracks.picture, tracks.point))
     point, picture = tracks.point[order], tracks.picture[order]
     follows = (np.diff(point) == 0) & (np.diff(picture) == 1)
     t_s = (t_ns[picture] - t_ns[0]) / 1e9 + delay_s[order]
-    before, after = velocities(t_s, xy[order], follows)
+    before, after = velocities(t_s, rays[order], follows)
     sides = np.stack([np.where(np.isnan(before), after, before), np.where(np.isnan(after), before, after)])
-    motion = np.empty_like(xy)
+    motion = np.empty_like(rays)
     motion[order] = sides.mean(axis=0) * delay_s[order, None]
     # A point that was seen once has no velocity, and is used for nothing.
-    return xy - np.nan_to_num(motion)
+    return rays - np.nan_to_num(motion)
 
 
 def _with_poses(camera: Camera, t_ns: Int64, found: Adjusted, prior: PosePrior, stated: bool) -> Camera:
@@ -230,7 +230,7 @@ class Adjusted:
 def adjust(
     picture: Int64,
     point: Int64,
-    xy: Float,
+    rays: Float,
     focal_px: float,
     position: Float,
     rotation: Float,
@@ -241,7 +241,7 @@ def adjust(
     Args:
         picture: [K] row of the poses in which a point was seen.
         point: [K] its number.
-        xy: [K, 2] normalised undistorted image coordinates.
+        rays: [K, 2] normalised undistorted image coordinates.
         focal_px: focal length, to convert them to pixels.
         position: [T, 3] m, logged; NaN without a pose.
         rotation: [T, 3, 3] logged world_from_camera.
@@ -263,7 +263,7 @@ def adjust(
         place[rows] = np.arange(len(rows))
         mine = place[picture] >= 0
         stretch = _Stretch.of(
-            place[picture[mine]], point[mine], xy[mine], focal_px, position[rows], rotation[rows], prior
+            place[picture[mine]], point[mine], rays[mine], focal_px, position[rows], rotation[rows], prior
         )
         if stretch.points_count < _FEWEST_POINTS:
             reason = (
@@ -304,7 +304,7 @@ class _Stretch:
 
     picture: Int64  # [K]
     point: Int64  # [K]
-    xy: Float  # [K, 2]
+    rays: Float  # [K, 2]
     sigma: float  # of a normalised image coordinate
     position: Float  # [T, 3]
     rotation: Float  # [T, 3, 3]
@@ -320,7 +320,7 @@ class _Stretch:
         cls,
         picture: Int64,
         point: Int64,
-        xy: Float,
+        rays: Float,
         focal_px: float,
         position: Float,
         rotation: Float,
@@ -329,7 +329,7 @@ class _Stretch:
         """Build a stretch from the points seen often enough, with enough parallax, in front of the camera."""
         names, number = np.unique(point, return_inverse=True)
         count = np.bincount(number, minlength=len(names))
-        ray = np.einsum("kij,kj->ki", rotation[picture], np.append(xy, np.ones((len(xy), 1)), axis=1))
+        ray = np.einsum("kij,kj->ki", rotation[picture], np.append(rays, np.ones((len(rays), 1)), axis=1))
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
         normal = _sum_by(across, number, len(names))
@@ -345,7 +345,7 @@ class _Stretch:
         return cls(
             picture[seen],
             renumbered[number[seen]],
-            xy[seen],
+            rays[seen],
             _PIXEL_SIGMA / focal_px,
             position,
             rotation,
@@ -409,7 +409,7 @@ class _Stretch:
         o = np.zeros_like(x)
         turned = np.stack([o, z, -y, -z, o, x, y, -x, o], axis=-1).reshape(-1, 3, 3)
         by_pose = np.concatenate([by_point, project @ turned], axis=2)
-        return by_pose, by_point, self.xy - np.stack([u, v], axis=1)
+        return by_pose, by_point, self.rays - np.stack([u, v], axis=1)
 
     def _step(
         self,

@@ -127,7 +127,7 @@ class Candidates:
 
     t_ns: Int64  # [T]
     frame: Int64  # [T, C] the camera's frame nearest in time, -1 if none is near
-    xy: Float  # [T, C, D, J, 2]
+    rays: Float  # [T, C, D, J, 2]
     confidence: Float  # [T, C, D, J]
     position: Float  # [T, C, 3]
     rotation: Float  # [T, C, 3, 3]
@@ -139,7 +139,7 @@ class Observations:
 
     t_ns: Int64  # [T]
     joints: tuple[str, ...]
-    xy: Float  # [T, P, J, C, 2] undistorted normalised image coordinates, NaN where not seen
+    rays: Float  # [T, P, J, C, 2] undistorted normalised image coordinates, NaN where not seen
     confidence: Float  # [T, P, J, C]
     position: Float  # [T, C, 3]
     rotation: Float  # [T, C, 3, 3]
@@ -166,14 +166,14 @@ def candidates(cameras: list[Camera], between: Interpolation) -> Candidates:
     frame = np.stack([_nearest_frame(camera.frame_t_ns, t_ns) for camera in cameras], axis=1)
     people = max(camera.rays.shape[1] for camera in cameras)
     joints = cameras[0].rays.shape[2]
-    xy = np.full((len(t_ns), len(cameras), people, joints, 2), np.nan)
-    confidence = np.zeros(xy.shape[:-1])
+    rays = np.full((len(t_ns), len(cameras), people, joints, 2), np.nan)
+    confidence = np.zeros(rays.shape[:-1])
     for c, camera in enumerate(cameras):
         (near,) = np.nonzero(frame[:, c] >= 0)
         seen = camera.rays.shape[1]
-        xy[near, c, :seen] = camera.rays[frame[near, c]]
+        rays[near, c, :seen] = camera.rays[frame[near, c]]
         confidence[near, c, :seen] = camera.confidence[frame[near, c]]
-    return Candidates(t_ns, frame, xy, confidence, *_poses_at(cameras, t_ns, between))
+    return Candidates(t_ns, frame, rays, confidence, *_poses_at(cameras, t_ns, between))
 
 
 def _poses_at(cameras: list[Camera], t_ns: Int64, between: Interpolation) -> tuple[Float, Float]:
@@ -201,8 +201,8 @@ def observe(
     """
     views, weights, sigmas = [], [], []
     for c, camera in enumerate(cameras):
-        xy, confidence = sightings_of(camera, found, c, choice[:, c])
-        views.append(_at(camera, xy, t_ns))
+        rays, confidence = sightings_of(camera, found, c, choice[:, c])
+        views.append(_at(camera, rays, t_ns))
         weights.append(_at(camera, confidence, t_ns))
         sigmas.append(camera.sigma_at(t_ns))
     rows = np.minimum(np.searchsorted(found.t_ns, t_ns), len(found.t_ns) - 1)
@@ -215,7 +215,7 @@ def observe(
     return Observations(
         t_ns=t_ns,
         joints=cameras[0].detections.joints,
-        xy=np.stack(views, axis=3),
+        rays=np.stack(views, axis=3),
         confidence=np.nan_to_num(np.stack(weights, axis=3)),
         position=position,
         rotation=rotation,
@@ -224,11 +224,11 @@ def observe(
     )
 
 
-def on_sides(xy: Float, confidence: Float, sides: Int64) -> tuple[Float, Float]:
+def on_sides(rays: Float, confidence: Float, sides: Int64) -> tuple[Float, Float]:
     """Give each joint its own view where left and right were exchanged.
 
     Args:
-        xy: [T, P, J, ..., 2].
+        rays: [T, P, J, ..., 2].
         confidence: [T, P, J, ...].
         sides: [T, P, J, ...] the joint whose view belongs to each joint; -1 for none.
 
@@ -236,7 +236,7 @@ def on_sides(xy: Float, confidence: Float, sides: Int64) -> tuple[Float, Float]:
         Both in the same shape; NaN and 0 where no view is left.
     """
     kept, joint = sides >= 0, np.maximum(sides, 0)
-    own_xy = np.take_along_axis(xy, joint[..., None], axis=2)
+    own_xy = np.take_along_axis(rays, joint[..., None], axis=2)
     own_confidence = np.take_along_axis(confidence, joint, axis=2)
     return np.where(kept[..., None], own_xy, np.nan), np.where(kept, own_confidence, 0.0)
 
@@ -295,10 +295,10 @@ def sightings_of(camera: Camera, found: Candidates, c: int, choice: Int64) -> tu
     A frame of a slow camera appears at several times of the timeline: the time nearest to it decides. Rays of
     a rolling shutter are those of the frames' stamps.
     """
-    xy, confidence, delay_s = _chosen(camera, found, c, choice)
+    rays, confidence, delay_s = _chosen(camera, found, c, choice)
     if camera.intrinsics.readout_s:
-        xy = xy - _row_motion(camera, xy, delay_s)
-    return xy, confidence
+        rays = rays - _row_motion(camera, rays, delay_s)
+    return rays, confidence
 
 
 def readout_of(camera: Camera, found: Candidates, c: int, choice: Int64) -> dict[str, float | int]:
@@ -306,18 +306,18 @@ def readout_of(camera: Camera, found: Candidates, c: int, choice: Int64) -> dict
 
     The others have no velocity: no neighbouring picture shows any joint of the person. They stay as they are.
     """
-    xy, _, delay_s = _chosen(camera, found, c, choice)
-    seen = int(np.isfinite(xy[..., 0]).sum())
-    moved = int(np.isfinite(_velocity(camera, xy, delay_s)[..., 0])[np.isfinite(xy[..., 0])].sum())
+    rays, _, delay_s = _chosen(camera, found, c, choice)
+    seen = int(np.isfinite(rays[..., 0]).sum())
+    moved = int(np.isfinite(_velocity(camera, rays, delay_s)[..., 0])[np.isfinite(rays[..., 0])].sum())
     return {"readout_s": camera.intrinsics.readout_s, "keypoints": moved, "without_motion": seen - moved}
 
 
-def _row_motion(camera: Camera, xy: Float, delay_s: Float) -> Float:
+def _row_motion(camera: Camera, rays: Float, delay_s: Float) -> Float:
     """Compute how far keypoints [F, P, J, 2] move from their frame's stamp to their row's time, or 0."""
-    return np.nan_to_num(_velocity(camera, xy, delay_s) * delay_s[..., None])
+    return np.nan_to_num(_velocity(camera, rays, delay_s) * delay_s[..., None])
 
 
-def _velocity(camera: Camera, xy: Float, delay_s: Float) -> Float:
+def _velocity(camera: Camera, rays: Float, delay_s: Float) -> Float:
     """Estimate velocities [F, P, J, 2] of keypoints at their rows' times; NaN of people in a lone picture.
 
     Of the velocities from the picture before and to the one after, and the median of all joints of the person
@@ -325,7 +325,7 @@ def _velocity(camera: Camera, xy: Float, delay_s: Float) -> Float:
     neighbour is missing, the other one decides; without any, the person's median.
     """
     t_s = (camera.frame_t_ns - camera.frame_t_ns[0])[:, None, None] / 1e9 + delay_s
-    before, after = velocities(t_s, xy, camera.bridged[:, None, None])
+    before, after = velocities(t_s, rays, camera.bridged[:, None, None])
     sides = np.concatenate([before, after], axis=2)
     known = np.isfinite(sides).any(axis=2, keepdims=True)
     body = np.where(known, np.nanmedian(np.where(known, sides, 0.0), axis=2, keepdims=True), np.nan)
@@ -337,18 +337,18 @@ def _velocity(camera: Camera, xy: Float, delay_s: Float) -> Float:
 def _chosen(camera: Camera, found: Candidates, c: int, choice: Int64) -> tuple[Float, Float, Float]:
     """Gather rays, confidence and delay (s) of each person's keypoints in the camera's frames, as taken."""
     shape = (len(camera.frame_t_ns), choice.shape[1], camera.rays.shape[2])
-    xy = np.full((*shape, 2), np.nan)
+    rays = np.full((*shape, 2), np.nan)
     confidence, delay_s = np.full(shape, np.nan), np.full(shape, np.nan)
     frame = found.frame[:, c]
     apart_ns = np.abs(found.t_ns - camera.frame_t_ns[frame])
     nearest_last = np.argsort(-apart_ns, kind="stable")
     for person in range(choice.shape[1]):
         rows = nearest_last[(frame[nearest_last] >= 0) & (choice[nearest_last, person] >= 0)]
-        xy[frame[rows], person] = camera.rays[frame[rows], choice[rows, person]]
+        rays[frame[rows], person] = camera.rays[frame[rows], choice[rows, person]]
         confidence[frame[rows], person] = camera.confidence[frame[rows], choice[rows, person]]
         delay_s[frame[rows], person] = camera.row_delay_s[frame[rows], choice[rows, person]]
-    confidence[np.isnan(xy[..., 0])] = np.nan
-    return xy, confidence, delay_s
+    confidence[np.isnan(rays[..., 0])] = np.nan
+    return rays, confidence, delay_s
 
 
 def _at(camera: Camera, values: Float, t_ns: Int64) -> Float:

@@ -191,12 +191,12 @@ def _observe_with_offsets(
     cameras = _shifted(flight.cameras, offset_s)
     t_ns, sides = flight.observations.t_ns[::every], flight.sides[::every]
     observed = observe(cameras, flight.found, flight.choice, t_ns, flight.between)
-    xy, confidence = on_sides(observed.xy, observed.confidence, sides)
-    observed = replace(observed, xy=xy, confidence=confidence)
+    rays, confidence = on_sides(observed.rays, observed.confidence, sides)
+    observed = replace(observed, rays=rays, confidence=confidence)
     rows = confidence[..., 0].size
     return observed, replace(
         flight.views,
-        xy=xy.reshape(rows, len(cameras), 2),
+        rays=rays.reshape(rows, len(cameras), 2),
         weight=confidence.reshape(rows, len(cameras)),
         pose_index=flight.views.pose_index[:rows],
         position=observed.position,
@@ -255,11 +255,11 @@ def _sighting(flight: RobustFlight, c: int, camera: Camera) -> Sighting:
     t_ns, frame_t_ns = flight.observations.t_ns, camera.frame_t_ns
     nearest = np.searchsorted((t_ns[:-1] + t_ns[1:]) // 2, frame_t_ns)
     seen = sightings_of(camera, flight.found, c, flight.choice[:, c])
-    xy, confidence = on_sides(*seen, flight.sides[nearest][..., c])
+    rays, confidence = on_sides(*seen, flight.sides[nearest][..., c])
     position, rotation = camera.poses_at(frame_t_ns, flight.between)
     return Sighting(
         t_s=(frame_t_ns - t_ns[0]) / 1e9,
-        xy=xy.reshape(len(frame_t_ns), -1, 2),
+        rays=rays.reshape(len(frame_t_ns), -1, 2),
         confidence=np.nan_to_num(confidence.reshape(len(frame_t_ns), -1)),
         position=position,
         rotation=rotation,
@@ -375,7 +375,7 @@ def _disagreement(views: Views, instants: int, known: Bool, camera: int) -> floa
     chosen = np.append(np.flatnonzero(known), camera)
     views = replace(
         views,
-        xy=views.xy[:, chosen],
+        rays=views.rays[:, chosen],
         weight=views.weight[:, chosen],
         position=views.position[:, chosen],
         rotation=views.rotation[:, chosen],
@@ -387,7 +387,7 @@ def _disagreement(views: Views, instants: int, known: Bool, camera: int) -> floa
     away = points[:, None] - views.position[views.pose_index]
     seen = np.einsum("ncij,nci->ncj", views.rotation[views.pose_index], away)
     depth = np.where(seen[..., 2] > 0, seen[..., 2], np.nan)
-    missed = seen[..., :2] / depth[..., None] - views.xy
+    missed = seen[..., :2] / depth[..., None] - views.rays
     missed[views.weight == 0] = np.nan
     missed = missed.reshape(instants, -1, len(chosen), 2)
     there = np.isfinite(missed[..., -1, 0])
@@ -424,7 +424,7 @@ def refined_points(
     sightings = [
         Sighting(
             t_s=t_s,
-            xy=views.xy[:, c].reshape(times, -1, 2),
+            rays=views.rays[:, c].reshape(times, -1, 2),
             confidence=views.weight[:, c].reshape(times, -1),
             position=views.position[:, c],
             rotation=views.rotation[:, c],

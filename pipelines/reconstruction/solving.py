@@ -80,7 +80,7 @@ def views_with_noise(
     focal = np.array([camera.focal_px for camera in cameras])
     stated = observations.pose_sigma
     views = Views(
-        xy=observations.xy.reshape(-1, count, 2),
+        rays=observations.rays.reshape(-1, count, 2),
         weight=observations.confidence.reshape(-1, count),
         pose_index=np.repeat(np.arange(times), people * joints),
         position=observations.position,
@@ -181,7 +181,7 @@ def _refit(views: Views, first: Triangulation, pose_covariance: Float, rows: Int
     inlier = first.inlier[rows]
     weight = np.where(inlier, views.weight[rows], 1.0)
     pixel = (views.pixel_sigma / views.focal / weight) ** 2
-    seen = np.where(inlier[..., None], views.xy[rows], 0.0)
+    seen = np.where(inlier[..., None], views.rays[rows], 0.0)
     covariance = pose_covariance[pose]
     points = first.points[rows].copy()
     normal = np.empty((len(rows), 3, 3))

@@ -28,7 +28,7 @@ def ring(frames: int, cameras: int) -> tuple[Float, Views]:
     rotation = np.stack([right, np.cross(-away, right), -away], axis=-1)
     n = frames * joints.shape[1]
     views = Views(
-        xy=project(joints, position, rotation).reshape(n, cameras, 2),
+        rays=project(joints, position, rotation).reshape(n, cameras, 2),
         weight=np.ones((n, cameras)),
         pose_index=np.repeat(np.arange(frames), joints.shape[1]),
         position=position,
@@ -60,7 +60,7 @@ def turned(rotation: Float, vector: Float) -> Float:
 
 
 def with_pixel_noise(views: Views, rng: np.random.Generator, sigma_px: float = 2.0) -> Views:
-    return replace(views, xy=views.xy + rng.normal(0, sigma_px / FOCAL, views.xy.shape))
+    return replace(views, rays=views.rays + rng.normal(0, sigma_px / FOCAL, views.rays.shape))
 
 
 def with_pose_noise(
@@ -86,6 +86,6 @@ def with_outliers(views: Views, rng: np.random.Generator, *, uniform: bool) -> t
     missing = rng.random((n, cameras)) < 0.05
     offset = rng.uniform(100, 300, (n, cameras, 2)) * rng.choice([-1, 1], (n, cameras, 2)) / FOCAL
     anywhere = rng.uniform([-960, -540], [960, 540], (n, cameras, 2)) / FOCAL
-    xy = np.where(bad[..., None], anywhere if uniform else views.xy + offset, views.xy)
+    xy = np.where(bad[..., None], anywhere if uniform else views.rays + offset, views.rays)
     xy[missing] = np.nan
-    return replace(views, xy=xy), ~bad & ~missing
+    return replace(views, rays=xy), ~bad & ~missing

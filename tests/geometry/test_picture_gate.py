@@ -97,7 +97,7 @@ def test_exactly_the_gross_errors_are_left_out_and_show_their_residuals() -> Non
     rng = np.random.default_rng(7)
     views = with_pose_noise(with_pixel_noise(ring(100, 5)[1], rng), rng, "b", constant=True, stated=True)
     bad, good = with_outliers(views, rng, uniform=False)
-    outlier = ~good & np.isfinite(bad.xy[..., 0])
+    outlier = ~good & np.isfinite(bad.rays[..., 0])
 
     found = gated(bad)
 
@@ -114,7 +114,7 @@ def test_two_cameras_lose_the_joint_and_say_that_views_disagreed() -> None:
     rng = np.random.default_rng(8)
     views = with_pose_noise(with_pixel_noise(ring(100, 2)[1], rng), rng, "b", constant=True, stated=True)
     bad, good = with_outliers(views, rng, uniform=False)
-    seen = np.isfinite(bad.xy[..., 0]).all(axis=1)
+    seen = np.isfinite(bad.rays[..., 0]).all(axis=1)
 
     found = gated(bad)
 
@@ -133,7 +133,7 @@ def test_rows_of_a_picture_need_not_stand_together() -> None:
     views = with_pose_noise(with_pixel_noise(ring(50, 4)[1], rng), rng, "b", constant=True, stated=True)
     bad, good = with_outliers(views, rng, uniform=False)
     order = rng.permutation(len(bad.weight))
-    mixed = replace(bad, xy=bad.xy[order], weight=bad.weight[order], pose_index=bad.pose_index[order])
+    mixed = replace(bad, rays=bad.rays[order], weight=bad.weight[order], pose_index=bad.pose_index[order])
 
     found = gated(mixed)
 
@@ -147,12 +147,12 @@ def test_a_picture_of_few_joints_tells_nothing() -> None:
     exact = ring(60, 3)[1]
     four = np.flatnonzero(np.arange(60 * 17) % 17 < 4)
     views = with_pose_noise(with_pixel_noise(exact, rng), rng, "b", constant=True, stated=True)
-    xy = views.xy.copy()
+    xy = views.rays.copy()
     xy[::17, 0, 0] += 150 / FOCAL
-    few = replace(views, xy=xy[four], weight=views.weight[four], pose_index=views.pose_index[four])
+    few = replace(views, rays=xy[four], weight=views.weight[four], pose_index=views.pose_index[four])
 
     assert same(gated(few), triangulate(with_estimated_noise(few), method="robust"))
-    whole = gated(replace(views, xy=xy))
+    whole = gated(replace(views, rays=xy))
     assert not whole.inlier[::17, 0].any()
 
 
@@ -166,7 +166,7 @@ def beside(one: Views, other: Views) -> tuple[Views, Int64]:
         return np.concatenate(parts, axis=1).reshape(2 * len(one.weight), *getattr(one, name).shape[1:])
 
     rows = np.repeat(np.arange(2 * frames), joints)
-    return replace(one, xy=both("xy"), weight=both("weight"), pose_index=rows // 2), rows
+    return replace(one, rays=both("xy"), weight=both("weight"), pose_index=rows // 2), rows
 
 
 def test_people_far_apart_share_no_shift() -> None:
@@ -176,14 +176,14 @@ def test_people_far_apart_share_no_shift() -> None:
     aside = replace(exact, position=exact.position - np.array([4.0, 0.0, 0.0]))
     logged = with_pose_noise(exact, rng, "b", constant=True, stated=True)
     # A person 4 m further east looks like one seen by cameras 4 m further west.
-    seen = exact.xy.copy()
+    seen = exact.rays.copy()
     away = np.einsum(
         "ncji,ncj->nci", aside.rotation[aside.pose_index], truth[:, None] - aside.position[aside.pose_index]
     )
     seen[...] = away[..., :2] / away[..., 2:]
     one, other = (
-        with_pixel_noise(replace(logged, xy=xy), np.random.default_rng(seed))
-        for seed, xy in ((0, exact.xy), (1, seen))
+        with_pixel_noise(replace(logged, rays=xy), np.random.default_rng(seed))
+        for seed, xy in ((0, exact.rays), (1, seen))
     )
     views, picture = beside(one, other)
 
@@ -199,10 +199,10 @@ def test_people_far_apart_share_no_shift() -> None:
 def test_what_has_no_keypoint_or_no_pose_is_not_gross() -> None:
     rng = np.random.default_rng(12)
     views = with_pixel_noise(ring(30, 3)[1], rng)
-    xy, position = views.xy.copy(), views.position.copy()
+    xy, position = views.rays.copy(), views.position.copy()
     xy[5::17, 0] = np.nan  # of confidence 1 nevertheless
     position[10:20, 1] = np.nan
-    lacking = replace(views, xy=xy, position=position)
+    lacking = replace(views, rays=xy, position=position)
 
     assert same(gated(lacking), triangulate(with_estimated_noise(lacking), method="robust"))
 
@@ -223,7 +223,9 @@ def test_nothing_seen_is_nothing_found() -> None:
     assert (
         len(
             gated(
-                replace(nothing, xy=views.xy[:0], weight=views.weight[:0], pose_index=views.pose_index[:0])
+                replace(
+                    nothing, rays=views.rays[:0], weight=views.weight[:0], pose_index=views.pose_index[:0]
+                )
             ).points
         )
         == 0

@@ -127,7 +127,7 @@ def test_dlt_is_the_smallest_singular_vector() -> None:
     camera_from_world = np.swapaxes(views.rotation, -1, -2)
     shift = -camera_from_world @ ((views.position - centre) / unit)[..., None]
     P = np.concatenate([camera_from_world, shift], axis=-1)[views.pose_index]
-    rows = FOCAL * views.weight[..., None, None] * (views.xy[..., None] * P[:, :, 2:] - P[:, :, :2])
+    rows = FOCAL * views.weight[..., None, None] * (views.rays[..., None] * P[:, :, 2:] - P[:, :, :2])
     X = np.linalg.svd(rows.reshape(len(rows), -1, 4))[2][:, -1]
     expected = (X[:, :3] / X[:, 3:]) * unit[views.pose_index, 0] + centre[views.pose_index, 0]
 
@@ -158,12 +158,12 @@ def test_the_covariance_is_that_of_the_errors(method: Method, cameras: int, nois
     truth = truth[one_joint]
     views = replace(
         views,
-        xy=views.xy[one_joint],
+        rays=views.rays[one_joint],
         weight=rng.uniform(0.5, 1.0, (frames, cameras)),
         pose_index=views.pose_index[one_joint],
     )
     sigma = 2.0 / FOCAL / views.weight[..., None]
-    views = replace(views, xy=views.xy + sigma * rng.standard_normal(views.xy.shape))
+    views = replace(views, rays=views.rays + sigma * rng.standard_normal(views.rays.shape))
     if noise == "a":
         views = with_pose_noise(views, rng, noise, constant=False, stated=True)
 
@@ -194,10 +194,10 @@ def test_two_clean_views_among_three_outliers_are_found() -> None:
     rng = np.random.default_rng(7)
     truth, views = ring(100, 5)
     views = with_pixel_noise(views, rng)
-    xy = views.xy.copy()
+    xy = views.rays.copy()
     xy[:, 2:] += rng.uniform(100, 300, xy[:, 2:].shape) * rng.choice([-1, 1], xy[:, 2:].shape) / FOCAL
 
-    result = triangulate(replace(views, xy=xy), method="robust")
+    result = triangulate(replace(views, rays=xy), method="robust")
 
     right = np.linalg.norm(result.points - truth, axis=1) < 0.1
     # A pair with an outlier agrees by chance in about 2 x 4 x 2 px x sqrt(2)/500 px = 5 % of cases; 9 such
@@ -209,16 +209,16 @@ def test_two_clean_views_among_three_outliers_are_found() -> None:
 
 def test_of_two_views_an_outlier_shows_in_the_epipolar_distance() -> None:
     truth, views = ring(20, 2)
-    xy = views.xy.copy()
+    xy = views.rays.copy()
     xy[:, 1, 1] += 60 / FOCAL  # up the picture: across the epipolar line of a camera at the same height
     # Along the first camera's line of sight the second cannot tell.
     moved = truth + 0.1 * (truth - views.position[views.pose_index, 0])
-    along = views.xy.copy()
+    along = views.rays.copy()
     along[:, 1] = project(moved.reshape(20, 17, 3), views.position, views.rotation).reshape(-1, 2, 2)[:, 1]
 
-    assert set(words(triangulate(replace(views, xy=xy), method="robust"))) == {"rejected"}
-    assert np.isfinite(triangulate(replace(views, xy=xy), method="midpoint").points).all()
-    undetectable = triangulate(replace(views, xy=along), method="robust")
+    assert set(words(triangulate(replace(views, rays=xy), method="robust"))) == {"rejected"}
+    assert np.isfinite(triangulate(replace(views, rays=xy), method="midpoint").points).all()
+    undetectable = triangulate(replace(views, rays=along), method="robust")
     assert undetectable.points == pytest.approx(moved, abs=1e-6)
 
 
@@ -228,8 +228,8 @@ def test_many_cameras_cost_a_bounded_number_of_trials(cameras: int) -> None:
     truth, views = ring(40, cameras)
     views = with_pixel_noise(views, rng)
     bad = rng.random(views.weight.shape) < 0.3
-    xy = views.xy + bad[..., None] * rng.uniform(100, 300, views.xy.shape) / FOCAL
-    views = replace(views, xy=xy)
+    xy = views.rays + bad[..., None] * rng.uniform(100, 300, views.rays.shape) / FOCAL
+    views = replace(views, rays=xy)
 
     result = triangulate(replace(views, pixel_sigma=estimate_noise(views)), method="robust")
     oracle = triangulate(replace(views, weight=(~bad).astype(float)), method="robust")
@@ -249,7 +249,7 @@ def test_the_pairs_of_many_views_are_distinct_and_reach_every_view() -> None:
 
 def test_every_missing_joint_says_why() -> None:
     _, views = ring(1, 3)
-    xy, weight = views.xy[:6].copy(), views.weight[:6].copy()
+    xy, weight = views.rays[:6].copy(), views.weight[:6].copy()
     position = np.repeat(views.position, 3, axis=0)
     rotation = np.repeat(views.rotation, 3, axis=0)
     position[1, :2] = np.nan  # two cameras without a pose
@@ -261,7 +261,7 @@ def test_every_missing_joint_says_why() -> None:
     xy[5, :, 1] += [0.0, 0.2, -0.2]
     views = replace(
         views,
-        xy=xy,
+        rays=xy,
         weight=weight,
         pose_index=np.array([0, 0, 0, 1, 2, 0]),
         position=position,
@@ -286,7 +286,7 @@ def test_cameras_that_face_each_other_have_no_parallax() -> None:
     forward = facing[:, :, 2]
     views = replace(
         views,
-        xy=np.zeros((1, 2, 2)),
+        rays=np.zeros((1, 2, 2)),
         weight=np.ones((1, 2)),
         pose_index=np.zeros(1, np.int64),
         position=(between - 5 * forward)[None],
@@ -299,7 +299,7 @@ def test_cameras_that_face_each_other_have_no_parallax() -> None:
 
 def test_a_point_behind_the_cameras_is_rejected() -> None:
     _, views = ring(5, 3)
-    backwards = replace(views, rotation=views.rotation * [-1.0, 1.0, -1.0], xy=views.xy * [-1.0, -1.0])
+    backwards = replace(views, rotation=views.rotation * [-1.0, 1.0, -1.0], rays=views.rays * [-1.0, -1.0])
 
     for method in METHODS:
         assert set(words(triangulate(backwards, method=method))) == {"rejected"}
@@ -319,11 +319,11 @@ def test_a_view_from_behind_is_left_out_and_its_residual_is_infinite() -> None:
 
 def test_min_views_counts_inliers() -> None:
     _, views = ring(5, 4)
-    xy = views.xy.copy()
+    xy = views.rays.copy()
     xy[:, 3] += 0.1
 
-    assert set(words(triangulate(replace(views, xy=xy), method="robust", min_views=3))) == {"ok"}
-    assert set(words(triangulate(replace(views, xy=xy), method="robust", min_views=4))) == {"rejected"}
+    assert set(words(triangulate(replace(views, rays=xy), method="robust", min_views=3))) == {"ok"}
+    assert set(words(triangulate(replace(views, rays=xy), method="robust", min_views=4))) == {"rejected"}
 
 
 def test_confidence_scales_the_standard_deviation() -> None:
@@ -361,7 +361,7 @@ def test_white_pose_noise_that_was_told_needs_no_more_pixel_noise() -> None:
 
 def test_no_frames_give_no_points() -> None:
     _, views = ring(1, 3)
-    none = replace(views, xy=views.xy[:0], weight=views.weight[:0], pose_index=views.pose_index[:0])
+    none = replace(views, rays=views.rays[:0], weight=views.weight[:0], pose_index=views.pose_index[:0])
 
     assert triangulate(none, method="robust", threads=2).points.shape == (0, 3)
     assert estimate_noise(none) == pytest.approx(2.0)
@@ -394,7 +394,7 @@ def test_moving_the_world_or_reordering_cameras_moves_the_points_along(seed: int
     shuffled = triangulate(
         replace(
             views,
-            xy=views.xy[:, order],
+            rays=views.rays[:, order],
             position=views.position[:, order],
             rotation=views.rotation[:, order],
         ),
@@ -415,13 +415,13 @@ def test_moving_the_world_or_reordering_cameras_moves_the_points_along(seed: int
 def test_nan_never_leaks(seed: int, method: Method, cameras: int) -> None:
     rng = np.random.default_rng(seed)
     _, views = ring(3, cameras)
-    xy, weight, position = views.xy.copy(), views.weight.copy(), views.position.copy()
+    xy, weight, position = views.rays.copy(), views.weight.copy(), views.position.copy()
     rotation = views.rotation.copy()
     xy[rng.random(xy.shape) < 0.2] = rng.choice([np.nan, np.inf])
     weight[rng.random(weight.shape) < 0.2] = rng.choice([0.0, np.nan])
     position[rng.random(position.shape) < 0.1] = np.nan
     rotation[rng.random(rotation.shape) < 0.02] = np.nan
-    views = replace(views, xy=xy, weight=weight, position=position, rotation=rotation)
+    views = replace(views, rays=xy, weight=weight, position=position, rotation=rotation)
 
     result = triangulate(views, method=method)
 

@@ -135,7 +135,7 @@ def triangulated(sightings: Sequence[Sighting]) -> Float:
     times, joints = sightings[0].confidence.shape
     count = len(sightings)
     views = Views(
-        xy=np.stack([s.xy for s in sightings], axis=2).reshape(-1, count, 2),
+        rays=np.stack([s.rays for s in sightings], axis=2).reshape(-1, count, 2),
         weight=np.stack([s.confidence for s in sightings], axis=2).reshape(-1, count),
         pose_index=np.repeat(np.arange(times), joints),
         position=np.stack([s.position for s in sightings], axis=1),

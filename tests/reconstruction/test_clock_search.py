@@ -22,14 +22,14 @@ def seen(flight: Formation, shift_s: float, unknown: NDArray[np.bool_]) -> Views
     views: list[Float] = []
     for camera, sighting in enumerate(flight.sightings):
         at_s = flight.t_s - (shift_s if unknown[camera] else 0.0)
-        xy = sighting.xy.reshape(len(flight.t_s), -1)
+        xy = sighting.rays.reshape(len(flight.t_s), -1)
         moved = [np.interp(at_s, flight.t_s, column, left=np.nan, right=np.nan) for column in xy.T]
         views.append(np.stack(moved, axis=1).reshape(-1, 2))
     times, joints = flight.sightings[0].confidence.shape
     cameras = len(views)
     rays = np.stack(views, axis=1)
     return Views(
-        xy=rays,
+        rays=rays,
         weight=np.isfinite(rays[..., 0]).astype(np.float64),
         pose_index=np.repeat(np.arange(times), joints),
         position=np.stack([s.position for s in flight.sightings], axis=1),
@@ -55,7 +55,7 @@ def test_half_a_second_is_found_to_a_step(models: list[NoiseModel], late_s: floa
 
 def test_a_camera_that_sees_nothing_for_a_while_is_left_out_then() -> None:
     flight = formation(TIMES, 3, [], 0, late_s=(0.0, 0.0, LATE_S))
-    flight.sightings[1].xy[40:80] = np.nan
+    flight.sightings[1].rays[40:80] = np.nan
     found = initial_offsets(flight, np.array([0.0, 0.0, SIGMA_S]))
     np.testing.assert_allclose(found, [0.0, 0.0, LATE_S], atol=STEP_S)
 
@@ -70,5 +70,5 @@ def test_who_stands_still_leaves_clocks_where_they_are() -> None:
     flight = formation(TIMES, 2, [], 0, still=True)
     rng = np.random.default_rng(0)
     for sighting in flight.sightings:
-        sighting.xy[:] = sighting.xy[:1] + rng.normal(0, 2 / FOCAL_PX, sighting.xy.shape)
+        sighting.rays[:] = sighting.rays[:1] + rng.normal(0, 2 / FOCAL_PX, sighting.rays.shape)
     assert not initial_offsets(flight, np.array([0.0, SIGMA_S])).any()

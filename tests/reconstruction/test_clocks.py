@@ -28,6 +28,8 @@ def test_a_clock_is_known_where_the_person_moves_and_unknown_where_nothing_does(
     assert abs(walking.clock_offset_s[1] - 0.02) < 3 * walking.clock_sigma_s[1]
 
     rng = np.random.default_rng(0)
-    frozen = [replace(s, xy=s.xy[:1] + rng.normal(0, 2 / FOCAL_PX, s.xy.shape)) for s in flight.sightings]
+    frozen = [
+        replace(s, rays=s.rays[:1] + rng.normal(0, 2 / FOCAL_PX, s.rays.shape)) for s in flight.sightings
+    ]
     standing = refined(frozen, flight.t_s, np.repeat(flight.start[:1], 45, axis=0))
     assert standing.clock_sigma_s[1] > 0.5 * PRIOR_S

@@ -96,7 +96,9 @@ def small_system(*, exact: bool, times: int = 5, knots: int = 3) -> tuple[System
     """
     flight = formation(times, 2, [], 0, pixel_px=0.0 if exact else 4.0)
     shown = np.array([5, 11, 15])
-    sightings = [replace(s, xy=s.xy[:, shown], confidence=s.confidence[:, shown]) for s in flight.sightings]
+    sightings = [
+        replace(s, rays=s.rays[:, shown], confidence=s.confidence[:, shown]) for s in flight.sightings
+    ]
     if not exact:
         sightings[1] = replace(sightings[1], t_s=sightings[1].t_s + 0.008)
     problem = build(flight.t_s, sightings, np.array([[0, 1], [1, 2]]))
@@ -217,7 +219,7 @@ def with_exact_pictures(system: System, state: State) -> System:
     """Return the system with pictures that match the state exactly."""
     pictures = system.problem.pictures
     seen = np.einsum("gij,gki->gkj", pictures.rotation, state.position[0][None] - pictures.position[:, None])
-    pictures = replace(pictures, xy=np.ascontiguousarray(seen[..., :2] / seen[..., 2:]))
+    pictures = replace(pictures, rays=np.ascontiguousarray(seen[..., :2] / seen[..., 2:]))
     problem = replace(system.problem, pictures=pictures)
     return System(problem, system.knowledge, system.layout, system.bound2)
 
@@ -389,7 +391,7 @@ def test_a_place_that_nobody_saw_is_the_log_s() -> None:
     _, numbers = result.corrections[0]
     position, rotation = corrected(flight.sightings[0].position, flight.sightings[0].rotation, numbers)
     seen = np.einsum("tij,tki->tkj", rotation, result.position - position[:, None])
-    miss_px = 1500 * np.abs(seen[..., :2] / seen[..., 2:] - flight.sightings[0].xy)
+    miss_px = 1500 * np.abs(seen[..., :2] / seen[..., 2:] - flight.sightings[0].rays)
     assert np.median(miss_px) < 2.0  # keypoints err by 2 px: 1.35 of it in the median
 
 

@@ -51,7 +51,7 @@ class PictureArrays(NamedTuple):
     first: Int64  # [G]
     camera: Int64  # [G]
     when_s: Float  # [G]
-    xy: Float  # [G, J, 2]
+    rays: Float  # [G, J, 2]
     sharpness: Float  # [G, J]
     trust: Float  # [G, J]
     position: Float  # [G, 3]
@@ -141,7 +141,7 @@ def linearise(
     joints: Float,
     velocity: Float,
     number: Float,
-    xy: Float,
+    rays: Float,
     sharpness: Float,
     position: Float,
     rotation: Float,
@@ -157,7 +157,7 @@ def linearise(
         joints: [J, 3] m, world, at the picture's time.
         velocity: [J, 3] m/s.
         number: [10] the picture's corrections, see the module.
-        xy: [J, 2] normalised image points, NaN for joints not seen.
+        rays: [J, 2] normalised image points, NaN for joints not seen.
         sharpness: [J] 1 / standard deviation of an image point.
         position: [3] m, the logged pose at the uncorrected time.
         rotation: [3, 3] world_from_camera.
@@ -186,7 +186,7 @@ def linearise(
             corrected_from_world[i, j] = total
     for joint in range(len(joints)):
         residual[joint, 0] = residual[joint, 1] = np.nan
-        if np.isnan(xy[joint, 0]):
+        if np.isnan(rays[joint, 0]):
             continue
         for i in range(3):
             before[i] = 0.0
@@ -216,7 +216,7 @@ def linearise(
         scale = sharpness[joint] / seen[2]
         for axis in range(2):
             slant = seen[axis] / seen[2]
-            residual[joint, axis] = sharpness[joint] * (slant - xy[joint, axis])
+            residual[joint, axis] = sharpness[joint] * (slant - rays[joint, axis])
             for j in range(3):
                 gradient = corrected_from_world[axis, j] - slant * corrected_from_world[2, j]
                 by_joint[joint, axis, j] = scale * gradient
@@ -365,7 +365,7 @@ def linearise_picture(
         out.number,
     )  # fmt: skip
     linearise(
-        out.joints, out.velocity, out.number, pictures.xy[g], pictures.sharpness[g], pictures.position[g],
+        out.joints, out.velocity, out.number, pictures.rays[g], pictures.sharpness[g], pictures.position[g],
         pictures.rotation[g], pictures.speed[g], pictures.turn[g], out.residual, out.by_joint, out.by_number,
     )  # fmt: skip
 

@@ -28,7 +28,7 @@ class Pictures:
     camera: Int64  # [G]
     logged: Int64  # [G] row of its pose's covariance in `Problem.pose_covariance`, -1 for none
     when_s: Float  # [G] on the skeleton's clock
-    xy: Float  # [G, J, 2]
+    rays: Float  # [G, J, 2]
     sharpness: Float  # [G, J] 1 / standard deviation of an image point
     trust: Float  # [G, J] 0 for points that must not be used
     position: Float  # [G, 3] m, the logged pose
@@ -128,7 +128,7 @@ class Problem:
     @property
     def joints(self) -> int:
         """Number of joints of all people together."""
-        return int(self.pictures.xy.shape[1])
+        return int(self.pictures.rays.shape[1])
 
     def intervals(self) -> tuple[Int64, Float]:
         """Find the knot before each skeleton time [T - 2], and each picture's fraction [G] of the span."""
@@ -157,7 +157,7 @@ class Sighting:
     """Keypoints of one camera in its F pictures, with its logged poses."""
 
     t_s: Float  # [F] strictly increasing, on the skeleton's clock
-    xy: Float  # [F, J, 2] normalised, undistorted; NaN where nothing was seen
+    rays: Float  # [F, J, 2] normalised, undistorted; NaN where nothing was seen
     confidence: Float  # [F, J]
     position: Float  # [F, 3] m, logged world_from_camera; NaN without a pose
     rotation: Float  # [F, 3, 3]
@@ -168,7 +168,7 @@ class Sighting:
     @property
     def range_of(self) -> Bool:
         """True for pictures [F] with a pose and a keypoint."""
-        return ~np.isnan(self.position[:, 0]) & ~np.isnan(self.xy[..., 0]).all(axis=1)
+        return ~np.isnan(self.position[:, 0]) & ~np.isnan(self.rays[..., 0]).all(axis=1)
 
 
 def build(t_s: Float, sightings: Sequence[Sighting], bones: Int64, *, threads: int = 1) -> Problem:
@@ -199,15 +199,15 @@ def _pictures(t_s: Float, sighting: Sighting, camera: int, logged: int) -> tuple
     first, near = _first_of_three(t_s, sighting.t_s, step)
     (kept,) = np.nonzero(near & sighting.range_of)
     speed, turn = _rates(sighting)
-    seen = ~np.isnan(sighting.xy[kept, :, 0]) & (sighting.confidence[kept] > 0)
+    seen = ~np.isnan(sighting.rays[kept, :, 0]) & (sighting.confidence[kept] > 0)
     sharpness = np.where(seen, sighting.confidence[kept], 0.0) * sighting.focal_px / sighting.pixel_sigma
-    xy = np.where(seen[..., None], sighting.xy[kept], np.nan)
+    rays = np.where(seen[..., None], sighting.rays[kept], np.nan)
     return (
         first[kept],
         np.full(len(kept), camera, dtype=np.int64),
         np.full(len(kept), -1) if sighting.pose_covariance is None else logged + kept,
         sighting.t_s[kept],
-        xy,
+        rays,
         sharpness,
         seen.astype(np.float64),
         sighting.position[kept],

@@ -283,7 +283,7 @@ def _participating(start: Float) -> Bool:
 
 
 def _take(sighting: Sighting, part: Bool) -> Sighting:
-    return replace(sighting, xy=sighting.xy[:, part], confidence=sighting.confidence[:, part])
+    return replace(sighting, rays=sighting.rays[:, part], confidence=sighting.confidence[:, part])
 
 
 def _renumbered(bones: Int64, part: Bool) -> Int64:
@@ -474,7 +474,7 @@ def _residuals(problem: Problem, position: Float) -> tuple[Float, Float]:
     away = position[nearest] - pictures.position[:, None]
     seen = np.einsum("gji,gkj->gki", pictures.rotation, away)
     depth = np.where(seen[..., 2] > 0.1, seen[..., 2], np.nan)
-    return seen[..., :2] / depth[..., None] - pictures.xy, depth
+    return seen[..., :2] / depth[..., None] - pictures.rays, depth
 
 
 # --- checks and results --------------------------------------------------------------------------------

@@ -53,7 +53,7 @@ class System:
                 first=seen.first,
                 camera=seen.camera,
                 when_s=seen.when_s,
-                xy=seen.xy,
+                rays=seen.rays,
                 sharpness=seen.sharpness / (known.pixel_scale * np.sqrt(known.memory)),
                 trust=seen.trust,
                 position=seen.position,
@@ -128,7 +128,7 @@ def misfit(system: System, state: State) -> tuple[float, Float, Float]:
 
     Residuals are NaN, and cost nothing, for joints that were not seen or lie behind the camera.
     """
-    residual = np.empty(system.pictures.xy.shape)
+    residual = np.empty(system.pictures.rays.shape)
     numbers = np.empty((len(residual), kernels.NUMBERS))
     total = kernels.misfit(system.equations(state, system.problem.t_s, system.pictures), residual, numbers)
     return total, residual, numbers

@@ -193,7 +193,7 @@ def views_of(
     rays = undistort(sightings.xy, seen_by.lens)
     trusted = np.where(sightings.confidence >= MIN_CONFIDENCE, sightings.confidence, 0.0)
     return Views(
-        xy=np.moveaxis(rays, 0, 2).reshape(times * joints, cameras, 2),
+        rays=np.moveaxis(rays, 0, 2).reshape(times * joints, cameras, 2),
         weight=np.moveaxis(trusted, 0, 2).reshape(times * joints, cameras),
         pose_index=np.repeat(np.arange(times), joints),
         position=position,
