@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from benchmarks.detectors import CAMERAS, DETECTORS, REAL, SAMPLE, real_flight
 from pipelines.detect import detect
-from pipelines.formats.videos.video import frames
+from pipelines.formats.videos.video import frames, index_video
 from pipelines.ingest import ingest
 from pipelines.keypoints.blazepose import BlazePose, _Network
 from pipelines.session.registries import KeypointNetworks, Region, find_detector
@@ -79,11 +79,11 @@ def row(detector: str, name: str, session: Path, people: Mapping[Path, int], rep
     networks = find_detector(detector).load(threads=1)
     with counted() as runs:
         stage(session, detector)
+    needed = sum(shown * index_video(path).count for path, shown in people.items())
     turns = np.array(
         [(taken_s(least, networks, people), taken_s(stage, session, detector)) for _ in range(repeats)]
     )
     least_s, stage_s = turns.min(axis=0)
-    needed = least(networks, people)
     passes = runs["landmarks"] / needed
     ratio = stage_s / least_s
     print(
@@ -100,15 +100,12 @@ def stage(session: Path, detector: str) -> None:
         detect(writable, detector=detector, force=True)
 
 
-def least(networks: KeypointNetworks, people: Mapping[Path, int]) -> int:
-    """Decode every picture, and locate as many people as it shows; return their number in all."""
-    count = 0
+def least(networks: KeypointNetworks, people: Mapping[Path, int]) -> None:
+    """Decode every picture, and locate as many people as it shows."""
     for path, shown in people.items():
         for _, picture in frames(path):
             height, width = picture.shape[:2]
             networks.locate(picture, [Region((width / 2, height / 2), height / 2)] * shown)
-            count += shown
-    return count
 
 
 @contextmanager
