@@ -19,13 +19,13 @@ from pipelines.reporting.plates import (
     LINE_STYLES,
     PAPER,
     Plate,
-    every,
     new_figure,
     page_style,
     quiet,
     shade,
     shade_keys,
     stacked,
+    stride_for,
     table,
 )
 from pipelines.reporting.replanned import Arm, CostMap, Replan, span_s
@@ -88,7 +88,7 @@ def draw_arms_over_time(arms: tuple[Arm, ...]) -> Plate:
         "and the actor. Below: the error to be expected of the position from all cameras together; "
         "no line where they determine none."
     )
-    step = every(len(arms[0].t_s))
+    step = stride_for(len(arms[0].t_s))
     if step > 1:
         caption += f" A point of a line stands for {step} poses, the band holds them all."
     cut = [arm for arm in arms if np.nanmax(arm.predicted_error_m, initial=0.0) * 100 > _top(arms)]
@@ -115,7 +115,7 @@ def _numbers_over_time(arm: Arm) -> pd.DataFrame:
 def _band(axes: Axes, arm: Arm, values: Float) -> None:
     """Draw the mean over cameras of [C, T] as a line, on the range of all of them."""
     colour = CAMERAS[arm.colour]
-    starts = np.arange(0, len(arm.t_s), every(len(arm.t_s)))
+    starts = np.arange(0, len(arm.t_s), stride_for(len(arm.t_s)))
     seconds, mean = _thinned(arm.t_s, values.mean(axis=0))
     low = np.minimum.reduceat(values.min(axis=0), starts)
     high = np.maximum.reduceat(values.max(axis=0), starts)
@@ -128,7 +128,7 @@ def _thinned(seconds: Float, values: Float) -> tuple[Float, Float]:
 
     A mean is NaN if one of its values is NaN.
     """
-    starts = np.arange(0, len(seconds), every(len(seconds)))
+    starts = np.arange(0, len(seconds), stride_for(len(seconds)))
     count = np.diff([*starts, len(seconds)])
     return np.add.reduceat(seconds, starts) / count, np.add.reduceat(values, starts) / count
 
@@ -229,7 +229,7 @@ def _span_deg(arms: tuple[Arm, ...]) -> tuple[float, float]:
 
 def _draw_yaws(axes: Axes, arm: Arm) -> None:
     """Draw the yaw of the first drone, and solid the commanded yaw, if there is one."""
-    stride = every(len(arm.t_s))
+    stride = stride_for(len(arm.t_s))
     t_s, colour, name = arm.t_s[::stride], CAMERAS[arm.colour], shortened(arm.name)
     chosen = arm.commanded_yaw_deg[::stride]
     commanded = np.isfinite(arm.commanded_yaw_deg).any()
@@ -267,7 +267,7 @@ def _draw_costs(axes: Axes, costs: CostMap, low: float, high: float) -> tuple[li
     """Shade the cost map over all drawn turns; return its levels, and the stride of the drawn times."""
     from matplotlib.ticker import MaxNLocator
 
-    step = every(len(costs.t_s), _MOST_TIMES)
+    step = stride_for(len(costs.t_s), _MOST_TIMES)
     t_s, cost = costs.t_s[::step], costs.cost[::step]
     least, most = float(np.nanmin(cost)), float(np.nanpercentile(cost, 98))
     levels = [float(v) for v in MaxNLocator(5).tick_values(least, most) if least < v < float(np.nanmax(cost))]

@@ -22,7 +22,6 @@ from pipelines.reporting.plates import (
     Plate,
     axis_label,
     bounds,
-    every,
     near_zero,
     new_figure,
     page_style,
@@ -30,6 +29,7 @@ from pipelines.reporting.plates import (
     shade,
     shade_keys,
     stacked,
+    stride_for,
     table,
 )
 from pipelines.reporting.replanned import Arm, Replan, bounds_of
@@ -121,7 +121,7 @@ def _draw_camera(
 
 def _draw_person(axes: Axes, label: str, person: Float, line: object) -> tuple[Float, int]:
     """Draw a person's path [T, 2] and its start; return the drawn path, and the stride of its poses."""
-    stride = every(len(person))
+    stride = stride_for(len(person))
     path = person[::stride]
     axes.plot(*path.T, color=INK, linewidth=2.0, linestyle=line, label=label, zorder=4)
     start = path[np.isfinite(path[:, 0])][:1]
@@ -131,7 +131,7 @@ def _draw_person(axes: Axes, label: str, person: Float, line: object) -> tuple[F
 
 def _drawn_path(t_ns: Int64, path: Float, gap_starts_ns: list[int]) -> tuple[Float, int]:
     """Return a decimated path, broken where the poses have a gap, and the stride of its poses."""
-    stride = every(len(path))
+    stride = stride_for(len(path))
     breaks = np.unique(np.searchsorted(t_ns, gap_starts_ns, side="right"))
     pieces = []
     for rows in np.split(np.arange(len(path)), breaks):
@@ -239,7 +239,7 @@ def _draw_panel(axes: Axes, arm: Arm, ground: Heights | None, low: Float, high: 
 
 
 def _draw_arm(axes: Axes, arm: Arm, origin: Float) -> None:
-    stride = every(len(arm.t_s))
+    stride = stride_for(len(arm.t_s))
     actor, places = arm.actor[:, :2] - origin, arm.position[..., :2] - origin
     axes.plot(*actor[::stride].T, color=INK, linewidth=1.8, zorder=4)
     chosen = keyframes(arm)
@@ -306,7 +306,7 @@ def _caption(replan: Replan, levels: list[float]) -> str:
             if levels
             else f" Nothing in the map rises {quantity(LOWEST_M, 'm')} above the ground."
         )
-    step = every(len(replan.arms[0].t_s))
+    step = stride_for(len(replan.arms[0].t_s))
     return caption + (f" One pose in {step} is drawn." if step > 1 else "")
 
 

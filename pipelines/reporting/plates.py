@@ -228,7 +228,7 @@ def stacked(tables: list[pd.DataFrame]) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
-def every(count: int, most: int = MOST_POINTS) -> int:
+def stride_for(count: int, most: int = MOST_POINTS) -> int:
     """Return the stride that leaves at most `most` of `count`."""
     return max(1, -(-count // most))
 
