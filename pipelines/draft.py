@@ -34,7 +34,7 @@ from pipelines.drafting.found import (
 from pipelines.drafting.manifest_text import write_manifest
 from pipelines.drafting.matching import match
 from pipelines.formats.common.rows import median_step_ns
-from pipelines.formats.drone_logs.dji_srt import read_subtitles
+from pipelines.formats.drone_logs.subtitles import read_subtitles
 from pipelines.formats.logs.messages import kind_of, samples
 from pipelines.formats.logs.presets import namespaces, parts_of
 from pipelines.formats.videos.frame_times import read_frame_times
