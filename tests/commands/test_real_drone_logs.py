@@ -70,8 +70,7 @@ def test_a_phantom_with_gimbal_angles_as_a_command(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     latitude, longitude = told["lat_lon_first"]
     assert f"world origin: {latitude:.7f}, {longitude:.7f}, 0.00 m (p4_rtk.SRT)" in done.stdout
-    assert "p4_rtk.SRT" in done.stderr
-    assert "clock" in done.stderr
+    assert "shows no clock" in done.stderr
     poses = poses_of(path)
     assert len(poses) == told["positions"]
     assert poses["z"].min() == pytest.approx(told["H_m"]["min"], abs=0.04)  # the Earth falls away on 700 m
@@ -170,7 +169,7 @@ def test_px4_at_gps_time_as_a_command(tmp_path: Path) -> None:
     )
     done = mocap("ingest", path)
     assert done.returncode == 0, done.stderr
-    assert "UTC" in done.stderr
+    assert "its stamps are turned to UTC" in done.stderr
     clock = session_of(path)["cameras"]["drone"]["log_clock"]
     assert clock["events"] == told["gps_samples"]
     # The first attitude after the first fix: those come every 5 ms, with pauses.
@@ -190,10 +189,10 @@ def test_what_is_left_open_is_drafted_as_comments(tmp_path: Path) -> None:
     assert "# gimbal: {fixed: {yaw_deg: 90, pitch_deg: -30}}  # missing" in result.text
     assert "gauss-markov: {position_m: 1.5" in result.text
     assert "origin: {latitude_deg: 0" in result.text
-    assert any("camera" in line for line in result.missing)
+    assert any("how the camera was turned" in line for line in result.missing)
 
 
 def test_a_flight_of_unknown_attitude_is_refused(tmp_path: Path) -> None:
     path = write_flight(tmp_path, "logs/dji_srt/air2s.srt", 1659879640.8, {"dji": ""})
-    with pytest.raises(DataError, match="gimbal"):
+    with pytest.raises(DataError, match="not how it was turned"):
         ingest(path)
