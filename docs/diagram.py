@@ -16,6 +16,7 @@ import grimp
 _ROWS = [
     ["mocap_cli"],
     ["stages"],
+    ["sources"],
     ["drafting", "formats", "keypoints", "reconstruction", "planning", "simulation", "reporting"],
     ["session"],
     ["geometry"],

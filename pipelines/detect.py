@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.formats.flights.pictures import Pictures, open_pictures, refuse_changed_pictures
 from pipelines.geometry.arrays import Float, Picture
 from pipelines.keypoints.actor_hints import actor_hints
 from pipelines.keypoints.hints import Hint
@@ -58,6 +57,7 @@ from pipelines.session.tables import (
     trajectory_from,
     write_table,
 )
+from pipelines.sources.pictures import Pictures, open_pictures, refuse_changed_pictures
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.formats.common.exporting import thinned
-from pipelines.formats.flights.pictures import open_pictures
 from pipelines.geometry.arrays import Int64, Picture
 from pipelines.reporting.content import estimated_clocks
 from pipelines.reporting.frame_drawing import caption_of, draw_frame
@@ -29,6 +28,7 @@ from pipelines.session.stages import open_session, session_name
 from pipelines.session.storage import as_data_error, read_json, remove_tree, sha256_of, write_json
 from pipelines.session.tables import FRAMES, POSES, SKELETON, motion_from, read_table, trajectory_from
 from pipelines.session.whole_folders import working_folder
+from pipelines.sources.pictures import open_pictures
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,29 +9,67 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Self
+
+import numpy as np
 
 from pipelines.formats.common.files import leads_out
-from pipelines.formats.flights.flight_reader import FlightReader, span_words
-from pipelines.formats.flights.flight_sources import losses
-from pipelines.formats.flights.source_hashes import (
-    hash_sources,
-    refuse_written,
-    source_stamps,
-    stated_paths,
+from pipelines.session.description import (
+    ActorEntry,
+    CameraEntry,
+    Description,
+    Interpolation,
+    MapEntry,
+    OriginEntry,
+    PlannedEntry,
+    TruthEntry,
+    read_description,
 )
-from pipelines.session.description import CameraEntry, Description, Interpolation, read_description
-from pipelines.session.errors import DataError, NotYetReadError
+from pipelines.session.errors import DataError, MocapError, NotYetReadError
 from pipelines.session.manifest import Flight, read_flight
+from pipelines.session.maps import store_map
 from pipelines.session.progress import Progress, Silent
+from pipelines.session.records import JointMotion, Occupancy
+from pipelines.session.registries import MapFormat, noise_models, recognise
 from pipelines.session.stage_records import Stage, StageRecord, note_sources
 from pipelines.session.stages import Run, locked
 from pipelines.session.storage import read_json, write_json
+from pipelines.session.tables import (
+    ACTOR,
+    CAMERA_POSES,
+    PLAN,
+    TRUTH,
+    actor_table,
+    motion_table,
+    pose_table,
+    write_table,
+)
+from pipelines.sources.cameras import FlightCameras
+from pipelines.sources.files import FlightFiles
+from pipelines.sources.hashes import hash_sources, refuse_written, source_stamps, stated_paths
+from pipelines.sources.logs import FlightLogs
+from pipelines.sources.maps import maps_of_log
+from pipelines.sources.parts import (
+    CameraData,
+    camera_entry,
+    near_picture,
+    refuse_no_overlap,
+    span_of_pictures,
+    span_words,
+    store_camera,
+    unmirrored,
+    within,
+)
+from pipelines.sources.poses import FlightPoses
+from pipelines.sources.world import losses
 
 INGEST = Stage("ingest", revision=5)
+
+_AHEAD_ROWS = 200_000  # of cameras that are read during hashing: some 70 MB
 
 
 @dataclass(frozen=True)
@@ -85,7 +123,7 @@ def ingest(
         "flight_from_session": Path(os.path.relpath(flight_path.parent, target)).as_posix(),  # for media
     }
 
-    with FlightReader(flight, flight_path, target, interpolation) as reader:
+    with _FlightReader(flight, flight_path, target, interpolation) as reader:
         stamps = source_stamps(flight, flight_path.parent)
         check_sources = partial(refuse_written, flight, flight_path.parent, stamps)
         # If nothing can be skipped, sources are read while they are hashed.
@@ -136,9 +174,266 @@ def ingest(
     return Ingested(target, record, description, skipped=False)
 
 
+class _FlightReader:
+    """Reader that stores the parts of one flight and collects doubts as notes.
+
+    It is a context manager that closes the logs.
+    """
+
+    def __init__(
+        self, flight: Flight, flight_path: Path, session: Path, interpolation: Interpolation
+    ) -> None:
+        base, gap_ns, note = flight_path.parent, interpolation.max_gap_ns, self._take_note
+        self._flight = flight
+        self._flight_path = flight_path
+        self._session = session
+        self._interpolation = interpolation
+        self._notes: list[str] = []
+        self._logs = FlightLogs(flight, base, note)
+        self._files = FlightFiles(flight, base)
+        self._poses = FlightPoses(flight, flight_path, self._logs, self._files, max_gap_ns=gap_ns, note=note)
+        self._cameras = FlightCameras(
+            flight_path, self._logs, self._files, self._poses, max_gap_ns=gap_ns, note=note
+        )
+        self._ahead: dict[str, CameraData] = {}
+
+    def __enter__(self) -> Self:
+        """Return the reader itself."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Close the logs."""
+        self._logs.__exit__(*exception)
+
+    def _take_note(self, line: str) -> None:
+        self._notes.append(line)
+
+    def read_ahead(self) -> Iterator[str]:
+        """Read cameras in advance for `store_camera`, one after the other, up to `_AHEAD_ROWS` rows.
+
+        An error ends it. The same error is raised again when that camera is stored.
+        """
+        for name in self._flight.cameras:
+            if sum(data.rows for data in self._ahead.values()) > _AHEAD_ROWS:
+                return
+            try:
+                self._ahead[name] = self._read_camera(name)
+            except (MocapError, OSError):
+                self._notes.clear()
+                return
+            yield name
+
+    def take_notes(self) -> list[str]:
+        """Return the notes since the last call, each once."""
+        taken = list(dict.fromkeys(self._notes))
+        self._notes.clear()
+        return taken
+
+    def store_camera(self, name: str, folder: Path) -> None:
+        """Write the tables of one camera, its entry and its warnings."""
+        camera = self._flight.cameras[name]
+        data = self._ahead.pop(name, None) or self._read_camera(name)
+        (folder / "tables").mkdir()
+        store_camera(data, folder / "tables")
+        entry = camera_entry(
+            name,
+            camera,
+            data,
+            self._interpolation,
+            base=self._flight_path.parent,
+            stamps=self._logs.settings(camera.pose.log).stamps if camera.pose.log else None,
+            note=self._take_note,
+        )
+        warnings = list(dict.fromkeys(data.notes + self.take_notes()))
+        write_json(folder / "entry.json", {"entry": entry.model_dump(mode="json"), "warnings": warnings})
+
+    def _read_camera(self, name: str) -> CameraData:
+        """Read everything about one camera, and check the parts against each other."""
+        camera = self._flight.cameras[name]
+        video = self._files.video(camera)
+        detections, detector_format = None, ""
+        if camera.keypoints:
+            detections, detector_format = self._files.keypoints(camera.keypoints)
+        intrinsics = self._cameras.intrinsics(name, camera, video, detections)
+        if detections is not None:
+            if camera.keypoints:
+                detections = unmirrored(detections, camera.keypoints.mirrored, intrinsics.width)
+            detections = near_picture(detections, intrinsics)
+        frames = self._cameras.frames(name, camera, video, detections, intrinsics)
+        trajectory = self._poses.trajectory(name, camera, int(frames.t_ns[0]))
+        if camera.pose_noise:
+            noise_models(f"{self._flight_path}: cameras.{name}.pose_noise", camera.pose_noise)
+        if detections is not None:
+            detections = within(detections, frames)
+            if not len(detections.frame):
+                raise DataError(
+                    self._flight_path,
+                    f"cameras.{name}: no frame of its keypoints is one of its pictures",
+                    "check first_frame and frame_times",
+                )
+        return CameraData(
+            detections,
+            detector_format,
+            intrinsics,
+            frames,
+            trajectory,
+            media=self._cameras.media(camera, frames, self._session),
+            log_clock=self._poses.log_clock(camera),
+            notes=self.take_notes(),
+        )
+
+    def origin(self) -> OriginEntry | None:
+        """Return the world's origin on Earth, if known; note cameras with different height references."""
+        self._poses.doubt_heights()
+        found = self._poses.origin()
+        if found is None:
+            return None
+        place = found.place
+        return OriginEntry(
+            latitude_deg=place.latitude_deg,
+            longitude_deg=place.longitude_deg,
+            altitude_m=place.altitude_m,
+            source=found.source,
+        )
+
+    def store_truth(self, folder: Path, entries: Mapping[str, CameraEntry]) -> TruthEntry | None:
+        """Write the ground truth, and return its entry with its joints, cameras and time span."""
+        truth = self._flight.truth
+        if truth is None:
+            return None
+        base = self._flight_path.parent
+        motion = self._files.true_joints(truth.joints) if truth.joints else None
+        if motion is not None and truth.joints is not None:
+            self._poses.refuse_projected(base / truth.joints.path, motion.position.reshape(-1, 3))
+            refuse_no_overlap(base / truth.joints.path, motion.t_ns, entries)
+            write_table(folder / "truth.parquet", motion_table(motion), TRUTH)
+        missing, dropped = self._note_truth_missing(motion) if motion else (0, {})
+        poses_dropped = {}
+        if truth.poses:
+            import pandas as pd
+
+            tables = []
+            for name, stated in truth.poses.items():
+                poses = self._poses.true_poses(stated)
+                tables.append(pose_table(poses).assign(camera=name))
+                if poses.dropped:
+                    poses_dropped[name] = poses.dropped
+                    self._notes.append(f"{name}: true poses dropped: {losses(poses.dropped)}")
+            write_table(folder / "truth_poses.parquet", pd.concat(tables, ignore_index=True), CAMERA_POSES)
+        return TruthEntry(
+            joints=list(motion.joints) if motion else [],
+            people=motion.position.shape[1] if motion else 0,
+            first_t_ns=int(motion.t_ns[0]) if motion else 0,
+            last_t_ns=int(motion.t_ns[-1]) if motion else 0,
+            cameras=list(truth.poses),
+            missing=missing,
+            dropped=dropped,
+            poses_dropped=poses_dropped,
+        )
+
+    def _note_truth_missing(self, motion: JointMotion) -> tuple[int, dict[str, int]]:
+        """Count the true positions that are missing, and those of them that were dropped; note both."""
+        is_missing = np.isnan(motion.position[..., 0])
+        missing = int(is_missing.sum())
+        if motion.dropped:
+            self._notes.append(f"truth: positions dropped: {losses(motion.dropped)}")
+        if missing > sum(motion.dropped.values()):
+            self._notes.append(f"truth: {missing} of {is_missing.size} positions of joints are missing")
+        return missing, motion.dropped
+
+    def store_actor(self, folder: Path, entries: Mapping[str, CameraEntry]) -> ActorEntry | None:
+        """Write the actor's logged positions."""
+        actor = self._flight.actor
+        if actor is None:
+            return None
+        trajectory = self._poses.actor(actor.log, actor.topic)
+        refuse_no_overlap(self._flight_path.parent / actor.log, trajectory.t_ns, entries)
+        write_table(folder / "actor.parquet", actor_table(trajectory), ACTOR)
+        if trajectory.dropped:
+            self._notes.append(f"actor: dropped: {losses(trajectory.dropped)}")
+        return ActorEntry(
+            source=actor.log,
+            sources=self._logs.settings(actor.log).path,
+            topic=actor.topic,
+            point=actor.point,
+            count=len(trajectory.t_ns),
+            dropped=trajectory.dropped,
+        )
+
+    def store_map(self, folder: Path, entries: Mapping[str, CameraEntry]) -> MapEntry | None:
+        """Write the map of obstacles: one from a file, or those of a log that replaced each other."""
+        stated = self._flight.map
+        if stated is None:
+            return None
+        if stated.log:
+            logged = maps_of_log(
+                self._flight,
+                stated,
+                self._logs,
+                max_gap_ns=self._interpolation.max_gap_ns,
+                note=self._take_note,
+            )
+            self._refuse_later_map(stated.log, int(logged.from_ns[0]), entries)
+            log = self._logs.paths(stated.log)[0]
+            held, dropped = store_map(folder, self._near_origin(log, logged.maps)), logged.dropped
+        else:
+            path = stated.path or ""
+            file = self._flight_path.parent / path
+            occupancy = recognise(file, MapFormat, "map").read_map(file, resolution_m=stated.resolution_m)
+            held, dropped = store_map(folder, self._near_origin(file, [occupancy])), occupancy.dropped
+            if self._flight.world.frame == "ned":
+                self._notes.append(f"{path}: the map is taken to be in ENU axes although the world is NED")
+        if dropped:
+            self._notes.append(f"map: dropped: {losses(dropped)}")
+        return MapEntry(
+            source=stated.log or stated.path or "",
+            unknown=stated.unknown,
+            resolution_m=held[-1].resolution_m,
+            shape=held[-1].shape,
+            occupied=held[-1].occupied,
+            free=held[-1].free,
+            dropped=dropped,
+            maps=held,
+        )
+
+    def store_plan(self, folder: Path, entries: Mapping[str, CameraEntry]) -> dict[str, PlannedEntry] | None:
+        """Write the positions that the on-board planner commanded."""
+        plan = self._flight.plan
+        if plan is None:
+            return None
+        import pandas as pd
+
+        tables, found = [], {}
+        for name in (camera for camera in self._flight.cameras if camera in plan.cameras):
+            stated = plan.files.get(name) or plan.log_of(name)
+            sent = self._poses.planned(name, plan)
+            refuse_no_overlap(self._flight_path.parent / stated, sent.t_ns, entries)
+            if sent.dropped:
+                self._notes.append(f"{name}: commands dropped: {losses(sent.dropped)}")
+            tables.append(pose_table(sent).assign(camera=name))
+            found[name] = PlannedEntry(source=stated, count=len(sent.t_ns), dropped=sent.dropped)
+        write_table(folder / "plan.parquet", pd.concat(tables, ignore_index=True), PLAN)
+        return found
+
+    def _refuse_later_map(self, log: str, from_ns: int, entries: Mapping[str, CameraEntry]) -> None:
+        first, last = span_of_pictures(entries)
+        if from_ns > last:
+            raise DataError(
+                f"{self._flight_path}: map.log {log}",
+                f"has its first map at {from_ns / 1e9:.3f} s, after the pictures ({span_words(first, last)})",
+                "check its clock, or take `stamps: receive`",
+            )
+
+    def _near_origin(self, source: Path, maps: Iterable[Occupancy]) -> Iterator[Occupancy]:
+        """Yield maps; refuse projected coordinates if the world has an origin on Earth."""
+        for occupancy in maps:
+            self._poses.refuse_projected(source, occupancy.origin[None])
+            yield occupancy
+
+
 def _store_cameras(
     run: Run,
-    reader: FlightReader,
+    reader: _FlightReader,
     names: Sequence[str],
     check_sources: Callable[[], None],
     progress: Progress,
@@ -156,7 +451,7 @@ def _store_cameras(
     return entries, warnings
 
 
-def _store_camera(reader: FlightReader, name: str, check_sources: Callable[[], None], folder: Path) -> None:
+def _store_camera(reader: _FlightReader, name: str, check_sources: Callable[[], None], folder: Path) -> None:
     """Store one camera; raise an error if its sources were changed meanwhile."""
     reader.store_camera(name, folder)
     check_sources()

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.formats.flights.pictures import open_pictures, refuse_changed_pictures
 from pipelines.formats.videos.video_writing import TICK_S, join_videos, write_h264
 from pipelines.geometry.arrays import Picture
 from pipelines.reporting.frame_drawing import blank_frame, caption_of, draw_frame, padded_to_even
@@ -29,6 +28,7 @@ from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, locked, open_session
 from pipelines.session.storage import read_json, write_json
 from pipelines.session.tables import FRAMES, SKELETON, read_table, rows_between
+from pipelines.sources.pictures import open_pictures, refuse_changed_pictures
 
 OVERLAY = Stage("overlay", revision=5)
 

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from pipelines.detect import detect, hints_from, hints_of
-from pipelines.formats.flights.pictures import open_pictures, refuse_changed_pictures
 from pipelines.geometry.arrays import Bool, Float, Int64, Picture
 from pipelines.geometry.triangulation import (
     STATUS,
@@ -68,6 +67,7 @@ from pipelines.session.stage_records import Stage, StageRecord
 from pipelines.session.stages import Run, WritableSession, locked
 from pipelines.session.storage import jsonable, read_json, sha256_of, write_json
 from pipelines.session.tables import CAMERA_POSES, SKELETON, write_table
+from pipelines.sources.pictures import open_pictures, refuse_changed_pictures
 
 if TYPE_CHECKING:
     import pandas as pd

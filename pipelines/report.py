@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.formats.flights.pictures import Pictures, open_pictures, refuse_changed_pictures
 from pipelines.geometry.arrays import Picture
 from pipelines.planning.loading import load_flight
 from pipelines.planning.scene import hidden_shares
@@ -42,6 +41,7 @@ from pipelines.session.tables import (
 )
 from pipelines.session.whole_folders import STUDY_MARK, is_made, whole_folder
 from pipelines.simulation.study.settings import command_of
+from pipelines.sources.pictures import Pictures, open_pictures, refuse_changed_pictures
 
 if TYPE_CHECKING:
     import pandas as pd

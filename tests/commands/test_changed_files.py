@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import pipelines.formats.flights.pictures
+import pipelines.sources.pictures
 from pipelines.export import export, load_recording
 from pipelines.film import film
 from pipelines.formats.videos.video import VideoReader
@@ -137,14 +137,14 @@ def test_the_same_video_goes_on_and_is_hashed_only_where_its_time_or_size_differ
         hashed.append(path.name)
         return sha256_of(path)
 
-    monkeypatch.setattr(pipelines.formats.flights.pictures, "sha256_of", counted)
+    monkeypatch.setattr(pipelines.sources.pictures, "sha256_of", counted)
     assert "unchanged" in succeeds(*again(flight))
     assert hashed == []
     os.utime(flight / "left.mp4", ns=(1, 1))
     assert "unchanged" in succeeds(*again(flight))
     assert hashed == ["left.mp4"]
     assert "unchanged" in succeeds("ingest", flight / "flight.yaml")  # which notes the new time
-    pipelines.formats.flights.pictures._content.cache_clear()
+    pipelines.sources.pictures._content.cache_clear()
     assert "unchanged" in succeeds(*again(flight))
     assert hashed == ["left.mp4"]
 

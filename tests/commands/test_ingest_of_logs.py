@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from benchmarks.ingest_log import CONTAINERS, RECORDER, in_a_process, ingested, timed, write
-from pipelines.formats.flights.flight_logs import FlightLogs
-from pipelines.formats.flights.pose_doubts import doubts_of_stillness
 from pipelines.formats.logs.mcap_log import McapLog
 from pipelines.formats.logs.recordings import OpenLog
 from pipelines.ingest import ingest
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import read_flight
 from pipelines.session.records import Trajectory
+from pipelines.sources.logs import FlightLogs
+from pipelines.sources.world import doubts_of_stillness
 from tests.synthetic.logged_flights import write_logged_flight
 from tests.synthetic.logs import Entry, write_log
 

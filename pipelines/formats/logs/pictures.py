@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from pipelines.formats.logs.layouts import Layout, find_layout
+from pipelines.formats.logs.message_decoders import Layout, find_layout
 from pipelines.formats.logs.messages import FAULTS, LATEST_NS, all_samples, nanoseconds, unreadable
 from pipelines.formats.logs.recordings import messages_alike
 from pipelines.geometry.arrays import Picture

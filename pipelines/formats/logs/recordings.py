@@ -153,7 +153,8 @@ class OpenLog:
     def __init__(self, parts: Sequence[LogPart], lost: Counter[str]) -> None:
         self.parts = parts
         self._lost = lost
-        self._topics = {key: self._summary(*key) for key in sorted(self._keys())}
+        keys = {_key(channel) for part in parts for channel in part.channels.values()}
+        self._topics = {key: self._summary(*key) for key in sorted(keys)}
 
     def __enter__(self) -> OpenLog:
         """Return the log itself."""
@@ -194,7 +195,7 @@ class OpenLog:
             UnlikeError: the messages of a file are not of one channel and one length.
         """
         for part in self.parts:
-            channels = _channels_of(part, topic.name, topic.type, topic.encoding)
+            channels = _channels_of(part, topic)
             if len(channels) > 1:
                 raise UnlikeError
             for rows, data in part.read_alike(np.sort(part.rows_of(channels))):
@@ -206,47 +207,36 @@ class OpenLog:
         In the order of the files; a stable sort by the stamps gives that of `messages`. Shorter messages
         are padded with zeros.
         """
-        for part in self.parts:
-            rows = part.rows_of(_channels_of(part, topic.name, topic.type, topic.encoding))
+        for part, rows in self._rows_of(topic):
             for found, sizes, heads in part.read_heads(np.sort(rows), length):
                 yield part.table.stamp_ns[found], sizes, heads
 
     def schemas(self, topic: Topic) -> set[Schema]:
         """Return the schemas of a topic's messages; parts may differ."""
-        return {
-            part.channels[channel].schema
-            for part in self.parts
-            for channel in _channels_of(part, topic.name, topic.type, topic.encoding)
-        }
+        return {part.channels[c].schema for part in self.parts for c in _channels_of(part, topic)}
 
     def stamps(self, topic: Topic) -> Int64:
         """Return the stamps of receipt of a topic's messages, sorted."""
-        stamps = [
-            part.table.stamp_ns[part.rows_of(_channels_of(part, topic.name, topic.type, topic.encoding))]
-            for part in self.parts
-        ]
-        return np.sort(np.concatenate(stamps))
+        return np.sort(np.concatenate([part.table.stamp_ns[rows] for part, rows in self._rows_of(topic)]))
 
     def size(self, topic: Topic) -> int:
         """Return the size of a topic's messages in bytes, uncompressed."""
-        return sum(
-            int(
-                part.table.size[
-                    part.rows_of(_channels_of(part, topic.name, topic.type, topic.encoding))
-                ].sum()
-            )
-            for part in self.parts
-        )
+        return sum(int(part.table.size[rows].sum()) for part, rows in self._rows_of(topic))
 
     def problem(self, topic: Topic) -> str:
         """Return why the messages of a topic cannot be decoded; empty if they can."""
         for part in self.parts:
-            for channel in _channels_of(part, topic.name, topic.type, topic.encoding):
+            for channel in _channels_of(part, topic):
                 try:
                     decoder(part.channels[channel].schema)
                 except ValueError as error:
                     return str(error)
         return ""
+
+    def _rows_of(self, topic: Topic) -> Iterator[tuple[LogPart, Int64]]:
+        """Yield the rows of a topic's messages by part, in the order of receipt."""
+        for part in self.parts:
+            yield part, part.rows_of(_channels_of(part, topic))
 
     def _of_part(self, part: LogPart, topics: frozenset[str]) -> Iterator[Message]:
         decoders = {}
@@ -269,9 +259,6 @@ class OpenLog:
                     part.lose(int(batch[k]), UNDECODABLE)
                     continue
                 yield Message(topic, stamps[k], value)
-
-    def _keys(self) -> set[tuple[str, str, str]]:
-        return {_key(channel) for part in self.parts for channel in part.channels.values()}
 
     def _summary(self, name: str, type_: str, encoding: str) -> Topic:
         stamps = self.stamps(Topic(name, type_, encoding, 0, None, None))
@@ -400,8 +387,9 @@ def _key(channel: Channel) -> tuple[str, str, str]:
     return channel.topic, channel.schema.type, channel.schema.encoding
 
 
-def _channels_of(part: LogPart, name: str, type_: str, encoding: str) -> list[int]:
-    return [number for number, channel in part.channels.items() if _key(channel) == (name, type_, encoding)]
+def _channels_of(part: LogPart, topic: Topic) -> list[int]:
+    key = topic.name, topic.type, topic.encoding
+    return [number for number, channel in part.channels.items() if _key(channel) == key]
 
 
 def _empty_table() -> MessageTable:

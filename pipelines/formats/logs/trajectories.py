@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.formats.logs.layouts import Layout, find_layout
+from pipelines.formats.logs.message_decoders import Layout, find_layout
 from pipelines.formats.logs.messages import LATEST_NS, Stamps, all_samples, kind_of
 from pipelines.formats.logs.recordings import UnlikeError, messages_alike
 from pipelines.formats.poses.pose_rows import clean_poses

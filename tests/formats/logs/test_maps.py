@@ -15,17 +15,16 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from numpy.typing import NDArray
 
-from pipelines.formats.flights.flight_logs import FlightLogs
-from pipelines.formats.flights.world_axes import in_world
 from pipelines.formats.logs import maps as log_maps
 from pipelines.formats.logs.maps import cloud_points, evenly
 from pipelines.formats.maps import octomap
 from pipelines.formats.maps.voxel_grids import occupancy_of
-from pipelines.geometry.poses import enu_from_ned
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Flight, Map, WorldFromLog
-from pipelines.session.records import Occupancy, Trajectory
+from pipelines.session.manifest import Flight, Log, Map, WorldFromLog
+from pipelines.session.records import Occupancy
 from pipelines.session.registries import MapFormat
+from pipelines.sources.logs import FlightLogs
+from pipelines.sources.maps import maps_of_log
 from tests.formats.maps.test_octomap import at, file_of, ot_body
 from tests.synthetic.logs import CONTAINERS, Container, Entry, write_log, write_ros2
 from tests.synthetic.map_logs import (
@@ -66,21 +65,19 @@ class Read:
         camera: dict[str, Any] = {"pose": {"tum": "x"}, "intrinsics": "x", "keypoints": "y"}
         if pose_topic:
             camera["pose"] = {"log": "a", "topic": pose_topic}
-        flight = Flight.model_validate(
-            {"schema": 1, "cameras": {"c": camera}, "logs": {"a": {"path": log.name, "stamps": stamps}}}
+        settings = Log(
+            path=[log.name],
+            stamps=stamps,
+            axes="ned" if ned else "enu",
+            world_from_log=place or WorldFromLog(),
         )
-
-        def to_world(poses: Trajectory) -> Trajectory:
-            if ned:
-                position, quaternion = enu_from_ned(poses.position, poses.quaternion_xyzw)
-                poses = Trajectory(poses.t_ns, position, quaternion)
-            return in_world(poses, place or WorldFromLog())
-
+        flight = Flight.model_validate({"schema": 1, "cameras": {"c": camera}, "logs": {"a": settings}})
         with FlightLogs(flight, folder, self.notes.append) as logs:
-            found = logs.maps(Map(log="a", **stated), to_world, max_gap_ns=SECOND)
+            found = maps_of_log(
+                flight, Map(log="a", **stated), logs, max_gap_ns=SECOND, note=self.notes.append
+            )
             self.maps = list(found.maps)
         self.dropped = found.dropped
-        self.notes += found.notes
         assert [one.from_ns for one in self.maps] == found.from_ns.tolist()
 
     @property
@@ -122,7 +119,7 @@ def test_octomap_of_a_log_without_definitions(tmp_path: Path) -> None:
     camera = {"pose": {"tum": "x"}, "intrinsics": "x", "keypoints": "y"}
     flight = Flight.model_validate({"schema": 1, "cameras": {"c": camera}})
     with FlightLogs(flight, tmp_path, lambda _: None) as logs:
-        (one,) = logs.maps(Map(log=path.name), lambda poses: poses, max_gap_ns=SECOND).maps
+        (one,) = maps_of_log(flight, Map(log=path.name), logs, max_gap_ns=SECOND, note=print).maps
     same(one, READER.read_map(tmp_path / "site" / "map.bt"))
 
 

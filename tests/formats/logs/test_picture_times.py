@@ -11,8 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipelines.formats.logs.layouts import find_layout
-from pipelines.formats.logs.message_decoders import Schema, decoder
+from pipelines.formats.logs.message_decoders import Schema, decoder, find_layout
 from pipelines.formats.logs.messages import all_samples
 from pipelines.formats.logs.pictures import (
     later_pictures,

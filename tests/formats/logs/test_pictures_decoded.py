@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.formats.flights.pictures import LoggedPictures
 from pipelines.formats.logs.pictures import KNOWN, decode
 from pipelines.geometry.arrays import Picture
 from pipelines.session.errors import DataError
 from pipelines.session.records import PictureSample
+from pipelines.sources.pictures import LoggedPictures
 from tests.synthetic.logs import CONTAINERS, Container, Entry, write_log
 
 WIDTH, HEIGHT = 16, 12

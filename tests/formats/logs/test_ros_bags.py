@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipelines.formats.logs import ros2_sqlite3
+from pipelines.formats.logs import ros2_bag
 from pipelines.formats.logs.chunked_logs import CHUNK_LIMIT
 from pipelines.session.errors import DataError
 from tests.formats.log_entries import (
@@ -308,9 +308,9 @@ def test_rows_listed_together_are_those_listed_one_by_one(
         content[4096 * lost_page : 4096 * (lost_page + 1)] = bytes(4096)
         path.write_bytes(content)
     else:
-        monkeypatch.setattr(ros2_sqlite3, "_LISTED", 7)
+        monkeypatch.setattr(ros2_bag, "_LISTED", 7)
     together = everything(path)
-    monkeypatch.setattr(ros2_sqlite3.Sqlite3Part, "_take_joined", lambda *_: False)
+    monkeypatch.setattr(ros2_bag.Sqlite3Part, "_take_joined", lambda *_: False)
     assert together == everything(path)
     kept = [message for k, message in enumerate(ALL, start=1) if k % 5 != 2 and k not in {60, 61}]
     if lost_page:

@@ -1,11 +1,12 @@
-"""Camera poses from drones' own logs, all in one world: ENU about one origin on Earth.
+"""Poses of cameras and positions of people, from files, logs and drones' own logs, all in one world.
 
-A drone logs its position and the attitudes of its body and gimbal separately, each at its own rate. This
-module joins them.
+A drone's own log has its position and the attitudes of its body and gimbal separately, each at its own rate.
+They are joined here, in ENU axes about one origin on Earth.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,25 +14,30 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.formats.flights.flight_logs import FlightLogs
-from pipelines.formats.flights.gimbal_angles import attitudes_at, stated_angles
-from pipelines.formats.flights.log_times import world_times
-from pipelines.formats.flights.world_axes import in_world
+from pipelines.formats.drone_logs.telemetry_rows import turned_as_stated
+from pipelines.formats.logs.presets import NAV_SAT_FIX, read_pair, read_positions, read_preset
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.clocks import ClockFit
 from pipelines.geometry.geodesy import Place, enu_from_enu, enu_from_geodetic
-from pipelines.geometry.mounting import attitude_in_enu, compose_gimbal, compose_mount, level_heading
+from pipelines.geometry.mounting import (
+    attitude_in_enu,
+    compose_gimbal,
+    compose_mount,
+    level_heading,
+)
 from pipelines.geometry.poses import (
     compose,
     interpolate_points,
+    interpolate_poses,
+    mounted_covariance,
     multiply,
     quaternion_from_matrix,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Camera, Flight, PoseSource
+from pipelines.session.manifest import Axes, Camera, Flight, Gimbal, Mount, Plan, PoseSource
 from pipelines.session.manifest import Log as LogSource
 from pipelines.session.records import Int64, Trajectory
-from pipelines.session.registries import FORMATS
+from pipelines.session.registries import FORMATS, TrajectoryFormat, recognise
 from pipelines.session.telemetry import (
     AttitudeTrack,
     PositionTrack,
@@ -40,7 +46,20 @@ from pipelines.session.telemetry import (
     TelemetryFormat,
     TriggerFormat,
 )
+from pipelines.sources.files import FlightFiles
+from pipelines.sources.logs import FlightLogs
+from pipelines.sources.world import (
+    as_stated,
+    body_in_enu,
+    in_enu,
+    in_world,
+    losses,
+    mounted,
+    refuse_projected,
+    world_times,
+)
 
+_FIXED = "fixed angles"
 _ABOVE_TAKE_OFF = ("take-off", "stated")
 _ADD_ANGLES = (
     "add gimbal: {log, topic, relative_to: world} with the angles of another log, or"
@@ -57,14 +76,15 @@ class Origin:
     source: str  # "world.origin", or the log whose first position it is
 
 
-class TelemetryPoses:
-    """Poses of cameras whose drones log their own position.
+class FlightPoses:
+    """Reader of the poses of one flight, in the world's axes and at its times.
 
     Args:
         flight: the manifest.
         manifest: its path.
-        logs: the flight's logs, for presets and gimbals.
-        max_gap_ns: the longest gap between two positions or angles that is interpolated.
+        logs: of the flight.
+        files: of the flight.
+        max_gap_ns: the longest gap between two poses or angles that is interpolated.
         note: receives each choice and each doubt, one line each.
     """
 
@@ -73,39 +93,256 @@ class TelemetryPoses:
         flight: Flight,
         manifest: Path,
         logs: FlightLogs,
+        files: FlightFiles,
         *,
         max_gap_ns: int,
         note: Callable[[str], None],
     ) -> None:
         self._flight = flight
         self._manifest = manifest
+        self._base = manifest.parent
         self._logs = logs
+        self._files = files
         self._max_gap_ns = max_gap_ns
         self._note = note
         self._origin: Origin | None = None
-        self._read: dict[str, Telemetry] = {}
+        self._telemetry: dict[str, Telemetry] = {}
 
-    # --- reading ---------------------------------------------------------------------------------------
+    # --- cameras ---------------------------------------------------------------------------------------
 
-    def telemetry(self, pose: PoseSource) -> Telemetry:
+    def trajectory(self, name: str, camera: Camera, first_frame_ns: int) -> Trajectory:
+        """Read world_from_camera over time; a static camera has one row, at its first frame.
+
+        Raises:
+            DataError: nothing usable, or the manifest does not state the camera's mount on the body.
+        """
+        pose = camera.pose
+        if pose.static:
+            calibrated = self._files.camera(name, pose.static.path, pose.static.camera)
+            if calibrated.position is None or calibrated.quaternion_xyzw is None:
+                path = self._base / pose.static.path
+                raise DataError(path, "holds intrinsics but no camera pose", "name a file with extrinsics")
+            still = Trajectory(
+                t_ns=np.array([first_frame_ns]),
+                position=calibrated.position[None],
+                quaternion_xyzw=calibrated.quaternion_xyzw[None],
+            )
+            return self._local(self._base / pose.static.path, in_enu(still, self._axes(pose.axes)))
+        return in_world(self._moving_trajectory(name, camera), pose.world_from_source)
+
+    def _moving_trajectory(self, name: str, camera: Camera) -> Trajectory:
+        """Read world_from_camera over time, in the world of its source."""
+        pose = camera.pose
+        if pose.is_telemetry:
+            return self._joined_trajectory(name, camera)
+        if pose.log:
+            return self._local(self._logs.paths(pose.log)[0], self._logged_trajectory(name, camera, pose.log))
+        stated = pose.tum or pose.csv or ""
+        trajectory = as_stated(self._filed_trajectory(stated, "tum" if pose.tum else "csv"), pose)
+        if pose.of != "body":
+            return self._local(self._base / stated, in_enu(trajectory, self._axes(pose.axes)))
+        turned = self._local(self._base / stated, body_in_enu(trajectory, self._axes(pose.axes)))
+        return self._on_body(name, camera, turned)
+
+    def _filed_trajectory(self, stated: str, kind: str) -> Trajectory:
+        path = self._base / stated
+        reader = FORMATS.get(kind)
+        if not isinstance(reader, TrajectoryFormat):
+            raise DataError(path, f"the format {kind} reads no trajectories")
+        trajectory = reader.read_trajectory(path)
+        if not len(trajectory.t_ns):
+            raise DataError(path, f"holds no usable pose ({losses(trajectory.dropped)})", "mend the log")
+        return trajectory
+
+    def _logged_trajectory(self, name: str, camera: Camera, log: str) -> Trajectory:
+        pose, settings = camera.pose, self._logs.settings(log)
+        trajectory = self._logs.trajectory(
+            log, pose.topic, pose.parent, pose.child, max_gap_ns=self._max_gap_ns
+        )
+        of_camera = pose.of == "camera" or (
+            pose.of is None and camera.mount is None and camera.gimbal is None
+        )
+        if of_camera and pose.of is None and pose.child is None:
+            self._note(
+                f"{name}: poses in {log} are taken as the camera's (say `of: body` with a mount if not)"
+            )
+        trajectory = as_stated(trajectory, pose)
+        axes = self._axes(pose.axes, settings.axes)
+        turned = in_enu(trajectory, axes) if of_camera else body_in_enu(trajectory, axes)
+        moved = in_world(turned, settings.world_from_log)
+        return moved if of_camera else self._on_body(name, camera, moved)
+
+    def _mounted(self, name: str, mount: Mount | None) -> tuple[Float, Float]:
+        try:
+            return mounted(mount)
+        except ValueError as error:
+            place = f"{self._manifest}: cameras.{name}.mount"
+            raise DataError(place, str(error), "say how the camera sits on the body") from None
+
+    def _on_body(self, name: str, camera: Camera, body: Trajectory) -> Trajectory:
+        """Compute the poses of the camera from those of the body that carries it."""
+        lever_arm, rotation = self._mounted(name, camera.mount)
+        world_from_body = (body.position, body.quaternion_xyzw)
+        dropped = dict(body.dropped)
+        if camera.gimbal is None:
+            position, quaternion = compose_mount(world_from_body, (lever_arm, rotation))
+        else:
+            position, quaternion, lost = self._on_gimbal(camera, body, lever_arm, rotation)
+            dropped |= lost
+        known = ~np.isnan(quaternion[:, 0])
+        if not known.any():
+            raise DataError(
+                self._manifest,
+                f"cameras.{name}: its gimbal's angles and the poses of its body share no time",
+                "check the clocks of the two logs",
+            )
+        covariance = body.covariance
+        if covariance is not None:
+            covariance = mounted_covariance(covariance, body.quaternion_xyzw, lever_arm, quaternion)
+            covariance = covariance if known.all() else covariance[known]
+        return Trajectory(
+            t_ns=body.t_ns[known],
+            position=position[known],
+            quaternion_xyzw=quaternion[known],
+            covariance=covariance,
+            dropped=dropped,
+        )
+
+    def _on_gimbal(
+        self, camera: Camera, body: Trajectory, lever_arm: Float, rotation: Float
+    ) -> tuple[Float, Float, dict[str, int]]:
+        """Compute positions and rotations of a camera on a gimbal; also return losses by cause."""
+        gimbal = camera.gimbal
+        if gimbal is None:
+            raise ValueError("the camera has no gimbal")
+        track = self._stated_angles(gimbal)
+        attitude = self._at(track, body.t_ns)
+        position, quaternion = compose_gimbal(
+            (body.position, body.quaternion_xyzw),
+            lever_arm,
+            attitude,
+            rotation,
+            relative_to=track.relative_to,
+        )
+        lost = dict(track.dropped)
+        if without := int(np.isnan(attitude[:, 0]).sum()):
+            lost["pose without gimbal angles"] = without
+        return position, quaternion, lost
+
+    def _stated_angles(self, gimbal: Gimbal) -> AttitudeTrack:
+        """Return the attitude of a gimbal with a topic or fixed angles, in our axes at world times."""
+        relative_to = gimbal.relative_to or "world"
+        if gimbal.fixed is not None:
+            angles = np.array([[gimbal.fixed.yaw_deg, gimbal.fixed.pitch_deg, gimbal.fixed.roll_deg]])
+            turned = turned_as_stated(angles, relative_to=relative_to)
+            return AttitudeTrack(_FIXED, np.zeros(1, dtype=np.int64), turned, relative_to)
+        log, topic = gimbal.log or "", gimbal.topic or ""
+        logged = self._logs.attitudes(log, topic, order=gimbal.order, units=gimbal.units)
+        axes = self._axes(gimbal.axes, self._logs.settings(log).axes)
+        turned = attitude_in_enu(logged.quaternion_xyzw, relative_to=relative_to, axes=axes)
+        lost = {f"gimbal angles: {cause}": count for cause, count in logged.dropped.items()}
+        return AttitudeTrack(topic, logged.t_ns, turned, relative_to, dropped=lost)
+
+    def _at(self, track: AttitudeTrack, t_ns: Int64) -> Float:
+        """Interpolate attitudes [N, 4] at given times, NaN outside the track; fixed angles always hold."""
+        if track.name == _FIXED:
+            return np.repeat(track.quaternion_xyzw, len(t_ns), axis=0)
+        return interpolate_poses(
+            track.t_ns,
+            np.zeros((len(track.t_ns), 3)),
+            track.quaternion_xyzw,
+            t_ns,
+            max_gap_ns=self._max_gap_ns,
+            max_extrapolation_ns=0,
+        )[1]
+
+    def _axes(self, *stated: Axes | None) -> Axes:
+        return next((axes for axes in stated if axes), self._flight.world.frame)
+
+    def _local(self, source: Path | str, trajectory: Trajectory) -> Trajectory:
+        """Return the same trajectory; refuse projected coordinates if the world has an origin on Earth."""
+        self.refuse_projected(source, trajectory.position)
+        return trajectory
+
+    def refuse_projected(self, source: Path | str, position: Float) -> None:
+        """Refuse positions [N, 3] in projected coordinates if the world has an origin on Earth."""
+        if (origin := self.origin()) is not None:
+            refuse_projected(source, position, origin.place)
+
+    # --- people, commands, truth -----------------------------------------------------------------------
+
+    def actor(self, log: str, topic: str | None) -> Trajectory:
+        """Read the actor's logged positions; the rotation has no meaning."""
+        with self._logs.open(log) as opened:
+            if opened.type_of(topic) == NAV_SAT_FIX and topic is not None:
+                dropped: dict[str, int] = {}
+                track = read_positions(
+                    opened.recording, opened.source, topic, opened.settings.stamps, dropped
+                )
+                track = replace(track, t_ns=opened.world_times(track.t_ns))
+                dropped = dict(Counter(dropped) + opened.lost)
+                return replace(self._points("actor", log, track), dropped=dropped)
+        settings = self._logs.settings(log)
+        trajectory = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
+        return self._local(
+            self._logs.paths(log)[0],
+            in_world(in_enu(trajectory, self._axes(settings.axes)), settings.world_from_log),
+        )
+
+    def planned(self, camera: str, plan: Plan) -> Trajectory:
+        """Read the commanded positions of a drone; the rotation has no meaning."""
+        if camera in plan.files:
+            path = self._base / plan.files[camera]
+            filed = recognise(path, TrajectoryFormat, "file of commanded poses").read_trajectory(path)
+            return self._local(path, in_enu(filed, self._flight.world.frame))
+        log, topic = plan.log_of(camera), plan.topics[camera].topic
+        settings = self._logs.settings(log)
+        sent = self._logs.commands(log, topic)
+        if sent is None:
+            sent = self._logs.trajectory(log, topic, None, None, max_gap_ns=self._max_gap_ns)
+        return self._local(
+            self._logs.paths(log)[0],
+            in_world(in_enu(sent, self._axes(settings.axes)), settings.world_from_log),
+        )
+
+    def true_poses(self, stated: str) -> Trajectory:
+        """Read the true poses of one camera."""
+        path = self._base / stated
+        trajectory = recognise(path, TrajectoryFormat, "camera trajectory").read_trajectory(path)
+        return self._local(path, in_enu(trajectory, self._flight.world.frame))
+
+    # --- drones' own logs ------------------------------------------------------------------------------
+
+    def _read(self, pose: PoseSource) -> Telemetry:
         """Read a drone's own log, at its own times; each log is read once."""
         stated = _stated(pose)
         choice = TelemetryChoice(pose.position, pose.instance, pose.time, pose.altitude)
         key = pose.model_dump_json(exclude={"of"})
-        if key not in self._read:
+        if key not in self._telemetry:
             if pose.log:
-                self._read[key] = self._logs.telemetry(pose, choice)
+                self._telemetry[key] = self._logged_telemetry(pose, choice)
             else:
                 reader = FORMATS.get(_kind(pose))
                 path = self._one_file(stated)
                 if not isinstance(reader, TelemetryFormat):
                     raise DataError(path, f"the format {_kind(pose)} reads no telemetry")
-                self._read[key] = reader.read_telemetry(path, choice)
-        return self._read[key]
+                self._telemetry[key] = reader.read_telemetry(path, choice)
+        return self._telemetry[key]
 
-    def fit(self, pose: PoseSource) -> ClockFit | None:
-        """Return the fit of the log's own clock to GPS time."""
-        return self.telemetry(pose).fit
+    def _logged_telemetry(self, pose: PoseSource, choice: TelemetryChoice) -> Telemetry:
+        """Read telemetry from a driver's usual topics, or from two named ones, at the log's own times."""
+        with self._logs.open(pose.log or "") as opened:
+            recording, source, stamps = opened.recording, opened.source, opened.settings.stamps
+            if pose.preset:
+                found = read_preset(recording, source, pose.preset, pose.namespace, choice, stamps)
+            else:
+                axes = self._axes(pose.axes, opened.settings.axes)
+                found = read_pair(recording, source, pose.topic or "", pose.attitude or "", axes, stamps)
+            return replace(found, dropped=dict(Counter(found.dropped) + opened.lost))
+
+    def log_clock(self, camera: Camera) -> ClockFit | None:
+        """Return the fit of a drone's log clock to GPS time; None without one."""
+        return self._read(camera.pose).fit if camera.pose.is_telemetry else None
 
     def triggers(self, kind: Literal["ulog", "ardupilot"], stated: str) -> Int64:
         """Read the trigger times of pictures from a drone's own log, at world times."""
@@ -142,7 +379,7 @@ class TelemetryPoses:
         for camera in self._flight.cameras.values():
             if not camera.pose.is_telemetry:
                 continue
-            track = self.telemetry(camera.pose).position
+            track = self._read(camera.pose).position
             first = track.origin or (_first_place(track) if track.on_earth else None)
             if first is not None:
                 self._origin = Origin(first, _stated(camera.pose))
@@ -152,9 +389,9 @@ class TelemetryPoses:
     def doubt_heights(self) -> None:
         """Note cameras whose heights have different references."""
         kinds = {
-            name: self.telemetry(camera.pose).position.height
+            name: self._read(camera.pose).position.height
             for name, camera in self._flight.cameras.items()
-            if camera.pose.is_telemetry and self.telemetry(camera.pose).position.on_earth
+            if camera.pose.is_telemetry and self._read(camera.pose).position.on_earth
         }
         if len(set(kinds.values())) > 1:
             said = ", ".join(f"{name}: {height}" for name, height in kinds.items())
@@ -182,7 +419,7 @@ class TelemetryPoses:
             height = height + origin.place.altitude_m
         return enu_from_geodetic(latitude, longitude, height, origin.place), level
 
-    def points(self, name: str, log: str, track: PositionTrack) -> Trajectory:
+    def _points(self, name: str, log: str, track: PositionTrack) -> Trajectory:
         """Return positions without a rotation in the world, as a trajectory; its rotation has no meaning.
 
         Raises:
@@ -200,24 +437,18 @@ class TelemetryPoses:
 
     # --- poses of cameras ------------------------------------------------------------------------------
 
-    def trajectory(self, name: str, camera: Camera, mounted: tuple[Float, Float]) -> Trajectory:
-        """Compute world_from_camera over time.
+    def _joined_trajectory(self, name: str, camera: Camera) -> Trajectory:
+        """Compute world_from_camera over time from a drone's own log.
 
         The stamps are those of positions or of attitudes, whichever have the higher rate. The others are
         interpolated, never across a gap.
-
-        Args:
-            name: the camera's.
-            camera: its part of the manifest.
-            mounted: lever arm [3] m in the body, and rotation [4] of the camera in its gimbal, or in the
-                body if there is no gimbal.
 
         Raises:
             DataError: the log cannot be used, does not give the camera's rotation, or its parts share
                 no time.
         """
         pose = camera.pose
-        telemetry = self.telemetry(pose)
+        telemetry = self._read(pose)
         for note in telemetry.notes:
             self._note(note)
         body, gimbal = telemetry.body, self._gimbal(name, camera, telemetry)
@@ -234,9 +465,9 @@ class TelemetryPoses:
 
         t_ns = _fastest(track.t_ns, [part.t_ns for part in (gimbal or body,) if part is not None])
         position = interpolate_points(track.t_ns, values, t_ns, max_gap_ns=self._max_gap_ns)
-        lever_arm, rotation = mounted
-        attitude = self._at(gimbal, t_ns)
-        world_from_body = self._at(body, t_ns)
+        lever_arm, rotation = self._mounted(name, camera.mount)
+        attitude = None if gimbal is None else self._at(gimbal, t_ns)
+        world_from_body = None if body is None else self._at(body, t_ns)
         if attitude is None and world_from_body is not None:
             position, quaternion = compose_mount((position, world_from_body), (lever_arm, rotation))
         elif attitude is not None and gimbal is not None:
@@ -284,7 +515,7 @@ class TelemetryPoses:
                 f" {meant} as stated"
             )
             return replace(moved, quaternion_xyzw=turned, relative_to=meant)
-        return stated_angles(gimbal, self._logs, self._flight.world.frame)
+        return self._stated_angles(gimbal)
 
     def _at_world_times(self, pose: PoseSource, telemetry: Telemetry, track: AttitudeTrack) -> AttitudeTrack:
         since_ns = int(telemetry.position.t_ns[0])
@@ -308,9 +539,6 @@ class TelemetryPoses:
             )
         if gimbal is None and camera.mount is None:
             raise DataError(place, f"{stated} holds no gimbal angles", _ADD_MOUNT)
-
-    def _at(self, track: AttitudeTrack | None, t_ns: Int64) -> Float | None:
-        return None if track is None else attitudes_at(track, t_ns, max_gap_ns=self._max_gap_ns)
 
     def _complete(
         self,

@@ -1,4 +1,4 @@
-"""Conversion of logged poses to the world: to its axes (east-north-up) and its origin."""
+"""Conversion of logged poses to the world: to its clock, its axes (east-north-up) and its origin; doubts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from pipelines.geometry.arrays import Float
 from pipelines.geometry.geodesy import Place
-from pipelines.geometry.mounting import flu_body_from_frd
+from pipelines.geometry.mounting import body_from_camera, flu_body_from_frd
 from pipelines.geometry.poses import (
     carried_covariance,
     compose,
@@ -19,13 +19,13 @@ from pipelines.geometry.poses import (
     quaternion_from_rotation_vector,
 )
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Axes, PoseSource, WorldFromLog
-from pipelines.session.records import Trajectory
+from pipelines.session.manifest import Axes, LogClock, Mount, PoseSource, WorldFromLog
+from pipelines.session.records import Int64, Trajectory
 
-_FARTHEST_M = 100_000.0  # from the origin: no drone flies so far, and UTM eastings begin at 166 km
-
-
+_FASTEST_MPS = 100.0  # no camera that films a person flies faster
+_FROZEN_S, _FROZEN_POSES = 1.0, 10  # a frozen pose stays the same for longer, and for as many messages
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
+_FARTHEST_M = 100_000.0  # from the origin: no drone flies so far, and UTM eastings begin at 166 km
 
 
 def as_stated(trajectory: Trajectory, pose: PoseSource) -> Trajectory:
@@ -44,6 +44,19 @@ def as_stated(trajectory: Trajectory, pose: PoseSource) -> Trajectory:
         scale = np.diag([metres] * 3 + [1.0] * 3)
         covariance = None if covariance is None else carried_covariance(scale, covariance)
     return replace(trajectory, position=position, quaternion_xyzw=quaternion, covariance=covariance)
+
+
+def world_times(clock: LogClock, t_ns: Int64, since_ns: int) -> Int64:
+    """Convert a log's own times to world times [N].
+
+    Args:
+        clock: the log's clock in the manifest.
+        t_ns: [N].
+        since_ns: the time from which the drift counts.
+    """
+    drift_ns = np.round((t_ns - since_ns) * (clock.drift_ppm * 1e-6)).astype(np.int64)
+    world_ns: Int64 = t_ns + drift_ns + round(clock.offset_s * 1e9)
+    return world_ns
 
 
 def in_enu(trajectory: Trajectory, axes: Axes) -> Trajectory:
@@ -108,3 +121,53 @@ def refuse_projected(source: Path | str, position: Float, origin: Place) -> None
             f" {origin.longitude_deg:.6f})",
             "give metres east, north and up of that origin: subtract its projected coordinates",
         )
+
+
+def doubts_of_speed(trajectory: Trajectory) -> list[str]:
+    """Report poses that jump further than anything flies, in one line or none."""
+    step_s = np.diff(trajectory.t_ns) / 1e9
+    speed = np.linalg.norm(np.diff(trajectory.position, axis=0), axis=1) / step_s
+    too_fast = speed > _FASTEST_MPS
+    if not too_fast.any():
+        return []
+    first_s = int(trajectory.t_ns[np.argmax(too_fast)] - trajectory.t_ns[0]) / 1e9
+    return [
+        f"its poses jump {int(too_fast.sum())} times, by up to {speed.max():.3g} m/s"
+        f" (first after {first_s:.2f} s)"
+    ]
+
+
+def doubts_of_stillness(trajectory: Trajectory) -> list[str]:
+    """Report poses that otherwise change but are bit-identical for over a second, in one line or none.
+
+    No drone is so still, so its estimator may have frozen. The poses stay in use, because identical poses
+    are no proof: a camera on the ground is as still in a log without noise.
+    """
+    pose = np.concatenate([trajectory.position, trajectory.quaternion_xyzw], axis=1)
+    changes = np.flatnonzero((np.diff(pose, axis=0) != 0).any(axis=1))
+    first, last = np.append(0, changes + 1), np.append(changes, len(pose) - 1)
+    lasts_s = (trajectory.t_ns[last] - trajectory.t_ns[first]) / 1e9
+    count = last - first + 1
+    frozen = (lasts_s > _FROZEN_S) & (count >= _FROZEN_POSES)
+    if not frozen.any() or len(first) == 1:
+        return []
+    after_s = int(trajectory.t_ns[first[np.argmax(frozen)]] - trajectory.t_ns[0]) / 1e9
+    return [
+        f"its poses stand still {frozen.sum()} times, for up to {lasts_s.max():.3g} s ({count[frozen].sum()}"
+        f" poses in all, first after {after_s:.2f} s): was its estimator frozen?"
+    ]
+
+
+def losses(dropped: dict[str, int]) -> str:
+    """Format the losses by cause, in words."""
+    return ", ".join(f"{count} {cause}" for cause, count in dropped.items()) or "it is empty"
+
+
+def mounted(mount: Mount | None) -> tuple[Float, Float]:
+    """Return lever arm [3] and rotation [4] of a camera in its body, or in its gimbal if there is one."""
+    if mount is None:  # the manifest's checks guarantee a gimbal in this case
+        return np.zeros(3), body_from_camera("forward")
+    if mount.body_from_camera is not None:
+        stated = mount.body_from_camera
+        return np.array(stated.translation), np.array(stated.rotation_xyzw)
+    return np.array(mount.translation), body_from_camera(mount.looks or "forward", mount.down_deg)

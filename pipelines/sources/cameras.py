@@ -1,51 +1,58 @@
-"""Times at which the pictures of a camera were taken, from the source in its manifest."""
+"""Pictures of a camera: the times at which they were taken, and intrinsics for their size."""
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
-from pipelines.formats.flights.flight_logs import FlightLogs, Frames
-from pipelines.formats.flights.telemetry_poses import TelemetryPoses
 from pipelines.formats.videos.frame_times import read_frame_times, times_of_frames
 from pipelines.formats.videos.picture_motion import followed_points
 from pipelines.formats.videos.video import created_ns
-from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.cameras import Intrinsics, fit_to_size
 from pipelines.geometry.clocks import fit_start
+from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
-from pipelines.session.manifest import Camera, FrameTimes
+from pipelines.session.manifest import Camera, FrameTimes, IntrinsicsSource
 from pipelines.session.records import Detections, Int64, Trajectory, VideoIndex
+from pipelines.sources.files import FlightFiles
+from pipelines.sources.logs import FlightLogs, Frames
+from pipelines.sources.parts import CameraFrames
 
 _MOST_FRAMES = 20_000_000  # a week at 30 Hz; a larger number was misread from a date
 _WATCHED_NS = 120 * 10**9  # of a video, to estimate when it began
 
 
-@dataclass(frozen=True)
-class CameraFrames:
-    """Pictures of a camera in world time; numbers and times strictly increase."""
-
-    frame: Int64  # [F] frame numbers as in the keypoints
-    t_ns: Int64  # [F]
-    pts_ns: Int64  # [F] since the first picture of the video
-    topic: str | None = None  # the topic of the log that holds the pictures themselves
-    dropped: dict[str, int] = field(default_factory=dict)  # pictures that were left out, by cause
-    start_sigma_s: float = 0.0  # sigma of the common offset of all times, if it was estimated
+# Shares of keypoints. Detectors extrapolate people whom the border cuts, to all sides alike. But if the
+# pictures have another size, keypoints lie beyond the right and the lower border only: all begin at 0.
+_LARGEST_SHARE_BEYOND = 0.2
+_LARGEST_SHARE_OUTSIDE = 0.5
 
 
-class FrameSources:
-    """Reader of the frame times of one flight.
+class PosesOfCameras(Protocol):
+    """Reader of the poses of cameras, for videos whose start is estimated, and of trigger times."""
+
+    def trajectory(self, name: str, camera: Camera, first_frame_ns: int) -> Trajectory:
+        """Read world_from_camera over time."""
+
+    def triggers(self, kind: Literal["ulog", "ardupilot"], stated: str) -> Int64:
+        """Read the trigger times of pictures from a drone's own log, at world times."""
+
+
+class FlightCameras:
+    """Reader of the frame times and the intrinsics of one flight.
 
     Args:
         manifest: the path of the manifest.
         logs: of the flight.
-        telemetry: of the flight.
-        trajectory: reads the poses of a camera, by name and manifest, for a video whose start is estimated.
+        files: of the flight.
+        poses: read the poses of a camera, and trigger times from a drone's own log.
         max_gap_ns: the longest gap between two poses that is interpolated.
         note: receives each choice and each doubt, one line each.
     """
@@ -54,8 +61,8 @@ class FrameSources:
         self,
         manifest: Path,
         logs: FlightLogs,
-        telemetry: TelemetryPoses,
-        trajectory: Callable[[str, Camera, int], Trajectory],
+        files: FlightFiles,
+        poses: PosesOfCameras,
         *,
         max_gap_ns: int,
         note: Callable[[str], None],
@@ -63,10 +70,12 @@ class FrameSources:
         self._manifest = manifest
         self._base = manifest.parent
         self._logs = logs
-        self._telemetry = telemetry
-        self._trajectory = trajectory
+        self._files = files
+        self._poses = poses
         self._max_gap_ns = max_gap_ns
         self._note = note
+
+    # --- frame times -----------------------------------------------------------------------------------
 
     def frames(
         self,
@@ -92,7 +101,7 @@ class FrameSources:
         times = camera.frame_times
         if times is not None and times.start_from == "motion":
             near_ns = times.start_ns + offset_ns if times.has_start else None
-            return self._begun_by_motion(name, camera, unclocked, intrinsics, near_ns)
+            return self._started_by_motion(name, camera, unclocked, intrinsics, near_ns)
         return replace(unclocked, t_ns=unclocked.t_ns + offset_ns)
 
     def _unclocked_frames(
@@ -117,7 +126,7 @@ class FrameSources:
             return self._frames_by_stamps(stamped.t_ns, stamped.dropped, pictures)
         if times.ulog or times.ardupilot:
             kind: Literal["ulog", "ardupilot"] = "ulog" if times.ulog else "ardupilot"
-            triggered = self._telemetry.triggers(kind, times.ulog or times.ardupilot or "")
+            triggered = self._poses.triggers(kind, times.ulog or times.ardupilot or "")
             return self._frames_by_stamps(triggered, {}, pictures)
         if pictures is None:
             raise DataError(
@@ -189,7 +198,7 @@ class FrameSources:
             )
         return times.start_ns + made_ns
 
-    def _begun_by_motion(
+    def _started_by_motion(
         self, name: str, camera: Camera, frames: CameraFrames, intrinsics: Intrinsics, near_ns: int | None
     ) -> CameraFrames:
         """Shift the frames of a video in time so that the motion in its pictures fits the poses."""
@@ -197,7 +206,7 @@ class FrameSources:
         remedy = "say start: SECONDS instead, or give the stamps of a log"
         if camera.video is None or camera.video.path is None or camera.pose.static:
             raise DataError(place, "start_from: motion needs a video and poses that move", remedy)
-        poses = self._trajectory(name, camera, 0)
+        poses = self._poses.trajectory(name, camera, 0)
         some = int(np.searchsorted(frames.pts_ns, frames.pts_ns[0] + _WATCHED_NS))
         try:
             fit = fit_start(
@@ -237,6 +246,67 @@ class FrameSources:
             dropped=dict(+lost),
         )
 
+    def media(self, camera: Camera, frames: CameraFrames, session: Path) -> MediaEntry | None:
+        """Return the paths of the pictures relative to the session, which moves together with its flight."""
+        video = camera.video
+        if video is None:
+            return None
+        stated = self._logs.settings(video.log).path if video.log else [video.path or ""]
+        return MediaEntry(
+            paths=[Path(os.path.relpath(self._base / path, session)).as_posix() for path in stated],
+            sources=stated,
+            topic=frames.topic,
+            stamps=self._logs.settings(video.log).stamps if video.log else "header",
+        )
+
+    # --- intrinsics ------------------------------------------------------------------------------------
+
+    def intrinsics(
+        self, name: str, camera: Camera, video: VideoIndex | None, detections: Detections | None
+    ) -> Intrinsics:
+        """Return the intrinsics of a camera, fitted to the size of its pictures.
+
+        Raises:
+            DataError: missing, for pictures of another shape, or too small for the keypoints.
+        """
+        source = camera.intrinsics
+        place = f"{self._manifest}: cameras.{name}.intrinsics"
+        if source.path:
+            calibrated = self._files.camera(name, source.path, source.camera)
+            if calibrated.intrinsics is None:
+                raise DataError(
+                    self._base / source.path, "holds poses but no intrinsics", "name one with both"
+                )
+            intrinsics = calibrated.intrinsics
+        elif source.log:
+            intrinsics = self._logs.intrinsics(source.log, source.topic).intrinsics
+        else:
+            intrinsics = _inline_intrinsics(source, place)
+        if source.readout_s:
+            intrinsics = replace(intrinsics, readout_s=source.readout_s)
+        if size := self._picture_size(camera, video, detections):
+            try:
+                intrinsics, note = fit_to_size(intrinsics, *size)
+            except ValueError as error:
+                remedy = "give the calibration that belongs to these pictures"
+                raise DataError(place, str(error), remedy) from None
+            if note:
+                self._note(f"{name}: {note}")
+        if detections is not None:
+            _refuse_keypoints_outside(place, intrinsics, detections)
+        return intrinsics
+
+    def _picture_size(
+        self, camera: Camera, video: VideoIndex | None, detections: Detections | None
+    ) -> tuple[int, int] | None:
+        """Return the size of the pictures themselves, or the size that the keypoints file gives."""
+        if video is not None:
+            return video.width, video.height
+        logged = camera.video.log if camera.video else None
+        if camera.video and logged and (size := self._logs.picture_size(logged, camera.video.topic)):
+            return size
+        return detections.image_size if detections else None
+
 
 def _pictures(video: VideoIndex | None, logged: Frames | None) -> CameraFrames | None:
     """Return the pictures of a video or a topic, by their own stamps; None if there are none."""
@@ -253,3 +323,45 @@ def _ticks_ns(count: int, fps: Fraction) -> Int64:
     """Return the times of `count` frames from 0, each rounded to a ns; Python's integers never overflow."""
     period = Fraction(1_000_000_000) / fps
     return np.array([round(k * period) for k in range(count)], dtype=np.int64)
+
+
+def _inline_intrinsics(source: IntrinsicsSource, place: str) -> Intrinsics:
+    # A fisheye without coefficients is the equidistant projection, as in calibration files, not a pinhole.
+    coefficients = tuple(source.distortion) or ((0.0,) * 4 if source.model == "fisheye" else ())
+    try:
+        return Intrinsics(
+            width=source.width or 0,
+            height=source.height or 0,
+            fx=source.fx or 0.0,
+            fy=source.fy or 0.0,
+            cx=source.cx or 0.0,
+            cy=source.cy or 0.0,
+            model=source.model if coefficients else "none",
+            distortion=coefficients,
+        )
+    except ValueError as error:
+        raise DataError(place, str(error), "mend the numbers") from None
+
+
+def _refuse_keypoints_outside(place: str, intrinsics: Intrinsics, detections: Detections) -> None:
+    """Refuse a calibration for pictures of another size, if too many keypoints lie outside its picture.
+
+    Keypoints are weighted by confidence: those that a detector extrapolates beyond the border have little.
+    """
+    found = ~np.isnan(detections.xy[..., 0])
+    xy, weight = detections.xy[found], np.maximum(detections.confidence[found], 0.0)
+    if not len(xy):
+        return
+    weight = weight if weight.any() else np.ones(len(weight))
+    beyond = (xy > [intrinsics.width - 0.5, intrinsics.height - 0.5]).any(axis=-1)
+    outside = beyond | (xy < -0.5).any(axis=-1)
+    share_beyond, share_outside = (float(np.average(which, weights=weight)) for which in (beyond, outside))
+    if share_beyond > _LARGEST_SHARE_BEYOND or share_outside > _LARGEST_SHARE_OUTSIDE:
+        (left, top), (right, bottom) = np.percentile(xy[outside], [1, 99], axis=0)
+        raise DataError(
+            place,
+            f"is for {intrinsics.width}x{intrinsics.height} pictures, but {share_outside:.0%} of the"
+            f" keypoints lie outside (those from x = {left:.0f}, y = {top:.0f} to x = {right:.0f},"
+            f" y = {bottom:.0f})",
+            "give the calibration of these pictures, or their size with keypoints: {image_size: [W, H]}",
+        )

@@ -12,12 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.formats.flights.calibration_sources import CalibrationSources
-from pipelines.formats.flights.flight_logs import FlightLogs
 from pipelines.geometry.arrays import Float
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Camera, Flight
 from pipelines.session.records import Detections
+from pipelines.sources.cameras import FlightCameras
+from pipelines.sources.files import FlightFiles
+from pipelines.sources.logs import FlightLogs
+from pipelines.sources.poses import FlightPoses
 from tests.commands.runner import refused, succeeds
 from tests.synthetic.flights import LENS, SyntheticFlight, write_flight
 
@@ -29,10 +31,16 @@ CAMERA = Camera.model_validate({"pose": {"tum": "a.tum"}, "intrinsics": LENS_OF,
 def check(xy: Float, confidence: Float) -> None:
     """Request the intrinsics of a camera with these keypoints [N, 2]."""
     flight = Flight.model_validate({"schema": 1, "cameras": {"drone1": CAMERA}})
-    sources = CalibrationSources(Path("flight.yaml"), FlightLogs(flight, Path(), print), print)
+    manifest, files, logs = (
+        Path("flight.yaml"),
+        FlightFiles(flight, Path()),
+        FlightLogs(flight, Path(), print),
+    )
+    poses = FlightPoses(flight, manifest, logs, files, max_gap_ns=0, note=print)
+    cameras = FlightCameras(manifest, logs, files, poses, max_gap_ns=0, note=print)
     number = np.arange(len(xy))
     seen = Detections(("nose",), number, number * 0, xy[:, None], confidence[:, None], number)
-    sources.intrinsics("drone1", CAMERA, None, seen)
+    cameras.intrinsics("drone1", CAMERA, None, seen)
 
 
 @st.composite

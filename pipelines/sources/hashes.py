@@ -7,8 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from pathlib import Path
 
-from pipelines.formats.flights.flight_sources import source_files
 from pipelines.formats.logs.mcap_log import OTHER_CHECKSUM, CheckedHash, stated_checksum
+from pipelines.formats.maps.ros_map import FORMAT as ROS_MAP
 from pipelines.session.errors import DataError
 from pipelines.session.manifest import Flight
 from pipelines.session.progress import Progress
@@ -59,7 +59,9 @@ def source_stamps(flight: Flight, base: Path) -> dict[str, str]:
     Raises:
         DataError: one of them is missing or cannot be read.
     """
-    stamps = {path: [file_stamp(file) for file in source_files(base / path)] for path in stated_paths(flight)}
+    stamps = {
+        path: [file_stamp(file) for file in _source_files(base / path)] for path in stated_paths(flight)
+    }
     return {path: own[0] if len(own) == 1 else hash_of(own) for path, own in stamps.items()}
 
 
@@ -128,6 +130,13 @@ def _hash_of(path: Path) -> tuple[str, int]:
         hashes.append(CheckedHash(stated_checksum(file)))
         return hashes[-1]
 
-    digests = [sha256_of(file, hash_for) for file in source_files(path)]
+    digests = [sha256_of(file, hash_for) for file in _source_files(path)]
     digest = digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
     return digest, sum(each.differs for each in hashes)
+
+
+def _source_files(path: Path) -> list[Path]:
+    """Return a source and the files that it refers to: a floor plan is a YAML and a picture."""
+    if path.suffix.lower() in {".yaml", ".yml"} and ROS_MAP.recognises(path):
+        return [path, *ROS_MAP.pictures(path)]
+    return [path]

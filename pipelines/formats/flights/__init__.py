@@ -1,1 +1,0 @@
-"""Readers of the parts that a manifest names, as records, independent of their format."""

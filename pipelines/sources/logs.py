@@ -1,0 +1,328 @@
+"""Readers of the parts that a manifest takes from logs: the recording, the topic, and its content.
+
+If no topic is stated, the only candidate of its kind is taken, and a note names it. Every reading
+is one pass over the messages of one topic: logs of any size stream.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, Self
+
+from pipelines.formats.logs.commands import COMMAND_TYPES, read_commands
+from pipelines.formats.logs.messages import Kind, all_samples, kind_of
+from pipelines.formats.logs.pictures import (
+    TRIGGER_TYPES,
+    decode,
+    later_times,
+    picture_stamps,
+    read_triggers,
+)
+from pipelines.formats.logs.recordings import OpenLog
+from pipelines.formats.logs.trajectories import (
+    Gathered,
+    StampCheck,
+    attitudes_of,
+    chained,
+    poses_of,
+    transforms_in,
+)
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import Flight
+from pipelines.session.manifest import Log as LogSource
+from pipelines.session.records import Int64, IntrinsicsSample, PictureSample, Trajectory
+from pipelines.session.registries import Log, LogFormat, recognise
+from pipelines.sources.world import world_times
+
+_KEPT_MESSAGES = 4_000_000  # of all logs that stay open: their tables have 160 MB
+_KEPT_FILES = 64
+
+_NOUNS: dict[Kind, str] = {
+    "poses": "poses",
+    "transforms": "transforms",
+    "angles": "gimbal angles",
+    "intrinsics": "camera info",
+    "pictures": "pictures",
+}
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Pictures of a topic, with the time at which each was taken, strictly increasing."""
+
+    topic: str
+    t_ns: Int64
+    dropped: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FlightLog:
+    """One log of a flight, open for one reading."""
+
+    recording: Log
+    source: str  # its name, for messages
+    settings: LogSource
+    note: Callable[[str], None]
+
+    @property
+    def lost(self) -> Counter[str]:
+        """Messages that could not be read so far, by cause."""
+        return Counter(self.recording.dropped)
+
+    def type_of(self, topic: str | None) -> str | None:
+        """Return the type of a topic's messages; None if the log does not have it."""
+        return next((known.type for known in self.recording.topics if known.name == topic), None)
+
+    def choose(self, kind: Kind, topic: str | None) -> str:
+        """Return the topic that is named, or the only one of its kind.
+
+        Raises:
+            DataError: no such topic, one of another kind, or several candidates.
+        """
+        there = [known.name for known in self.recording.topics if kind_of(known) == kind]
+        return self.choose_among(there, _NOUNS[kind], topic)
+
+    def choose_among(self, there: list[str], noun: str, topic: str | None) -> str:
+        """Return the topic that is named, or the only candidate; errors as in `choose`."""
+        there = sorted(set(there))
+        listed = ", ".join(there) or "none"
+        if topic is not None:
+            if topic in there:
+                return topic
+            type_ = self.type_of(topic)
+            problem = f"topic {topic} holds {type_}, no {noun}" if type_ else f"has no topic {topic}"
+            raise DataError(self.source, problem, f"topics with {noun}: {listed}")
+        if len(there) != 1:
+            problem = f"has {len(there)} topics with {noun} ({listed})"
+            raise DataError(self.source, problem, "say which with `topic:`" if there else "name another log")
+        self.note(f"{self.source}: took {noun} from {there[0]}, the only candidate")
+        return there[0]
+
+    @property
+    def started_ns(self) -> int:
+        """Time of receipt of its first message, from which the drift of its clock counts."""
+        firsts = (topic.first_ns for topic in self.recording.topics if topic.first_ns is not None)
+        return min(firsts, default=0)
+
+    def world_times(self, t_ns: Int64) -> Int64:
+        """Convert the log's times to world times."""
+        return world_times(self.settings.clock, t_ns, self.started_ns)
+
+    def at_world_times(self, gathered: Gathered) -> Trajectory:
+        """Return a trajectory at world times, with all losses; note how its stamps disagree."""
+        for doubt in doubts_of_stamps(gathered.stamps, self.settings.stamps):
+            self.note(f"{self.source}: {doubt}")
+        trajectory = gathered.trajectory
+        return replace(
+            trajectory,
+            t_ns=self.world_times(trajectory.t_ns),
+            dropped=dict(Counter(trajectory.dropped) + self.lost),
+        )
+
+
+class FlightLogs:
+    """Logs of one flight; a context manager that closes those that it keeps open.
+
+    Logs of our own formats stay open between readings, within bounds, so that their indices are read once.
+
+    Args:
+        flight: the manifest.
+        base: the folder that its paths are relative to.
+        note: receives each choice and each doubt, one line each.
+    """
+
+    def __init__(self, flight: Flight, base: Path, note: Callable[[str], None]) -> None:
+        self._flight = flight
+        self._base = base
+        self._note = note
+        self._kept: dict[tuple[Path, ...], OpenLog] = {}  # the most recently used one is last
+
+    def __enter__(self) -> Self:
+        """Return the logs themselves."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Close the files."""
+        for paths in list(self._kept):
+            self._close(paths)
+
+    def settings(self, log: str) -> LogSource:
+        """Return the manifest's settings of a log, given by its name or by a path."""
+        return self._flight.logs.get(log) or LogSource(path=[log])
+
+    def paths(self, log: str) -> list[Path]:
+        """Return the files of a log."""
+        return [self._base / path for path in self.settings(log).path]
+
+    @contextmanager
+    def open(self, log: str) -> Iterator[FlightLog]:
+        """Open a recording for one reading.
+
+        Raises:
+            DataError: a file is missing, damaged beyond use, or no log.
+        """
+        paths = tuple(self.paths(log))
+        recording: Log | None = self._kept.pop(paths, None)
+        if recording is None:
+            recording = recognise(paths[0], LogFormat, "log").open_log(paths)
+        opened = FlightLog(recording, str(paths[0]), self.settings(log), self._note)
+        if not isinstance(recording, OpenLog):
+            with recording:
+                yield opened
+            return
+        self._kept[paths] = recording
+        while len(self._kept) > 1 and (
+            sum(topic.count for log in self._kept.values() for topic in log.topics) > _KEPT_MESSAGES
+            or sum(len(log.parts) for log in self._kept.values()) > _KEPT_FILES
+        ):
+            self._close(next(iter(self._kept)))
+        recording.forget()  # losses counted while another topic was read
+        yield opened
+
+    def _close(self, paths: tuple[Path, ...]) -> None:
+        with self._kept.pop(paths):
+            pass
+
+    def trajectory(
+        self, log: str, topic: str | None, parent: str | None, child: str | None, *, max_gap_ns: int
+    ) -> Trajectory:
+        """Read poses in the log's own world and axes, at world times.
+
+        Raises:
+            DataError: no such topic or frame, several candidates, or nothing usable.
+        """
+        with self.open(log) as opened:
+            recording, source, stamps = opened.recording, opened.source, opened.settings.stamps
+            if parent is not None and child is not None:
+                named = None if topic is None else opened.choose("transforms", topic)
+                transforms = transforms_in(recording, source, named)
+                gathered = chained(
+                    transforms, source, parent=parent, child=child, stamps=stamps, max_gap_ns=max_gap_ns
+                )
+            else:
+                gathered = poses_of(recording, opened.choose("poses", topic), source, stamps)
+            return opened.at_world_times(gathered)
+
+    def triggers(self, log: str, topic: str | None) -> Frames | None:
+        """Read trigger times of pictures from a topic, at world times; None if it is no topic of triggers."""
+        with self.open(log) as opened:
+            if topic is None or opened.type_of(topic) not in TRIGGER_TYPES:
+                return None
+            t_ns, repeated = read_triggers(opened.recording, opened.source, topic)
+            lost = opened.lost + Counter({"trigger without a later stamp": repeated})
+            return Frames(topic, opened.world_times(t_ns), dict(lost))
+
+    def commands(self, log: str, topic: str) -> Trajectory | None:
+        """Read commanded positions of a drone, at world times; None if the topic holds no command type."""
+        with self.open(log) as opened:
+            if opened.type_of(topic) not in COMMAND_TYPES:
+                return None
+            found = read_commands(opened.recording, opened.source, topic, opened.settings.stamps)
+            dropped = dict(Counter(found.dropped) + opened.lost)
+            return replace(found, t_ns=opened.world_times(found.t_ns), dropped=dropped)
+
+    def attitudes(
+        self,
+        log: str,
+        topic: str,
+        *,
+        order: Literal["ypr", "rpy", "pry"],
+        units: Literal["deg", "rad"],
+    ) -> Trajectory:
+        """Read a gimbal's attitude in the log's axes, at world times; its positions have no meaning."""
+        with self.open(log) as opened:
+            name, source = opened.choose("angles", topic), opened.source
+            samples = all_samples(opened.recording.messages([name]), source)
+            stamps = opened.settings.stamps
+            gathered = attitudes_of(samples, f"{source} {name}", stamps=stamps, order=order, units=units)
+            return opened.at_world_times(gathered)
+
+    def intrinsics(self, log: str, topic: str | None) -> IntrinsicsSample:
+        """Return the first camera info of a topic.
+
+        Raises:
+            DataError: no such topic, or it is empty or its calibration changes during the flight.
+        """
+        first: IntrinsicsSample | None = None
+        with self.open(log) as opened:
+            name, source = opened.choose("intrinsics", topic), opened.source
+            for sample in all_samples(opened.recording.messages([name]), source):
+                if not isinstance(sample, IntrinsicsSample):
+                    raise DataError(source, f"{name} holds no camera info", "name another topic")
+                if first is not None and sample.intrinsics != first.intrinsics:
+                    raise DataError(
+                        source,
+                        f"{name} changes during the flight (zoom?)",
+                        "give one calibration in a file or inline",
+                    )
+                first = first or sample
+        if first is None:
+            raise DataError(source, f"{name} is empty", "name another topic, or give the intrinsics")
+        return first
+
+    def frames(self, log: str, topic: str | None) -> Frames:
+        """Read the times at which the pictures of a topic were taken, at world times.
+
+        Raises:
+            DataError: no such topic, or no picture in it.
+        """
+        with self.open(log) as opened:
+            name = opened.choose("pictures", topic)
+            taken_ns, received_ns = picture_stamps(opened.recording, name, opened.source)
+            t_ns = later_times(taken_ns, received_ns, opened.settings.stamps)
+            if not len(t_ns):
+                raise DataError(opened.source, f"{name} holds no picture", "name another topic")
+            lost = opened.lost + Counter({"picture without a later stamp": len(taken_ns) - len(t_ns)})
+            return Frames(name, opened.world_times(t_ns), dict(lost))
+
+    def picture_size(self, log: str, topic: str | None) -> tuple[int, int] | None:
+        """Return width and height of a topic's pictures, from the first readable one; None without any.
+
+        Raises:
+            DataError: no such topic.
+        """
+        with self.open(log) as opened:
+            name = opened.choose("pictures", topic)
+            for sample in all_samples(opened.recording.messages([name]), opened.source):
+                if not isinstance(sample, PictureSample):
+                    continue  # `frames` refuses it
+                if sample.width and sample.height:
+                    return sample.width, sample.height
+                if (picture := decode(sample)) is not None:
+                    return picture.shape[1], picture.shape[0]
+        return None
+
+
+def doubts_of_stamps(check: StampCheck, stamps: str) -> list[str]:
+    """Describe how the stamps of a log disagree with each other, one line each.
+
+    Args:
+        check: statistics of the stamps.
+        stamps: the stamps in use, header or receive.
+    """
+    used, doubts = f"{stamps} stamps are used", []
+    if check.without_header:
+        doubts.append(
+            f"{check.without_header} of {check.count} messages have no header stamp, their time of receipt is"
+            " taken"
+        )
+    if check.disagreeing:
+        doubts.append(
+            f"header and receive stamps disagree by up to {check.largest_disagreement_s:.3g} s in"
+            f" {check.disagreeing} of {check.count} messages; {used}"
+        )
+    drift = check.drift
+    if drift is not None and drift.drift_ppm and not check.jumps:
+        doubts.append(
+            f"header stamps drift {drift.drift_ppm:.1f} ppm (+- {drift.drift_sigma_ppm:.1g}) against those of"
+            f" receipt; {used}, not corrected (logs: clock: drift_ppm does)"
+        )
+    doubts += [
+        f"the clock jumps by {jump.jump_s:.3g} s at {jump.header_ns / 1e9:.3f} s; {used}"
+        for jump in check.jumps[:5]
+    ]
+    return doubts

@@ -1,0 +1,114 @@
+"""Maps of obstacles, from a file or from a log in which they replace each other, in the world."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+from pipelines.formats.logs.maps import (
+    MAP_TYPES,
+    OCCUPANCY_GRID,
+    LoggedMaps,
+    Losses,
+    MapTopic,
+    frame_of,
+    read_maps,
+)
+from pipelines.formats.logs.trajectories import frames_of_poses, place_of_frame
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import Flight
+from pipelines.session.manifest import Map as MapSource
+from pipelines.session.records import Int64, Message, Occupancy
+from pipelines.sources.logs import FlightLogs
+from pipelines.sources.world import in_enu, in_world, world_times
+
+DEFAULT_HEIGHT_M = 2.5
+"""Height of the cells of a floor plan: an ordinary storey."""
+
+
+def maps_of_log(
+    flight: Flight, stated: MapSource, logs: FlightLogs, *, max_gap_ns: int, note: Callable[[str], None]
+) -> LoggedMaps:
+    """Read the maps of a topic, in ENU axes at world times.
+
+    Args:
+        flight: the manifest.
+        stated: the log and topic.
+        logs: of the flight.
+        max_gap_ns: the longest gap between two transforms that is interpolated.
+        note: receives each choice and each doubt, one line each.
+
+    Raises:
+        DataError: no such topic, several candidates, no readable map, or a map in a frame that the
+            log does not connect with its world.
+    """
+    log = stated.log or ""
+    with logs.open(log) as opened:
+        recording, source, settings = opened.recording, opened.source, opened.settings
+        there = [known.name for known in recording.topics if known.type in MAP_TYPES]
+        topic = opened.choose_among(there, "maps", stated.topic)
+        type_ = opened.type_of(topic) or ""
+        place = f"{source} {topic}"
+        first = next(recording.messages([topic]), None)
+        if first is None:
+            raise Losses(place, recording.dropped).nothing_usable()
+        if stated.height_m is not None and type_ != OCCUPANCY_GRID:
+            problem = f"{topic} holds {type_}, which has heights of its own"
+            raise DataError(source, problem, "leave `height_m` out")
+        frame = frame_of(first, place)
+        log_from_frame = place_of_frame(
+            recording,
+            source,
+            place,
+            frame,
+            parent=stated.parent,
+            poses_in=frames_of_poses(recording, source, _poses_taken(flight, logs, log)),
+            stamps=settings.stamps,
+            max_gap_ns=max_gap_ns,
+            note=note,
+        )
+        started_ns = opened.started_ns
+    lost: dict[str, int] = {}
+
+    def read() -> Iterator[Message]:
+        with logs.open(log) as opened:
+            yield from opened.recording.messages([topic])
+            lost.update(opened.recording.dropped)
+
+    about = MapTopic(
+        source=place,
+        frame=frame,
+        stamps=settings.stamps,
+        world_from_frame=in_world(
+            in_enu(log_from_frame, settings.axes or flight.world.frame), settings.world_from_log
+        ),
+        max_gap_ns=max_gap_ns,
+        resolution_m=stated.resolution_m,
+        height_m=DEFAULT_HEIGHT_M if stated.height_m is None else stated.height_m,
+    )
+    found = read_maps(read, type_, about)
+    for line in found.notes:
+        note(line)
+    from_ns = world_times(settings.clock, found.from_ns, started_ns)
+    return replace(
+        found,
+        maps=_at_times(found.maps, from_ns),
+        from_ns=from_ns,
+        dropped=dict(Counter(found.dropped) + Counter(lost)),
+    )
+
+
+def _poses_taken(flight: Flight, logs: FlightLogs, log: str) -> list[tuple[str | None, str | None]]:
+    """Return topic and parent of all poses that the flight takes from a log."""
+    poses = [camera.pose for camera in flight.cameras.values()]
+    taken = [(pose.log, pose.topic, pose.parent) for pose in poses]
+    if actor := flight.actor:
+        taken.append((actor.log, actor.topic, None))
+    paths = logs.paths(log)
+    return [(topic, parent) for name, topic, parent in taken if name and logs.paths(name) == paths]
+
+
+def _at_times(maps: Iterator[Occupancy], from_ns: Int64) -> Iterator[Occupancy]:
+    for occupancy, since_ns in zip(maps, from_ns.tolist(), strict=True):
+        yield replace(occupancy, from_ns=since_ns)

@@ -1,0 +1,333 @@
+"""Parts of a flight as they were read, and as a session stores them: tables, entries, doubts."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.geometry.cameras import Intrinsics
+from pipelines.geometry.clocks import ClockFit
+from pipelines.geometry.poses import gaps
+from pipelines.session.camera_poses import poses_at
+from pipelines.session.description import (
+    CameraEntry,
+    ClockEntry,
+    FramesEntry,
+    Interpolation,
+    IntrinsicsEntry,
+    KeypointsEntry,
+    LogClockEntry,
+    MediaEntry,
+    MountEntry,
+    PosesEntry,
+)
+from pipelines.session.errors import DataError
+from pipelines.session.manifest import Camera, PoseSource
+from pipelines.session.records import Detections, Int64, Trajectory
+from pipelines.session.tables import (
+    FRAMES,
+    KEYPOINTS,
+    POSES,
+    POSES_WITH_COVARIANCE,
+    frames_table,
+    keypoints_table,
+    pose_table,
+    write_table,
+)
+from pipelines.sources.world import doubts_of_speed, doubts_of_stillness, losses, mounted
+
+_MUCH_SHORTER = 0.9  # a video that covers less than this share of its pose log gets a note
+_SHORTER_S = 1.0
+# Share of a picture's sides. Detectors search the box of a person; most of them pad it to 1.25 of its size.
+# If the box is as large as the picture, it then reaches an eighth beyond it: no detector looked further.
+_EXTRAPOLATED = 1 / 8
+
+
+@dataclass(frozen=True)
+class CameraFrames:
+    """Pictures of a camera in world time; numbers and times strictly increase."""
+
+    frame: Int64  # [F] frame numbers as in the keypoints
+    t_ns: Int64  # [F]
+    pts_ns: Int64  # [F] since the first picture of the video
+    topic: str | None = None  # the topic of the log that holds the pictures themselves
+    dropped: dict[str, int] = field(default_factory=dict)  # pictures that were left out, by cause
+    start_sigma_s: float = 0.0  # sigma of the common offset of all times, if it was estimated
+
+
+@dataclass(frozen=True)
+class CameraData:
+    """Data of one camera, as read."""
+
+    detections: Detections | None
+    detector_format: str
+    intrinsics: Intrinsics
+    frames: CameraFrames
+    trajectory: Trajectory
+    media: MediaEntry | None
+    log_clock: ClockFit | None
+    notes: list[str]
+
+    @property
+    def rows(self) -> int:
+        """Approximate number of its rows in all tables."""
+        return (
+            len(self.frames.t_ns)
+            + len(self.trajectory.t_ns)
+            + (len(self.detections.frame) if self.detections else 0)
+        )
+
+
+def store_camera(data: CameraData, folder: Path) -> None:
+    """Write the tables of one camera."""
+    frames, poses = data.frames, data.trajectory
+    write_table(folder / "frames.parquet", frames_table(frames.frame, frames.t_ns, frames.pts_ns), FRAMES)
+    columns = POSES if poses.covariance is None else POSES_WITH_COVARIANCE
+    write_table(folder / "poses.parquet", pose_table(poses), columns)
+    if data.detections is not None:
+        keypoints = keypoints_table(data.detections, frames.frame, frames.t_ns)
+        write_table(folder / "keypoints.parquet", keypoints, KEYPOINTS)
+
+
+def camera_entry(
+    name: str,
+    camera: Camera,
+    data: CameraData,
+    interpolation: Interpolation,
+    *,
+    base: Path,
+    stamps: str | None,
+    note: Callable[[str], None],
+) -> CameraEntry:
+    """Describe a camera for session.json; note doubts about its poses, and losses.
+
+    Args:
+        name: the camera's.
+        camera: its part of the manifest.
+        data: as read.
+        interpolation: of its poses.
+        base: the folder that the manifest's paths are relative to.
+        stamps: the stamps in use of the log that its poses come from; None if they come from a file.
+        note: receives each doubt and each loss, one line each.
+
+    Raises:
+        DataError: no frame has a pose.
+    """
+    frames = data.frames
+    entry = CameraEntry(
+        intrinsics=IntrinsicsEntry.of(data.intrinsics),
+        frames=FramesEntry(
+            count=len(frames.t_ns),
+            first_t_ns=int(frames.t_ns[0]),
+            last_t_ns=int(frames.t_ns[-1]),
+            rate_hz=_rate(frames.t_ns),
+            dropped=frames.dropped,
+        ),
+        poses=_poses_entry(name, camera, data, interpolation, base=base, stamps=stamps, note=note),
+        keypoints=_keypoints_entry(camera, data),
+        clock=ClockEntry(
+            offset_s=camera.clock.offset_ns / 1e9 if camera.clock else 0.0,
+            sigma_s=_clock_sigma_s(camera, frames),
+        ),
+        log_clock=LogClockEntry(**asdict(data.log_clock)) if data.log_clock else None,
+        pose_noise=camera.pose_noise,
+        media=data.media,
+    )
+    for part, dropped in (
+        ("frames", entry.frames.dropped),
+        ("poses", entry.poses.dropped),
+        ("keypoints", entry.keypoints.dropped if entry.keypoints else {}),
+    ):
+        if dropped:
+            note(f"{name}: {part} dropped: {losses(dropped)}")
+    if entry.keypoints and entry.keypoints.adjusted:
+        note(f"{name}: keypoints adjusted: {losses(entry.keypoints.adjusted)}")
+    return entry
+
+
+def _poses_entry(
+    name: str,
+    camera: Camera,
+    data: CameraData,
+    interpolation: Interpolation,
+    *,
+    base: Path,
+    stamps: str | None,
+    note: Callable[[str], None],
+) -> PosesEntry:
+    pose, trajectory, frames_t_ns = camera.pose, data.trajectory, data.frames.t_ns
+    static = pose.static is not None
+    without_pose = 0
+    if not static:
+        position, _ = poses_at(trajectory, frames_t_ns, interpolation)
+        without_pose = int(np.isnan(position[:, 0]).sum())
+        if without_pose == len(frames_t_ns):
+            frames, poses = (span_words(*t_ns[[0, -1]]) for t_ns in (frames_t_ns, trajectory.t_ns))
+            raise DataError(
+                base / _pose_source(pose),
+                f"has a pose for none of the {without_pose} frames of camera {name}: frames span {frames},"
+                f" poses {poses} at {_rate(trajectory.t_ns) or 0:.3g} Hz",
+                "check clocks and units, or raise --max-pose-gap",
+            )
+        if without_pose:
+            note(
+                f"{name}: {without_pose} of {len(frames_t_ns)} frames have no pose (no logged pose within"
+                f" {interpolation.max_gap_s:g} s gaps and {interpolation.max_extrapolation_s:g} s"
+                " at the ends)"
+            )
+        for doubt in (*doubts_of_speed(trajectory), *doubts_of_stillness(trajectory)):
+            note(f"{name}: {doubt}")
+        span, covered = int(np.ptp(trajectory.t_ns)) / 1e9, int(np.ptp(frames_t_ns)) / 1e9
+        if covered < _MUCH_SHORTER * span and span - covered > _SHORTER_S:
+            note(f"{name}: its pictures cover {covered:.1f} s of {span:.1f} s of poses")
+    return PosesEntry(
+        source=_pose_source(pose),
+        static=static,
+        count=len(trajectory.t_ns),
+        rate_hz=_rate(trajectory.t_ns),
+        gaps_ns=[] if static else gaps(trajectory.t_ns, interpolation.max_gap_ns),
+        frames_without_pose=without_pose,
+        dropped=trajectory.dropped,
+        stamps=stamps,
+        mount=_mount_entry(camera),
+    )
+
+
+def _keypoints_entry(camera: Camera, data: CameraData) -> KeypointsEntry | None:
+    detections = data.detections
+    if camera.keypoints is None or detections is None:
+        return None
+    frames, people = np.unique(detections.frame, return_counts=True)
+    return KeypointsEntry(
+        source=camera.keypoints.path,
+        format=data.detector_format,
+        joints=list(detections.joints),
+        detections=len(detections.frame),
+        people_at_once=int(people.max()),
+        frames_without_person=len(data.frames.t_ns) - len(frames),
+        dropped=detections.dropped,
+        adjusted=detections.adjusted,
+    )
+
+
+def unmirrored(detections: Detections, mirrored: bool | str, width: int) -> Detections:
+    """Undo that keypoints were found in mirrored pictures.
+
+    Args:
+        detections: as the file has them.
+        mirrored: True, or of what: "x" alone counts from the right, or "names" alone have left for right.
+        width: of the pictures, px.
+    """
+    if mirrored in (True, "x"):
+        xy = detections.xy.copy()
+        xy[..., 0] = width - 1 - xy[..., 0]
+        detections = replace(detections, xy=xy)
+    if mirrored in (True, "names"):
+        order = [detections.joints.index(_other_side(name, detections.joints)) for name in detections.joints]
+        detections = replace(
+            detections, xy=detections.xy[:, order], confidence=detections.confidence[:, order]
+        )
+    return detections
+
+
+def _other_side(name: str, joints: tuple[str, ...]) -> str:
+    """Return the name of the same joint on the other side; its own if there is none."""
+    other = {"left": "right", "right": "left"}.get(name.partition("_")[0])
+    opposite = f"{other}_{name.partition('_')[2]}" if other else name
+    return opposite if opposite in joints else name
+
+
+def near_picture(detections: Detections, intrinsics: Intrinsics) -> Detections:
+    """Drop and count keypoints further outside the picture than a detector may extrapolate."""
+    size = np.array([intrinsics.width, intrinsics.height])
+    margin = _EXTRAPOLATED * size
+    with np.errstate(invalid="ignore"):
+        beyond = (detections.xy < -0.5 - margin) | (detections.xy > size - 0.5 + margin)
+    far = np.asarray(beyond.any(axis=-1))
+    if not far.any():
+        return detections
+    lost = {"keypoints far outside the picture": int(far.sum())}
+    xy = np.where(far[..., None], np.nan, detections.xy)
+    confidence = np.where(far, 0.0, detections.confidence)
+    seen = np.isfinite(xy).any(axis=(1, 2))
+    if not seen.all():
+        lost["people far outside the picture"] = int((~seen).sum())
+    return replace(
+        detections,
+        frame=detections.frame[seen],
+        person=detections.person[seen],
+        xy=xy[seen],
+        confidence=confidence[seen],
+        dropped=dict(Counter(detections.dropped) + Counter(lost)),
+    )
+
+
+def within(detections: Detections, frames: CameraFrames) -> Detections:
+    """Keep the detections in frames that have a time; count the others."""
+    known = np.isin(detections.frame, frames.frame)
+    if known.all():
+        return detections
+    lost = {"detections in frames without a time": int((~known).sum())}
+    return replace(
+        detections,
+        frame=detections.frame[known],
+        person=detections.person[known],
+        xy=detections.xy[known],
+        confidence=detections.confidence[known],
+        dropped=detections.dropped | lost,
+    )
+
+
+def _clock_sigma_s(camera: Camera, frames: CameraFrames) -> float:
+    """Return the clock sigma of the manifest; one estimated by motion comes before the manifest's default."""
+    clock = camera.clock
+    if clock is None or (frames.start_sigma_s and "sigma_s" not in clock.model_fields_set):
+        return frames.start_sigma_s
+    return clock.sigma_s
+
+
+def _pose_source(pose: PoseSource) -> str:
+    drones_own = pose.dji or pose.ulog or pose.ardupilot
+    return pose.tum or pose.csv or drones_own or (pose.static.path if pose.static else pose.log) or ""
+
+
+def _mount_entry(camera: Camera) -> MountEntry | None:
+    """Describe how a camera is fixed to the body whose poses are logged; None where it is not fixed."""
+    if camera.mount is None or camera.gimbal is not None:
+        return None
+    translation, rotation_xyzw = mounted(camera.mount)
+    return MountEntry(translation=tuple(translation.tolist()), rotation_xyzw=tuple(rotation_xyzw.tolist()))
+
+
+def _rate(t_ns: Int64) -> float | None:
+    return 1e9 * (len(t_ns) - 1) / float(t_ns[-1] - t_ns[0]) if len(t_ns) > 1 else None
+
+
+def span_of_pictures(entries: Mapping[str, CameraEntry]) -> tuple[int, int]:
+    """Return the first and the last frame time of all cameras, ns."""
+    frames = [entry.frames for entry in entries.values()]
+    return min(each.first_t_ns for each in frames), max(each.last_t_ns for each in frames)
+
+
+def span_words(first_ns: int, last_ns: int) -> str:
+    """Format a time span for messages."""
+    return f"{first_ns / 1e9:.3f} to {last_ns / 1e9:.3f} s"
+
+
+def refuse_no_overlap(source: Path, t_ns: Int64, entries: Mapping[str, CameraEntry]) -> None:
+    """Refuse data that share no time with the pictures.
+
+    Raises:
+        DataError: all times [N] are before or after the pictures of all cameras.
+    """
+    first, last = span_of_pictures(entries)
+    if t_ns[0] > last or t_ns[-1] < first:
+        raise DataError(
+            source,
+            f"spans {span_words(t_ns[0], t_ns[-1])}, the pictures {span_words(first, last)}",
+            "check its time base: stamps are world times",
+        )
