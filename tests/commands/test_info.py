@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import json
+import re
 import zlib
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from pipelines.formats.logs.mcap_log import OTHER_CHECKSUM
+from pipelines.session.registries import FORMATS
 from pipelines.session.storage import read_json, write_json
 from tests.commands.runner import refused, succeeds
 from tests.keypoints.spotted_flights import CAMERAS, spot_detector, write_spotted_flight
 from tests.synthetic.flights import write_flight
 from tests.synthetic.logged_flights import write_logged_flight
 
-SCENARIO = """
+NAME = "A short one"
+STALE = "out of date"  # a key of a stage
+SCENARIO = f"""
 schema: 1
-name: A short one
+name: {NAME}
 seed: 5
 duration_s: 0.5
-actor: {start: [0, 0], motion: [{stand: {seconds: 1}}]}
-drones: {count: 3}
+actor: {{start: [0, 0], motion: [{{stand: {{seconds: 1}}}}]}}
+drones: {{count: 3}}
 """
 
 
@@ -37,17 +42,21 @@ def test_yaml_is_what_its_keys_say(tmp_path: Path) -> None:
     told = reading(scenario)
     assert (told["kind"], told["seed"], told["drones"]["count"]) == ("scenario", 5, 3)
     scenario.write_text(SCENARIO.replace("seed: 5", "sead: 5"))
-    assert "sead: unknown key, did you mean 'seed'?" in refused("info", scenario)
+    line = refused("info", scenario)
+    assert "sead: " in line
+    assert "'seed'" in line
     planner = tmp_path / "planner.yaml"
     planner.write_text("radius_m: 12\nw_obs: 2\n")
-    assert reading(planner) == {"kind": "planner settings", "radius_m": 12, "w_obs": 2}
+    described = reading(planner)
+    assert described.pop("kind").startswith("planner")
+    assert described == {"radius_m": 12, "w_obs": 2}
     planner.write_text("radius_m: 12\nw_obs: -2\n")
     assert "w_obs" in refused("info", planner)
     for text in ("schema: 1\nname: of what?\n", "services: {web: {image: nginx}}\n"):
         planner.write_text(text)
-        assert "planner.yaml: is YAML, but of no known kind; a flight manifest has" in refused(
-            "info", planner
-        )
+        line = refused("info", planner)
+        assert "planner.yaml: " in line
+        assert all(key in line for key in ("YAML", "`cameras:`", "`drones:`", "`w_obs:`"))
 
 
 def test_a_simulated_flight_and_its_summary(tmp_path: Path) -> None:
@@ -56,16 +65,15 @@ def test_a_simulated_flight_and_its_summary(tmp_path: Path) -> None:
     succeeds("simulate", tmp_path / "a.yaml", "-o", folder, "--no-video")
     for path in (folder, folder / "simulation.json"):
         told = reading(path)
-        assert (told["kind"], told["name"], told["seed"]) == ("simulated flight", "A short one", 5)
+        assert "simulated" in told["kind"]
+        assert (told["name"], told["seed"]) == (NAME, 5)
         assert set(told["frames"]) == {"drone1", "drone2", "drone3"}
     write_json(folder / "simulation.json", {"schema": 2, "simulated": True})
-    assert "simulation.json: has schema 2, newer than 1; update mocap" in refused("info", folder)
+    assert re.search(r"simulation\.json: .*\b2\b.*\b1\b", refused("info", folder))
     write_json(folder / "simulation.json", {"schema": 1, "simulated": True})
-    assert "simulation.json: lacks what it should hold" in refused("info", folder)
+    assert "simulation.json: " in refused("info", folder)
     (folder / "simulation.json").write_text('{"schema": 1,')
-    assert "simulation.json: is of no known kind: it is no valid JSON" in refused(
-        "info", folder / "simulation.json"
-    )
+    assert re.search(r"simulation\.json: .*\bJSON\b", refused("info", folder / "simulation.json"))
 
 
 def test_a_study_tells_the_error_of_every_condition(tmp_path: Path) -> None:
@@ -73,21 +81,22 @@ def test_a_study_tells_the_error_of_every_condition(tmp_path: Path) -> None:
     succeeds("ablate", "tilt", *asked, "--trials", "1", "--keypoints", "exact", "-o", tmp_path / "study")
     told = reading(tmp_path / "study")
     cells = read_json(tmp_path / "study" / "summary.json")["cells"]
-    assert told["kind"] == "study of simulated flights"
+    assert told["kind"].startswith("study")
     assert told["study"] == "tilt"
     assert [list(errors.values()) for errors in told["mpjpe_mm"].values()] == [
         [cell["metrics"]["mpjpe_mm"]["mean"]] for cell in cells
     ]
-    assert list(told["mpjpe_mm"]) == [f"{tilt} deg, 2 drones, noise low" for tilt in (0, 30)]
+    for tilt, condition in zip((0, 30), told["mpjpe_mm"], strict=True):
+        assert re.fullmatch(rf"{tilt} deg, 2 \w+, \w+ low", condition)
     (tmp_path / "summary.json").write_text("[1, 2]")  # a file of another program
-    assert "is of no known kind" in refused("info", tmp_path / "summary.json")
+    assert all(name in refused("info", tmp_path / "summary.json") for name in FORMATS.names())
 
 
 @pytest.mark.parametrize("right", [True, False])
 def test_the_data_section_of_an_mcap_file_is_checked(tmp_path: Path, right: bool) -> None:
     flight = write_logged_flight(tmp_path, "mcap-cdr")
     log = tmp_path / flight.settings["cameras"]["drone1"]["pose"]["log"]
-    assert reading(log)["checksum"] == "not stated"
+    assert "right" not in reading(log)["checksum"]
     whole = log.read_bytes()
     # The summary begins where the footer says; before it the end of the data states 0, no checksum.
     end = int.from_bytes(whole[-28:-20], "little") - 13
@@ -95,7 +104,7 @@ def test_the_data_section_of_an_mcap_file_is_checked(tmp_path: Path, right: bool
     log.write_bytes(whole[: end + 9] + crc.to_bytes(4, "little") + whole[end + 13 :])
     told = reading(log)
     assert told.get("checksum") == ("right" if right else None)
-    assert ("differs from its checksum: copy it again" in told.get("damage", "")) != right
+    assert (OTHER_CHECKSUM in told.get("damage", "")) != right
 
 
 def test_a_stage_whose_data_changed_is_out_of_date(tmp_path: Path) -> None:
@@ -103,18 +112,19 @@ def test_a_stage_whose_data_changed_is_out_of_date(tmp_path: Path) -> None:
     session = flight.manifest.with_suffix(".session")
     succeeds("ingest", flight.manifest)
     succeeds("reconstruct", session)
-    assert "out of date" not in reading(session)["reconstruct"]
+    assert STALE not in reading(session)["reconstruct"]
     flight.settings["cameras"]["drone2"]["clock"] = {"offset_s": 0.01}
     flight.save()
     succeeds("ingest", flight.manifest)
-    assert "run it again" in reading(session)["reconstruct"]["out of date"]
+    assert reading(session)["reconstruct"][STALE]
     changed = "The inputs of reconstruct have changed since: run it again."
     succeeds("report", session)
-    assert changed in (session / "report" / "index.html").read_text(encoding="utf-8")
+    page = session / "report" / "index.html"
+    assert changed in page.read_text(encoding="utf-8")
     succeeds("reconstruct", session)
-    assert "out of date" not in reading(session)["reconstruct"]
+    assert STALE not in reading(session)["reconstruct"]
     succeeds("report", session)
-    assert changed not in (session / "report" / "index.html").read_text(encoding="utf-8")
+    assert changed not in page.read_text(encoding="utf-8")
 
 
 def test_detections_of_a_session_are_the_imported_or_the_found_ones(tmp_path: Path) -> None:

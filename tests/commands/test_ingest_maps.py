@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from pipelines.formats.logs.maps import DAMAGED
 from pipelines.formats.maps.octomap import FORMAT
 from pipelines.session.maps import load_maps
 from pipelines.session.records import Occupancy
@@ -51,8 +53,8 @@ def test_maps_of_a_log_are_stored_with_their_times(tmp_path: Path, container: Co
     flight = flight_with_maps(tmp_path, container)
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0, done.stderr
-    assert "took maps from /octomap, the only candidate" in done.stderr
-    assert "2 maps that follow each other (3 repeat the one before)" in done.stderr
+    assert " /octomap, " in done.stderr
+    assert re.search(r"\b2 maps\b.*\b3\b", done.stderr)
     session = tmp_path / "flight.session"
     start_ns = int(flight.t_ns[0])
     index = json.loads((session / "map" / "index.json").read_text(encoding="utf-8"))["maps"]
@@ -87,7 +89,8 @@ def test_the_same_map_from_a_file_and_from_a_log(tmp_path: Path) -> None:
     (logged,) = load_maps(tmp_path / "flight.session")
     before = content(tmp_path / "flight.session")
     assert "unchanged" in succeeds("ingest", flight.manifest)
-    assert content(tmp_path / "flight.session") == before
+    session = flight.manifest.with_suffix(".session")
+    assert content(session) == before
     flight.settings["map"] = "site/map.bt"
     flight.save()
     succeeds("ingest", flight.manifest)
@@ -132,7 +135,7 @@ def test_maps_change_during_the_replay(tmp_path: Path) -> None:
     succeeds("reconstruct", tmp_path / "flight.session")
     done = mocap("replan-compare", tmp_path / "flight.session", "--arms", "adaptive,fixed")
     assert done.returncode == 0, done.stderr
-    assert "the first map comes 0.5 s after the start" in done.stderr
+    assert re.search(r"\bmap\b.* 0\.5 s ", done.stderr)
 
 
 def test_height_belongs_to_plans_of_logs(tmp_path: Path) -> None:
@@ -146,7 +149,7 @@ def test_height_belongs_to_plans_of_logs(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "flight.session/session.json").read_text())["map"]["shape"] == [8, 8, 8]
     flight.settings["map"] = {"path": "site/map.bt", "height_m": 4}
     flight.save()
-    assert "height_m: only a map from a log has that" in refused("ingest", flight.manifest)
+    assert "height_m: " in refused("ingest", flight.manifest)
 
 
 def test_maps_of_another_day_are_refused(tmp_path: Path) -> None:
@@ -157,8 +160,7 @@ def test_maps_of_another_day_are_refused(tmp_path: Path) -> None:
     flight.settings["map"]["log"] = "ground"
     flight.save()
     line = refused("ingest", flight.manifest)
-    assert "has its first map at" in line
-    assert "after the pictures" in line
+    assert re.search(r"flight\.yaml: map\.log .*: .*\bmap\b.*\bpictures\b.*`stamps: receive`", line)
 
 
 def test_truncated_maps_are_counted_or_refused(tmp_path: Path) -> None:
@@ -170,11 +172,9 @@ def test_truncated_maps_are_counted_or_refused(tmp_path: Path) -> None:
         flight.settings["map"]["log"] = str(log.relative_to(tmp_path))
         flight.save()
         if count == 1:
-            assert "/octomap: its tree breaks off" in refused("ingest", flight.manifest)
+            assert re.search("/octomap: .*tree", refused("ingest", flight.manifest))
         else:
-            assert (
-                "map: dropped: 1 map messages that cannot be used" in mocap("ingest", flight.manifest).stderr
-            )
+            assert f"map: dropped: 1 {DAMAGED}" in mocap("ingest", flight.manifest).stderr
 
 
 # --- real recordings -----------------------------------------------------------------------------------
@@ -214,12 +214,12 @@ def test_real_lidar(tmp_path: Path) -> None:
     pose = {"log": str(real_data(HUSKY)), "of": "body"}
     about: dict[str, Any] = {"log": "lidar", "topic": "/luminar_pointcloud"}
     path = write_flight(tmp_path, pose, start_s=first_s + 1, logs={"lidar": lidar}, map=about)
-    assert "lies in 'luminar_lidar', which no transforms of the log connect" in refused("ingest", path)
+    assert re.search("'luminar_lidar'.*`parent:`", refused("ingest", path))
     about |= {"parent": "luminar_lidar", "resolution_m": 0.5}
     path = write_flight(tmp_path, pose, start_s=first_s + 1, logs={"lidar": lidar}, map=about)
     done = mocap("ingest", path)
     assert done.returncode == 0, done.stderr
-    assert f"{told['count']} clouds make {told['count']} maps" in done.stderr
+    assert re.search(rf"\b{told['count']} clouds .* {told['count']} maps\b", done.stderr)
     maps = load_maps(tmp_path / "flight.session")
     assert len(maps) == told["count"]
     counts = [int((one.probability == 1).sum()) for one in maps]

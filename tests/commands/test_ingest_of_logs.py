@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -61,7 +62,7 @@ def test_logs_are_closed_after_a_fault(tmp_path: Path, opened: list[OpenLog]) ->
     flight = write_logged_flight(tmp_path, "mcap-cdr")
     flight.settings["cameras"]["drone2"]["pose"]["topic"] = "/nothing"
     flight.save()
-    with pytest.raises(DataError, match="has no topic /nothing"):
+    with pytest.raises(DataError, match=r"topic /nothing; .*/drone"):
         ingest(flight.manifest)
     assert opened
     assert all_closed(opened)
@@ -91,7 +92,7 @@ def test_losses_count_for_the_topic_that_lost_them(tmp_path: Path) -> None:
     path.write_bytes(broken)
     with FlightLogs(read_flight(flight.manifest), tmp_path, lambda _: None) as logs:
         for _ in range(2):
-            with pytest.raises(DataError, match="/picture holds no picture"):
+            with pytest.raises(DataError, match=r"/picture .*topic"):
                 logs.frames(path.name, "/picture")
             trajectory = logs.trajectory(path.name, "/pose", None, None, max_gap_ns=10**9)
             assert trajectory.dropped == {}
@@ -104,10 +105,8 @@ def test_a_frozen_estimator_is_told_from_a_camera_at_rest() -> None:
     position = np.stack([x, np.zeros(1000), np.full(1000, 5.0)], axis=1)
     turn = np.tile([0.0, 0.0, 0.0, 1.0], (1000, 1))
     t_ns = 1_700_000_000_000_000_000 + 10_000_000 * k
-    assert doubts_of_stillness(Trajectory(t_ns, position, turn)) == [
-        "its poses stand still 1 times, for up to 2.5 s (251 poses in all, first after 2.00 s):"
-        " was its estimator frozen?"
-    ]
+    (doubt,) = doubts_of_stillness(Trajectory(t_ns, position, turn))
+    assert re.search(r" 1 .* 2\.5 s \(251 .* 2\.00 s\)", doubt)
     turning = turn + np.stack([k * 1e-9, 0 * k, 0 * k, 0 * k], axis=1)  # a gimbal turns on
     assert doubts_of_stillness(Trajectory(t_ns, position, turning)) == []
     assert doubts_of_stillness(Trajectory(t_ns, np.ones((1000, 3)), turn)) == []  # at rest throughout

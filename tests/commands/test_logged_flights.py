@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import zlib
 from pathlib import Path
@@ -12,6 +13,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipelines.formats.logs.mcap_log import OTHER_CHECKSUM
+from pipelines.formats.logs.recordings import TRUNCATED
 from pipelines.geometry.poses import conjugate, multiply
 from tests.commands.runner import content, mocap, refused, succeeds
 from tests.synthetic.logged_flights import write_logged_flight
@@ -72,8 +75,8 @@ def test_a_topic_that_is_left_out_is_chosen_and_said(tmp_path: Path) -> None:
     flight.save()
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0
-    assert "took poses from /drone1/odometry, the only candidate" in done.stderr
-    assert "poses are timed by the header stamps of their logs: drone1, drone2" in done.stdout
+    assert " /drone1/odometry, " in done.stderr
+    assert re.search(r"\bheader\b.*: drone1, drone2\b", done.stdout)
 
 
 def test_strict_refuses_what_is_salvaged_otherwise(tmp_path: Path) -> None:
@@ -82,8 +85,8 @@ def test_strict_refuses_what_is_salvaged_otherwise(tmp_path: Path) -> None:
     log = tmp_path / flight.settings["cameras"]["drone1"]["pose"]["log"]
     log.write_bytes(log.read_bytes()[:-2000])
     line = refused("ingest", flight.manifest, "--strict")
-    assert "flight.yaml: is not whole, and --strict was given (drone1: " in line
-    assert "1 file truncated" in line
+    assert re.search(r"flight\.yaml: .*--strict .*\(drone1: ", line)
+    assert f"1 {TRUNCATED}" in line
     kept = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
     assert kept["cameras"]["drone1"]["poses"]["dropped"] == {}  # the session is the one from before
     _, description = ingested(tmp_path)
@@ -106,8 +109,8 @@ def test_a_log_that_differs_from_its_own_checksum_is_said_and_refused_by_strict(
         _, description = ingested(tmp_path)
         assert description["damage"] == damage
         assert description["cameras"]["drone1"]["poses"]["dropped"] == {}  # every message could be read
-        assert any("differs from its checksum" in line for line in description["warnings"]) == bool(damage)
-    assert f"{stated}: 1 data section that differs" in refused("ingest", flight.manifest, "--strict")
+        assert any(OTHER_CHECKSUM in line for line in description["warnings"]) == bool(damage)
+    assert f"{stated}: 1 {OTHER_CHECKSUM}" in refused("ingest", flight.manifest, "--strict")
 
 
 def test_missing_topic_lists_the_candidates(tmp_path: Path) -> None:
@@ -115,7 +118,7 @@ def test_missing_topic_lists_the_candidates(tmp_path: Path) -> None:
     flight.settings["cameras"]["drone1"]["pose"]["topic"] = "/drone1/odom"
     flight.save()
     line = refused("ingest", flight.manifest)
-    assert "has no topic /drone1/odom" in line
+    assert "/drone1/odom;" in line
     assert "/drone1/odometry" in line
     flight.settings["cameras"]["drone1"]["pose"]["topic"] = "/drone1/camera_info"
     flight.save()
@@ -159,8 +162,7 @@ def test_clock_that_jumps_in_flight_is_said_and_the_rest_is_used(tmp_path: Path)
     flight = write_logged_flight(tmp_path, "mcap-cdr", seconds=2.0, jump_s=-30.0)
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0, done.stderr
-    assert "the clock jumps by -30 s" in done.stderr
-    assert "header stamps are used" in done.stderr
+    assert re.search(r"\bclock\b.* -30 s .*; header ", done.stderr)
     stored = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
     # What was stamped before the jump's landing cannot be put into an order: it is counted.
     lost = stored["cameras"]["drone1"]["poses"]["dropped"]
@@ -178,7 +180,7 @@ def test_clock_of_another_day_is_refused(tmp_path: Path) -> None:
     flight.save()
     line = refused("ingest", flight.manifest)
     assert "drone1" in line
-    assert "check clocks" in line
+    assert "--max-pose-gap" in line
 
 
 def test_video_shorter_than_its_log_is_said(tmp_path: Path) -> None:
@@ -192,7 +194,7 @@ def test_video_shorter_than_its_log_is_said(tmp_path: Path) -> None:
     flight.save()
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0
-    assert "drone1: its pictures cover 1.0 s of 4.0 s of poses" in done.stderr
+    assert re.search(r"drone1: .* 1\.0 s of 4\.0 s ", done.stderr)
 
 
 def test_keypoints_beyond_the_pictures_are_counted(tmp_path: Path) -> None:
@@ -204,22 +206,23 @@ def test_keypoints_beyond_the_pictures_are_counted(tmp_path: Path) -> None:
     keypoints.write_text(json.dumps(people + beyond), encoding="utf-8")
     done = mocap("ingest", flight.manifest)
     assert done.returncode == 0, done.stderr
-    assert "drone1: keypoints dropped: 3 detections in frames without a time" in done.stderr
+    assert "drone1: keypoints dropped: 3 " in done.stderr
 
 
 def test_moved_flight_is_the_same_flight(tmp_path: Path) -> None:
     write_logged_flight(tmp_path / "here", "ros2-mcap")
     session, _ = ingested(tmp_path / "here")
     shutil.copytree(tmp_path / "here", tmp_path / "there")
-    assert "unchanged" in succeeds("ingest", tmp_path / "there" / "flight.yaml")
-    assert content(tmp_path / "there" / "flight.session") == content(session)
+    moved = tmp_path / "there" / "flight.yaml"
+    assert "unchanged" in succeeds("ingest", moved)
+    assert content(moved.with_suffix(".session")) == content(session)
 
 
 def test_logged_pictures_of_another_size_are_told_from_those_of_the_calibration(tmp_path: Path) -> None:
     flight = write_logged_flight(tmp_path / "shape", "ros2-mcap", picture_size=(640, 400))
     line = refused("ingest", flight.manifest)
     assert "cameras.drone1.intrinsics" in line
-    assert "pictures are 640 x 400, the calibration is for 1280 x 720" in line
+    assert re.search(r"\b640 x 400, .* 1280 x 720\b", line)
 
     flight = write_logged_flight(tmp_path / "half", "ros2-mcap", picture_size=(640, 360))
     for name in flight.cameras:
@@ -228,4 +231,4 @@ def test_logged_pictures_of_another_size_are_told_from_those_of_the_calibration(
     _, description = ingested(tmp_path / "half")
     lens = description["cameras"]["drone1"]["intrinsics"]
     assert (lens["width"], lens["height"], lens["fx"], lens["cy"]) == (640, 360, 381.0, 178.75)
-    assert any("drone1: pictures are 640 x 360" in line for line in description["warnings"])
+    assert any(re.search("drone1: .* 640 x 360", line) for line in description["warnings"])

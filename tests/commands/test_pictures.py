@@ -99,7 +99,8 @@ def test_overlays_on_pictures_of_a_log(tmp_path: Path) -> None:
     succeeds("ingest", tmp_path / "flight.yaml")
     succeeds("reconstruct", session)
     succeeds("report", session)
-    assert "data:image/jpeg" in (session / "report" / "index.html").read_text(encoding="utf-8")
+    page = session / "report" / "index.html"
+    assert "data:image/jpeg" in page.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("content", [b"", b"no video at all", b"\0\0\0\x18ftypisom" + bytes(40)])
@@ -116,5 +117,6 @@ def test_video_without_keypoints_is_ingested_and_reconstruct_says_what_is_missin
     flight.save()
     succeeds("ingest", flight.manifest)
     assert session_json(tmp_path)["cameras"]["drone1"]["keypoints"] is None
-    assert "keypoints" in refused("reconstruct", tmp_path / "flight.session")
+    session = tmp_path / "flight.session"
+    assert "keypoints" in refused("reconstruct", session)
     succeeds("report", tmp_path / "flight.session")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,7 @@ def test_odometry_of_a_real_robot(tmp_path: Path) -> None:
     path = write_flight(tmp_path, {"log": str(real_data(name)), "of": "body"}, start_s=first_s + 10)
     done = mocap("ingest", path)
     assert done.returncode == 0, done.stderr
-    assert "took poses from /husky_velocity_controller/odom, the only candidate" in done.stderr
+    assert " /husky_velocity_controller/odom, " in done.stderr
     poses = pd.read_parquet(tmp_path / "flight.session" / "cameras" / "husky" / "poses.parquet")
     assert len(poses) == told["count"]
     assert session_of(path)["cameras"]["husky"]["poses"]["dropped"] == {}
@@ -84,8 +85,7 @@ def test_stamps_that_disagree_by_months_are_doubted(tmp_path: Path) -> None:
     path = write_flight(tmp_path, {"log": str(real_data(name)), "of": "body"}, start_s=60)
     done = mocap("ingest", path)
     assert done.returncode == 0, done.stderr
-    assert "header and receive stamps disagree by up to" in done.stderr
-    assert "header stamps are used" in done.stderr
+    assert re.search(r"\bheader and receive\b.* s in .*; header ", done.stderr)
 
 
 def test_a_chain_of_transforms(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_calibration_and_pictures_of_a_real_json_log(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     # Its calibration is an example that does not belong to its pictures.
-    assert "pictures are 520 x 360, the calibration is for 640 x 480" in refused("ingest", path)
+    assert re.search(r"\b520 x 360, .* 640 x 480\b", refused("ingest", path))
     text = path.read_text(encoding="utf-8")
     logged = f"{{log: {log}, topic: /camera_calibration}}"
     inline = "{width: 520, height: 360, fx: 800, fy: 800, cx: 260, cy: 180, distortion: [-0.2, 0.1, 0, 0]}"
@@ -137,7 +137,7 @@ def test_calibration_and_pictures_of_a_real_json_log(tmp_path: Path) -> None:
     # Its header stamps stand still: one picture can be told from the others by them.
     path.write_text(path.read_text(encoding="utf-8").replace("stamps: receive", "stamps: header"), "utf-8")
     done = mocap("ingest", path)
-    assert "9 picture without a later stamp" in done.stderr
+    assert re.search(r"\b9 picture", done.stderr)
     path.write_text(text.replace("/camera_calibration", "/camera_calibration/custom"), encoding="utf-8")
     assert "CylinderCameraModel" in refused("ingest", path)
 
@@ -155,7 +155,8 @@ def test_real_octomaps(tmp_path: Path, name: str) -> None:
     assert stored["resolution_m"] == told["resolution"]
     assert stored["occupied"] == told["occupied_voxels_at_finest"]
     assert stored["free"] == told["free_voxels_at_finest"]
-    assert (tmp_path / "flight.session" / "map" / "0.npz").exists()
+    first = tmp_path / "flight.session" / "map" / "0.npz"
+    assert first.exists()
 
 
 @pytest.mark.parametrize(
@@ -173,7 +174,8 @@ def test_info_of_real_logs(name: str) -> None:
     (reading,) = json.loads(succeeds("info", real_data(name), "--json"))["readings"]
     assert reading["messages"] == told["messages"]
     # The public reader trusts metadata.yaml; if that is wrong, the reading has both values.
-    assert reading.get("metadata.yaml states", reading)["first_ns"] == told["start_ns"]
+    stated = reading.get("metadata.yaml states", reading)
+    assert stated["first_ns"] == told["start_ns"]
     assert {topic: seen["messages"] for topic, seen in reading["topics"].items()} == {
         topic: seen["count"] for topic, seen in told["topics"].items()
     }

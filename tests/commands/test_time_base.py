@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -146,5 +147,4 @@ def test_offsets_in_milliseconds_are_refused_before_anything_is_read(tmp_path: P
     flight.settings["logs"] = {"d1": {"path": "d1.mcap", "clock": {"offset_s": 1.7e12}}}
     flight.save()
     line = refused("ingest", flight.manifest)
-    assert "logs.d1.clock.offset_s: is no time in seconds" in line
-    assert "are these ms or ns?" in line
+    assert re.search(r"logs\.d1\.clock\.offset_s: .*\bms or ns\b", line)

@@ -91,7 +91,7 @@ def test_what_a_detector_makes_up_of_legs_below_the_picture_refuses_no_flight() 
     below = np.arange(1000) % 2 == 0
     xy = np.stack([np.full(1000, 600.0), np.where(below, HEIGHT + 40.0, 500.0)], axis=1)
     check(xy, np.where(below, 0.08, 0.8))
-    with pytest.raises(DataError, match="50% of the keypoints lie outside"):
+    with pytest.raises(DataError, match=r"\b50%"):
         check(xy, np.full(1000, 0.8))
 
 
@@ -117,11 +117,9 @@ def test_keypoints_slightly_outside_are_kept_and_far_ones_left_out(tmp_path: Pat
     assert len(kept) == before - 18
     assert np.count_nonzero(kept["x"] == slightly) == 5
     entry = json.loads((tmp_path / "flight.session" / "session.json").read_text(encoding="utf-8"))
-    assert entry["cameras"]["drone1"]["keypoints"]["dropped"] == {
-        "keypoints far outside the picture": 18,
-        "people far outside the picture": 1,
-    }
-    assert "drone1: keypoints: 18 keypoints far outside" in refused("ingest", flight.manifest, "--strict")
+    dropped = entry["cameras"]["drone1"]["keypoints"]["dropped"]
+    assert {cause.split()[0]: count for cause, count in dropped.items()} == {"keypoints": 18, "people": 1}
+    assert "drone1: keypoints: 18 " in refused("ingest", flight.manifest, "--strict")
 
 
 def keypoints_of(flight: SyntheticFlight) -> pd.DataFrame:

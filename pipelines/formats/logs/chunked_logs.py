@@ -22,9 +22,11 @@ from pipelines.formats.logs.message_decoders import inflate
 from pipelines.formats.logs.recordings import (
     DAMAGED,
     MISPLACED,
+    NOT_FOUND,
     TAIL,
     TRUNCATED,
     UNCLOSED,
+    UNINDEXED,
     UNNAMED,
     Channel,
     LogPart,
@@ -214,7 +216,7 @@ class ChunkedPart(LogPart):
     def _compare_with_stated(self) -> None:
         found = len(self.table.stamp_ns) + self.lost[UNNAMED]
         if self.messages_stated is not None and found < self.messages_stated:
-            self.lost["messages stated but not found"] += self.messages_stated - found
+            self.lost[NOT_FOUND] += self.messages_stated - found
 
     def _look_into_chunks(self, closed: bool) -> None:
         for number, chunk in enumerate(self.chunks):
@@ -226,7 +228,7 @@ class ChunkedPart(LogPart):
             content = self._content(number)
             if content is None:
                 if unindexed:
-                    self.lost["damaged blocks without an index"] += 1
+                    self.lost[UNINDEXED] += 1
                 continue
             found = self.look(content)
             self.channels = found.channels | self.channels

@@ -39,11 +39,12 @@ MOST_MAPS = 100
 MOST_CLOUD_MAPS = 10
 """Largest number of times at which the points so far become a map."""
 
-_DAMAGED = "map messages that cannot be used"
-_PLACELESS = "map messages at whose time no transform is known"
-_EMPTY = "empty maps"
-_LATE = "maps without a later stamp"
-_NOT_KEPT = "maps between those that are kept"
+# Causes of losses.
+DAMAGED = "map messages that cannot be used"
+PLACELESS = "map messages at whose time no transform is known"
+EMPTY = "empty maps"
+LATE = "maps without a later stamp"
+NOT_KEPT = "maps between those that are kept"
 _RECORD_AGAIN = "check what wrote the log"
 
 # Types that coordinates can have, by the numbers of sensor_msgs/PointField.
@@ -138,14 +139,14 @@ class Losses:
 
     def damaged(self, fault: DataError) -> None:
         """Count a message that cannot be read; keep the first fault for the note."""
-        self.counts[_DAMAGED] += 1
+        self.counts[DAMAGED] += 1
         self._first = self._first or fault
 
     def notes(self) -> list[str]:
         """Return a note about the messages that cannot be read; empty if all can."""
         if self._first is None:
             return []
-        return [f"{self._source}: {self._first.problem} ({self.counts[_DAMAGED]} such messages)"]
+        return [f"{self._source}: {self._first.problem} ({self.counts[DAMAGED]} such messages)"]
 
     def nothing_usable(self) -> DataError:
         """Return the error for a topic without a usable map: the first fault, else the losses."""
@@ -211,19 +212,19 @@ def _changing(read: Callable[[], Iterator[Message]], about: MapTopic) -> LoggedM
         try:
             made = _made(message, about)
         except _EmptyMapError:
-            lost.counts[_EMPTY] += 1
+            lost.counts[EMPTY] += 1
             continue
         except DataError as fault:
             lost.damaged(fault)
             continue
         if made is None:
-            lost.counts[_PLACELESS] += 1
+            lost.counts[PLACELESS] += 1
             continue
         digest = _digest(made)
         if digest == last:
             repeated += 1
         elif made.from_ns <= newest_ns:
-            lost.counts[_LATE] += 1
+            lost.counts[LATE] += 1
         else:
             only = None if changes else made
             last, newest_ns = digest, made.from_ns
@@ -233,12 +234,12 @@ def _changing(read: Callable[[], Iterator[Message]], about: MapTopic) -> LoggedM
     notes = lost.notes()
     kept = _spread(changes)
     if len(kept) < len(changes):
-        lost.counts[_NOT_KEPT] += len(changes) - len(kept)
+        lost.counts[NOT_KEPT] += len(changes) - len(kept)
         notes.append(
             f"{about.source}: {len(kept)} of {len(changes)} changes of the map are kept, evenly over the"
             f" flight (at most {MOST_MAPS}, and {MOST_VOXELS / 1e6:g} million voxels together)"
         )
-    if lost.counts[_LATE]:
+    if lost.counts[LATE]:
         notes.append(
             f"{about.source}: maps whose stamp stands still or goes back; `stamps: receive` may be better"
         )
@@ -365,7 +366,7 @@ def _accumulated(messages: Iterator[Message], about: MapTopic) -> LoggedMaps:
             lost.damaged(fault)
             continue
         if pose is None:
-            lost.counts[_PLACELESS] += 1
+            lost.counts[PLACELESS] += 1
             continue
         with np.errstate(invalid="ignore", over="ignore"):  # NaN and infinity stay, and are counted
             voxels.add(points if _is_the_world(pose) else transform(pose, points), t_ns)

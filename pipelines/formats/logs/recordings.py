@@ -23,6 +23,7 @@ from pipelines.session.errors import DataError
 from pipelines.session.records import Int64, Message, Topic
 from pipelines.session.registries import Log
 
+# Causes of losses, as sessions and `mocap info` state them.
 UNDEFINED = "messages without a usable definition"
 UNDECODABLE = "messages that cannot be decoded"
 DAMAGED = "messages in damaged blocks"
@@ -31,6 +32,9 @@ UNNAMED = "messages of unknown topics"
 TRUNCATED = "file truncated"
 UNCLOSED = "recording not closed"
 TAIL = "bytes after the last complete record"
+UNREADABLE_FILES = "files that cannot be read"
+UNINDEXED = "damaged blocks without an index"
+NOT_FOUND = "messages stated but not found"
 
 _BATCH = 1 << 16  # messages whose places are Python integers at a time: 10 MB
 _HEADS = 4096  # messages whose heads are read at a time
@@ -307,7 +311,7 @@ def open_parts(
             raise
     if refusals and not parts:
         raise refusals[0]
-    return parts, Counter({"files that cannot be read": len(refusals)} if refusals else {})
+    return parts, Counter({UNREADABLE_FILES: len(refusals)} if refusals else {})
 
 
 def require_content(part: LogPart) -> None:

@@ -45,6 +45,13 @@ from pipelines.session.records import Int64
 from pipelines.session.storage import is_special
 from pipelines.session.yaml_files import plain_yaml
 
+# Causes of losses.
+NOT_IN_FILES = "messages that metadata.yaml counts and the files lack"
+BAD_METADATA = "metadata.yaml cannot be read"
+MISSING_FILES = "files of the bag that are missing"
+GAPS = "gaps in the table of messages"
+UNMERGED = "bytes of its write-ahead log, not merged"
+
 _MAGIC = b"SQLite format 3\0"
 
 _LARGEST_ROWID = 1 << 48
@@ -102,7 +109,7 @@ class Ros2Bag:
         stated = [c.stated.messages for c in contents if c.stated]
         found = sum(len(part.table.stamp_ns) for part in parts)
         if len(stated) == len(contents) and found < sum(stated):
-            lost["messages that metadata.yaml counts and the files lack"] = sum(stated) - found
+            lost[NOT_IN_FILES] = sum(stated) - found
         return OpenLog(parts, lost)
 
 
@@ -165,10 +172,10 @@ def _contents(path: Path) -> _Contents:
         try:
             stated = _read_metadata(path / "metadata.yaml")
         except ValueError:
-            lost["metadata.yaml cannot be read"] = 1
+            lost[BAD_METADATA] = 1
     files = [path / PurePath(name).name for name in (stated.files if stated else [])]
     if missing := sum(not file.is_file() for file in files):
-        lost["files of the bag that are missing"] = missing
+        lost[MISSING_FILES] = missing
     files = [file for file in files if file.is_file()] or _storage_files(path)
     if not files:
         raise DataError(path, "is a bag without its .db3 or .mcap files", "copy the whole folder again")
@@ -381,7 +388,7 @@ class Sqlite3Part(LogPart):
                 last, step = numbers[-4], 1
             if not whole:
                 # A page is missing or damaged: continue after it, in growing steps.
-                self.lost["gaps in the table of messages"] += step == 1
+                self.lost[GAPS] += step == 1
                 last, step = last + step, 2 * step
         rows = np.array(numbers, np.int64).reshape(-1, 4)
         return MessageTable(rows[:, 1], rows[:, 2], np.zeros(len(rows), np.int64), rows[:, 0], rows[:, 3])
@@ -446,7 +453,7 @@ class Sqlite3Part(LogPart):
     def _count_unmerged(self) -> None:
         log = self.path.with_name(self.path.name + "-wal")
         if log.is_file() and (size := log.stat().st_size):
-            self.lost["bytes of its write-ahead log, not merged"] += size
+            self.lost[UNMERGED] += size
 
 
 def _connect(path: Path) -> apsw.Connection:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -160,7 +161,7 @@ def test_maps_that_follow_each_other(tmp_path: Path) -> None:
         pytest.approx(0.971),
     ]
     assert found.dropped == {}
-    assert any("3 maps that follow each other (3 repeat the one before)" in note for note in found.notes)
+    assert any(re.search(r"\b3 maps\b.*\b3\b", note) for note in found.notes)
 
 
 def test_no_more_maps_than_a_replay_can_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,8 +171,8 @@ def test_no_more_maps_than_a_replay_can_use(tmp_path: Path, monkeypatch: pytest.
     found = Read(tmp_path, entries)
     # Of rows 0 to 9 four, evenly spaced.
     assert [(one.from_ns - T0) // SECOND for one in found.maps] == [0, 3, 6, 9]
-    assert found.dropped == {"maps between those that are kept": 6}
-    assert any("4 of 10 changes of the map are kept" in note for note in found.notes)
+    assert found.dropped == {log_maps.NOT_KEPT: 6}
+    assert any(re.search(r"\b4 of 10\b", note) for note in found.notes)
     monkeypatch.setattr(log_maps, "MOST_VOXELS", 2 * box().probability.size)
     assert [(one.from_ns - T0) // SECOND for one in Read(tmp_path, entries).maps] == [0, 9]
 
@@ -191,8 +192,8 @@ def test_stamps_that_stand_still_are_counted(tmp_path: Path) -> None:
     files = [as_bt(box(p), tmp_path / "site") for p in (0.971, 0.1192)]
     entries = [octomap_entry(files[k % 2], T0, received_ns=T0 + k * SECOND) for k in range(4)]
     found = Read(tmp_path, entries)
-    assert found.dropped == {"maps without a later stamp": 2}
-    assert any("`stamps: receive` may be better" in note for note in found.notes)
+    assert found.dropped == {log_maps.LATE: 2}
+    assert any("`stamps: receive`" in note for note in found.notes)
     assert len(Read(tmp_path, entries, stamps="receive").maps) == 4
 
 
@@ -211,8 +212,8 @@ def test_damaged_and_empty_maps_are_counted(tmp_path: Path) -> None:
     ]
     found = Read(tmp_path, entries)
     assert found.only.from_ns == T0 + 2
-    assert found.dropped == {"empty maps": 1, "map messages that cannot be used": 2}
-    assert any("breaks off" in note and "2 such messages" in note for note in found.notes)
+    assert found.dropped == {log_maps.EMPTY: 1, log_maps.DAMAGED: 2}
+    assert any(re.search(r"tree.*\(2 ", note) for note in found.notes)
 
 
 @pytest.mark.parametrize(
@@ -239,7 +240,7 @@ def test_coarser_octomap(tmp_path: Path) -> None:
     file = as_bt(box(), tmp_path / "site")
     one = Read(tmp_path, [octomap_entry(file, T0)], resolution_m=0.4).only
     same(one, READER.read_map(tmp_path / "site" / "map.bt", resolution_m=0.4))
-    with pytest.raises(DataError, match=r"voxels of 0\.2 m cannot be merged to 0\.3 m"):
+    with pytest.raises(DataError, match=r"0\.2 m\b.*\b0\.3 m"):
         Read(tmp_path, [octomap_entry(file, T0)], resolution_m=0.3)
 
 
@@ -298,7 +299,7 @@ def test_tilted_grids_are_refused(tmp_path: Path) -> None:
         transform_entry("map", "lidar", tilted, T0, topic="/tf_static"),
         octomap_entry(file, T0, frame="lidar"),
     ]
-    with pytest.raises(DataError, match=r"tilted by 22\.9 deg"):
+    with pytest.raises(DataError, match=r"22\.9 deg"):
         Read(tmp_path, entries)
 
 
@@ -316,7 +317,7 @@ def test_transforms_of_the_log_place_a_map(tmp_path: Path) -> None:
     true = occupied_centres(READER.read_map(tmp_path / "site" / "map.bt"))
     true = true[:, [1, 0, 2]] * [-1, 1, 1] + [2, 0, 0]
     np.testing.assert_allclose(in_order(occupied_centres(found.only)), in_order(true), rtol=0, atol=1e-5)
-    assert any("lies in 'site', which the log's transforms place in 'map'" in note for note in found.notes)
+    assert any(re.search("'site'.*'map'", note) for note in found.notes)
 
 
 def test_frames_that_nothing_connects(tmp_path: Path) -> None:
@@ -324,9 +325,9 @@ def test_frames_that_nothing_connects(tmp_path: Path) -> None:
     pose = {"header": {"stamp": T0, "frame_id": "odom"}, "pose": {"orientation": {"w": 1.0}}}
     poses = [Entry("/pose", "geometry_msgs/msg/PoseStamped", T0, pose)]
     found = Read(tmp_path, [*poses, octomap_entry(file, T0)], pose_topic="/pose")
-    assert any("lies in 'map', poses in 'odom'; nothing in the log connects" in note for note in found.notes)
+    assert any(re.search("'map'.*'odom'", note) for note in found.notes)
     elsewhere = [*poses, octomap_entry(file, T0, frame="sensor")]
-    with pytest.raises(DataError, match="'sensor', which no transforms of the log connect with 'odom'"):
+    with pytest.raises(DataError, match=r"'sensor'.*'odom'.*`parent:`"):
         Read(tmp_path, elsewhere, pose_topic="/pose")
     same(Read(tmp_path, elsewhere, pose_topic="/pose", parent="/sensor").only, found.only)
 
@@ -426,7 +427,7 @@ def test_unusable_plans_are_one_clear_line(tmp_path: Path, change: dict[str, Any
 
 def test_plan_on_edge_is_refused(tmp_path: Path) -> None:
     upright: Pose = ((0.0, 0.0, 0.0), (ROOT_HALF, 0.0, 0.0, ROOT_HALF))
-    with pytest.raises(DataError, match="tilted by 90 deg"):
+    with pytest.raises(DataError, match=r"\b90 deg"):
         Read(tmp_path, [grid_entry(plan(), T0, origin=upright)])
 
 
@@ -442,7 +443,7 @@ def test_cloud_is_that_of_a_file(tmp_path: Path, container: Container) -> None:
     found = Read(tmp_path, [cloud_entry(cloud_fields(POINTS), T0)], container=container)
     expected = occupancy_of("cloud", POINTS.astype(np.float32).astype(np.float64), None)
     same(found.only, expected)
-    assert found.dropped == {"points that are not finite": 1}
+    assert list(found.dropped.values()) == [1]
 
 
 @settings(deadline=None)
@@ -516,11 +517,11 @@ def test_cloud_of_a_moving_sensor_is_placed_by_transforms(tmp_path: Path) -> Non
     found = Read(tmp_path, [*entries, late], resolution_m=0.1)
     assert found.only.probability.shape == (1, 1, 1)
     np.testing.assert_allclose(found.only.origin, wall - 0.05, rtol=0, atol=1e-9)
-    assert found.dropped == {"map messages at whose time no transform is known": 1}
+    assert found.dropped == {log_maps.PLACELESS: 1}
 
 
 def test_cloud_of_a_sensor_without_transforms_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="lies in 'lidar', which no transforms of the log connect") as caught:
+    with pytest.raises(DataError, match=r"'lidar'.*'map'") as caught:
         Read(tmp_path, [cloud_entry(cloud_fields(POINTS), T0, frame="lidar")])
     assert "parent" in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -551,26 +552,28 @@ def test_unusable_clouds_are_one_clear_line(tmp_path: Path, change: dict[str, An
     if "width" not in change:
         found = Read(tmp_path, [bad, cloud_entry(cloud_fields(POINTS), T0 + 1)])
         assert found.only.from_ns == T0 + 1
-        assert found.dropped["map messages that cannot be used"] == 1
+        assert found.dropped[log_maps.DAMAGED] == 1
 
 
 def test_stray_points_are_one_clear_line(tmp_path: Path) -> None:
     stray = np.array([[0.0, 0, 0], [9e3, 9e3, 9e3], [1e300, 0, 0]])
-    with pytest.raises(DataError, match=r"its box is 45001 x 45001 x 45001 voxels"):
+    with pytest.raises(DataError, match="45001 x 45001 x 45001"):
         Read(tmp_path, [cloud_entry(cloud_fields(stray, kind="f8"), T0)])
     found = Read(tmp_path, [cloud_entry(cloud_fields(stray[[0, 2]], kind="f8"), T0)])
-    assert found.dropped == {"points beyond 104858 m": 1}
+    ((cause, count),) = found.dropped.items()
+    assert "104858 m" in cause
+    assert count == 1
 
 
 def test_only_plans_take_a_height(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="PointCloud2, which has heights of its own"):
+    with pytest.raises(DataError, match=r"PointCloud2.*`height_m`"):
         Read(tmp_path, [cloud_entry(cloud_fields(POINTS), T0)], height_m=3.0)
 
 
 def test_no_topic_of_maps(tmp_path: Path) -> None:
     pose = {"header": {"stamp": T0, "frame_id": "odom"}, "pose": {"orientation": {"w": 1.0}}}
     poses = [Entry("/pose", "geometry_msgs/msg/PoseStamped", T0, pose)]
-    with pytest.raises(DataError, match="has 0 topics with maps"):
+    with pytest.raises(DataError, match=r"\b0 topics\b.*maps"):
         Read(tmp_path, poses)
-    with pytest.raises(DataError, match="topic /pose holds geometry_msgs/msg/PoseStamped, no maps"):
+    with pytest.raises(DataError, match=r"/pose.*geometry_msgs/msg/PoseStamped.*maps"):
         Read(tmp_path, poses, topic="/pose")

@@ -9,9 +9,9 @@ import pytest
 
 from pipelines.formats.logs.pictures import KNOWN, decode
 from pipelines.geometry.arrays import Picture
-from pipelines.session.errors import DataError
 from pipelines.session.records import PictureSample
 from pipelines.sources.pictures import LoggedPictures
+from tests.formats.refusals import refuses
 from tests.synthetic.logs import CONTAINERS, Container, Entry, write_log
 
 WIDTH, HEIGHT = 16, 12
@@ -131,5 +131,5 @@ def test_raw_pictures_of_a_log(container: Container, tmp_path: Path) -> None:
 
 def test_an_encoding_that_nobody_knows_is_said_at_once(tmp_path: Path) -> None:
     path = logged(tmp_path, "ros1", "32FC1", np.zeros((HEIGHT, 4 * WIDTH), np.uint8))
-    with pytest.raises(DataError, match=r"pictures of /camera are encoded as '32FC1', which is not known"):
+    with refuses(path, "/camera", "32FC1", *KNOWN):
         LoggedPictures([path], "/camera", "header")

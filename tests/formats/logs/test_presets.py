@@ -134,7 +134,7 @@ def test_local_positions_are_placed_by_the_fixes_beside_them(tmp_path: Path) -> 
     first = enu_from_geodetic(np.array(47.5), np.array(8.5), np.array(400.0), origin)
     # Steps of 1e-6 deg of longitude are 0.07536 m here, 0.0754 in the local positions: 0.3 mm over 8 rows.
     np.testing.assert_allclose(first, [5.0, -7.0, 12.0], atol=1e-3)
-    assert any("placed on Earth by /dji_sdk/gps_position" in note for note in telemetry.notes)
+    assert any(" /dji_sdk/gps_position" in note for note in telemetry.notes)
 
 
 def test_mavros(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_what_a_receiver_says_of_itself(tmp_path: Path) -> None:
     assert telemetry.position.accuracy_m == (2.0, 3.0)
     assert telemetry.position.height == "ellipsoid"
     lost = fixes("/mavros/global_position/global", status={"status": -1})
-    with pytest.raises(DataError, match="8 no fix"):
+    with pytest.raises(DataError, match=r"\b8 no\b"):
         read(tmp_path / "lost", "mavros", lost, imu("/mavros/imu/data", (0, 0, 0, 1)))
 
 
@@ -185,7 +185,7 @@ def test_the_recorder_against_gps_time(tmp_path: Path) -> None:
         for t in stamps()
     ]
     telemetry = read(tmp_path, "mavros", poses("/mavros/local_position/pose", (0, 0, 1)), ticks)
-    assert any("GPS time is 2.500 s ahead of its stamps" in note for note in telemetry.notes)
+    assert any(" 2.500 s " in note for note in telemetry.notes)
 
 
 def test_several_drones(tmp_path: Path) -> None:
@@ -193,14 +193,14 @@ def test_several_drones(tmp_path: Path) -> None:
     assert namespaces(topics) == [("dji_osdk", ""), ("mavros", "/a"), ("mavros", "/b")]
     assert parts_of("mavros", "/a", topics).position == topics[:1]
     both = [poses(topics[0], (1, 0, 0)), poses(topics[1], (2, 0, 0))]
-    with pytest.raises(DataError, match=r"2 drones \(/a, /b\); say which with `namespace:`"):
+    with pytest.raises(DataError, match=r"\b2 .*\(/a, /b\).*`namespace:`"):
         read(tmp_path / "x", "mavros", *both)
     assert read(tmp_path / "y", "mavros", *both, namespace="b").position.values[0, 0] == 2
-    with pytest.raises(DataError, match="namespaces with them: /a, /b"):
+    with pytest.raises(DataError, match=r"/c.* /a, /b"):
         read(tmp_path / "z", "mavros", *both, namespace="/c")
-    with pytest.raises(DataError, match="has no topics of dji_osdk"):
+    with pytest.raises(DataError, match=r"dji_osdk .*dji_sdk/dji_osdk_ros"):
         read(tmp_path / "w", "dji_osdk", *both)
-    with pytest.raises(DataError, match="has no gps position of /a/mavros; there is local"):
+    with pytest.raises(DataError, match=r"gps .*/a/mavros.* local"):
         read(tmp_path / "v", "mavros", both[0], position="gps")
 
 
@@ -244,10 +244,10 @@ def test_vectors_and_fixes_of_foxglove_are_no_poses(tmp_path: Path) -> None:
     ros = sorted([*vectors("/v", "", 1, 2, 3), *imu("/imu", (0, 0, 0, 1))], key=lambda entry: entry.stamp_ns)
     as_ros = write_log(tmp_path, "b", "ros1", ros)
     for path, topic, turned in ((as_json, "/place", "/place"), (as_ros, "/v", "/imu")):
-        with pytest.raises(DataError, match=f"topic {topic} holds .*no position") as refused:
+        with pytest.raises(DataError, match=f" {topic} .*NavSatFix") as refused:
             _pair(path, topic, turned)
         assert "attribute" not in str(refused.value)
-    with pytest.raises(DataError, match=r"topic /v holds .*no position"):
+    with pytest.raises(DataError, match=r" /v .*NavSatFix"):
         _pair(as_ros, "/v", "/v")
 
 

@@ -25,8 +25,8 @@ from pipelines.formats.logs.trajectories import (
     transforms_of,
 )
 from pipelines.geometry.poses import matrix_from_quaternion
-from pipelines.session.errors import DataError
 from pipelines.session.records import AngleSample, Message, PoseSample, Sample, Topic
+from tests.formats.refusals import refuses
 from tests.real_data import real_data
 
 S = 1_000_000_000
@@ -82,7 +82,7 @@ def test_a_clock_jump_is_told_with_its_place_and_size(jump_s: float) -> None:
     assert found.stamps.disagreeing == 8
     assert found.stamps.largest_disagreement_s == pytest.approx(jump_s - 0.002)
     if jump_s < 0:  # no stamp after the jump is later than those before it
-        assert found.trajectory.dropped == {"stamp out of order": 8}
+        assert list(found.trajectory.dropped.values()) == [8]
     else:
         assert found.trajectory.dropped == {}
 
@@ -107,7 +107,11 @@ def test_losses_are_counted_by_the_rules_of_every_pose_file() -> None:
     stated[4] = replace(stated[4], quaternion_xyzw=(0.0, 0.0, 0.0, 0.0))
     stated.append(replace(stated[-1]))
     found = trajectory_of(stated, "d1", stamps="header")
-    assert found.trajectory.dropped == {"not finite": 1, "zero quaternion": 1, "duplicate stamp": 1}
+    assert [(cause.split()[-1], count) for cause, count in found.trajectory.dropped.items()] == [
+        ("finite", 1),
+        ("quaternion", 1),
+        ("stamp", 1),
+    ]
     assert len(found.trajectory.t_ns) == 8
 
 
@@ -124,11 +128,11 @@ def test_covariances_turn_with_the_body() -> None:
 
 
 def test_poses_of_several_things_or_of_none_are_refused() -> None:
-    with pytest.raises(DataError, match=r"poses of several frames .'base' in 'odom', 'tag' in 'odom'"):
+    with refuses("d1", "frames", "'base' in 'odom'", "'tag' in 'odom'"):
         trajectory_of(flown() + flown(frames=("odom", "tag")), "d1", stamps="header")
-    with pytest.raises(DataError, match="holds no poses"):
+    with refuses("d1", "topic", "poses"):
         trajectory_of([AngleSample(1, 1, (0, 0, 0), None)], "d1", stamps="header")
-    with pytest.raises(DataError, match=r"no usable pose .it has no rows."):
+    with refuses("d1", "rows"):
         trajectory_of([], "d1", stamps="header")
 
 
@@ -158,8 +162,8 @@ def test_gimbal_angles_and_quaternions_say_the_same() -> None:
 def test_angles_that_are_no_numbers_are_dropped_and_counted() -> None:
     stated = [AngleSample(k, k, (0.0, value, 0.0), None) for k, value in ((1, 0.0), (2, np.inf), (3, np.nan))]
     found = attitudes_of(stated, "d1", stamps="header")
-    assert found.trajectory.dropped == {"not finite": 2}
-    with pytest.raises(DataError, match="holds no gimbal angles"):
+    assert list(found.trajectory.dropped.values()) == [2]
+    with refuses("d1", "gimbal", "quaternions"):
         attitudes_of(flown(), "d1", stamps="header")
 
 
@@ -182,7 +186,7 @@ def test_chains_of_moving_and_static_transforms() -> None:
     )
     found = chained(transforms, "d1", parent="map", child="/camera", stamps="header", max_gap_ns=S)
     # 5 Hz ends at 0.8 s, so the last nine stamps of 0.00 to 0.98 s at 50 Hz have no correction.
-    assert found.trajectory.dropped == {"no transform": 9}
+    assert list(found.trajectory.dropped.values()) == [9]
     np.testing.assert_allclose(
         found.trajectory.position, [[k / 50 + 0.5, 100, 0] for k in range(41)], rtol=0, atol=1e-12
     )
@@ -202,17 +206,19 @@ def test_losses_of_a_chain_say_which_transform_they_are_of() -> None:
     stated[2] = replace(stated[2], position=(np.inf, 0.0, 0.0))
     transforms = transforms_of([*stated, *flown(frames=("odom", "other"))], "d1")
     found = chained(transforms, "d1", parent="base", child="other", stamps="header", max_gap_ns=S)
-    assert found.trajectory.dropped == {"not finite ('base' in 'odom')": 1}
+    ((cause, count),) = found.trajectory.dropped.items()
+    assert "('base' in 'odom')" in cause
+    assert count == 1
 
 
 def test_frames_that_cannot_be_chained_are_refused() -> None:
     late = [replace(s, stamp_ns=s.stamp_ns + 1000 * S) for s in flown(frames=("base", "camera"))]
     transforms = transforms_of([*flown(), *late], "d1.mcap")
-    with pytest.raises(DataError, match=r"d1.mcap: there is no frame 'bace' .nearest: base"):
+    with refuses("d1.mcap", "'bace'", "base", "`parent`", "`child`"):
         chained(transforms, "d1.mcap", parent="odom", child="bace", stamps="header", max_gap_ns=S)
-    with pytest.raises(DataError, match="never states all the transforms from 'odom' to 'camera'"):
+    with refuses("d1.mcap", "'odom'", "'camera'", "--max-pose-gap"):
         chained(transforms, "d1.mcap", parent="odom", child="camera", stamps="header", max_gap_ns=S)
-    with pytest.raises(DataError, match="holds no transforms"):
+    with refuses("d1.mcap", "topic", "transforms"):
         transforms_of([AngleSample(1, 1, (0, 0, 0), None)], "d1.mcap")
 
 
