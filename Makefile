@@ -44,6 +44,7 @@ bench: setup
 	$(BIN)/python -m benchmarks.association
 	$(BIN)/python -m benchmarks.loss
 	$(BIN)/python -m benchmarks.ingest_log
+	$(BIN)/python -m benchmarks.log_readers
 	$(BIN)/python -m benchmarks.planning
 	$(BIN)/python -m benchmarks.arms
 	$(BIN)/python -m benchmarks.rendering

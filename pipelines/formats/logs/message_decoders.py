@@ -1,8 +1,8 @@
 """Decoders of messages: from the bytes of one to a value with the schema's fields as attributes, by encoding.
 
 Messages of one topic usually differ in numbers only: their texts are equal, and so every field stands at
-one position. `find_layout` finds these positions. A thousand messages are then one array, which is read ten
-times as fast as single messages (docs/decisions/0009-log-readers.md).
+one position. `find_layout` finds these positions. A thousand messages are then one array, which is read
+several times as fast as single messages (docs/decisions/0009-log-readers.md).
 """
 
 from __future__ import annotations
