@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.formats.calibrations.camera_matrices import intrinsics
-from pipelines.geometry.arrays import Float
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.session.errors import DataError
 from pipelines.session.records import (
@@ -116,23 +115,21 @@ def unreadable(message: Message, source: Source, error: Exception) -> DataError:
     )
 
 
-# --- poses and transforms ------------------------------------------------------------------------------
+# --- poses, transforms, gimbal angles ------------------------------------------------------------------
 
 
 def _odometry(message: Message, _: Source) -> Iterator[Sample]:
-    value = message.value
-    yield _pose(
-        value.header, message.receive_ns, str(value.child_frame_id), value.pose.pose, value.pose.covariance
-    )
+    value, stated = message.value, message.value.pose
+    yield _pose(message, value.header, stated.pose, str(value.child_frame_id), stated.covariance)
 
 
 def _pose_stamped(message: Message, _: Source) -> Iterator[Sample]:
-    yield _pose(message.value.header, message.receive_ns, "", message.value.pose)
+    yield _pose(message, message.value.header, message.value.pose)
 
 
 def _pose_with_covariance(message: Message, _: Source) -> Iterator[Sample]:
     stated = message.value.pose
-    yield _pose(message.value.header, message.receive_ns, "", stated.pose, stated.covariance)
+    yield _pose(message, message.value.header, stated.pose, covariance=stated.covariance)
 
 
 def _path(message: Message, source: Source) -> Iterator[Sample]:
@@ -145,99 +142,67 @@ def _path(message: Message, source: Source) -> Iterator[Sample]:
             "name a topic of Odometry or PoseStamped instead",
         )
     for pose, stamp_ns in zip(poses, stamps, strict=True):
-        yield _pose(pose.header, _checked(message.receive_ns + stamp_ns - stamps[-1]), "", pose.pose)
+        receive_ns = _checked(message.receive_ns + stamp_ns - stamps[-1])
+        yield _pose(replace(message, receive_ns=receive_ns), pose.header, pose.pose)
+
+
+def _pose(message: Message, header: Any, pose: Any, frame: str = "", covariance: Any = None) -> PoseSample:
+    return PoseSample(
+        nanoseconds(header.stamp),
+        message.receive_ns,
+        str(header.frame_id),
+        frame,
+        _vector(pose.position),
+        _quaternion(pose.orientation),
+        None if covariance is None else np.asarray(covariance, dtype=np.float64).reshape(6, 6),
+    )
+
+
+def _foxglove_pose(message: Message, _: Source) -> Iterator[Sample]:
+    stamp_ns, frame, pose = _stamp_ns(message), str(message.value.frame_id), message.value.pose
+    place, turn = _vector(pose.position), _quaternion(pose.orientation)
+    yield PoseSample(stamp_ns, message.receive_ns, frame, "", place, turn)
 
 
 def _transform(message: Message, _: Source) -> Iterator[Sample]:
-    yield _link(message.value, message.receive_ns)
+    yield _link(message, message.value)
 
 
 def _transforms(message: Message, _: Source) -> Iterator[Sample]:
     for stated in message.value.transforms:
-        yield _link(stated, message.receive_ns)
+        yield _link(message, stated)
 
 
-def _foxglove_pose(message: Message, _: Source) -> Iterator[Sample]:
-    value = message.value
-    yield PoseSample(
-        stamp_ns=nanoseconds(value.timestamp),
-        receive_ns=message.receive_ns,
-        target=str(value.frame_id),
-        source="",
-        position=_vector(value.pose.position),
-        quaternion_xyzw=_quaternion(value.pose.orientation),
-    )
-
-
-def _foxglove_transform(message: Message, _: Source) -> Iterator[Sample]:
-    yield _foxglove_link(message.value, message.receive_ns)
-
-
-def _foxglove_transforms(message: Message, _: Source) -> Iterator[Sample]:
-    for stated in message.value.transforms:
-        yield _foxglove_link(stated, message.receive_ns)
-
-
-def _pose(header: Any, receive_ns: int, frame: str, pose: Any, covariance: Any = None) -> PoseSample:
+def _link(message: Message, stated: Any) -> PoseSample:
+    if _is_foxglove(message):
+        stamp, frame = stated.timestamp, stated.parent_frame_id
+        place, turn = stated.translation, stated.rotation
+    else:
+        stamp, frame = stated.header.stamp, stated.header.frame_id
+        place, turn = stated.transform.translation, stated.transform.rotation
     return PoseSample(
-        stamp_ns=nanoseconds(header.stamp),
-        receive_ns=receive_ns,
-        target=str(header.frame_id),
-        source=frame,
-        position=_vector(pose.position),
-        quaternion_xyzw=_quaternion(pose.orientation),
-        covariance=None if covariance is None else _covariance(covariance),
+        nanoseconds(stamp),
+        message.receive_ns,
+        str(frame),
+        str(stated.child_frame_id),
+        _vector(place),
+        _quaternion(turn),
     )
-
-
-def _link(stated: Any, receive_ns: int) -> PoseSample:
-    return PoseSample(
-        stamp_ns=nanoseconds(stated.header.stamp),
-        receive_ns=receive_ns,
-        target=str(stated.header.frame_id),
-        source=str(stated.child_frame_id),
-        position=_vector(stated.transform.translation),
-        quaternion_xyzw=_quaternion(stated.transform.rotation),
-    )
-
-
-def _foxglove_link(stated: Any, receive_ns: int) -> PoseSample:
-    return PoseSample(
-        stamp_ns=nanoseconds(stated.timestamp),
-        receive_ns=receive_ns,
-        target=str(stated.parent_frame_id),
-        source=str(stated.child_frame_id),
-        position=_vector(stated.translation),
-        quaternion_xyzw=_quaternion(stated.rotation),
-    )
-
-
-# --- gimbal angles -------------------------------------------------------------------------------------
 
 
 def _quaternion_stamped(message: Message, _: Source) -> Iterator[Sample]:
-    value = message.value
-    yield AngleSample(
-        nanoseconds(value.header.stamp), message.receive_ns, None, _quaternion(value.quaternion)
-    )
+    yield AngleSample(_stamp_ns(message), message.receive_ns, None, _quaternion(message.value.quaternion))
 
 
 def _vector_stamped(message: Message, _: Source) -> Iterator[Sample]:
-    value = message.value
-    yield AngleSample(nanoseconds(value.header.stamp), message.receive_ns, _vector(value.vector), None)
+    yield AngleSample(_stamp_ns(message), message.receive_ns, _vector(message.value.vector), None)
 
 
 # --- intrinsics ----------------------------------------------------------------------------------------
 
 
 def _camera_info(message: Message, source: Source) -> Iterator[Sample]:
-    stamp = message.value.header.stamp
-    yield IntrinsicsSample(nanoseconds(stamp), message.receive_ns, _lens(message, source))
-
-
-def _foxglove_calibration(message: Message, source: Source) -> Iterator[Sample]:
-    stamp = message.value.timestamp
-    yield IntrinsicsSample(nanoseconds(stamp), message.receive_ns, _lens(message, source))
+    yield IntrinsicsSample(_stamp_ns(message), message.receive_ns, _lens(message, source))
 
 
 def _lens(message: Message, source: Source) -> Intrinsics:
@@ -299,32 +264,9 @@ def _of_the_picture(full: Intrinsics, value: Any) -> Intrinsics:
 
 
 def _compressed_image(message: Message, _: Source) -> Iterator[Sample]:
-    yield _encoded_picture(message.value.header.stamp, message)
-
-
-def _image(message: Message, _: Source) -> Iterator[Sample]:
-    yield _raw_picture(message.value.header.stamp, message)
-
-
-def _foxglove_compressed_image(message: Message, _: Source) -> Iterator[Sample]:
-    yield _encoded_picture(message.value.timestamp, message)
-
-
-def _foxglove_raw_image(message: Message, _: Source) -> Iterator[Sample]:
-    yield _raw_picture(message.value.timestamp, message)
-
-
-def _encoded_picture(stamp: Any, message: Message) -> PictureSample:
     data = bytes_of(message.value.data)
-    return PictureSample(
-        stamp_ns=nanoseconds(stamp),
-        receive_ns=message.receive_ns,
-        encoding=_codec(data, str(getattr(message.value, "format", ""))),
-        width=None,
-        height=None,
-        step=None,
-        data=data,
-    )
+    encoding = _codec(data, str(getattr(message.value, "format", "")))
+    yield PictureSample(_stamp_ns(message), message.receive_ns, encoding, None, None, None, data)
 
 
 def _codec(data: NDArray[np.uint8], stated: str) -> str:
@@ -336,10 +278,10 @@ def _codec(data: NDArray[np.uint8], stated: str) -> str:
     return stated.lower()
 
 
-def _raw_picture(stamp: Any, message: Message) -> PictureSample:
+def _image(message: Message, _: Source) -> Iterator[Sample]:
     value = message.value
-    return PictureSample(
-        stamp_ns=nanoseconds(stamp),
+    yield PictureSample(
+        stamp_ns=_stamp_ns(message),
         receive_ns=message.receive_ns,
         encoding=str(value.encoding),
         width=operator.index(value.width),
@@ -350,6 +292,15 @@ def _raw_picture(stamp: Any, message: Message) -> PictureSample:
 
 
 # --- fields --------------------------------------------------------------------------------------------
+
+
+def _is_foxglove(message: Message) -> bool:
+    return message.topic.type.startswith("foxglove")
+
+
+def _stamp_ns(message: Message) -> int:
+    value = message.value
+    return nanoseconds(value.timestamp if _is_foxglove(message) else value.header.stamp)
 
 
 def nanoseconds(stamp: Any) -> int:
@@ -375,10 +326,6 @@ def _vector(value: Any) -> tuple[float, float, float]:
 
 def _quaternion(value: Any) -> tuple[float, float, float, float]:
     return float(value.x), float(value.y), float(value.z), float(value.w)
-
-
-def _covariance(value: Any) -> Float:
-    return np.asarray(value, dtype=np.float64).reshape(6, 6)
 
 
 def bytes_of(data: Any) -> NDArray[np.uint8]:
@@ -412,12 +359,12 @@ _ROS_READERS: dict[str, tuple[Kind, _Reader]] = {
     "tf2_msgs/msg/TFMessage": ("transforms", _transforms),
 }
 _FOXGLOVE_READERS: dict[str, tuple[Kind, _Reader]] = {
-    "CameraCalibration": ("intrinsics", _foxglove_calibration),
-    "CompressedImage": ("pictures", _foxglove_compressed_image),
-    "FrameTransform": ("transforms", _foxglove_transform),
-    "FrameTransforms": ("transforms", _foxglove_transforms),
+    "CameraCalibration": ("intrinsics", _camera_info),
+    "CompressedImage": ("pictures", _compressed_image),
+    "FrameTransform": ("transforms", _transform),
+    "FrameTransforms": ("transforms", _transforms),
     "PoseInFrame": ("poses", _foxglove_pose),
-    "RawImage": ("pictures", _foxglove_raw_image),
+    "RawImage": ("pictures", _image),
 }
 _READERS: dict[str, tuple[Kind, _Reader]] = {
     **_ROS_READERS,
