@@ -110,11 +110,11 @@ def _of_summary(path: Path) -> Survey | None:
         with suppress(DataError):  # damaged, or another program's file of that name: described as any file
             summary = read_json(file)
         if summary.get("simulated") is True:
-            return Survey(path, title, _told(file, summary, reader))
+            return Survey(path, title, _described(file, summary, reader))
     return None
 
 
-def _told(
+def _described(
     file: Path, summary: Mapping[str, Any], reader: Callable[[Mapping[str, Any]], dict[str, Any]]
 ) -> dict[str, Any]:
     schema = summary.get("schema")

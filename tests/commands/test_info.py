@@ -31,16 +31,16 @@ drones: {{count: 3}}
 
 
 def reading(path: Path) -> dict[str, Any]:
-    told = json.loads(succeeds("info", path, "--json"))["readings"]
-    assert len(told) == 1
-    return dict(told[0])
+    facts = json.loads(succeeds("info", path, "--json"))["readings"]
+    assert len(facts) == 1
+    return dict(facts[0])
 
 
 def test_yaml_is_what_its_keys_say(tmp_path: Path) -> None:
     scenario = tmp_path / "a.yaml"
     scenario.write_text(SCENARIO)
-    told = reading(scenario)
-    assert (told["kind"], told["seed"], told["drones"]["count"]) == ("scenario", 5, 3)
+    facts = reading(scenario)
+    assert (facts["kind"], facts["seed"], facts["drones"]["count"]) == ("scenario", 5, 3)
     scenario.write_text(SCENARIO.replace("seed: 5", "sead: 5"))
     line = refused("info", scenario)
     assert "sead: " in line
@@ -64,10 +64,10 @@ def test_a_simulated_flight_and_its_summary(tmp_path: Path) -> None:
     folder = tmp_path / "flight"
     succeeds("simulate", tmp_path / "a.yaml", "-o", folder, "--no-video")
     for path in (folder, folder / "simulation.json"):
-        told = reading(path)
-        assert "simulated" in told["kind"]
-        assert (told["name"], told["seed"]) == (NAME, 5)
-        assert set(told["frames"]) == {"drone1", "drone2", "drone3"}
+        facts = reading(path)
+        assert "simulated" in facts["kind"]
+        assert (facts["name"], facts["seed"]) == (NAME, 5)
+        assert set(facts["frames"]) == {"drone1", "drone2", "drone3"}
     write_json(folder / "simulation.json", {"schema": 2, "simulated": True})
     assert re.search(r"simulation\.json: .*\b2\b.*\b1\b", refused("info", folder))
     write_json(folder / "simulation.json", {"schema": 1, "simulated": True})
@@ -79,14 +79,14 @@ def test_a_simulated_flight_and_its_summary(tmp_path: Path) -> None:
 def test_a_study_tells_the_error_of_every_condition(tmp_path: Path) -> None:
     asked = ("--tilts", "0,30", "--levels", "low", "--methods", "dlt", "--seconds", "4", "--rate", "5")
     succeeds("ablate", "tilt", *asked, "--trials", "1", "--keypoints", "exact", "-o", tmp_path / "study")
-    told = reading(tmp_path / "study")
+    facts = reading(tmp_path / "study")
     cells = read_json(tmp_path / "study" / "summary.json")["cells"]
-    assert told["kind"].startswith("study")
-    assert told["study"] == "tilt"
-    assert [list(errors.values()) for errors in told["mpjpe_mm"].values()] == [
+    assert facts["kind"].startswith("study")
+    assert facts["study"] == "tilt"
+    assert [list(errors.values()) for errors in facts["mpjpe_mm"].values()] == [
         [cell["metrics"]["mpjpe_mm"]["mean"]] for cell in cells
     ]
-    for tilt, condition in zip((0, 30), told["mpjpe_mm"], strict=True):
+    for tilt, condition in zip((0, 30), facts["mpjpe_mm"], strict=True):
         assert re.fullmatch(rf"{tilt} deg, 2 \w+, \w+ low", condition)
     (tmp_path / "summary.json").write_text("[1, 2]")  # a file of another program
     assert all(name in refused("info", tmp_path / "summary.json") for name in FORMATS.names())
@@ -102,9 +102,9 @@ def test_the_data_section_of_an_mcap_file_is_checked(tmp_path: Path, right: bool
     end = int.from_bytes(whole[-28:-20], "little") - 13
     crc = zlib.crc32(whole[:end]) if right else 1
     log.write_bytes(whole[: end + 9] + crc.to_bytes(4, "little") + whole[end + 13 :])
-    told = reading(log)
-    assert told.get("checksum") == ("right" if right else None)
-    assert (OTHER_CHECKSUM in told.get("damage", "")) != right
+    facts = reading(log)
+    assert facts.get("checksum") == ("right" if right else None)
+    assert (OTHER_CHECKSUM in facts.get("damage", "")) != right
 
 
 def test_a_stage_whose_data_changed_is_out_of_date(tmp_path: Path) -> None:

@@ -185,7 +185,7 @@ HUSKY = "logs/ros1/husky_gps_imu_odom.bag"
 @pytest.mark.parametrize("name", ["octomap_geb079.bt", "octomap_ecmrv4_withfree.ot"])
 def test_real_octomap_in_a_log(tmp_path: Path, name: str) -> None:
     """Put real octrees into messages and compare the voxel counts with those of OctoMap's own library."""
-    told = facts(f"maps/{name}")
+    expected = facts(f"maps/{name}")
     first_s = facts(HUSKY)["topics"]["/husky_velocity_controller/odom"]["header_stamp_range"][0]
     entry = octomap_entry(real_data(f"maps/{name}").read_bytes(), round(first_s * 1e9))
     log = write_log(tmp_path, "map", "ros2-sqlite3", [entry])
@@ -193,9 +193,9 @@ def test_real_octomap_in_a_log(tmp_path: Path, name: str) -> None:
     path = write_flight(tmp_path, pose, start_s=first_s + 1, map={"log": log.name})
     succeeds("ingest", path)
     stored = session_of(path)["map"]
-    assert stored["resolution_m"] == told["resolution"]
-    assert stored["occupied"] == told["occupied_voxels_at_finest"]
-    assert stored["free"] == told["free_voxels_at_finest"]
+    assert stored["resolution_m"] == expected["resolution"]
+    assert stored["occupied"] == expected["occupied_voxels_at_finest"]
+    assert stored["free"] == expected["free_voxels_at_finest"]
     (logged,) = load_maps(tmp_path / "flight.session")
     filed = FORMAT.read_map(real_data(f"maps/{name}"))
     np.testing.assert_array_equal(logged.probability, filed.probability)
@@ -205,11 +205,11 @@ def test_real_octomap_in_a_log(tmp_path: Path, name: str) -> None:
 def test_real_lidar(tmp_path: Path) -> None:
     """Use five clouds of a car's lidar; the log does not state the sensor's pose."""
     name = "logs/ros1/embag_pointcloud2_lidar.bag"
-    told = facts(name)["topics"]["/luminar_pointcloud"]
+    expected = facts(name)["topics"]["/luminar_pointcloud"]
     first_s = facts(HUSKY)["topics"]["/husky_velocity_controller/odom"]["header_stamp_range"][0]
     lidar: dict[str, Any] = {
         "path": str(real_data(name)),
-        "clock": {"offset_s": first_s - told["header_stamp_range"][0]},
+        "clock": {"offset_s": first_s - expected["header_stamp_range"][0]},
     }
     pose = {"log": str(real_data(HUSKY)), "of": "body"}
     about: dict[str, Any] = {"log": "lidar", "topic": "/luminar_pointcloud"}
@@ -219,9 +219,9 @@ def test_real_lidar(tmp_path: Path) -> None:
     path = write_flight(tmp_path, pose, start_s=first_s + 1, logs={"lidar": lidar}, map=about)
     done = mocap("ingest", path)
     assert done.returncode == 0, done.stderr
-    assert re.search(rf"\b{told['count']} clouds .* {told['count']} maps\b", done.stderr)
+    assert re.search(rf"\b{expected['count']} clouds .* {expected['count']} maps\b", done.stderr)
     maps = load_maps(tmp_path / "flight.session")
-    assert len(maps) == told["count"]
+    assert len(maps) == expected["count"]
     counts = [int((one.probability == 1).sum()) for one in maps]
     assert counts == sorted(set(counts))
     # The points of the last map lie in no more voxels than there are points, and in those alone.

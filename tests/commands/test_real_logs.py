@@ -20,8 +20,8 @@ FRAMES = 20
 
 def facts(name: str) -> dict[str, Any]:
     every: dict[str, Any] = json.loads(real_data("facts.json").read_text(encoding="utf-8"))
-    told: dict[str, Any] = every[name]
-    return told
+    expected: dict[str, Any] = every[name]
+    return expected
 
 
 def write_flight(folder: Path, pose: dict[str, Any], start_s: float, **parts: Any) -> Path:
@@ -60,22 +60,22 @@ def session_of(path: Path) -> dict[str, Any]:
 
 def test_odometry_of_a_real_robot(tmp_path: Path) -> None:
     name = "logs/ros1/husky_gps_imu_odom.bag"
-    told = facts(name)["topics"]["/husky_velocity_controller/odom"]
-    first_s, last_s = told["header_stamp_range"]
+    expected = facts(name)["topics"]["/husky_velocity_controller/odom"]
+    first_s, last_s = expected["header_stamp_range"]
     path = write_flight(tmp_path, {"log": str(real_data(name)), "of": "body"}, start_s=first_s + 10)
     done = mocap("ingest", path)
     assert done.returncode == 0, done.stderr
     assert " /husky_velocity_controller/odom, " in done.stderr
     poses = pd.read_parquet(tmp_path / "flight.session" / "cameras" / "husky" / "poses.parquet")
-    assert len(poses) == told["count"]
+    assert len(poses) == expected["count"]
     assert session_of(path)["cameras"]["husky"]["poses"]["dropped"] == {}
     # Stated with six decimals, stamps as doubles of seconds since the epoch.
     position = poses[["x", "y", "z"]].to_numpy()
-    assert position.min(axis=0) == pytest.approx(told["position_bbox"]["min"], abs=1e-6)
-    assert position.max(axis=0) == pytest.approx(told["position_bbox"]["max"], abs=1e-6)
+    assert position.min(axis=0) == pytest.approx(expected["position_bbox"]["min"], abs=1e-6)
+    assert position.max(axis=0) == pytest.approx(expected["position_bbox"]["max"], abs=1e-6)
     assert poses["t_ns"].iloc[[0, -1]].to_numpy() / 1e9 == pytest.approx([first_s, last_s], abs=1e-6)
     assert np.linalg.norm(np.diff(position, axis=0), axis=1).sum() == pytest.approx(
-        told["path_length"], abs=1e-3
+        expected["path_length"], abs=1e-3
     )
 
 
@@ -90,13 +90,13 @@ def test_stamps_that_disagree_by_months_are_doubted(tmp_path: Path) -> None:
 
 def test_a_chain_of_transforms(tmp_path: Path) -> None:
     name = "logs/ros1/foxglove_example.bag"
-    told = facts(name)
+    expected = facts(name)
     pose = {"log": str(real_data(name)), "parent": "world", "child": "turtle1", "of": "body"}
-    path = write_flight(tmp_path, pose, start_s=told["start_ns"] / 1e9 + 5)
+    path = write_flight(tmp_path, pose, start_s=expected["start_ns"] / 1e9 + 5)
     succeeds("ingest", path)
     poses = pd.read_parquet(tmp_path / "flight.session" / "cameras" / "husky" / "poses.parquet")
     # Two turtles, one transform each, in every other message of /tf.
-    assert len(poses) == told["topics"]["/tf"]["count"] / 2
+    assert len(poses) == expected["topics"]["/tf"]["count"] / 2
 
 
 def test_rotations_that_are_none_are_refused(tmp_path: Path) -> None:
@@ -111,7 +111,7 @@ def test_rotations_that_are_none_are_refused(tmp_path: Path) -> None:
 def test_calibration_and_pictures_of_a_real_json_log(tmp_path: Path) -> None:
     name = "logs/mcap/json_camera_calibration_images.mcap"
     log = str(real_data(name))
-    told = facts(name)["topics"]["/image/compressed"]
+    expected = facts(name)["topics"]["/image/compressed"]
     (tmp_path / "still.toml").write_text(
         '[camera]\nname = "camera"\nsize = [640, 480]\nmatrix = [[800, 0, 320], [0, 800, 240], [0, 0, 1]]\n'
         "distortions = [0, 0, 0, 0]\nrotation = [0, 0, 0]\ntranslation = [0, 0, 0]\n",
@@ -132,9 +132,9 @@ def test_calibration_and_pictures_of_a_real_json_log(tmp_path: Path) -> None:
     path.write_text(text.replace(logged, inline), encoding="utf-8")
     succeeds("ingest", path)
     camera = session_of(path)["cameras"]["camera"]
-    assert camera["frames"]["count"] == told["count"]
+    assert camera["frames"]["count"] == expected["count"]
     assert camera["frames"]["first_t_ns"] == facts(name)["start_ns"]
-    # Its header stamps stand still: one picture can be told from the others by them.
+    # Its header stamps stand still: one picture can be expected from the others by them.
     path.write_text(path.read_text(encoding="utf-8").replace("stamps: receive", "stamps: header"), "utf-8")
     done = mocap("ingest", path)
     assert re.search(r"\b9 picture", done.stderr)
@@ -144,7 +144,7 @@ def test_calibration_and_pictures_of_a_real_json_log(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["maps/octomap_geb079.bt", "maps/octomap_ecmrv4_withfree.ot"])
 def test_real_octomaps(tmp_path: Path, name: str) -> None:
-    told = facts(name)
+    expected = facts(name)
     log = "logs/ros1/husky_gps_imu_odom.bag"
     first_s = facts(log)["topics"]["/husky_velocity_controller/odom"]["header_stamp_range"][0]
     path = write_flight(
@@ -152,9 +152,9 @@ def test_real_octomaps(tmp_path: Path, name: str) -> None:
     )
     succeeds("ingest", path)
     stored = session_of(path)["map"]
-    assert stored["resolution_m"] == told["resolution"]
-    assert stored["occupied"] == told["occupied_voxels_at_finest"]
-    assert stored["free"] == told["free_voxels_at_finest"]
+    assert stored["resolution_m"] == expected["resolution"]
+    assert stored["occupied"] == expected["occupied_voxels_at_finest"]
+    assert stored["free"] == expected["free_voxels_at_finest"]
     first = tmp_path / "flight.session" / "map" / "0.npz"
     assert first.exists()
 
@@ -170,12 +170,12 @@ def test_real_octomaps(tmp_path: Path, name: str) -> None:
     ],
 )
 def test_info_of_real_logs(name: str) -> None:
-    told = facts(name)
+    expected = facts(name)
     (reading,) = json.loads(succeeds("info", real_data(name), "--json"))["readings"]
-    assert reading["messages"] == told["messages"]
+    assert reading["messages"] == expected["messages"]
     # The public reader trusts metadata.yaml; if that is wrong, the reading has both values.
     stated = reading.get("metadata.yaml states", reading)
-    assert stated["first_ns"] == told["start_ns"]
+    assert stated["first_ns"] == expected["start_ns"]
     assert {topic: seen["messages"] for topic, seen in reading["topics"].items()} == {
-        topic: seen["count"] for topic, seen in told["topics"].items()
+        topic: seen["count"] for topic, seen in expected["topics"].items()
     }

@@ -67,9 +67,9 @@ def test_keypoints_of_larger_pictures_are_refused_with_numbers_outside(
     rng = np.random.default_rng(seed)
     xy = rng.uniform(0, [times * WIDTH, times * HEIGHT], (500, 2))  # a share 1 - 1 / times^2 lies outside
     confidence = np.full(500, 0.9 if all_alike else 0.0)
-    with pytest.raises(DataError) as told:
+    with pytest.raises(DataError) as caught:
         check(xy, confidence)
-    right, bottom = (int(n) for n in re.findall(r"to x = (-?\d+), y = (-?\d+)\)", str(told.value))[0])
+    right, bottom = (int(n) for n in re.findall(r"to x = (-?\d+), y = (-?\d+)\)", str(caught.value))[0])
     assert right > WIDTH or bottom > HEIGHT
     assert right <= times * WIDTH
     assert bottom <= times * HEIGHT
@@ -79,9 +79,9 @@ def test_keypoints_of_larger_pictures_are_refused_with_numbers_outside(
 def test_keypoints_that_count_from_elsewhere_are_refused_with_numbers_outside(seed: int) -> None:
     """Count pixels from the middle of the picture: in three quarters of it a coordinate is negative."""
     xy = np.random.default_rng(seed).uniform(-0.5, 0.5, (500, 2)) * [WIDTH, HEIGHT]
-    with pytest.raises(DataError) as told:
+    with pytest.raises(DataError) as caught:
         check(xy, np.ones(500))
-    left, top = (int(n) for n in re.findall(r"from x = (-?\d+), y = (-?\d+) to", str(told.value))[0])
+    left, top = (int(n) for n in re.findall(r"from x = (-?\d+), y = (-?\d+) to", str(caught.value))[0])
     assert -WIDTH / 2 - 1 <= left < 0
     assert -HEIGHT / 2 - 1 <= top < 0
 

@@ -24,7 +24,7 @@ LATE = SECOND // 20  # from stamp to receipt
 
 
 @dataclass
-class Told:
+class StatedLog:
     """Log of one topic."""
 
     type: str
@@ -105,8 +105,8 @@ def target(k: int, mask: int = 0b111111111000, frame: int = 1) -> tuple[int, Any
 
 
 def test_position_targets_say_where_to_unless_they_do_not() -> None:
-    told = Told(TARGET, [target(0), target(1, mask=0b000111000111), target(2, frame=8), target(3)])
-    found = read_commands(told, "d1.bag", "/sent", "header")  # type: ignore[arg-type]
+    log = StatedLog(TARGET, [target(0), target(1, mask=0b000111000111), target(2, frame=8), target(3)])
+    found = read_commands(log, "d1.bag", "/sent", "header")  # type: ignore[arg-type]
     np.testing.assert_array_equal(found.t_ns, [START, START + 3 * SECOND])
     np.testing.assert_array_equal(found.position, [[0, 5, 6], [3, 5, 6]])
     assert [(cause.split()[-1], count) for cause, count in found.dropped.items()] == [

@@ -256,7 +256,7 @@ def test_a_region_of_interest_and_binning_are_applied() -> None:
 
 
 @pytest.mark.parametrize(
-    ("stated", "told"),
+    ("stated", "reason"),
     [
         ({"k": np.zeros(9)}, "topic /t: the camera is not calibrated .focal lengths 0, 0."),
         ({"distortion_model": "CylinderCameraModel"}, "distortion model 'CylinderCameraModel' is none of"),
@@ -266,8 +266,8 @@ def test_a_region_of_interest_and_binning_are_applied() -> None:
         ({"k": [800, 5, 320, 0, 800, 240, 0, 0, 1]}, "skew"),
     ],
 )
-def test_what_is_no_camera_is_refused(stated: Any, told: str) -> None:
-    with pytest.raises(DataError, match=told) as error:
+def test_what_is_no_camera_is_refused(stated: Any, reason: str) -> None:
+    with pytest.raises(DataError, match=reason) as error:
         lens(camera_info("ros2", **stated))
     assert str(error.value).startswith("d1.mcap: ")
 
@@ -344,7 +344,7 @@ def test_kinds() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "type_name", "told"),
+    ("value", "type_name", "reason"),
     [
         (from_json(timestamp=JSON_STAMP), "foxglove.PoseInFrame", "lacks the field 'frame_id'"),
         (
@@ -373,8 +373,8 @@ def test_kinds() -> None:
         (None, "std_msgs/msg/String", "holds std_msgs/msg/String, which is not read"),
     ],
 )
-def test_messages_that_are_not_what_their_type_says(value: Any, type_name: str, told: str) -> None:
-    with pytest.raises(DataError, match=told):
+def test_messages_that_are_not_what_their_type_says(value: Any, type_name: str, reason: str) -> None:
+    with pytest.raises(DataError, match=reason):
         list(samples(message(value, type_name), "d1.mcap"))
 
 
