@@ -15,7 +15,7 @@ the nose.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
@@ -138,16 +138,16 @@ class Parts(NamedTuple):
     gimbal: list[str]
 
 
-def parts_of(preset: Preset, namespace: str, names: Sequence[str]) -> Parts:
+def parts_of(preset: Preset, namespace: str, names: Collection[str]) -> Parts:
     """Return the topics among `names` that a preset reads in a namespace."""
     driver = DRIVERS[preset]
+    positions = [part for parts in driver.positions.values() for part in parts]
+    return Parts(*(_among(names, namespace, driver, p) for p in (positions, driver.attitude, driver.gimbal)))
 
-    def among(parts: Iterable[str]) -> list[str]:
-        wanted = [f"{namespace}/{base}/{part}" for part in parts for base in driver.names]
-        return [name for name in wanted if name in names]
 
-    positions = (part for parts in driver.positions.values() for part in parts)
-    return Parts(among(positions), among(driver.attitude), among(driver.gimbal))
+def _among(names: Collection[str], prefix: str, driver: _Driver, parts: Iterable[str]) -> list[str]:
+    topics = [f"{prefix}/{base}/{part}" for part in parts for base in driver.names]
+    return [topic for topic in topics if topic in names]
 
 
 def read_preset(
@@ -171,13 +171,12 @@ def read_preset(
     Raises:
         DataError: no such topics, several drones, or nothing usable.
     """
-    counts = {topic.name: topic.count for topic in recording.topics}
     driver = DRIVERS[preset]
-    prefix = _prefix(source, preset, namespace, counts)
+    prefix = _prefix(source, preset, namespace, [topic.name for topic in recording.topics])
+    with_messages = {topic.name for topic in recording.topics if topic.count}
 
     def first(parts: Sequence[str]) -> str | None:
-        topics = [f"{prefix}/{base}/{part}" for part in parts for base in driver.names]
-        return next((topic for topic in topics if counts.get(topic)), None)
+        return next(iter(_among(with_messages, prefix, driver, parts)), None)
 
     wanted = [choice.position] if choice.position else list(driver.positions)
     places = {kind: topic for kind in wanted if (topic := first(driver.positions[kind]))}
@@ -191,12 +190,12 @@ def read_preset(
     kind, place = next(iter(places.items()))
     dropped: dict[str, int] = {}
     notes = [f"{source}: took the {kind} position from {place}"]
-    position = _position(recording, source, place, driver.height, stamps, dropped)
+    position = read_positions(recording, source, place, stamps, dropped, driver.height)
     fixes = first([part for kind in ("global", "gps") for part in driver.positions[kind]])
     if not position.on_earth and fixes:
-        on_earth = _position(recording, source, fixes, driver.height, stamps, {})
-        position, said = placed_by(position, on_earth)
-        notes.append(f"{source}: {said}")
+        on_earth = read_positions(recording, source, fixes, stamps, {}, driver.height)
+        position, placed = placed_by(position, on_earth)
+        notes.append(f"{source}: {placed}")
 
     body: AttitudeTrack | None = None
     if attitude := first(driver.attitude):
@@ -205,8 +204,8 @@ def read_preset(
     gimbal: AttitudeTrack | None = None
     if angles := first(driver.gimbal):
         gimbal = _gimbal(recording, source, angles, preset, body, stamps, dropped)
-    if said := _gps_time(recording, source, f"{prefix}/mavros/time_reference", counts):
-        notes.append(said)
+    if f"{prefix}/mavros/time_reference" in with_messages:
+        notes += _gps_time(recording, source, f"{prefix}/mavros/time_reference")
     return Telemetry(
         position=position,
         body=body,
@@ -238,7 +237,7 @@ def read_pair(
         if not counts.get(name):
             raise DataError(source, f"has no topic {name}, or nothing in it", "name another")
     dropped: dict[str, int] = {}
-    track = _position(recording, source, position, "ellipsoid", stamps, dropped)
+    track = read_positions(recording, source, position, stamps, dropped)
     rows = _read(recording, source, attitude, _quaternion_of)
     turned = rows.values()
     if axes == "ned":
@@ -255,18 +254,42 @@ def read_pair(
 
 
 def read_positions(
-    recording: Log, source: str, topic: str, stamps: Stamps, dropped: dict[str, int]
+    recording: Log,
+    source: str,
+    topic: str,
+    stamps: Stamps,
+    dropped: dict[str, int],
+    height: Height = "ellipsoid",
 ) -> PositionTrack:
     """Read a topic of positions alone; unusable rows are counted in `dropped`.
 
     Raises:
         DataError: nothing usable in it.
     """
-    return _position(recording, source, topic, "ellipsoid", stamps, dropped)
+    if _type_of(recording, topic) != NAV_SAT_FIX:
+        rows = _read(recording, source, topic, _point_of)
+        return position_track(source, topic, rows.times(stamps), rows.values(), dropped, on_earth=False)
+    rows = _read(recording, source, topic, _fix_of)
+    values = rows.values()
+    track = position_track(
+        source,
+        topic,
+        rows.times(stamps),
+        values[:, :3],
+        dropped,
+        on_earth=True,
+        height=height,
+        unusable={"no fix": values[:, 3] <= _NO_FIX},
+    )
+    variance = values[(values[:, 4] > 0) & (values[:, 5] > 0)][:, 4:]
+    if not len(variance):
+        return track
+    sigma = np.sqrt(np.median(variance, axis=0))
+    return replace(track, accuracy_m=(float(sigma[0]), float(sigma[1])))
 
 
-def _prefix(source: str, preset: Preset, namespace: str | None, counts: dict[str, int]) -> str:
-    there = [before for known, before in namespaces(list(counts)) if known == preset]
+def _prefix(source: str, preset: Preset, namespace: str | None, names: Sequence[str]) -> str:
+    there = [before for known, before in namespaces(names) if known == preset]
     if namespace is not None:
         wanted = namespace.rstrip("/")
         wanted = wanted if wanted.startswith("/") or not wanted else f"/{wanted}"
@@ -294,36 +317,6 @@ def _prefix(source: str, preset: Preset, namespace: str | None, counts: dict[str
 # --- topics --------------------------------------------------------------------------------------------
 
 
-def _position(
-    recording: Log,
-    source: str,
-    topic: str,
-    height: Height,
-    stamps: Stamps,
-    dropped: dict[str, int],
-) -> PositionTrack:
-    if _type_of(recording, topic) != NAV_SAT_FIX:
-        rows = _read(recording, source, topic, _point_of)
-        return position_track(source, topic, rows.times(stamps), rows.values(), dropped, on_earth=False)
-    rows = _read(recording, source, topic, _fix_of)
-    values = rows.values()
-    track = position_track(
-        source,
-        topic,
-        rows.times(stamps),
-        values[:, :3],
-        dropped,
-        on_earth=True,
-        height=height,
-        unusable={"no fix": values[:, 3] <= _NO_FIX},
-    )
-    variance = values[(values[:, 4] > 0) & (values[:, 5] > 0)][:, 4:]
-    if not len(variance):
-        return track
-    sigma = np.sqrt(np.median(variance, axis=0))
-    return replace(track, accuracy_m=(float(sigma[0]), float(sigma[1])))
-
-
 def _gimbal(
     recording: Log,
     source: str,
@@ -347,10 +340,10 @@ def _gimbal(
     return attitude_track(topic, rows.times(stamps), turned_as_stated(angles), dropped, stated=stated)
 
 
-def _gps_time(recording: Log, source: str, topic: str, counts: dict[str, int]) -> str:
+def _gps_time(recording: Log, source: str, topic: str) -> list[str]:
     """Describe offset and drift of the log's stamps to the autopilot's GPS time; empty without GPS time."""
-    if not counts.get(topic) or _type_of(recording, topic) != _TIME_REFERENCE:
-        return ""
+    if _type_of(recording, topic) != _TIME_REFERENCE:
+        return []
     pairs = []
     for message in recording.messages([topic]):
         try:
@@ -360,11 +353,11 @@ def _gps_time(recording: Log, source: str, topic: str, counts: dict[str, int]) -
     stamped = np.array([pair for pair in pairs if min(pair) > 0], dtype=np.int64).reshape(-1, 2)
     fit = fit_clock(stamped[:, 0], stamped[:, 1])
     if fit is None:
-        return ""
-    return (
+        return []
+    return [
         f"{source}: GPS time is {fit.offset_ns / 1e9:.3f} s ahead of its stamps, drifting"
         f" {fit.drift_ppm:.1f} ppm (+- {fit.drift_sigma_ppm:.1f}; {topic}, not applied)"
-    )
+    ]
 
 
 def _type_of(recording: Log, topic: str) -> str:
@@ -383,10 +376,10 @@ def _read(recording: Log, source: str, topic: str, numbers: Callable[[Any], Sequ
         value = message.value
         try:
             header = getattr(value, "header", None)
-            said = [float(number) for number in numbers(value)]
+            row = [float(number) for number in numbers(value)]
             rows.header_ns.append(0 if header is None else nanoseconds(header.stamp))
             rows.receive_ns.append(message.receive_ns)
-            rows.numbers.extend(said)
+            rows.numbers.extend(row)
             if header is not None:
                 rows.frames.add(str(header.frame_id))
         except FAULTS as error:
