@@ -22,11 +22,7 @@ def hash_sources(
 ) -> tuple[dict[str, str], dict[str, dict[str, int]]]:
     """Compute the sha256 of every file that is read, and the damage, both by the manifest's path.
 
-    Args:
-        flight: the manifest.
-        base: the folder that its paths are relative to.
-        progress: receives the progress.
-        meanwhile: steps to run until all is hashed.
+    Steps of `meanwhile` run until all is hashed.
     """
     unique = stated_paths(flight)
     for path in unique:  # before anything waits for one of them
@@ -51,10 +47,6 @@ def hash_sources(
 
 def source_stamps(flight: Flight, base: Path) -> dict[str, str]:
     """Return the stamp of every file that is read, by the manifest's path.
-
-    Args:
-        flight: the manifest.
-        base: the folder that its paths are relative to.
 
     Raises:
         DataError: one of them is missing or cannot be read.

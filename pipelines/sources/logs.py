@@ -298,12 +298,7 @@ class FlightLogs:
 
 
 def doubts_of_stamps(check: StampCheck, stamps: str) -> list[str]:
-    """Describe how the stamps of a log disagree with each other, one line each.
-
-    Args:
-        check: statistics of the stamps.
-        stamps: the stamps in use, header or receive.
-    """
+    """Describe how the stamps of a log disagree with each other, one line each."""
     used, doubts = f"{stamps} stamps are used", []
     if check.without_header:
         doubts.append(

@@ -32,13 +32,6 @@ def maps_of_log(
 ) -> LoggedMaps:
     """Read the maps of a topic, in ENU axes at world times.
 
-    Args:
-        flight: the manifest.
-        stated: the log and topic.
-        logs: of the flight.
-        max_gap_ns: the longest gap between two transforms that is interpolated.
-        note: receives each choice and each doubt, one line each.
-
     Raises:
         DataError: no such topic, several candidates, no readable map, or a map in a frame that the
             log does not connect with its world.

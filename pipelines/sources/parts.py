@@ -103,16 +103,7 @@ def camera_entry(
     stamps: str | None,
     note: Callable[[str], None],
 ) -> CameraEntry:
-    """Describe a camera for session.json; note doubts about its poses, and losses.
-
-    Args:
-        name: the camera's.
-        camera: its part of the manifest.
-        data: as read.
-        interpolation: of its poses.
-        base: the folder that the manifest's paths are relative to.
-        stamps: the stamps in use of the log that its poses come from; None if they come from a file.
-        note: receives each doubt and each loss, one line each.
+    """Describe a camera for session.json; note doubts about its poses, and losses, one line each.
 
     Raises:
         DataError: no frame has a pose.

@@ -37,11 +37,6 @@ class Pictures(Protocol):
 def open_pictures(session: Path, description: Description, camera: str) -> Iterator[Pictures]:
     """Open the pictures that a session was made from; check before and after that they did not change.
 
-    Args:
-        session: its folder.
-        description: its session.json.
-        camera: name of a camera that has pictures.
-
     Raises:
         DataError: they are missing, differ from those that were ingested, or cannot be read.
     """
@@ -61,11 +56,6 @@ def refuse_changed_pictures(session: Path, description: Description, cameras: It
 
     A file with the size and the time of change that ingest noted is taken to be the same. The content of any
     other file is hashed, so copies pass. Missing files pass too; opening them fails later.
-
-    Args:
-        session: its folder.
-        description: its session.json.
-        cameras: names of cameras that have pictures.
 
     Raises:
         DataError: a file has other content than the one that was ingested.
@@ -101,11 +91,6 @@ def _media(description: Description, camera: str) -> MediaEntry:
 
 class LoggedPictures:
     """Pictures of a topic, numbered as in ingest; reading forward is cheap, reading backward restarts.
-
-    Args:
-        paths: the files of the recording.
-        topic: the topic.
-        stamps: which stamps order the pictures: header or receive.
 
     Raises:
         DataError: the log cannot be opened, or the encoding of its pictures is unknown.

@@ -47,13 +47,7 @@ def as_stated(trajectory: Trajectory, pose: PoseSource) -> Trajectory:
 
 
 def world_times(clock: LogClock, t_ns: Int64, since_ns: int) -> Int64:
-    """Convert a log's own times to world times [N].
-
-    Args:
-        clock: the log's clock in the manifest.
-        t_ns: [N].
-        since_ns: the time from which the drift counts.
-    """
+    """Convert a log's own times to world times [N]; its drift counts from `since_ns`."""
     drift_ns = np.round((t_ns - since_ns) * (clock.drift_ppm * 1e-6)).astype(np.int64)
     world_ns: Int64 = t_ns + drift_ns + round(clock.offset_s * 1e9)
     return world_ns

@@ -59,14 +59,10 @@ class _Way:
 def read_commands(recording: Log, source: str, topic: str, stamps: Stamps) -> Trajectory:
     """Read the positions that a topic of one of `COMMAND_TYPES` commanded, in the axes of the log.
 
+    By the stamps of receipt, a plan begins at the time of its receipt.
+
     Setpoints without a position or relative to the body are dropped and counted, and so are empty
     plans. The rotation is the identity and has no meaning.
-
-    Args:
-        recording: the log.
-        source: its path, for messages.
-        topic: its name; one of these types.
-        stamps: the stamps to use; with receipt, a plan begins at the time of its receipt.
 
     Raises:
         DataError: a message cannot be read, the points of a plan have no increasing times, a plan moves

@@ -53,25 +53,15 @@ _FLOAT_TYPES = {7: "f4", 8: "f8"}
 
 @dataclass(frozen=True)
 class MapTopic:
-    """Settings to read the messages of a topic of maps.
+    """Settings to read the messages of a topic of maps."""
 
-    Args:
-        source: log and topic, for messages.
-        frame: of all its messages.
-        stamps: the stamps in use: header or receive.
-        world_from_frame: poses of that frame; a single row always holds.
-        max_gap_ns: the longest gap between two of its rows that is interpolated.
-        resolution_m: side of the voxels, if it is stated.
-        height_m: height of the cells of a floor plan.
-    """
-
-    source: str
-    frame: str
+    source: str  # log and topic, for messages
+    frame: str  # of all its messages
     stamps: Stamps
-    world_from_frame: Trajectory
-    max_gap_ns: int
-    resolution_m: float | None
-    height_m: float
+    world_from_frame: Trajectory  # a single row always holds
+    max_gap_ns: int  # the longest gap between two of its rows that is interpolated
+    resolution_m: float | None  # side of the voxels, if it is stated
+    height_m: float  # of the cells of a floor plan
 
 
 @dataclass(frozen=True)
@@ -98,12 +88,7 @@ class _Change:
 
 
 def read_maps(read: Callable[[], Iterator[Message]], type_: str, about: MapTopic) -> LoggedMaps:
-    """Read the maps of a topic, in the world's axes and by the log's times.
-
-    Args:
-        read: returns the messages in the order of receipt, anew at each call.
-        type_: of the messages.
-        about: settings to read them.
+    """Read the maps of a topic, in the world's axes and by the log's times; `read` begins anew at each call.
 
     Raises:
         DataError: no map is usable, or one is too large.

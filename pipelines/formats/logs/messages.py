@@ -64,10 +64,6 @@ def samples(message: Message, source: Source) -> Iterator[Sample]:
     A CameraInfo's K is of the full sensor; region of interest and binning are applied, so that the
     intrinsics are those of the pictures beside it.
 
-    Args:
-        message: of a topic that `kind_of` knows.
-        source: the log, for messages to the user.
-
     Raises:
         DataError: the type is not read, a field is missing or no number, a camera is not calibrated
             (K is zero) or has an unknown distortion model, or a path's poses have no stamps.

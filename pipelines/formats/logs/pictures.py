@@ -86,11 +86,6 @@ def picture_stamps(recording: Log, topic: str, source: Path | str) -> tuple[Int6
 
     The order is that of receipt. If the messages have one layout, only the beginning of each is read.
 
-    Args:
-        recording: an open log.
-        topic: its name.
-        source: the log, for messages to the user.
-
     Raises:
         DataError: the topic holds something else.
     """

@@ -160,13 +160,7 @@ def read_preset(
 ) -> Telemetry:
     """Read position, attitude and gimbal of a drone, from the usual topics of its driver.
 
-    Args:
-        recording: the log.
-        source: its name, for messages.
-        preset: the driver.
-        namespace: the prefix of the driver's name, if the log holds several drones.
-        choice: the kind of position, if the user chose one.
-        stamps: the stamps to use: header or receive.
+    A namespace is needed if the log holds several drones.
 
     Raises:
         DataError: no such topics, several drones, or nothing usable.
@@ -221,13 +215,7 @@ def read_pair(
 ) -> Telemetry:
     """Read a topic of positions (NavSatFix, PointStamped) and one of attitudes (Imu, QuaternionStamped).
 
-    Args:
-        recording: the log.
-        source: its name, for messages.
-        position: the topic of the positions.
-        attitude: the topic of the attitudes, of the body in the world.
-        axes: of attitudes and of positions in metres.
-        stamps: the stamps to use: header or receive.
+    Axes are those of attitudes, and of positions in metres.
 
     Raises:
         DataError: no such topics, or nothing usable in them.

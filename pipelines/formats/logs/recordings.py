@@ -86,14 +86,11 @@ class LogPart(ABC):
 
     @abstractmethod
     def read_alike(self, rows: Int64) -> Iterator[tuple[Int64, NDArray[np.uint8]]]:
-        """Yield the bytes of messages that are all of one length, many at a time.
+        """Yield the bytes of messages of one channel that are all of one length, many at a time.
 
         Yields:
             Rows of the table, increasing, and their messages [n, length]. Unreadable rows are passed to
             `lose`.
-
-        Args:
-            rows: of one channel, increasing.
 
         Raises:
             UnlikeError: their records or lengths differ, or one is not at the index's position.

@@ -205,10 +205,6 @@ def poses_of(recording: Log, topic: str, source: Source, stamps: Stamps) -> Gath
 def poses_one_by_one(samples: Iterable[Sample], source: Source) -> LoggedRows:
     """Gather the poses of one body.
 
-    Args:
-        samples: poses in the order of receipt.
-        source: the log and topic, for messages.
-
     Raises:
         DataError: samples that are no poses, or poses of several bodies.
     """
@@ -326,12 +322,7 @@ def transforms_in(recording: Log, source: str, topic: str | None = None) -> Tran
 def transforms_of(
     samples: Iterable[Sample], source: Source, *, static: Iterable[Sample] = ()
 ) -> TransformLog:
-    """Collect every transform of a log, between any frames; they are cleaned when used.
-
-    Args:
-        samples: of /tf and similar topics, in the order of receipt.
-        source: the log, for messages.
-        static: of /tf_static: these always hold.
+    """Collect every transform of a log, between any frames, cleaned when used; those of `static` always hold.
 
     Raises:
         DataError: samples that are no transforms.
