@@ -32,6 +32,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
@@ -193,7 +194,7 @@ def ingested(log: Path) -> int:
 
 
 def write(folder: Path, container: str, topics: Topics, picture_bytes: int, megabytes: int) -> Path:
-    """Write the log with rosbags; the pictures do not compress, as JPEGs do not."""
+    """Write the log with rosbags; the pictures do not compress: a small JPEG, and noise behind its end."""
     folder.mkdir()
     store = ROS1 if container == "ros1" else ROS2
     serialize = store.serialize_ros1 if container == "ros1" else store.serialize_cdr
@@ -207,6 +208,7 @@ def write(folder: Path, container: str, topics: Topics, picture_bytes: int, mega
         writer = Ros2Writer(path, version=9, storage_plugin=plugin)
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 256, 4 * picture_bytes, dtype=np.uint8)
+    jpeg = cv2.imencode(".jpg", np.zeros((9, 16, 3), np.uint8))[1].ravel()
     turn = {"w": 1.0}
     with writer:
         connections: dict[str, Any] = {
@@ -218,6 +220,8 @@ def write(folder: Path, container: str, topics: Topics, picture_bytes: int, mega
             stamp_ns = 1_700_000_000_000_000_000 + tick * 1_000_000_000 // TICKS_HZ
             place = {"x": 1.5 * tick / TICKS_HZ, "z": 5.0}
             start = int(rng.integers(3 * picture_bytes))
+            picture = noise[start : start + picture_bytes].copy()
+            picture[: len(jpeg)] = jpeg
             fields = {
                 "header": {"stamp": stamp_ns, "frame_id": "odom"},
                 "child_frame_id": "base_link",
@@ -225,7 +229,7 @@ def write(folder: Path, container: str, topics: Topics, picture_bytes: int, mega
                 "transform": {"translation": place, "rotation": turn},
                 "orientation": turn,
                 "format": "jpeg",
-                "data": noise[start : start + picture_bytes],
+                "data": picture,
             }
             for topic, (type_, every) in topics.items():
                 if tick % every == 0:
