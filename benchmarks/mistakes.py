@@ -1,6 +1,7 @@
 """Mistakes in a flight's description: are they doubted, named, and does the remedy mend them?
 
     python -m benchmarks.mistakes [--folder FOLDER] [--kept] [FLIGHT ...]
+    python -m benchmarks.mistakes --right 40    # random right flights: none should be doubted
 
 Right flights (simulated, modelled keypoints) are described anew with one mistake each. A mistake counts if
 the error of the skeleton grows by more than 20 %, or nothing can be reconstructed. `named`: the first doubt
@@ -359,6 +360,16 @@ def of_mounts(turn: Float, only: str | None = None) -> Change:
     return apply
 
 
+def looks_left(mistaken: Mistaken) -> None:
+    """State that every camera looks to the left of the body, or write its attitude so."""
+    for name in mistaken.names:
+        if mistaken.of.flight.carried:
+            mistaken.manifest["cameras"][name]["mount"]["looks"] = "left"
+        else:
+            stamps, (position, quaternion) = mistaken.poses[name]
+            mistaken.poses[name] = (stamps, (position, multiply(quaternion, turned("y", -90))))
+
+
 def of_cameras(change: Callable[[Mistaken, str, dict[str, Any]], None], only: str | None = None) -> Change:
     def apply(mistaken: Mistaken) -> None:
         for name in mistaken.names:
@@ -483,7 +494,7 @@ def _mistakes() -> list[Mistake]:
         Mistake("upside down, all", ("mount",), of_mounts(turned("z", 180))),
         Mistake("rolled by 90, one", ("mount",), of_mounts(turned("z", 90), one)),
         Mistake("tilt's sign, all", ("mount",), of_mounts(turned("x", 2 * DOWN_DEG))),
-        Mistake("looks left, all", ("mount", "pose"), of_mounts(turned("y", -90))),
+        Mistake("looks left, all", ("mount", "pose"), looks_left),
         Mistake("pictures mirrored", ("mirrored",), with_keypoints(both)),
         Mistake("x mirrored", ("mirrored",), with_keypoints(mirrored)),
         Mistake("names mirrored", ("mirrored",), with_keypoints(lambda pixels, _: pixels[COCO_SWAPPED])),
@@ -570,13 +581,71 @@ def with_remedy(manifest: Path, remedy: str) -> bool:
     return True
 
 
+_MOTIONS = (
+    "[walk: {distance_m: 7, turn_deg: 60}]",
+    "[jog: {distance_m: 14, turn_deg: -30}]",
+    "[stand: {seconds: 6}]",
+    "[crouch: {seconds: 3, depth: 0.9}, walk: {distance_m: 3}]",
+    "[kick: {foot: right, run_up_m: 3}, turn: {deg: 180}]",
+    "[turn: {deg: 270}, reach: {side: left, height_m: 2.0}, walk: {distance_m: 2}]",
+)
+_NOISES = (
+    "{white: {position_m: 0.02, rotation_deg: 0.2}, bias: {position_m: 0.05, rotation_deg: 0.3}}",
+    "{white: {position_m: 0.3, rotation_deg: 1}}",
+    "{bias: {position_m: 0.5, rotation_deg: 2}}",
+    "{white: {position_m: 0.5, rotation_deg: 2}}",
+    "{gauss-markov: {position_m: 0.3, rotation_deg: 0.5, correlation_s: 10}}",
+)
+
+
+def right_flight(seed: int) -> Flight:
+    """Draw a right flight: motion, people, drones, formation, stated noise, what was logged."""
+    draw = np.random.default_rng(seed)
+    moving = f", yaw_rate_deg_per_s: {draw.uniform(-10, 10):.1f}" if draw.random() < 0.5 else ""
+    formation = (
+        f"{{radius_m: {draw.uniform(6, 14):.1f}, tilt_deg: {draw.uniform(5, 40):.0f},"
+        f" yaw_deg: {draw.uniform(0, 360):.0f}{moving}}}"
+    )
+    sex = ("male", "female")[int(draw.integers(2))]
+    return Flight(
+        f"right{seed}",
+        int(draw.integers(2, 5)),
+        _MOTIONS[int(draw.integers(len(_MOTIONS)))],
+        formation,
+        seed,
+        carried=bool(draw.random() < 0.5),
+        actor=bool(draw.random() < 0.5),
+        map=bool(draw.random() < 0.5),
+        body=f"{{sex: {sex}, height_m: {draw.normal(1.78 if sex == 'male' else 1.65, 0.07):.2f}}}",
+        heading=int(draw.integers(360)),
+        noise=_NOISES[int(draw.integers(len(_NOISES)))],
+    )
+
+
+def doubted_right_flights(folder: Path, count: int) -> None:
+    """Check random right flights, and print those that are doubted."""
+    doubted = 0
+    for seed in range(100, 100 + count):
+        flight = right_flight(seed)
+        manifest = mistaken(Described(flight, folder / flight.name), None)
+        doubts = check(manifest).doubts
+        doubted += bool(doubts)
+        if doubts:
+            print(f"{flight}\n  {doubts[0].code}: {doubts[0].what} {doubts[0].evidence}", flush=True)
+    print(f"{doubted} of {count} right flights doubted")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Measure how mistakes in descriptions are named.")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()) / "mocap_mistakes")
     parser.add_argument("--kept", action="store_true", help="The flights that were kept aside.")
     parser.add_argument("--mistake", action="append", default=[], help="Only these; repeat it for several.")
+    parser.add_argument("--right", type=int, metavar="N", help="Check random right flights instead.")
     parser.add_argument("flights", nargs="*")
     options = parser.parse_args()
+    if options.right:
+        doubted_right_flights(options.folder, options.right)
+        return
     print("| flight | mistake | error mm | first doubt | named | after the remedy mm |")
     print("| --- | --- | --- | --- | --- | --- |")
     tallies: dict[int, list[tuple[bool, bool, bool]]] = {2: [], 3: []}

@@ -20,6 +20,7 @@ from benchmarks.mistakes import (
     clock,
     focal,
     heading,
+    looks_left,
     mirrored,
     mistaken,
     of_cameras,
@@ -93,7 +94,7 @@ def test_reconstruct_states_doubts_and_strict_refuses(flight: Described, tmp_pat
 
 
 def test_what_cannot_be_reconstructed_names_the_mistake(flight: Described, tmp_path: Path) -> None:
-    manifest, session = mistaken(flight, of_mounts(turned("y", -90))), tmp_path / "left.session"
+    manifest, session = mistaken(flight, looks_left), tmp_path / "left.session"
     succeeds("ingest", manifest, "-o", session)
     assert re.search(
         r"cameras\.drone1\.mount: \{(looks: forward|body_from_camera)", refused("reconstruct", session)

@@ -302,8 +302,9 @@ def _person(flight: Sampled, scene: Scene, solved: Solved) -> _Person | None:
     }
     odd["unposed"] = _unposed(scene) / 0.05
     odd |= body.posture()
-    odd |= body.motion(flight, stature)
-    odd |= _place(flight, scene, solved, body)
+    far_m = _distances(solved)
+    odd |= body.motion(flight, stature, _moved_by(scene.sigma[:, 2:], far_m))
+    odd |= _place(flight, scene, body, far_m)
     return _Person(odd, stature)
 
 
@@ -356,34 +357,52 @@ class _Body:
         forwards: Float = np.cross(up, self["right_hip"] - self["left_hip"])
         return forwards
 
-    def motion(self, flight: Sampled, stature: float) -> dict[str, float]:
-        """Say how oddly the person moves: not forwards, faster than people, or with a foot that slides."""
+    def motion(self, flight: Sampled, stature: float, white_m: float) -> dict[str, float]:
+        """Say how oddly the person moves: not forwards, faster than people, or with a foot that slides.
+
+        Args:
+            flight: the flight.
+            stature: m.
+            white_m: by how much pose errors that are new in every pose move the person.
+        """
         step_s = STEP_NS / 1e9
+        noise = np.sqrt(2) * white_m / step_s  # m/s
         moved = (self.hips[flight.second] - self.hips[flight.first]) / step_s
-        fast = _quantile(np.linalg.norm(moved[:, :2], axis=-1), 0.75)
+        pace = np.linalg.norm(moved[:, :2], axis=-1)
         feet = [
             np.linalg.norm(self[name][flight.second] - self[name][flight.first], axis=-1) / step_s
             for name in ("left_ankle", "right_ankle")
         ]
         forwards = self._forwards()[flight.first, :2]
-        walks = np.linalg.norm(moved[:, :2], axis=-1) > 0.7
+        walks = pace > 0.7 + 2 * noise
         course = (moved[:, :2] * forwards).sum(axis=-1)[walks]
-        course /= np.linalg.norm(moved[walks, :2], axis=-1) * np.linalg.norm(forwards[walks], axis=-1)
+        course /= pace[walks] * np.linalg.norm(forwards[walks], axis=-1)
         ahead = _median(course) if np.isfinite(course).sum() >= 8 else 1.0
+        climbed = _median(np.abs(moved[:, 2]))
         return {
             "course": max(0.0, 0.5 - ahead) / 0.3,
-            "speed": max(0.0, fast - 4.0) / 2,
-            "climb": max(0.0, _median(np.abs(moved[:, 2])) - 0.5) / 0.5,
-            "slide": max(0.0, _median(np.minimum(*feet)) - 0.4 * stature / 1.7) / 0.5,
+            "speed": max(0.0, _quantile(pace, 0.75) - 4.0 - 1.5 * noise) / (2 + noise),
+            "climb": max(0.0, climbed - 0.5 - noise) / (0.5 + noise / 2),
+            "slide": max(0.0, _median(np.minimum(*feet)) - 0.4 * stature / 1.7 - noise) / (0.5 + noise / 2),
         }
 
 
-def _place(flight: Sampled, scene: Scene, solved: Solved, body: _Body) -> dict[str, float]:
+def _distances(solved: Solved) -> Float:
+    """Return the median distance [C] m of the joints from each camera."""
+    far = [_median(np.abs(depth[seen])) for depth, seen in zip(solved.depth, solved.seen, strict=True)]
+    near_enough: Float = np.minimum(np.nan_to_num(np.array(far), nan=10.0), _FARTHEST_M)
+    return near_enough
+
+
+def _moved_by(sigma: Float, far_m: Float) -> float:
+    """Return by how much errors of poses, position m and rotation rad [C, 2], move a person at a distance."""
+    return float(np.sqrt(np.mean(sigma[:, 0] ** 2 + (far_m * sigma[:, 1]) ** 2)))
+
+
+def _place(flight: Sampled, scene: Scene, body: _Body, far_m: Float) -> dict[str, float]:
     """Say how far the person is from where people are: below drones, on the ground, at the logged actor."""
     odd: dict[str, float] = {}
-    far = [_median(np.abs(depth[seen])) for depth, seen in zip(solved.depth, solved.seen, strict=True)]
-    far_m = np.minimum(np.nan_to_num(np.array(far), nan=10.0), _FARTHEST_M)
-    stated_m = float(np.sqrt(np.mean(scene.sigma[:, 0] ** 2 + (far_m * scene.sigma[:, 1]) ** 2)))
+    stated_m, white_m = _moved_by(scene.sigma[:, :2], far_m), _moved_by(scene.sigma[:, 2:], far_m)
     if not all(camera.static for camera in flight.cameras):
         odd["above"] = max(0.0, _median(body.hips[:, 2]) - _median(scene.position[..., 2])) / 2.0
     if flight.ground is not None:
@@ -399,7 +418,8 @@ def _place(flight: Sampled, scene: Scene, solved: Solved, body: _Body) -> dict[s
         apart = body.hips - flight.hips
         constant = np.array([_median(apart[:, axis]) for axis in range(3)])
         odd["actor"] = max(0.0, float(np.linalg.norm(constant)) - 0.25 - 2 * stated_m) / 0.4
-        odd["actor_path"] = max(0.0, _median(np.linalg.norm(apart - constant, axis=-1)) - 0.45) / 0.3
+        path = _median(np.linalg.norm(apart - constant, axis=-1))
+        odd["actor_path"] = max(0.0, path - 0.45 - 2 * white_m) / 0.3
     return {name: value for name, value in odd.items() if np.isfinite(value)}
 
 
