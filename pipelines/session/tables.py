@@ -22,82 +22,40 @@ from pipelines.session.records import POINT_COVARIANCE_COLUMNS, Detections, Int6
 if TYPE_CHECKING:
     import pandas as pd
 
-_POSE = [(name, pa.float64()) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+_T_NS, _CAMERA, _PERSON = ("t_ns", pa.int64()), ("camera", pa.string()), ("person", pa.int64())
+_FRAME, _JOINT, _STATUS = ("frame", pa.int64()), ("joint", pa.string()), ("status", pa.string())
+_XY, _XYZ = ([(name, pa.float64()) for name in names] for names in ("xy", "xyz"))
+_POSE = [*_XYZ, *((name, pa.float64()) for name in ("qx", "qy", "qz", "qw"))]
 COVARIANCE_COLUMNS = tuple(f"c{i}{j}" for i in range(6) for j in range(i, 6))
 """Upper triangle of a pose covariance: position in world, rotation vector in camera."""
 
-FRAMES = pa.schema([("frame", pa.int64()), ("t_ns", pa.int64()), ("pts_ns", pa.int64())])
-POSES = pa.schema([("t_ns", pa.int64()), *_POSE])
+FRAMES = pa.schema([_FRAME, _T_NS, ("pts_ns", pa.int64())])
+POSES = pa.schema([_T_NS, *_POSE])
 POSES_WITH_COVARIANCE = pa.schema([*POSES, *[(name, pa.float64()) for name in COVARIANCE_COLUMNS]])
-KEYPOINTS = pa.schema(
-    [
-        ("frame", pa.int64()),
-        ("t_ns", pa.int64()),
-        ("person", pa.int64()),
-        ("joint", pa.string()),
-        ("x", pa.float64()),
-        ("y", pa.float64()),
-        ("confidence", pa.float64()),
-    ]
-)
-ACTOR = pa.schema(
-    [
-        ("t_ns", pa.int64()),
-        ("person", pa.int64()),
-        ("x", pa.float64()),
-        ("y", pa.float64()),
-        ("z", pa.float64()),
-    ]
-)
-TRUTH = pa.schema(
-    [
-        ("t_ns", pa.int64()),
-        ("person", pa.int64()),
-        ("joint", pa.string()),
-        ("x", pa.float64()),
-        ("y", pa.float64()),
-        ("z", pa.float64()),
-    ]
-)
-CAMERA_POSES = pa.schema([("t_ns", pa.int64()), ("camera", pa.string()), *_POSE])
+KEYPOINTS = pa.schema([_FRAME, _T_NS, _PERSON, _JOINT, *_XY, ("confidence", pa.float64())])
+ACTOR = pa.schema([_T_NS, _PERSON, *_XYZ])
+TRUTH = pa.schema([_T_NS, _PERSON, _JOINT, *_XYZ])
+CAMERA_POSES = pa.schema([_T_NS, _CAMERA, *_POSE])
 """truth_poses.parquet: the true pose of every camera."""
 
-PLAN = pa.schema(
-    [
-        ("t_ns", pa.int64()),
-        ("camera", pa.string()),
-        ("x", pa.float64()),
-        ("y", pa.float64()),
-        ("z", pa.float64()),
-    ]
-)
+PLAN = pa.schema([_T_NS, _CAMERA, *_XYZ])
 """plan.parquet: the setpoints of the on-board planner for every drone."""
 
 SKELETON = pa.schema(
     [
-        ("t_ns", pa.int64()),
-        ("person", pa.int64()),
-        ("joint", pa.string()),
-        ("x", pa.float64()),
-        ("y", pa.float64()),
-        ("z", pa.float64()),
-        *[(name, pa.float64()) for name in POINT_COVARIANCE_COLUMNS],
+        *(_T_NS, _PERSON, _JOINT, *_XYZ),
+        *((name, pa.float64()) for name in POINT_COVARIANCE_COLUMNS),
         ("views", pa.int64()),
         ("reprojection_px", pa.float64()),
-        ("status", pa.string()),
+        _STATUS,
     ]
 )
 
+_SLOT = ("formation_yaw_rad", "slot_yaw_rad", "slot_tilt_rad", "slot_range_m", "tilt_rad")
 REPLAN = pa.schema(
     [
-        ("t_ns", pa.int64()),
-        ("camera", pa.string()),
-        *_POSE,
-        ("formation_yaw_rad", pa.float64()),
-        ("slot_yaw_rad", pa.float64()),
-        ("slot_tilt_rad", pa.float64()),
-        ("slot_range_m", pa.float64()),
-        ("tilt_rad", pa.float64()),
+        *(_T_NS, _CAMERA, *_POSE),
+        *((name, pa.float64()) for name in _SLOT),
         ("visible", pa.bool_()),
         ("predicted_error_m", pa.float64()),
     ]
@@ -105,19 +63,10 @@ REPLAN = pa.schema(
 """replan/<arm>/trajectories.parquet, sorted by time, then camera: the pose (world_from_camera), the commanded
 slot (yaw continuous, NaN for the flown trajectories), the tilt above the actor, `visible` (True if nothing
 blocks the sight line), and the predicted error of all cameras together (NaN where not determined)."""
-SEEN = pa.schema(
-    [
-        ("t_ns", pa.int64()),
-        ("camera", pa.string()),
-        ("joint", pa.string()),
-        ("x", pa.float64()),
-        ("y", pa.float64()),
-        ("status", pa.string()),
-    ]
-)
+SEEN = pa.schema([_T_NS, _CAMERA, _JOINT, *_XY, _STATUS])
 """replan/<arm>/seen.parquet, once a second: the position of each known joint in the arm's pictures (exact px,
 NaN outside) and its status: `seen`, `hidden` by the surroundings, or `outside` the picture."""
-COST_MAP = pa.schema([("t_ns", pa.int64()), ("yaw_rad", pa.float64()), ("cost", pa.float64())])
+COST_MAP = pa.schema([_T_NS, ("yaw_rad", pa.float64()), ("cost", pa.float64())])
 """replan/cost_map.parquet: the cost of a formation at a time, by the yaw of its first camera."""
 
 
