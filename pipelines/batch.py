@@ -13,9 +13,10 @@ import os
 import resource
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -149,88 +150,61 @@ def batch(
 
 def run_flight(job: Job) -> Outcome:
     """Run all stages of one flight; errors are part of the outcome."""
-    flight = _Flight(job)
-    for stage in STAGES:
-        if stage in job.settings.stages and flight.can(stage):
-            flight.run(stage)
-    return flight.outcome()
-
-
-class _Flight:
-    """State of a flight between its stages."""
-
-    def __init__(self, job: Job) -> None:
-        self.job = job
-        self.error: str | None = None
-        self.failed_stage: str | None = None
-        self.unchanged = True
-        self.finished: list[str] = []
-        self.seconds: dict[str, dict[str, float]] = {}
-
-    @property
-    def ingested(self) -> bool:
-        return (self.job.session / "session.json").is_file() and self.failed_stage != "ingest"
-
-    def can(self, stage: str) -> bool:
-        """Return True if a stage can run: after an error, only the report of an ingested flight."""
-        return self.error is None or (stage == "report" and self.ingested)
-
-    def run(self, stage: str) -> None:
+    failed: dict[str, str] = {}  # the first error, by its stage
+    finished: list[str] = []
+    seconds: dict[str, dict[str, float]] = {}
+    unchanged = True
+    for stage in (stage for stage in STAGES if stage in job.settings.stages):
+        if failed and not (stage == "report" and _is_ingested(job, failed)):
+            continue
         wall_s, cpu_s = time.perf_counter(), time.process_time()
         try:
-            self.unchanged &= _patiently(lambda: self._skipped(stage))
-            self.finished.append(stage)
+            unchanged &= _patiently(partial(_run, stage, job))
+            finished.append(stage)
         except MocapError as error:
-            self._fail(stage, str(error))
+            failed = failed or {stage: str(error)}
         except Exception as error:  # a bug of mocap in one flight must not stop the others
-            self._fail(
-                stage, f"{self.job.flight}: a bug of mocap stopped {stage} ({type(error).__name__}: {error})"
-            )
-        self.seconds[stage] = {
+            line = f"{job.flight}: a bug of mocap stopped {stage} ({type(error).__name__}: {error})"
+            failed = failed or {stage: line}
+        seconds[stage] = {
             "wall": round(time.perf_counter() - wall_s, 3),
             "cpu": round(time.process_time() - cpu_s, 3),
         }
+    outcome = Outcome()
+    try:
+        if _is_ingested(job, failed):
+            outcome = _summed_up(job.session, finished)
+    except MocapError as error:
+        failed = failed or {"report": str(error)}
+    return replace(
+        outcome,
+        failed_stage=next(iter(failed), None),
+        error=next((" ".join(line.split()) for line in failed.values()), None),
+        unchanged=unchanged and not failed,
+        seconds=seconds,
+        peak_memory_mb=_peak_memory_mb(),
+        worker=os.getpid(),
+    )
 
-    def _skipped(self, stage: str) -> bool:
-        """Run a stage; return True if there was nothing to do."""
-        job, force = self.job, self.job.force
-        match stage:
-            case "ingest":
-                job.session.parent.mkdir(parents=True, exist_ok=True)
-                return ingest(job.flight, job.session, force=force).skipped
-            case "reconstruct":
-                chosen = job.settings
-                settings = ReconstructSettings(chosen.method, detector=chosen.detector, every=chosen.every)
-                return reconstruct(job.session, settings, workers=job.threads, force=force).skipped
-            case "replan-compare":
-                return replan(job.session, force=force).skipped
-            case _:
-                return report(job.session, force=force).skipped
 
-    def _fail(self, stage: str, line: str) -> None:
-        if self.error is None:
-            self.failed_stage, self.error = stage, " ".join(line.split())
+def _is_ingested(job: Job, failed: Mapping[str, str]) -> bool:
+    return (job.session / "session.json").is_file() and "ingest" not in failed
 
-    def outcome(self) -> Outcome:
-        name: str | None = None
-        figures: dict[str, float] = {}
-        warnings: tuple[str, ...] = ()
-        try:
-            if self.ingested:
-                name, figures, warnings = _told(self.job.session, self.finished)
-        except MocapError as error:
-            self._fail("report", str(error))
-        return Outcome(
-            failed_stage=self.failed_stage,
-            error=self.error,
-            unchanged=self.unchanged and self.error is None,
-            name=name,
-            figures=figures,
-            warnings=warnings,
-            seconds=self.seconds,
-            peak_memory_mb=_peak_memory_mb(),
-            worker=os.getpid(),
-        )
+
+def _run(stage: str, job: Job) -> bool:
+    """Run a stage; return True if there was nothing to do."""
+    match stage:
+        case "ingest":
+            job.session.parent.mkdir(parents=True, exist_ok=True)
+            return ingest(job.flight, job.session, force=job.force).skipped
+        case "reconstruct":
+            chosen = job.settings
+            settings = ReconstructSettings(chosen.method, detector=chosen.detector, every=chosen.every)
+            return reconstruct(job.session, settings, workers=job.threads, force=job.force).skipped
+        case "replan-compare":
+            return replan(job.session, force=job.force).skipped
+        case _:
+            return report(job.session, force=job.force).skipped
 
 
 def _patiently(call: Callable[[], T]) -> T:
@@ -245,7 +219,7 @@ def _patiently(call: Callable[[], T]) -> T:
             time.sleep(0.5)
 
 
-def _told(session: Path, stages: Sequence[str]) -> tuple[str, dict[str, float], tuple[str, ...]]:
+def _summed_up(session: Path, stages: Sequence[str]) -> Outcome:
     """Read the flight's name, and the figures and warnings of its finished stages."""
     description = read_description(session)
     found: dict[str, object] = {}
@@ -261,7 +235,7 @@ def _told(session: Path, stages: Sequence[str]) -> tuple[str, dict[str, float], 
         else:
             found |= {f"tilt_deg_{name}": arm["tilt_deg"]["mean"] for name, arm in metrics["arms"].items()}
     figures = {name: float(value) for name, value in found.items() if isinstance(value, int | float)}
-    return description.flight, figures, tuple(dict.fromkeys(warnings))
+    return Outcome(name=description.flight, figures=figures, warnings=tuple(dict.fromkeys(warnings)))
 
 
 def _peak_memory_mb() -> float:

@@ -173,8 +173,10 @@ class CameraText:
             return self._said("frame_times", choice.all, told(choice.taken))
         if self._camera.videos and self._film is None:
             return []  # the log's own stamps
-        if coarse := self._coarse_start():
-            return coarse
+        if self._coarse_start is not None:
+            self._assume("frame_times: start by the subtitles' clock, to a second")
+            remark = "assumed: by the subtitles' clock, whole seconds of local time taken as UTC"
+            return [entry("frame_times", {"start": self._coarse_start}, remark)]
         start, reason = self._start()
         if self._film:
             if start is None:
@@ -191,15 +193,13 @@ class CameraText:
         remark = f"assumed: {ASSUMED_FPS} frames a second, the first {reason}"
         return [entry("frame_times", {"start": start, **fps}, remark)]
 
-    def _coarse_start(self) -> list[str]:
-        """Write the video's start from subtitles that show whole seconds."""
+    @property
+    def _coarse_start(self) -> Decimal | None:
+        """The video's start in seconds, by subtitles that show whole seconds."""
         found = self._camera.poses.taken.found if self._camera.poses else None
         if not isinstance(found, DroneLog) or found.video_start_ns is None or not self._film:
-            return []
-        self._assume("frame_times: start by the subtitles' clock, to a second")
-        start = Decimal(found.video_start_ns) / 10**9
-        remark = "assumed: by the subtitles' clock, whole seconds of local time taken as UTC"
-        return [entry("frame_times", {"start": start.normalize()}, remark)]
+            return None
+        return (Decimal(found.video_start_ns) / 10**9).normalize()
 
     def _start(self) -> tuple[Decimal | None, str]:
         """Assume the first frame's time in seconds: when poses and truth have begun; None for 0."""
@@ -224,7 +224,7 @@ class CameraText:
     def _clock(self) -> list[str]:
         if self._camera.videos and self._film is None:
             return []
-        if self._coarse_start():
+        if self._coarse_start is not None:
             settings = {"offset_s": 0, "sigma_s": 1}
             return [entry("clock", settings, "the subtitles' clock shows whole seconds")]
         return ["# clock: {offset_s: 0, sigma_s: 0.2}  # if its clock is off against the poses', or unsure"]
