@@ -19,7 +19,6 @@ from pipelines.drafting.found import (
     FrameTimes,
     Joints,
     Keypoints,
-    LeftOut,
     Lens,
     Map,
     Poses,
@@ -100,9 +99,13 @@ def draft(
     if target.exists() and not overwrite:
         raise DataError(target, "exists", "choose another with --output, or replace it with --overwrite")
     findings, unread = _read_all(things, home, progress or Silent())
-    left_out = [left for left in [*search.left_out, *unread] if left.path != _absolute(target)]
+    left_out = search.left_out | unread
+    left_out.pop(_absolute(target), None)
     if not findings.all():
-        raise DataError(*_nothing(home, left_out))
+        path, reason = home, f"holds nothing that can be used ({len(left_out)} files)"
+        if len(left_out) == 1:
+            [(path, reason)] = left_out.items()
+        raise DataError(path, reason, f"known formats: {', '.join(FORMATS.names())}")
 
     flight = match(findings)
     manifest = write_manifest(flight, home.name or "flight", lambda path: _stated(path, target.parent))
@@ -113,16 +116,8 @@ def draft(
         cameras=[camera.name for camera in flight.cameras],
         missing=manifest.missing or ([problem] if problem else []),
         assumed=manifest.assumed,
-        left_out={left.path: left.reason for left in left_out},
+        left_out=left_out,
     )
-
-
-def _nothing(home: Path, left_out: Sequence[LeftOut]) -> tuple[Path, str, str]:
-    """Write the parts of the error for a search without usable files."""
-    known = f"known formats: {', '.join(FORMATS.names())}"
-    if len(left_out) == 1:
-        return left_out[0].path, left_out[0].reason, known
-    return home, f"holds nothing that can be used ({len(left_out)} files)", known
 
 
 def _absolute(path: Path) -> Path:
@@ -157,16 +152,16 @@ def _write(target: Path, text: str) -> str:
 # --- reading -------------------------------------------------------------------------------------------
 
 
-def _read_all(things: Sequence[Thing], home: Path, progress: Progress) -> tuple[Findings, list[LeftOut]]:
+def _read_all(things: Sequence[Thing], home: Path, progress: Progress) -> tuple[Findings, dict[Path, str]]:
     """Read all things as far as the matching needs it; return also those that are of no use."""
     progress.start("Reading", len(things))
     found: list[Found] = []
-    unread: list[LeftOut] = []
+    unread: dict[Path, str] = {}
     for path, formats in things:
         known, problem = _read(path, formats, home)
         found += known
         if not known:
-            unread.append(LeftOut(path, problem))
+            unread[path] = problem
         progress.advance()
     return Findings(found), unread
 

@@ -202,23 +202,15 @@ _BODIES = frozenset({"base", "body", "imu", "fcu"})
 _FILES_ASKED = 16  # of a folder of keypoints, for their format
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """A path that was looked at but is not used."""
-
-    path: Path
-    reason: str
-
-
 Thing = tuple[Path, list[Format]]
 """A file or folder, and the formats that recognise it."""
 
 
 class Search:
-    """A search through files and folders, which notes what it had to leave out."""
+    """A search through files and folders; `left_out` has the paths that cannot be used, with the reason."""
 
     def __init__(self) -> None:
-        self.left_out: list[LeftOut] = []
+        self.left_out: dict[Path, str] = {}
         self._formats = FORMATS.all()
         self._seen: set[Path] = set()
 
@@ -245,13 +237,13 @@ class Search:
             return
         self._seen.add(path.resolve())
         if not _is_text(path):
-            self.left_out.append(LeftOut(path, "its name is no text that a manifest could state, left out"))
+            self.left_out[path] = "its name is no text that a manifest could state, left out"
         elif path.is_dir():
             yield from self._under_folder(path)
         elif formats := self._recognising(path):
             yield path, formats
         else:
-            self.left_out.append(LeftOut(path, _why_left_out(path)))
+            self.left_out[path] = _why_left_out(path)
 
     def _under_folder(self, folder: Path) -> Iterator[Thing]:
         """Yield the folder itself if it is one thing, and things in it that are not part of that."""
@@ -297,7 +289,7 @@ class Search:
         try:
             children = sorted(folder.iterdir())
         except OSError as error:
-            self.left_out.append(LeftOut(folder, f"cannot be read ({error.strerror}), left out"))
+            self.left_out[folder] = f"cannot be read ({error.strerror}), left out"
             return []
         return [c for c in children if not c.name.startswith(".") and c.suffix != ".session" and c.exists()]
 
