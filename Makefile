@@ -28,7 +28,7 @@ demo: setup
 	$(BIN)/mocap export $(DEMO)/mound_walk.session --to trc,csv,tum --overwrite
 	@echo "Open $(DEMO)/mound_walk.session/report/index.html in a browser."
 
-# The bytecode first: where Python is told to write none, every command under test would compile all modules.
+# The bytecode first: where Python may not write any, every command under test would compile all modules.
 test: setup
 	$(BIN)/python -m compileall -qq mocap_cli pipelines
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 20 --durations-min 5

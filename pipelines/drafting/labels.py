@@ -125,8 +125,8 @@ def camera_names(labels: Sequence[Label]) -> list[str]:
     if len(labels) > 1:
         shared = Counter(word.key for label in labels for word in label if word.number is not None)
         common = {key for key, count in shared.items() if count == len(labels)}
-        told = [tuple(word for word in label if word.key not in common) for label in labels]
-        labels = told if all(told) else labels
+        distinct = [tuple(word for word in label if word.key not in common) for label in labels]
+        labels = distinct if all(distinct) else labels
         longest = max(len(label) for label in labels)
         enough = (k for k in range(1, longest) if len({_keys(label[:k]) for label in labels}) == len(labels))
         length = next(enough, longest)

@@ -136,7 +136,7 @@ class CameraText:
             return [
                 f"# video: {self._camera.name}.mp4  # missing: or {{log, topic}} of pictures, or keypoints"
             ]
-        remark = told(videos[0])
+        remark = describe(videos[0])
         if self._camera.paired:
             remark += "; assumed: of the same camera as the keypoints"
             self._assume("that video and keypoints are of one camera")
@@ -148,7 +148,7 @@ class CameraText:
         taken, *others = self._camera.keypoints
         found = taken.found
         settings = dict(taken.settings)
-        remarks = [told(taken)]
+        remarks = [describe(taken)]
         if isinstance(found, Keypoints) and found.ambiguous:
             settings["format"] = found.format
             remarks.append("assumed: other formats recognise it too")
@@ -170,7 +170,7 @@ class CameraText:
     def _frame_times(self) -> list[str]:
         choice = self._camera.frame_times
         if choice:
-            return self._said("frame_times", choice.all, told(choice.taken))
+            return self._said("frame_times", choice.all, describe(choice.taken))
         if self._camera.videos and self._film is None:
             return []  # the log's own stamps
         if self._coarse_start is not None:
@@ -202,7 +202,7 @@ class CameraText:
         return (Decimal(found.video_start_ns) / 10**9).normalize()
 
     def _start(self) -> tuple[Decimal | None, str]:
-        """Assume the first frame's time in seconds: when poses and truth have begun; None for 0."""
+        """Assume the first frame's time in seconds: the start of poses and truth; None for 0."""
         poses = self._camera.poses.taken.span if self._camera.poses else None
         truth = next((joints.span for joints in self._draft.true_joints), None)
         known = {"its poses": poses, "the truth": truth}
@@ -242,7 +242,7 @@ class CameraText:
                 "#   {dji: SRT}, {ulog: FILE}, {ardupilot: FILE}, {log: LOG, preset: dji_osdk or mavros}",
             ]
         taken = choice.taken
-        remarks = [told(taken)]
+        remarks = [describe(taken)]
         if not choice.named:
             remarks.append("assumed: they are its own")
             self._assume("pose: that these poses are its own")
@@ -339,7 +339,7 @@ class CameraText:
                 f"  # missing: nothing of that name has them{self._loose(Calibration)}",
                 "#   or a calibration file, or {log: LOG, topic: TOPIC}",
             ]
-        remark = told(choice.taken)
+        remark = describe(choice.taken)
         if not choice.named:
             remark += "; assumed: it holds for this camera"
             self._assume("intrinsics: that one calibration holds for them")
@@ -371,7 +371,7 @@ class CameraText:
         settings: Callable[[Candidate], object] = lambda candidate: candidate.settings,
     ) -> list[str]:
         lines = [
-            f"# or {entry(key, stated(settings(candidate), self._relative), told(candidate))}"
+            f"# or {entry(key, stated(settings(candidate), self._relative), describe(candidate))}"
             for candidate in candidates[:_MOST_OTHERS]
         ]
         more = len(candidates) - len(lines)
@@ -399,7 +399,7 @@ def stated(settings: object, relative: Callable[[Path], str]) -> object:
     return said["path"] if said.keys() == {"path"} else said
 
 
-def told(candidate: Candidate) -> str:
+def describe(candidate: Candidate) -> str:
     """Describe a candidate in a few words."""
     found, topic = candidate.found, candidate.topic
     if topic:
@@ -455,7 +455,7 @@ _NO_CAMERA = """
 _ABOUT_LOGS = """\
   # With stamps: receive the time of receipt counts. Where a clock or an origin is another:
   #   clock: {offset_s: 0, drift_ppm: 0}, world_from_log: {translation: [0, 0, 0], yaw_deg: 0}"""
-_NAMES_TOLD = 5
+_NAMES_LISTED = 5
 
 
 @dataclass(frozen=True)
@@ -496,7 +496,7 @@ def _in_short(remarks: Mapping[str, list[str]]) -> list[str]:
     """Write one line for each remark, with the cameras that it concerns."""
     lines = []
     for what, names in remarks.items():
-        shown = ", ".join(names[:_NAMES_TOLD]) + (", ..." if len(names) > _NAMES_TOLD else "")
+        shown = ", ".join(names[:_NAMES_LISTED]) + (", ..." if len(names) > _NAMES_LISTED else "")
         lines.append(f"{shown}: {what}" if shown else what)
     return lines
 
@@ -542,7 +542,7 @@ def _actor(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) -> l
         return []
     taken, *others = draft.actors
     remarks.assumed["actor: point hip, which point of the person the log follows"] = []
-    remark = f"{told(taken)}; assumed: point, one of hip, head, feet, centre"
+    remark = f"{describe(taken)}; assumed: point, one of hip, head, feet, centre"
     lines = ["", entry("actor", stated({**taken.settings, "point": "hip"}, relative), remark)]
     return lines + [f"# or actor: {flowing(other.settings, relative)}" for other in others]
 
@@ -594,4 +594,4 @@ def _unused(draft: Draft, relative: Callable[[Path], str]) -> list[str]:
 def _held(found: Found) -> str:
     """List the topics of an unused log, which the user could still name."""
     topics = [topic.name for topic in found.topics if topic.count] if isinstance(found, Recording) else []
-    return f" with {one_line(', '.join(topics[:_NAMES_TOLD]))}" if topics else ""
+    return f" with {one_line(', '.join(topics[:_NAMES_LISTED]))}" if topics else ""

@@ -181,10 +181,10 @@ class Stopwatch:
 
 def versions_of(folder: Path) -> dict[str, dict[str, str]]:
     """Return the versions of mocap, Python and libraries with which each stage last ran, from run.json."""
-    told: dict[str, dict[str, str]] = {}
+    versions: dict[str, dict[str, str]] = {}
     for run in _runs(folder):
-        told[str(run.get("stage"))] = {"mocap": str(run.get("version")), **run.get("libraries", {})}
-    return told
+        versions[str(run.get("stage"))] = {"mocap": str(run.get("version")), **run.get("libraries", {})}
+    return versions
 
 
 def note_sources(session: Path, hashes: Mapping[str, str], stamps: Mapping[str, str]) -> None:
