@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DEMO := demo
 
-.PHONY: setup demo test lint bench results fuzz wheel docs sample lock clean
+.PHONY: setup demo test check lint bench results fuzz wheel docs sample lock clean
 .DELETE_ON_ERROR:
 
 setup: $(STAMP)
@@ -32,6 +32,12 @@ demo: setup
 test: setup
 	$(BIN)/python -m compileall -qq mocap_cli pipelines
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 20 --durations-min 5
+
+# Lint and the tests that need the least time: under a minute on two cores, once mypy and Numba have their caches.
+QUICK := session drafting geometry planning $(addprefix formats/,calibrations common keypoint_files poses skeletons)
+
+check: lint
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not slow" $(addprefix tests/,$(QUICK))
 
 lint: setup
 	$(BIN)/ruff format --check .
