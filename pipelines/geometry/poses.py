@@ -363,7 +363,7 @@ def mounted_covariance(
         world_from_body = matrix_from_quaternion(world_from_body_xyzw)
         camera_from_world = np.swapaxes(matrix_from_quaternion(world_from_camera_xyzw), -1, -2)
         jacobian = _block_diagonal(camera_from_world @ world_from_body)
-        jacobian[..., :3, 3:] = -_cross_matrix(rotate(world_from_body_xyzw, lever_arm)) @ world_from_body
+        jacobian[..., :3, 3:] = -cross_matrix(rotate(world_from_body_xyzw, lever_arm)) @ world_from_body
         return _propagated(jacobian, covariance)
 
     return _by_blocks(mounted, covariance, world_from_body_xyzw, lever_arm, world_from_camera_xyzw)
@@ -394,7 +394,7 @@ def _block_diagonal(rotation: Float) -> Float:
     return jacobian
 
 
-def _cross_matrix(vector: Float) -> Float:
+def cross_matrix(vector: Float) -> Float:
     """Build the matrix [..., 3, 3] whose product with a vector u is the cross product v x u."""
     x, y, z = np.moveaxis(vector, -1, 0)
     o = np.zeros_like(x)

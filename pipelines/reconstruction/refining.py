@@ -14,7 +14,6 @@ import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64
 from pipelines.geometry.noise import WHITE_SHARE, NoiseModel, PoseErrors, pose_errors
-from pipelines.geometry.poses import quaternion_from_matrix
 from pipelines.geometry.triangulation import (
     STATUS,
     Triangulation,
@@ -35,6 +34,7 @@ from pipelines.reconstruction.observations import (
 )
 from pipelines.reconstruction.refinement.problem import Sighting
 from pipelines.reconstruction.refinement.refine import SETTLED_S, Refined, corrected, refine
+from pipelines.reconstruction.results import poses_table
 from pipelines.reconstruction.solving import pictures_of
 from pipelines.session.description import Interpolation
 from pipelines.session.skeletons import bones_of
@@ -315,20 +315,13 @@ def _metrics(refined: Refined, cameras: Sequence[Camera], offset_s: Float) -> di
 
 def _camera_table(flight: RobustFlight, refined: Refined, offset_s: Float) -> pd.DataFrame:
     """Build the table of corrected poses of every picture that has one."""
-    import pandas as pd
-
-    parts = []
-    for c, camera in enumerate(_shifted(flight.cameras, offset_s)):
-        position, rotation = camera.poses_at(camera.frame_t_ns, flight.between)
-        (posed,) = np.nonzero(~np.isnan(position[:, 0]))
-        stamped_s = (camera.frame_t_ns[posed] - flight.observations.t_ns[0]) / 1e9 - refined.clock_offset_s[c]
-        numbers = _numbers_at(refined.corrections[c], stamped_s)
-        true_position, true_rotation = corrected(position[posed], rotation[posed], numbers)
-        table = pd.DataFrame({"t_ns": camera.frame_t_ns[posed], "camera": camera.name})
-        table[["x", "y", "z"]] = true_position
-        table[["qx", "qy", "qz", "qw"]] = quaternion_from_matrix(true_rotation)
-        parts.append(table)
-    return pd.concat(parts, ignore_index=True)
+    cameras = _shifted(flight.cameras, offset_s)
+    poses = []
+    for c, camera in enumerate(cameras):
+        t_s = (camera.frame_t_ns - flight.observations.t_ns[0]) / 1e9 - refined.clock_offset_s[c]
+        logged = camera.poses_at(camera.frame_t_ns, flight.between)
+        poses.append(corrected(*logged, _numbers_at(refined.corrections[c], t_s)))
+    return poses_table(cameras, poses)
 
 
 # --- initial clock offsets -----------------------------------------------------------------------------
@@ -439,10 +432,9 @@ def refined_points(
     if found.fallback is not None:
         return start, found.fallback
     position, rotation = views.position.copy(), views.rotation.copy()
-    for c, (when_s, numbers) in enumerate(found.corrections):
-        if len(when_s):
-            there = np.stack([np.interp(t_s, when_s, column) for column in numbers.T], axis=1)
-            position[:, c], rotation[:, c] = corrected(position[:, c], rotation[:, c], there)
+    for c, correction in enumerate(found.corrections):
+        numbers = _numbers_at(correction, t_s)
+        position[:, c], rotation[:, c] = corrected(position[:, c], rotation[:, c], numbers)
     moved = replace(views, position=position, rotation=rotation, pose_sigma=np.zeros_like(views.pose_sigma))
     gated = triangulate(replace(moved, pixel_sigma=estimate_noise(moved)), method="robust")
     refined = found.position.reshape(-1, 3)

@@ -236,11 +236,15 @@ def camera_poses_table(cameras: Sequence[Camera], between: Interpolation) -> pd.
 
     Pictures without a pose, for example in a pause of the log, have no row.
     """
+    return poses_table(cameras, [camera.poses_at(camera.frame_t_ns, between) for camera in cameras])
+
+
+def poses_table(cameras: Sequence[Camera], poses: Sequence[tuple[Float, Float]]) -> pd.DataFrame:
+    """Build the same rows from each camera's poses at its pictures: position [F, 3], rotation [F, 3, 3]."""
     import pandas as pd
 
     parts = []
-    for camera in cameras:
-        position, rotation = camera.poses_at(camera.frame_t_ns, between)
+    for camera, (position, rotation) in zip(cameras, poses, strict=True):
         (posed,) = np.nonzero(np.isfinite(position[:, 0]))
         table = pd.DataFrame({"t_ns": camera.frame_t_ns[posed], "camera": camera.name})
         table[["x", "y", "z"]] = position[posed]

@@ -21,6 +21,7 @@ from typing import Literal
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float, Int64
+from pipelines.geometry.poses import cross_matrix
 from pipelines.geometry.triangulation import (
     STATUS,
     Method,
@@ -196,7 +197,7 @@ def _refit(views: Views, first: Triangulation, pose_covariance: Float, rows: Int
         by_point = np.einsum("ncij,nckj->ncik", project, rotation)
         # A camera that stands e further, and is turned by w about its axes, sees the point at
         # exp(-w) R' (X - p - e): by e as by -X, by w as by the cross product with the point.
-        by_turn = project @ _cross_matrix(away)
+        by_turn = project @ cross_matrix(away)
         by_pose = np.concatenate([-by_point, by_turn], axis=-1)
         spread = by_pose @ covariance @ np.swapaxes(by_pose, -1, -2)
         spread[..., 0, 0] += pixel
@@ -208,14 +209,6 @@ def _refit(views: Views, first: Triangulation, pose_covariance: Float, rows: Int
         right = np.einsum("ncij,ncj->ni", weighted, residual)
         points = points + np.linalg.solve(normal, right[..., None])[..., 0]
     return points, np.asarray(np.linalg.inv(normal), dtype=np.float64)
-
-
-def _cross_matrix(vector: Float) -> Float:
-    """Return the cross-product matrix [..., 3, 3] of v: (v x) u."""
-    x, y, z = np.moveaxis(vector, -1, 0)
-    o = np.zeros_like(x)
-    rows = [[o, -z, y], [z, o, -x], [-y, x, o]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 # --- heavy-tailed loss ---------------------------------------------------------------------------------
