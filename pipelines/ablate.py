@@ -19,8 +19,8 @@ from pipelines.geometry.arrays import Float
 from pipelines.geometry.metrics import PCK_THRESHOLD_M, common, measure
 from pipelines.geometry.noise import NoiseModel
 from pipelines.geometry.triangulation import Views, locate
-from pipelines.keypoints.alone import FollowedAlone
 from pipelines.keypoints.hints import project_actor
+from pipelines.keypoints.tracking import FollowedAlone
 from pipelines.reconstruction.refining import refined_points
 from pipelines.reporting.studies import Row, draw, estimates, results_csv
 from pipelines.session.errors import DataError

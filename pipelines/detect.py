@@ -25,8 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.geometry.arrays import Float, Picture
-from pipelines.keypoints.actor_hints import actor_hints
-from pipelines.keypoints.hints import Hint
+from pipelines.keypoints.hints import Hint, actor_hints
 from pipelines.keypoints.tracking import PeopleTracker
 from pipelines.session.description import (
     Description,

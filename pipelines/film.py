@@ -21,9 +21,8 @@ from pipelines.formats.videos.video_writing import write_h264
 from pipelines.geometry.arrays import Float, Int64, Picture
 from pipelines.geometry.cameras import Intrinsics
 from pipelines.geometry.noise import NoiseModel
-from pipelines.keypoints.actor_hints import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD
-from pipelines.keypoints.alone import FollowedAlone
-from pipelines.keypoints.hints import project_actor
+from pipelines.keypoints.hints import ACTOR_SIGMA_M, UNKNOWN_SIGMA_RAD, project_actor
+from pipelines.keypoints.tracking import FollowedAlone
 from pipelines.planning.arm_flights import poses_from
 from pipelines.planning.formation import TILT, slot_of
 from pipelines.planning.loading import LoggedFlight, load_flight

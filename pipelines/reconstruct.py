@@ -25,8 +25,7 @@ from pipelines.geometry.triangulation import (
 )
 from pipelines.keypoints.association import Association, associate
 from pipelines.keypoints.calibration import measured_for, read_calibration
-from pipelines.keypoints.swaps import undo_swaps_of_tracks
-from pipelines.keypoints.swaps_across_views import swaps_across_views
+from pipelines.keypoints.swaps import swaps_across_views, undo_swaps_of_tracks
 from pipelines.reconstruction.background import Followed, prior_of, refine_cameras, rows_to_follow
 from pipelines.reconstruction.background_tracks import follow, people_boxes
 from pipelines.reconstruction.doubts.diagnosis import Doubt, doubts_of, said_doubts

@@ -15,8 +15,7 @@ the assignment that keeps people apart wins even where one wrong pair happens to
 one (exchanging two people costs 2 (their separation)^2 for any pose error). A logged actor takes
 part as the only detection of one more camera.
 
-`follow` is the one function called from outside. `grouping_rays` compares detections and places groups,
-`grouping_partition` finds the partition, `grouping_tracks` keeps the identities of earlier frames.
+`follow` is the one function called from outside. `grouping_rays` compares detections and places groups.
 """
 
 from __future__ import annotations
@@ -29,27 +28,386 @@ from numpy.typing import NDArray
 
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.compilation import cached, helper
-from pipelines.keypoints.grouping_partition import begin_groups, bind_known, join_groups, settle_nodes
 from pipelines.keypoints.grouping_rays import (
+    FEW_JOINTS,
     Nodes,
     add_logged_node,
     collect_nodes,
     compare_nodes,
     empty_nodes,
+    median_of,
     place_group,
+    put_into_group,
+    size_of_group,
     views_of_group,
-)
-from pipelines.keypoints.grouping_tracks import (
-    Tracks,
-    empty_tracks,
-    found_tracks,
-    is_most_like,
-    recognise_tracks,
-    remember_tracks,
-    resume_tracks,
 )
 
 Int64 = NDArray[np.int64]
+
+_HOLD_S = 0.5  # a picture is compared with later ones for this long
+_PACE_M_PER_S = 0.7  # random part of a walk, for taking up a track again
+_BODY_RADIUS_M = 0.3  # the middle of a body depends on which joints are seen
+
+
+class Tracks(NamedTuple):
+    """State of the people seen so far: arrays of S slots."""
+
+    identity: Int64  # [S] number of the track, -1 free
+    views: Int64  # [S] camera-frames in company of another camera
+    seen_s: Float  # [S] time of `middle`
+    middle: Float  # [S, 3] m
+    spread: Float  # [S] m
+    held_s: Float  # [S, C] time of the picture held, -inf none
+    held: Float  # [S, C, J, 2]
+    apart: Bool  # [S, S] seen side by side in one picture: two people
+
+
+def empty_tracks(slots: int, cameras: int, joints: int) -> Tracks:
+    """Allocate tracks without any person; the logged actor is one more camera."""
+    return Tracks(
+        identity=np.full(slots, -1, np.int64),
+        views=np.zeros(slots, np.int64),
+        seen_s=np.zeros(slots),
+        middle=np.zeros((slots, 3)),
+        spread=np.full(slots, np.nan),
+        held_s=np.full((slots, cameras + 1), -np.inf),
+        held=np.zeros((slots, cameras + 1, joints, 2)),
+        apart=np.zeros((slots, slots), np.bool_),
+    )
+
+
+@helper
+def recognise_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, scratch: Float) -> None:
+    """Rate, 0..1, how well each detection continues each track's last picture in the same camera."""
+    slots, cameras = tracks.held_s.shape[0], tracks.held_s.shape[1] - 1
+    for a in range(n):
+        c = nodes.camera[a]
+        for k in range(slots):
+            nodes.known[a, k] = 0.0
+            if c == cameras:
+                held = tracks.identity[k] >= 0 and tracks.held_s[k, c] > -np.inf
+                nodes.known[a, k] = 1.0 if held else 0.0
+                continue
+            wait = now - tracks.held_s[k, c]
+            if tracks.identity[k] < 0 or wait > _HOLD_S:
+                continue
+            count = 0
+            for j in range(nodes.points.shape[1]):
+                du = nodes.points[a, j, 0] - tracks.held[k, c, j, 0]
+                dv = nodes.points[a, j, 1] - tracks.held[k, c, j, 1]
+                if math.isfinite(du):
+                    scratch[count] = math.hypot(du, dv)
+                    count += 1
+            if count > 0 and nodes.size[a] > 0.0:
+                # A body is about four sizes tall. It may shift a seventh of its height at once (jitter, a
+                # gimbal's jerk) and a height per second beside: a walk, and the camera's own turning.
+                shift = median_of(scratch, count) / (4.0 * nodes.size[a]) / (0.15 + wait)
+                nodes.known[a, k] = max(0.0, 1.0 - shift * shift) * count / (count + FEW_JOINTS)
+
+
+@helper
+def resume_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, middle: Float, spread: Float) -> None:
+    """Assign lost tracks to groups without a track, nearest first."""
+    slots = len(tracks.identity)
+    while True:
+        best, group, track = 9.0, -1, -1
+        for label in range(slots, slots + n):
+            if not math.isfinite(spread[label]):
+                continue
+            for k in range(slots):
+                free = tracks.identity[k] >= 0 and size_of_group(nodes, k) == 0
+                if free and math.isfinite(tracks.spread[k]):
+                    wait = now - tracks.seen_s[k]
+                    variance = spread[label] ** 2 + tracks.spread[k] ** 2
+                    variance += _BODY_RADIUS_M**2 + (_PACE_M_PER_S * wait) ** 2
+                    square = 0.0
+                    for axis in range(3):
+                        square += (middle[label, axis] - tracks.middle[k, axis]) ** 2 / variance
+                    if square < best:
+                        best, group, track = square, label, k
+        if group < 0:
+            return
+        _rename(nodes, group, track, middle, spread)
+
+
+@helper
+def _rename(nodes: Nodes, old: int, new: int, middle: Float, spread: Float) -> None:
+    for c in range(nodes.member.shape[1]):
+        if nodes.member[old, c] >= 0:
+            put_into_group(nodes, nodes.member[old, c], new)
+            nodes.member[old, c] = -1
+    for axis in range(3):
+        middle[new, axis] = middle[old, axis]
+    spread[new] = spread[old]
+    spread[old] = np.nan
+
+
+@helper
+def found_tracks(
+    nodes: Nodes, n: int, tracks: Tracks, now: float, identity: int, middle: Float, spread: Float
+) -> int:
+    """Start a track for every group that has none and return the next free identity."""
+    slots = len(tracks.identity)
+    for label in range(slots, slots + n):
+        if size_of_group(nodes, label) == 0:
+            continue
+        k = _vacant(nodes, tracks, now)
+        tracks.identity[k] = identity
+        tracks.views[k] = 0
+        tracks.spread[k] = np.nan
+        for c in range(tracks.held_s.shape[1]):
+            tracks.held_s[k, c] = -np.inf
+        for other in range(slots):
+            tracks.apart[k, other] = tracks.apart[other, k] = False
+        identity += 1
+        _rename(nodes, label, k, middle, spread)
+    return identity
+
+
+@helper
+def _vacant(nodes: Nodes, tracks: Tracks, now: float) -> int:
+    """Choose a slot: a free one, else one that no person can return to, else the least seen."""
+    best, score = 0, np.inf
+    for k in range(len(tracks.identity)):
+        if tracks.identity[k] < 0:
+            return k
+        if size_of_group(nodes, k) > 0:
+            continue
+        lost = tracks.views[k] == 0
+        for c in range(tracks.held_s.shape[1]):
+            lost = lost and now - tracks.held_s[k, c] > _HOLD_S
+        value = -1.0 if lost else float(tracks.views[k])
+        if value < score:
+            best, score = k, value
+    return best
+
+
+@helper
+def remember_tracks(nodes: Nodes, n: int, tracks: Tracks, now: float, middle: Float, spread: Float) -> None:
+    """Store the pictures and places of this frame."""
+    slots, cameras = tracks.held_s.shape
+    for k in range(slots):
+        for c in range(cameras):
+            a = nodes.member[k, c]
+            if a >= 0:
+                tracks.held_s[k, c] = now
+                for j in range(nodes.points.shape[1]):
+                    for axis in range(2):
+                        tracks.held[k, c, j, axis] = nodes.points[a, j, axis]
+                for other in range(k):
+                    if nodes.member[other, c] >= 0:
+                        tracks.apart[k, other] = True
+                        tracks.apart[other, k] = True
+            elif tracks.identity[k] >= 0 and now - tracks.held_s[k, c] <= _HOLD_S:
+                _hand_over(nodes, n, tracks, k, c)
+        if math.isfinite(spread[k]):
+            tracks.views[k] += views_of_group(nodes, k)
+            tracks.seen_s[k] = now
+            for axis in range(3):
+                tracks.middle[k, axis] = middle[k, axis]
+            tracks.spread[k] = spread[k]
+
+
+@helper
+def _hand_over(nodes: Nodes, n: int, tracks: Tracks, k: int, c: int) -> None:
+    """Forget a track's picture when its continuation was given to another track.
+
+    Otherwise both tracks would claim the detection while the old picture is held.
+    """
+    best = -1
+    for a in range(n):
+        if (
+            nodes.camera[a] == c
+            and nodes.known[a, k] > 0.0
+            and (best < 0 or nodes.known[a, k] > nodes.known[best, k])
+        ):
+            best = a
+    if best >= 0 and is_most_like(nodes, best, k):
+        tracks.held_s[k, c] = -np.inf
+
+
+@helper
+def is_most_like(nodes: Nodes, a: int, track: int) -> bool:
+    """Test if no other track is more like a detection than this one."""
+    greatest = 0.0
+    for k in range(nodes.known.shape[1]):
+        greatest = max(greatest, nodes.known[a, k])
+    return bool(nodes.known[a, track] >= greatest)
+
+
+_KNOWN = 1.0  # each side of a pair that continues the track adds this; 8 locked wrong starts in for good
+_LOYAL = 14.0  # on top, for leaving company for none: a known detection is refused beyond 5 sigma
+_STAY = 4.0  # score of continuing a track for a detection that is alone in its group
+_SURE = 0.3  # likeness 0..1 with a track's last picture above which the detection is a known person
+
+
+@helper
+def begin_groups(nodes: Nodes, n: int, slots: int) -> None:
+    """Start from the pictures: each detection goes to the track it continues best, or stands alone."""
+    nodes.member[:] = -1
+    for a in range(n):
+        best = -1
+        for k in range(slots):
+            if nodes.known[a, k] > 0.0 and (best < 0 or nodes.known[a, k] > nodes.known[a, best]):
+                best = k
+        if best < 0:
+            put_into_group(nodes, a, slots + a)
+            continue
+        rival = nodes.member[best, nodes.camera[a]]
+        if rival >= 0 and nodes.known[rival, best] >= nodes.known[a, best]:
+            put_into_group(nodes, a, slots + a)
+            continue
+        if rival >= 0:
+            put_into_group(nodes, rival, slots + rival)
+        put_into_group(nodes, a, best)
+
+
+@helper
+def _affinity(nodes: Nodes, one: int, two: int) -> float:
+    """Compute the mean weight between two groups; -inf if they share a camera, 0 without comparable pairs."""
+    total: float = 0.0
+    pairs = 0
+    for c in range(nodes.member.shape[1]):
+        a = nodes.member[one, c]
+        if a < 0:
+            continue
+        if nodes.member[two, c] >= 0:
+            return -np.inf
+        for other in range(nodes.member.shape[1]):
+            b = nodes.member[two, other]
+            if b >= 0 and nodes.weight[a, b] != 0.0:
+                total += nodes.weight[a, b]
+                pairs += 1
+    return total / pairs if pairs else 0.0
+
+
+@helper
+def join_groups(nodes: Nodes, n: int, tracks: Tracks) -> None:
+    """Join groups that agree, best first, until none does; joined tracks become the one seen more."""
+    slots = len(tracks.identity)
+    while True:
+        best, stay, leave = 0.0, -1, -1
+        for two in range(slots + n):
+            if size_of_group(nodes, two) == 0:
+                continue
+            for one in range(two):
+                if size_of_group(nodes, one) == 0 or (two < slots and tracks.apart[one, two]):
+                    continue
+                affinity = _affinity(nodes, one, two)
+                if affinity > best:
+                    best, stay, leave = affinity, one, two
+        if stay < 0:
+            return
+        if leave < slots and tracks.views[leave] > tracks.views[stay]:
+            stay, leave = leave, stay
+        for c in range(nodes.member.shape[1]):
+            if nodes.member[leave, c] >= 0:
+                put_into_group(nodes, nodes.member[leave, c], stay)
+                nodes.member[leave, c] = -1
+        if leave < slots:
+            for a in range(n):
+                nodes.known[a, stay] = max(nodes.known[a, stay], nodes.known[a, leave])
+                nodes.known[a, leave] = 0.0
+            tracks.identity[leave] = -1
+
+
+@helper
+def bind_known(nodes: Nodes, n: int, tracks: Tracks) -> None:
+    """Compute the bond of each detection to each track: continuity minus that of the best other track.
+
+    If a detection continues a person who was once seen beside the track in one picture, it is not assigned
+    to the track (the actor disappears behind a tree and the bystander stays), unless the two exchange places.
+    """
+    slots = len(tracks.identity)
+    for a in range(n):
+        first, second = -1, -1
+        for k in range(slots):
+            if nodes.known[a, k] > 0.0:
+                if first < 0 or nodes.known[a, k] > nodes.known[a, first]:
+                    first, second = k, first
+                elif second < 0 or nodes.known[a, k] > nodes.known[a, second]:
+                    second = k
+        best = nodes.known[a, first] if first >= 0 else 0.0
+        next_best = nodes.known[a, second] if second >= 0 else 0.0
+        for k in range(slots, slots + n):
+            nodes.bond[a, k] = -best
+        for k in range(slots):
+            if k == first:
+                nodes.bond[a, k] = best - next_best
+            else:
+                nodes.bond[a, k] = nodes.known[a, k] - best
+            nodes.barred[a, k] = best > _SURE and k != first and tracks.apart[first, k]
+
+
+@helper
+def _gain(nodes: Nodes, a: int, label: int) -> float:
+    """Compute a detection's contribution to a group's score; ignore others of its own camera in the group."""
+    bond = float(nodes.bond[a, label])
+    total = _STAY * bond
+    for c in range(nodes.member.shape[1]):
+        b = nodes.member[label, c]
+        if c != nodes.camera[a] and b >= 0:
+            total += nodes.weight[a, b] + _KNOWN * (bond + nodes.bond[b, label])
+    return total
+
+
+@helper
+def settle_nodes(nodes: Nodes, n: int, slots: int) -> None:
+    """Move and exchange detections while the score of the partition rises."""
+    labels = slots + n
+    for _ in range(100):
+        changed = False
+        for a in range(n):
+            here, c = nodes.label[a], nodes.camera[a]
+            own = _gain(nodes, a, here)
+            best, target, exchange = 1e-9, -1, False
+            empty_tried = False
+            for label in range(labels):
+                if label == here:
+                    continue
+                empty = size_of_group(nodes, label) == 0
+                if empty and label < slots and nodes.known[a, label] == 0.0:
+                    continue
+                if empty and label >= slots:
+                    if empty_tried:
+                        continue
+                    empty_tried = True
+                gain = _gain(nodes, a, label) - own
+                rival = nodes.member[label, c]
+                if empty and label >= slots:
+                    mates = max(0, size_of_group(nodes, here) - 1)
+                    gain -= _LOYAL * mates * nodes.known[a, here] if here < slots else 0.0
+                barred = label < slots and nodes.barred[a, label]
+                if rival < 0:
+                    if gain > best and not barred:
+                        best, target, exchange = gain, label, False
+                    continue
+                gain -= _gain(nodes, rival, label)
+                swapped = gain + _gain(nodes, rival, here)
+                if swapped > best:
+                    best, target, exchange = swapped, label, True
+                evicted = gain + _STAY * nodes.bond[rival, labels - 1]
+                if evicted > best and not barred:
+                    best, target, exchange = evicted, label, False
+            if target < 0:
+                continue
+            changed = True
+            rival = nodes.member[target, c]
+            nodes.member[here, c] = -1
+            put_into_group(nodes, a, target)
+            if rival >= 0:
+                put_into_group(nodes, rival, here if exchange else _empty_label(nodes, slots, labels))
+        if not changed:
+            return
+
+
+@helper
+def _empty_label(nodes: Nodes, slots: int, labels: int) -> int:
+    for label in range(slots, labels):
+        if size_of_group(nodes, label) == 0:
+            return label
+    return labels - 1  # never reached: an evicted node leaves fewer than N others for N labels
+
 
 _SPARE = 16  # tracks remembered beyond one for each possible detection
 

@@ -186,7 +186,7 @@ def test_a_detector_looks_at_rendered_pictures(tmp_path: Path, monkeypatch: pyte
     """Put joint k at k pixels right of the middle in two perpendicular views: this gives its position."""
     for module in (stage, settings):
         monkeypatch.setattr(module, "find_detector", lambda _: _Pointing())
-    monkeypatch.setattr("pipelines.keypoints.alone.PeopleTracker", _Follower)
+    monkeypatch.setattr("pipelines.keypoints.tracking.PeopleTracker", _Follower)
     asked = settings.settings_for(
         "tilt",
         tilts_deg=[0.0],

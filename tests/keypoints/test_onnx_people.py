@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.keypoints.onnx_network import OnnxNetwork
-from pipelines.keypoints.onnx_people import OnnxPeople, distinct
-from pipelines.keypoints.onnx_pose import DETECTOR
+from pipelines.keypoints.onnx_pose import DETECTOR, OnnxPeople, distinct
 from pipelines.session.errors import DataError
 from tests.keypoints.onnx_graphs import constant_model, heatmap_model
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipelines.geometry.arrays import Float
-from pipelines.keypoints.pose_outputs import decoder_for, heatmap_peaks, simcc_peaks
+from pipelines.keypoints.onnx_network import decoder_for, heatmap_peaks, simcc_peaks
 from pipelines.session.errors import DataError
 
 inner = st.floats(9.0, 38.0)
