@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.reconstruction.doubts.hypotheses import Hypothesis, Trial, of_descriptions, of_paths, of_times
-from pipelines.reconstruction.doubts.scene import Sampled, Scene, sample, scene_of
+from pipelines.reconstruction.doubts.scene import Camera, Sampled, Scene, sample, scene_of
 from pipelines.reconstruction.doubts.score import STATURE_M, Score, base_of, residual_px, solve
-from pipelines.reconstruction.observations import Camera
 from pipelines.session.description import Description
 from pipelines.session.maps import each_map
 from pipelines.session.people import logged_actor
@@ -93,7 +92,7 @@ class Diagnosis:
 def doubts_of(
     folder: Path,
     description: Description,
-    cameras: list[Camera],
+    cameras: Sequence[Camera],
     *,
     chosen: Sequence[Int64],
     pose_noise: str | None = None,

@@ -31,16 +31,14 @@ def frame_rate(cameras: Sequence[Filmed], group: Sequence[int], factor: float) -
 
     def said(camera: Filmed) -> str:
         steps = np.diff(camera.t_ns)
-        rate = 1e9 / float(np.median(steps)) / factor if len(steps) else float("nan")
-        return f"frame_times.fps: {_round(rate)}"
+        return f"frame_times.fps: {_rounded(1e9 / float(np.median(steps)) / factor)}"
 
     return _lines(cameras, group, said)
 
 
-def _round(rate: float) -> str:
-    """Round a rate to a usual one where it is that but for rounding."""
-    near = round(rate)
-    return f"{near}" if abs(rate / near - 1) < 0.005 else f"{rate:.3f}"
+def _rounded(rate: float) -> str:
+    """Write a rate, as a whole number where it is that but for rounding."""
+    return f"{rate:.0f}" if abs(round(rate) - rate) < 0.005 * rate else f"{rate:.3f}"
 
 
 def videos(cameras: Sequence[Filmed], order: Sequence[int]) -> str:

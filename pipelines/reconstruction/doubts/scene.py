@@ -7,18 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from pipelines.geometry.arrays import Bool, Float
 from pipelines.geometry.cameras import Intrinsics, undistort
 from pipelines.geometry.poses import matrix_from_quaternion
-from pipelines.reconstruction.observations import Camera
 from pipelines.session.camera_poses import stated_models
 from pipelines.session.description import CameraEntry, Description, Interpolation
 from pipelines.session.people import LoggedActor
-from pipelines.session.records import Int64, Occupancy
+from pipelines.session.records import Detections, Int64, Occupancy, Trajectory
 
 JOINTS = (
     "nose",
@@ -47,6 +46,49 @@ _UNKNOWN = (
 _CALIBRATED = (0.003, 0.001, 0.0, 0.0)  # of a still camera
 _LONGEST_GAP_NS = 250_000_000  # between two pictures across which a keypoint is interpolated
 _NEW_SHARE = 0.5  # of a logged covariance: the part that is drawn anew in every pose
+
+
+class Camera(Protocol):
+    """A camera as `reconstruction.observations` has it; the doubts need no more of it."""
+
+    @property
+    def name(self) -> str:
+        """Its name in flight.yaml."""
+        ...
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Its calibration."""
+        ...
+
+    @property
+    def frame_t_ns(self) -> Int64:
+        """The times [F] of its pictures."""
+        ...
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Its logged poses."""
+        ...
+
+    @property
+    def static(self) -> bool:
+        """True if it stands still."""
+        ...
+
+    @property
+    def sigma(self) -> Float | None:
+        """The standard deviations [N, 2] of its poses, m and rad."""
+        ...
+
+    @property
+    def detections(self) -> Detections:
+        """The people in its pictures."""
+        ...
+
+    def poses_at(self, t_ns: Int64, between: Interpolation) -> tuple[Float, Float]:
+        """Return world_from_camera at given times."""
+        ...
 
 
 class PoseSigma(NamedTuple):
@@ -142,7 +184,7 @@ class Ground(NamedTuple):
 
 
 def sample(
-    cameras: list[Camera],
+    cameras: Sequence[Camera],
     description: Description,
     *,
     actor: LoggedActor | None,
