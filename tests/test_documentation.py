@@ -148,6 +148,15 @@ def _modules() -> list[Path]:
     return [path for folder in ("pipelines", "mocap_cli") for path in (_ROOT / folder).rglob("*.py")]
 
 
+def test_every_page_that_code_names_exists() -> None:
+    for folder in (*_FOLDERS, "."):
+        pattern = "*" if folder == "." else "**/*"
+        for path in (_ROOT / folder).glob(pattern):
+            if path.suffix in {".py", ".yaml", ".toml", ".md"} and "CHANGELOG" not in path.name:
+                for named in re.findall(r"docs/[\w/-]+\.md", path.read_text(encoding="utf-8")):
+                    assert (_ROOT / named).is_file(), (path, named)
+
+
 def test_the_navigation_has_every_page_once() -> None:
     navigation = re.findall(r"[\w/-]+\.md", (_ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
     assert sorted(navigation) == sorted(page.relative_to(_DOCS).as_posix() for page in _DOCS.rglob("*.md"))
