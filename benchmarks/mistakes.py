@@ -133,14 +133,25 @@ FLIGHTS = [
         True,
         noise=_NOISY,
     ),
-]
-KEPT_ASIDE = [
     Flight(
         "reach3",
         3,
         "[walk: {distance_m: 4, turn_deg: -50}, reach: {side: right, height_m: 1.9}]",
         "{radius_m: 9, tilt_deg: 18, yaw_deg: 300, yaw_rate_deg_per_s: 5}",
         11,
+        True,
+        False,
+        True,
+        body="{sex: female, height_m: 1.72}",
+    ),
+]
+KEPT_ASIDE = [
+    Flight(
+        "turn3",
+        3,
+        "[walk: {distance_m: 3, turn_deg: 40}, turn: {deg: -90}, walk: {distance_m: 3}]",
+        "{radius_m: 9, tilt_deg: 20, yaw_deg: 170, yaw_rate_deg_per_s: -6}",
+        15,
         True,
         False,
         True,

@@ -51,11 +51,14 @@ MARGIN = 3.0
 MARGIN_OF_TIMES = 2.0
 """The same for clocks and frame rates, which only the scatter of rays can tell."""
 
-ODD = 4.0
+ODD = 3.0
 """Score of a description from which more than times is tried."""
 
-SCATTERED = 0.7
-"""Scatter of rays from which more than times is tried, whatever the score; 0.4 to 0.65 on right flights."""
+SCATTERED = 0.65
+"""Scatter of rays from which more than times is tried, whatever the score; 0.35 to 0.7 on right flights."""
+
+MISSED = 1.8
+"""Misfit of rays from which more than times is tried, whatever the score; 0.4 to 1.6 on right flights."""
 
 DOUBTFUL = 6.0
 """Score of a description above which it is doubted although no mistake explains it."""
@@ -152,7 +155,8 @@ def diagnose(flight: Sampled | None) -> Diagnosis:
     trial = Trial(flight, described, base)
     hypotheses = [*of_paths(trial), *of_times(trial)]
     explained = min((each.total for each in hypotheses), default=np.inf)
-    if base.total >= ODD or found.scatter >= SCATTERED or explained <= base.total - MARGIN_OF_TIMES:
+    odd = base.total >= ODD or found.scatter >= SCATTERED or found.misfit >= MISSED
+    if odd or explained <= base.total - MARGIN_OF_TIMES:
         hypotheses += list(of_descriptions(trial))
     hypotheses.sort(key=lambda each: each.total)
     causes = _causes(hypotheses, base.total)

@@ -45,6 +45,7 @@ _UNKNOWN = (
 )  # of poses whose noise nobody states, in a usual flight
 _CALIBRATED = (0.003, 0.001, 0.0, 0.0)  # of a still camera
 _LONGEST_GAP_NS = 250_000_000  # between two pictures across which a keypoint is interpolated
+_CHOSEN_SHARE = 0.5  # of the pictures with people
 _NEW_SHARE = 0.5  # of a logged covariance: the part that is drawn anew in every pose
 
 
@@ -247,8 +248,14 @@ def _most_seen(camera: Camera) -> Int64:
 
 
 def _chosen(camera: Camera, of_frame: Int64) -> Int64:
-    """Return the detections that were chosen, by their rank [F] among those of their picture."""
+    """Return the detections that were chosen, by their rank [F] among those of their picture.
+
+    A camera of which few were chosen fits the others badly: its person is whom it shows most, since what is
+    wrong with it is what is looked for.
+    """
     frame = np.flatnonzero(of_frame >= 0)
+    if len(frame) < _CHOSEN_SHARE * len(np.unique(camera.detections.frame)):
+        return _most_seen(camera)
     return np.searchsorted(camera.detections.frame, frame) + of_frame[frame]
 
 
