@@ -127,7 +127,7 @@ class Filmed:
 
 @dataclass(frozen=True)
 class Scene:
-    """What C cameras saw at T moments."""
+    """View of C cameras at T moments."""
 
     rays: Float  # [C, T, J, 2] normalised image coordinates; NaN where nothing was seen
     position: Float  # [C, T, 3] m

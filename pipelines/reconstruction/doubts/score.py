@@ -1,4 +1,4 @@
-"""How well a scene fits itself, and how much its people are people.
+"""Score of a scene: how well it fits itself, and how much its people are people.
 
 Lower is better. A score adds three things:
 
