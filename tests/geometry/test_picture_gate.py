@@ -166,7 +166,7 @@ def beside(one: Views, other: Views) -> tuple[Views, Int64]:
         return np.concatenate(parts, axis=1).reshape(2 * len(one.weight), *getattr(one, name).shape[1:])
 
     rows = np.repeat(np.arange(2 * frames), joints)
-    return replace(one, rays=both("xy"), weight=both("weight"), pose_index=rows // 2), rows
+    return replace(one, rays=both("rays"), weight=both("weight"), pose_index=rows // 2), rows
 
 
 def test_people_far_apart_share_no_shift() -> None:
