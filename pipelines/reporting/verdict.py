@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,13 +74,10 @@ def _why_nothing(summary: Summary) -> str:
 
 def _lead(summary: Summary) -> str:
     share = summary.share or 0.0
-    doubt = next((doubt for doubt in items(summary.metrics, "doubts") if isinstance(doubt, dict)), None)
-    if doubt is not None:
-        remedy = text(doubt, "remedy")
+    if doubts := _of_the_flight(summary):
         return (
-            f"This flight is doubted: {text(doubt, 'what')}. "
-            + (f"In flight.yaml set {remedy}. " if remedy else "")
-            + f"{percent(share)} of {plural(summary.total, 'joint-frame')} were reconstructed all the same."
+            f"This flight is doubted: {text(doubts[0], 'what')}. "
+            f"{percent(share)} of {plural(summary.total, 'joint-frame')} were reconstructed all the same."
         )
     amount = next(
         words
@@ -192,8 +190,19 @@ def _large_errors(summary: Summary) -> list[str]:
     ]
 
 
+def _of_the_flight(summary: Summary) -> list[dict[str, object]]:
+    """Return what metrics.json doubts of the flight, what explains the most first."""
+    return [doubt for doubt in items(summary.metrics, "doubts") if isinstance(doubt, dict)]
+
+
+def _stated(doubt: Mapping[str, object]) -> str:
+    """State a doubt of the flight as `reconstruct` warns of it."""
+    remedy = text(doubt, "remedy")
+    return f"doubt ({text(doubt, 'code')}): {text(doubt, 'what')}" + (f"; set {remedy}" if remedy else "")
+
+
 def _doubts(content: SessionContent, summary: Summary) -> list[str]:
-    doubts = []
+    doubts = [_stated(doubt) for doubt in _of_the_flight(summary)]
     losses = sorted(((n, word) for word, n in summary.counts.items() if word != "ok"), reverse=True)
     if not summary.nothing_measured:
         doubts += [

@@ -131,7 +131,7 @@ def test_no_warnings_no_doubts(content: SessionContent) -> None:
 def test_a_doubt_comes_before_everything_else(content: SessionContent) -> None:
     doubt = {"code": "mount", "cameras": ["mast"], "what": "W1", "evidence": {}, "remedy": "R1"}
     doubted = replace(content, metrics={**(content.metrics or {}), "doubts": [doubt]})
-    lead = give_verdict(doubted, summarise(doubted)).lead
-    right = give_verdict(content, summarise(content)).lead
-    assert lead.index("W1") < lead.index("R1") < lead.index("81.1")
-    assert right.split()[0] not in lead
+    verdict, right = give_verdict(doubted, summarise(doubted)), give_verdict(content, summarise(content))
+    assert verdict.lead.index("W1") < verdict.lead.index("81.1")
+    assert right.lead.split()[0] not in verdict.lead
+    assert "R1" in verdict.doubts[0]
