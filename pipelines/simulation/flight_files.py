@@ -143,7 +143,7 @@ def _visible_lines(flight: SimulatedFlight, drone: SimulatedDrone) -> list[str]:
 
 
 def write_keypoints(folder: Path, flight: SimulatedFlight, drone: SimulatedDrone) -> None:
-    """What a detector would have found, as AlphaPose writes it, and when the pictures were taken."""
+    """Write what a detector would have found, as AlphaPose does, and the times of the pictures."""
     people = [Sighting(1 + k, *keypoints_of(flight, drone, person)) for k, person in enumerate(flight.people)]
     write_alphapose(folder / f"{drone.name}_keypoints.json", people)
     stamps = picture_stamps(flight, drone)

@@ -1,4 +1,4 @@
-"""What exports share: names of files, tables, chosen times, and what viewers show of maps and covariances."""
+"""Parts that exports share: names of files, tables, chosen times, maps and covariances for viewers."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ CODES = (
     "residual",
     "noise",
 )
-"""What a doubt can be of."""
+"""The codes of doubts."""
 
 MARGIN = 3.0
 """By how much a mistake must score better than the description to be named."""
