@@ -1,11 +1,12 @@
 """Check a flight: what its description, its logs and its pictures cannot all be true of.
 
 A flight that was not ingested yet is read into a temporary session. Where no keypoints are known, the
-detector looks at a few seconds in the middle of the flight.
+detector looks at a few seconds in the middle of the flight, in a temporary copy: a check changes no session.
 """
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,11 +62,26 @@ def check(
     """
     progress = progress or Silent()
     if path.is_dir():
-        return _checked(path, pose_noise, detector, workers, progress)
+        if _has_keypoints(path):
+            return _checked(path, pose_noise, detector, workers, progress)
+        # Beside the session, so that its relative paths to videos lead there from the copy, too.
+        with tempfile.TemporaryDirectory(prefix=".mocap-check-", dir=path.resolve().parent) as folder:
+            shutil.copytree(path, folder, dirs_exist_ok=True)
+            return _checked(Path(folder), pose_noise, detector, workers, progress)
     with tempfile.TemporaryDirectory(prefix="mocap-check-") as folder:
         session = Path(folder) / "check.session"
         ingest(path, session, progress=progress)
         return _checked(session, pose_noise, detector, workers, progress)
+
+
+def _has_keypoints(folder: Path) -> bool:
+    """Return True if nothing has to be detected."""
+    with locked(folder) as session:
+        return (
+            session.intact_record("ingest") is None
+            or not cameras_to_detect(read_description(folder))
+            or session.intact_record(DETECT.name) is not None
+        )
 
 
 def _checked(

@@ -157,3 +157,12 @@ def test_poses_that_state_themselves_take_no_such_keys(flight: Described, tmp_pa
     assert with_remedy(manifest, "cameras.drone1.pose: {static: made/drone1_camera.yaml, inverse: true}")
     assert "cameras.drone1.pose" in (line := refused("ingest", manifest, "-o", tmp_path / "still.session"))
     assert "inverse" in line
+
+
+def test_a_check_changes_no_session(tmp_path: Path) -> None:
+    sample = Path(__file__).parents[2] / "sample_data" / "mound_walk"
+    session = tmp_path / "mound.session"
+    succeeds("ingest", sample / "flight.yaml", "-o", session)
+    before = sorted(path.relative_to(tmp_path) for path in tmp_path.rglob("*"))
+    assert json.loads(succeeds("check", session, "--json"))["doubts"] == []
+    assert sorted(path.relative_to(tmp_path) for path in tmp_path.rglob("*")) == before
