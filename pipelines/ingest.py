@@ -28,6 +28,7 @@ from pipelines.session.description import (
     PlannedEntry,
     TruthEntry,
     read_description,
+    said_assumptions,
 )
 from pipelines.session.errors import DataError, MocapError, NotYetReadError
 from pipelines.session.manifest import Flight, read_flight
@@ -67,7 +68,7 @@ from pipelines.sources.parts import (
 from pipelines.sources.poses import FlightPoses
 from pipelines.sources.world import losses
 
-INGEST = Stage("ingest", revision=5)
+INGEST = Stage("ingest", revision=6)
 
 _AHEAD_ROWS = 200_000  # of cameras that are read during hashing: some 70 MB
 
@@ -148,6 +149,7 @@ def ingest(
             origin = reader.origin()
             check_sources()
             warnings += reader.take_notes()
+            warnings += said_assumptions(flight.assumptions)
             warnings += [f"{path}: {losses(causes)}: copy it again" for path, causes in damage.items()]
 
             description = Description(
@@ -164,6 +166,7 @@ def ingest(
                 plan=plan,
                 sources=sources,
                 damage=damage,
+                assumptions=flight.assumptions,
                 warnings=warnings,
             )
             if strict:

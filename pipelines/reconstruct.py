@@ -57,7 +57,7 @@ from pipelines.reconstruction.solving import (
     views_with_noise,
 )
 from pipelines.reconstruction.trials import disturbances, disturbed, summary_of_trials
-from pipelines.session.description import Description, Interpolation, read_description
+from pipelines.session.description import Description, Interpolation, read_description, said_assumptions
 from pipelines.session.errors import DataError
 from pipelines.session.people import LoggedActor, logged_actor, true_joints_at
 from pipelines.session.progress import Progress, Silent
@@ -211,6 +211,7 @@ def reconstruct(
             counts=_counts(metrics, stored, swaps),
             warnings=[
                 *said_doubts(doubts),
+                *said_assumptions(description.assumptions),
                 *_hint_warnings(description, ingested, detected),
                 *warnings,
                 *stored.warnings,

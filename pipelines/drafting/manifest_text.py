@@ -111,6 +111,7 @@ class CameraText:
         self._draft = draft
         self._relative = relative
         self._remarks = remarks
+        self._assumed: set[str] = set()  # keys that get `assumed: true`
 
     def lines(self) -> list[str]:
         """Write the lines below the camera's name, without indentation."""
@@ -139,7 +140,7 @@ class CameraText:
         remark = describe(videos[0])
         if self._camera.paired:
             remark += "; assumed: of the same camera as the keypoints"
-            self._assume("that video and keypoints are of one camera")
+            self._assume("video", "of the same camera as the keypoints")
         return self._said("video", videos, remark)
 
     def _keypoints(self) -> list[str]:
@@ -152,11 +153,11 @@ class CameraText:
         if isinstance(found, Keypoints) and found.ambiguous:
             settings["format"] = found.format
             remarks.append("assumed: other formats recognise it too")
-            self._assume(f"keypoints: that they are {found.format}'s")
+            self._assume("keypoints", f"that they are {found.format}'s")
         if isinstance(found, Keypoints) and (first := _first_frame(found, self._film)):
             settings["first_frame"] = first
             remarks.append(f"assumed: frame {first} of it is the first")
-            self._assume(f"keypoints: first_frame {first}")
+            self._assume("keypoints", f"first_frame {first}")
         return self._said("keypoints", [replace(taken, settings=settings), *others], "; ".join(remarks))
 
     @property
@@ -174,24 +175,25 @@ class CameraText:
         if self._camera.videos and self._film is None:
             return []  # the log's own stamps
         if self._coarse_start is not None:
-            self._assume("frame_times: start by the subtitles' clock, to a second")
+            self._assume("frame_times", "start by the subtitles' clock, to a second")
             remark = "assumed: by the subtitles' clock, whole seconds of local time taken as UTC"
-            return [entry("frame_times", {"start": self._coarse_start}, remark)]
+            return [self._entry("frame_times", {"start": self._coarse_start}, remark)]
         start, reason = self._start()
         if self._film:
             if start is None:
                 return ["# frame_times: {start: SECONDS}  # when the first frame was taken, if not at 0"]
-            self._assume("frame_times: start, when the first frame was taken")
-            return [entry("frame_times", {"start": start}, f"assumed: the first frame {reason}")]
+            self._assume("frame_times", "start, when the first frame was taken")
+            return [self._entry("frame_times", {"start": start}, f"assumed: the first frame {reason}")]
         if not self._camera.keypoints:
             return []
         fps = {"fps": ASSUMED_FPS}
         if start is None:
-            self._assume(f"frame_times: fps {ASSUMED_FPS}, the first frame at 0 s")
-            return [entry("frame_times", fps, f"assumed: {ASSUMED_FPS} frames a second, the first at 0 s")]
-        self._assume(f"frame_times: fps {ASSUMED_FPS}; start, when the first frame was taken")
+            self._assume("frame_times", f"fps {ASSUMED_FPS}, the first frame at 0 s")
+            remark = f"assumed: {ASSUMED_FPS} frames a second, the first at 0 s"
+            return [self._entry("frame_times", fps, remark)]
+        self._assume("frame_times", f"fps {ASSUMED_FPS}; start, when the first frame was taken")
         remark = f"assumed: {ASSUMED_FPS} frames a second, the first {reason}"
-        return [entry("frame_times", {"start": start, **fps}, remark)]
+        return [self._entry("frame_times", {"start": start, **fps}, remark)]
 
     @property
     def _coarse_start(self) -> Decimal | None:
@@ -245,10 +247,10 @@ class CameraText:
         remarks = [describe(taken)]
         if not choice.named:
             remarks.append("assumed: they are its own")
-            self._assume("pose: that these poses are its own")
+            self._assume("pose", "that these poses are its own")
         if taken.is_true:
             remarks.append("assumed: these poses, called the truth, for there are no others")
-            self._assume("pose: what is called the truth, for there is nothing else")
+            self._assume("pose", "what is called the truth, for there is nothing else")
         filmed = self._camera.filmed
         if filmed and taken.span and filmed.overlap_ns(taken.span) < 0:
             remarks.append(f"missing: it was filmed at other times, {spanned(filmed)}")
@@ -259,7 +261,7 @@ class CameraText:
             remarks += self._about_drone(taken.found)
         if taken.ned_hint:
             remarks.append(f"{flow(taken.ned_hint)} sounds like north-east-down: then add axes: ned")
-            self._assume("pose: axes enu, although a name sounds like ned")
+            self._assume("pose", "axes enu, although a name sounds like ned")
         return self._said("pose", choice.all, "; ".join(remarks), self._pose_settings)
 
     def _about_drone(self, found: DroneLog) -> list[str]:
@@ -269,10 +271,10 @@ class CameraText:
             self._miss("pose: altitude, for its log states no height")
             remarks.append("missing: altitude: METRES above the take-off")
         elif found.key == "dji" and found.height == "unknown":
-            self._assume("pose: absolute heights from a barometer, which differ between drones by metres")
+            self._assume("pose", "absolute heights from a barometer, which differ between drones by metres")
             remarks.append("assumed: absolute heights (altitude: relative takes the other)")
         elif found.key == "dji":
-            self._assume("pose: heights above the take-off, which was level for all")
+            self._assume("pose", "heights above the take-off, which was level for all")
             remarks.append("assumed: heights above the take-off (altitude: absolute takes the other)")
         if found.step_ns > _BRIDGED_NS:
             step_s = found.step_ns / 1e9
@@ -302,9 +304,11 @@ class CameraText:
             return []
         choice = self._camera.gimbal
         if choice is None:
-            self._assume("mount: the camera looks forward, level, from the body's origin")
+            self._assume("mount", "the camera looks forward, level, from the body's origin")
             settings = {"looks": "forward", "down_deg": 0, "translation": [0, 0, 0]}
-            return [entry("mount", settings, "assumed: along the body's x axis, level, no lever arm (m)")]
+            return [
+                self._entry("mount", settings, "assumed: along the body's x axis, level, no lever arm (m)")
+            ]
         self._miss("gimbal: relative_to, what its angles are relative to")
         lines = ["gimbal:", *(f"  {entry(key, value)}" for key, value in choice.taken.settings.items())]
         lines.append(
@@ -313,7 +317,8 @@ class CameraText:
         if choice.taken.topic and "Quaternion" not in choice.taken.topic.type:
             lines.append("  # order: ypr  # assumed: yaw, pitch, roll as they stand in the message; or rpy")
             lines.append("  # units: deg  # assumed; or rad")
-            self._assume("gimbal: order ypr, units deg")
+            self._assume("gimbal", "order ypr, units deg")
+            lines.append("  assumed: true")
         lines.append("# mount: {looks: forward, translation: [0, 0, 0]}  # the lever arm to the gimbal, m")
         return [*lines, *self._others("gimbal", choice.others)]
 
@@ -342,7 +347,7 @@ class CameraText:
         remark = describe(choice.taken)
         if not choice.named:
             remark += "; assumed: it holds for this camera"
-            self._assume("intrinsics: that one calibration holds for them")
+            self._assume("intrinsics", "that one calibration holds for them")
         return self._said("intrinsics", choice.all, remark, self._of_calibration)
 
     def _of_calibration(self, candidate: Candidate) -> object:
@@ -361,8 +366,15 @@ class CameraText:
         settings: Callable[[Candidate], object] = lambda candidate: candidate.settings,
     ) -> list[str]:
         """Write the first candidate, and the others as comments below."""
-        line = entry(key, stated(settings(candidates[0]), self._relative), remark)
+        line = self._entry(key, settings(candidates[0]), remark)
         return [line, *self._others(key, candidates[1:], settings)]
+
+    def _entry(self, key: str, settings: object, remark: str) -> str:
+        """Write a line of the camera, with `assumed: true` where anything in it was assumed."""
+        value = stated(settings, self._relative)
+        if key in self._assumed:
+            value = {**(value if isinstance(value, dict) else {"path": value}), "assumed": True}
+        return entry(key, value, remark)
 
     def _others(
         self,
@@ -382,8 +394,9 @@ class CameraText:
         paths = [self._relative(found.path) for found in self._draft.unused if isinstance(found, kinds)]
         return f"; there is {', '.join(map(flow, paths[:_MOST_OTHERS]))}" if paths else ""
 
-    def _assume(self, what: str) -> None:
-        self._remarks.assumed.setdefault(what, []).append(self._camera.name)
+    def _assume(self, key: str, what: str) -> None:
+        self._assumed.add(key)
+        self._remarks.assumed.setdefault(f"{key}: {what}", []).append(self._camera.name)
 
     def _miss(self, what: str) -> None:
         self._remarks.missing.setdefault(what, []).append(self._camera.name)
@@ -445,7 +458,8 @@ def flowing(settings: object, relative: Callable[[Path], str]) -> str:
 
 _HEAD = """\
 # A flight for `mocap ingest`, drafted by `mocap init` from what the files say.
-# What is marked "assumed" or "missing" they do not say: only you can know it."""
+# What is marked "assumed" or "missing" they do not say: only you can know it. Everything with
+# `assumed: true` is reported as a guess until you take that away."""
 _NO_CAMERA = """
 # cameras:  # missing: one for each drone, with its video or keypoints, poses and intrinsics
 #   drone1:
@@ -476,11 +490,15 @@ def write_manifest(draft: Draft, name: str, relative: Callable[[Path], str]) -> 
         relative: converts a path to the form in the manifest.
     """
     remarks = Remarks()
+    guessed = any(
+        isinstance(camera.poses.taken.found, Poses | Recording) for camera in draft.cameras if camera.poses
+    )  # calibrations and drones' own logs state their axes
+    world = {"frame": "enu"} | ({"assumed": True} if guessed else {})
     lines = [
         _HEAD,
         entry("schema", SCHEMA),
         entry("name", name),
-        entry("world", {"frame": "enu"}, "assumed: the poses have z up (x east, y north); or ned"),
+        entry("world", world, "assumed: the poses have z up (x east, y north); or ned" if guessed else ""),
         *_origin(draft),
         *_logs(draft, relative, remarks),
         *_cameras(draft, relative, remarks),
@@ -513,14 +531,17 @@ def _logs(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) -> li
     if not draft.logs:
         return []
     lines = ["", "logs:"]
+    taken = [camera.poses.taken.settings for camera in draft.cameras if camera.poses]
+    several = len({str(settings["log"]) for settings in taken if "log" in settings}) > 1
     for name, log in draft.logs.items():
         paths = [relative(path) for path in log.parts]
-        settings = {"path": paths[0] if len(paths) == 1 else paths, "stamps": "header"}
+        settings: dict[str, object] = {"path": paths[0] if len(paths) == 1 else paths, "stamps": "header"}
+        if several:
+            settings["assumed"] = True
         spans = [topic.span for topic in log.topics if topic.count]
         whole = Span(min(s.first_ns for s in spans), max(s.last_ns for s in spans))
         lines.append("  " + entry(name, settings, f"{log.title}, {spanned(whole)}"))
-    taken = [camera.poses.taken.settings for camera in draft.cameras if camera.poses]
-    if len({str(settings["log"]) for settings in taken if "log" in settings}) > 1:
+    if several:
         remarks.assumed["logs: one clock and one origin for all; else say clock and world_from_log"] = []
     return [*lines, _ABOUT_LOGS]
 
@@ -543,7 +564,10 @@ def _actor(draft: Draft, relative: Callable[[Path], str], remarks: Remarks) -> l
     taken, *others = draft.actors
     remarks.assumed["actor: point hip, which point of the person the log follows"] = []
     remark = f"{describe(taken)}; assumed: point, one of hip, head, feet, centre"
-    lines = ["", entry("actor", stated({**taken.settings, "point": "hip"}, relative), remark)]
+    lines = [
+        "",
+        entry("actor", stated({**taken.settings, "point": "hip", "assumed": True}, relative), remark),
+    ]
     return lines + [f"# or actor: {flowing(other.settings, relative)}" for other in others]
 
 

@@ -22,7 +22,7 @@ from pipelines.reporting.motion import (
 )
 from pipelines.reporting.wording import ABSENT, THIN, fixed, percent, quantity, significant
 from pipelines.session.camera_poses import logged_covariance
-from pipelines.session.description import CameraEntry, Description
+from pipelines.session.description import CameraEntry, ClockEntry, Description
 from pipelines.session.people import true_joints_at
 from pipelines.session.tables import motion_from, trajectory_from
 
@@ -341,11 +341,17 @@ def _quality_row(content: SessionContent, summary: Summary, camera: CameraRow) -
         if poses is None or truth is None or still
         else _measured_noise(poses, truth, summary),
         offset=offset,
-        sigma="known" if clock.sigma_s == 0 else f"±{THIN}{quantity(clock.sigma_s, 's', 3)}",
+        sigma=_clock_words(clock),
         detected=detected,
         confident=confident,
         hidden=content.hidden.get(camera.name),
     )
+
+
+def _clock_words(clock: ClockEntry) -> str:
+    sigma_s = clock.prior_sigma_s
+    words = f"±{THIN}{quantity(sigma_s, 's', 3)}" if sigma_s else "known"
+    return words + {"stated": "", "assumed": ", assumed", "none": ", not stated"}[clock.start]
 
 
 # --- poses ---------------------------------------------------------------------------------------------

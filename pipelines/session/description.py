@@ -5,8 +5,10 @@ Only ingest writes it. Every later stage reads it through this module and does n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -92,11 +94,23 @@ class KeypointsEntry(Entry):
     adjusted: dict[str, int] = {}  # values that are in the tables, but not as the file has them
 
 
+UNSTATED_CLOCK_SIGMA_S = 0.5
+"""Standard deviation of a camera's clock where its start was assumed or is not stated."""
+
+
 class ClockEntry(Entry):
     """World time = camera time + offset; the offset is already applied to the tables."""
 
     offset_s: float
     sigma_s: float
+    # The start of the pictures in world time: "stated" by the manifest, by a file or log that it names or by
+    # the motion in the pictures; "assumed" by `mocap init`; "none": nothing states it.
+    start: Literal["stated", "assumed", "none"] = "stated"
+
+    @property
+    def prior_sigma_s(self) -> float:
+        """The standard deviation of the offset: `sigma_s`, or 0.5 s where the start is not stated."""
+        return self.sigma_s if self.sigma_s or self.start == "stated" else UNSTATED_CLOCK_SIGMA_S
 
 
 class MediaEntry(Entry):
@@ -250,6 +264,7 @@ class Description(Entry):
     plan: dict[str, PlannedEntry] | None = None  # by camera
     sources: dict[str, str]  # path as the manifest states it -> sha256
     damage: dict[str, dict[str, int]] = {}  # of sources as wholes: path -> how often, by cause
+    assumptions: list[str] = []  # keys of the manifest that `mocap init` guessed and nobody confirmed
     warnings: list[str]
 
     @model_validator(mode="after")
@@ -293,6 +308,12 @@ class Description(Entry):
     def start_ns(self) -> int:
         """Time of the flight's first frame of any camera; seconds that users give count from it."""
         return min(entry.frames.first_t_ns for entry in self.cameras.values())
+
+
+def said_assumptions(assumptions: Sequence[str]) -> list[str]:
+    """State what `mocap init` guessed and nobody has confirmed, as one warning if there is anything."""
+    remedy = "confirm it in flight.yaml and take `assumed: true` away"
+    return [f"assumed by `mocap init`: {', '.join(assumptions)}; {remedy}"] if assumptions else []
 
 
 def read_description(session: Path) -> Description:

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import difflib
 import math
+from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
@@ -60,6 +61,12 @@ Seconds = Annotated[float, AfterValidator(_seconds)]
 """Seconds that can be added to any time."""
 
 
+class Guess(Part):
+    """A mapping of which something may be a guess of `mocap init` that nobody has confirmed yet."""
+
+    assumed: bool = False
+
+
 class Origin(Part):
     """Place on Earth of the world's origin."""
 
@@ -68,7 +75,7 @@ class Origin(Part):
     altitude_m: float = 0.0
 
 
-class World(Part):
+class World(Guess):
     """The axes of all sources that do not state their own, and the world's origin."""
 
     frame: Axes = "enu"
@@ -89,7 +96,7 @@ class WorldFromLog(Part):
     yaw_deg: float = 0.0
 
 
-class Log(Part):
+class Log(Guess):
     """A recording: one file or several parts of it."""
 
     shorthand = "path"
@@ -102,7 +109,7 @@ class Log(Part):
     world_from_log: WorldFromLog = WorldFromLog()
 
 
-class Video(Part):
+class Video(Guess):
     """A video file, or pictures in a log."""
 
     shorthand = "path"
@@ -115,7 +122,7 @@ class Video(Part):
 _COUNTED = (("start", "start_ns"), ("start_from", "start_from"), ("fps", "fps"))  # not with other keys
 
 
-class FrameTimes(Part):
+class FrameTimes(Guess):
     """Source of the frames' times; by default the container's stamps, counted from `start`."""
 
     start_ns: SecondsAsNs = Field(0, alias="start")
@@ -147,8 +154,14 @@ class FrameTimes(Part):
         """True if a start is stated, even 0."""
         return "start_ns" in self.model_fields_set
 
+    @property
+    def is_placed(self) -> bool:
+        """True if the times are world times: more than a rate, or the container's stamps from 0 on."""
+        named = (self.start_from, self.csv, self.log, self.srt, self.ulog, self.ardupilot)
+        return self.has_start or any(source is not None for source in named)
 
-class Clock(Part):
+
+class Clock(Guess):
     """World time = video time + offset; sigma 0 means that it is known."""
 
     offset_ns: SecondsAsNs = Field(0, alias="offset_s")
@@ -163,7 +176,7 @@ class StaticPose(Part):
     camera: str | None = None
 
 
-class PoseSource(Part):
+class PoseSource(Guess):
     """Source of a camera's poses."""
 
     one_of = ("log", "tum", "csv", "static", "dji", "ulog", "ardupilot")
@@ -239,7 +252,7 @@ class RigidTransform(Part):
     rotation_xyzw: Annotated[Quaternion, AfterValidator(_unit_quaternion)]
 
 
-class Mount(Part):
+class Mount(Guess):
     """Pose of the camera on the body."""
 
     looks: Literal["forward", "backward", "left", "right", "down", "up"] | None = None
@@ -257,7 +270,7 @@ class FixedAngles(Part):
     roll_deg: float = Field(0.0, ge=-180, le=180)
 
 
-class Gimbal(Part):
+class Gimbal(Guess):
     """Source of the gimbal's angles: a topic, fixed angles, or the drone's own log that gives the pose."""
 
     log: str | None = None
@@ -283,7 +296,7 @@ class Gimbal(Part):
         return self
 
 
-class IntrinsicsSource(Part):
+class IntrinsicsSource(Guess):
     """A calibration file (and which of its cameras), a topic, or the numbers themselves."""
 
     shorthand = "path"
@@ -311,7 +324,7 @@ class IntrinsicsSource(Part):
         return self
 
 
-class KeypointSource(Part):
+class KeypointSource(Guess):
     """2D keypoints of this camera, made by a detector of the user's own."""
 
     shorthand = "path"
@@ -362,7 +375,7 @@ class Camera(Part):
         return self
 
 
-class Actor(Part):
+class Actor(Guess):
     """Source of the actor's positions, logged in flight."""
 
     log: str
@@ -478,9 +491,22 @@ class Flight(Part):
         return self
 
     @property
+    def assumptions(self) -> list[str]:
+        """The keys of all mappings with `assumed: true`, as `cameras.drone1.frame_times`."""
+        return list(_assumed_in(self.model_dump(), ""))
+
+    @property
     def reference_camera(self) -> str:
         """The camera whose clock offset is held at its given value when clocks are estimated."""
         return self.clock_reference or next(iter(self.cameras))
+
+
+def _assumed_in(mapping: Mapping[str, Any], place: str) -> Iterator[str]:
+    if mapping.get("assumed"):
+        yield place
+    for key, value in mapping.items():
+        if isinstance(value, dict):
+            yield from _assumed_in(value, f"{place}.{key}" if place else key)
 
 
 def read_flight(path: Path) -> Flight:

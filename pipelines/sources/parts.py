@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -123,6 +124,7 @@ def camera_entry(
         clock=ClockEntry(
             offset_s=camera.clock.offset_ns / 1e9 if camera.clock else 0.0,
             sigma_s=_clock_sigma_s(camera, frames),
+            start=_clock_start(camera),
         ),
         log_clock=LogClockEntry(**asdict(data.log_clock)) if data.log_clock else None,
         pose_noise=camera.pose_noise,
@@ -279,6 +281,16 @@ def _clock_sigma_s(camera: Camera, frames: CameraFrames) -> float:
     if clock is None or (frames.start_sigma_s and "sigma_s" not in clock.model_fields_set):
         return frames.start_sigma_s
     return clock.sigma_s
+
+
+def _clock_start(camera: Camera) -> Literal["stated", "assumed", "none"]:
+    """Return if the manifest, or a file or log that it names, states when the pictures were taken."""
+    times, clock = camera.frame_times, camera.clock
+    if (times and times.assumed) or (clock and clock.assumed):
+        return "assumed"
+    if clock or (camera.video and camera.video.log) or (times and times.is_placed):
+        return "stated"
+    return "none"
 
 
 def _pose_source(pose: PoseSource) -> str:

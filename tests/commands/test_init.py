@@ -101,7 +101,7 @@ def test_drafted_logs_are_ingested_as_they_were_flown(tmp_path: Path, container:
         assert camera["video"] == {"log": name, "topic": f"/{name}/image/compressed"}
         assert camera["pose"] == {"log": name, "topic": f"/{name}/odometry", "of": "body"}
         assert camera["intrinsics"] == {"log": name, "topic": f"/{name}/camera_info"}
-    mount = "{looks: forward, down_deg: %g, translation: %s}"
+    mount = "{looks: forward, down_deg: %g, translation: %s, assumed: true}"
     edit(result.path, {mount % (0, [0, 0, 0]): mount % (30, list(LEVER_ARM))})
     ingest(result.path)
     assert tables(tmp_path / "flight.session") == tables(tmp_path / "written.session")
@@ -165,7 +165,7 @@ def test_the_truth_stands_in_for_poses_only_with_a_word(tmp_path: Path) -> None:
     write_lenses(flight)
     (tmp_path / "drone2.tum").unlink()
     result, stated = drafted(tmp_path)
-    assert stated["cameras"]["drone2"]["pose"] == {"tum": "drone2_true.tum"}
+    assert stated["cameras"]["drone2"]["pose"] == {"tum": "drone2_true.tum", "assumed": True}
     assert stated["truth"]["poses"] == {"drone1": "drone1_true.tum"}
     assert any(remark.startswith("drone2: pose: ") and "truth" in remark for remark in result.assumed)
 
@@ -281,7 +281,7 @@ def test_parts_of_a_log_beside_a_video_are_one_log_and_not_the_folder(tmp_path: 
     camera = stated["cameras"]["drone1"]
     assert camera["video"] == "drone1.mp4"
     # The container counts from 0, the log since the epoch.
-    assert camera["frame_times"] == {"start": START_NS // 10**9}
+    assert camera["frame_times"] == {"start": START_NS // 10**9, "assumed": True}
     [line] = [line for line in result.text.splitlines() if line.startswith("    pose: ")]
     assert "odom_ned " in line
     assert line.endswith(" axes: ned")
@@ -303,9 +303,13 @@ def test_the_whereabouts_of_a_gimbal_are_for_the_user_to_say(tmp_path: Path) -> 
         ],
     )
     result, stated = drafted(tmp_path)
-    assert stated["cameras"]["drone1"]["gimbal"] == {"log": "drone1", "topic": "/drone1/gimbal"}
+    assert stated["cameras"]["drone1"]["gimbal"] == {
+        "log": "drone1",
+        "topic": "/drone1/gimbal",
+        "assumed": True,
+    }
     assert "mount" not in stated["cameras"]["drone1"]
-    assert stated["actor"] == {"log": "drone1", "topic": "/actor/pose", "point": "hip"}
+    assert stated["actor"] == {"log": "drone1", "topic": "/actor/pose", "point": "hip", "assumed": True}
     assert [m for m in result.missing if "relative_to" in m]
     edit(result.path, {"# relative_to": "relative_to", "# intrinsics": "intrinsics"})
     assert read_flight(result.path).cameras["drone1"].gimbal is not None

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from pipelines.session.description import read_description
 from tests.commands.runner import mocap, refused, succeeds
 from tests.synthetic.flights import START_NS, SyntheticFlight, film_at, write_flight
 
@@ -148,3 +149,39 @@ def test_offsets_in_milliseconds_are_refused_before_anything_is_read(tmp_path: P
     flight.save()
     line = refused("ingest", flight.manifest)
     assert re.search(r"logs\.d1\.clock\.offset_s: .*\bms or ns\b", line)
+
+
+def test_guesses_stay_visible_until_they_are_confirmed(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=3, clean=True)
+    cameras = flight.settings["cameras"]
+    cameras["drone1"]["frame_times"]["assumed"] = True
+    # The keypoints of drone3 count from 0, as its clock says: nothing else states when it began.
+    cameras["drone3"] |= {"frame_times": {"fps": 30}, "clock": {"offset_s": START_NS // 10**9, "sigma_s": 0}}
+    flight.save()
+    told = mocap("ingest", flight.manifest).stderr
+    session = json.loads((tmp_path / "flight.session" / "session.json").read_text())
+    assert session["assumptions"] == ["cameras.drone1.frame_times"]
+    assert "cameras.drone1.frame_times" in told
+    starts = {name: camera["clock"]["start"] for name, camera in session["cameras"].items()}
+    assert starts == {"drone1": "assumed", "drone2": "stated", "drone3": "stated"}
+    succeeds("reconstruct", tmp_path / "flight.session")
+    record = json.loads((tmp_path / "flight.session" / "reconstruct" / "stage.json").read_text())
+    assert any("cameras.drone1.frame_times" in line for line in record["warnings"])
+    del cameras["drone1"]["frame_times"]["assumed"]
+    flight.save()
+    succeeds("ingest", flight.manifest)
+    session = json.loads((tmp_path / "flight.session" / "session.json").read_text())
+    assert not session["assumptions"]
+
+
+def test_a_start_that_nothing_states_is_unknown_by_half_a_second(tmp_path: Path) -> None:
+    flight = write_flight(tmp_path, cameras=2, clean=True, static=True)
+    for camera in flight.settings["cameras"].values():
+        camera["frame_times"] = {"fps": 30}
+        del camera["clock"]
+    del flight.settings["truth"]
+    flight.save()
+    succeeds("ingest", flight.manifest)
+    for camera in read_description(tmp_path / "flight.session").cameras.values():
+        assert camera.clock.start == "none"
+        assert camera.clock.prior_sigma_s == 0.5

@@ -80,7 +80,7 @@ def test_a_video_that_the_poses_outlast_needs_no_start() -> None:
 def test_a_video_that_counts_from_elsewhere_starts_with_the_first_pose_rounded_up() -> None:
     first_ns = EPOCH_NS + 123_456_789
     text, stated = written(Findings([video(300), poses(first_ns, first_ns + 20 * SECOND)]))
-    assert stated["cameras"]["drone1"]["frame_times"] == {"start": 1700000000.124}
+    assert stated["cameras"]["drone1"]["frame_times"] == {"start": 1700000000.124, "assumed": True}
     [remark] = text.assumed
     assert remark.startswith("drone1: frame_times: start,")
 
@@ -91,7 +91,11 @@ def test_truth_of_another_time_is_told_but_not_stated() -> None:
     text, stated = written(findings)
     assert "truth" not in stated
     assert "truth: {joints: truth.csv}" in text.text
-    assert stated["cameras"]["drone1"]["frame_times"] == {"start": 1700000000, "fps": 30}
+    assert stated["cameras"]["drone1"]["frame_times"] == {
+        "start": 1700000000,
+        "fps": 30,
+        "assumed": True,
+    }
 
 
 def test_a_camera_of_a_calibration_is_named_where_its_name_is_another() -> None:
@@ -105,7 +109,11 @@ def test_a_camera_of_a_calibration_is_named_where_its_name_is_another() -> None:
 def test_keypoints_of_several_formats_state_one() -> None:
     two = Keypoints(*about("drone1.json", "coco"), 10, 0, 9, ambiguous=True)
     text, stated = written(Findings([two]))
-    assert stated["cameras"]["drone1"]["keypoints"] == {"path": "drone1.json", "format": "coco"}
+    assert stated["cameras"]["drone1"]["keypoints"] == {
+        "path": "drone1.json",
+        "format": "coco",
+        "assumed": True,
+    }
     assert any(r.startswith("drone1: keypoints: ") and r.endswith(" coco's") for r in text.assumed)
 
 
