@@ -1,0 +1,418 @@
+"""Accuracy on real pictures that move, by virtual gimbals: `python -m benchmarks.gimbals FOLDER`.
+
+The real recording of Pose2Sim's demo has four still cameras (`MOCAP_REAL_DATA` names the folder that holds
+`pose2sim_single`; 100 pictures at 60 Hz). Each picture is undistorted and turned by a homography, as a gimbal
+would have turned the camera: it follows the person loosely, pans, tilts, rolls and shakes along a known path.
+Film, person, texture and detector are real. The path and the attitude errors in the log are not: they are
+drawn. Errors are about each axis of the camera, with the same standard deviation for the part that is
+constant and for the part that is new in every picture. Positions are exact.
+
+What this rests on:
+
+- A path is known exactly, and so is the changing part of an attitude error. Its constant part and every
+  distance are as good as the calibration (`Calib_refit.toml`, refitted to keypoints of the same recording;
+  the calibration that comes with it is 0.5 to 0.9 deg off for two cameras).
+- There is no truth of the person. The reference is the result of `robust` from the still cameras, with the
+  same detector and calibration. It has errors of its own, and shares part of the detector's with what is
+  compared to it. The row "true attitudes" is what remains without any error in the log: the floor.
+- `NEES` takes the distance as if the reference were exact (strict); `NEES both` adds its covariance (lenient:
+  errors that both share count as independent).
+- Jitter is the length of the second difference of a joint's path, over sqrt(3): that of white noise has the
+  size of its frame-to-frame difference. The person's own accelerations are in it; the floor says how much.
+- No parallax: positions never change. No blur beyond the recording's own. 1.7 s of one person.
+
+Paths a and b are for tuning; c and d are kept aside, and are measured with --kept only.
+
+Films, detections and sessions stay in FOLDER and are used again; methods are always measured anew.
+FOLDER/PATH/NAME.yaml are flights that every command of `mocap` takes, FOLDER/PATH/CAMERA.true.tum their true
+poses. Set OPENBLAS_NUM_THREADS=1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from itertools import product
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pandas as pd
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from benchmarks.detectors import CAMERAS, PEER, REAL
+from benchmarks.results_page import markdown_table
+from pipelines.formats.skeletons.trc import FORMAT as TRC
+from pipelines.geometry.arrays import Float
+from pipelines.ingest import ingest
+from pipelines.reconstruct import Settings, reconstruct
+from pipelines.session.description import IntrinsicsEntry, read_description
+from pipelines.session.records import POINT_COVARIANCE_COLUMNS
+
+TUNED, KEPT = ("a", "b"), ("c", "d")
+LEVELS_DEG = (0.5, 1.0)
+DRAWS = 1
+METHODS: dict[str, dict[str, Any]] = {
+    "robust": {"method": "robust"},
+    "refined": {"method": "refined"},
+    "background": {"method": "robust", "refine_cameras": "background"},
+    "refined + background": {"method": "refined", "refine_cameras": "background"},
+    "auto": {"method": "auto"},
+}
+_CALIBRATION = REAL / "calibration" / "Calib_refit.toml"
+_FPS, _SIZE = 60, (720, 960)
+_ZOOM = 0.8  # focal length of the virtual camera over the real one's
+_FOLLOWED_S = 0.3  # the person's centre is followed as slowly as that
+_AXES_SHARE = np.array([0.6, 1.0, 1.2])  # of the sway about x (tilt), y (pan) and z (roll)
+_SWAY_HZ_DEG = ((0.31, 2.2), (0.77, 0.9), (1.27, 0.35))
+_SHAKE_HZ_DEG = ((6.3, 0.06), (8.9, 0.05), (11.2, 0.04))
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What a real camera was when the recording was made: intrinsics and pose."""
+
+    intrinsics: IntrinsicsEntry
+    position: Float  # [3] m
+    world_from_camera: Float  # [3, 3]
+
+
+@dataclass(frozen=True)
+class Log:
+    """Errors of one logged flight."""
+
+    level_deg: float  # standard deviation per axis of the constant part, and of the changing part
+    draw: int = 0
+
+    @property
+    def name(self) -> str:
+        """The flight's name, as its manifest without suffix."""
+        return f"{self.level_deg:g}deg-{self.draw}" if self.level_deg else "true"
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Measured values of one reconstruction; NaN where the method has none."""
+
+    distance_mm: float
+    jitter_mm: float
+    changing_deg: float
+    constant_deg: float
+    nees: float
+    nees_both: float
+    share: float
+    cpu_s: float
+
+
+def main() -> None:
+    """Print a table for each detector and set of paths."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", type=Path, help="for films and sessions, outside the repository")
+    parser.add_argument("--kept", action="store_true", help="measure on the paths that are kept aside")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=[*METHODS][:-1])
+    parser.add_argument("--detectors", nargs="+", default=["blazepose"])
+    parser.add_argument("--paths", nargs="+", help="some of the paths only")
+    parser.add_argument("--draws", type=int, default=DRAWS, help=f"of the log's errors (default {DRAWS})")
+    arguments = parser.parse_args()
+    if not REAL.is_dir():
+        raise SystemExit(f"{REAL} is not here: MOCAP_REAL_DATA names the folder of pose2sim_single")
+    paths = arguments.paths or (KEPT if arguments.kept else TUNED)
+    folder = arguments.folder.resolve()
+    logs = [Log(level, draw) for level in LEVELS_DEG for draw in range(arguments.draws)]
+    with get_context("spawn").Pool(2) as pool:
+        for detector in arguments.detectors:
+            prepare(folder, detector)
+            pool.map(partial(prepare_path, folder, detector, logs), paths, chunksize=1)
+            cases = [(path, Log(0.0), False) for path in paths]
+            cases += list(product(paths, logs, (True, False)))
+            one = partial(measured, folder, detector, arguments.methods)
+            found = dict(zip(cases, pool.map(one, cases, chunksize=1), strict=True))
+            print_table(detector, paths, arguments.methods, found)
+
+
+# --- films and flights -----------------------------------------------------------------------------------
+
+
+def prepare(folder: Path, detector: str) -> None:
+    """Reconstruct from the still cameras: the reference."""
+    place = folder / "still"
+    place.mkdir(parents=True, exist_ok=True)
+    cameras = [
+        f"  {name}: {{video: {REAL / 'videos' / name}.mp4, intrinsics: {_CALIBRATION},"
+        f" pose: {{static: {_CALIBRATION}}}, frame_times: {{start: 0.0, fps: {_FPS}}}}}"
+        for name in CAMERAS
+    ]
+    _write(place / "flight.yaml", "\n".join(["schema: 1", "name: Still cameras", "cameras:", *cameras]))
+    session = place / f"{detector}.session"
+    ingest(place / "flight.yaml", session)
+    reconstruct(session, Settings(method="robust", detector=detector), workers=2)
+
+
+def prepare_path(folder: Path, detector: str, logs: Sequence[Log], path: str) -> None:
+    """Film along a path, write its flights, and detect the person once."""
+    place = folder / path
+    place.mkdir(exist_ok=True)
+    shots = _shots(folder / "still" / f"{detector}.session")
+    for log in (Log(0.0), *logs):
+        write_flight(place, log, path, shots)
+    for name, shot in shots.items():
+        if not (place / f"{name}.mp4").exists():
+            _film(name, shot, attitudes(path, name, shot), place / f"{name}.mp4")
+    session = _session(place, detector, Log(0.0))
+    ingest(place / "true.yaml", session)
+    reconstruct(session, Settings(method="robust", detector=detector))
+
+
+def _shots(still: Path) -> dict[str, Shot]:
+    """Return the real cameras as ingest understood them."""
+    cameras = read_description(still).cameras
+    shots = {}
+    for name, camera in cameras.items():
+        pose = pd.read_parquet(still / "cameras" / name / "poses.parquet").iloc[0]
+        turned = Rotation.from_quat(pose[["qx", "qy", "qz", "qw"]].to_numpy(float)).as_matrix()
+        shots[name] = Shot(camera.intrinsics, pose[["x", "y", "z"]].to_numpy(float), turned)
+    return shots
+
+
+def attitudes(path: str, name: str, shot: Shot) -> Float:
+    """Compute the true attitudes world_from_camera [T, 3, 3] of one camera along a path."""
+    rng = np.random.default_rng([1, ord(path), CAMERAS.index(name)])
+    joints = TRC.read_joints(PEER, unit=None, axes=None).position[:, 0]
+    centre = (np.nanmin(joints, axis=1) + np.nanmax(joints, axis=1)) / 2
+    centre = gaussian_filter1d(centre, _FOLLOWED_S * _FPS, axis=0, mode="nearest")
+    x, y, z = ((centre - shot.position) @ shot.world_from_camera).T
+    followed = Rotation.from_euler("yx", np.stack([np.arctan2(x, z), -np.arctan2(y, np.hypot(x, z))], axis=1))
+    t_s = np.arange(len(centre))[:, None] / _FPS
+    angle_deg = np.zeros((len(centre), 3))
+    for table, share in ((_SWAY_HZ_DEG, _AXES_SHARE), (_SHAKE_HZ_DEG, np.ones(3))):
+        for hz, deg in table:
+            angle_deg += deg * share * np.sin(2 * np.pi * (hz * t_s + rng.uniform(0, 1, 3)))
+    swayed = followed * Rotation.from_rotvec(np.radians(angle_deg))
+    turned: Float = shot.world_from_camera @ swayed.as_matrix()
+    return turned
+
+
+def write_flight(place: Path, log: Log, path: str, shots: dict[str, Shot]) -> None:
+    """Write the manifests of a flight, with and without its pose noise, and its poses."""
+    lines: dict[bool, list[str]] = {
+        given: ["schema: 1", f"name: Path {path}", "cameras:"] for given in (True, False)
+    }
+    for number, (name, shot) in enumerate(shots.items()):
+        true = attitudes(path, name, shot)
+        rng = np.random.default_rng([2, ord(path), log.draw, number])
+        drawn = rng.normal(size=3) + rng.normal(size=(len(true), 3))
+        error = Rotation.from_rotvec(np.radians(log.level_deg) * drawn)
+        rows = np.column_stack(
+            [
+                np.arange(len(true)) / _FPS,
+                np.broadcast_to(shot.position, (len(true), 3)),
+                (Rotation.from_matrix(true) * error).as_quat(),
+            ]
+        )
+        file = f"{name}.{log.name}.tum"
+        _write(place / file, "\n".join(" ".join(f"{value:.9f}" for value in row) for row in rows))
+        fx, fy, cx, cy = _virtual_lens(shot)
+        noise = f"rotation_deg: {log.level_deg:g}"
+        for given, own in lines.items():
+            own += [
+                f"  {name}:",
+                f"    video: {name}.mp4",
+                f"    frame_times: {{start: 0.0, fps: {_FPS}}}",
+                f"    pose: {{tum: {file}, of: camera}}",
+                f"    intrinsics: {{width: {_SIZE[0]}, height: {_SIZE[1]},"
+                f" fx: {fx:.6f}, fy: {fy:.6f}, cx: {cx}, cy: {cy}}}",
+            ]
+            if given and log.level_deg:
+                own.append(f"    pose_noise: {{white: {{{noise}}}, bias: {{{noise}}}}}")
+    _write(place / f"{log.name}.yaml", "\n".join(lines[False]))
+    if log.level_deg:
+        _write(place / f"{log.name}-given.yaml", "\n".join(lines[True]))
+
+
+def _virtual_lens(shot: Shot) -> tuple[float, float, float, float]:
+    focal = _ZOOM * shot.intrinsics.fx
+    return focal, focal, _SIZE[0] / 2 - 0.5, _SIZE[1] / 2 - 0.5
+
+
+def _film(name: str, shot: Shot, world_from_virtual: Float, out: Path) -> None:
+    """Film again what a camera saw, turned along a path; black where it saw nothing."""
+    lens = shot.intrinsics
+    k = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
+    fx, fy, cx, cy = _virtual_lens(shot)
+    k_virtual = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    unfinished = out.with_suffix(".part.mp4")
+    options = {"crf": "16", "threads": "1", "x264-params": "cpu-independent=1"}
+    with av.open(str(REAL / "videos" / f"{name}.mp4")) as source, av.open(str(unfinished), "w") as film:
+        stream = film.add_stream("libx264", rate=_FPS, options=options)
+        stream.width, stream.height, stream.pix_fmt = *_SIZE, "yuv420p"
+        for turned, frame in zip(world_from_virtual, source.decode(video=0), strict=True):
+            virtual_from_camera = turned.T @ shot.world_from_camera
+            maps = cv2.initUndistortRectifyMap(
+                k, np.array(lens.distortion), virtual_from_camera, k_virtual, _SIZE, cv2.CV_32FC1
+            )
+            picture = cv2.remap(frame.to_ndarray(format="bgr24"), *maps, cv2.INTER_CUBIC)
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
+        film.mux(stream.encode(None))
+    unfinished.replace(out)
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a file unless it holds this text already, so that ingest finds it unchanged."""
+    if not path.exists() or path.read_text(encoding="utf-8") != text + "\n":
+        path.write_text(text + "\n", encoding="utf-8")
+
+
+def _session(place: Path, detector: str, log: Log, *, given: bool = False) -> Path:
+    return place / detector / f"{log.name}{'-given' if given else ''}.session"
+
+
+# --- measuring -------------------------------------------------------------------------------------------
+
+
+def measured(
+    folder: Path, detector: str, methods: Sequence[str], case: tuple[str, Log, bool]
+) -> dict[str, Figures]:
+    """Reconstruct one flight by each method, and compare it with the still cameras."""
+    cv2.setNumThreads(1)
+    path, log, given = case
+    place = folder / path
+    session = _session(place, detector, log, given=given)
+    if not session.exists():
+        shutil.copytree(_session(place, detector, Log(0.0)), session)
+        shutil.rmtree(session / "reconstruct")
+    ingest(place / session.with_suffix(".yaml").name, session)
+    reference = pd.read_parquet(folder / "still" / f"{detector}.session" / "reconstruct" / "skeleton.parquet")
+    shots = _shots(folder / "still" / f"{detector}.session")
+    true = {name: attitudes(path, name, shot) for name, shot in shots.items()}
+    found = {}
+    for method in methods:
+        # The code may have changed since: nothing of an earlier run is taken for a result.
+        shutil.rmtree(session / "reconstruct", ignore_errors=True)
+        started_s = time.process_time()
+        reconstruct(session, Settings(**METHODS[method], detector=detector), workers=1)
+        taken_s = time.process_time() - started_s
+        found[method] = _figures(session, reference, true, taken_s)
+    return found
+
+
+def _figures(session: Path, reference: pd.DataFrame, true: dict[str, Float], taken_s: float) -> Figures:
+    table = pd.read_parquet(session / "reconstruct" / "skeleton.parquet")
+    ours, theirs = (_of_person(skeleton) for skeleton in (table, reference))
+    apart = ours.position - theirs.position
+    both = np.isfinite(apart).all(axis=-1)
+    second = np.diff(ours.position, 2, axis=0)
+    changing, constant = _attitude_errors_deg(session, true)
+    return Figures(
+        distance_mm=1e3 * float(np.median(np.linalg.norm(apart[both], axis=-1))),
+        jitter_mm=1e3 * float(np.nanmedian(np.linalg.norm(second, axis=-1))) / np.sqrt(3),
+        changing_deg=changing,
+        constant_deg=constant,
+        nees=_nees(apart[both], ours.covariance[both]),
+        nees_both=_nees(apart[both], ours.covariance[both] + theirs.covariance[both]),
+        share=float(both.sum() / np.isfinite(theirs.position).all(axis=-1).sum()),
+        cpu_s=taken_s,
+    )
+
+
+@dataclass(frozen=True)
+class _Person:
+    position: Float  # [T, J, 3] m
+    covariance: Float  # [T, J, 3, 3] m^2
+
+
+def _of_person(skeleton: pd.DataFrame) -> _Person:
+    """Shape a dense table, sorted by time, person and joint; the only person is 0."""
+    own = skeleton[skeleton["person"] == 0]
+    shape = (own["t_ns"].nunique(), -1)
+    c = own[list(POINT_COVARIANCE_COLUMNS)].to_numpy(float)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
+    return _Person(own[["x", "y", "z"]].to_numpy(float).reshape(*shape, 3), c.reshape(*shape, 3, 3))
+
+
+def _nees(apart: Float, covariance: Float) -> float:
+    return float(np.mean(np.einsum("ni,nij,nj->n", apart, np.linalg.inv(covariance), apart)))
+
+
+def _attitude_errors_deg(session: Path, true: dict[str, Float]) -> tuple[float, float]:
+    """Compute the changing and the constant part of the attitude errors: RMS per axis over the cameras.
+
+    Attitudes are those that the method used: its own, or the logged ones.
+    """
+    changing, constant = [], []
+    own = session / "reconstruct" / "cameras.parquet"
+    for name, attitude in true.items():
+        if own.exists():
+            poses = pd.read_parquet(own).query("camera == @name")
+        else:
+            poses = pd.read_parquet(session / "cameras" / name / "poses.parquet")
+        quaternion = poses.sort_values("t_ns")[["qx", "qy", "qz", "qw"]].to_numpy()
+        error = (Rotation.from_matrix(attitude).inv() * Rotation.from_quat(quaternion)).as_rotvec(
+            degrees=True
+        )
+        changing.append(error - error.mean(axis=0))
+        constant.append(error.mean(axis=0))
+    return float(np.sqrt(np.mean(np.square(changing)))), float(np.sqrt(np.mean(np.square(constant))))
+
+
+# --- the table -------------------------------------------------------------------------------------------
+
+
+def print_table(
+    detector: str,
+    paths: Sequence[str],
+    methods: Sequence[str],
+    found: dict[tuple[str, Log, bool], dict[str, Figures]],
+) -> None:
+    """Print the mean of each figure over paths and draws, by level, statement and method."""
+    print(f"\n{detector}, paths {', '.join(paths)}; mean over paths and draws")
+    header = [
+        "logged attitudes",
+        "stated",
+        "method",
+        "distance mm",
+        "jitter mm",
+        "changing deg",
+        "constant deg",
+    ]
+    print(
+        "\n".join(
+            markdown_table([*header, "NEES", "NEES both", "measured %", "CPU s"], list(_rows(methods, found)))
+        )
+    )
+
+
+def _rows(
+    methods: Sequence[str], found: dict[tuple[str, Log, bool], dict[str, Figures]]
+) -> Iterator[list[str]]:
+    levels = sorted({(log.level_deg, given) for _, log, given in found}, key=lambda key: (key[0], not key[1]))
+    for level, given in levels:
+        own = [of for (_, log, stated), of in found.items() if (log.level_deg, stated) == (level, given)]
+        for method in methods:
+            values = np.array([[getattr(of[method], field.name) for field in fields(Figures)] for of in own])
+            distance, jitter, changing, constant, nees, both, share, cpu_s = values.mean(axis=0)
+            yield [
+                f"{level:g} deg" if level else "true",
+                ("yes" if given else "no") if level else "",
+                method,
+                f"{distance:.1f}",
+                f"{jitter:.2f}",
+                f"{changing:.3f}",
+                f"{constant:.3f}",
+                f"{nees:.1f}",
+                f"{both:.1f}",
+                f"{100 * share:.1f}",
+                f"{cpu_s:.1f}",
+            ]
+
+
+if __name__ == "__main__":
+    main()
