@@ -68,7 +68,7 @@ from pipelines.sources.parts import (
 from pipelines.sources.poses import FlightPoses
 from pipelines.sources.world import losses
 
-INGEST = Stage("ingest", revision=6)
+INGEST = Stage("ingest", revision=7)
 
 _AHEAD_ROWS = 200_000  # of cameras that are read during hashing: some 70 MB
 

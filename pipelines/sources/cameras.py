@@ -14,8 +14,8 @@ import numpy as np
 
 from pipelines.formats.videos.frame_times import read_frame_times, times_of_frames
 from pipelines.formats.videos.picture_motion import followed_points
-from pipelines.formats.videos.video import created_ns
-from pipelines.geometry.cameras import Intrinsics, fit_to_size
+from pipelines.formats.videos.video import black_bars, created_ns
+from pipelines.geometry.cameras import Intrinsics, fit_to_size, is_resized
 from pipelines.geometry.clocks import fit_start
 from pipelines.session.description import MediaEntry
 from pipelines.session.errors import DataError
@@ -285,8 +285,11 @@ class FlightCameras:
         if source.readout_s:
             intrinsics = replace(intrinsics, readout_s=source.readout_s)
         if size := self._picture_size(camera, video, detections):
+            bars = (0, 0, 0, 0)
+            if camera.video and camera.video.path and not is_resized(intrinsics, *size):
+                bars = black_bars(self._base / camera.video.path)
             try:
-                intrinsics, note = fit_to_size(intrinsics, *size)
+                intrinsics, note = fit_to_size(intrinsics, *size, bars)
             except ValueError as error:
                 remedy = "give the calibration that belongs to these pictures"
                 raise DataError(place, str(error), remedy) from None

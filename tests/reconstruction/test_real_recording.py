@@ -62,6 +62,22 @@ def test_default_disagrees_less_with_the_pictures_than_the_peer(tmp_path: Path) 
     assert np.nanmedian(distance_to_peer_mm(skeleton)) < 25.0
 
 
+def test_letterboxed_videos_get_the_intrinsics_of_their_pictures(tmp_path: Path) -> None:
+    """The picture that each camera was calibrated with, found again in its video, says what happened to it.
+
+    `camNN_ext.png` of the wheel pose2sim 0.8.4 has the calibration's 1088 x 1920 px. An affine map fitted to
+    519 and 1156 matches of its background in the videos of cam01 and cam02 multiplies x by 0.9928 and 0.9926,
+    y by 0.9926 and 0.9925 (standard deviations up to 0.0001), and moves y by 7.1 and 7.2 px (0.1 px).
+    """
+    succeeds("ingest", manifest_of(tmp_path))
+    cameras = json.loads((tmp_path / "videos.session" / "session.json").read_text("utf-8"))["cameras"]
+    for name, fx, cy in (("cam01", 1681.2449, 948.1374), ("cam02", 1673.7296, 963.2259)):
+        lens = cameras[name]["intrinsics"]
+        assert lens["fx"] / fx == pytest.approx(0.9926, abs=2e-4)
+        assert lens["cy"] == pytest.approx(0.9926 * cy + 7.15, abs=0.3)
+    assert cameras["cam03"]["intrinsics"]["cy"] == pytest.approx(955.0051, abs=1e-3)
+
+
 @pytest.mark.slow
 def test_videos_alone_come_near_the_peers_skeleton(tmp_path: Path) -> None:
     """The peer used OpenPose's keypoints; here the larger BlazePose looks at every fifth picture: 38 mm.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -53,6 +53,7 @@ def write_video(
     key_every: int = 12,
     b_frames: int = 2,
     turned_deg: int = 0,
+    draw: Callable[[int], Picture] = bar_code,
 ) -> Path:
     """Write one frame for each stamp; the suffix of the path is the container, MP4 with its table in front.
 
@@ -64,12 +65,13 @@ def write_video(
         key_every: frames from one key frame to the next.
         b_frames: number of consecutive frames that refer to later ones.
         turned_deg: counter-clockwise rotation that the container states.
+        draw: makes the picture of a frame; all have the same size.
     """
     mp4 = path.suffix in {".mp4", ".mov"}
     with av.open(str(path), "w", options={"movflags": "faststart"} if mp4 else {}) as container:
         stream = container.add_stream(codec, rate=30)
         assert isinstance(stream, av.VideoStream)
-        stream.width, stream.height = SIZE
+        stream.height, stream.width = draw(0).shape[:2]
         stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
         stream.time_base = stream.codec_context.time_base = tick_s
         options = {"g": str(key_every), "bf": str(b_frames)}
@@ -80,7 +82,7 @@ def write_video(
             stream.set_display_rotation(turned_deg)
         container.start_encoding()  # also without a frame
         for number, pts in enumerate(ticks):
-            frame = av.VideoFrame.from_ndarray(bar_code(number), format="bgr24")
+            frame = av.VideoFrame.from_ndarray(draw(number), format="bgr24")
             frame.pts, frame.time_base = pts, tick_s
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.formats.videos import video
-from pipelines.formats.videos.video import VideoReader, created_ns, frames, index_video, is_shown
+from pipelines.formats.videos.video import VideoReader, black_bars, created_ns, frames, index_video, is_shown
 from pipelines.geometry.arrays import Picture
 from pipelines.session.errors import DataError
 from pipelines.session.registries import FORMATS, VideoFormat
@@ -485,3 +485,28 @@ def test_the_stated_time_of_creation_is_read(tmp_path: Path, stated: str | None,
             container.mux(stream.encode(picture))
         container.mux(stream.encode(None))
     assert created_ns(path) == made_ns
+
+
+# --- black bars ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bars", [(0, 0, 0, 0), (0, 7, 0, 8), (33, 0, 21, 0)])
+def test_black_bars_are_counted_to_a_pixel(tmp_path: Path, bars: tuple[int, int, int, int]) -> None:
+    left, top, right, bottom = bars
+
+    def draw(number: int) -> Picture:
+        picture = np.zeros((120, 200, 3), dtype=np.uint8)
+        picture[top : 120 - bottom, left : 200 - right] = (150, 110 + number, 100)
+        return picture
+
+    assert black_bars(write_video(tmp_path / "v.mp4", even_ticks(9), draw=draw)) == bars
+
+
+def test_a_black_video_has_no_bars(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mp4", even_ticks(2), draw=lambda _: np.zeros((48, 64, 3), np.uint8))
+    assert black_bars(path) == (0, 0, 0, 0)
+
+
+def test_the_real_letterboxed_videos() -> None:
+    for name, rows in (("cam01", 7), ("cam02", 7), ("cam03", 0)):
+        assert black_bars(real_data(f"pose2sim_single/videos/{name}.mp4")) == (0, rows, 0, rows)
